@@ -1,0 +1,19 @@
+"""Files that come with handtouch (deployments, scenarios, the node's EDS): where this installation keeps them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+_PLACES = (_PACKAGE / "shipped_files", _PACKAGE.parents[1] / "config")  # a wheel's; a checkout's
+
+
+def path(name: str) -> Path:
+    """Path of a shipped file by its name in `config/`, e.g. "handtouch-node.eds".
+
+    Raises FileNotFoundError naming the places looked in.
+    """
+    for place in _PLACES:
+        if (place / name).is_file():
+            return place / name
+    raise FileNotFoundError(f"{name} is not among the shipped files in {' or '.join(map(str, _PLACES))}")
