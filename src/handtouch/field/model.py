@@ -1,0 +1,41 @@
+"""What every forward model of a pad offers, so that estimators and banks work with any of them."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@runtime_checkable
+class ForwardModel(Protocol):
+    """A point contact at (x, y) of a pad 0 <= x <= a, 0 <= y <= b, to the fractions its channels measure.
+
+    Channels are ordered x0, xa, y0, yb; a model with other electrodes has as many channels as electrodes.
+    The fractions are those *measured* (corner gaps and series resistors included), per unit of the current
+    that the contact would inject into a grounded sheet; they need not sum to one.
+    """
+
+    @property
+    def a(self) -> float:
+        """Length of the pad along x, in the unit of x."""
+        ...
+
+    @property
+    def b(self) -> float:
+        """Length of the pad along y, in the unit of y."""
+        ...
+
+    def fractions(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return the measured fractions, shape (channels, ...) for x and y of broadcast shape (...).
+
+        NaN, in its own element only, for a point that is NaN or off the pad.
+        """
+        ...
+
+    def fractions_with_jacobian(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return `fractions` and their derivatives by (x, y), shape (channels, 2, ...)."""
+        ...
