@@ -1,0 +1,173 @@
+"""Surfaces of revolution with any smooth profile, tabulated to 1e-12 of its length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+from handtouch.field._conformal import FloatArray, Meridian, Revolved, check_arc
+
+_STEPS = 128  # table steps per spline segment
+_ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+@dataclass(frozen=True)
+class Revolution(Revolved):
+    """A patch of any surface of revolution, its profile a smooth curve (cubic spline) through given points.
+
+    `axial_m`, `radius_m`: the points of the profile from electrode x0 to xa, at least two, no two the same,
+    radii positive; the outside is the side away from the axis. Lengths and angles follow the spline to
+    1e-12 of the profile's length.
+    """
+
+    axial_m: tuple[float, ...]
+    radius_m: tuple[float, ...]
+    arc_rad: float
+
+    def __post_init__(self) -> None:
+        check_arc(self.arc_rad)
+        axial, radius = np.asarray(self.axial_m, float), np.asarray(self.radius_m, float)
+        if axial.ndim != 1 or axial.size < 2 or not np.isfinite(axial).all():
+            raise ValueError("axial_m must be a sequence of at least two finite numbers")
+        if radius.shape != axial.shape:
+            raise ValueError(f"radius_m must have as many points as axial_m, {axial.size}, got {radius.size}")
+        if not (np.isfinite(radius).all() and (radius > 0).all()):
+            raise ValueError("radius_m must be positive and finite at every point")
+        if (np.hypot(np.diff(axial), np.diff(radius)) == 0).any():
+            raise ValueError("axial_m and radius_m name the same point twice running")
+        _ = self._profile  # built here, so that a curve that cannot be is refused here
+
+    @cached_property
+    def _profile(self) -> SplineProfile:
+        return SplineProfile(np.asarray(self.axial_m, float), np.asarray(self.radius_m, float))
+
+    @cached_property
+    def a(self) -> float:
+        return self._mid_radius * self._profile.conformal_length
+
+    @cached_property
+    def b(self) -> float:
+        return self._mid_radius * self.arc_rad
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        return self._profile.length, self.b
+
+    @cached_property
+    def _mid_point(self) -> tuple[float, float, float]:
+        """Conformal coordinate, axial position and radius half way along the profile."""
+        half = np.array([self._profile.length / 2])
+        parameter = self._profile.at_arc_length(half)
+        axial, radius, _, _ = self._profile.curve(parameter)
+        return float(self._profile.conformal(parameter)[0]), float(axial[0]), float(radius[0])
+
+    @property
+    def _mid_radius(self) -> float:
+        return self._mid_point[2]
+
+    @property
+    def _curvature(self) -> float:
+        return 1 / self._mid_radius
+
+    @property
+    def _middle(self) -> float:
+        return self._mid_point[0] * self._mid_radius
+
+    def _arc_length(self, x: FloatArray) -> FloatArray:
+        return self._profile.arc_length(self._profile.at_conformal(x / self._mid_radius))
+
+    def _conformal(self, u: FloatArray) -> FloatArray:
+        return self._mid_radius * self._profile.conformal(self._profile.at_arc_length(u))
+
+    def _meridian(self, x: FloatArray) -> Meridian:
+        axial, radius, cosine, sine = self._profile.curve(self._profile.at_conformal(x / self._mid_radius))
+        _, mid_axial, mid_radius = self._mid_point
+        return Meridian(axial - mid_axial, radius - mid_radius, radius / mid_radius, cosine, sine)
+
+
+class SplineProfile:
+    """Cubic spline (axial, radius) against chord length; the parameter t is the chord length.
+
+    The axis is taken in the direction of travel, so that the outside is always the side away from it.
+    """
+
+    def __init__(self, axial: FloatArray, radius: FloatArray) -> None:
+        forward = 1.0 if axial[-1] >= axial[0] else -1.0
+        points = np.stack([forward * axial, radius], axis=1)
+        knots = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        self._spline = CubicSpline(knots, points)
+        steps = np.linspace(0, 1, _STEPS, endpoint=False)
+        self._nodes = np.append((knots[:-1, None] + np.diff(knots)[:, None] * steps).ravel(), knots[-1])
+        if not self._spline(self._nodes)[:, 1].min() > 0:
+            raise ValueError(
+                "radius_m: the smooth curve through the points crosses the axis; give more points"
+            )
+        half = np.diff(self._nodes) / 2
+        samples = (self._nodes[:-1] + half)[:, None] + half[:, None] * _ABSCISSAE
+        speed = self._speed(samples)
+        self._arc = self._table(half * (speed @ _WEIGHTS), self._speed(self._nodes))
+        self._log = self._table(
+            half * ((speed / self._spline(samples)[..., 1]) @ _WEIGHTS),
+            self._speed(self._nodes) / self._spline(self._nodes)[..., 1],
+        )
+        self._from_arc = self._inverse(self._arc)
+        self._from_log = self._inverse(self._log)
+
+    @property
+    def length(self) -> float:
+        """Arc length of the whole profile."""
+        return float(self._arc(self._nodes[-1]))
+
+    @property
+    def conformal_length(self) -> float:
+        """Integral of ds / r over the whole profile."""
+        return float(self._log(self._nodes[-1]))
+
+    def curve(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Axial position, radius, and cosine and sine of the slope at t; NaN outside the profile."""
+        axial, radius = np.moveaxis(self._spline(t, extrapolate=False), -1, 0)
+        forward, outward = np.moveaxis(self._spline(t, 1, extrapolate=False), -1, 0)
+        speed = np.hypot(forward, outward)
+        return axial, radius, forward / speed, outward / speed
+
+    def arc_length(self, t: FloatArray) -> FloatArray:
+        """Arc length from the start to t."""
+        return np.asarray(self._arc(t))
+
+    def conformal(self, t: FloatArray) -> FloatArray:
+        """Integral of ds / r from the start to t."""
+        return np.asarray(self._log(t))
+
+    def at_arc_length(self, length: FloatArray) -> FloatArray:
+        """T where the arc length is as given."""
+        return _solve(self._arc, self._from_arc, length)
+
+    def at_conformal(self, value: FloatArray) -> FloatArray:
+        """T where the conformal coordinate is as given."""
+        return _solve(self._log, self._from_log, value)
+
+    def _speed(self, t: FloatArray) -> FloatArray:
+        return np.asarray(np.hypot(*np.moveaxis(self._spline(t, 1), -1, 0)))
+
+    def _table(self, pieces: FloatArray, slope: FloatArray) -> CubicHermiteSpline:
+        return CubicHermiteSpline(
+            self._nodes, np.concatenate([[0.0], np.cumsum(pieces)]), slope, extrapolate=False
+        )
+
+    def _inverse(self, table: CubicHermiteSpline) -> CubicHermiteSpline:
+        return CubicHermiteSpline(
+            table(self._nodes), self._nodes, 1 / table(self._nodes, 1), extrapolate=False
+        )
+
+
+def _solve(table: CubicHermiteSpline, inverse: CubicHermiteSpline, value: FloatArray) -> FloatArray:
+    """Table's argument for a value: a start from the inverse table, one Newton step to rounding error."""
+    first, last = inverse.x[0], inverse.x[-1]
+    slack = 1e-12 * (last - first)  # the end itself, as its rounding may leave it
+    inside = (value >= first - slack) & (value <= last + slack)
+    value = np.where(inside, np.clip(value, first, last), np.nan)
+    start = inverse(value)
+    return np.clip(start - (table(start) - value) / table(start, 1), table.x[0], table.x[-1])

@@ -1,0 +1,329 @@
+"""Surfaces that a sensor may cover, each with the conformal map that makes it a rectangle.
+
+Public names: `Surface` and its kinds `Plane`, `Prism`, `Cylinder`, `Cone`, `Sphere`, `Revolution`;
+`Anisotropic` wraps any of them.
+
+The currents of a sensor do not change under a conformal map, so a pad is solved on its rectangle [0, a] x
+[0, b] and only the result is carried to the surface. For a surface of revolution of radius r(u) at arc
+length u the rectangle is x = r_mid * integral du / r(u), y = r_mid * angle, where r_mid is the radius half
+way along the profile: there, at the centre of the pad, a rectangle unit is a metre. The isotropic sheet
+resistance stays as it is; a contact of radius A becomes one of radius A / `scale`.
+
+Coordinates
+    x, y   on the rectangle; electrode x0 lies at x = 0, xa at x = a, y0 at y = 0, yb at y = b
+    u, v   metres along the surface: u along the profile from x0, v along the parallel at that u from y0
+    pad frame   metres; origin on the surface at u = u_max / 2, half way round; z is the outward normal
+                there, x points towards electrode xa, y = z cross x towards yb
+Arguments broadcast. Outside the patch the surface is continued as far as it exists; beyond that the answer
+is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from handtouch.field._conformal import (
+    FloatArray,
+    Meridian,
+    Revolved,
+    Surface,
+    check_arc,
+    check_lengths,
+    ratio_or_one,
+)
+from handtouch.field._prism import Prism
+from handtouch.field._revolution import Revolution
+
+__all__ = ["Anisotropic", "Cone", "Cylinder", "Plane", "Prism", "Revolution", "Sphere", "Surface"]
+
+
+class _Straight(Revolved):
+    """A plane or a cylinder: the conformal coordinate is the arc length."""
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        return self.a, self.b
+
+    @property
+    def _middle(self) -> float:
+        return self.a / 2
+
+    def _arc_length(self, x: FloatArray) -> FloatArray:
+        return +x
+
+    def _conformal(self, u: FloatArray) -> FloatArray:
+        return +u
+
+    def _meridian(self, x: FloatArray) -> Meridian:
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        return Meridian(x - self._middle, zero, one, one, zero)
+
+
+@dataclass(frozen=True)
+class Plane(_Straight):
+    """A flat rectangle; rectangle units are metres.
+
+    `width_m` runs along x, from electrode x0 to xa; `height_m` along y.
+    """
+
+    width_m: float
+    height_m: float
+
+    def __post_init__(self) -> None:
+        check_lengths(width_m=self.width_m, height_m=self.height_m)
+
+    @property
+    def a(self) -> float:
+        return self.width_m
+
+    @property
+    def b(self) -> float:
+        return self.height_m
+
+    @property
+    def _curvature(self) -> float:
+        return 0.0
+
+
+@dataclass(frozen=True)
+class Cylinder(_Straight):
+    """A patch of a cylinder: x along the axis, y around it; developable, so rectangle units are metres."""
+
+    radius_m: float
+    length_m: float
+    arc_rad: float
+
+    def __post_init__(self) -> None:
+        check_lengths(radius_m=self.radius_m, length_m=self.length_m)
+        check_arc(self.arc_rad)
+
+    @property
+    def a(self) -> float:
+        return self.length_m
+
+    @property
+    def b(self) -> float:
+        return self.radius_m * self.arc_rad
+
+    @property
+    def _curvature(self) -> float:
+        return 1 / self.radius_m
+
+
+@dataclass(frozen=True)
+class Cone(Revolved):
+    """A patch of a cone between two of its circles; log(radius) and the angle are its rectangle.
+
+    `near_radius_m`, `far_radius_m`: radius of the circle at electrode x0 and at xa. `slant_m`: length
+    between them along the surface. Either end may be the wider one; equal radii make a cylinder, |far -
+    near| = slant a flat ring.
+    """
+
+    near_radius_m: float
+    far_radius_m: float
+    slant_m: float
+    arc_rad: float
+
+    def __post_init__(self) -> None:
+        check_lengths(near_radius_m=self.near_radius_m, far_radius_m=self.far_radius_m, slant_m=self.slant_m)
+        check_arc(self.arc_rad)
+        if abs(self.far_radius_m - self.near_radius_m) > self.slant_m:
+            raise ValueError(
+                f"slant_m must be at least the difference of the radii, "
+                f"{abs(self.far_radius_m - self.near_radius_m)} m, got {self.slant_m}"
+            )
+
+    @cached_property
+    def a(self) -> float:
+        return float(self._conformal(np.array(self.slant_m)))
+
+    @cached_property
+    def b(self) -> float:
+        return self._mid_radius * self.arc_rad
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        return self.slant_m, self.b
+
+    @cached_property
+    def _mid_radius(self) -> float:
+        return (self.near_radius_m + self.far_radius_m) / 2
+
+    @cached_property
+    def _slope(self) -> float:
+        return (self.far_radius_m - self.near_radius_m) / self.slant_m
+
+    @property
+    def _curvature(self) -> float:
+        return 1 / self._mid_radius
+
+    @cached_property
+    def _middle(self) -> float:
+        return float(self._conformal(np.array(self.slant_m / 2)))
+
+    def _arc_length(self, x: FloatArray) -> FloatArray:
+        growth = x * (self._slope / self._mid_radius)
+        return np.asarray(
+            x * (self.near_radius_m / self._mid_radius) * ratio_or_one(np.expm1(growth), growth)
+        )
+
+    def _conformal(self, u: FloatArray) -> FloatArray:
+        growth = u * (self._slope / self.near_radius_m)
+        with np.errstate(invalid="ignore", divide="ignore"):  # at or beyond the apex: no such point
+            logarithm = np.where(growth > -1, np.log1p(growth), np.nan)
+        return np.asarray(u * (self._mid_radius / self.near_radius_m) * ratio_or_one(logarithm, growth))
+
+    def _meridian(self, x: FloatArray) -> Meridian:
+        from_centre = self._arc_length(x) - self.slant_m / 2
+        cosine = math.sqrt((1 - self._slope) * (1 + self._slope))
+        scale = 1 + from_centre * (self._slope / self._mid_radius)
+        return Meridian(
+            cosine * from_centre,
+            self._slope * from_centre,
+            scale,
+            np.full_like(scale, cosine),
+            np.full_like(scale, self._slope),
+        )
+
+
+@dataclass(frozen=True)
+class Sphere(Revolved):
+    """A patch of a sphere between two parallels and two meridians; Mercator's coordinate is its x.
+
+    `from_rad`, `to_rad`: latitudes of electrodes x0 and xa, inside (-pi/2, pi/2), either one the northern.
+    """
+
+    radius_m: float
+    from_rad: float
+    to_rad: float
+    arc_rad: float
+
+    def __post_init__(self) -> None:
+        check_lengths(radius_m=self.radius_m)
+        check_arc(self.arc_rad)
+        for name, latitude in (("from_rad", self.from_rad), ("to_rad", self.to_rad)):
+            if not abs(latitude) < math.pi / 2:
+                raise ValueError(
+                    f"{name} must be a latitude between -pi/2 and pi/2, poles excluded, got {latitude}"
+                )
+        if self.from_rad == self.to_rad:
+            raise ValueError(f"to_rad must differ from from_rad, got {self.to_rad} for both")
+
+    @cached_property
+    def a(self) -> float:
+        return float(self._conformal(np.array(self.extent_m[0])))
+
+    @cached_property
+    def b(self) -> float:
+        return self._mid_radius * self.arc_rad
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        return self.radius_m * abs(self.to_rad - self.from_rad), self.b
+
+    @cached_property
+    def _start(self) -> float:
+        # the pole that the pad points to is called the north one
+        return self.from_rad if self.to_rad > self.from_rad else -self.from_rad
+
+    @cached_property
+    def _mid_latitude(self) -> float:
+        return self._start + abs(self.to_rad - self.from_rad) / 2
+
+    @cached_property
+    def _mid_radius(self) -> float:
+        return self.radius_m * math.cos(self._mid_latitude)
+
+    @property
+    def _curvature(self) -> float:
+        return 1 / self._mid_radius
+
+    @cached_property
+    def _middle(self) -> float:
+        return float(self._conformal(np.array(self.extent_m[0] / 2)))
+
+    def _climb(self, x: FloatArray) -> FloatArray:
+        """Latitude above electrode x0's: differences are formed before the functions, so none cancels."""
+        half = x / (2 * self._mid_radius)
+        return np.asarray(2 * np.arctan(np.sinh(half) / np.cosh(half + math.asinh(math.tan(self._start)))))
+
+    def _arc_length(self, x: FloatArray) -> FloatArray:
+        return self.radius_m * self._climb(x)
+
+    def _conformal(self, u: FloatArray) -> FloatArray:
+        half = u / (2 * self.radius_m)
+        latitude = self._start + 2 * half
+        rise = 2 * np.cos(self._start + half) * np.sin(half)  # difference of the sines of latitude
+        with np.errstate(divide="ignore", invalid="ignore"):  # at the pole
+            mercator = np.arcsinh(rise / (np.cos(latitude) * math.cos(self._start)))
+        return np.asarray(np.where(np.abs(latitude) < np.pi / 2, self._mid_radius * mercator, np.nan))
+
+    def _meridian(self, x: FloatArray) -> Meridian:
+        latitude = self._start + self._climb(x)
+        half = (latitude - self._mid_latitude) / 2
+        mean = (latitude + self._mid_latitude) / 2
+        cosine, sine = np.cos(latitude), np.sin(latitude)
+        chord = 2 * self.radius_m * np.sin(half)
+        return Meridian(
+            chord * np.cos(mean), -chord * np.sin(mean), cosine / math.cos(self._mid_latitude), cosine, -sine
+        )
+
+
+@dataclass(frozen=True)
+class Anisotropic(Surface):
+    """A surface whose sheet conducts worse along x than along y, or better: x of the rectangle is stretched
+    to suit.
+
+    `resistivity_ratio` is rho_x / rho_y; the rectangle then belongs to an isotropic sheet of sqrt(rho_x
+    rho_y) / w ohm per square (paper 3.3).
+    """
+
+    surface: Surface
+    resistivity_ratio: float
+
+    def __post_init__(self) -> None:
+        check_lengths(resistivity_ratio=self.resistivity_ratio)
+
+    @cached_property
+    def _stretch(self) -> float:
+        return math.sqrt(self.resistivity_ratio)
+
+    @property
+    def a(self) -> float:
+        return self.surface.a * self._stretch
+
+    @property
+    def b(self) -> float:
+        return self.surface.b
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        return self.surface.extent_m
+
+    def from_rectangle(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        return self.surface.from_rectangle(self._relaxed(x), y)
+
+    def to_rectangle(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        x, y = self.surface.to_rectangle(u, v)
+        return np.asarray(x * self._stretch), y
+
+    def point(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        return self.surface.point(self._relaxed(x), y)
+
+    def tangents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        return self.surface.tangents(self._relaxed(x), y)
+
+    def normal(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        return self.surface.normal(self._relaxed(x), y)
+
+    def scales(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        along, around = self.surface.scales(self._relaxed(x), y)
+        return np.stack([along / self._stretch, around])
+
+    def _relaxed(self, x: npt.ArrayLike) -> FloatArray:
+        return np.asarray(np.asarray(x, np.float64) / self._stretch)
