@@ -1,0 +1,307 @@
+"""The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
+
+Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Service`; `encode`, `decode`, `topic_of`,
+`WireError`, `PadState`. `docs/wire.md` describes every field for readers in other languages.
+SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil, never NaN.
+"""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Any, Union
+
+import msgpack
+
+SCHEMA_VERSION = 1
+"""Goes up when a field changes its meaning or goes; new fields don't raise it: readers ignore unknown keys."""
+
+Vector3 = tuple[float, float, float]
+Floats9 = tuple[float, float, float, float, float, float, float, float, float]
+
+
+class WireError(ValueError):
+    """A message that doesn't keep the contract."""
+
+
+class PadState(IntEnum):
+    """What a subscriber may believe of a pad: no contact, stale and faulted are different things."""
+
+    CLEAR = 0
+    """sampled, not touched"""
+    TOUCHED = 1
+    STALE = 2
+    """no sample for three periods"""
+    LOST = 3
+    """the node's heartbeat timed out"""
+    FAULTED = 4
+    """samples that can't be trusted: see the pad's health"""
+    STARTING = 5
+    """the node hasn't been brought up yet"""
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """`contact/<hand>/<link>`: one touch at one instant of its life."""
+
+    v: int
+    seq: int
+    t_ns: int
+    event: str
+    """begin, update or end"""
+    id: int
+    """the same from begin to end, never used again while the daemon lives"""
+    hand: str
+    link: str
+    frame: str
+    """frame of position_m, normal and covariance_m2: the link's name"""
+    begin_ns: int
+    duration_s: float
+    age_s: float
+    """from the sample to the sending of this message"""
+    position_m: Vector3 | None
+    normal: Vector3 | None
+    covariance_m2: Floats9 | None
+    """of position_m, row by row"""
+    pad_m: tuple[float, float] | None
+    """arc lengths on the pad from the electrodes x0 and y0"""
+    location: str
+    """valid or invalid"""
+    force_n: float | None
+    force_std_n: float | None
+    peak_force_n: float | None
+    strength: str
+    """valid, saturated (force_n is a lower bound) or invalid"""
+    current_a: float
+    residual: float | None
+    """excess of the two x currents over those of a point, part of the total; positive: elongated along x"""
+    residual_std: float | None
+    on_n: float
+    off_n: float
+    calibration: str
+    reason: str
+    """why a contact ended: released, stale, lost, faulted or stopped; else empty"""
+    repeat: bool
+    """sent again for a late joiner, under the seq of the original"""
+
+
+@dataclass(frozen=True, slots=True)
+class HandFrame:
+    """`hand/<hand>`: the whole hand as columns, one per tick; each column little-endian, one row per link."""
+
+    v: int
+    seq: int
+    t_ns: int
+    tick: int
+    hand: str
+    links: tuple[str, ...]
+    state: bytes
+    """uint8, PadState"""
+    contact: bytes
+    """uint32 contact id, 0 for none"""
+    sample_ns: bytes
+    """int64, sample time of each pad, 0 before the first"""
+    current_a: bytes
+    """float32, total current"""
+    position_m: bytes
+    """float32 x 3 in the link frame, NaN without a valid location"""
+    normal: bytes
+    """float32 x 3"""
+    force_n: bytes
+    """float32, NaN without a valid strength"""
+    force_std_n: bytes
+    """float32"""
+    repeat: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """`health/<hand>/<link>`: a pad and its node; sent at every change and once a second."""
+
+    v: int
+    seq: int
+    t_ns: int
+    hand: str
+    link: str
+    bus: str
+    node_id: int
+    state: str
+    """the pad, as PadState in small letters"""
+    node: str
+    """the node's state: absent, booting, identified, configuring, settling, operational, faulted, stopped"""
+    since_ns: int
+    """when the node entered its state"""
+    reason: str
+    """cause and remedy in plain words, empty when all is well"""
+    serial: int | None
+    rate_hz: float
+    """samples per second over the last second"""
+    samples: int
+    missed: int
+    """ticks that had to do without a sample of this pad"""
+    age_s: float | None
+    emergencies: tuple[str, ...]
+    """latest EMCY messages as text, newest last"""
+    repeat: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Raw:
+    """`raw/<hand>`: the counts as they came, one per tick."""
+
+    v: int
+    seq: int
+    t_ns: int
+    tick: int
+    hand: str
+    links: tuple[str, ...]
+    counts: bytes
+    """int16 x 4 (x0, xa, y0, yb), little-endian, one row per link"""
+    sample_ns: bytes
+    """int64"""
+    fresh: bytes
+    """uint8, 1 where the sample belongs to this tick"""
+    repeat: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """`service`: the daemon's own heartbeat, twice a second; three missed ones mean that it is gone."""
+
+    v: int
+    seq: int
+    t_ns: int
+    wall_offset_ns: int
+    """add to a t_ns for nanoseconds since 1970 UTC"""
+    version: str
+    pid: int
+    uptime_s: float
+    period_s: float
+    hands: dict[str, Any]
+    """hand -> list of its links"""
+    ticks: int
+    overruns: int
+    """ticks that were not done when the next was due"""
+    rate_hz: float
+    tick_us: dict[str, Any]
+    """median, p99 and max of the last half second's ticks, from the last sample to the last message"""
+    buses: dict[str, Any]
+    """bus -> load (part of the bit rate) and counters by cause"""
+    drops: dict[str, Any]
+    """messages dropped by cause"""
+    subscriptions: tuple[str, ...]
+    repeat: bool
+
+
+Message = Contact | HandFrame | Health | Raw | Service
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A row of the table: how a topic starts, how many parts follow, what it carries."""
+
+    prefix: str
+    parts: int
+    payload: type[Any]
+    rate: str
+
+
+TOPICS = (
+    Topic("contact", 2, Contact, "at each tick while touched, and at begin and end"),
+    Topic("hand", 1, HandFrame, "one per tick"),
+    Topic("health", 2, Health, "at every change, and once a second"),
+    Topic("raw", 1, Raw, "one per tick"),
+    Topic("service", 0, Service, "twice a second"),
+)
+_BY_PREFIX = {topic.prefix: topic for topic in TOPICS}
+_FIELDS = {topic.payload: tuple(field.name for field in fields(topic.payload)) for topic in TOPICS}
+
+
+def topic_of(message: Message) -> str:
+    """Topic that a message belongs to."""
+    if isinstance(message, Contact):
+        return f"contact/{message.hand}/{message.link}"
+    if isinstance(message, Health):
+        return f"health/{message.hand}/{message.link}"
+    if isinstance(message, HandFrame):
+        return f"hand/{message.hand}"
+    return f"raw/{message.hand}" if isinstance(message, Raw) else "service"
+
+
+def encode(message: Message) -> list[bytes]:
+    """The two parts of a message, ready for a ZeroMQ multipart send."""
+    payload = {name: getattr(message, name) for name in _FIELDS[type(message)]}
+    return [topic_of(message).encode(), msgpack.packb(payload)]
+
+
+def decode(parts: typing.Sequence[bytes]) -> Message:
+    """The message in the two parts of a ZeroMQ message; unknown keys of the map are ignored.
+
+    Raises WireError naming what is wrong with a malformed message, whatever its bytes.
+    """
+    if len(parts) != 2:
+        raise WireError(f"{len(parts)} parts instead of [topic, payload]")
+    name = parts[0].decode("utf-8", "replace")
+    prefix, *rest = name.split("/")
+    row = _BY_PREFIX.get(prefix)
+    if row is None or len(rest) != row.parts:
+        raise WireError(f"unknown topic {name[:80]!r}")
+    try:
+        payload = msgpack.unpackb(parts[1])
+    except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:
+        raise WireError(f"{name}: payload isn't msgpack: {error}") from error
+    if not isinstance(payload, dict):
+        raise WireError(f"{name}: payload isn't a map")
+    if payload.get("v") != SCHEMA_VERSION:
+        raise WireError(f"{name}: schema version {payload.get('v')!r}, this reader knows {SCHEMA_VERSION}")
+    message = row.payload(**_checked(name, payload, row.payload))
+    if topic_of(message) != name:
+        raise WireError(f"{name}: payload belongs to {topic_of(message)}")
+    return typing.cast(Message, message)
+
+
+def _checked(topic: str, payload: dict[Any, Any], kind: type[Any]) -> dict[str, Any]:
+    values = {}
+    for name, check in _CHECKS[kind]:
+        try:
+            values[name] = check(payload[name])
+        except KeyError:
+            raise WireError(f"{topic}: {name} is missing") from None
+        except (TypeError, ValueError):
+            raise WireError(f"{topic}: {name} = {payload[name]!r:.60} has the wrong type") from None
+    return values
+
+
+def _check(kind: Any) -> Callable[[Any], Any]:
+    """A function that returns a value of the annotated type or raises TypeError."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (Union, types.UnionType):
+        inner = next(_check(argument) for argument in arguments if argument is not type(None))
+        return lambda value: None if value is None else inner(value)
+    if origin is tuple:
+        item = _check(arguments[0])
+        length = None if arguments[-1] is Ellipsis else len(arguments)
+        return lambda value: _tuple(value, item, length)
+    accepted = {float: (float, int)}.get(kind, (origin or kind,))
+    return lambda value: _scalar(value, accepted, kind is bool)
+
+
+def _tuple(value: Any, item: Callable[[Any], Any], length: int | None) -> tuple[Any, ...]:
+    if not isinstance(value, list | tuple) or (length is not None and len(value) != length):
+        raise TypeError
+    return tuple(item(element) for element in value)
+
+
+def _scalar(value: Any, accepted: tuple[type, ...], boolean: bool) -> Any:
+    if not isinstance(value, accepted) or (isinstance(value, bool) and not boolean):
+        raise TypeError
+    return float(typing.cast(float, value)) if accepted[0] is float else value
+
+
+_CHECKS = {
+    payload: tuple((name, _check(hint)) for name, hint in typing.get_type_hints(payload).items())
+    for payload in _FIELDS
+}
