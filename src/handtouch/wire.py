@@ -17,7 +17,7 @@ from typing import Any, Union
 import msgpack
 
 SCHEMA_VERSION = 1
-"""Goes up when a field changes its meaning or goes; new fields don't raise it: readers ignore unknown keys."""
+"""Goes up when a field changes its meaning or goes; new fields don't count: readers ignore unknown keys."""
 
 Vector3 = tuple[float, float, float]
 Floats9 = tuple[float, float, float, float, float, float, float, float, float]

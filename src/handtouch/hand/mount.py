@@ -1,0 +1,33 @@
+"""From the deployment's millimetres and degrees to surfaces and mounts in SI."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from handtouch import config
+from handtouch.field.surface import Cone, Cylinder, Plane, Sphere, Surface
+
+_MM = 1e-3
+
+
+def surface_of(pad: config.Pad) -> Surface:
+    """The surface that a pad covers, in metres and radians."""
+    shape = pad.surface
+    if isinstance(shape, config.Plane):
+        return Plane(shape.length_mm * _MM, shape.width_mm * _MM)
+    arc_rad = math.radians(shape.arc_deg)
+    if isinstance(shape, config.Cylinder):
+        return Cylinder(shape.radius_mm * _MM, shape.length_mm * _MM, arc_rad)
+    if isinstance(shape, config.Cone):
+        return Cone(shape.near_radius_mm * _MM, shape.far_radius_mm * _MM, shape.slant_mm * _MM, arc_rad)
+    return Sphere(shape.radius_mm * _MM, math.radians(shape.from_deg), math.radians(shape.to_deg), arc_rad)
+
+
+def mount_of(pad: config.Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and translation (3,) [m] that carry the pad's frame into its link's frame."""
+    rotation = Rotation.from_euler("xyz", pad.mount.rpy_deg, degrees=True).as_matrix()
+    return np.asarray(rotation, np.float64), np.array(pad.mount.position_mm) * _MM

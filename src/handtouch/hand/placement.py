@@ -1,0 +1,119 @@
+"""Places contacts of many pads on their links in one vectorised pass.
+
+Every surface is a meridian swept about an axis (a plane is the case without curvature). The meridian of
+each pad is tabulated once as cubic splines over x, in components along the axis and away from it; the mount
+is folded into each pad's basis, so that a tick costs a gather, a few sines and one small matrix product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from handtouch.field.surface import Surface
+
+FloatArray = NDArray[np.float64]
+_INTERVALS = 64
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Contacts in the frames of their links; n rows."""
+
+    position_m: FloatArray
+    """(n, 3)"""
+    normal: FloatArray
+    """(n, 3), unit, outward"""
+    covariance_m2: FloatArray
+    """(n, 3, 3) of position_m; singular along the normal, for a contact lies on the surface"""
+    pad_m: FloatArray
+    """(n, 2) arc lengths from the electrodes x0 and y0"""
+
+
+class Placement:
+    """Where contacts of the pads of a hand are: `place` for any of them at once.
+
+    `pads` are (surface, rotation (3, 3), translation (3,)) triples, the mount carrying the pad's frame
+    into the link's; surfaces are planes or patches of surfaces of revolution. Positions are within 1e-8 of
+    a pad's size of the surface's own `point`.
+    """
+
+    def __init__(self, pads: Sequence[tuple[Surface, FloatArray, FloatArray]]) -> None:
+        self._origin = np.stack([translation for _, _, translation in pads])
+        self._mid_y = np.array([surface.b / 2 for surface, _, _ in pads])
+        self._per_x = np.array([_INTERVALS / surface.a for surface, _, _ in pads])
+        self._curvature = np.array([_sweep(surface)[0] for surface, _, _ in pads])
+        self._basis = np.stack([_sweep(surface)[1] @ rotation.T for surface, rotation, _ in pads])
+        self._meridian = np.stack([_meridian(surface) for surface, _, _ in pads])
+
+    def place(self, index: NDArray[np.intp], x: FloatArray, y: FloatArray, covariance: FloatArray) -> Placed:
+        """Contacts at (x, y) [rectangle units, shape (n,)] with covariance (n, 2, 2), on pads `index` (n,).
+
+        NaN in gives NaN out in the same row; points off the pad continue its surface.
+        """
+        step = np.where(np.isfinite(x), x, 0.0) * self._per_x[index]
+        interval = np.clip(step.astype(np.intp), 0, _INTERVALS - 1)
+        cubic = self._meridian[index, interval]  # (n, 4, 7)
+        t = (x * self._per_x[index] - interval)[:, None]
+        axial, radial, cosine, sine, scale_x, scale_y, u = (
+            ((cubic[:, 0] * t + cubic[:, 1]) * t + cubic[:, 2]) * t + cubic[:, 3]
+        ).T
+        off_middle = y - self._mid_y[index]
+        angle = off_middle * self._curvature[index]
+        across = scale_y * off_middle
+        cos, sin = np.cos(angle), np.sin(angle)
+        vectors = np.zeros((len(x), 4, 3))  # rows: point, tangents, normal; in axis, radial, aside
+        point, along, around, normal = vectors[:, 0], vectors[:, 1], vectors[:, 2], vectors[:, 3]
+        point[:, 0] = axial
+        point[:, 1] = radial - across * (angle / 2) * np.sinc(angle / (2 * np.pi)) ** 2
+        point[:, 2] = across * np.sinc(angle / np.pi)
+        along[:, 0], along[:, 1], along[:, 2] = cosine, sine * cos, sine * sin
+        around[:, 1], around[:, 2] = -sin, cos
+        normal[:, 0], normal[:, 1], normal[:, 2] = -sine, cosine * cos, cosine * sin
+        vectors = vectors @ self._basis[index]
+        scales = np.stack([scale_x, scale_y], axis=1)
+        tangents = vectors[:, 1:3] * scales[:, :, None]
+        return Placed(
+            vectors[:, 0] + self._origin[index],
+            vectors[:, 3],
+            tangents.transpose(0, 2, 1) @ covariance @ tangents,
+            np.stack([u, scale_y * y], axis=1),
+        )
+
+
+def _sweep(surface: Surface) -> tuple[float, FloatArray]:
+    """Curvature about the axis [1/m] and the rows axis, radial, aside (3, 3) in the pad frame."""
+    quarter = surface.b / 4  # off the middle; less than a quarter turn, so the sine below has one sign
+    aside, turned = surface.tangents(surface.a / 2, np.array([2, 3]) * quarter)[1].T
+    sine = float(np.hypot(turned[0], turned[2]))
+    radial = -np.array([turned[0], 0.0, turned[2]]) / sine if sine > 0 else np.array([0.0, 0.0, 1.0])
+    axis = np.array([radial[2], 0.0, -radial[0]])
+    return float(np.arctan2(sine, turned[1])) / quarter, np.stack([axis, radial, aside])
+
+
+def _meridian(surface: Surface) -> FloatArray:
+    """Spline coefficients (intervals, 4, 7), highest power first, each interval of unit length.
+
+    Columns: position along the axis and away from it [m], the same of the unit tangent, metres per
+    rectangle unit along x and y, arc length u [m].
+    """
+    x = np.linspace(0, surface.a, _INTERVALS + 1)
+    y = np.full_like(x, surface.b / 2)
+    axis, radial, _ = _sweep(surface)[1]
+    point, tangent = surface.point(x, y), surface.tangents(x, y)[0]
+    columns = np.stack(
+        [
+            axis @ point,
+            radial @ point,
+            axis @ tangent,
+            radial @ tangent,
+            *surface.scales(x, y),
+            surface.from_rectangle(x, y)[0],
+        ],
+        axis=1,
+    )
+    return np.asarray(CubicSpline(np.arange(_INTERVALS + 1), columns).c.transpose(1, 0, 2))
