@@ -1,0 +1,33 @@
+"""When to tick: once per SYNC, as soon as every expected sample is there, or when its window has passed.
+
+The same rules serve a live bus and a recorded one: time comes in as an argument, from the clock or the log.
+"""
+
+from __future__ import annotations
+
+
+class Cycle:
+    """One SYNC period after another; `t_ns` is the present one's SYNC.
+
+    Between two `begin`s exactly one tick falls due. Without a SYNC (none sent on this bus, or a producer
+    that died) `begin_overdue` says when to go on by the timer, so that silence is noticed too.
+    """
+
+    def __init__(self, period_ns: int, window: float) -> None:
+        self.period_ns = period_ns
+        self.window_ns = round(period_ns * window)
+        self.t_ns = 0
+        self.ticked = True
+
+    def begin(self, t_ns: int) -> None:
+        """A SYNC was sent or seen."""
+        self.t_ns = t_ns
+        self.ticked = False
+
+    def tick_due(self, t_ns: int, complete: bool) -> bool:
+        """Whether to tick now; `complete` says that every expected sample has arrived."""
+        return not self.ticked and (complete or t_ns - self.t_ns >= self.window_ns)
+
+    def begin_overdue(self, t_ns: int) -> bool:
+        """Whether a foreign SYNC is so late that the timer has to take its place."""
+        return t_ns - self.t_ns >= self.period_ns + self.period_ns // 2
