@@ -1,0 +1,125 @@
+"""Sends messages on the live and the complete stream, to whoever subscribed; encodes nothing for nobody."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import zmq
+
+from handtouch import wire
+
+LIVE_QUEUE = 64
+"""Messages kept for a slow subscriber of the live stream: a few ticks, the newest matter."""
+COMPLETE_QUEUE = 20_000
+"""Messages kept on the complete stream: seconds."""
+
+
+class Publisher:
+    """Two XPUB sockets with the same topics; never blocks, counts what a full queue drops.
+
+    `endpoints` (stream -> endpoint as bound, with its real port), `drops` (stream -> messages that a full
+    queue of some subscriber couldn't take), `subscriptions` (prefixes that somebody asked for).
+
+    Raises OSError naming the endpoint when it can't be bound.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], live: str, complete: str) -> None:
+        self.drops: Counter[str] = Counter()
+        self.subscriptions: frozenset[bytes] = frozenset()
+        self.endpoints: dict[str, str] = {}
+        self._sockets: dict[str, zmq.Socket[bytes]] = {}
+        self._asked: dict[str, set[bytes]] = {}
+        self._seq: Counter[str] = Counter()
+        self._last: dict[str, wire.Message] = {}
+        self._wanted: dict[str, bool] = {}
+        for stream, endpoint, queue in (("live", live, LIVE_QUEUE), ("complete", complete, COMPLETE_QUEUE)):
+            socket: zmq.Socket[bytes] = context.socket(zmq.XPUB)
+            self._sockets[stream] = socket
+            self._asked[stream] = set()
+            socket.setsockopt(zmq.SNDHWM, queue)
+            socket.setsockopt(zmq.LINGER, 200)  # so that the ends of contacts still leave at shutdown
+            socket.setsockopt(zmq.XPUB_NODROP, 1)
+            socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
+            socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
+            try:
+                self.endpoints[stream] = bind(socket, endpoint, f"the {stream} stream")
+            except OSError:
+                self.close()
+                raise
+
+    def take_subscriptions(self) -> None:
+        """Read what subscribers asked for or gave up; repeat lasting messages for those who come late."""
+        for stream, socket in self._sockets.items():
+            while True:
+                try:
+                    request = socket.recv(zmq.NOBLOCK)
+                except zmq.Again:
+                    break
+                if request[:1] == b"\x01":
+                    self._asked[stream].add(request[1:])
+                    self._repeat(socket, request[1:])
+                elif request[:1] == b"\x00":
+                    self._asked[stream].discard(request[1:])
+                else:
+                    continue  # not a subscription: nobody has anything else to say here
+                self.subscriptions = frozenset().union(*self._asked.values())
+                self._wanted.clear()
+
+    def wants(self, topic: str) -> bool:
+        """Whether anybody subscribed to a prefix of the topic."""
+        wanted = self._wanted.get(topic)
+        if wanted is None:
+            wanted = any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
+            self._wanted[topic] = wanted
+        return wanted
+
+    def next_seq(self, topic: str) -> int:
+        """Number of the topic's next message."""
+        self._seq[topic] += 1
+        return self._seq[topic]
+
+    def send(self, message: wire.Message, lasting: bool = False) -> None:
+        """Send to those who subscribed; a `lasting` message is repeated for those who subscribe later."""
+        topic = wire.topic_of(message)
+        if lasting:
+            self._last[topic] = message
+        if not self.wants(topic):
+            return
+        parts = wire.encode(message)
+        for stream, socket in self._sockets.items():
+            if any(parts[0].startswith(prefix) for prefix in self._asked[stream]):
+                self._try_send(stream, socket, parts)
+
+    def close(self) -> None:
+        """Close both streams; what is queued has 0.2 s to leave."""
+        for socket in self._sockets.values():
+            socket.close()
+
+    def _repeat(self, socket: zmq.Socket[bytes], prefix: bytes) -> None:
+        for topic, message in self._last.items():
+            if topic.encode().startswith(prefix):
+                stream = next(name for name, known in self._sockets.items() if known is socket)
+                self._try_send(stream, socket, wire.encode(replace(message, repeat=True)))
+
+    def _try_send(self, stream: str, socket: zmq.Socket[bytes], parts: list[bytes]) -> None:
+        try:
+            socket.send_multipart(parts, zmq.NOBLOCK)
+        except zmq.Again:
+            # XPUB_NODROP tells that one queue is full, but then sends to nobody: the others still get theirs
+            self.drops[stream] += 1
+            socket.setsockopt(zmq.XPUB_NODROP, 0)
+            socket.send_multipart(parts, zmq.NOBLOCK)
+            socket.setsockopt(zmq.XPUB_NODROP, 1)
+
+
+def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str) -> str:
+    """Bind and return the endpoint with its real port; OSError names purpose, endpoint and remedy."""
+    try:
+        socket.bind(endpoint)
+    except zmq.ZMQError as error:
+        raise OSError(
+            f"{purpose} can't be opened at {endpoint}: {error.strerror}; is another daemon running there? "
+            "`handtouch doctor CONFIG` tells, and [daemon] in the deployment sets another endpoint"
+        ) from error
+    return socket.getsockopt_string(zmq.LAST_ENDPOINT)
