@@ -1,0 +1,97 @@
+# Install, show, test and package handtouch. Needs make and Python 3.11 or later with venv; `make help` lists what there is.
+
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+ONLY ?= *
+ARGS ?=
+
+.PHONY: help
+help: ## what can be made (the default)
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | while IFS='	' read -r name text; do \
+		printf '  make %-10s %s\n' "$$name" "$$text"; done
+
+# --- installation: a stamp file tells what a virtual environment holds, so a second run costs nothing
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "no Python 3.11 or later found; say make PYTHON=/path/to/python3"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { echo "python3 -m venv failed; on Debian: apt-get install python3-venv"; exit 1; }
+
+$(VENV)/.run: pyproject.toml requirements.lock | $(BIN)/python
+	@echo "installing handtouch into $(VENV) ..."
+	@test -e $(VENV)/.dev || $(PIP) install -c requirements.lock -e .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python
+	@echo "installing handtouch and its tools into $(VENV) ..."
+	@$(PIP) install -c requirements.lock -e '.[dev]'
+	@touch $@
+
+.PHONY: install dev
+install: $(VENV)/.run ## install into .venv what a robot needs
+dev: $(VENV)/.dev ## install into .venv what a developer needs
+
+# --- use
+
+.PHONY: demo
+demo: $(VENV)/.run ## a simulated hand, the daemon and a live view; half a minute, no hardware
+	@$(BIN)/handtouch demo $(ARGS)
+
+# --- test
+
+.PHONY: test lint types unit socketcan
+test: ## everything that CI runs
+	@$(MAKE) --no-print-directory lint
+	@$(MAKE) --no-print-directory types
+	@$(MAKE) --no-print-directory unit
+	@$(MAKE) --no-print-directory socketcan
+
+lint: $(VENV)/.dev ## style
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(VENV)/.dev ## static types
+	$(BIN)/mypy --strict
+
+unit: $(VENV)/.dev ## all tests that need no SocketCAN, with coverage
+	$(BIN)/python -m pytest -m "not socketcan" --cov --cov-report=term:skip-covered $(ARGS)
+
+socketcan: $(VENV)/.dev ## the tests on real SocketCAN; skipped with the reason where there is none, which fails CI
+	@tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $(ARGS); status=$$?; \
+	if [ $$status -eq 77 ] && [ "$(CI)" != true ]; then echo "SocketCAN tests SKIPPED, see the reason above"; exit 0; \
+	elif [ $$status -eq 77 ]; then echo "SocketCAN tests were skipped, and CI needs them"; exit 1; fi; exit $$status
+
+# --- measure: every benchmarks/{bench,soak,stress}_NAME.py; ONLY=NAME chooses one
+
+.PHONY: bench soak stress
+bench: ## run time against error, latency, load
+soak: ## long runs
+stress: ## sweeps too slow for every test run
+bench soak stress: $(VENV)/.dev
+	@set -e; for program in benchmarks/$@_$(ONLY).py; do \
+		test -e "$$program" || { echo "there is no $$program"; exit 1; }; \
+		echo "== $$program"; $(BIN)/python "$$program" $(ARGS); done
+
+# --- maintain
+
+.PHONY: format lock schema dist clean
+format: $(VENV)/.dev ## put the source in form
+	$(BIN)/ruff check --fix-only
+	$(BIN)/ruff format
+
+lock: $(BIN)/python ## choose versions of all packages anew
+	@$(PIP) install uv
+	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
+		--no-emit-index-url --no-emit-find-links --output-file requirements.lock pyproject.toml
+
+schema: $(VENV)/.run ## write config/handtouch.schema.json from the definitions that check a deployment
+	$(BIN)/handtouch check --schema >config/handtouch.schema.json
+
+dist: $(VENV)/.dev ## build the wheel and the source archive
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation
+
+clean: ## remove what was made, .venv too
+	rm -rf $(VENV) dist build .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis
