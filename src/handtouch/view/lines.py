@@ -1,0 +1,68 @@
+"""Messages as plain lines, for pipes, logs and terminals that can do no more."""
+
+from __future__ import annotations
+
+from handtouch import wire
+
+
+def contact_line(contact: wire.Contact) -> str:
+    """One touch in one line: what happened where, how hard, how sure."""
+    parts = [
+        f"{contact.t_ns * 1e-9:14.4f}  {contact.event:6}  {contact.hand}/{contact.link:<16}  #{contact.id:<4}"
+    ]
+    if contact.position_m is not None:
+        x, y, z = (1e3 * value for value in contact.position_m)
+        parts.append(f"at ({x:7.2f}, {y:7.2f}, {z:7.2f}) mm +- {1e3 * location_std_m(contact):.2f}")
+    else:
+        parts.append("location invalid" + " " * 24)
+    parts.append(strength_text(contact))
+    if contact.event == "end":
+        peak = "" if contact.peak_force_n is None else f", peak {contact.peak_force_n:.2f} N"
+        parts.append(f"{contact.reason} after {contact.duration_s:.2f} s{peak}")
+    return "  ".join(parts)
+
+
+def strength_text(contact: wire.Contact) -> str:
+    """How hard, and how sure."""
+    if contact.force_n is None:
+        return "strength invalid"
+    if contact.strength == "saturated":
+        return f"> {contact.force_n:.2f} N (saturated)"
+    return f"{contact.force_n:6.2f} +- {contact.force_std_n or 0.0:.2f} N"
+
+
+def location_std_m(contact: wire.Contact) -> float:
+    """Root of the summed variances of the position [m]; NaN without a location."""
+    if contact.covariance_m2 is None:
+        return float("nan")
+    xx, yy, zz = contact.covariance_m2[0], contact.covariance_m2[4], contact.covariance_m2[8]
+    return max(0.0, xx + yy + zz) ** 0.5
+
+
+def health_line(health: wire.Health) -> str:
+    """A pad and its node in one line."""
+    serial = "" if health.serial is None else f" serial {health.serial}"
+    why = f": {health.reason}" if health.reason else ""
+    return (
+        f"{health.t_ns * 1e-9:14.4f}  health  {health.hand}/{health.link:<16}  {health.state:8} "
+        f"node {health.node_id} on {health.bus} {health.node}{serial}, {health.rate_hz:.0f} Hz, "
+        f"{health.missed} missed{why}"
+    )
+
+
+def line(message: wire.Message) -> str:
+    """Any message in one line."""
+    if isinstance(message, wire.Contact):
+        return contact_line(message)
+    if isinstance(message, wire.Health):
+        return health_line(message)
+    head = f"{message.t_ns * 1e-9:14.4f}  "
+    if isinstance(message, wire.HandFrame):
+        touched = sum(state == wire.PadState.TOUCHED for state in message.state)
+        return f"{head}hand    {message.hand}  tick {message.tick}, {touched} of {len(message.links)} touched"
+    if isinstance(message, wire.Raw):
+        return f"{head}raw     {message.hand}  tick {message.tick}, {sum(message.fresh)} fresh"
+    return (
+        f"{head}service handtouch {message.version}, up {message.uptime_s:.0f} s, "
+        f"{message.rate_hz:.0f} ticks/s, {message.overruns} overruns"
+    )
