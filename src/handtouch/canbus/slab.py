@@ -13,7 +13,7 @@ class Slab:
     """Latest sample of each of `size` pads, as arrays that share memory with what the receive path writes.
 
     `counts` (size, 4) int16, channel order x0, xa, y0, yb; `t_ns` (size,) int64 arrival on the host's
-    monotonic clock, 0 before the first sample; `fresh` (size,) uint8, 1 where a sample came since `begin_cycle`.
+    monotonic clock, 0 before the first sample; `fresh` (size,) uint8, 1 where one came since `begin_cycle`.
     """
 
     def __init__(self, size: int) -> None:
@@ -21,12 +21,12 @@ class Slab:
         self._bytes = bytearray(size * SAMPLE_BYTES)
         self.counts: NDArray[np.int16] = np.frombuffer(self._bytes, dtype="<i2").reshape(size, 4)
         self.t_ns: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
-        self._t_ns = memoryview(self.t_ns)  # item assignment without numpy's scalar boxing: 50 ns
+        self._t_ns = self.t_ns.data  # item assignment without numpy's scalar boxing: 50 ns
         self._fresh = bytearray(size)
         self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
         self.fresh_count = 0
 
-    def write(self, slot: int, data: bytes, t_ns: int) -> None:
+    def write(self, slot: int, data: bytes | bytearray, t_ns: int) -> None:
         """Store a sample of SAMPLE_BYTES bytes; a second one within a cycle replaces the first."""
         start = slot * SAMPLE_BYTES
         self._bytes[start : start + SAMPLE_BYTES] = data

@@ -1,0 +1,312 @@
+"""The life of one CANopen node as a pure state machine: a life and an event in, a life and actions out.
+
+Public names: `NodeState`, `Action`, `Timing`, `Life`, `advance`, `due_ns` and the events. No clock, no bus:
+time is an argument in ns, and whoever calls carries out the actions and reports their results as events.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum, IntEnum, auto
+from typing import assert_never
+
+
+class NodeState(IntEnum):
+    """Where a node is in its life. Samples are to be trusted in OPERATIONAL only."""
+
+    ABSENT = 0  # never heard, or lost: its heartbeat timed out
+    BOOTING = 1  # heard; its identity is being read
+    IDENTIFIED = 2  # it is who it should be; its PDO mapping is being read
+    CONFIGURING = 3  # its heartbeat and PDO are being set and read back
+    SETTLING = 4  # started; its first samples are discarded
+    OPERATIONAL = 5
+    STALE = 6  # it is alive, but no samples come
+    FAULTED = 7  # it can't be used, for the reason given; tried again from time to time
+    STOPPED = 8  # by us
+
+
+class Action(Enum):
+    """What the machine wants done. IDENTIFY, READ_MAPPING and CONFIGURE end in a `Done` or a `Failed`."""
+
+    PROBE = auto()  # ask over SDO, without waiting, whether anybody is there
+    IDENTIFY = auto()
+    READ_MAPPING = auto()
+    CONFIGURE = auto()
+    ENTER_PREOPERATIONAL = auto()  # these three: NMT, to this node alone
+    START = auto()
+    STOP = auto()
+
+
+NMT_BOOT_UP, NMT_STOPPED, NMT_OPERATIONAL, NMT_PREOPERATIONAL = 0, 4, 5, 127
+NMT_NAMES = {NMT_STOPPED: "stopped", NMT_OPERATIONAL: "operational", NMT_PREOPERATIONAL: "pre-operational"}
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Times of one node, ns."""
+
+    heartbeat_ns: int
+    heartbeat_timeout_ns: int
+    settle_samples: int = 3
+    settle_timeout_ns: int = 1_000_000_000
+    retry_first_ns: int = 100_000_000
+    retry_last_ns: int = 5_000_000_000
+
+    def pause_ns(self, failures: int) -> int:
+        """Pause after that many failures in a row: doubled each time, up to the longest."""
+        return min(self.retry_first_ns << min(failures, 16), self.retry_last_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """A node's life so far."""
+
+    state: NodeState = NodeState.ABSENT
+    since_ns: int = 0
+    reason: str = "not heard yet"
+    nmt: int | None = None  # NMT state that it last told
+    heard_ns: int | None = None  # boot-up, heartbeat or answer
+    heartbeat_ns: int | None = None  # the last one, or since when one is due; None: not supervised
+    started_ns: int = 0
+    due_ns: int = 0  # next probe (ABSENT), attempt (FAULTED) or end of patience (SETTLING)
+    attempt: int = 0  # which boot this is; results of others are void
+    failures: int = 0  # in a row; they set the pause before the next attempt
+    discard: int = 0  # samples still to be discarded
+    reboots: int = 0
+    stranger: bool = False  # at its last identification it was not the configured node
+
+
+@dataclass(frozen=True, slots=True)
+class BootUp:
+    """The node has (re)started: heartbeat identifier with a 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """A heartbeat with the node's NMT state."""
+
+    nmt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """An SDO answer to a probe."""
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A step of attempt `attempt` has succeeded."""
+
+    step: Action
+    attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A step of attempt `attempt` has failed. `silent`: no answer. `stranger`: not the configured node."""
+
+    step: Action
+    attempt: int
+    reason: str
+    silent: bool = False
+    stranger: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A sample has arrived."""
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """No sample for too long, this many ns."""
+
+    age_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """The node is not wanted any more."""
+
+
+Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Tick | Stop
+Next = tuple[Life, tuple[Action, ...]]
+
+_IN_BOOT = frozenset({NodeState.BOOTING, NodeState.IDENTIFIED, NodeState.CONFIGURING})
+_STARTED = frozenset({NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE})
+
+
+def advance(life: Life, event: Event, t_ns: int, timing: Timing) -> Next:
+    """The life after an event at `t_ns`, and what is to be done now."""
+    if life.state is NodeState.STOPPED:
+        return life, ()
+    match event:
+        case Heartbeat(nmt):
+            return _heartbeat(life, nmt, t_ns, timing)
+        case BootUp():
+            return _boot_up(life, t_ns)
+        case Answer():
+            return _answer(life, t_ns)
+        case Done():
+            return _done(life, event, t_ns, timing)
+        case Failed():
+            return _failed(life, event, t_ns, timing)
+        case Sample():
+            return _sample(life, t_ns, timing)
+        case Silence(age_ns):
+            return _silence(life, age_ns, t_ns)
+        case Tick():
+            return _tick(life, t_ns, timing)
+        case Stop():
+            wanted = () if life.stranger else (Action.STOP,)  # a stranger at its id is not ours to stop
+            return _enter(life, NodeState.STOPPED, t_ns, "stopped by handtouch"), wanted
+        case _:
+            assert_never(event)
+
+
+def due_ns(life: Life, timing: Timing) -> int | None:
+    """When the life needs its next Tick; None if nothing is timed."""
+    dues = []
+    if life.state in (NodeState.ABSENT, NodeState.FAULTED, NodeState.SETTLING):
+        dues.append(life.due_ns)
+    if life.heartbeat_ns is not None and life.state not in (NodeState.ABSENT, NodeState.STOPPED):
+        dues.append(life.heartbeat_ns + timing.heartbeat_timeout_ns)
+    return min(dues, default=None)
+
+
+def _enter(life: Life, state: NodeState, t_ns: int, reason: str) -> Life:
+    since_ns = life.since_ns if state is life.state else t_ns
+    return replace(life, state=state, since_ns=since_ns, reason=reason)
+
+
+def _boot(life: Life, t_ns: int, reason: str) -> Next:
+    """Begin again, with the identity."""
+    life = _enter(life, NodeState.BOOTING, t_ns, reason)
+    return replace(life, attempt=life.attempt + 1), _identify(life)
+
+
+def _identify(life: Life) -> tuple[Action, ...]:
+    """A stopped node doesn't serve SDO: first it is made to."""
+    if life.nmt == NMT_STOPPED:
+        return Action.ENTER_PREOPERATIONAL, Action.IDENTIFY
+    return (Action.IDENTIFY,)
+
+
+def _heartbeat(life: Life, nmt: int, t_ns: int, timing: Timing) -> Next:
+    if life.heartbeat_ns is not None:
+        life = replace(life, heartbeat_ns=t_ns)
+    life = replace(life, nmt=nmt, heard_ns=t_ns)
+    told = f"heartbeat: node is {NMT_NAMES.get(nmt, f'in NMT state {nmt}')}"
+    if life.state is NodeState.ABSENT:
+        return _boot(life, t_ns, told)
+    # A heartbeat sent before our start command may still arrive after it.
+    settled = t_ns - life.started_ns > 2 * timing.heartbeat_ns
+    if life.state in _STARTED and nmt != NMT_OPERATIONAL and settled:
+        return _boot(life, t_ns, f"{told}, though it was started")
+    return life, ()
+
+
+def _boot_up(life: Life, t_ns: int) -> Next:
+    by_itself = life.state is not NodeState.ABSENT
+    life = replace(
+        life,
+        nmt=NMT_PREOPERATIONAL,
+        heard_ns=t_ns,
+        heartbeat_ns=None,  # a restarted node's heartbeat time is its default, maybe none
+        reboots=life.reboots + by_itself,
+    )
+    return _boot(life, t_ns, "rebooted by itself" if by_itself else "boot-up message")
+
+
+def _answer(life: Life, t_ns: int) -> Next:
+    life = replace(life, heard_ns=t_ns)
+    if life.state is not NodeState.ABSENT:
+        return life, ()
+    return _boot(replace(life, nmt=None), t_ns, "answers over SDO")
+
+
+def _done(life: Life, event: Done, t_ns: int, timing: Timing) -> Next:
+    if event.attempt != life.attempt:
+        return life, ()
+    life = replace(life, heard_ns=t_ns)
+    match event.step:
+        case Action.IDENTIFY if life.state in (NodeState.BOOTING, NodeState.FAULTED):
+            life = replace(_enter(life, NodeState.IDENTIFIED, t_ns, "identity as expected"), stranger=False)
+            return life, (Action.READ_MAPPING,)
+        case Action.READ_MAPPING if life.state is NodeState.IDENTIFIED:
+            life = _enter(life, NodeState.CONFIGURING, t_ns, "PDO mapping as expected")
+            return life, (Action.CONFIGURE,)
+        case Action.CONFIGURE if life.state is NodeState.CONFIGURING:
+            return _start(life, t_ns, timing)
+    return life, ()
+
+
+def _start(life: Life, t_ns: int, timing: Timing) -> Next:
+    """Trust begins after some samples; a node found running is left running."""
+    running = life.nmt == NMT_OPERATIONAL
+    life = _enter(life, NodeState.SETTLING, t_ns, "found running" if running else "started")
+    life = replace(
+        life,
+        heartbeat_ns=t_ns,
+        started_ns=t_ns,
+        discard=timing.settle_samples,
+        due_ns=t_ns + timing.settle_timeout_ns,
+    )
+    return life, () if running else (Action.START,)
+
+
+def _failed(life: Life, event: Failed, t_ns: int, timing: Timing) -> Next:
+    if event.attempt != life.attempt or life.state not in _IN_BOOT | {NodeState.FAULTED}:
+        return life, ()
+    quiet_ns = t_ns - life.heard_ns if life.heard_ns is not None else t_ns
+    gone = event.silent and quiet_ns > timing.heartbeat_timeout_ns
+    life = _enter(life, NodeState.ABSENT if gone else NodeState.FAULTED, t_ns, event.reason)
+    failures = 0 if gone else life.failures + 1
+    stranger = life.stranger or event.stranger
+    due = t_ns + timing.pause_ns(failures)
+    heartbeat_ns = None if gone else life.heartbeat_ns
+    return replace(life, failures=failures, stranger=stranger, due_ns=due, heartbeat_ns=heartbeat_ns), ()
+
+
+def _sample(life: Life, t_ns: int, timing: Timing) -> Next:
+    if life.state not in (NodeState.SETTLING, NodeState.STALE):
+        return life, ()
+    discard = max(life.discard - 1, 0) if life.state is NodeState.SETTLING else life.discard
+    if discard == 0:
+        return replace(_enter(life, NodeState.OPERATIONAL, t_ns, ""), discard=0, failures=0), ()
+    if life.state is NodeState.STALE:
+        life = _enter(life, NodeState.SETTLING, t_ns, "samples came")
+        discard -= 1
+    return replace(life, discard=discard, due_ns=t_ns + timing.settle_timeout_ns), ()
+
+
+def _silence(life: Life, age_ns: int, t_ns: int) -> Next:
+    if life.state is not NodeState.OPERATIONAL:
+        return life, ()
+    return _enter(life, NodeState.STALE, t_ns, f"no sample for {age_ns / 1e6:.0f} ms, heartbeat is there"), ()
+
+
+def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
+    supervised = life.heartbeat_ns is not None and life.state is not NodeState.ABSENT
+    if supervised and life.heartbeat_ns is not None:
+        quiet_ns = t_ns - life.heartbeat_ns
+        if quiet_ns > timing.heartbeat_timeout_ns:
+            life = _enter(life, NodeState.ABSENT, t_ns, f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms")
+            return replace(life, heartbeat_ns=None, nmt=None, failures=0, due_ns=t_ns), ()
+    if t_ns < life.due_ns:
+        return life, ()
+    if life.state is NodeState.ABSENT:
+        pause_ns = timing.pause_ns(life.failures)
+        return replace(life, failures=life.failures + 1, due_ns=t_ns + pause_ns), (Action.PROBE,)
+    if life.state is NodeState.FAULTED:
+        # It stays FAULTED, with its reason, until an attempt gets further.
+        life = replace(life, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns)
+        return life, _identify(life)
+    if life.state is NodeState.SETTLING:
+        return _enter(life, NodeState.STALE, t_ns, "started, but no sample came: is there a SYNC?"), ()
+    return life, ()

@@ -1,0 +1,347 @@
+"""The master's side of a hand's CANopen nodes: boots each one, watches it, brings it back when it was away.
+
+Public names: `Master`, `NodeSpec`, `NodeStatus`, `NodeEvent`. One thread receives and calls `handle` and
+`poll`; whatever has to wait for a node's answer is done in one worker thread of the master's own. Nodes are
+addressed one by one, never by a broadcast.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import boot, eds, emergency
+from .lifecycle import (
+    NMT_BOOT_UP,
+    NMT_PREOPERATIONAL,
+    Action,
+    Answer,
+    BootUp,
+    Done,
+    Event,
+    Failed,
+    Heartbeat,
+    Life,
+    NodeState,
+    Sample,
+    Silence,
+    Stop,
+    Tick,
+    Timing,
+    advance,
+    due_ns,
+)
+from .nodes import NodeEvent, NodeSpec, NodeStatus
+from .port import Port
+from .router import IDENTIFIERS, NOBODY
+
+__all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus"]
+
+STALE_PERIODS = 3
+"""Periods without a sample after which an operational node is stale."""
+EMERGENCIES_KEPT = 16
+_EVENTS_KEPT = 1024
+_NEVER_NS = 1 << 62
+
+_NMT, _SYNC, _TIME, _LSS_ANSWER, _LSS_REQUEST = 0x000, 0x080, 0x100, 0x7E4, 0x7E5
+_EMCY, _SDO_ANSWER, _SDO_REQUEST, _HEARTBEAT = 0x080, 0x580, 0x600, 0x700
+_PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
+_PROBE = bytes(
+    (0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0)
+)  # SDO: read 0x1000, the device type, which all nodes have
+_NMT_COMMANDS = {Action.START: 1, Action.STOP: 2, Action.ENTER_PREOPERATIONAL: 128}
+
+_FOREIGN, _IGNORED = -1, -2
+_NOBODY_WAITS = (NodeState.ABSENT, NodeState.STOPPED)
+Outcome = Done | Failed
+Result = boot.Identity | boot.Tpdo | None
+
+
+@dataclass(slots=True, eq=False)
+class _Node:
+    """All that is known of a node. Only the receiving thread changes it."""
+
+    spec: NodeSpec
+    port: Port
+    timing: Timing
+    tpdos: tuple[int, ...]
+    sdo: boot.Sdo
+    life: Life = field(default_factory=Life)
+    identity: boot.Identity | None = None
+    tpdo: boot.Tpdo | None = None
+    heartbeats: int = 0
+    missed: int = 0
+    emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
+
+    def status(self) -> NodeStatus:
+        return NodeStatus(
+            self.spec.slot,
+            self.spec.name,
+            self.spec.bus,
+            self.spec.node_id,
+            self.life.state,
+            self.life.since_ns,
+            self.life.reason,
+            self.identity,
+            self.tpdo.cob_id if self.tpdo else None,
+            self.heartbeats,
+            self.missed,
+            self.life.reboots,
+            tuple(self.emergencies),
+        )
+
+
+class Master:
+    """Boots and watches nodes on one or several buses that share a slab.
+
+    `states` (slots,) uint8 holds the NodeState of each slot; samples are to be trusted in OPERATIONAL alone.
+    """
+
+    def __init__(
+        self, ports: Mapping[str, Port], nodes: Sequence[NodeSpec], sync_period_ns: int | None = None
+    ) -> None:
+        """Read the nodes' EDS files; nothing is sent before `start`.
+
+        With `sync_period_ns` an operational node without samples for three periods becomes STALE. Raises
+        EdsError for an EDS that can't be used, ValueError for nodes that contradict each other.
+        """
+        slabs = {id(port.slab): port.slab for port in ports.values()}
+        if len(slabs) != 1:
+            raise ValueError("the ports must share one slab")
+        (self._slab,) = slabs.values()
+        self._ports = ports
+        self.states: NDArray[np.uint8] = np.zeros(self._slab.size, dtype=np.uint8)
+        self._stale_ns = STALE_PERIODS * sync_period_ns if sync_period_ns else 0
+        self._nodes = [_node(spec, ports, sync_period_ns or 0) for spec in nodes]
+        self._by_slot = {node.spec.slot: node for node in self._nodes}
+        self._owners = _owners(ports, self._nodes)
+        self._seen = self._slab.t_ns.copy()
+        self._next_due_ns = 0
+        self._events: deque[NodeEvent] = deque(maxlen=_EVENTS_KEPT)
+        self._results: deque[tuple[_Node, Outcome, Result]] = deque()  # from the worker
+        self._worker: ThreadPoolExecutor | None = None
+
+    def start(self, t_ns: int) -> None:
+        """Begin to look for the nodes."""
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="canopen-sdo")
+        self._next_due_ns = t_ns
+        self.poll(t_ns)
+
+    def handle(self, bus_name: str, can_id: int, data: bytes, t_ns: int) -> None:
+        """Take a frame that was no sample. What no configured node sends is counted as foreign."""
+        owner = self._owners[bus_name][can_id]
+        if owner >= 0:
+            self._from_node(self._nodes[owner], can_id & 0x780, data, t_ns)
+        elif owner == _FOREIGN:
+            self._ports[bus_name].counters.foreign += 1
+        if self._results:
+            self._collect(t_ns)
+
+    def poll(self, t_ns: int) -> None:
+        """Time-outs, retries and results of the worker; once a tick, after `drain` and `handle`."""
+        if self._results:
+            self._collect(t_ns)
+        self._watch_samples(t_ns)
+        if t_ns >= self._next_due_ns:
+            self._tick(t_ns)
+
+    def status(self) -> list[NodeStatus]:
+        """Every node as it is now, in the order given."""
+        return [node.status() for node in self._nodes]
+
+    def take_events(self) -> list[NodeEvent]:
+        """What has happened since the last call, oldest first; the latest thousand if nobody asked."""
+        events = list(self._events)
+        self._events.clear()
+        return events
+
+    def stop(self, t_ns: int) -> None:
+        """NMT stop to each configured node, one by one; returns when the worker has ended (0.2 s at most)."""
+        for node in self._nodes:
+            self._advance(node, Stop(), t_ns)
+        if self._worker is not None:
+            self._worker.shutdown(wait=True, cancel_futures=True)
+            self._worker = None
+        self._results.clear()
+
+    def _from_node(self, node: _Node, service: int, data: bytes, t_ns: int) -> None:
+        size = {_HEARTBEAT: 1}.get(service, 8)
+        if len(data) != size:
+            node.port.counters.short += 1
+        elif service == _HEARTBEAT:
+            self._heartbeat(node, data[0] & 0x7F, t_ns)
+        elif service == _EMCY:
+            if (message := emergency.decode(data, t_ns)) is not None:
+                node.emergencies.append(message)
+        elif node.sdo.waiting:
+            node.sdo.deliver(data)
+        else:
+            self._advance(node, Answer(), t_ns)
+
+    def _heartbeat(self, node: _Node, nmt: int, t_ns: int) -> None:
+        if nmt == NMT_BOOT_UP:
+            self._advance(node, BootUp(), t_ns)
+            return
+        node.heartbeats += 1
+        if node.life.heartbeat_ns is not None:
+            node.missed += max(round((t_ns - node.life.heartbeat_ns) / node.timing.heartbeat_ns) - 1, 0)
+        self._advance(node, Heartbeat(nmt), t_ns)
+
+    def _watch_samples(self, t_ns: int) -> None:
+        slab, states = self._slab, self.states
+        waiting = (states == NodeState.SETTLING) | (states == NodeState.STALE)
+        if waiting.any():
+            for slot in np.flatnonzero(waiting & (slab.t_ns != self._seen)).tolist():
+                self._advance(self._by_slot[slot], Sample(), t_ns)
+        self._seen[:] = slab.t_ns
+        if self._stale_ns:
+            ages = t_ns - slab.t_ns
+            silent = (states == NodeState.OPERATIONAL) & (ages > self._stale_ns)
+            if silent.any():
+                for slot in np.flatnonzero(silent).tolist():
+                    self._advance(self._by_slot[slot], Silence(int(ages[slot])), t_ns)
+
+    def _tick(self, t_ns: int) -> None:
+        self._next_due_ns = _NEVER_NS
+        for node in self._nodes:
+            due = due_ns(node.life, node.timing)
+            if due is not None and due <= t_ns:
+                self._advance(node, Tick(), t_ns)
+                due = due_ns(node.life, node.timing)
+            if due is not None:
+                self._next_due_ns = min(self._next_due_ns, due)
+
+    def _advance(self, node: _Node, event: Event, t_ns: int) -> None:
+        before = node.life
+        node.life, actions = advance(before, event, t_ns, node.timing)
+        after = node.life
+        if (before.state, before.reason) != (after.state, after.reason):
+            self.states[node.spec.slot] = after.state
+            self._tell(node, before.state, after.reason, t_ns)
+        due = due_ns(after, node.timing)
+        if due is not None and due < self._next_due_ns:
+            self._next_due_ns = due
+        for action in actions:
+            self._act(node, action)
+
+    def _tell(self, node: _Node, old: NodeState, reason: str, t_ns: int) -> None:
+        self._events.append(NodeEvent(node.spec.slot, t_ns, old, node.life.state, reason))
+
+    def _act(self, node: _Node, action: Action) -> None:
+        if action in _NMT_COMMANDS:
+            _command(node, action)
+        elif action is Action.PROBE:
+            node.port.send(_SDO_REQUEST + node.spec.node_id, _PROBE)
+        elif self._worker is not None:
+            self._worker.submit(self._work, node, action, node.life.attempt)
+
+    def _work(self, node: _Node, step: Action, attempt: int) -> None:
+        """In the worker: carry out a step; its outcome goes to the receiving thread."""
+        node.sdo.outdated = lambda: node.life.attempt != attempt or node.life.state in _NOBODY_WAITS
+        result: Result = None
+        outcome: Outcome = Done(step, attempt)
+        try:
+            result = _carry_out(node, step)
+        except boot.Outdated:
+            return
+        except boot.BootError as error:
+            outcome = Failed(step, attempt, str(error), error.silent, error.stranger)
+        except Exception as error:  # noqa: BLE001 - a future would swallow it; here it becomes the node's reason
+            outcome = Failed(step, attempt, f"unexpected {type(error).__name__}: {error}")
+        self._results.append((node, outcome, result))
+
+    def _collect(self, t_ns: int) -> None:
+        while self._results:
+            node, outcome, result = self._results.popleft()
+            if outcome.attempt != node.life.attempt:
+                continue
+            if isinstance(result, boot.Identity):
+                self._take_identity(node, result, t_ns)
+            elif isinstance(result, boot.Tpdo) and (clash := self._take_tpdo(node, result)):
+                outcome = Failed(outcome.step, outcome.attempt, clash)
+            self._advance(node, outcome, t_ns)
+
+    def _take_identity(self, node: _Node, identity: boot.Identity, t_ns: int) -> None:
+        before = node.identity
+        node.identity = identity
+        if before is not None and before.serial != identity.serial:
+            self._tell(
+                node, node.life.state, f"serial number was {before.serial}, is {identity.serial}", t_ns
+            )
+
+    def _take_tpdo(self, node: _Node, tpdo: boot.Tpdo) -> str:
+        """Route the node's samples; the reason where its identifier is another node's already."""
+        router, slot = node.port.router, node.spec.slot
+        owner = router.slot(tpdo.cob_id)
+        if owner not in (NOBODY, slot):
+            return (
+                f"TPDO{tpdo.number} has identifier 0x{tpdo.cob_id:X}, as has {self._by_slot[owner].spec.name}"
+            )
+        if node.tpdo is not None and node.tpdo.cob_id != tpdo.cob_id:
+            router.route(node.tpdo.cob_id, NOBODY)
+        router.route(tpdo.cob_id, slot)
+        node.tpdo = tpdo
+        return ""
+
+
+def _carry_out(node: _Node, step: Action) -> Result:
+    spec = node.spec
+    if step is Action.IDENTIFY:
+        return boot.identify(node.sdo, boot.Expected(spec.vendor_id, spec.product_code, spec.serial))
+    if step is Action.READ_MAPPING:
+        return boot.read_mapping(node.sdo, node.tpdos)
+    if node.tpdo is None:
+        raise boot.BootError("no PDO mapping to configure")
+
+    def halt() -> None:
+        if node.life.nmt != NMT_PREOPERATIONAL:
+            _command(node, Action.ENTER_PREOPERATIONAL)
+
+    boot.configure(node.sdo, node.tpdo, spec.heartbeat_ms, halt)
+    return None
+
+
+def _command(node: _Node, action: Action) -> None:
+    """NMT, to one node: the second byte is never 0, which would mean all."""
+    node.port.send(_NMT, bytes((_NMT_COMMANDS[action], node.spec.node_id)))
+
+
+def _node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns: int) -> _Node:
+    if spec.bus not in ports:
+        raise ValueError(f'node "{spec.name}" is on bus "{spec.bus}", which is not open')
+    if not 1 <= spec.node_id <= 127:
+        raise ValueError(f'node "{spec.name}": node id {spec.node_id} is outside 1 to 127')
+    port = ports[spec.bus]
+    if not 0 <= spec.slot < port.slab.size:
+        raise ValueError(f'node "{spec.name}": slot {spec.slot} is outside the slab of {port.slab.size}')
+    timing = Timing(
+        heartbeat_ns=spec.heartbeat_ms * 1_000_000,
+        heartbeat_timeout_ns=spec.heartbeat_timeout_ms * 1_000_000,
+        settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
+    )
+    numbers = eds.tpdo_numbers(eds.load(spec.eds, spec.node_id)) if spec.eds else eds.DEFAULT_TPDOS
+    return _Node(spec, port, timing, numbers, boot.Sdo(spec.node_id, port.send))
+
+
+def _owners(ports: Mapping[str, Port], nodes: Sequence[_Node]) -> dict[str, list[int]]:
+    """For each bus and identifier: which of `nodes` handles it, _IGNORED or _FOREIGN."""
+    owners = {name: [_FOREIGN] * IDENTIFIERS for name in ports}
+    for table in owners.values():
+        for can_id in (_NMT, _SYNC, _TIME, _LSS_ANSWER, _LSS_REQUEST):
+            table[can_id] = _IGNORED
+    slots: set[int] = set()
+    for number, node in enumerate(nodes):
+        spec, table = node.spec, owners[node.spec.bus]
+        if table[_HEARTBEAT + spec.node_id] != _FOREIGN or spec.slot in slots:
+            raise ValueError(f'node "{spec.name}": node id {spec.node_id} or slot {spec.slot} is given twice')
+        slots.add(spec.slot)
+        for service in (_EMCY, _SDO_ANSWER, _HEARTBEAT):
+            table[service + spec.node_id] = number
+        for service in (_SDO_REQUEST, *_PDOS):  # our own requests, echoed; PDOs before they are routed
+            table[service + spec.node_id] = _IGNORED
+    return owners

@@ -1,0 +1,139 @@
+"""One CAN bus: open it by python-can's interface name and channel, receive, send, count.
+
+Public names: `Port`, `BusError`.
+"""
+
+from __future__ import annotations
+
+import errno
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import can
+
+from handtouch.config import Bus
+
+from .load import frame_bits
+from .receivers import PolledReceiver, Receiver, SocketcanReceiver, ThreadReceiver
+from .router import Counters, Frame, Router
+from .slab import Slab
+
+_ECHOES = frozenset({"udp_multicast"})  # what we send comes back and is counted there
+_OWN_BIT_RATE = frozenset({"socketcan", "udp_multicast", "virtual"})  # python-can can't set it there
+
+
+class BusError(OSError):
+    """A bus that can't be opened; `str` names the bus, its interface and channel, and a remedy."""
+
+
+class Port:
+    """A bus in use. Receive in one thread; `send` is safe from any."""
+
+    def __init__(self, bus: Bus, receiver: Receiver, slab: Slab) -> None:
+        """Use a receiver that is open already; `Port.open` makes one from a bus's description."""
+        self.name = bus.name
+        self.bus = bus
+        self.router = Router(slab)
+        self._receiver = receiver
+        self._send_lock = threading.Lock()
+        self._echoes = bus.interface in _ECHOES
+
+    @classmethod
+    def open(cls, bus: Bus, slab: Slab) -> Port:
+        """Open a bus; samples will be written to `slab`. Raises BusError if it can't be opened."""
+
+        def opener() -> can.BusABC:
+            return _open_bus(bus)
+
+        try:
+            receiver = _receiver(bus.interface, opener)
+        except Exception as error:  # drivers raise anything; all of it means that the bus is not there
+            raise BusError(
+                f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: '
+                f"{error}; {_remedy(bus, error)}"
+            ) from error
+        return cls(bus, receiver, slab)
+
+    @property
+    def slab(self) -> Slab:
+        """Where samples go; several ports may share one."""
+        return self.router.slab
+
+    @property
+    def counters(self) -> Counters:
+        """What this bus has carried."""
+        return self.router.counters
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the bus now (interface down, adapter gone …); empty when nothing is."""
+        return self._receiver.problem
+
+    def fileno(self) -> int:
+        """Descriptor that is readable while frames wait; the same for the port's whole life."""
+        return self._receiver.fileno()
+
+    def route(self, can_id: int, slot: int) -> None:
+        """Samples with this identifier go straight to that slot of the slab; see `Router.route`."""
+        self.router.route(can_id, slot)
+
+    def drain(self) -> list[Frame]:
+        """Read what waits, at most a few thousand frames, without blocking.
+
+        Samples are in the slab then; all other data frames are returned. Call it when `fileno` is readable
+        and at least once a tick: a bus that is gone is opened again from here.
+        """
+        return self._receiver.drain(self.router)
+
+    def send(self, can_id: int, data: bytes) -> bool:
+        """Send a frame; a full queue or a bus that is down is counted, never raised. True if it went out."""
+        counters = self.router.counters
+        with self._send_lock:
+            try:
+                self._receiver.send(can_id, data)
+            except (can.CanError, OSError):
+                counters.send_failures += 1
+                return False
+            counters.sent += 1
+            if not self._echoes:
+                counters.bits += frame_bits(len(data))
+        return True
+
+    def close(self) -> None:
+        """Give the bus back."""
+        self._receiver.close()
+
+
+def _receiver(interface: str, opener: Callable[[], can.BusABC]) -> Receiver:
+    if interface == "socketcan":
+        return SocketcanReceiver(opener)
+    if interface == "udp_multicast":
+        return PolledReceiver(opener)
+    return ThreadReceiver(opener, interface)
+
+
+def _open_bus(bus: Bus) -> can.BusABC:
+    options: dict[str, Any] = dict(bus.options)
+    if bus.interface not in _OWN_BIT_RATE:
+        options.setdefault("bitrate", bus.bitrate_bit_s)
+    return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
+
+
+def _remedy(bus: Bus, error: Exception) -> str:
+    if isinstance(error, NotImplementedError | ImportError):
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        return f"interface must be one of python-can's, with its driver installed: {known}"
+    code = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    if bus.interface == "socketcan":
+        if code == errno.EAFNOSUPPORT:
+            return "this kernel has no CAN support (modprobe can can_raw); udp_multicast works without"
+        return (
+            "plug in the adapter, or bring the interface up: "
+            f"ip link set {bus.channel} up type can bitrate {bus.bitrate_bit_s} (ip link lists what there is)"
+        )
+    if code in (errno.EACCES, errno.EPERM):
+        return "this user may not open it; add it to the device's group (dialout for serial lines)"
+    if bus.interface == "udp_multicast":
+        return "give a multicast address as channel, e.g. 239.74.163.2, and options = { port = 43113 }"
+    return "is the channel right, the adapter plugged in, and no other program using it?"

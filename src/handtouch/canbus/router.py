@@ -1,0 +1,92 @@
+"""Where a frame goes: samples straight into the slab, everything else to whoever asked; counts of both.
+
+A live bus and a replayed log feed the same `Router`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import can
+
+from .load import frame_bits
+from .slab import SAMPLE_BYTES, Slab
+
+IDENTIFIERS = 2048
+"""CANopen uses 11-bit identifiers."""
+NOBODY = -1
+
+Frame = tuple[int, bytes, int]
+"""Identifier, data, arrival in ns of the host's monotonic clock."""
+
+_FRAME_BITS = tuple(frame_bits(size) for size in range(9))
+
+
+@dataclass(slots=True)
+class Counters:
+    """What one bus has carried since it was opened; all only grow."""
+
+    frames: int = 0  # data frames with an 11-bit identifier that were received
+    sent: int = 0
+    bits: int = 0  # of received and sent frames, worst case of bit stuffing: their rate is the bus load
+    samples: int = 0
+    short: int = 0  # of a known identifier but the wrong length: dropped
+    foreign: int = 0  # of nobody that we know, or of a kind that CANopen doesn't use: dropped
+    errors: int = 0  # error frames
+    send_failures: int = 0
+    receive_errors: int = 0
+    overflow: int = 0  # frames lost between the controller and us, in the kernel's queue or our own
+
+
+class Router:
+    """Takes frames one by one; writes the routed ones into the slab."""
+
+    def __init__(self, slab: Slab) -> None:
+        self.slab = slab
+        self.counters = Counters()
+        self._slots = [NOBODY] * IDENTIFIERS
+        self._write = slab.write
+
+    def route(self, can_id: int, slot: int) -> None:
+        """Frames with this identifier are samples for that slot of the slab; NOBODY takes the route away.
+
+        Raises ValueError for an identifier beyond 11 bits or a slot beyond the slab.
+        """
+        if not 0 <= can_id < IDENTIFIERS:
+            raise ValueError(f"identifier 0x{can_id:X} has more than 11 bits")
+        if not NOBODY <= slot < self.slab.size:
+            raise ValueError(f"slot {slot} is outside the slab of {self.slab.size}")
+        self._slots[can_id] = slot
+
+    def slot(self, can_id: int) -> int:
+        """Slot that frames with this identifier are written to, NOBODY without a route."""
+        return self._slots[can_id]
+
+    def accept(self, can_id: int, data: bytes | bytearray, t_ns: int) -> bool:
+        """Take a data frame with an 11-bit identifier and at most 8 bytes; False if it isn't a sample.
+
+        A sample of the wrong length is counted and dropped.
+        """
+        counters = self.counters
+        size = len(data)
+        counters.frames += 1
+        counters.bits += _FRAME_BITS[size]
+        slot = self._slots[can_id]
+        if slot < 0:
+            return False
+        if size == SAMPLE_BYTES:
+            self._write(slot, data, t_ns)
+            counters.samples += 1
+        else:
+            counters.short += 1
+        return True
+
+    def accept_message(self, message: can.Message, t_ns: int) -> Frame | None:
+        """Take any frame as python-can gives it; what isn't ours to store or to drop is returned."""
+        if message.is_error_frame:
+            self.counters.errors += 1
+        elif message.is_extended_id or message.is_remote_frame or message.is_fd or len(message.data) > 8:
+            self.counters.foreign += 1
+        elif not self.accept(message.arbitration_id, message.data, t_ns):
+            return message.arbitration_id, bytes(message.data), t_ns
+        return None
