@@ -1,4 +1,4 @@
-"""From the deployment's millimetres and degrees to surfaces and mounts in SI."""
+"""From the deployment's millimetres and degrees to a pad's surface, electrodes and mount in SI."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handtouch import config
+from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.surface import Cone, Cylinder, Plane, Sphere, Surface
 
 _MM = 1e-3
@@ -31,3 +32,20 @@ def mount_of(pad: config.Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     """Rotation (3, 3) and translation (3,) [m] that carry the pad's frame into its link's frame."""
     rotation = Rotation.from_euler("xyz", pad.mount.rpy_deg, degrees=True).as_matrix()
     return np.asarray(rotation, np.float64), np.array(pad.mount.position_mm) * _MM
+
+
+def network_of(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
+    """The pad's electrodes on its rectangle, with the bare corners as they are on the surface."""
+    surface, gap_m = surface_of(pad), pad.gap_mm * _MM
+    (begin, end), _ = surface.to_rectangle([gap_m, surface.extent_m[0] - gap_m], [0.0, 0.0])
+    _, corners = surface.to_rectangle([0.0, surface.extent_m[0]], [gap_m, gap_m])
+    near, far = corners.tolist()
+    electrodes = [
+        Electrode("x0", near, surface.b - near),
+        Electrode("xa", far, surface.b - far),
+        Electrode("y0", float(begin), float(end)),
+        Electrode("yb", float(begin), float(end)),
+    ]
+    return ElectrodeNetwork.from_electrodes(
+        surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
+    )
