@@ -1,22 +1,21 @@
 """Deployment file (TOML) -> frozen, checked objects; every mistake named with its place, value and remedy.
 
-Public names: `load`, `parse`, `json_schema`, `ConfigError`, `Deployment` and the tables it is made of.
+Public names: `load`, `parse`, `with_bus`, `json_schema`, `ConfigError`, `Deployment` and its tables.
 Keys carry their unit (`width_mm`, `sync_period_ms`); the objects keep the units of the file, and
 `handtouch.hand` converts them to SI once.
 """
 
 from __future__ import annotations
 
-import difflib
-import json
-import math
+import re
 import tomllib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from handtouch.config_checks import problems_in
+from handtouch.config_problems import ConfigError, Problem, problems_of
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -24,8 +23,6 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
-_LOOPBACK = ("tcp://127.", "tcp://localhost:", "tcp://[::1]:")
-
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
@@ -51,7 +48,7 @@ class Daemon(Table):
 class Bus(Table):
     """`[[bus]]`: one CAN bus, by python-can's names."""
 
-    name: Name
+    name: Name = Field(description="what pads and --bus call it")
     interface: str = Field(description="python-can interface: socketcan, udp_multicast, virtual, slcan …")
     channel: str | int = Field(description="python-can channel: can0, 239.74.163.2, /dev/ttyACM0 …")
     bitrate_bit_s: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit rate, for the bus load")
@@ -81,7 +78,7 @@ class Node(Table):
 
 
 class Sheet(Table):
-    """`[sheet.NAME]`: a kind of resistive sandwich with its contact law, k / pressure^alpha (paper eq. 12)."""
+    """`[sheet.NAME]`: a resistive sandwich with its contact law, k / pressure^alpha (paper eq. 12)."""
 
     ohm_per_square: Positive = Field(description="sheet resistance rho/w")
     contact_ohm_mm2: Positive = Field(description="contact resistance times area at the reference pressure")
@@ -98,16 +95,18 @@ class Plane(Table):
 
     kind: Literal["plane"]
     length_mm: Positive = Field(description="from electrode x0 to electrode xa")
-    width_mm: Positive = Field(description="from electrode y0 to electrode yb")
+    width_mm: Positive = Field(description="from electrode y0 to electrode yb; 360: all round")
 
 
 class Cylinder(Table):
     """A patch of a cylinder; its x axis runs along the cylinder."""
 
     kind: Literal["cylinder"]
-    radius_mm: Positive
+    radius_mm: Positive = Field(description="radius of the sensing surface")
     length_mm: Positive = Field(description="along the axis, from electrode x0 to electrode xa")
-    arc_deg: float = Field(gt=0, le=360, description="around the axis, from electrode y0 to electrode yb")
+    arc_deg: float = Field(
+        gt=0, le=360, description="around the axis, from electrode y0 to electrode yb; 360: all round"
+    )
 
 
 class Cone(Table):
@@ -117,17 +116,21 @@ class Cone(Table):
     near_radius_mm: Positive = Field(description="radius of the circle at electrode x0")
     far_radius_mm: Positive = Field(description="radius of the circle at electrode xa")
     slant_mm: Positive = Field(description="along the surface, from electrode x0 to electrode xa")
-    arc_deg: float = Field(gt=0, le=360, description="around the axis, from electrode y0 to electrode yb")
+    arc_deg: float = Field(
+        gt=0, le=360, description="around the axis, from electrode y0 to electrode yb; 360: all round"
+    )
 
 
 class Sphere(Table):
     """A patch of a sphere between two parallels and two meridians."""
 
     kind: Literal["sphere"]
-    radius_mm: Positive
+    radius_mm: Positive = Field(description="radius of the sensing surface")
     from_deg: float = Field(gt=-90, lt=90, description="latitude of electrode x0")
     to_deg: float = Field(gt=-90, lt=90, description="latitude of electrode xa")
-    arc_deg: float = Field(gt=0, le=360, description="around the axis, from electrode y0 to electrode yb")
+    arc_deg: float = Field(
+        gt=0, le=360, description="around the axis, from electrode y0 to electrode yb; 360: all round"
+    )
 
 
 Surface = Annotated[Plane | Cylinder | Cone | Sphere, Field(discriminator="kind")]
@@ -153,28 +156,28 @@ class Pad(Table):
     """`[[hand.pad]]`: one area touch sensor on a link of the hand."""
 
     link: Name = Field(description="link that carries the pad; also its name in topics")
-    bus: Name
-    node_id: NodeId
+    bus: Name = Field(description="name of the [[bus]] that its node is on")
+    node_id: NodeId = Field(description="CANopen node id, 1 to 127")
     serial: Unsigned32 | None = Field(
         None, description="serial number (0x1018 sub 4) of the node calibrated here"
     )
     node: Name = Field(description="kind of node, a [node.NAME] table")
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
-    surface: Surface
+    surface: Surface = Field(description="shape of the sensing surface")
     gap_mm: NonNegative = Field(
         description="bare length from each corner along each side, on the pad's rectangle"
     )
     series_ohm: Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(strict=False)] = (
         Field((0.0, 0.0, 0.0, 0.0), description="resistors from the electrodes x0, xa, y0, yb to ground")
     )
-    mount: Mount = Mount()
+    mount: Mount = Field(Mount(), description="where the pad sits on its link")
     touch: Touch | None = Field(None, description="thresholds of this pad alone; left out: those of [touch]")
 
 
 class Hand(Table):
     """`[[hand]]`: a hand and its pads."""
 
-    name: Name
+    name: Name = Field(description="name of the hand in topics")
     pads: Annotated[tuple[Pad, ...], Field(strict=False, min_length=1)] = Field(alias="pad")
 
 
@@ -187,27 +190,6 @@ class Deployment(Table):
     sheets: dict[Name, Sheet] = Field(alias="sheet")
     touch: Touch = Touch()
     hands: Annotated[tuple[Hand, ...], Field(strict=False, min_length=1)] = Field(alias="hand")
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One mistake: where it is, what stands there, and what would be right."""
-
-    place: str
-    value: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.place}{self.value}: {self.remedy}"
-
-
-class ConfigError(ValueError):
-    """A deployment file that can't be used; `problems` holds every mistake found, `str` a line for each."""
-
-    def __init__(self, file: str, problems: tuple[Problem, ...]) -> None:
-        super().__init__("\n".join(f"{file}: {problem}" for problem in problems))
-        self.file = file
-        self.problems = problems
 
 
 def load(path: Path | str) -> Deployment:
@@ -235,16 +217,45 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
     try:
         deployment = Deployment.model_validate(raw)
     except ValidationError as error:
-        found = tuple(_problem(raw, item) for item in error.errors() if not _is_echo(item))
-        raise ConfigError(file, found) from error
+        raise ConfigError(file, problems_of(raw, error, _TABLES, _SURFACES)) from error
     nodes = {
         name: node.model_copy(update={"eds": str((folder or Path()) / node.eds)}) if node.eds else node
         for name, node in deployment.nodes.items()
     }
-    deployment = deployment.model_copy(update={"nodes": nodes})
-    if problems := tuple(_cross_check(deployment)):
-        raise ConfigError(file, problems)
-    return deployment
+    return _checked(deployment.model_copy(update={"nodes": nodes}), file)
+
+
+def with_bus(deployment: Deployment, text: str) -> Deployment:
+    """The deployment with one bus on another wire: NAME=INTERFACE:CHANNEL[,option=value...].
+
+    Name, bit rate and SYNC stay; the options of the old interface go. A udp_multicast channel may end in
+    :PORT. Values are read as TOML where they are numbers or truth values, else as text. Raises ConfigError.
+    """
+    file = f"--bus {text}"
+    form = re.fullmatch(
+        r"(?P<name>[^=:,]+)=(?P<interface>[^:,]+):(?P<channel>[^,]+)(?P<options>(,[^,=]+=[^,]*)*)", text
+    )
+    if not form:
+        remedy = "must be NAME=INTERFACE:CHANNEL[,option=value...], e.g. can0=socketcan:can1"
+        raise ConfigError(file, (Problem("the bus", "", remedy),))
+    names = [bus.name for bus in deployment.buses]
+    if form["name"] not in names:
+        known = f"the deployment has no bus of that name; there are: {', '.join(names)}"
+        raise ConfigError(file, (Problem("NAME", f" = {form['name']}", known),))
+    pairs = [pair.split("=", 1) for pair in form["options"].split(",")[1:]]
+    options = {key: _scalar(value) for key, value in pairs}
+    channel = form["channel"]
+    if form["interface"] == "udp_multicast" and (split := re.fullmatch(r"([0-9.]+):(\d+)", channel)):
+        channel, options["port"] = split[1], int(split[2])
+    update = {
+        "interface": form["interface"],
+        "channel": int(channel) if channel.isdecimal() else channel,
+        "options": options,
+    }
+    buses = tuple(
+        bus.model_copy(update=update) if bus.name == form["name"] else bus for bus in deployment.buses
+    )
+    return _checked(deployment.model_copy(update={"buses": buses}), file)
 
 
 def json_schema() -> dict[str, Any]:
@@ -270,232 +281,17 @@ _TABLES: dict[str, type[Table]] = {
     "hand.pad.mount": Mount,
     "hand.pad.touch": Touch,
 }
-_UNITS = ("_mm", "_ms", "_deg", "_n", "_v", "_ma", "_ohm", "_bit_s", "_mm2", "_kpa", "_counts", "_samples")
 
 
-def _problem(raw: Mapping[str, Any], error: Any) -> Problem:
-    """What pydantic found, in the words of the file."""
-    path, place, table = _locate(raw, tuple(error["loc"]))
-    key = path[-1] if path else ""
-    model = _model(path[:-1], table)
-    kind, value = error["type"], error["input"]
-    if kind == "extra_forbidden":
-        return Problem(place, f" = {_show(value)}", _unknown_key(key, model))
-    if kind == "missing":
-        near = _near(key, [k for k in table if model is None or k not in _keys(model)])
-        hint = f'; "{near}" stands there: did you mean "{key}"?' if near else ""
-        return Problem(place, "", f"is missing{hint}{_meaning(key, model)}")
-    if kind.startswith("union_tag"):
-        known = ", ".join(f'kind = "{name}"' for name in _SURFACES)
-        return Problem(place, f" = {_show(value)}", f"needs one of {known}")
-    message = (
-        str(error["msg"])
-        .replace("Input should be", "must be")
-        .replace("Input", "value")
-        .replace("Tuple", "list")
-    )
-    return Problem(place, f" = {_show(value)}", message + _meaning(key, model))
+def _checked(deployment: Deployment, file: str) -> Deployment:
+    if problems := tuple(problems_in(deployment)):
+        raise ConfigError(file, problems)
+    return deployment
 
 
-def _is_echo(error: Any) -> bool:
-    """A list is also called too short when all its entries are wrong; those are reported by themselves."""
-    return error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]
-
-
-def _locate(raw: Mapping[str, Any], loc: tuple[str | int, ...]) -> tuple[list[str], str, Mapping[str, Any]]:
-    """Follow pydantic's location to (keys, place in the words of the file, innermost table)."""
-    here: Any = raw
-    table: Mapping[str, Any] = raw
-    path: list[str] = []
-    section = ""
-    shown: list[str] = []
-    for step in loc:
-        if isinstance(step, int):
-            here = here[step] if isinstance(here, list) and step < len(here) else None
-            if isinstance(here, dict):
-                name = here.get("link") or here.get("name")
-                section = f"[[{'.'.join(path)}]] {step + 1}" + (f' "{name}"' if isinstance(name, str) else "")
-                table, shown = here, []
-            elif shown:
-                shown[-1] += f"[{step}]"
-            continue
-        if step == "[key]" or (
-            isinstance(here, dict) and here.get("kind") == step and path[-1:] == ["surface"]
-        ):
-            continue  # pydantic's own marks, not keys of the file
-        if isinstance(here, dict):
-            table = here
-            here = here.get(step)
-        path.append(step)
-        shown.append(step)
-    if not section and len(shown) > 1:
-        section, shown = f"[{'.'.join(shown[:-1])}]", shown[-1:]
-    return path, ": ".join(part for part in (section, ".".join(shown)) if part) or "top level", table
-
-
-def _model(path: list[str], table: Mapping[str, Any]) -> type[Table] | None:
-    """The definition that the table at a path must follow."""
-    if path[-1:] == ["surface"]:
-        return _SURFACES.get(str(table.get("kind")))
-    return _TABLES.get(".".join(path)) or _TABLES.get(".".join([*path[:-1], "*"]))
-
-
-def _keys(model: type[Table]) -> dict[str, str]:
-    """Keys of a table as the file spells them, with their meaning."""
-    return {field.alias or name: field.description or "" for name, field in model.model_fields.items()}
-
-
-def _meaning(key: str, model: type[Table] | None) -> str:
-    meaning = _keys(model).get(key.split("[")[0], "") if model else ""
-    return f" ({key}: {meaning})" if meaning else ""
-
-
-def _unknown_key(key: str, model: type[Table] | None) -> str:
-    keys = list(_keys(model)) if model else []
-    if near := _near(key, keys):
-        unit = (
-            "; keys carry their unit"
-            if near != key and near.startswith(key) and near.endswith(_UNITS)
-            else ""
-        )
-        return f'unknown key; did you mean "{near}"{unit}?'
-    return f"unknown key; known here: {', '.join(keys)}"
-
-
-def _near(key: str, candidates: list[str]) -> str | None:
-    """The candidate that differs from the key by a forgotten unit or a slip of the pen."""
-    for candidate in candidates:
-        if any(candidate == key + unit or key == candidate + unit for unit in _UNITS):
-            return candidate
-    return next(iter(difflib.get_close_matches(key, candidates, n=1, cutoff=0.6)), None)
-
-
-def _show(value: object) -> str:
-    text = json.dumps(value, default=str, ensure_ascii=False)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _cross_check(deployment: Deployment) -> Iterator[Problem]:
-    """Mistakes that no single key shows."""
-    yield from _check_endpoints(deployment.daemon)
-    yield from _check_names("bus", [bus.name for bus in deployment.buses])
-    yield from _check_names("hand", [hand.name for hand in deployment.hands])
-    for name, node in deployment.nodes.items():
-        if node.heartbeat_timeout_ms <= node.heartbeat_ms:
-            yield Problem(
-                f"[node.{name}]: heartbeat_timeout_ms",
-                f" = {node.heartbeat_timeout_ms}",
-                f"must be longer than heartbeat_ms = {node.heartbeat_ms}; three times it is usual",
-            )
-        if node.eds and not Path(node.eds).is_file():
-            yield Problem(
-                f"[node.{name}]: eds", f" = {_show(node.eds)}", "no such file; give its path beside this one"
-            )
-    yield from _check_touch("[touch]", deployment.touch)
-    taken: dict[tuple[str, int], str] = {}
-    for hand in deployment.hands:
-        yield from _check_names("hand.pad", [pad.link for pad in hand.pads])
-        for number, pad in enumerate(hand.pads, 1):
-            place = f'[[hand.pad]] {number} "{pad.link}"'
-            yield from _check_references(place, pad, deployment)
-            yield from _check_shape(place, pad)
-            if pad.touch:
-                yield from _check_touch(f"{place}: touch", pad.touch)
-            owner = taken.setdefault((pad.bus, pad.node_id), f"{hand.name}/{pad.link}")
-            if owner != f"{hand.name}/{pad.link}":
-                yield Problem(
-                    f"{place}: node_id",
-                    f" = {pad.node_id}",
-                    f'is already the node of "{owner}" on bus "{pad.bus}"; every node needs an id of its own',
-                )
-
-
-def _check_names(section: str, names: list[str]) -> Iterator[Problem]:
-    key = "link" if section == "hand.pad" else "name"
-    for number, name in enumerate(names, 1):
-        if name in names[: number - 1]:
-            yield Problem(
-                f"[[{section}]] {number}: {key}", f" = {_show(name)}", "is used twice; names must differ"
-            )
-
-
-def _check_endpoints(daemon: Daemon) -> Iterator[Problem]:
-    seen: dict[str, str] = {}
-    for key in ("live", "complete", "control", "inputs"):
-        endpoint = getattr(daemon, key)
-        place, value = f"[daemon]: {key}", f" = {_show(endpoint)}"
-        if not endpoint.startswith(("tcp://", "ipc://")):
-            yield Problem(
-                place,
-                value,
-                "must be a ZeroMQ endpoint such as tcp://127.0.0.1:5580 or ipc:///run/handtouch/live",
-            )
-        elif endpoint.startswith("tcp://") and not endpoint.startswith(_LOOPBACK):
-            yield Problem(
-                place, value, "reaches beyond this machine; only loopback (127.0.0.1) is open without keys"
-            )
-        elif endpoint in seen and not endpoint.endswith(":*"):
-            yield Problem(place, value, f"is the endpoint of {seen[endpoint]} too; give each its own port")
-        seen[endpoint] = key
-
-
-def _check_touch(place: str, touch: Touch) -> Iterator[Problem]:
-    if touch.off_n >= touch.on_n:
-        yield Problem(
-            f"{place}: off_n", f" = {touch.off_n}", f"must be below on_n = {touch.on_n}, or contacts flicker"
-        )
-
-
-def _check_references(place: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
-    known = {
-        "bus": [bus.name for bus in deployment.buses],
-        "node": list(deployment.nodes),
-        "sheet": list(deployment.sheets),
-    }
-    for key, names in known.items():
-        value = getattr(pad, key)
-        if value not in names:
-            header = "[[bus]]" if key == "bus" else f"[{key}.NAME]"
-            yield Problem(
-                f"{place}: {key}",
-                f" = {_show(value)}",
-                f"no {header} of that name; there are: {', '.join(names)}",
-            )
-
-
-def _check_shape(place: str, pad: Pad) -> Iterator[Problem]:
-    """What the geometry of a pad forbids; lengths of sides along the surface, in mm."""
-    surface = pad.surface
-    if isinstance(surface, Plane):
-        sides = (surface.length_mm, surface.width_mm)
-    elif isinstance(surface, Cylinder):
-        sides = (surface.length_mm, surface.radius_mm * math.radians(surface.arc_deg))
-    elif isinstance(surface, Cone):
-        narrow = min(surface.near_radius_mm, surface.far_radius_mm)
-        sides = (surface.slant_mm, narrow * math.radians(surface.arc_deg))
-        if surface.slant_mm < abs(surface.far_radius_mm - surface.near_radius_mm):
-            yield Problem(
-                f"{place}: surface.slant_mm",
-                f" = {surface.slant_mm}",
-                "is shorter than the difference of the two radii; no cone has that shape",
-            )
-    else:
-        widest = max(abs(surface.from_deg), abs(surface.to_deg))
-        narrow = surface.radius_mm * math.cos(math.radians(widest))
-        sides = (
-            surface.radius_mm * math.radians(surface.to_deg - surface.from_deg),
-            narrow * math.radians(surface.arc_deg),
-        )
-        if surface.to_deg <= surface.from_deg:
-            yield Problem(
-                f"{place}: surface.to_deg",
-                f" = {surface.to_deg}",
-                f"must be above from_deg = {surface.from_deg}",
-            )
-            return
-    if 2 * pad.gap_mm >= min(sides):
-        yield Problem(
-            f"{place}: gap_mm",
-            f" = {pad.gap_mm}",
-            f"leaves no electrode on a side of {min(sides):.4g} mm; it must be below {min(sides) / 2:.4g}",
-        )
+def _scalar(text: str) -> str | int | float | bool:
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+    return value if isinstance(value, int | float) else text

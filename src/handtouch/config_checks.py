@@ -1,0 +1,191 @@
+"""What no single key of a deployment shows: names used twice, references to nothing, shapes that can't be.
+
+Public names: `problems_in`, `rectangle_mm`.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from handtouch.config_problems import Problem
+
+if TYPE_CHECKING:
+    from handtouch.config import Bus, Daemon, Deployment, Node, Pad, Surface, Touch
+
+_LOOPBACK = ("tcp://127.", "tcp://localhost:", "tcp://[::1]:")
+
+
+def problems_in(deployment: Deployment) -> Iterator[Problem]:
+    """Every mistake of a deployment whose tables are right one by one."""
+    yield from _check_endpoints(deployment.daemon)
+    yield from _check_names("[[bus]]", "name", [bus.name for bus in deployment.buses])
+    yield from _check_buses(deployment.buses)
+    for name, node in deployment.nodes.items():
+        yield from _check_node(f"[node.{name}]", node)
+    yield from _check_touch("[touch]: ", deployment.touch)
+    yield from _check_names("[[hand]]", "name", [hand.name for hand in deployment.hands])
+    taken: dict[tuple[str, int], str] = {}
+    for hand in deployment.hands:
+        yield from _check_names("[[hand.pad]]", "link", [pad.link for pad in hand.pads])
+        for number, pad in enumerate(hand.pads, 1):
+            name = f"{hand.name}/{pad.link}"
+            place = f'[[hand.pad]] {number} "{name}": '
+            yield from _check_references(place, pad, deployment)
+            yield from _check_shape(place, pad)
+            if pad.touch:
+                yield from _check_touch(f"{place}touch.", pad.touch)
+            if (pad.bus, pad.node_id) in taken:
+                yield Problem(
+                    f"{place}node_id",
+                    f" = {pad.node_id}",
+                    f'is already the node of "{taken[pad.bus, pad.node_id]}" on bus "{pad.bus}"; '
+                    "every node needs an id of its own",
+                )
+            taken.setdefault((pad.bus, pad.node_id), name)
+
+
+def rectangle_mm(surface: Surface) -> tuple[float, float]:
+    """Sides (a, b) [mm] of the conformal rectangle of a pad, as `handtouch.field.surface` has them.
+
+    A surface of revolution of radius r(s) is scaled by its radius half way, r_mid: a = r_mid * integral of
+    ds / r(s), b = r_mid * angle. NaN for a cone or sphere that doesn't exist. In plain arithmetic, so that a
+    deployment loads without the numerical packages.
+    """
+    if surface.kind == "plane":
+        return surface.length_mm, surface.width_mm
+    arc = math.radians(surface.arc_deg)
+    if surface.kind == "cylinder":
+        return surface.length_mm, surface.radius_mm * arc
+    if surface.kind == "cone":
+        near, far = surface.near_radius_mm, surface.far_radius_mm
+        middle = (near + far) / 2
+        growth = (far - near) / near
+        stretch = math.log1p(growth) / growth if growth else 1.0
+        return surface.slant_mm * stretch * middle / near, middle * arc
+    start, end = math.radians(surface.from_deg), math.radians(surface.to_deg)
+    middle = surface.radius_mm * math.cos((start + end) / 2)
+    return middle * (math.asinh(math.tan(end)) - math.asinh(math.tan(start))), middle * arc
+
+
+def _check_names(section: str, key: str, names: list[str]) -> Iterator[Problem]:
+    for number, name in enumerate(names, 1):
+        if name in names[: number - 1]:
+            yield Problem(f"{section} {number}: {key}", _is(name), "is used twice; names must differ")
+
+
+def _check_endpoints(daemon: Daemon) -> Iterator[Problem]:
+    seen: dict[str, str] = {}
+    for key in ("live", "complete", "control", "inputs"):
+        endpoint = getattr(daemon, key)
+        place, value = f"[daemon]: {key}", _is(endpoint)
+        if not endpoint.startswith(("tcp://", "ipc://")):
+            yield Problem(
+                place,
+                value,
+                "must be a ZeroMQ endpoint such as tcp://127.0.0.1:5580 or ipc:///run/handtouch/live",
+            )
+        elif endpoint.startswith("tcp://") and not endpoint.startswith(_LOOPBACK):
+            yield Problem(
+                place, value, "reaches beyond this machine; only loopback (127.0.0.1) is open without keys"
+            )
+        elif endpoint in seen and not endpoint.endswith(":*"):
+            yield Problem(place, value, f"is the endpoint of {seen[endpoint]} too; give each its own port")
+        seen[endpoint] = key
+
+
+def _check_buses(buses: Iterable[Bus]) -> Iterator[Problem]:
+    from can.interfaces import VALID_INTERFACES  # costs 0.1 s, and only a deployment needs it
+
+    seen: dict[str, str] = {}
+    for number, bus in enumerate(buses, 1):
+        place = f'[[bus]] {number} "{bus.name}": '
+        if bus.interface not in VALID_INTERFACES:
+            known = ", ".join(sorted(VALID_INTERFACES))
+            yield Problem(f"{place}interface", _is(bus.interface), f"python-can knows {known}")
+        if bus.interface == "udp_multicast" and not _is_multicast(str(bus.channel)):
+            yield Problem(
+                f"{place}channel", _is(bus.channel), "must be a multicast address such as 239.74.163.2"
+            )
+        port = bus.options.get("port") if bus.interface == "udp_multicast" else None
+        wire = json.dumps([bus.interface, bus.channel, port])
+        if wire in seen:
+            yield Problem(
+                f"{place}channel", _is(bus.channel), f'is the wire of bus "{seen[wire]}" too; name each once'
+            )
+        seen.setdefault(wire, bus.name)
+
+
+def _is_multicast(channel: str) -> bool:
+    try:
+        return ipaddress.ip_address(channel).is_multicast
+    except ValueError:
+        return False
+
+
+def _check_node(place: str, node: Node) -> Iterator[Problem]:
+    if node.heartbeat_timeout_ms <= node.heartbeat_ms:
+        yield Problem(
+            f"{place}: heartbeat_timeout_ms",
+            _is(node.heartbeat_timeout_ms),
+            f"must be longer than heartbeat_ms = {node.heartbeat_ms}; three times it is usual",
+        )
+    if node.eds and not Path(node.eds).is_file():
+        yield Problem(
+            f"{place}: eds",
+            _is(node.eds),
+            "no such file; give its path, starting at the folder of the deployment file",
+        )
+
+
+def _check_touch(place: str, touch: Touch) -> Iterator[Problem]:
+    if touch.off_n >= touch.on_n:
+        yield Problem(
+            f"{place}off_n", _is(touch.off_n), f"must be below on_n = {touch.on_n}, or contacts flicker"
+        )
+
+
+def _check_references(place: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
+    known = (
+        ("bus", "[[bus]]", [bus.name for bus in deployment.buses]),
+        ("node", "[node.NAME]", list(deployment.nodes)),
+        ("sheet", "[sheet.NAME]", list(deployment.sheets)),
+    )
+    for key, header, names in known:
+        value = getattr(pad, key)
+        if value not in names:
+            there = f"there are: {', '.join(names)}" if names else "there are none"
+            yield Problem(f"{place}{key}", _is(value), f"no {header} of that name; {there}")
+
+
+def _check_shape(place: str, pad: Pad) -> Iterator[Problem]:
+    """What the geometry of a pad forbids."""
+    surface = pad.surface
+    if surface.kind == "cone" and surface.slant_mm < abs(surface.far_radius_mm - surface.near_radius_mm):
+        least = abs(surface.far_radius_mm - surface.near_radius_mm)
+        yield Problem(
+            f"{place}surface.slant_mm",
+            _is(surface.slant_mm),
+            f"no cone has that shape; it must be at least the difference of the two radii, {least:.4g}",
+        )
+        return
+    if surface.kind == "sphere" and surface.to_deg <= surface.from_deg:
+        yield Problem(
+            f"{place}surface.to_deg", _is(surface.to_deg), f"must be above from_deg = {surface.from_deg}"
+        )
+        return
+    side = min(rectangle_mm(surface))
+    if not 2 * pad.gap_mm < side:
+        yield Problem(
+            f"{place}gap_mm",
+            _is(pad.gap_mm),
+            f"leaves no electrode on a side of {side:.4g} mm; it must be below {side / 2:.4g}",
+        )
+
+
+def _is(value: object) -> str:
+    return f" = {json.dumps(value, ensure_ascii=False)}"
