@@ -1,0 +1,263 @@
+"""Maximum-likelihood contact, with its covariance, from all the noisy currents of any forward model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch.field.model import FloatArray, ForwardModel
+
+BoolArray = NDArray[np.bool_]
+
+_MAX_STEPS = 40
+_SETTLED = 1e-6  # squared Newton decrement, in variances: the step then taken leaves far less
+_SMALLEST_STEP = 1e-14  # of a side: rounding
+_EDGE = 1e-9  # of a side: how near to an edge an estimate may come
+_LONGEST_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
+_LOST = 1e3  # sides: a coordinate less certain than this is not known at all
+_CORNER = 0.7  # shorter sides, times the root of the relative noise: how near a corner currents tell anything
+_GRID = 9  # points a side of the search that finds a start without a closed form
+
+
+@dataclass(frozen=True)
+class PointEstimate:
+    """The most likely point contact; arrays of one shape (...), or scalars.
+
+    x, y: position in the unit of the pad, on the pad; NaN with infinite variance where the currents do not
+        hold it: a standard deviation beyond a thousand sides, or no positive total.
+    total: the current injected, in the unit of the currents.
+    residual: signed excess of (x0 + xa) over that of this point, divided by the total; NaN for a model
+        with other channels than x0, xa, y0, yb.
+    chi_squared: sum of squared misfits in standard deviations; channels - 3 degrees of freedom for a point.
+    covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate.
+    converged: False where the iteration stopped before the maximum, or found no positive total.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    total: FloatArray
+    residual: FloatArray
+    chi_squared: FloatArray
+    covariance: FloatArray
+    converged: BoolArray
+
+
+def estimate(
+    model: ForwardModel, currents: ArrayLike, noise: ArrayLike, start: ArrayLike | None = None
+) -> PointEstimate:
+    """Return the point contact that makes `currents` most likely under independent normal noise.
+
+    currents: shape (channels, ...), any unit; negative and zero readings are ordinary noise.
+    noise: standard deviation of each current, same unit, broadcastable against `currents`. An infinite one
+        leaves its channel out; one that is not positive gives NaN.
+    start: (x, y), shape (2, ...), where to begin; found from the currents if absent.
+
+    Gauss-Newton on (x, y) with the total eliminated (variable projection), halved until the likelihood rises.
+    Raises ValueError if the first axis of `currents` is not the model's channels.
+    """
+    currents = np.asarray(currents, dtype=np.float64)
+    channels = len(model.fractions(model.a / 2, model.b / 2))
+    if currents.shape[:1] != (channels,):
+        raise ValueError(f"currents have shape {currents.shape}: the first axis is the {channels} channels")
+    shape = currents.shape[1:]
+    flat = currents.reshape(channels, -1)
+    sigma = np.broadcast_to(np.asarray(noise, dtype=np.float64), currents.shape).reshape(channels, -1)
+    with np.errstate(all="ignore"):
+        fit = _Fit(model, flat, np.where(sigma > 0, sigma, np.nan))
+        if start is None:
+            begin = fit.guess()
+        else:
+            begin = np.broadcast_to(np.asarray(start, dtype=np.float64), (2, *shape)).reshape(2, -1)
+        result = fit.run(begin)
+    return PointEstimate(
+        x=result.x.reshape(shape)[()],
+        y=result.y.reshape(shape)[()],
+        total=result.total.reshape(shape)[()],
+        residual=result.residual.reshape(shape)[()],
+        chi_squared=result.chi_squared.reshape(shape)[()],
+        covariance=result.covariance.reshape(*shape, 3, 3),
+        converged=result.converged.reshape(shape)[()],
+    )
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """The model at one point of each element, whitened; total eliminated.
+
+    total: its best value, (n,). misfit: whitened residuals, (channels, n). fractions: whitened. slopes: their
+    derivatives by x and y, (2, channels, n), less `mixing` times the fractions, which the total absorbs.
+    cost: sum of squared misfits.
+    """
+
+    total: FloatArray
+    misfit: FloatArray
+    fractions: FloatArray
+    slopes: FloatArray
+    mixing: FloatArray
+    cost: FloatArray
+
+    def pick(self, index: NDArray[np.intp] | BoolArray) -> _Linear:
+        """Some of the elements."""
+        return _Linear(*(getattr(self, k)[..., index] for k in self.__dataclass_fields__))
+
+    def put(self, index: NDArray[np.intp] | BoolArray, other: _Linear) -> None:
+        """Overwrite some of the elements."""
+        for k in self.__dataclass_fields__:
+            getattr(self, k)[..., index] = getattr(other, k)
+
+
+class _Fit:
+    """Many independent fits of one model at once; arrays are (..., n)."""
+
+    def __init__(self, model: ForwardModel, currents: FloatArray, noise: FloatArray) -> None:
+        self.model, self.currents = model, currents
+        self.weight = 1 / noise
+        self.data = currents * self.weight
+        sides = np.array([[model.a], [model.b]])
+        self.low, self.high = _EDGE * sides, (1 - _EDGE) * sides
+        self.shortest = float(sides.min())
+        self.longest, self.smallest = _LONGEST_STEP * self.shortest, _SMALLEST_STEP * sides
+
+    def guess(self) -> FloatArray:
+        """A start from the currents alone, shape (2, n): the most likely of a grid of points."""
+        fractions_of_side = (np.arange(_GRID) + 0.5) / _GRID
+        x, y = (
+            s.ravel() for s in np.meshgrid(self.model.a * fractions_of_side, self.model.b * fractions_of_side)
+        )
+        table = self.model.fractions(x, y)
+        best = np.full(self.data.shape[1], -np.inf)
+        begin = np.full((2, len(best)), np.nan)
+        for px, py, fractions in zip(x, y, table.T, strict=True):
+            whitened = fractions[:, None] * self.weight
+            explained = np.maximum((whitened * self.data).sum(0), 0) ** 2 / (whitened * whitened).sum(0)
+            better = explained > best
+            best = np.where(better, explained, best)
+            begin[0, better], begin[1, better] = px, py
+        return begin
+
+    def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> _Linear:
+        """Evaluate the model at `point`, shape (2, n), for the elements `index`."""
+        f, jacobian = self.model.fractions_with_jacobian(point[0], point[1])
+        weight, data = self.weight[:, index], self.data[:, index]
+        f = f * weight
+        slopes = np.moveaxis(jacobian, 1, 0) * weight
+        norm = (f * f).sum(0)
+        total = (f * data).sum(0) / norm
+        misfit = data - total * f
+        mixing = (slopes * f).sum(1) / norm
+        slopes = slopes - mixing[:, None] * f
+        return _Linear(total, misfit, f, slopes, mixing, (misfit * misfit).sum(0))
+
+    def step(self, at: _Linear, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton step (2, n) and squared decrement (n,); coordinates held by an edge stay."""
+        slopes = at.slopes * at.total
+        gradient = (slopes * at.misfit).sum(1)
+        held = ((point <= self.low) & (gradient < 0)) | ((point >= self.high) & (gradient > 0))
+        slopes = np.where(held[:, None], 0.0, slopes)
+        sx, sy = slopes
+        xx = (sx * sx).sum(0)
+        overlap = np.where(xx > 0, (sx * sy).sum(0) / xx, 0.0)
+        sy = sy - overlap * sx
+        yy = (sy * sy).sum(0)
+        along_x, along_y = (sx * at.misfit).sum(0), (sy * at.misfit).sum(0)
+        dy = np.where(yy > 0, along_y / yy, 0.0)
+        dx = np.where(xx > 0, along_x / xx, 0.0) - overlap * dy
+        decrement = np.where(xx > 0, along_x**2 / xx, 0.0) + np.where(yy > 0, along_y**2 / yy, 0.0)
+        shrink = np.minimum(1.0, self.longest / np.maximum(np.maximum(abs(dx), abs(dy)), 1e-300))
+        return np.stack([dx, dy]) * shrink, decrement
+
+    def run(self, begin: FloatArray) -> PointEstimate:
+        """Iterate every element to its maximum; elements that have settled are left alone."""
+        point = np.clip(begin, self.low, self.high)
+        known = np.isfinite(self.data).all(0) & np.isfinite(self.weight).all(0)
+        point = np.where(known, np.where(np.isfinite(point), point, (self.low + self.high) / 2), np.nan)
+        best = self.linearise(point, slice(None))
+        converged = np.zeros(point.shape[1], dtype=np.bool_)
+        damping = np.ones(point.shape[1])
+        active = np.flatnonzero(known)
+        for _ in range(_MAX_STEPS):
+            if not active.size:
+                break
+            here, at = point[:, active], best.pick(active)
+            step, decrement = self.step(at, here)
+            trial = np.clip(here + damping[active] * step, self.low, self.high)
+            new = self.linearise(trial, active)
+            accept = (new.cost <= at.cost) & (new.total > 0) | (at.total <= 0)
+            point[:, active[accept]] = trial[:, accept]
+            best.put(active[accept], new.pick(accept))
+            damping[active] = np.where(accept, np.minimum(1.0, 4 * damping[active]), damping[active] / 4)
+            moved = (abs(trial - here) > self.smallest).any(0)
+            done = (accept & (decrement < _SETTLED)) | ~moved
+            converged[active[done]] = best.total[active[done]] > 0
+            active = active[~done]
+        cornered = self.leave_corner(point, best, converged)
+        if cornered.size:
+            best.put(cornered, self.linearise(point[:, cornered], cornered))
+        return self.result(point, best, converged)
+
+    def leave_corner(self, point: FloatArray, at: _Linear, converged: BoolArray) -> NDArray[np.intp]:
+        """Move points too near a corner straight out, in place, to where currents begin to tell; their indices.
+
+        Near a corner the two far currents vanish with the square of its distance r, so that all r up to
+        sqrt(noise) sides are equally likely, and only the direction from the corner is known.
+        """
+        noise = 1 / np.sqrt((self.weight * self.weight).mean(0))
+        radius = self.shortest * np.minimum(_CORNER * np.sqrt(noise / np.maximum(at.total, 0)), 0.25)
+        corner = np.where(2 * point > self.low + self.high, self.low + self.high, 0.0)
+        offset = point - corner
+        distance = np.hypot(*offset)
+        index = np.flatnonzero(distance < radius)
+        point[:, index] = (corner + offset * (radius / distance))[:, index]
+        converged[index] = at.total[index] > 0
+        return index
+
+    def result(self, point: FloatArray, at: _Linear, converged: BoolArray) -> PointEstimate:
+        """Covariance and residual at the points reached."""
+        if len(self.currents) == 4:
+            pair = (at.misfit[:2] / self.weight[:2]).sum(0)
+            residual = pair / at.total
+        else:
+            residual = np.full_like(at.total, math.nan)
+        covariance = covariance_of(at.slopes * at.total, at.mixing * at.total, at.fractions, self.high[:, 0])
+        held = np.isfinite(np.diagonal(covariance, axis1=1, axis2=2))
+        return PointEstimate(
+            x=np.where(held[:, 0], point[0], np.nan),
+            y=np.where(held[:, 1], point[1], np.nan),
+            total=at.total,
+            residual=residual,
+            chi_squared=at.cost,
+            covariance=covariance,
+            converged=converged,
+        )
+
+
+def covariance_of(
+    slopes: FloatArray, mixing: FloatArray, fractions: FloatArray, sides: FloatArray
+) -> FloatArray:
+    """Inverse Fisher information of (x, y, total), shape (n, 3, 3).
+
+    slopes, mixing: as in `_Linear`, times the total. fractions: whitened. sides: (2,), lengths of the pad.
+    A coordinate whose standard deviation exceeds `_LOST` sides has infinite variance and no covariances.
+    """
+    sx, sy = slopes
+    xx, yy, xy = (sx * sx).sum(0), (sy * sy).sum(0), (sx * sy).sum(0)
+    # Each variance from what the other coordinate cannot explain: no difference of products.
+    free = np.stack([((sx - (xy / yy) * sy) ** 2).sum(0), ((sy - (xy / xx) * sx) ** 2).sum(0)])
+    least = (_LOST * sides[:, None]) ** -2.0
+    lost_x, lost_y = ~(xx > least[0]), ~(yy > least[1])
+    free = np.where(np.stack([lost_y, lost_x]), np.stack([xx, yy]), free)
+    held_x, held_y = free > least
+    covariance = np.zeros((len(xx), 3, 3))
+    covariance[:, 0, 0] = np.where(held_x, 1 / free[0], np.inf)
+    covariance[:, 1, 1] = np.where(held_y, 1 / free[1], np.inf)
+    covariance[:, 0, 1] = covariance[:, 1, 0] = np.where(held_x & held_y, -xy / (xx * free[1]), 0.0)
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    for i in range(2):
+        covariance[:, i, 2] = covariance[:, 2, i] = -(finite[:, i, :2] * mixing.T).sum(1)
+    spread = -(covariance[:, :2, 2] * mixing.T).sum(1)
+    covariance[:, 2, 2] = 1 / (fractions * fractions).sum(0) + spread
+    covariance[np.isnan(covariance[:, 2, 2])] = np.nan
+    return covariance

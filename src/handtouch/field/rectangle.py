@@ -1,0 +1,258 @@
+"""Rectangle: the ideal pad, four electrodes along its whole sides; exact both ways, in double precision."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from handtouch.field._ratio_inverse import LOGARITHMIC_DEPTH, RatioInverse, distance_in_strip
+from handtouch.field._separable import SideRatio, theta_four, theta_two
+from handtouch.field.estimate import PointEstimate, estimate
+from handtouch.field.model import FloatArray
+
+_HALF_PI = math.pi / 2
+_SAFE_SCALE = 1e100  # sides within this factor of 1 need no scaling against overflow
+_NEAREST = 1e-140  # of a side: closer to an edge, derivatives are taken here
+
+
+@dataclass(frozen=True)
+class Location:
+    """The exact inverse of four currents; arrays of one shape (...), or scalars.
+
+    x, y: position, in the unit of the pad; NaN where the currents no longer hold it.
+    total: sum of the four currents.
+    residual: signed excess of (x0 + xa) over that of a point at (x, y), divided by the total. Positive is
+        elongated along x. It vanishes for a point (paper, eqs. 14-15).
+    """
+
+    x: FloatArray
+    y: FloatArray
+    total: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A pad 0 <= x <= a, 0 <= y <= b with a grounded electrode along each whole side.
+
+    a, b: lengths of the sides, any one unit. ValueError unless both are positive and finite.
+
+    Everything is even-handed between the sides and accurate for aspect ratios from 1e-3 to 1e3, down to
+    1e-12 of a side from edges and corners. Points that are NaN or off the pad give NaN in their own element.
+    """
+
+    a: float
+    b: float
+
+    def __post_init__(self) -> None:
+        for name in ("a", "b"):
+            value = float(getattr(self, name))
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} = {value!r}: a side of a rectangle is positive and finite")
+            object.__setattr__(self, name, value)
+
+    # Forward ----------------------------------------------------------------------------------------------
+
+    def side_fractions(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return the fractions of the current that sides x0, xa, y0, yb collect, shape (4, ...), sum 1.
+
+        They are the harmonic measures of the sides seen from (x, y): the sums of eqs. 3-5 in closed form.
+        Error: a few 1e-16 absolute and, down to 1e-290, 1e-12 relative. At a corner exactly the two sides
+        share equally.
+        """
+        ratio_x, ratio_y = self._ratios(*self._on_pad(x, y))
+        with np.errstate(all="ignore"):
+            return np.asarray(np.arctan2(*self._tangents(ratio_x, ratio_y)) / _HALF_PI)
+
+    def fractions(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return `side_fractions`: an ideal pad measures them as they are."""
+        return self.side_fractions(x, y)
+
+    def fractions_with_jacobian(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return `side_fractions` and their derivatives by (x, y), shape (4, 2, ...), per unit of a and b.
+
+        On an edge the derivatives are those a rounding error inside it; at a corner they are unbounded.
+        """
+        x, y = self._on_pad(x, y)
+        with np.errstate(all="ignore"):
+            x, y = (
+                np.clip(s, _NEAREST * side, np.nextafter(side, 0))
+                for s, side in zip((x, y), self._sides, strict=True)
+            )
+            ratios = self._ratios(x, y)
+            numerator, denominator = self._tangents(*ratios)
+            tangent = numerator / denominator
+            weight = 2 / math.pi / (tangent + 1 / tangent)  # sin(pi f) / pi
+            across, along = self._log_slopes(*ratios)
+            jacobian = np.empty((4, 2, *x.shape))
+            for i, (own, other) in enumerate(((0, 1), (0, 1), (1, 0), (1, 0))):
+                jacobian[i, own] = weight[i] * across[own] * (1 if i % 2 else -1)
+                jacobian[i, other] = weight[i] * along[other]
+            return np.arctan2(numerator, denominator) / _HALF_PI, jacobian * self._unit
+
+    def conformal_radius(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return the conformal radius of the pad seen from (x, y), shape (...), in the unit of a and b.
+
+        A small contact of radius A meets the sheet resistance ln(radius / A) / (2 pi) ohm per ohm per square.
+        Relative error a few 1e-16; it vanishes at the edges.
+        """
+        ratios = self._ratios(*self._on_pad(x, y))
+        with np.errstate(all="ignore"):
+            across, along = self._log_slopes(*ratios)
+            gradient = np.hypot(along[self._long], across[1 - self._long])
+            return np.asarray(2 / gradient / self._unit)[()]
+
+    # Inverse ----------------------------------------------------------------------------------------------
+
+    def locate(self, currents: ArrayLike) -> Location:
+        """Return the point contact whose currents x0, xa, y0, yb are `currents`, shape (4, ...), any unit.
+
+        x follows from x0 and xa as fractions of the total, y from y0 and yb, and what is left over is the
+        residual. An element with a negative or NaN current is NaN (`estimate` takes noise), as is a
+        coordinate of which the currents hold nothing: both of its currents underflowed, or zero.
+        """
+        currents = np.asarray(currents, dtype=np.float64)
+        if currents.shape[:1] != (4,):
+            raise ValueError(f"currents have shape {currents.shape}: the first axis is x0, xa, y0, yb")
+        shape = currents.shape[1:]
+        pairs = currents.reshape(2, 2, -1)
+        with np.errstate(all="ignore"):
+            sums = pairs[:, 0] + pairs[:, 1]
+            total = sums[0] + sums[1]
+            tangents, measured = _half_angle_tangents(pairs, total)
+            x, y, expected = self._invert(tangents)
+            residual = measured - expected
+        return Location(*(v.reshape(shape)[()] for v in (x, y, total, residual)))
+
+    def estimate(
+        self, currents: ArrayLike, noise: ArrayLike, start: ArrayLike | None = None
+    ) -> PointEstimate:
+        """Return the maximum-likelihood contact from all four noisy currents; see `estimate`."""
+        return estimate(self, currents, noise, start)
+
+    # Details ----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _unit(self) -> float:
+        """Power of two that brings extreme sides near 1, so that no intermediate leaves double range."""
+        largest = max(self.a, self.b)
+        if 1 / _SAFE_SCALE < largest < _SAFE_SCALE:
+            return 1.0
+        return math.ldexp(1.0, min(1000, -math.frexp(largest)[1]))
+
+    @cached_property
+    def _sides(self) -> tuple[float, float]:
+        return self.a * self._unit, self.b * self._unit
+
+    @cached_property
+    def _long(self) -> int:
+        """Axis of the longer sides."""
+        return 0 if self.a >= self.b else 1
+
+    @cached_property
+    def _pairs(self) -> tuple[SideRatio, SideRatio]:
+        a, b = self._sides
+        return SideRatio(a, b), SideRatio(b, a)
+
+    @cached_property
+    def _coupling(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Per axis: numerator factor, delta and slope of the algebra in `_separable`.
+
+        Ratios along the longer axis keep the factor `root`, which may underflow, and those along the shorter
+        one are divided by it; the factors here make up for that.
+        """
+        long = self._long
+        root = self._pairs[long].root
+        nome = math.exp(-math.pi * self._sides[long] / self._sides[1 - long])
+        strong = 8 * (theta_two(nome) / theta_four(nome)) ** 2
+        short_slope = self._pairs[1 - long].slope * self._pairs[1 - long].root
+        by_length = np.array(
+            [[strong, 4 / strong], [4 / strong, strong * root], [self._pairs[long].slope, short_slope]]
+        )
+        numerator, delta, slope = by_length if long == 0 else by_length[:, ::-1]
+        return numerator, delta, slope
+
+    @cached_property
+    def _inverse(self) -> RatioInverse:
+        """One for both axes, or, for a strip, one for its shorter axis."""
+        short = self._pairs[1 - self._long]
+        return RatioInverse((short,) if self._is_strip else self._pairs)
+
+    @cached_property
+    def _is_strip(self) -> bool:
+        return self._sides[self._long] > LOGARITHMIC_DEPTH * self._sides[1 - self._long]
+
+    def _on_pad(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """x and y as float64 of one shape, NaN off the pad, scaled by `_unit`."""
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        with np.errstate(all="ignore"):
+            on = (x >= 0) & (x <= self.a) & (y >= 0) & (y <= self.b)
+            return np.where(on, x, np.nan) * self._unit, np.where(on, y, np.nan) * self._unit
+
+    def _ratios(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Ratios G of the two sides of either pair, shape (2, ...) each; the short axis' without its root."""
+        with np.errstate(all="ignore"):
+            ratios = [np.stack(pair(s)) for pair, s in zip(self._pairs, (x, y), strict=True)]
+            ratios[1 - self._long] /= self._pairs[1 - self._long].root
+            return ratios[0], ratios[1]
+
+    def _tangents(self, ratio_x: FloatArray, ratio_y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Numerators and denominators of tan(pi f / 2), shape (4, ...) each."""
+        numerator, delta, _ = self._coupling
+        sum_x, sum_y = ratio_x[0] + ratio_x[1], ratio_y[0] + ratio_y[1]
+        below_x, below_y = sum_y + np.hypot(sum_y, delta[1]), sum_x + np.hypot(sum_x, delta[0])
+        return (
+            np.concatenate([numerator[0] * ratio_x, numerator[1] * ratio_y]),
+            np.stack([below_x, below_x, below_y, below_y]),
+        )
+
+    def _log_slopes(
+        self, ratio_x: FloatArray, ratio_y: FloatArray
+    ) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Per axis: how fast ln T falls with distance from its own side, and rises in the other pair."""
+        _, delta, slope = self._coupling
+        ratios = (ratio_x, ratio_y)
+        across = [slope[i] * np.hypot(ratios[i][0] + ratios[i][1], delta[i]) for i in range(2)]
+        along = [slope[i] * (ratios[i][0] - ratios[i][1]) for i in range(2)]
+        return across, along
+
+    def _invert(self, tangents: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x, y and the fraction expected in the pair x0, xa, from T of shape (2 pairs, 2 sides, n)."""
+        ratio = tangents[:, 0] / tangents[:, 1]
+        mirrored = ratio < 1
+        ratio = np.where(mirrored, 1 / ratio, ratio)
+        if self._is_strip:
+            short = 1 - self._long
+            near = np.maximum(tangents[self._long, 0], tangents[self._long, 1])
+            distance = np.empty_like(ratio)
+            distance[short] = self._inverse(ratio[[short]])[0]
+            distance[self._long] = distance_in_strip(self._pairs[self._long], near, distance[short])
+        else:
+            distance = self._inverse(ratio)
+        x, y = np.where(mirrored, np.array(self._sides)[:, None] - distance, distance) / self._unit
+        if self._is_strip:
+            expected = self.side_fractions(x, y)[:2].sum(axis=0)
+        else:
+            root = np.sqrt(ratio)
+            g = root + 1 / root
+            expected = np.arctan(self._complementary_ratio * (g[0] / g[1])) / _HALF_PI
+        return x, y, expected
+
+    @cached_property
+    def _complementary_ratio(self) -> float:
+        """k' / k of the rectangle: the tangent of pi / 2 times the x0 + xa fraction at its centre."""
+        _, delta, _ = self._coupling
+        return float(delta[1] / 2) if self._long == 0 else float(2 / delta[0])
+
+
+def _half_angle_tangents(pairs: FloatArray, total: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """T = tan(pi f / 2) of every current, shape (2 pairs, 2 sides, n), and the fraction in the first pair."""
+    fractions = np.where(pairs >= 0, pairs, np.nan) / total
+    sums = fractions[:, 0] + fractions[:, 1]
+    rest = fractions[:, ::-1] + sums[::-1, None]  # not 1 - f: what is left beside a large f keeps its digits
+    tangents = np.tan(_HALF_PI * np.minimum(fractions, rest))
+    return np.where(fractions > rest, 1 / tangents, tangents), sums[0]
