@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from handtouch import wire
 
 
@@ -36,7 +38,7 @@ def location_std_m(contact: wire.Contact) -> float:
     if contact.covariance_m2 is None:
         return float("nan")
     xx, yy, zz = contact.covariance_m2[0], contact.covariance_m2[4], contact.covariance_m2[8]
-    return max(0.0, xx + yy + zz) ** 0.5
+    return math.sqrt(max(0.0, xx + yy + zz))
 
 
 def health_line(health: wire.Health) -> str:

@@ -1,89 +1,120 @@
-"""`handtouch watch`: a live view in a terminal, plain or JSON lines anywhere else."""
+"""`handtouch watch`: a live page in a terminal, plain or JSON lines anywhere else."""
 
 from __future__ import annotations
 
 import json
 import sys
-import threading
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Protocol, Self
 
+from handtouch import wire
 from handtouch.client import LIVE, Subscriber, connect
 from handtouch.view.lines import line
-from handtouch.wire import Contact
 
 _FRAMES_PER_S = 15
 _UPDATE_LINES_PER_S = 4
 
 
-def run(patterns: tuple[str, ...], *, endpoint: str = LIVE, style: str = "auto", seconds: float = 0) -> int:
-    """Show messages until Ctrl-C, or for `seconds`; `style`: auto, live, plain or json. Exit status 0.
+class Display(AbstractContextManager["Display"], Protocol):
+    """Shows messages one way or another."""
 
-    With no pattern: contacts and health.
+    def take(self, message: wire.Message) -> None:
+        """Show a message, at once or with the next frame."""
+
+    def frame(self, alive: bool) -> None:
+        """Draw; called `_FRAMES_PER_S` times a second with whether the daemon was heard lately."""
+
+
+class LiveDisplay:
+    """The live page, on the terminal's alternate screen."""
+
+    def __init__(self, title: str) -> None:
+        from rich.live import Live
+
+        from handtouch.view.terminal import HandView
+
+        self._view = HandView(title)
+        self._live = Live(self._view.render(), screen=True, auto_refresh=False)
+
+    def take(self, message: wire.Message) -> None:
+        self._view.update(message)
+
+    def frame(self, alive: bool) -> None:
+        self._live.update(self._view.render(alive), refresh=True)
+
+    def __enter__(self) -> Self:
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+
+class LineDisplay:
+    """A line per message; for people, updates of a contact are thinned out."""
+
+    def __init__(self, as_json: bool = False) -> None:
+        self._as_json = as_json
+        self._printed_ns: dict[str, int] = {}
+        self._alive = True
+
+    def take(self, message: wire.Message) -> None:
+        if self._as_json:
+            print(json.dumps(_plain(asdict(message))), flush=True)
+            return
+        if isinstance(message, wire.Contact) and message.event == "update":
+            if message.t_ns - self._printed_ns.get(message.link, 0) < 1e9 / _UPDATE_LINES_PER_S:
+                return
+            self._printed_ns[message.link] = message.t_ns
+        print(line(message), flush=True)
+
+    def frame(self, alive: bool) -> None:
+        if alive != self._alive:
+            self._alive = alive
+            print(
+                "the daemon is back" if alive else "the daemon is silent: is handtouch run up?",
+                file=sys.stderr,
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.stdout.flush()
+
+
+def follow(messages: Subscriber, display: Display, done: Callable[[], bool]) -> None:
+    """Show messages as they come until `done`."""
+    next_frame_s = 0.0
+    while not done():
+        message = messages.recv(max(0.0, next_frame_s - time.monotonic()))
+        if message is not None:
+            display.take(message)
+        if time.monotonic() >= next_frame_s:
+            display.frame(messages.alive)
+            next_frame_s = time.monotonic() + 1 / _FRAMES_PER_S
+
+
+def run(patterns: tuple[str, ...], *, endpoint: str = LIVE, style: str = "auto", seconds: float = 0) -> int:
+    """Show messages until Ctrl-C, or for `seconds`; `style`: auto, plain or json. Exit status 0, 2 (usage).
+
+    Without a pattern, contacts and health; on a terminal that is the live page.
     """
-    if style == "auto":
-        style = "live" if sys.stdout.isatty() and not patterns else "plain"
-    if style == "live":
-        patterns = ("contact/*/*", "health/*/*", "service")
-    stop = threading.Event()
-    if seconds:
-        timer = threading.Timer(seconds, stop.set)
-        timer.daemon = True
-        timer.start()
+    live = style == "auto" and sys.stdout.isatty() and not patterns
+    wanted = patterns or (("contact/*/*", "health/*/*", "service") if live else ("contact/*/*", "health/*/*"))
+    end_s = time.monotonic() + seconds if seconds else float("inf")
     try:
-        with connect(*(patterns or ("contact/*/*", "health/*/*")), endpoint=endpoint) as messages:
-            if style == "live":
-                show_live(messages, stop, f"handtouch at {endpoint}")
-            else:
-                show_lines(messages, stop, as_json=style == "json")
+        messages = connect(*wanted, endpoint=endpoint)
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
-    except (KeyboardInterrupt, BrokenPipeError):
-        return 0
+    display: Display = LiveDisplay(f"handtouch at {endpoint}") if live else LineDisplay(style == "json")
+    with messages, display:
+        follow(messages, display, lambda: time.monotonic() > end_s)
     return 0
-
-
-def show_live(messages: Subscriber, stop: threading.Event, title: str) -> None:
-    """Draw the live view until `stop` is set."""
-    from rich.live import Live
-
-    from handtouch.view.terminal import HandView
-
-    view = HandView(title)
-    with Live(view.render(), refresh_per_second=_FRAMES_PER_S, screen=True, auto_refresh=False) as live:
-        next_frame_s = time.monotonic()
-        while not stop.is_set():
-            message = messages.recv(max(0.0, next_frame_s - time.monotonic()))
-            if message is not None:
-                view.update(message)
-            if time.monotonic() >= next_frame_s:
-                live.update(view.render(messages.alive), refresh=True)
-                next_frame_s = time.monotonic() + 1 / _FRAMES_PER_S
-
-
-def show_lines(messages: Subscriber, stop: threading.Event, *, as_json: bool) -> None:
-    """Print a line per message until `stop` is set; for people, updates of a contact are thinned out."""
-    printed_ns: dict[str, int] = {}
-    silent = False
-    while not stop.is_set():
-        message = messages.recv(0.2)
-        if messages.alive == silent:
-            silent = not messages.alive
-            print(
-                "the daemon is silent: is handtouch run up?" if silent else "the daemon is back",
-                file=sys.stderr,
-            )
-        if message is None:
-            continue
-        if as_json:
-            print(json.dumps(_plain(asdict(message))), flush=True)
-        elif not isinstance(message, Contact) or message.event != "update":
-            print(line(message), flush=True)
-        elif message.t_ns - printed_ns.get(message.link, 0) >= 1e9 / _UPDATE_LINES_PER_S:
-            printed_ns[message.link] = message.t_ns
-            print(line(message), flush=True)
 
 
 def _plain(value: Any) -> Any:

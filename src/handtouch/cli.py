@@ -1,0 +1,227 @@
+"""The command line; each command's work is done by the module that it names, loaded only when called."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from handtouch import __version__
+
+LIVE = "tcp://127.0.0.1:5580"
+CONTROL = "tcp://127.0.0.1:5581"
+
+Command = Callable[[argparse.Namespace], int]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; exit status 0 (well), 1 (it failed) or 2 (wrong usage or configuration)."""
+    asked = build_parser().parse_args(arguments)
+    command: Command = asked.command
+    try:
+        return command(asked)
+    except KeyboardInterrupt:
+        return 0
+    except BrokenPipeError:  # the reader of our output left, as `| head` does
+        sys.stderr.close()
+        return 0
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="handtouch",
+        description="Gives a robot hand a sense of touch: CANopen touch sensors in, contacts out.",
+    )
+    parser.add_argument("--version", action="version", version=f"handtouch {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_serving(commands)
+    _add_looking(commands)
+    _add_checking(commands)
+    return parser
+
+
+def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    demo = _command(
+        commands, "demo", _demo, "a simulated hand, the daemon and a live view, for half a minute"
+    )
+    demo.add_argument("--seconds", type=_positive, help="end after so long (default: when the scenario ends)")
+    demo.add_argument("--plain", action="store_true", help="lines instead of the live view")
+    demo.add_argument(
+        "--tolerances", action="store_true", help="hide tolerances of parts from the estimator too"
+    )
+    demo.add_argument("--seed", type=int, default=1, help="seed of noise and tolerances (default: 1)")
+    demo.add_argument("--config", type=Path, help="deployment to simulate (default: the shipped hand)")
+
+    run = _command(commands, "run", _run, "serve the pads of a deployment until told to stop")
+    _add_config(run)
+    _add_bus(run)
+
+    simulate = _command(
+        commands, "simulate", _simulate, "simulated nodes for a deployment, on its real buses"
+    )
+    _add_config(simulate)
+    _add_bus(simulate)
+    simulate.add_argument("--scenario", type=Path, help="touches to play (default: a tour over the pads)")
+    simulate.add_argument("--truth", type=Path, help="write what really happened to this file, as JSON lines")
+    simulate.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    simulate.add_argument("--tolerances", action="store_true", help="tolerances of parts besides the noise")
+    simulate.add_argument("--seed", type=int, default=1, help="seed of noise and tolerances (default: 1)")
+
+    replay = _command(commands, "replay", _replay, "feed a recorded CAN log through the same pipeline")
+    replay.add_argument(
+        "log", type=Path, help="log in any format of python-can: candump .log, .asc, .blf, .gz ..."
+    )
+    _add_config(replay)
+    replay.add_argument(
+        "--speed", type=_speed, default=0.0, help="1 as recorded, 2 twice as fast, max (default)"
+    )
+    replay.add_argument("--json", action="store_true", help="every contact message as a JSON line")
+    replay.add_argument("--publish", action="store_true", help="publish on the deployment's endpoints too")
+
+
+def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    watch = _command(commands, "watch", _watch, "show what a running daemon publishes")
+    watch.add_argument("pattern", nargs="*", help='topics such as "contact/*/thumb_*", "hand/*", "service"')
+    watch.add_argument("--endpoint", default=LIVE, help=f"stream to listen to (default: {LIVE})")
+    style = watch.add_mutually_exclusive_group()
+    style.add_argument(
+        "--plain", dest="style", action="store_const", const="plain", help="lines, in a terminal too"
+    )
+    style.add_argument("--json", dest="style", action="store_const", const="json", help="JSON lines")
+    watch.add_argument("--seconds", type=_positive, default=0.0, help="end after so long")
+
+    status = _command(commands, "status", _status, "how the daemon, its buses and its pads fare")
+    status.add_argument("--endpoint", default=CONTROL, help=f"control endpoint (default: {CONTROL})")
+    status.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _add_checking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    check = _command(commands, "check", _check, "check a deployment, compute its bus load, warn")
+    check.add_argument("config", type=Path, nargs="?", help="deployment file")
+    check.add_argument("--json", action="store_true", help="as JSON")
+    check.add_argument(
+        "--schema", action="store_true", help="print the JSON schema of deployment files instead"
+    )
+
+    doctor = _command(commands, "doctor", _doctor, "what this machine lacks to serve a deployment")
+    doctor.add_argument("config", type=Path, nargs="?", help="deployment file")
+    doctor.add_argument("--json", action="store_true", help="as JSON")
+
+    figures = _command(commands, "figures", _figures, "redraw the paper's theoretical figures")
+    figures.add_argument("--out", type=Path, default=Path("figures"), help="folder (default: figures)")
+
+    design = _command(commands, "design", _design, "expected location error of a pad as configured")
+    _add_config(design)
+    design.add_argument("--link", help="pad to draw (default: the first)")
+    design.add_argument("--out", type=Path, default=Path("design"), help="folder (default: design)")
+
+
+def _command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, function: Command, text: str
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    parser.set_defaults(command=function)
+    return parser
+
+
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, help="deployment file (TOML)")
+
+
+def _add_bus(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--bus",
+        action="append",
+        default=[],
+        metavar="NAME=INTERFACE:CHANNEL[,OPTION=VALUE...]",
+        help="use another python-can interface for a bus of the deployment",
+    )
+
+
+def _demo(asked: argparse.Namespace) -> int:
+    from handtouch import demo
+
+    return demo.run(
+        config_path=asked.config,
+        seconds=asked.seconds,
+        plain=asked.plain,
+        tolerances=asked.tolerances,
+        seed=asked.seed,
+    )
+
+
+def _run(asked: argparse.Namespace) -> int:
+    from handtouch.daemon import daemon
+
+    return daemon.run(asked.config, tuple(asked.bus))
+
+
+def _simulate(asked: argparse.Namespace) -> int:
+    from handtouch.simulate import run as simulate
+    from handtouch.simulate.world import World
+
+    return simulate.run(
+        asked.config,
+        buses=tuple(asked.bus),
+        scenario=asked.scenario,
+        truth=asked.truth,
+        world=World(seed=asked.seed) if asked.tolerances else World.ideal_parts(asked.seed),
+        seconds=asked.seconds,
+    )
+
+
+def _replay(asked: argparse.Namespace) -> int:
+    from handtouch.daemon import replay
+
+    return replay.run(asked.log, asked.config, speed=asked.speed, as_json=asked.json, publish=asked.publish)
+
+
+def _watch(asked: argparse.Namespace) -> int:
+    from handtouch.view import watch
+
+    return watch.run(
+        tuple(asked.pattern), endpoint=asked.endpoint, style=asked.style or "auto", seconds=asked.seconds
+    )
+
+
+def _status(asked: argparse.Namespace) -> int:
+    from handtouch.view import status
+
+    return status.run(endpoint=asked.endpoint, as_json=asked.json)
+
+
+def _check(asked: argparse.Namespace) -> int:
+    from handtouch import check
+
+    return check.run(asked.config, json=asked.json, schema=asked.schema)
+
+
+def _doctor(asked: argparse.Namespace) -> int:
+    from handtouch import doctor
+
+    return doctor.run(asked.config, json=asked.json)
+
+
+def _figures(asked: argparse.Namespace) -> int:
+    from handtouch import figures
+
+    return figures.run(asked.out)
+
+
+def _design(asked: argparse.Namespace) -> int:
+    from handtouch import design
+
+    return design.run(asked.config, asked.out, link=asked.link)
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text}: must be above 0")
+    return value
+
+
+def _speed(text: str) -> float:
+    return 0.0 if text == "max" else _positive(text)

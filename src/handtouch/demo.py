@@ -1,0 +1,120 @@
+"""`handtouch demo`: a simulated hand, the daemon and a live view in one process, on a bus inside it.
+
+Nothing is needed but this machine, and nothing is in the way of a daemon that runs here already: the bus
+is python-can's `virtual` one and the endpoints take free ports.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Self
+
+from handtouch import shipped, wire
+from handtouch.client import Subscriber, connect
+from handtouch.config import ConfigError, Deployment, load
+from handtouch.daemon.daemon import Daemon
+from handtouch.simulate.run import SimulatedHand
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.score import score
+from handtouch.simulate.world import World
+from handtouch.view.watch import Display, LineDisplay, LiveDisplay, follow
+
+DEPLOYMENT = "utah_mit.toml"
+SCENARIO = "utah_mit_session.toml"
+_BOOT_S = 2.0
+_GIL_SWITCH_S = 0.0005
+"""Hand, daemon and view share one interpreter here; the daemon must not wait long for the view."""
+
+
+def run(
+    *,
+    config_path: Path | None = None,
+    seconds: float | None = None,
+    plain: bool = False,
+    tolerances: bool = False,
+    seed: int = 1,
+) -> int:
+    """Play the scenario to its end, or for `seconds`, or until Ctrl-C; then compare contacts with the truth.
+
+    Exit status 0, 1 when no contact came through, 2 for a configuration that can't be used.
+    """
+    logging.basicConfig(level=logging.ERROR)
+    try:
+        deployment = in_process(load(config_path or shipped.path(DEPLOYMENT)))
+        scenario = Scenario.tour(deployment) if config_path else Scenario.load(shipped.path(SCENARIO))
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    sys.setswitchinterval(_GIL_SWITCH_S)
+    print("building the simulated hand ...", file=sys.stderr)
+    hand = SimulatedHand.open(
+        deployment, scenario, World(seed=seed) if tolerances else World.ideal_parts(seed)
+    )
+    display = (
+        LineDisplay() if plain or not sys.stdout.isatty() else LiveDisplay("handtouch demo: Ctrl-C ends it")
+    )
+    keeper = _Keeper(display)
+    with Daemon(deployment) as daemon, _subscribe(daemon) as messages:
+        hand.start()
+        served = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
+        served.start()
+        end_s = time.monotonic() + (seconds or scenario.duration_s + _BOOT_S)
+        with keeper:
+            follow(messages, keeper, lambda: stop.is_set() or time.monotonic() > end_s)
+        stop.set()
+        served.join()
+    hand.stop()
+    print(score(keeper.contacts, hand.truth))
+    return 0 if keeper.contacts else 1
+
+
+class _Keeper:
+    """A display that keeps the contacts it is shown, for the comparison with the truth."""
+
+    def __init__(self, display: Display) -> None:
+        self.contacts: list[wire.Contact] = []
+        self._display = display
+
+    def take(self, message: wire.Message) -> None:
+        if isinstance(message, wire.Contact):
+            self.contacts.append(message)
+        self._display.take(message)
+
+    def frame(self, alive: bool) -> None:
+        self._display.frame(alive)
+
+    def __enter__(self) -> Self:
+        self._display.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._display.__exit__(None, None, None)
+
+
+def in_process(deployment: Deployment) -> Deployment:
+    """The deployment with its buses inside this process and its endpoints on free ports."""
+    buses = tuple(
+        bus.model_copy(
+            update={"interface": "virtual", "channel": f"handtouch-{os.getpid()}-{bus.name}", "options": {}}
+        )
+        for bus in deployment.buses
+    )
+    free = "tcp://127.0.0.1:*"
+    endpoints = dict.fromkeys(("live", "complete", "control", "inputs"), free)
+    return deployment.model_copy(
+        update={"buses": buses, "daemon": deployment.daemon.model_copy(update=endpoints)}
+    )
+
+
+def _subscribe(daemon: Daemon) -> Subscriber:
+    endpoint = daemon.publisher.endpoints["live"]
+    return connect("contact/*/*", "health/*/*", "service", endpoint=endpoint, queue=100_000)

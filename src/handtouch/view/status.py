@@ -1,0 +1,59 @@
+"""`handtouch status`: how the daemon, its buses and its pads fare, asked over the control endpoint."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from handtouch.client import CONTROL, request
+
+
+def run(*, endpoint: str = CONTROL, as_json: bool = False) -> int:
+    """Print the status; exit status 0 if every pad is well, 1 if not or if no daemon answers."""
+    try:
+        answer = request("status", endpoint=endpoint)
+    except (TimeoutError, RuntimeError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    if as_json:
+        print(json.dumps(answer, indent=2))
+    else:
+        _show(answer, Console(soft_wrap=True))
+    return 0 if all(pad["state"] in ("clear", "touched") for pad in answer["pads"]) else 1
+
+
+def _show(answer: dict[str, Any], console: Console) -> None:
+    service = answer["service"]
+    tick = service["tick_us"]
+    console.print(
+        f"handtouch {service['version']}, process {service['pid']}, up {service['uptime_s']:.0f} s: "
+        f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
+        + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
+    )
+    drops = ", ".join(f"{count} on {stream}" for stream, count in service["drops"].items()) or "none"
+    console.print(
+        f"messages dropped: {drops}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
+    )
+    for name, bus in service["buses"].items():
+        counts = ", ".join(f"{key} {value}" for key, value in bus.items() if key not in ("load", "problem"))
+        problem = f" [red]{bus['problem']}[/red]" if bus["problem"] else ""
+        console.print(f"bus {name}: load {100 * bus['load']:.0f} %, {counts}{problem}")
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for column in ("link", "pad", "node", "id", "serial", "Hz", "missed", "why"):
+        table.add_column(column, justify="right" if column in ("id", "serial", "Hz", "missed") else "left")
+    for pad in answer["pads"]:
+        table.add_row(
+            f"{pad['hand']}/{pad['link']}",
+            pad["state"],
+            pad["node"],
+            str(pad["node_id"]),
+            "" if pad["serial"] is None else str(pad["serial"]),
+            f"{pad['rate_hz']:.0f}",
+            str(pad["missed"]),
+            "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]])),
+        )
+    console.print(table)
