@@ -1,0 +1,323 @@
+"""Pads with their electrodes as they are built: bare corners, divided sides, resistors to ground.
+
+Public names: `ElectrodeNetwork`, `Electrode`.
+
+By reciprocity the current that a point contact sends to grounded electrode i is the potential phi_i there
+when electrode i alone is at 1 and the bare boundary insulates; `_electrodes` has those potentials to
+rounding error. Resistors R mix the currents: (1 + G R / sheet) I = phi, G the conductance matrix for one
+ohm per square.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from handtouch.field._disc import CirclePoints, DiscMap
+from handtouch.field._electrodes import ElectrodePotentials
+from handtouch.field.estimate import PointEstimate, estimate
+from handtouch.field.rectangle import Location, Rectangle
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+Side = Literal["x0", "xa", "y0", "yb"]
+
+SIDES: tuple[Side, ...] = ("x0", "xa", "y0", "yb")
+LONGEST_ASPECT = 50.0
+_STEPS = 30
+_LEAST = 1e-13  # a smaller fraction holds no digits of a place
+
+
+@dataclass(frozen=True)
+class Electrode:
+    """A piece of a side: from `start` to `stop`, measured along y on x0 and xa, along x on y0 and yb."""
+
+    side: Side
+    start: float
+    stop: float
+
+
+class ElectrodeNetwork:
+    """A resistive rectangle [0, a] x [0, b] with any electrodes on its boundary; a `ForwardModel`.
+
+    The plain case is four electrodes that leave `gap` bare from each corner along each side: one number, or
+    one for each side in the order x0, xa, y0, yb; 0 <= gap < half a side, in the unit of a and b.
+    `series_ohm` are the resistors from the electrodes to ground; infinity leaves one floating. Any other
+    arrangement is made by `from_electrodes`; channels are in the order in which electrodes are given.
+
+    Fractions are accurate to a few 1e-16 for sides within 50:1 of each other, which is the limit. Arguments
+    broadcast; points off the pad or NaN give NaN.
+
+    Raises ValueError for sides, gaps, resistances or an arrangement that cannot be, named.
+    """
+
+    def __init__(
+        self,
+        a: float,
+        b: float,
+        gap: float | Sequence[float],
+        sheet_ohm_per_square: float,
+        series_ohm: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        gaps = [float(g) for g in np.broadcast_to(np.asarray(gap, np.float64), (4,))]
+        lengths = {"x0": b, "xa": b, "y0": a, "yb": a}
+        for side, bare in zip(SIDES, gaps, strict=True):
+            if not 0 <= bare < lengths[side] / 2:
+                raise ValueError(f"gap must be at least 0 and less than half of side {side}, got {bare}")
+        electrodes = [Electrode(s, g, lengths[s] - g) for s, g in zip(SIDES, gaps, strict=True)]
+        self._build(a, b, electrodes, sheet_ohm_per_square, series_ohm)
+
+    @classmethod
+    def from_electrodes(
+        cls,
+        a: float,
+        b: float,
+        electrodes: Sequence[Electrode],
+        sheet_ohm_per_square: float,
+        series_ohm: Sequence[float] | None = None,
+    ) -> ElectrodeNetwork:
+        """A pad with two or more electrodes anywhere on its boundary; without resistors unless given."""
+        network = cls.__new__(cls)
+        series = (0.0,) * len(electrodes) if series_ohm is None else series_ohm
+        network._build(a, b, list(electrodes), sheet_ohm_per_square, series)
+        return network
+
+    def with_series(self, series_ohm: Sequence[float]) -> ElectrodeNetwork:
+        """The same pad with its resistors switched to others; costs microseconds."""
+        network = self.__class__.__new__(self.__class__)
+        network.__dict__.update(self.__dict__)
+        network._connect(series_ohm)
+        return network
+
+    @property
+    def a(self) -> float:
+        """Length along x, from side x0 to xa."""
+        return self._rectangle.a
+
+    @property
+    def b(self) -> float:
+        """Length along y, from side y0 to yb."""
+        return self._rectangle.b
+
+    @property
+    def conductance(self) -> FloatArray:
+        """Currents into the electrodes per unit of their voltages (m, m), for one ohm per square.
+
+        Symmetric; rows sum to zero. Raises ValueError if electrodes touch: they conduct without limit.
+        """
+        if self._potentials.conductance is None:
+            raise ValueError("gap: electrodes that touch (gap 0) conduct without limit")
+        return self._potentials.conductance[np.ix_(self._place, self._place)]
+
+    def ideal_fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """What each electrode would collect were it grounded directly, shape (m, ...), summing to 1."""
+        with np.errstate(all="ignore"):  # NaN in gives NaN out
+            return np.asarray(self._potentials.potentials(self._to_disc(x, y))[self._place])
+
+    def fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Measured fractions of the contact's current, resistors included, shape (m, ...), summing to 1."""
+        return self._mixed(self.ideal_fractions(x, y))
+
+    def currents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """`fractions`, by its other name."""
+        return self.fractions(x, y)
+
+    def fractions_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """`fractions` (m, ...), their derivatives by (x, y) (m, 2, ...), unbounded at electrodes' ends."""
+        ideal, jacobian = self._ideal_with_jacobian(x, y)
+        return self._mixed(ideal), self._mixed(jacobian)
+
+    def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """The radius R that gives the sheet's resistance, sheet / (2 pi) * ln(R / A), to a contact of
+        radius A.
+
+        Electrodes at ground, in the unit of a and b, shape (...). It is the conformal radius, enlarged by the
+        gaps: exact in the limit of a small contact (2 pi times the regular part of Green's function is ln
+        R). Zero at an electrode. For resistors see `series_resistance`.
+        """
+        defects = self._to_disc(x, y)
+        with np.errstate(all="ignore"):
+            return np.asarray(self._disc.radius(defects) * np.exp(self._potentials.log_spread(defects)))
+
+    def series_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """What the resistors add between a contact and ground [ohm], shape (...): sum of phi_i V_i."""
+        ideal = self.ideal_fractions(x, y)
+        return np.asarray(np.einsum("i...,ij,j...->...", ideal, self._lift, ideal))
+
+    def locate(self, currents: npt.ArrayLike) -> Location:
+        """The point contact that sends `currents` (m, ...), the exact inverse of `currents`.
+
+        x follows from the currents of sides x0 and xa, y from those of y0 and yb, resistors undone, as in
+        `Rectangle.locate`, to which this tends for small gaps; the residual is what is left. Error, 3 % or
+        farther from the edges: 1e-12 of the short side up to 3:1, 1e-9 at 5:1, 1e-3 at 10:1, as the far
+        electrode's fraction sinks towards rounding. NaN where an undone fraction is less than 1e-13, or no
+        point of the pad fits. Raises ValueError if a side has no electrode, or an electrode floats: see
+        `estimate`.
+        """
+        currents = np.asarray(currents, np.float64)
+        self._check_channels(currents)
+        if self._side_sums is None or self._unmix is None:
+            raise ValueError("locate needs a connected electrode on every side; estimate does not")
+        shape = currents.shape[1:]
+        flat = currents.reshape(currents.shape[0], -1)
+        total = flat.sum(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            measured = self._side_sums @ (self._unmix @ (flat / total))
+        x, y = self._newton(self._side_sums, measured)
+        expected = self.ideal_fractions(x, y)
+        residual = measured[:2].sum(axis=0) - (self._side_sums[:2] @ expected).sum(axis=0)
+        return Location(*(v.reshape(shape)[()] for v in (x, y, total, residual)))
+
+    def estimate(
+        self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None
+    ) -> PointEstimate:
+        """The maximum-likelihood contact from all noisy currents (m, ...); see `handtouch.field.estimate`."""
+        return estimate(self, currents, noise, start)
+
+    def _build(
+        self,
+        a: float,
+        b: float,
+        electrodes: Sequence[Electrode],
+        sheet_ohm_per_square: float,
+        series_ohm: Sequence[float],
+    ) -> None:
+        self._rectangle = Rectangle(a, b)
+        if max(a / b, b / a) > LONGEST_ASPECT:
+            raise ValueError(f"a and b must be within {LONGEST_ASPECT:g}:1 of each other, got {a} and {b}")
+        if not (sheet_ohm_per_square > 0 and math.isfinite(sheet_ohm_per_square)):
+            raise ValueError(f"sheet_ohm_per_square must be positive and finite, got {sheet_ohm_per_square}")
+        self.electrodes = tuple(electrodes)
+        self.sheet_ohm_per_square = float(sheet_ohm_per_square)
+        order = _counter_clockwise(self.electrodes, a, b)
+        self._place = np.argsort(order)
+        self._disc = DiscMap(a, b)
+        ends = np.array([_ends(self.electrodes[i], a, b) for i in order])  # (m, start and stop, x and y)
+        starts, stops = (CirclePoints.at(self._disc.defects(*ends[:, k].T)) for k in range(2))
+        inside = self._disc.defects(*ends[0].mean(axis=0))
+        self._potentials = ElectrodePotentials(starts, stops, inside)
+        sums = np.array([[float(e.side == side) for e in self.electrodes] for side in SIDES])
+        self._side_sums = sums if sums.any(axis=1).all() else None
+        self._connect(series_ohm)
+
+    def _connect(self, series_ohm: Sequence[float]) -> None:
+        """Matrices of the resistors: currents from phi and back, and voltages per ampere from phi."""
+        resistance = np.asarray(series_ohm, np.float64)
+        count = len(self.electrodes)
+        if resistance.shape != (count,) or not (resistance >= 0).all():
+            raise ValueError(f"series_ohm must be {count} resistances of at least 0, got {series_ohm}")
+        self.series_ohm = tuple(float(r) for r in resistance)
+        self._mix: FloatArray = np.eye(count)
+        self._unmix: FloatArray | None = np.eye(count)
+        self._lift: FloatArray = np.zeros((count, count))
+        if not resistance.any():
+            return
+        if not np.isfinite(resistance).any():
+            raise ValueError("series_ohm: at least one electrode must have a way to ground")
+        # unknowns: the current of a connected electrode, the voltage over `sheet` of a floating one
+        connected = np.isfinite(resistance)
+        drop = np.where(connected, resistance, self.sheet_ohm_per_square)
+        system = np.diag(connected.astype(float)) + self.conductance * (drop / self.sheet_ohm_per_square)
+        solution = np.asarray(np.linalg.inv(system), np.float64)
+        self._mix = solution * connected[:, None]
+        self._unmix = system if connected.all() else None
+        self._lift = drop[:, None] * solution
+
+    def _to_disc(self, x: npt.ArrayLike, y: npt.ArrayLike) -> ComplexArray:
+        """Defects (2, ...), NaN off the pad."""
+        x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        on_pad = (x >= 0) & (x <= self.a) & (y >= 0) & (y <= self.b)
+        with np.errstate(all="ignore"):
+            return self._disc.defects(np.where(on_pad, x, np.nan), np.where(on_pad, y, np.nan))
+
+    def _mixed(self, ideal: FloatArray) -> FloatArray:
+        return np.asarray(np.tensordot(self._mix, ideal, axes=1)) if any(self.series_ohm) else ideal
+
+    def _ideal_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        with np.errstate(all="ignore"):
+            defects = self._to_disc(x, y)
+            values, slope = self._potentials.potentials_and_slope(defects)
+            slope = slope * self._disc.derivative(defects)
+        # phi = Im Phi: d/dx = Im Phi', d/dy = Im(i Phi') = Re Phi'
+        return values[self._place], np.stack([slope.imag, slope.real], axis=1)[self._place]
+
+    def _check_channels(self, currents: FloatArray) -> None:
+        if currents.shape[:1] != (len(self.electrodes),):
+            raise ValueError(
+                f"currents have shape {currents.shape}: the first axis is the {len(self.electrodes)} channels"
+            )
+
+    def _newton(self, sums: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """x and y (n,) where side sums (4, n) are as measured, from where a pad without gaps has them."""
+        start = self._rectangle.locate(measured)
+        inset = 1e-9 * np.array([[self.a], [self.b]])
+        far = np.array([[self.a], [self.b]]) - inset
+        at = np.clip(np.stack([start.x, start.y]), inset, far)
+        wanted, _ = _log_ratios(measured)
+        settled = np.zeros(at.shape[1], bool)
+        for _ in range(_STEPS):
+            moving = np.flatnonzero(~settled & np.isfinite(at).all(axis=0))
+            if moving.size == 0:
+                break
+            values, jacobian = self._ideal_with_jacobian(*at[:, moving])
+            ratios, slopes = _log_ratios(sums @ values)
+            rates = slopes[:, None] * np.tensordot(sums, jacobian, axes=1)
+            (xx, xy), (yx, yy) = rates[1] - rates[0], rates[3] - rates[2]
+            miss_x, miss_y = wanted[:, moving] - ratios
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - yx * miss_x]) / (xx * yy - xy * yx)
+            new = np.clip(at[:, moving] + np.clip(step, -far / 4, far / 4), inset, far)
+            settled[moving] = (np.abs(new - at[:, moving]) < 1e-13 * far).all(axis=0)
+            at[:, moving] = new
+        on_edge = ((at == inset) | (at == far)).any(axis=0)
+        at[:, on_edge] = np.nan
+        return at[0], at[1]
+
+
+def _log_ratios(sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """ln of tan(pi f / 2) of the far side over that of the near one, (2, n), and d ln tan / df (4, n)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sides = np.where(sides > _LEAST, sides, np.nan)
+        logs = np.log(np.tan(np.pi / 2 * sides))
+        return np.stack([logs[1] - logs[0], logs[3] - logs[2]]), np.pi / np.sin(np.pi * sides)
+
+
+def _counter_clockwise(electrodes: Sequence[Electrode], a: float, b: float) -> list[int]:
+    """Order of the electrodes counter-clockwise from corner (0, 0), checked to be on the pad and apart."""
+    if len(electrodes) < 2:
+        raise ValueError(f"electrodes: at least two are needed, got {len(electrodes)}")
+    for electrode in electrodes:
+        if electrode.side not in SIDES:
+            raise ValueError(f"side must be one of {', '.join(SIDES)}, got {electrode.side!r}")
+        length = a if electrode.side in ("y0", "yb") else b
+        if not 0 <= electrode.start < electrode.stop <= length:
+            raise ValueError(f"start and stop must be 0 <= start < stop <= {length}, got {electrode}")
+    for side in SIDES:
+        pieces = sorted((e for e in electrodes if e.side == side), key=lambda e: e.start)
+        for one, other in itertools.pairwise(pieces):
+            if other.start < one.stop:
+                raise ValueError(f"electrodes overlap: {one} and {other}")
+    side_order: tuple[Side, ...] = ("y0", "xa", "yb", "x0")
+
+    def place(i: int) -> tuple[int, float]:
+        side = electrodes[i].side
+        return side_order.index(side), electrodes[i].start if side in ("y0", "xa") else -electrodes[i].start
+
+    return sorted(range(len(electrodes)), key=place)
+
+
+def _ends(electrode: Electrode, a: float, b: float) -> list[tuple[float, float]]:
+    """The two ends of an electrode, counter-clockwise."""
+    start, stop = electrode.start, electrode.stop
+    return {
+        "y0": [(start, 0.0), (stop, 0.0)],
+        "xa": [(a, start), (a, stop)],
+        "yb": [(stop, b), (start, b)],
+        "x0": [(0.0, stop), (0.0, start)],
+    }[electrode.side]
