@@ -53,8 +53,8 @@ class Timing:
     retry_last_ns: int = 5_000_000_000
 
     def pause_ns(self, failures: int) -> int:
-        """Pause after that many failures in a row: doubled each time, up to the longest."""
-        return min(self.retry_first_ns << min(failures, 16), self.retry_last_ns)
+        """Pause after that many failures in a row: doubled with each, up to the longest."""
+        return min(self.retry_first_ns << min(max(failures - 1, 0), 16), self.retry_last_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +73,7 @@ class Life:
     failures: int = 0  # in a row; they set the pause before the next attempt
     discard: int = 0  # samples still to be discarded
     reboots: int = 0
+    must_beat: bool = False  # lost for want of heartbeats: not trusted before it has sent one
     stranger: bool = False  # at its last identification it was not the configured node
 
 
@@ -192,7 +193,7 @@ def _boot(life: Life, t_ns: int, reason: str) -> Next:
 
 def _identify(life: Life) -> tuple[Action, ...]:
     """A stopped node doesn't serve SDO: first it is made to."""
-    if life.nmt == NMT_STOPPED:
+    if life.nmt == NMT_STOPPED and not life.stranger:
         return Action.ENTER_PREOPERATIONAL, Action.IDENTIFY
     return (Action.IDENTIFY,)
 
@@ -200,9 +201,10 @@ def _identify(life: Life) -> tuple[Action, ...]:
 def _heartbeat(life: Life, nmt: int, t_ns: int, timing: Timing) -> Next:
     if life.heartbeat_ns is not None:
         life = replace(life, heartbeat_ns=t_ns)
-    life = replace(life, nmt=nmt, heard_ns=t_ns)
+    just_stopped = nmt == NMT_STOPPED != life.nmt
+    life = replace(life, nmt=nmt, heard_ns=t_ns, must_beat=False)
     told = f"heartbeat: node is {NMT_NAMES.get(nmt, f'in NMT state {nmt}')}"
-    if life.state is NodeState.ABSENT:
+    if life.state is NodeState.ABSENT or (life.state in _IN_BOOT and just_stopped):
         return _boot(life, t_ns, told)
     # A heartbeat sent before our start command may still arrive after it.
     settled = t_ns - life.started_ns > 2 * timing.heartbeat_ns
@@ -218,6 +220,7 @@ def _boot_up(life: Life, t_ns: int) -> Next:
         nmt=NMT_PREOPERATIONAL,
         heard_ns=t_ns,
         heartbeat_ns=None,  # a restarted node's heartbeat time is its default, maybe none
+        must_beat=False,
         reboots=life.reboots + by_itself,
     )
     return _boot(life, t_ns, "rebooted by itself" if by_itself else "boot-up message")
@@ -277,11 +280,11 @@ def _sample(life: Life, t_ns: int, timing: Timing) -> Next:
     if life.state not in (NodeState.SETTLING, NodeState.STALE):
         return life, ()
     discard = max(life.discard - 1, 0) if life.state is NodeState.SETTLING else life.discard
-    if discard == 0:
+    if discard == 0 and not life.must_beat:
         return replace(_enter(life, NodeState.OPERATIONAL, t_ns, ""), discard=0, failures=0), ()
     if life.state is NodeState.STALE:
         life = _enter(life, NodeState.SETTLING, t_ns, "samples came")
-        discard -= 1
+        discard = max(discard - 1, 0)
     return replace(life, discard=discard, due_ns=t_ns + timing.settle_timeout_ns), ()
 
 
@@ -296,13 +299,19 @@ def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
     if supervised and life.heartbeat_ns is not None:
         quiet_ns = t_ns - life.heartbeat_ns
         if quiet_ns > timing.heartbeat_timeout_ns:
+            # One that never sends heartbeats, though it was told to, is probed less and less often.
+            failures = life.failures + 1 if life.must_beat else 0
             life = _enter(life, NodeState.ABSENT, t_ns, f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms")
-            return replace(life, heartbeat_ns=None, nmt=None, failures=0, due_ns=t_ns), ()
+            due = t_ns + timing.pause_ns(failures)
+            return replace(
+                life, heartbeat_ns=None, nmt=None, must_beat=True, failures=failures, due_ns=due
+            ), ()
     if t_ns < life.due_ns:
         return life, ()
     if life.state is NodeState.ABSENT:
-        pause_ns = timing.pause_ns(life.failures)
-        return replace(life, failures=life.failures + 1, due_ns=t_ns + pause_ns), (Action.PROBE,)
+        failures = life.failures + 1
+        due = t_ns + timing.pause_ns(failures)
+        return replace(life, failures=failures, due_ns=due), (Action.PROBE,)
     if life.state is NodeState.FAULTED:
         # It stays FAULTED, with its reason, until an attempt gets further.
         life = replace(life, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns)

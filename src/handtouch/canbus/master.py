@@ -120,7 +120,7 @@ class Master:
         self._nodes = [_node(spec, ports, sync_period_ns or 0) for spec in nodes]
         self._by_slot = {node.spec.slot: node for node in self._nodes}
         self._owners = _owners(ports, self._nodes)
-        self._seen = self._slab.t_ns.copy()
+        self._waiting: dict[int, int] = {}  # slots whose next sample matters -> stamp of the last one
         self._next_due_ns = 0
         self._events: deque[NodeEvent] = deque(maxlen=_EVENTS_KEPT)
         self._results: deque[tuple[_Node, Outcome, Result]] = deque()  # from the worker
@@ -193,15 +193,14 @@ class Master:
         self._advance(node, Heartbeat(nmt), t_ns)
 
     def _watch_samples(self, t_ns: int) -> None:
-        slab, states = self._slab, self.states
-        waiting = (states == NodeState.SETTLING) | (states == NodeState.STALE)
-        if waiting.any():
-            for slot in np.flatnonzero(waiting & (slab.t_ns != self._seen)).tolist():
+        stamps = self._slab.t_ns
+        for slot, seen_ns in list(self._waiting.items()):
+            if stamps[slot] != seen_ns:
+                self._waiting[slot] = int(stamps[slot])
                 self._advance(self._by_slot[slot], Sample(), t_ns)
-        self._seen[:] = slab.t_ns
         if self._stale_ns:
-            ages = t_ns - slab.t_ns
-            silent = (states == NodeState.OPERATIONAL) & (ages > self._stale_ns)
+            ages = t_ns - stamps
+            silent = (self.states == NodeState.OPERATIONAL) & (ages > self._stale_ns)
             if silent.any():
                 for slot in np.flatnonzero(silent).tolist():
                     self._advance(self._by_slot[slot], Silence(int(ages[slot])), t_ns)
@@ -221,13 +220,22 @@ class Master:
         node.life, actions = advance(before, event, t_ns, node.timing)
         after = node.life
         if (before.state, before.reason) != (after.state, after.reason):
-            self.states[node.spec.slot] = after.state
+            self._changed(node)
             self._tell(node, before.state, after.reason, t_ns)
         due = due_ns(after, node.timing)
         if due is not None and due < self._next_due_ns:
             self._next_due_ns = due
         for action in actions:
             self._act(node, action)
+
+    def _changed(self, node: _Node) -> None:
+        """Keep what is derived from a node's state."""
+        slot, state = node.spec.slot, node.life.state
+        self.states[slot] = state
+        if state in (NodeState.SETTLING, NodeState.STALE):
+            self._waiting.setdefault(slot, int(self._slab.t_ns[slot]))
+        else:
+            self._waiting.pop(slot, None)
 
     def _tell(self, node: _Node, old: NodeState, reason: str, t_ns: int) -> None:
         self._events.append(NodeEvent(node.spec.slot, t_ns, old, node.life.state, reason))
