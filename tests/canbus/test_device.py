@@ -73,9 +73,9 @@ def plug_all(bus: DeviceBus, wire: Wire) -> None:
     wire.take()
 
 
-def upload(bus: DeviceBus, wire: Wire, node_id: int, index: int, sub: int, t_ns: int = 0) -> bytes:
+def upload(bus: DeviceBus, wire: Wire, node_id: int, index: int, sub: int) -> bytes:
     """An expedited SDO upload: the eight bytes of the answer."""
-    bus.handle(message(0x600 + node_id, *struct.pack("<BHB4x", 0x40, index, sub)), t_ns)
+    bus.handle(message(0x600 + node_id, *struct.pack("<BHB4x", 0x40, index, sub)), 0)
     (identifier, data) = wire.take()[-1]
     assert identifier == 0x580 + node_id
     assert struct.unpack_from("<HB", data, 1) == (index, sub)
@@ -184,7 +184,9 @@ def test_identity_mapping_and_readings_are_read_over_sdo(bus: DeviceBus, wire: W
         struct.pack("<I", 0x64010010 | sub << 8) for sub in range(1, 5)
     ]
     assert upload(bus, wire, 5, 0x6401, 0)[4] == 4
-    assert upload(bus, wire, 5, 0x6401, 3, t_ns=9 * MS)[4:6] == struct.pack("<h", 311)
+    assert upload(bus, wire, 5, 0x6401, 3)[4:6] == struct.pack("<h", 0)
+    bus.handle(SYNC, 9 * MS)
+    assert upload(bus, wire, 5, 0x6401, 3)[4:6] == struct.pack("<h", 311)
 
 
 def test_a_transmission_type_n_answers_every_nth_sync(

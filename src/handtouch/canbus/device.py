@@ -113,7 +113,7 @@ class Device:
     def stick(self, channel: int) -> None:
         """Let a channel (0-3) keep its present count, until `release`."""
         with self._bus.lock:
-            self.held = {**self.held, channel: int(self._bus.sample_now()[self._row, channel])}
+            self.held = {**self.held, channel: self._bus.latest(self._row, channel)}
 
     def release(self) -> None:
         """Let all channels show what they measure."""
@@ -193,7 +193,7 @@ class Device:
     def _read(self, index: int, subindex: int, **_: object) -> int | None:
         if index != _CHANNELS or not 1 <= subindex <= 4:
             return None
-        return self.held.get(subindex - 1, int(self._bus.sample_now()[self._row, subindex - 1]))
+        return self.held.get(subindex - 1, self._bus.latest(self._row, subindex - 1))
 
     def _write(self, index: int, subindex: int, data: bytes, **_: object) -> None:
         if index != _TPDO2:
@@ -226,6 +226,7 @@ class DeviceBus:
         self._sample = sample
         self._clock = clock
         self._now_ns = clock()
+        self._counts = np.zeros((0, 4), np.int16)
         self._next_ns: int | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -308,9 +309,9 @@ class DeviceBus:
             self._thread.join()
             self._thread = None
 
-    def sample_now(self) -> NDArray[np.int16]:
-        """Counts (n, 4) at the time of the frame being handled."""
-        return self._sample(self._now_ns)
+    def latest(self, row: int, channel: int) -> int:
+        """What a channel measured at the latest SYNC, 0 before the first."""
+        return int(self._counts[row, channel]) if row < len(self._counts) else 0
 
     def transmit(self, message: can.Message) -> None:
         """Send; a bus that doesn't take it costs the frame and nothing else, as on a real node."""
@@ -339,7 +340,8 @@ class DeviceBus:
 
     def _answer_sync(self, t_ns: int) -> None:
         self.syncs += 1
-        samples = self._sample(t_ns).astype("<i2", copy=False).tobytes()
+        self._counts = self._sample(t_ns)
+        samples = self._counts.astype("<i2", copy=False).tobytes()
         for row, device in enumerate(self.devices.values()):
             message = device.tpdo(samples[8 * row : 8 * row + 8])
             if message is not None:
