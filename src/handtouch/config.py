@@ -17,6 +17,30 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from handtouch.config_checks import problems_in
 from handtouch.config_problems import ConfigError, Problem, problems_of
 
+__all__ = [
+    "Bus",
+    "Cone",
+    "ConfigError",
+    "Cylinder",
+    "Daemon",
+    "Deployment",
+    "Hand",
+    "Mount",
+    "Node",
+    "Pad",
+    "Plane",
+    "Problem",
+    "Sheet",
+    "Sphere",
+    "Surface",
+    "Table",
+    "Touch",
+    "json_schema",
+    "load",
+    "parse",
+    "with_bus",
+]
+
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
@@ -164,9 +188,7 @@ class Pad(Table):
     node: Name = Field(description="kind of node, a [node.NAME] table")
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
     surface: Surface = Field(description="shape of the sensing surface")
-    gap_mm: NonNegative = Field(
-        description="bare length from each corner along each side, on the pad's rectangle"
-    )
+    gap_mm: NonNegative = Field(description="bare length of each side next to its corners, along the surface")
     series_ohm: Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(strict=False)] = (
         Field((0.0, 0.0, 0.0, 0.0), description="resistors from the electrodes x0, xa, y0, yb to ground")
     )

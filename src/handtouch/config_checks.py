@@ -178,13 +178,33 @@ def _check_shape(place: str, pad: Pad) -> Iterator[Problem]:
             f"{place}surface.to_deg", _is(surface.to_deg), f"must be above from_deg = {surface.from_deg}"
         )
         return
-    side = min(rectangle_mm(surface))
+    side = min(_sides_mm(surface))
     if not 2 * pad.gap_mm < side:
         yield Problem(
             f"{place}gap_mm",
             _is(pad.gap_mm),
             f"leaves no electrode on a side of {side:.4g} mm; it must be below {side / 2:.4g}",
         )
+    if pad.gap_mm == 0 and any(pad.series_ohm):
+        yield Problem(
+            f"{place}gap_mm",
+            _is(pad.gap_mm),
+            "electrodes that touch share their currents, so series_ohm needs a gap; give the bare length",
+        )
+
+
+def _sides_mm(surface: Surface) -> tuple[float, ...]:
+    """Lengths of a pad's sides along its surface."""
+    if surface.kind == "plane":
+        return surface.length_mm, surface.width_mm
+    arc = math.radians(surface.arc_deg)
+    if surface.kind == "cylinder":
+        return surface.length_mm, surface.radius_mm * arc
+    if surface.kind == "cone":
+        return surface.slant_mm, surface.near_radius_mm * arc, surface.far_radius_mm * arc
+    latitudes = math.radians(surface.from_deg), math.radians(surface.to_deg)
+    around = [surface.radius_mm * math.cos(latitude) * arc for latitude in latitudes]
+    return surface.radius_mm * (latitudes[1] - latitudes[0]), *around
 
 
 def _is(value: object) -> str:

@@ -1,0 +1,473 @@
+"""A deployment file is taken whole, or refused with every mistake named: place, value and remedy."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from handtouch import config, shipped
+from handtouch.config import ConfigError
+from handtouch.config_checks import rectangle_mm
+from handtouch.hand import surface_of
+
+CONFIG = Path(__file__).parents[1] / "config"
+SMALL = """
+[[bus]]
+name = "can0"
+interface = "socketcan"
+channel = "can0"
+
+[node.four]
+drive_v = 5.0
+full_scale_ma = 10.0
+noise_counts = 1.0
+
+[sheet.firm]
+ohm_per_square = 2400.0
+contact_ohm_mm2 = 20_000.0
+alpha = 1.5
+contact_radius_mm = 2.5
+contact_radius_std_mm = 0.5
+
+[touch]
+on_n = 0.06
+off_n = 0.03
+
+[[hand]]
+name = "right"
+
+[[hand.pad]]
+link = "thumb"
+bus = "can0"
+node_id = 5
+node = "four"
+sheet = "firm"
+surface = { kind = "cylinder", radius_mm = 12.0, length_mm = 30.0, arc_deg = 150.0 }
+gap_mm = 0.8
+mount = { position_mm = [1.0, 2.0, 3.0] }
+
+[[hand.pad]]
+link = "index"
+bus = "can0"
+node_id = 6
+node = "four"
+sheet = "firm"
+surface = { kind = "cone", near_radius_mm = 12.0, far_radius_mm = 10.0, slant_mm = 25.0, arc_deg = 120.0 }
+gap_mm = 0.8
+"""
+THUMB = 'hand.toml: [[hand.pad]] 1 "right/thumb": '
+INDEX = 'hand.toml: [[hand.pad]] 2 "right/index": '
+
+
+def complaint(text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        config.parse(text, "hand.toml")
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG.glob("utah_mit*.toml")), ids=lambda path: path.name)
+def test_shipped_deployments_are_right(path: Path) -> None:
+    deployment = config.load(path)
+    assert [len(hand.pads) for hand in deployment.hands] == [15]
+
+
+def test_the_shipped_pads_are_well_conditioned() -> None:
+    for pad in config.load(shipped.path("utah_mit.toml")).hands[0].pads:
+        a, b = rectangle_mm(pad.surface)
+        assert max(a / b, b / a) < 1.8, pad.link
+
+
+def test_the_shipped_schema_is_that_of_the_definitions() -> None:
+    kept = json.loads((CONFIG / "handtouch.schema.json").read_text())
+    assert kept == config.json_schema(), "run `make schema`"
+
+
+# --- every mistake is named: file, section, key, value, and what would be right
+
+MISTAKES = {
+    "unknown key": (
+        ("drive_v = 5.0", "drive_v = 5.0\ncolour = 3"),
+        "hand.toml: [node.four]: colour = 3: unknown key; known here: eds, vendor_id",
+    ),
+    "misspelt key": (
+        ("full_scale_ma = 10.0", "ful_scale_ma = 10.0"),
+        'hand.toml: [node.four]: ful_scale_ma = 10.0: unknown key; did you mean "full_scale_ma"?',
+    ),
+    "missing unit": (
+        ("drive_v = 5.0", "drive = 5.0"),
+        'hand.toml: [node.four]: drive = 5.0: unknown key; did you mean "drive_v"? Keys carry their unit',
+    ),
+    "missing unit in a surface": (
+        ("radius_mm = 12.0,", "radius = 12.0,"),
+        THUMB + 'surface.radius = 12.0: unknown key; did you mean "radius_mm"? Keys carry their unit',
+    ),
+    "missing key": (("gap_mm = 0.8\nmount", "mount"), THUMB + "gap_mm: is missing (gap_mm: bare length"),
+    "unknown table": (("[touch]", "[tuch]"), "hand.toml: [tuch]: unknown table; did you mean [touch]?"),
+    "one table for many": (("[[bus]]", "[bus]"), "hand.toml: [bus]: must be a list of tables: write [[bus]]"),
+    "out of range": (
+        ("node_id = 5", "node_id = 200"),
+        THUMB + "node_id = 200: must be less than or equal to 127 (node_id: CANopen node id, 1 to 127)",
+    ),
+    "not positive": (
+        ("drive_v = 5.0", "drive_v = -5.0"),
+        "hand.toml: [node.four]: drive_v = -5.0: must be greater than 0",
+    ),
+    "not finite": (("drive_v = 5.0", "drive_v = nan"), "[node.four]: drive_v = NaN: must be a finite number"),
+    "number as text": (
+        ("drive_v = 5.0", 'drive_v = "5 V"'),
+        '[node.four]: drive_v = "5 V": must be a number',
+    ),
+    "list too short": (
+        ("[1.0, 2.0, 3.0]", "[1.0, 2.0]"),
+        THUMB + "mount.position_mm[2]: is missing (position_mm: origin of the pad frame",
+    ),
+    "no list": (
+        ("gap_mm = 0.8\nmount", "gap_mm = 0.8\nseries_ohm = 336\nmount"),
+        THUMB + "series_ohm = 336: must be a list",
+    ),
+    "bad name": (
+        ('name = "right"', 'name = "my hand"'),
+        'hand.toml: [[hand]] 1 "my hand": name = "my hand": a name starts with a letter and holds letters',
+    ),
+    "wrong shape": (
+        ('kind = "cylinder"', 'kind = "tube"'),
+        THUMB + 'surface.kind = "tube": needs kind = "plane", kind = "cylinder", kind = "cone" or',
+    ),
+    "wrong option": (
+        ('channel = "can0"', 'channel = "can0"\noptions = { fd = [1] }'),
+        'hand.toml: [[bus]] 1 "can0": options.fd = [1]: must be a string or a number',
+    ),
+    "two pads on one node id": (
+        ("node_id = 6", "node_id = 5"),
+        INDEX + 'node_id = 5: is already the node of "right/thumb" on bus "can0"; every node needs an id of',
+    ),
+    "two pads on one link": (
+        ('link = "index"', 'link = "thumb"'),
+        'hand.toml: [[hand.pad]] 2: link = "thumb": is used twice; names must differ',
+    ),
+    "pad wider than its cone": (
+        ("arc_deg = 120.0", "arc_deg = 400.0"),
+        INDEX + "surface.arc_deg = 400.0: must be less than or equal to 360 (arc_deg: around the axis",
+    ),
+    "impossible cone": (
+        ("slant_mm = 25.0", "slant_mm = 1.5"),
+        INDEX + "surface.slant_mm = 1.5: no cone has that shape; it must be at least the difference of the "
+        "two radii, 2",
+    ),
+    "gaps that leave no electrode": (
+        ("gap_mm = 0.8\nmount", "gap_mm = 15.0\nmount"),
+        THUMB + "gap_mm = 15.0: leaves no electrode on a side of 30 mm; it must be below 15",
+    ),
+    "gaps longer than a cone is wide at its end": (
+        ("far_radius_mm = 10.0, slant_mm = 25.0", "far_radius_mm = 0.5, slant_mm = 25.0"),
+        INDEX + "gap_mm = 0.8: leaves no electrode on a side of 1.047 mm; it must be below 0.5236",
+    ),
+    "resistors without gaps": (
+        ("gap_mm = 0.8\nmount", "gap_mm = 0\nseries_ohm = [336, 0, 0, 0]\nmount"),
+        THUMB + "gap_mm = 0.0: electrodes that touch share their currents, so series_ohm needs a gap",
+    ),
+    "bus that is not there": (
+        ('bus = "can0"', 'bus = "can1"'),
+        THUMB + 'bus = "can1": no [[bus]] of that name; there are: can0',
+    ),
+    "sheet that is not there": (
+        ('sheet = "firm"', 'sheet = "frim"'),
+        THUMB + 'sheet = "frim": no [sheet.NAME] of that name; there are: firm',
+    ),
+    "unknown interface": (
+        ('interface = "socketcan"', 'interface = "socketcann"'),
+        'hand.toml: [[bus]] 1 "can0": interface = "socketcann": python-can knows canalystii',
+    ),
+    "no multicast address": (
+        ('interface = "socketcan"', 'interface = "udp_multicast"'),
+        '[[bus]] 1 "can0": channel = "can0": must be a multicast address such as 239.74.163.2',
+    ),
+    "two names for one wire": (
+        ("[node.four]", '[[bus]]\nname = "b"\ninterface = "socketcan"\nchannel = "can0"\n[node.four]'),
+        '[[bus]] 2 "b": channel = "can0": is the wire of bus "can0" too; name each once',
+    ),
+    "hasty time-out": (
+        ("noise_counts = 1.0", "noise_counts = 1.0\nheartbeat_timeout_ms = 90"),
+        "[node.four]: heartbeat_timeout_ms = 90: must be longer than heartbeat_ms = 100",
+    ),
+    "EDS that is not there": (
+        ("noise_counts = 1.0", 'noise_counts = 1.0\neds = "my.eds"'),
+        '[node.four]: eds = "my.eds": no such file',
+    ),
+    "thresholds the wrong way round": (
+        ("off_n = 0.03", "off_n = 0.07"),
+        "hand.toml: [touch]: off_n = 0.07: must be below on_n = 0.06",
+    ),
+    "thresholds of a pad the wrong way round": (
+        ("gap_mm = 0.8\nmount", "gap_mm = 0.8\ntouch = { on_n = 0.1, off_n = 0.2 }\nmount"),
+        THUMB + "touch.off_n = 0.2: must be below on_n = 0.1",
+    ),
+    "endpoint open to the world": (
+        ("[[bus]]", '[daemon]\nlive = "tcp://0.0.0.0:5580"\n[[bus]]'),
+        '[daemon]: live = "tcp://0.0.0.0:5580": reaches beyond this machine; only loopback',
+    ),
+    "endpoint used twice": (
+        ("[[bus]]", '[daemon]\nlive = "tcp://127.0.0.1:5582"\n[[bus]]'),
+        '[daemon]: complete = "tcp://127.0.0.1:5582": is the endpoint of live too',
+    ),
+    "no endpoint": (
+        ("[[bus]]", '[daemon]\nlive = "5580"\n[[bus]]'),
+        '[daemon]: live = "5580": must be a ZeroMQ endpoint such as tcp://127.0.0.1:5580',
+    ),
+    "no TOML": (("[touch]", "[touch"), "hand.toml: TOML: Expected ']'"),
+}
+
+
+@pytest.mark.parametrize(("change", "expected"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_is_named(change: tuple[str, str], expected: str) -> None:
+    assert SMALL.count(change[0]) >= 1
+    said = complaint(SMALL.replace(*change, 1))
+    assert expected in said
+    assert len(said.splitlines()) == 1, "one mistake, one line"
+
+
+def test_every_mistake_is_named_at_once() -> None:
+    said = complaint(SMALL.replace("drive_v = 5.0", "drive_v = 0").replace("node_id = 5", "node_id = 0"))
+    assert len(said.splitlines()) == 2
+
+
+def test_node_ids_may_repeat_on_another_bus() -> None:
+    second = '[[bus]]\nname = "can1"\ninterface = "socketcan"\nchannel = "can1"\n[node.four]'
+    text = SMALL.replace("[node.four]", second).replace(
+        'link = "index"\nbus = "can0"\nnode_id = 6', 'link = "index"\nbus = "can1"\nnode_id = 5'
+    )
+    assert [pad.bus for pad in config.parse(text).hands[0].pads] == ["can0", "can1"]
+
+
+def test_a_file_that_is_not_there_is_a_config_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"missing\.toml: the file: No such file"):
+        config.load(tmp_path / "missing.toml")
+
+
+def test_a_file_that_is_not_text_is_a_config_error(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="is not UTF-8 text"):
+        config.load(tmp_path / "a.toml")
+
+
+def test_an_eds_is_found_beside_its_deployment(tmp_path: Path) -> None:
+    (tmp_path / "my.eds").touch()
+    (tmp_path / "a.toml").write_text(
+        SMALL.replace("noise_counts = 1.0", 'noise_counts = 1.0\neds = "my.eds"')
+    )
+    assert config.load(tmp_path / "a.toml").nodes["four"].eds == str(tmp_path / "my.eds")
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        {"kind": "plane", "length_mm": 30.0, "width_mm": 20.0},
+        {"kind": "cylinder", "radius_mm": 11.0, "length_mm": 30.0, "arc_deg": 150.0},
+        {"kind": "cone", "near_radius_mm": 12.0, "far_radius_mm": 7.0, "slant_mm": 25.0, "arc_deg": 150.0},
+        {"kind": "cone", "near_radius_mm": 7.0, "far_radius_mm": 12.0, "slant_mm": 25.0, "arc_deg": 150.0},
+        {"kind": "cone", "near_radius_mm": 7.0, "far_radius_mm": 7.0, "slant_mm": 25.0, "arc_deg": 150.0},
+        {"kind": "sphere", "radius_mm": 10.0, "from_deg": -30.0, "to_deg": 55.0, "arc_deg": 140.0},
+    ],
+    ids=lambda surface: surface["kind"],
+)
+def test_the_checked_rectangle_is_the_one_solved(surface: dict[str, Any]) -> None:
+    raw = tomllib.loads(SMALL)
+    raw["hand"][0]["pad"][0]["surface"] = surface
+    pad = config.parse(toml(raw)).hands[0].pads[0]
+    solved = surface_of(pad)
+    assert rectangle_mm(pad.surface) == pytest.approx((solved.a * 1e3, solved.b * 1e3), rel=1e-12)
+
+
+# --- another wire for a bus
+
+
+@pytest.mark.parametrize(
+    ("text", "interface", "channel", "options"),
+    [
+        ("can0=socketcan:vcan0", "socketcan", "vcan0", {}),
+        ("can0=virtual:demo-1", "virtual", "demo-1", {}),
+        ("can0=vector:1", "vector", 1, {}),
+        ("can0=udp_multicast:239.74.163.2:43113", "udp_multicast", "239.74.163.2", {"port": 43113}),
+        ("can0=udp_multicast:239.74.163.2,port=43113", "udp_multicast", "239.74.163.2", {"port": 43113}),
+        ("can0=slcan:/dev/tty@9,sleep=0.5,on=true", "slcan", "/dev/tty@9", {"sleep": 0.5, "on": True}),
+        ("can0=socketcand:can0,host=a b", "socketcand", "can0", {"host": "a b"}),
+    ],
+)
+def test_a_bus_is_put_on_another_wire(
+    text: str, interface: str, channel: str | int, options: dict[str, Any]
+) -> None:
+    before = config.parse(
+        SMALL.replace('channel = "can0"', 'channel = "can0"\nbitrate_bit_s = 500000\noptions = { fd = true }')
+    )
+    after = config.with_bus(before, text)
+    bus = after.buses[0]
+    assert (bus.name, bus.interface, bus.channel, bus.options) == ("can0", interface, channel, options)
+    assert bus.bitrate_bit_s == 500_000
+    assert after.hands == before.hands
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("can0", "must be NAME=INTERFACE:CHANNEL"),
+        ("can0=socketcan", "must be NAME=INTERFACE:CHANNEL"),
+        ("can0=socketcan:can0,fd", "must be NAME=INTERFACE:CHANNEL"),
+        ("can7=socketcan:can0", "NAME = can7: the deployment has no bus of that name; there are: can0"),
+        ("can0=socketcann:can0", 'interface = "socketcann": python-can knows'),
+        ("can0=udp_multicast:10.0.0.1", 'channel = "10.0.0.1": must be a multicast address'),
+    ],
+)
+def test_a_wrong_wire_is_named(text: str, expected: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        config.with_bus(config.parse(SMALL), text)
+    assert str(caught.value).startswith(f"--bus {text}: ")
+    assert expected in str(caught.value)
+
+
+# --- properties
+
+names = st.from_regex(r"[A-Za-z][A-Za-z0-9_\-]{0,8}", fullmatch=True)
+lengths = st.floats(1.0, 100.0)
+arcs = st.floats(10.0, 360.0)
+any_text = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+any_value = st.recursive(
+    st.booleans()
+    | st.integers(-(2**63), 2**63 - 1)
+    | st.floats()
+    | any_text
+    | st.sampled_from(["plane", "cone", "can0", "tcp://127.0.0.1:*", 0, 1.0, -1]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(any_text, inner, max_size=3),
+    max_leaves=4,
+)
+
+
+@st.composite
+def surfaces(draw: st.DrawFn) -> dict[str, Any]:
+    kind = draw(st.sampled_from(["plane", "cylinder", "cone", "sphere"]))
+    if kind == "plane":
+        return {"kind": kind, "length_mm": draw(lengths), "width_mm": draw(lengths)}
+    arc = {"kind": kind, "arc_deg": draw(arcs)}
+    if kind == "cylinder":
+        return arc | {"radius_mm": draw(lengths), "length_mm": draw(lengths)}
+    if kind == "cone":
+        near, far = draw(lengths), draw(lengths)
+        return arc | {
+            "near_radius_mm": near, "far_radius_mm": far, "slant_mm": abs(far - near) + draw(lengths)
+        }  # fmt: skip
+    start = draw(st.floats(-80.0, 70.0))
+    return arc | {"radius_mm": draw(lengths), "from_deg": start, "to_deg": draw(st.floats(start + 5, 85.0))}
+
+
+@st.composite
+def deployments(draw: st.DrawFn) -> dict[str, Any]:
+    """Deployments that are right, as the tables of a file."""
+    raw = tomllib.loads(SMALL)
+    ids = draw(st.lists(st.integers(1, 127), min_size=1, max_size=4, unique=True))
+    links = draw(st.lists(names, min_size=len(ids), max_size=len(ids), unique=True))
+    raw["hand"][0]["name"] = draw(names)
+    raw["hand"][0]["pad"] = [
+        {
+            "link": link,
+            "bus": "can0",
+            "node_id": node_id,
+            "node": "four",
+            "sheet": "firm",
+            "surface": draw(surfaces()),
+            "gap_mm": draw(st.floats(0.001, 0.01)),
+            "series_ohm": draw(st.lists(st.floats(0.0, 1e4), min_size=4, max_size=4)),
+            "mount": {"rpy_deg": draw(st.lists(st.floats(-180, 180), min_size=3, max_size=3))},
+        }
+        for link, node_id in zip(links, ids, strict=True)
+    ]
+    raw["bus"][0]["options"] = draw(
+        st.dictionaries(names, st.integers() | st.booleans() | any_text, max_size=2)
+    )
+    raw["daemon"] = {"sync_period_ms": draw(st.floats(0.5, 1000.0))}
+    return raw
+
+
+def toml(value: Any) -> str:
+    """The tables of a file as TOML text."""
+    return "".join(f"{quoted(key)} = {inline(item)}\n" for key, item in value.items())
+
+
+def inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{quoted(key)} = {inline(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(inline, value)) + "]"
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
+    return json.dumps(value)
+
+
+def quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def places(value: Any) -> list[tuple[Any, Any]]:
+    """Every (container, key) of nested tables and lists."""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [place for key, item in pairs for place in [(value, key), *places(item)]]
+
+
+@given(deployments())
+def test_a_right_deployment_survives_the_round_trip(raw: dict[str, Any]) -> None:
+    deployment = config.parse(toml(raw))
+    kept = deployment.model_dump(by_alias=True, exclude_none=True)
+    assert config.parse(toml(kept)) == deployment
+
+
+@given(deployments(), st.data())
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_no_damage_raises_anything_but_a_config_error(raw: dict[str, Any], data: st.DataObject) -> None:
+    for _ in range(data.draw(st.integers(1, 2))):
+        container, key = data.draw(st.sampled_from(places(raw)))
+        if data.draw(st.booleans()):
+            container[key] = data.draw(any_value)
+        else:
+            container.pop(key)
+    problems: tuple[config.Problem, ...] = ()
+    try:
+        config.parse(toml(raw), "hand.toml")
+    except ConfigError as error:
+        problems = error.problems
+    assert all(problem.place and problem.remedy for problem in problems)
+
+
+@given(deployments(), any_text, any_value, st.data())
+def test_an_unknown_key_is_always_named(
+    raw: dict[str, Any], key: str, value: Any, data: st.DataObject
+) -> None:
+    free = (raw["bus"][0]["options"], raw["node"], raw["sheet"])  # tables whose keys the user chooses
+    tables = [raw] + [
+        container[name]
+        for container, name in places(raw)
+        if isinstance(container[name], dict) and not any(container[name] is table for table in free)
+    ]
+    table = data.draw(st.sampled_from(tables))
+    known = {"eds", "vendor_id", "product_code", "serial", "touch", "rpy_deg", "position_mm", "reference_kpa"}
+    known |= set(config.Daemon.model_fields) | set(config.Bus.model_fields) | set(config.Node.model_fields)
+    known |= set(config.Touch.model_fields) | set(table)
+    if key in known:
+        return
+    table[key] = value
+    assert key in complaint(toml(raw))
+
+
+@given(any_text)
+def test_no_bus_text_raises_anything_but_a_config_error(text: str) -> None:
+    deployment = config.parse(SMALL)
+    for wire in (text, f"can0={text}", f"can0=socketcan:{text}", f"can0=udp_multicast:239.0.0.1,{text}"):
+        with contextlib.suppress(ConfigError):
+            assert config.with_bus(deployment, wire).hands == deployment.hands
