@@ -1,16 +1,15 @@
-"""The conformal map of a rectangle onto the unit disc, exact near the crowded images of its short sides.
+"""The conformal map of a rectangle onto the unit disc, exact near corners and crowded images of short sides.
 
 With s the position from the centre of the rectangle, its shorter side along the real axis, v = pi s / (2
-shorter), nome q = exp(-pi longer / shorter) <= exp(-pi), the map that takes the middles of the short sides
-to +1 and -1 is
+shorter), nome q = exp(-pi longer / shorter) <= exp(-pi), the map is, up to a turn,
 
-    zeta = theta1(v) theta3(v) / (i theta2(v) theta4(v))
+    zeta = theta1(v) theta3(v) / (theta2(v) theta4(v))
 
 (zeros at the centre and its images by an even number of reflections, poles at the others, |zeta| = 1 on the
-boundary). Computed are the defects 1 - zeta and 1 + zeta, each a product without cancellation: of
-theta2 theta4 +- i theta1 theta3 all but a quickly falling series factors into 1 - q exp(-+4iv), which
-vanishes where the defect does. The derivative needs no theta function: d zeta / ds = C sqrt(product over
-corners of (1 - zeta / corner)).
+boundary). Computed are the defects from the four corners, 1 - zeta / corner: each vanishes twice at its
+corner and at the images of that, so it is C exp(-+iv) theta1(v - v_corner)^2 / (theta2(v) theta4(v)), a
+product without cancellation. The derivative needs no theta function: d zeta / ds = C sqrt(product of the
+defects).
 """
 
 from __future__ import annotations
@@ -25,101 +24,104 @@ ComplexArray = npt.NDArray[np.complex128]
 
 
 class DiscMap:
-    """Rectangle [0, a] x [0, b] onto |zeta| <= 1, for sides within 50:1 of each other.
+    """Rectangle [0, a] x [0, b] onto |zeta| <= 1, corner (0, 0) to zeta = 1, for sides within 50:1 of each
+    other.
 
-    A point of the disc is given by its defects from the poles +1 and -1: [1 - zeta, 1 + zeta]; a point of the
-    circle by its nearer pole (0 or 1) and the angle from there.
+    A point of the disc is given by its defects 1 - zeta / corner from the corners (0, 0), (a, 0), (a, b), (0,
+    b).
     """
 
     def __init__(self, a: float, b: float) -> None:
-        self._centre = complex(a / 2, b / 2)
         shorter, longer = min(a, b), max(a, b)
-        self._turn = 1.0 if a <= b else -1j  # lays the shorter side along the real axis
-        self._to_angle = math.pi / (2 * shorter)
-        self._half_length = 0.5j * longer
-        self._q = math.exp(-math.pi * longer / shorter)
-        images = _image_polynomial(self._q)
-        signs = (-1.0) ** np.arange(images.size)
-        self._images = images * signs
-        growth = float(images.sum() / self._images.sum())  # theta1 theta3 / (theta2 theta4) is v times this
-        self._growth = -1j * self._turn * self._to_angle * growth
-        self._scale = 1.0
-        self._scale = 1.0 / complex(self.defects(np.array(a / 2), np.array(b / 2))[0]).real
-        corners = self.defects(np.array([0.0, a, a, 0.0]), np.array([0.0, 0.0, b, b]))
-        self._corners = CirclePoints.at(corners)
+        turn = 1.0 if a <= b else -1j  # lays the shorter side along the real axis
+        self._centre = complex(a / 2, b / 2)
+        self._rate = turn * math.pi / (2 * shorter)
+        self._places = np.array([0, a, complex(a, b), complex(0, b)])
+        below_real = ((self._places - self._centre) * turn).imag < 0
+        self._raised = np.where(below_real, 1j, -1j)  # corner's factor exp(-+iv), as an exponent of v
+        q = math.exp(-math.pi * longer / shorter)
+        self._first, third = _theta_polynomials(q)
+        images = np.convolve(self._first, third)
+        self._images = images * (-1.0) ** np.arange(images.size)  # the same with the sign of cos 2v changed
+        self._scale = np.ones(4, np.complex128)
+        self._scale = 1 / self.defects(np.asarray(a / 2), np.asarray(b / 2))
+        at_corners = self.defects(self._places.real, self._places.imag)  # [seen from, corner]
+        self.turns = angle_of(at_corners)
+        self.corners = 1 - at_corners[0]
+        v = self._rate * (self._places[0] - self._centre)
+        first_corner = (
+            np.tan(v)
+            * np.polyval(images[::-1], np.cos(2 * v))
+            / np.polyval(self._images[::-1], np.cos(2 * v))
+        )
+        self._growth = self._rate * images.sum() / self._images.sum() / first_corner
 
     def defects(self, x: FloatArray, y: FloatArray) -> ComplexArray:
-        """[1 - zeta, 1 + zeta], shape (2, ...)."""
-        s = (x + 1j * y - self._centre) * self._turn
-        w = np.exp(1j * self._to_angle * s)
-        inverse = 1 / w
-        double_cosine = w * w + inverse * inverse
-        below = np.full_like(w, self._images[-1])
-        for coefficient in self._images[-2::-1]:
-            below = below * (0.5 * double_cosine) + coefficient
-        below *= w + inverse
-        above = [w * self._factor(s - self._half_length), inverse * self._factor(-s - self._half_length)]
-        return np.stack(above) / below
+        """1 - zeta / corner, shape (4, ...)."""
+        z = x + 1j * y
+        column = (4,) + (1,) * z.ndim
+        v = self._rate * (z - self._centre)
+        below = _polynomial(self._images, np.cos(2 * v)) * np.cos(v)
+        sine = np.sin(self._rate * (z - self._places.reshape(column)))
+        theta = sine * _polynomial(self._first, 1 - 2 * sine * sine)
+        raised = np.exp(self._raised.reshape(column) * v)
+        return np.asarray(self._scale.reshape(column) * raised * theta * theta / below)
 
     def derivative(self, defects: ComplexArray) -> ComplexArray:
         """D zeta / d(x + iy) where the defects are given."""
-        roots = np.sqrt(self._corners.factors(defects))
+        roots = np.sqrt(defects)
         return np.asarray(self._growth * (roots[0] * roots[1]) * (roots[2] * roots[3]))
 
     def radius(self, defects: ComplexArray) -> FloatArray:
         """Conformal radius, (1 - |zeta|^2) / |d zeta / dz|."""
-        near = np.where(np.abs(defects[0]) < np.abs(defects[1]), defects[0], defects[1])
-        return np.asarray((2 * near.real - np.abs(near) ** 2) / np.abs(self.derivative(defects)))
-
-    def _factor(self, beyond: ComplexArray) -> ComplexArray:
-        """(1 - y) and its series in y = q exp(-4iv); `beyond` is s from the middle of the short side."""
-        exponent = -4j * self._to_angle * beyond
-        y = np.exp(exponent)
-        small = self._q**4 / y
-        second = small * small * self._q**4 * (1 + y * (1 + y * (1 + y * (1 + y))))
-        series = 1 - small * (1 + y * (1 + y)) + second
-        return np.asarray(-np.expm1(exponent) * series * self._scale)
+        nearest = np.argmin(np.abs(defects), axis=0)
+        near = np.take_along_axis(defects, nearest[None], axis=0)[0]
+        inside = np.maximum(2 * near.real - np.abs(near) ** 2, 0.0)
+        return np.asarray(inside / np.abs(self.derivative(defects)))
 
 
 class CirclePoints:
-    """Points of the unit circle, each as its nearer pole (0: +1, 1: -1) and its angle from there,
-    counter-clockwise.
+    """Points e of the unit circle, each as its nearest corner of a `DiscMap` and the angle from there.
 
+    `defects`: theirs, shape (4, n). `inverse`: 1 / e, shape (n,).
     """
 
-    def __init__(self, pole: npt.NDArray[np.intp], angle: FloatArray) -> None:
-        self.pole, self.angle = pole, angle
+    def __init__(self, disc: DiscMap, defects: ComplexArray) -> None:
+        self.corner = np.argmin(np.abs(defects), axis=0)
+        self.angle = angle_of(np.take_along_axis(defects, self.corner[None], axis=0)[0])
+        self._turns = disc.turns
         self._constant = -np.expm1(-1j * self.angle)
         self._slope = np.exp(-1j * self.angle)
-        self.inverse = self._slope * (1.0 - 2.0 * self.pole)  # 1 / e
-
-    @classmethod
-    def at(cls, defects: ComplexArray) -> CirclePoints:
-        """The points of the circle that have these defects, (2, n)."""
-        pole = np.argmin(np.abs(defects), axis=0)
-        near = np.take_along_axis(defects, pole[None], axis=0)[0]
-        return cls(pole, -np.sign(near.imag) * 2 * np.arcsin(np.minimum(np.abs(near) / 2, 1.0)))
-
-    def rolled(self, places: int) -> CirclePoints:
-        """The same points in another order, as by `numpy.roll`."""
-        return CirclePoints(np.roll(self.pole, places), np.roll(self.angle, places))
+        self.inverse = self._slope * np.conj(disc.corners[self.corner])
 
     def factors(self, defects: ComplexArray) -> ComplexArray:
-        """1 - zeta / e for every point e, shape (n, ...)."""
-        columns = (-1,) + (1,) * (defects.ndim - 1)
-        return np.asarray(self._constant.reshape(columns) + self._slope.reshape(columns) * defects[self.pole])
+        """1 - zeta / e for places (4, ...), shape (n, ...)."""
+        column = (-1,) + (1,) * (defects.ndim - 1)
+        return np.asarray(self._constant.reshape(column) + self._slope.reshape(column) * defects[self.corner])
 
-    def ahead_of(self, pole: int, angle: FloatArray) -> FloatArray:
-        """Angle in (-pi, pi] from each point to the places at `angle` (k,) from a pole, shape (n, k)."""
-        ahead = angle - self.angle[:, None] + np.pi * (self.pole[:, None] != pole)
-        return np.asarray(np.where(ahead > np.pi, ahead - 2 * np.pi, ahead))
+    def angle_to(self, corner: npt.NDArray[np.intp] | int, angle: FloatArray) -> FloatArray:
+        """Angle in (-pi, pi] from each point (n, 1) to places given by their corner and angle from there."""
+        ahead = angle - self.angle[:, None] + self._turns[self.corner[:, None], np.asarray(corner)]
+        ahead = np.where(ahead > np.pi, ahead - 2 * np.pi, ahead)
+        return np.asarray(np.where(ahead <= -np.pi, ahead + 2 * np.pi, ahead))
 
 
-def _image_polynomial(q: float) -> FloatArray:
-    """Coefficients, in powers of cos 2v, of theta1 theta3 / (2 q^(1/4) sin v).
+def angle_of(defect: ComplexArray) -> FloatArray:
+    """The angle t of a point of the circle whose defect is 1 - exp(it), small ones to their last digit."""
+    size = np.abs(defect)
+    small = -np.sign(defect.imag) * 2 * np.arcsin(np.minimum(size, 1.0) / 2)
+    return np.asarray(np.where(size < 1, small, np.angle(1 - defect)))
 
-    With the opposite sign of cos 2v it is theta2 theta4 / (2 q^(1/4) cos v).
-    """
+
+def _theta_polynomials(q: float) -> tuple[FloatArray, FloatArray]:
+    """Coefficients, in powers of cos 2v, of theta1(v) / (2 q^(1/4) sin v) and of theta3(v)."""
     first = np.array([1 - q**2 - q**6 + q**12, 2 * (q**6 - q**2) + 4 * q**12, 4 * (q**6 - q**12), -8 * q**12])
     third = np.array([1 - 2 * q**4, 2 * q - 6 * q**9, 4 * q**4, 8 * q**9])
-    return np.convolve(first, third)
+    return first, third
+
+
+def _polynomial(coefficients: FloatArray, argument: ComplexArray) -> ComplexArray:
+    value = np.full_like(argument, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = value * argument + coefficient
+    return value

@@ -33,21 +33,20 @@ _NEGLIGIBLE, _ROUNDING = 1e-14, 1e-9
 class ElectrodePotentials:
     """Unit potentials phi_i of m electrodes: phi_i is 1 on electrode i and 0 on the others.
 
-    `starts`, `ends`: the electrodes' ends, in counter-clockwise order; a gap may be zero. `inside`: defects
-    (2,) of any place on electrode 0. Places are given by their defects, [1 - zeta, 1 + zeta], shape (2,
+    `ends`, `starts`: where electrode j ends and where the next one starts, counter-clockwise; a gap may be
+    zero. `inside`: any place on electrode 0. Places are given by their defects from the corners, shape (4,
     ...). Raises ValueError when electrodes are so short beside the gaps that 512 terms per gap do not
     suffice.
     """
 
-    def __init__(self, starts: CirclePoints, ends: CirclePoints, inside: ComplexArray) -> None:
-        self.count = starts.angle.size
-        self._ends = (ends, starts.rolled(-1))
-        first, last = self._ends
-        width = last.angle - first.angle + np.pi * (last.pole != first.pole)
+    def __init__(self, ends: CirclePoints, starts: CirclePoints, inside: ComplexArray) -> None:
+        self.count = ends.angle.size
+        self._ends = (ends, starts)
+        width = np.diagonal(ends.angle_to(starts.corner, starts.angle))
         self._half = np.where(width < 0, width + 2 * np.pi, width) / 2
         self._kappa = np.exp(0.5j * self._half)
         # d K / d zeta = this / (s1 s2 D^2); the difference of the ends is formed without cancellation
-        self._slope = self._kappa * first.inverse * np.expm1(-2j * self._half)
+        self._slope = self._kappa * ends.inverse * np.expm1(-2j * self._half)
         identity = np.eye(self.count)
         self._log_weights = (identity - np.roll(identity, -1, axis=1)) * (2 / np.pi)
         self._solve()
@@ -56,7 +55,7 @@ class ElectrodePotentials:
 
     def potentials(self, defects: ComplexArray) -> FloatArray:
         """Unit potentials at places, shape (m, ...)."""
-        flat = defects.reshape(2, -1)
+        flat = defects.reshape(4, -1)
         first, last = self._roots(flat)
         total = first + last
         values = self._log_weights @ np.angle(total) + self._offset[:, None]
@@ -67,7 +66,7 @@ class ElectrodePotentials:
 
     def potentials_and_slope(self, defects: ComplexArray) -> tuple[FloatArray, ComplexArray]:
         """Unit potentials and d Phi / d zeta, both (m, ...); the slope is infinite at electrodes' ends."""
-        flat = defects.reshape(2, -1)
+        flat = defects.reshape(4, -1)
         first, last = self._roots(flat)
         total = first + last
         values = self._log_weights @ np.angle(total) + self._offset[:, None]
@@ -91,7 +90,7 @@ class ElectrodePotentials:
 
         2 pi times the regular part of Green's function, gaps insulated, less that of the closed circle.
         """
-        flat = defects.reshape(2, -1)
+        flat = defects.reshape(4, -1)
         first, last = self._roots(flat)
         inner = (first - last) / (first + last)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -161,8 +160,8 @@ class ElectrodePotentials:
         """`_roots` on a gap at nodes in (-1, 1), from angles that keep their small differences."""
         half = self._half[gap]
         aside = 2 * np.arctan(nodes * np.tan(half / 2))
-        pole, angle = self._ends[0].pole[gap], self._ends[0].angle[gap] + half + aside
-        first, last = (_boundary_root(ends.ahead_of(pole, angle)) for ends in self._ends)
+        corner, angle = int(self._ends[0].corner[gap]), self._ends[0].angle[gap] + half + aside
+        first, last = (_boundary_root(ends.angle_to(corner, angle)) for ends in self._ends)
         # on the gap itself from the angles as they are: their sums would cost digits of a small gap
         first[gap], last[gap] = _boundary_root(half + aside), _boundary_root(aside - half)
         return first, self._kappa[:, None] * last

@@ -199,9 +199,9 @@ class ElectrodeNetwork:
         self._place = np.argsort(order)
         self._disc = DiscMap(a, b)
         ends = np.array([_ends(self.electrodes[i], a, b) for i in order])  # (m, start and stop, x and y)
-        starts, stops = (CirclePoints.at(self._disc.defects(*ends[:, k].T)) for k in range(2))
-        inside = self._disc.defects(*ends[0].mean(axis=0))
-        self._potentials = ElectrodePotentials(starts, stops, inside)
+        starts = CirclePoints(self._disc, self._disc.defects(*np.roll(ends[:, 0], -1, axis=0).T))
+        stops = CirclePoints(self._disc, self._disc.defects(*ends[:, 1].T))
+        self._potentials = ElectrodePotentials(stops, starts, self._disc.defects(*ends[0].mean(axis=0)))
         sums = np.array([[float(e.side == side) for e in self.electrodes] for side in SIDES])
         self._side_sums = sums if sums.any(axis=1).all() else None
         self._connect(series_ohm)
@@ -230,7 +230,7 @@ class ElectrodeNetwork:
         self._lift = drop[:, None] * solution
 
     def _to_disc(self, x: npt.ArrayLike, y: npt.ArrayLike) -> ComplexArray:
-        """Defects (2, ...), NaN off the pad."""
+        """Defects (4, ...), NaN off the pad."""
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         on_pad = (x >= 0) & (x <= self.a) & (y >= 0) & (y <= self.b)
         with np.errstate(all="ignore"):
