@@ -1,0 +1,323 @@
+"""`handtouch doctor [CONFIG]`: what this machine lacks to serve a deployment, and how to mend it.
+
+Public names: `run`, `Finding`, `examine`. Without a deployment the machine alone is looked at, and the
+endpoints are the default ones. It looks only: nothing is configured, no frame is sent.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib.metadata
+import importlib.util
+import json as json_text
+import os
+import platform
+import re
+import resource
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from handtouch import config
+from handtouch.canbus.receivers import RECEIVE_BUFFER_BYTES
+
+State = Literal["ok", "warn", "fail"]
+EXACT_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at: how it is, and in words what to do about it."""
+
+    subject: str
+    state: State
+    detail: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where to look; tests look elsewhere."""
+
+    proc: Path = Path("/proc")
+    sys: Path = Path("/sys")
+
+    def number(self, name: str) -> int | None:
+        """A sysctl by its path below /proc/sys."""
+        try:
+            return int((self.proc / "sys" / name).read_text())
+        except (OSError, ValueError):
+            return None
+
+    def link(self, name: str) -> dict[str, Any] | None:
+        """What `ip -details -json link` says of an interface; None without iproute2."""
+        try:
+            done = subprocess.run(
+                ["ip", "-details", "-json", "link", "show", "dev", name],
+                capture_output=True,
+                text=True,
+                timeout=10,
+                check=False,
+            )
+            answer = json_text.loads(done.stdout) if done.returncode == 0 else []
+        except (OSError, ValueError, subprocess.TimeoutExpired):
+            return None
+        return next((dict(link) for link in answer if link), None)
+
+
+def run(path: Path | None, json: bool) -> int:
+    """Print the findings; exit status 0, 1 if something fails, 2 if the deployment can't be read."""
+    deployment = None
+    if path is not None:
+        try:
+            deployment = config.load(path)
+        except config.ConfigError as error:
+            print(error, file=sys.stderr)
+            return 2
+    findings = list(examine(deployment))
+    if json:
+        print(json_text.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        for finding in findings:
+            print(f"{finding.state:<5} {finding.subject}: {finding.detail}")
+            if finding.remedy:
+                print(f"      -> {finding.remedy}")
+    return 1 if any(finding.state == "fail" for finding in findings) else 0
+
+
+def examine(deployment: config.Deployment | None, machine: Machine | None = None) -> Iterator[Finding]:
+    """Everything that can be looked at."""
+    machine = machine or Machine()
+    yield from python_findings()
+    yield from clock_findings(machine)
+    yield from scheduling_findings()
+    yield from buffer_findings(machine)
+    for bus in deployment.buses if deployment else ():
+        yield from bus_findings(bus, machine)
+    yield from endpoint_findings(deployment.daemon if deployment else config.Daemon())
+
+
+def python_findings() -> Iterator[Finding]:
+    """Python and the packages that handtouch requires."""
+    yield Finding("python", "ok", f"{platform.python_version()} in {sys.prefix}")
+    missing, found = [], []
+    for requirement in importlib.metadata.requires("handtouch") or []:
+        name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
+        if "extra ==" in requirement:
+            continue
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            missing.append(name)
+    if missing:
+        yield Finding("packages", "fail", f"missing: {', '.join(missing)}", "pip install handtouch again")
+    else:
+        yield Finding("packages", "ok", ", ".join(found))
+
+
+def clock_findings(machine: Machine) -> Iterator[Finding]:
+    """The clock that stamps samples: a slow source costs microseconds a frame."""
+    place = machine.sys / "devices/system/clocksource/clocksource0/current_clocksource"
+    try:
+        source = place.read_text().strip()
+    except OSError:
+        yield Finding("clock", "warn", "clock source unknown", f"look why {place} can't be read")
+        return
+    if source in EXACT_CLOCKS:
+        yield Finding("clock", "ok", source)
+    else:
+        yield Finding(
+            "clock", "warn", f"{source} is slow to read", "see why the kernel distrusts tsc (dmesg)"
+        )
+
+
+def scheduling_findings() -> Iterator[Finding]:
+    """Whether the daemon may be given priority over other programs."""
+    _, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if os.geteuid() == 0 or hard > 0 or hard == resource.RLIM_INFINITY:
+        yield Finding("real-time priority", "ok", "may be asked for")
+    else:
+        yield Finding(
+            "real-time priority",
+            "warn",
+            "not allowed for this user; other programs can delay contacts by milliseconds",
+            "run it as the systemd service, or set rtprio in /etc/security/limits.d/",
+        )
+
+
+def buffer_findings(machine: Machine) -> Iterator[Finding]:
+    """The room for frames that wait: the default holds 17 ms of a busy bus."""
+    limit = machine.number("net/core/rmem_max")
+    if limit is None:
+        yield Finding("receive buffer", "warn", "net.core.rmem_max can't be read", "look into /proc/sys")
+    elif limit >= RECEIVE_BUFFER_BYTES or _has_net_admin(machine):
+        yield Finding("receive buffer", "ok", f"{RECEIVE_BUFFER_BYTES >> 10} KiB may be had")
+    else:
+        yield Finding(
+            "receive buffer",
+            "warn",
+            f"limited to {limit >> 10} of {RECEIVE_BUFFER_BYTES >> 10} KiB: a busy machine loses frames",
+            f"sysctl -w net.core.rmem_max={RECEIVE_BUFFER_BYTES}, or grant CAP_NET_ADMIN as the service does",
+        )
+
+
+def bus_findings(bus: config.Bus, machine: Machine) -> Iterator[Finding]:
+    """One bus of the deployment."""
+    subject = f"bus {bus.name}"
+    if bus.interface == "socketcan":
+        yield from _socketcan_findings(subject, bus, machine)
+    elif bus.interface == "udp_multicast":
+        yield _multicast_finding(subject, bus)
+    elif bus.interface == "virtual":
+        yield Finding(
+            subject,
+            "warn",
+            "virtual reaches no other process",
+            "use it inside one program only; udp_multicast connects processes",
+        )
+    elif str(bus.channel).startswith("/dev/"):
+        yield from _device_findings(subject, bus)
+    else:
+        yield Finding(subject, "ok", f"{bus.interface} {bus.channel}: not looked into")
+
+
+def endpoint_findings(daemon: config.Daemon) -> Iterator[Finding]:
+    """Whether the daemon could bind its endpoints."""
+    for name in ("live", "complete", "control", "inputs"):
+        endpoint = getattr(daemon, name)
+        subject = f"endpoint {name}"
+        if endpoint.startswith("ipc://"):
+            folder = Path(endpoint.removeprefix("ipc://")).parent
+            if not os.access(folder, os.W_OK):
+                yield Finding(subject, "fail", f"{folder} can't be written", "create it, or give its rights")
+                continue
+        elif trouble := _trouble_binding(endpoint):
+            remedy = "is a daemon running (`handtouch status`)? Else choose another port in [daemon]"
+            yield Finding(subject, "fail", f"{endpoint}: {trouble}", remedy)
+            continue
+        yield Finding(subject, "ok", f"{endpoint} is free")
+
+
+def _socketcan_findings(subject: str, bus: config.Bus, machine: Machine) -> Iterator[Finding]:
+    trouble = _trouble_opening_raw()
+    if trouble:
+        yield Finding(subject, "fail", *trouble)
+    name = str(bus.channel)
+    bring_up = f"ip link set {name} up type can bitrate {bus.bitrate_bit_s} restart-ms 100"
+    if not (machine.sys / "class/net" / name).exists():
+        yield Finding(
+            subject,
+            "fail",
+            f"there is no interface {name}",
+            "plug the adapter in and load its driver; without one: ip link add "
+            f"{name} type vcan && ip link set {name} up",
+        )
+        return
+    link = machine.link(name)
+    if link is None:
+        yield Finding(subject, "warn", f"{name} is there; its state is unknown", "install iproute2")
+        return
+    if "UP" not in link.get("flags", []):
+        yield Finding(subject, "fail", f"{name} is down", bring_up)
+        return
+    info = link.get("linkinfo", {})
+    if info.get("info_kind") == "vcan":
+        yield Finding(subject, "ok", f"{name} is up (vcan)")
+        return
+    data = info.get("info_data", {})
+    yield from _adapter_findings(subject, bus, data, f"ip link set {name} down; {bring_up}")
+
+
+def _adapter_findings(
+    subject: str, bus: config.Bus, data: dict[str, Any], bring_up: str
+) -> Iterator[Finding]:
+    """A real adapter, by what the kernel tells of it."""
+    name = bus.channel
+    rate = data.get("bittiming", {}).get("bitrate")
+    state = str(data.get("state", "unknown"))
+    if rate is not None and rate != bus.bitrate_bit_s:
+        yield Finding(
+            subject, "fail", f"{name} runs at {rate} bit/s, the deployment says {bus.bitrate_bit_s}", bring_up
+        )
+    if state == "BUS-OFF":
+        yield Finding(
+            subject, "fail", f"{name} is bus-off", f"check wiring, termination, bit rate; then {bring_up}"
+        )
+    elif state in ("ERROR-WARNING", "ERROR-PASSIVE"):
+        yield Finding(
+            subject,
+            "warn",
+            f"{name} is {state}",
+            "check wiring, termination (120 ohm at both ends), bit rate",
+        )
+    elif rate in (None, bus.bitrate_bit_s):
+        yield Finding(
+            subject, "ok", f"{name} is up, {state}" + (f", {rate} bit/s" if rate is not None else "")
+        )
+    if not data.get("restart_ms") and state != "BUS-OFF":
+        yield Finding(subject, "warn", f"{name} stays off after a bus-off", bring_up)
+
+
+def _trouble_opening_raw() -> tuple[str, str] | None:
+    """Why a raw CAN socket can't be had, with the remedy."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError as error:
+        if error.errno in (errno.EPERM, errno.EACCES):
+            return (
+                "raw CAN sockets are not allowed here",
+                "start it outside the sandbox, or allow AF_CAN in it",
+            )
+        return f"the kernel has no SocketCAN ({error.strerror})", "modprobe can_raw, or use another interface"
+    return None
+
+
+def _multicast_finding(subject: str, bus: config.Bus) -> Finding:
+    group, port = str(bus.channel), bus.options.get("port", 43113)
+    family = socket.AF_INET6 if ":" in group else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((group, int(port)))  # sends nothing, asks the routing table
+    except (OSError, OverflowError, ValueError) as error:
+        return Finding(subject, "fail", f"no route to {group}: {error}", "ip route add 239.0.0.0/8 dev lo")
+    return Finding(subject, "ok", f"{group} port {port} has a route")
+
+
+def _device_findings(subject: str, bus: config.Bus) -> Iterator[Finding]:
+    device = str(bus.channel).split("@")[0]
+    if importlib.util.find_spec("serial") is None:
+        yield Finding(subject, "fail", f"{bus.interface} needs pyserial", "pip install pyserial")
+    if not Path(device).exists():
+        yield Finding(subject, "fail", f"there is no {device}", "plug the adapter in")
+    elif not os.access(device, os.R_OK | os.W_OK):
+        yield Finding(subject, "fail", f"{device} may not be opened", "add the user to the group dialout")
+    else:
+        yield Finding(subject, "ok", f"{device} is there")
+
+
+def _trouble_binding(endpoint: str) -> str | None:
+    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    if port == "*":
+        return None
+    family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host.strip("[]"), int(port)))
+    except (OSError, OverflowError, ValueError) as error:
+        return str(getattr(error, "strerror", None) or error).lower()
+    return None
+
+
+def _has_net_admin(machine: Machine) -> bool:
+    """CAP_NET_ADMIN (bit 12) is effective: socket buffers may exceed rmem_max."""
+    try:
+        status = (machine.proc / "self/status").read_text()
+    except OSError:
+        return False
+    found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    return found is not None and bool(int(found[1], 16) >> 12 & 1)
