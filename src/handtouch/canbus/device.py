@@ -53,7 +53,9 @@ class Device:
     `held` : channel (0-3) -> count that this channel shows whatever it measures
     """
 
-    def __init__(self, bus: DeviceBus, row: int, node_id: int, eds: str, identity: dict[int, int]) -> None:
+    def __init__(
+        self, bus: DeviceBus, row: int, node_id: int, eds: str, identity: dict[int, int | None]
+    ) -> None:
         self.node_id = node_id
         self.send_heartbeat = True
         self.send_data = True
@@ -62,8 +64,14 @@ class Device:
         self.plugged = False
         self._bus = bus
         self._row = row
-        self._identity = identity
-        self._node: Any = canopen.LocalNode(node_id, import_eds(eds, node_id))
+        objects = import_eds(eds, node_id)
+        if not {_TPDO2, _CHANNELS, _IDENTITY} <= set(objects):
+            raise ValueError(f"{eds}: a simulated node needs objects 0x1018, 0x1801 and 0x6401")
+        self._identity = {
+            sub: value if value is not None else objects[_IDENTITY][sub].default or 0
+            for sub, value in identity.items()
+        }
+        self._node: Any = canopen.LocalNode(node_id, objects)
         # until the first transfer has set them the library's own abort messages fail on these
         self._node.sdo._index = self._node.sdo._subindex = 0
         self._node.add_read_callback(self._read)
@@ -235,16 +243,19 @@ class DeviceBus:
         self,
         node_id: int,
         *,
-        serial: int = 0,
         eds: Path | str | None = None,
-        vendor_id: int = 0,
-        product_code: int = 0x401,
-        revision: int = 0x10000,
+        vendor_id: int | None = None,
+        product_code: int | None = None,
+        serial: int | None = None,
     ) -> Device:
-        """A new node, its row of `sample` the next one; it is silent until `Device.plug` or `start`."""
+        """A new node, its row of `sample` the next one; it is silent until `Device.plug` or `start`.
+
+        The EDS is the shipped one unless another is given, the identity that of the EDS. Raises ValueError
+        for a node id out of range or taken, and for an EDS without the objects of such a node.
+        """
         if not 1 <= node_id <= 127 or node_id in self.devices:
             raise ValueError(f"node_id must be 1 to 127 and used once, got {node_id}")
-        identity = {1: vendor_id, 2: product_code, 3: revision, 4: serial}
+        identity = {1: vendor_id, 2: product_code, 3: None, 4: serial}
         path = str(eds or shipped.path("handtouch-node.eds"))
         device = Device(self, len(self.devices), node_id, path, identity)
         self.devices[node_id] = device

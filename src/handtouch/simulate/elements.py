@@ -1,0 +1,114 @@
+"""One-dimensional spectral elements, graded where the potential is singular; sheets are products of two.
+
+Public names: `Axis`, `lobatto`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+DEGREE: Final = 8
+"""Of the elements."""
+_RATIO = 0.25  # of successive elements towards a singular point, where the potential goes as a root
+_SMALLEST = 1e-3  # of those elements, as a fraction of the axis
+_LARGEST = 0.15  # of all elements, as a fraction of the axis
+_LOCAL = np.arange(DEGREE + 1)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Elements along one coordinate: nodes, and the basis functions at quadrature points."""
+
+    breaks: FloatArray
+    nodes: FloatArray
+    at: FloatArray
+    weights: FloatArray
+    values: FloatArray
+    slopes: FloatArray
+
+    @classmethod
+    def graded(cls, length: float, singular: Iterable[float]) -> Axis:
+        """Elements on [0, length], graded towards its ends and `singular` points in between."""
+        breaks = _graded_breaks(sorted({0.0, *singular, length}), length)
+        reference, (abscissae, weights) = lobatto(DEGREE), legendre.leggauss(DEGREE + 2)
+        values, slopes = _lagrange(DEGREE, abscissae)
+        half = np.diff(breaks) / 2
+        middle = breaks[:-1] + half
+        first = DEGREE * np.arange(len(half))[:, None]
+        into = np.arange(half.size * abscissae.size).reshape(len(half), -1, 1), (first + _LOCAL)[:, None]
+        shape = (half.size * abscissae.size, DEGREE * half.size + 1)
+        all_values, all_slopes = np.zeros(shape), np.zeros(shape)
+        all_values[into], all_slopes[into] = values, slopes / half[:, None, None]
+        nodes = (middle[:, None] + half[:, None] * reference[:-1]).ravel()
+        return cls(
+            breaks,
+            np.append(nodes, length),
+            (middle[:, None] + half[:, None] * abscissae).ravel(),
+            np.outer(half, weights).ravel(),
+            all_values,
+            all_slopes,
+        )
+
+    def stiffness(self, weight: FloatArray) -> FloatArray:
+        """Integral of weight u' v'."""
+        return self.slopes.T @ ((self.weights * weight)[:, None] * self.slopes)
+
+    def mass(self, weight: FloatArray) -> FloatArray:
+        """Integral of weight u v."""
+        return self.values.T @ ((self.weights * weight)[:, None] * self.values)
+
+    def at_points(self, points: FloatArray) -> FloatArray:
+        """Basis functions at points, shape (points, nodes)."""
+        element = np.clip(np.searchsorted(self.breaks, points, side="right") - 1, 0, len(self.breaks) - 2)
+        start, end = self.breaks[element], self.breaks[element + 1]
+        basis = np.zeros((len(points), len(self.nodes)))
+        into = np.arange(len(points))[:, None], DEGREE * element[:, None] + _LOCAL
+        basis[into] = _lagrange(DEGREE, (2 * points - start - end) / (end - start))[0]
+        return basis
+
+
+def _graded_breaks(ends: list[float], length: float) -> FloatArray:
+    """Boundaries of elements that shrink towards each of `ends` from both sides."""
+    breaks = [ends[0]]
+    for start, end in itertools.pairwise(ends):
+        half = (end - start) / 2
+        layers = max(0, math.ceil(math.log(_SMALLEST * length / half) / math.log(_RATIO)))
+        steps = half * _RATIO ** np.arange(layers, -1.0, -1.0)
+        for step in (*(start + steps), *(end - steps[-2::-1]), end):
+            pieces = math.ceil((step - breaks[-1]) / (_LARGEST * length))
+            breaks.extend(np.linspace(breaks[-1], step, pieces + 1)[1:])
+    return np.array(breaks)
+
+
+@cache
+def lobatto(degree: int) -> FloatArray:
+    """Gauss-Lobatto nodes on [-1, 1]."""
+    inner = legendre.legroots(legendre.legder(np.eye(degree + 1)[degree]))
+    return np.concatenate([[-1.0], np.sort(inner.real), [1.0]])
+
+
+@cache
+def _coefficients(degree: int) -> FloatArray:
+    """Columns: the Lagrange polynomials of the Lobatto nodes as sums of Legendre's."""
+    return np.asarray(np.linalg.inv(legendre.legvander(lobatto(degree), degree)), np.float64)
+
+
+def _lagrange(degree: int, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lagrange polynomials of the Lobatto nodes at points (...) of [-1, 1], and slopes, (..., degree + 1)."""
+    coefficients = _coefficients(degree)
+    slopes = legendre.legder(coefficients)
+    return (
+        legendre.legvander(at, degree) @ coefficients,
+        legendre.legvander(at, degree - 1) @ slopes,
+    )

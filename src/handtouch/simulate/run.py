@@ -1,0 +1,257 @@
+"""A simulated hand on the buses of a deployment, in real time; `handtouch simulate`.
+
+Public names: `SimulatedHand`, `run`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self, TextIO
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config, shipped
+from handtouch.canbus.device import Device, DeviceBus
+from handtouch.canbus.port import BusError
+from handtouch.config_problems import ConfigError
+from handtouch.simulate import truth as truth_file
+from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.truth import Truth
+from handtouch.simulate.world import World
+
+_SESSION = "utah_mit_session.toml"
+_STATUS_EVERY_S = 5.0
+_WRITE_EVERY_S = 0.5
+_NO_BIT_RATE = ("socketcan", "udp_multicast", "virtual")
+
+
+class SimulatedHand:
+    """The nodes of a deployment, playing a scenario from the first SYNC; a thread serves each bus.
+
+    `devices` are the nodes by "hand/link", with their fault switches.
+    """
+
+    def __init__(self, stages: Sequence[_Stage], opened: contextlib.ExitStack) -> None:
+        self._stages = stages
+        self._opened = opened
+        self.devices: dict[str, Device] = {
+            name: device for stage in stages for name, device in stage.devices.items()
+        }
+
+    @classmethod
+    def open(
+        cls, deployment: config.Deployment, scenario: Scenario, world: World, *, record: bool = True
+    ) -> Self:
+        """Build the hand and open the buses that carry its pads; `record` keeps the truth of every SYNC.
+
+        Raises ConfigError for a touch on no pad, BusError for a bus that can't be opened, ValueError for an
+        EDS that can't be simulated.
+        """
+        scenario.check_links(pad.link for hand in deployment.hands for pad in hand.pads)
+        start = _Start()
+        stages: list[_Stage] = []
+        with contextlib.ExitStack() as opened:
+            for bus in deployment.buses:
+                if any(pad.bus == bus.name for hand in deployment.hands for pad in hand.pads):
+                    wire = _open_bus(bus)
+                    opened.callback(wire.shutdown)
+                    virtual = VirtualHand(deployment, scenario, world, bus.name)
+                    stages.append(_Stage(deployment, wire, virtual, start, record))
+            return cls(stages, opened.pop_all())
+
+    def start(self) -> None:
+        """Plug in every node."""
+        for stage in self._stages:
+            stage.nodes.start()
+
+    def stop(self) -> None:
+        """Silence all nodes and shut the buses down, for good."""
+        for stage in self._stages:
+            stage.nodes.stop()
+        self._opened.close()
+
+    @property
+    def truth(self) -> list[Truth]:
+        """What happened at every SYNC so far; none without `record`, or taken by `take_truth`."""
+        return [record for stage in self._stages for record in stage.truth(list(stage.times_ns))]
+
+    def take_truth(self) -> list[Truth]:
+        """`truth` since the last call."""
+        return [record for stage in self._stages for record in stage.truth(stage.take_times())]
+
+    @property
+    def syncs(self) -> int:
+        """SYNCs answered, all buses together."""
+        return sum(stage.nodes.syncs for stage in self._stages)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+class _Start:
+    """When the scenario began: at the first SYNC on any bus."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._t_ns: int | None = None
+
+    def since_s(self, t_ns: int) -> float:
+        with self._lock:
+            if self._t_ns is None:
+                self._t_ns = t_ns
+            return (t_ns - self._t_ns) * 1e-9
+
+
+class _Stage:
+    """One bus with its nodes."""
+
+    def __init__(
+        self,
+        deployment: config.Deployment,
+        bus: can.BusABC,
+        virtual: VirtualHand,
+        start: _Start,
+        record: bool,
+    ) -> None:
+        self.times_ns: deque[int] = deque()
+        self.devices: dict[str, Device] = {}
+        self._virtual, self._start, self._record = virtual, start, record
+        self.nodes = DeviceBus(bus, self._sample)
+        for hand, pad in virtual.pads:
+            node = deployment.nodes[pad.node]
+            self.devices[f"{hand}/{pad.link}"] = self.nodes.add(
+                pad.node_id,
+                eds=node.eds,
+                vendor_id=node.vendor_id,
+                product_code=node.product_code,
+                serial=pad.serial,
+            )
+
+    def truth(self, times_ns: Sequence[int]) -> list[Truth]:
+        return [
+            record for t_ns in times_ns for record in self._virtual.truth(self._start.since_s(t_ns), t_ns)
+        ]
+
+    def take_times(self) -> list[int]:
+        return [self.times_ns.popleft() for _ in range(len(self.times_ns))]
+
+    def _sample(self, t_ns: int) -> NDArray[np.int16]:
+        if self._record:
+            self.times_ns.append(t_ns)
+        return self._virtual.sample(self._start.since_s(t_ns))
+
+
+def run(
+    config_path: Path,
+    *,
+    buses: tuple[str, ...] = (),
+    scenario: Path | None = None,
+    truth: Path | None = None,
+    world: World | None = None,
+    seconds: float | None = None,
+    stop: threading.Event | None = None,
+) -> int:
+    """Simulate the nodes of a deployment until `seconds` have passed, `stop` is set, or a signal comes.
+
+    Without `stop`, SIGINT and SIGTERM end it. Without a scenario the shipped session is played if the
+    deployment has its links, else a tour over the pads. `buses` put the deployment on other wires, as
+    `config.with_bus` has it. Exit status 0, 1 for a bus or file that can't be opened, 2 for a mistake in
+    the deployment or scenario.
+    """
+    try:
+        deployment = config.load(config_path)
+        for other in buses:
+            deployment = config.with_bus(deployment, other)
+        played = Scenario.load(scenario) if scenario else _usual(deployment)
+        hand = SimulatedHand.open(deployment, played, world or World.ideal_parts(), record=truth is not None)
+    except BusError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except ValueError as error:  # ConfigError, or an EDS that can't be simulated
+        print(error, file=sys.stderr)
+        return 2
+    with hand, contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(truth.open("w", encoding="utf-8")) if truth else None
+        except OSError as error:
+            print(f"{truth}: {error.strerror}", file=sys.stderr)
+            return 1
+        _play(hand, deployment, file, seconds, stop or _stop_on_signal())
+    return 0
+
+
+def _play(
+    hand: SimulatedHand,
+    deployment: config.Deployment,
+    file: TextIO | None,
+    seconds: float | None,
+    stop: threading.Event,
+) -> None:
+    places = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in deployment.buses)
+    print(f"{len(hand.devices)} nodes on {places}; the scenario starts with the first SYNC", flush=True)
+    if file:
+        truth_file.write_header(file)
+    hand.start()
+    begin_s = time.monotonic()
+    told_s, told_syncs = begin_s, 0
+    while not stop.wait(_WRITE_EVERY_S if seconds is None else min(_WRITE_EVERY_S, seconds / 4)):
+        now_s = time.monotonic()
+        if file:
+            truth_file.write(file, hand.take_truth())
+        if seconds is not None and now_s - begin_s >= seconds:
+            break
+        if now_s - told_s >= _STATUS_EVERY_S:
+            print(_status(hand, now_s - begin_s, (hand.syncs - told_syncs) / (now_s - told_s)), flush=True)
+            told_s, told_syncs = now_s, hand.syncs
+    hand.stop()
+    if file:
+        truth_file.write(file, hand.take_truth())
+    print(f"{hand.syncs} SYNCs answered", flush=True)
+
+
+def _status(hand: SimulatedHand, since_s: float, rate_hz: float) -> str:
+    states = [device.state for device in hand.devices.values()]
+    return (
+        f"{since_s:6.0f} s  {rate_hz:5.0f} SYNC/s  {states.count('OPERATIONAL')} of {len(states)} operational"
+    )
+
+
+def _usual(deployment: config.Deployment) -> Scenario:
+    """The shipped session where it fits, else a tour."""
+    session = Scenario.load(shipped.path(_SESSION))
+    with contextlib.suppress(ConfigError):
+        session.check_links(pad.link for hand in deployment.hands for pad in hand.pads)
+        return session.model_copy(update={"repeat": True})
+    return Scenario.tour(deployment)
+
+
+def _stop_on_signal() -> threading.Event:
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def _open_bus(bus: config.Bus) -> can.BusABC:
+    options: dict[str, Any] = dict(bus.options)
+    if bus.interface not in _NO_BIT_RATE:
+        options.setdefault("bitrate", bus.bitrate_bit_s)
+    try:
+        return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
+    except Exception as error:  # drivers raise anything; all of it means that the bus is not there
+        raise BusError(
+            f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: {error}'
+        ) from error

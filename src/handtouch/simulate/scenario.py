@@ -1,0 +1,181 @@
+"""Scenario file (TOML) -> frozen, checked touches on links: where, when and how hard.
+
+Public names: `Scenario`, `Touch`, `Pressing`. Mistakes are reported as in a deployment file.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tomllib
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, NamedTuple, Self
+
+from pydantic import Field, ValidationError
+
+from handtouch.config import Deployment, Name, Positive, Table
+from handtouch.config_problems import ConfigError, Problem, problems_of
+
+_Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
+_Point = Annotated[tuple[_Fraction, _Fraction], Field(strict=False)]
+_TOUR_S, _TOUR_STEP_S = 1.6, 1.0
+
+
+class Pressing(NamedTuple):
+    """A contact at one moment: the touch's number, the place as fractions of the pad, the force."""
+
+    touch: int
+    x: float
+    y: float
+    force_n: float
+
+
+class Touch(Table):
+    """`[[touch]]`: one contact from its begin to its end."""
+
+    link: Name = Field(description="link that is touched")
+    from_s: float = Field(ge=0, description="when it begins, from the start of the scenario")
+    duration_s: Positive = Field(description="how long it lasts, ramps included")
+    path: Annotated[tuple[_Point, ...], Field(strict=False, min_length=1)] = Field(
+        description="way points (x, y) as fractions of the pad, from electrodes x0 and y0; 0.02 to 0.98"
+    )
+    force_n: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = Field(
+        description="forces at even times between the ramps, smoothly joined; one for an even press"
+    )
+    ramp_s: Positive = Field(0.15, description="time in which the force rises from nothing and falls again")
+    radius_mm: Positive | None = Field(None, description="radius of the contact; left out: the sheet's own")
+
+    @property
+    def until_s(self) -> float:
+        """When it ends."""
+        return self.from_s + self.duration_s
+
+    def place(self, t_s: float) -> tuple[float, float]:
+        """Where it is at `t_s`, fractions of the pad; it starts and stops gently and passes at even speed."""
+        if len(self.path) == 1:
+            return self.path[0]
+        passed = self._lengths[-1] * _gentle((t_s - self.from_s) / self.duration_s)
+        leg = min(max(bisect_right(self._lengths, passed) - 1, 0), len(self.path) - 2)
+        (x0, y0), (x1, y1) = self.path[leg], self.path[leg + 1]
+        length = self._lengths[leg + 1] - self._lengths[leg]
+        part = (passed - self._lengths[leg]) / length if length > 0 else 0.0
+        return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+
+    def force(self, t_s: float) -> float:
+        """Force at `t_s` in newton, 0 outside the touch."""
+        since, left = t_s - self.from_s, self.until_s - t_s
+        if since <= 0 or left <= 0:
+            return 0.0
+        ramp = min(self.ramp_s, self.duration_s / 2)
+        return _gentle(since / ramp) * _gentle(left / ramp) * self._plateau((since - ramp), ramp)
+
+    def _plateau(self, since_s: float, ramp: float) -> float:
+        span = self.duration_s - 2 * ramp
+        steps = len(self.force_n) - 1
+        if steps == 0 or span <= 0:
+            return self.force_n[0]
+        at = min(max(since_s / span * steps, 0.0), float(steps))
+        step = min(int(at), steps - 1)
+        before, after = self.force_n[step], self.force_n[step + 1]
+        return before + (after - before) * _gentle(at - step)
+
+    @cached_property
+    def _lengths(self) -> list[float]:
+        """Length of the path up to each way point."""
+        return [0.0, *itertools.accumulate(math.dist(a, b) for a, b in itertools.pairwise(self.path))]
+
+
+class Scenario(Table):
+    """What happens to a hand; after the last touch it ends, or begins again after `pause_s`."""
+
+    touches: Annotated[tuple[Touch, ...], Field(strict=False, min_length=1)] = Field(alias="touch")
+    repeat: bool = Field(False, description="whether it begins again when it has ended")
+    pause_s: float = Field(1.0, ge=0, description="time after the last touch, before it ends or begins again")
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read and check a scenario file. Raises ConfigError naming every mistake."""
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
+            problem = Problem("the file", "", f"{reason}; give the path of a scenario file")
+            raise ConfigError(str(path), (problem,)) from error
+        return cls.parse(text, str(path))
+
+    @classmethod
+    def parse(cls, text: str, file: str = "scenario.toml") -> Self:
+        """Check the text of a scenario file. Raises ConfigError naming every mistake."""
+        try:
+            raw = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(file, (Problem("TOML", "", f"{error}; mend the syntax there"),)) from error
+        try:
+            scenario = cls.model_validate(raw)
+        except ValidationError as error:
+            raise ConfigError(file, problems_of(raw, error, {"": cls, "touch": Touch}, {})) from error
+        if problems := tuple(scenario._overlaps()):
+            raise ConfigError(file, problems)
+        return scenario
+
+    @classmethod
+    def tour(cls, deployment: Deployment) -> Self:
+        """A touch that slides and presses on every pad in turn, each begun before the last has ended."""
+        links = dict.fromkeys(pad.link for hand in deployment.hands for pad in hand.pads)
+        touches = [
+            Touch(
+                link=link,
+                from_s=1.0 + number * _TOUR_STEP_S,
+                duration_s=_TOUR_S,
+                path=((0.3, 0.35), (0.7, 0.5), (0.4, 0.65)),
+                force_n=(0.5, 2.0, 1.0),
+            )
+            for number, link in enumerate(links)
+        ]
+        return cls.model_validate({"touch": touches, "repeat": True})
+
+    @property
+    def duration_s(self) -> float:
+        """Time of one round."""
+        return max(touch.until_s for touch in self.touches) + self.pause_s
+
+    def pressing(self, t_s: float) -> list[Pressing]:
+        """The contacts at `t_s` from the start."""
+        if self.repeat:
+            t_s %= self.duration_s
+        return [
+            Pressing(number, *touch.place(t_s), force)
+            for number, touch in enumerate(self.touches)
+            if touch.from_s < t_s < touch.until_s and (force := touch.force(t_s)) > 0
+        ]
+
+    def check_links(self, links: Iterable[str], file: str = "scenario") -> None:
+        """Raise ConfigError for a touch on a link that carries no pad."""
+        known = sorted(set(links))
+        problems = [
+            Problem(
+                f"[[touch]] {number}: link", f' = "{touch.link}"', f"carries no pad; pads: {', '.join(known)}"
+            )
+            for number, touch in enumerate(self.touches, 1)
+            if touch.link not in known
+        ]
+        if problems:
+            raise ConfigError(file, tuple(problems))
+
+    def _overlaps(self) -> Iterator[Problem]:
+        for (i, one), (j, other) in itertools.combinations(enumerate(self.touches, 1), 2):
+            if one.link == other.link and one.from_s < other.until_s and other.from_s < one.until_s:
+                yield Problem(
+                    f'[[touch]] {j} "{other.link}": from_s',
+                    f" = {other.from_s}",
+                    f"[[touch]] {i} still presses on that pad then; one contact at a time, please",
+                )
+
+
+def _gentle(part: float) -> float:
+    """0 to 1 with level ends (smoothstep)."""
+    part = min(max(part, 0.0), 1.0)
+    return part * part * (3 - 2 * part)
