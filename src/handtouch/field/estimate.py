@@ -17,8 +17,8 @@ _SETTLED = 1e-6  # squared Newton decrement, in variances: the step then taken l
 _SMALLEST_STEP = 1e-14  # of a side: rounding
 _EDGE = 1e-9  # of a side: how near to an edge an estimate may come
 _LONGEST_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
-_LOST = 1e3  # sides: a coordinate less certain than this is not known at all
-_CORNER = 0.7  # shorter sides, times the root of the relative noise: how near a corner currents tell anything
+LOST = 1e3  # sides: a coordinate less certain than this is not known at all
+CORNER = 0.7  # shorter sides, times the root of the relative noise: how near a corner currents tell anything
 _GRID = 9  # points a side of the search that finds a start without a closed form
 
 
@@ -199,13 +199,13 @@ class _Fit:
         return self.result(point, best, converged)
 
     def leave_corner(self, point: FloatArray, at: _Linear, converged: BoolArray) -> NDArray[np.intp]:
-        """Move points too near a corner straight out, in place, to where currents begin to tell; their indices.
+        """Move points too near a corner straight out, in place, to where currents tell; their indices.
 
         Near a corner the two far currents vanish with the square of its distance r, so that all r up to
         sqrt(noise) sides are equally likely, and only the direction from the corner is known.
         """
         noise = 1 / np.sqrt((self.weight * self.weight).mean(0))
-        radius = self.shortest * np.minimum(_CORNER * np.sqrt(noise / np.maximum(at.total, 0)), 0.25)
+        radius = self.shortest * np.minimum(CORNER * np.sqrt(noise / np.maximum(at.total, 0)), 0.25)
         corner = np.where(2 * point > self.low + self.high, self.low + self.high, 0.0)
         offset = point - corner
         distance = np.hypot(*offset)
@@ -240,13 +240,13 @@ def covariance_of(
     """Inverse Fisher information of (x, y, total), shape (n, 3, 3).
 
     slopes, mixing: as in `_Linear`, times the total. fractions: whitened. sides: (2,), lengths of the pad.
-    A coordinate whose standard deviation exceeds `_LOST` sides has infinite variance and no covariances.
+    A coordinate whose standard deviation exceeds `LOST` sides has infinite variance and no covariances.
     """
     sx, sy = slopes
     xx, yy, xy = (sx * sx).sum(0), (sy * sy).sum(0), (sx * sy).sum(0)
     # Each variance from what the other coordinate cannot explain: no difference of products.
     free = np.stack([((sx - (xy / yy) * sy) ** 2).sum(0), ((sy - (xy / xx) * sx) ** 2).sum(0)])
-    least = (_LOST * sides[:, None]) ** -2.0
+    least = (LOST * sides[:, None]) ** -2.0
     lost_x, lost_y = ~(xx > least[0]), ~(yy > least[1])
     free = np.where(np.stack([lost_y, lost_x]), np.stack([xx, yy]), free)
     held_x, held_y = free > least

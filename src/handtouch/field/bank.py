@@ -1,0 +1,311 @@
+"""LocatorBank: maximum-likelihood contacts on all the pads of a hand, of any models, in one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch.field._bank_table import GRIDS, RATIO_CELLS, RATIO_SPAN, TERMS, PadTable, log_ratios
+from handtouch.field.estimate import CORNER, LOST, PointEstimate
+from handtouch.field.model import FloatArray, ForwardModel
+
+IndexArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+_ERROR_WANTED = 1e-6  # of a fraction; finer tables are tried until all models meet it
+_STEPS = 10
+_SETTLED = 1e-2  # squared Newton decrement, in variances: the step then taken leaves far less
+_LONGEST_STEP = 1.0  # in w, where places are 1 / (1 + exp(-w)) of a side
+_WITH_SLOPES = np.hstack([np.eye(TERMS), np.diag(np.arange(1.0, TERMS), 1)])  # powers and their derivatives
+
+
+class LocatorBank:
+    """Tables of one forward model for each pad, read for many contacts at once.
+
+    models: one for each pad, with channels x0, xa, y0, yb; pads that share a model object share its table.
+    table_error: (pads,), the largest error of a tabulated fraction, as measured between the nodes, at 3 % of
+        a side and farther from the edges. edge_error: the same up to the edges.
+
+    Contacts are kept 0.15 % of a side inside the edges, where the tables end. Raises ValueError for a model
+    with other channels.
+    """
+
+    def __init__(self, models: Sequence[ForwardModel]) -> None:
+        distinct = list({id(model): model for model in models}.values())
+        for model in distinct:
+            channels = len(model.fractions(model.a / 2, model.b / 2))
+            if channels != 4:
+                raise ValueError(f"a bank takes models with four channels, one has {channels}")
+        for grid in GRIDS:
+            tables = [PadTable.of(model, grid) for model in distinct]
+            if all(table.error < _ERROR_WANTED for table in tables):
+                break
+        order = {id(model): i for i, model in enumerate(distinct)}
+        self._model = np.array([order[id(model)] for model in models], dtype=np.intp)
+        self._grid = grid
+        self._top = np.nextafter(float(grid.cells), 0)
+        self._fractions = np.ascontiguousarray(np.concatenate([table.fractions for table in tables]))
+        self._log_radius = np.ascontiguousarray(np.concatenate([table.log_radius for table in tables]))
+        self._starts = np.stack([table.starts for table in tables]).reshape(-1)
+        self._sides = np.array([(model.a, model.b) for model in distinct])[self._model]
+        self._shortest = self._sides.min(axis=1) ** 2
+        self.table_error = np.array([table.error for table in tables])[self._model]
+        self.edge_error = np.array([table.edge_error for table in tables])[self._model]
+
+    def fractions(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return the measured fractions (4, n) of points (n,) on the pads `index` (n,)."""
+        index = np.asarray(index, dtype=np.intp)
+        with np.errstate(all="ignore"):
+            s = self._coordinates(index, np.stack([x, y], axis=-1))
+            return np.ascontiguousarray(self._read(self._first_row(index), s)[:, 0].T)
+
+    def conformal_radius(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return the radius R (n,) that gives a contact of radius A the resistance sheet / 2 pi ln(R / A).
+
+        The conformal radius of an ideal pad, in the unit of its sides, and the spreading radius of one with
+        gaps.
+        """
+        index = np.asarray(index, dtype=np.intp)
+        with np.errstate(all="ignore"):
+            s = self._coordinates(index, np.stack([x, y], axis=-1))
+            basis, row = self._basis(self._first_row(index), s)
+            table = self._log_radius.take(row, axis=0, mode="clip")
+            powers = basis[:, :, 0]
+            along_x = np.matmul(powers[:, 1, None], table)[:, 0]
+            return np.asarray(np.exp((along_x * powers[:, 0]).sum(axis=1)))
+
+    def estimate(
+        self, index: ArrayLike, currents: ArrayLike, noise: ArrayLike, start: ArrayLike | None = None
+    ) -> PointEstimate:
+        """Return the most likely contacts, arrays (n,), for currents (4, n) of the pads `index` (n,).
+
+        noise: standard deviations, same unit, broadcastable against `currents`; an infinite one leaves its
+            channel out. start: (2, n), the last (x, y) of contacts being followed, NaN for new ones.
+
+        The same likelihood, clamps and covariance as `handtouch.field.estimate`. Never raises for any
+        reading: what is NaN, has noise that is not positive, or has no positive total is NaN in its own
+        element, and `converged` says which iterations were cut off.
+        """
+        index = np.asarray(index, dtype=np.intp)
+        data = np.asarray(currents, dtype=np.float64)
+        with np.errstate(all="ignore"):
+            weight = np.empty_like(data)
+            np.divide(1.0, noise, out=weight)
+            s = self._start(index, data, weight, start)
+            return self._iterate(index, s, data.T, weight.T)
+
+    # Details ----------------------------------------------------------------------------------------------
+
+    def _first_row(self, index: IndexArray) -> IndexArray:
+        return np.asarray(self._model.take(index) * self._grid.cells**2)
+
+    def _coordinates(self, index: IndexArray, point: FloatArray) -> FloatArray:
+        """Cells (n, 2) of points (n, 2), clamped to the tables."""
+        s = self._grid.coordinate(point / self._sides.take(index, axis=0))
+        return np.asarray(np.minimum(np.maximum(s, 0.0), self._top))
+
+    def _start(
+        self, index: IndexArray, data: FloatArray, weight: FloatArray, start: ArrayLike | None
+    ) -> FloatArray:
+        """Where to begin, in cells (n, 2): the last place, or what the ratios of opposite currents say."""
+        if start is not None:
+            s = self._coordinates(index, np.asarray(start, dtype=np.float64).T)
+            fresh = np.isnan(s).any(axis=1)
+            if not fresh.any():
+                return s
+            s[fresh] = self._start(index[fresh], data[:, fresh], weight[:, fresh], None)
+            return s
+        ratios = log_ratios(np.maximum(data, 0.3 / weight))
+        position = (RATIO_SPAN - ratios) * (RATIO_CELLS / (2 * RATIO_SPAN))
+        position = np.minimum(np.maximum(position, 0.0), RATIO_CELLS - 1e-9).T
+        cell = position.astype(np.intp)
+        position -= cell
+        cell += (2 * self._model.take(index))[:, None] * (RATIO_CELLS + 1)
+        cell[:, 1] += RATIO_CELLS + 1
+        low = self._starts.take(cell, mode="clip")
+        return np.asarray(low + position * (self._starts.take(cell + 1, mode="clip") - low))
+
+    def _basis(self, first_row: IndexArray, s: FloatArray) -> tuple[FloatArray, IndexArray]:
+        """Powers within the cell and their slopes, (n, x or y, value or slope, TERMS), and table rows."""
+        cell = s.astype(np.intp)
+        powers = np.empty((len(s), 2, TERMS))
+        powers[:, :, 0] = 1.0
+        powers[:, :, 1:] = (s - cell)[:, :, None]
+        np.multiply.accumulate(powers, axis=2, out=powers)
+        basis = np.matmul(powers.reshape(-1, TERMS), _WITH_SLOPES).reshape(-1, 2, 2, TERMS)
+        return basis, first_row + cell[:, 1] * self._grid.cells + cell[:, 0]
+
+    def _read(self, first_row: IndexArray, s: FloatArray) -> FloatArray:
+        """Fractions, their slopes along x, along y and their cross slope by cell: (n, 4, channels)."""
+        basis, row = self._basis(first_row, s)
+        table = self._fractions.take(row, axis=0, mode="clip")
+        by_y = np.matmul(basis[:, 1], table).reshape(-1, 2, TERMS, 4)
+        rows: FloatArray = np.matmul(basis[:, 0, None], by_y).reshape(-1, 4, 4)
+        return rows
+
+    def _linearise(
+        self, first_row: IndexArray, s: FloatArray, data: FloatArray, weight: FloatArray
+    ) -> _Normal:
+        """Whitened normal equations at s, for data and weight of shape (n, 4)."""
+        rows = self._read(first_row, s)
+        rows[:, 3] = data
+        rows *= weight[:, None]
+        gram = np.matmul(rows, rows.swapaxes(1, 2))
+        mixing = gram[:, 1:3, :1] / gram[:, :1, :1]
+        return _Normal(rows, gram, mixing, gram[:, 1:3] - mixing * gram[:, :1])
+
+    def _iterate(
+        self, index: IndexArray, s: FloatArray, data: FloatArray, weight: FloatArray
+    ) -> PointEstimate:
+        """Gauss-Newton on the cell coordinates, the total eliminated, all contacts in step."""
+        first_row = self._first_row(index)
+        longest = _LONGEST_STEP / self._grid.width
+        for _ in range(_STEPS):
+            at = self._linearise(first_row, s, data, weight)
+            total = at.gram[:, 0, 3] / at.gram[:, 0, 0]
+            step, decrement = at.step(total, s, self._top)
+            np.minimum(np.maximum(step, -longest, out=step), longest, out=step)
+            step += s
+            np.minimum(np.maximum(step, 0.0, out=step), self._top, out=step)
+            s, step = step, step - s
+            unsettled = decrement > _SETTLED
+            if not np.logical_or.reduce(unsettled):
+                break
+        return self._result(index, s, step, at, decrement, ~unsettled, data, weight)
+
+    def _result(
+        self,
+        index: IndexArray,
+        s: FloatArray,
+        step: FloatArray,
+        at: _Normal,
+        decrement: FloatArray,
+        settled: BoolArray,
+        data: FloatArray,
+        weight: FloatArray,
+    ) -> PointEstimate:
+        """The estimate at s, a last step away from where the model was read."""
+        gram = at.gram
+        total = gram[:, 0, 3] / gram[:, 0, 0]
+        step_x, step_y = step.T
+        chi_squared = gram[:, 3, 3] - total * gram[:, 0, 3] - decrement
+        np.maximum(chi_squared, 0.0, out=chi_squared)
+        pair = at.rows[:, :3, 0] / weight[:, :1] + at.rows[:, :3, 1] / weight[:, 1:2]
+        total *= 1 - at.mixing[:, 0, 0] * step_x - at.mixing[:, 1, 0] * step_y
+        residual = (data[:, 0] + data[:, 1]) / total
+        residual -= pair[:, 0] + pair[:, 1] * step_x + pair[:, 2] * step_y
+        sides = self._sides.take(index, axis=0)
+        fraction = self._grid.place(s)
+        point = sides * fraction
+        covariance = at.covariance(total, (self._grid.width * (1 - fraction)) * point)
+        found = total > 0
+        if not np.logical_and.reduce(found):
+            point[~found] = covariance[~found] = np.nan
+        self._leave_corner(index, point, sides, total, data, weight, covariance)
+        _forget_lost(point, sides, covariance)
+        return PointEstimate(
+            point[:, 0], point[:, 1], total, residual, chi_squared, covariance, settled & found
+        )
+
+    def _leave_corner(
+        self,
+        index: IndexArray,
+        point: FloatArray,
+        sides: FloatArray,
+        total: FloatArray,
+        data: FloatArray,
+        weight: FloatArray,
+        covariance: FloatArray,
+    ) -> None:
+        """As in `estimate`: out to where currents tell, in place, with the covariance of there."""
+        nearest = np.minimum(point, sides - point)
+        distance = nearest[:, 0] ** 2 + nearest[:, 1] ** 2
+        if not np.logical_or.reduce(distance < 0.0625 * self._shortest.take(index)):
+            return
+        noise = 2 / np.sqrt((weight * weight).sum(axis=1))
+        radius = self._shortest.take(index) * np.minimum(CORNER * CORNER * noise / total, 0.0625)
+        which = np.flatnonzero(distance < radius)
+        if not which.size:
+            return
+        index, sides, data, weight = index[which], sides[which], data[which], weight[which]
+        offset = nearest[which] * np.sqrt(radius / distance)[which, None]
+        point[which] = np.where(2 * point[which] > sides, sides - offset, offset)
+        s = self._coordinates(index, point[which])
+        fraction = self._grid.place(s)
+        scale = sides * fraction * (1 - fraction) * self._grid.width
+        at = self._linearise(self._first_row(index), s, data, weight)
+        covariance[which] = at.covariance(total[which], scale)
+
+
+class _Normal(NamedTuple):
+    """Least squares at one point of each contact, in cells.
+
+    rows: whitened fractions, their slopes along x and y, and the data, (n, 4, 4). gram: their products.
+    mixing: what of the slopes the total absorbs, per total, (n, 2, 1). reduced: products of the rest of the
+    slopes with the fractions (zero), the slopes and the data, (n, 2, 4).
+    """
+
+    rows: FloatArray
+    gram: FloatArray
+    mixing: FloatArray
+    reduced: FloatArray
+
+    def step(self, total: FloatArray, s: FloatArray, top: float) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton step (n, 2) and squared decrement; coordinates held by the table's end stay."""
+        reduced = self.reduced
+        if np.fmin.reduce(s, axis=None, initial=top) <= 0 or np.fmax.reduce(s, axis=None, initial=0) >= top:
+            reduced = _held_back(reduced, s, top)
+        xx, xy, yy = reduced[:, 0, 1], reduced[:, 0, 2], reduced[:, 1, 2]
+        gradient = reduced[:, :, 3]
+        gradient_x, gradient_y = gradient[:, 0], gradient[:, 1]
+        step = np.empty(s.shape)
+        np.subtract(yy * gradient_x, xy * gradient_y, out=step[:, 0])
+        np.subtract(xx * gradient_y, xy * gradient_x, out=step[:, 1])
+        step /= (xx * yy - xy * xy)[:, None]
+        decrement = step[:, 0] * gradient_x + step[:, 1] * gradient_y
+        step /= total[:, None]
+        return step, decrement
+
+    def covariance(self, total: FloatArray, scale: FloatArray) -> FloatArray:
+        """Inverse Fisher information of (x, y, total), (n, 3, 3); scale: lengths of a cell, (n, 2)."""
+        xx, xy, yy = self.reduced[:, 0, 1], self.reduced[:, 0, 2], self.reduced[:, 1, 2]
+        inverse = np.empty((len(xx), 2, 2))
+        inverse[:, 0, 0] = yy
+        inverse[:, 1, 1] = xx
+        inverse[:, 0, 1] = inverse[:, 1, 0] = -xy
+        inverse /= (xx * yy - xy * xy)[:, None, None]
+        carry = np.zeros((len(xx), 3, 2))
+        np.divide(scale, total[:, None], out=carry.reshape(-1, 6)[:, :4:3])
+        np.negative(self.mixing[:, :, 0], out=carry[:, 2])
+        covariance: FloatArray = np.matmul(np.matmul(carry, inverse), carry.swapaxes(1, 2))
+        covariance[:, 2, 2] += 1 / self.gram[:, 0, 0]
+        return covariance
+
+
+def _held_back(reduced: FloatArray, s: FloatArray, top: float) -> FloatArray:
+    """The normal equations without the coordinates that would leave the table."""
+    gradient = reduced[:, :, 3]
+    held = ((s <= 0) & (gradient < 0)) | ((s >= top) & (gradient > 0))
+    reduced = np.where(held[:, :, None], 0.0, reduced)
+    reduced[:, :, 1:3][held[:, None, :].repeat(2, axis=1)] = 0.0
+    reduced[:, 0, 1] += held[:, 0]
+    reduced[:, 1, 2] += held[:, 1]
+    return reduced
+
+
+def _forget_lost(point: FloatArray, sides: FloatArray, covariance: FloatArray) -> None:
+    """Make NaN, with infinite variance, the coordinates that the currents do not hold; in place."""
+    variance = covariance.reshape(-1, 9)[:, :5:4]
+    limit = LOST * sides
+    held = (variance >= 0) & (variance <= limit * limit)
+    if np.logical_and.reduce(held, axis=None):
+        return
+    lost = ~held
+    point[lost] = np.nan
+    for axis in range(2):
+        covariance[lost[:, axis], axis] = 0.0
+        covariance[lost[:, axis], :, axis] = 0.0
+        covariance[lost[:, axis], axis, axis] = np.inf
