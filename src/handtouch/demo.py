@@ -28,6 +28,7 @@ from handtouch.view.watch import Display, LineDisplay, LiveDisplay, follow
 DEPLOYMENT = "utah_mit.toml"
 SCENARIO = "utah_mit_session.toml"
 _BOOT_S = 2.0
+_WINDOW = 0.95  # the nodes answer when the interpreter lets them
 _GIL_SWITCH_S = 0.0005
 """Hand, daemon and view share one interpreter here; the daemon must not wait long for the view."""
 
@@ -87,7 +88,8 @@ class _Keeper:
     def take(self, message: wire.Message) -> None:
         if isinstance(message, wire.Contact):
             self.contacts.append(message)
-        self._display.take(message)
+        if not (isinstance(message, wire.Service) and isinstance(self._display, LineDisplay)):
+            self._display.take(message)
 
     def frame(self, alive: bool) -> None:
         self._display.frame(alive)
@@ -108,11 +110,9 @@ def in_process(deployment: Deployment) -> Deployment:
         )
         for bus in deployment.buses
     )
-    free = "tcp://127.0.0.1:*"
-    endpoints = dict.fromkeys(("live", "complete", "control", "inputs"), free)
-    return deployment.model_copy(
-        update={"buses": buses, "daemon": deployment.daemon.model_copy(update=endpoints)}
-    )
+    settings = dict.fromkeys(("live", "complete", "control", "inputs"), "tcp://127.0.0.1:*")
+    daemon = deployment.daemon.model_copy(update={**settings, "window": _WINDOW})
+    return deployment.model_copy(update={"buses": buses, "daemon": daemon})
 
 
 def _subscribe(daemon: Daemon) -> Subscriber:

@@ -32,6 +32,8 @@ class Placed:
     """(n, 3, 3) of position_m; singular along the normal, for a contact lies on the surface"""
     pad_m: FloatArray
     """(n, 2) arc lengths from the electrodes x0 and y0"""
+    scale: FloatArray
+    """(n,) metres on the surface per unit of the rectangle"""
 
 
 class Placement:
@@ -82,6 +84,7 @@ class Placement:
             vectors[:, 3],
             tangents.transpose(0, 2, 1) @ covariance @ tangents,
             np.stack([u, scale_y * y], axis=1),
+            2 / (1 / scale_x + 1 / scale_y),
         )
 
 

@@ -14,7 +14,7 @@ def contact_line(contact: wire.Contact) -> str:
     ]
     if contact.position_m is not None:
         x, y, z = (1e3 * value for value in contact.position_m)
-        parts.append(f"at ({x:7.2f}, {y:7.2f}, {z:7.2f}) mm +- {1e3 * location_std_m(contact):.2f}")
+        parts.append(f"at ({x:7.2f}, {y:7.2f}, {z:7.2f}) mm +- {1e3 * location_std_m(contact):.3f}")
     else:
         parts.append("location invalid" + " " * 24)
     parts.append(strength_text(contact))

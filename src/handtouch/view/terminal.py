@@ -43,11 +43,10 @@ class HandView:
         elif isinstance(message, wire.Health):
             before = self._health.get((message.hand, message.link))
             self._health[message.hand, message.link] = message
-            if before and (before.state, before.node) != (message.state, message.node):
-                text = f"{message.link}: {message.state}, node {message.node}"
-                self._note(
-                    message.t_ns, f"{text}: {message.reason}" if message.reason else text, message.state
-                )
+            if before and (_pad_state(before), before.node) != (_pad_state(message), message.node):
+                text = f"{message.link}: pad {_pad_state(message)}, node {message.node}"
+                why = f": {message.reason}" if message.reason else ""
+                self._note(message.t_ns, text + why, _pad_state(message))
         elif isinstance(message, wire.Service):
             self._service = message
 
@@ -95,14 +94,14 @@ class HandView:
         )
 
     def _table(self) -> Table:
-        table = Table(expand=True, show_edge=False, pad_edge=False, header_style="dim")
+        table = Table(expand=True, box=None, pad_edge=False, header_style="dim")
         table.add_column("link", no_wrap=True, ratio=3)
         table.add_column("pad", no_wrap=True, width=8)
         table.add_column("node", no_wrap=True, width=11)
         table.add_column("Hz", justify="right", no_wrap=True, width=4)
         table.add_column("force", no_wrap=True, width=_BAR)
-        table.add_column("how hard", no_wrap=True, ratio=3)
-        table.add_column("where on the link, mm", no_wrap=True, justify="right", ratio=4)
+        table.add_column("how hard", no_wrap=True, width=17)
+        table.add_column("where on the link, mm", no_wrap=True, justify="right", width=23)
         table.add_column("+-", justify="right", no_wrap=True, width=5)
         table.add_column("for", justify="right", no_wrap=True, width=7)
         hands = {hand for hand, _ in self._health}
@@ -112,7 +111,7 @@ class HandView:
         return table
 
     def _row(self, health: wire.Health, contact: wire.Contact | None) -> list[Text]:
-        state = "touched" if contact else health.state if health.state != "touched" else "clear"
+        state = "touched" if contact else _pad_state(health)
         row = [
             Text(state, style=_STYLE_OF_STATE.get(state, "")),
             Text(health.node, style="green" if health.node == "operational" else "yellow"),
@@ -123,7 +122,7 @@ class HandView:
         where, sure = "invalid", ""
         if contact.position_m is not None:
             where = " ".join(f"{1e3 * value:7.2f}" for value in contact.position_m)
-            sure = f"{1e3 * location_std_m(contact):.2f}"
+            sure = f"{1e3 * location_std_m(contact):.3f}"
         filled = 0 if contact.force_n is None else round(_BAR * min(1.0, contact.force_n / _FULL_BAR_N))
         return [
             *row,
@@ -137,3 +136,8 @@ class HandView:
     def _footer(self) -> RenderableType:
         lines = [*self._events, *[Text("")] * (_EVENTS - len(self._events))]
         return Group(Text(""), *lines)
+
+
+def _pad_state(health: wire.Health) -> str:
+    """State of a pad apart from being touched, which contacts tell."""
+    return "clear" if health.state == "touched" else health.state

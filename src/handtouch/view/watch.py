@@ -15,7 +15,7 @@ from handtouch.client import LIVE, Subscriber, connect
 from handtouch.view.lines import line
 
 _FRAMES_PER_S = 15
-_UPDATE_LINES_PER_S = 4
+_UPDATE_LINES_PER_S = 1
 
 
 class Display(AbstractContextManager["Display"], Protocol):
@@ -54,22 +54,33 @@ class LiveDisplay:
 
 
 class LineDisplay:
-    """A line per message; for people, updates of a contact are thinned out."""
+    """A line per message; for people, what only repeats itself is thinned out."""
 
     def __init__(self, as_json: bool = False) -> None:
         self._as_json = as_json
         self._printed_ns: dict[str, int] = {}
+        self._health: dict[str, tuple[str, ...]] = {}
         self._alive = True
 
     def take(self, message: wire.Message) -> None:
         if self._as_json:
             print(json.dumps(_plain(asdict(message))), flush=True)
             return
-        if isinstance(message, wire.Contact) and message.event == "update":
-            if message.t_ns - self._printed_ns.get(message.link, 0) < 1e9 / _UPDATE_LINES_PER_S:
-                return
+        if self._is_news(message):
+            print(line(message), flush=True)
+
+    def _is_news(self, message: wire.Message) -> bool:
+        if isinstance(message, wire.Health):
+            pad_state = "clear" if message.state == "touched" else message.state
+            state = (pad_state, message.node, message.reason, *message.emergencies)
+            known, self._health[message.link] = self._health.get(message.link), state
+            return state != known
+        if isinstance(message, wire.Contact):
+            thinned = message.event == "update"
+            if thinned and message.t_ns - self._printed_ns.get(message.link, 0) < 1e9 / _UPDATE_LINES_PER_S:
+                return False
             self._printed_ns[message.link] = message.t_ns
-        print(line(message), flush=True)
+        return True
 
     def frame(self, alive: bool) -> None:
         if alive != self._alive:

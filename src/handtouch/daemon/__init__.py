@@ -1,0 +1,1 @@
+"""Slab of samples -> tick -> contacts -> messages: the daemon and its replay."""

@@ -1,0 +1,212 @@
+"""The daemon: owns buses, sockets and the clock, and drives the pipeline in one hot loop.
+
+Public names: `Daemon`, `run`.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zmq
+
+from handtouch.canbus.master import Master, NodeSpec
+from handtouch.canbus.port import BusError, Port
+from handtouch.config import ConfigError, Deployment, load
+from handtouch.daemon.control import Control
+from handtouch.daemon.model import PadModel
+from handtouch.daemon.notify import Notifier
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.publisher import Publisher
+from handtouch.daemon.report import Report
+
+SYNC_ID = 0x80
+_log = logging.getLogger("handtouch.daemon")
+
+
+class Daemon:
+    """A deployment at work: `open` it, `run` it in one thread until told to stop, `close` it.
+
+    Raises BusError or OSError, each naming what is missing and a remedy, when a bus or an endpoint can't be
+    opened.
+    """
+
+    def __init__(self, deployment: Deployment, model: PadModel | None = None) -> None:
+        self.deployment = deployment
+        settings = deployment.daemon
+        period_ns = round(settings.sync_period_ms * 1e6)
+        with ExitStack() as opened:
+            context = opened.enter_context(zmq.Context())
+            self.publisher = Publisher(context, settings.live, settings.complete)
+            opened.callback(self.publisher.close)
+            self.control = Control(context, settings.control)
+            opened.callback(self.control.close)
+            self.pipeline = Pipeline(
+                model or PadModel(deployment), period_ns, settings.window, self.publisher
+            )
+            self.ports: dict[str, Port] = {}
+            for bus in deployment.buses:
+                self.ports[bus.name] = port = Port.open(bus, self.pipeline.slab)
+                opened.callback(port.close)
+            self._opened = opened.pop_all()
+        self.master = Master(self.ports, node_specs(deployment))
+        self.report = Report(deployment, self.pipeline, self.master, self.ports, self.publisher)
+        self.control.commands["status"] = self.report.status
+        self._producers = [self.ports[bus.name] for bus in deployment.buses if bus.sync == "producer"]
+        self._period_ns = period_ns
+
+    def __enter__(self) -> Daemon:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give buses and endpoints back."""
+        self._opened.close()
+
+    def run(self, stop: threading.Event, alive: Callable[[], None] = lambda: None) -> None:
+        """Serve until `stop` is set; `alive` is called after every tick. Contacts end, nodes are stopped."""
+        self.master.start(time.monotonic_ns())
+        gc.collect()
+        gc.freeze()
+        try:
+            self._loop(stop, alive)
+        finally:
+            now_ns = time.monotonic_ns()
+            self.pipeline.messages.end_all(now_ns, self.publisher)
+            self.master.stop(now_ns)
+            gc.unfreeze()
+
+    def _loop(self, stop: threading.Event, alive: Callable[[], None]) -> None:
+        pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
+        next_sync_ns = time.monotonic_ns()
+        while not stop.is_set():
+            now_ns = time.monotonic_ns()
+            if self._producers and now_ns >= next_sync_ns:
+                next_sync_ns = self._sync(now_ns, next_sync_ns)
+            elif not self._producers and cycle.begin_overdue(now_ns):
+                pipeline.begin(now_ns)
+            wake_ns = cycle.t_ns + (self._period_ns if cycle.ticked else cycle.window_ns)
+            wait_s = max(0, min(wake_ns, next_sync_ns if self._producers else wake_ns) - now_ns) * 1e-9
+            select.select(ports, (), (), wait_s)
+            self._receive(ports)
+            now_ns = time.monotonic_ns()
+            if pipeline.advance(now_ns, self.report.node_state) is not None:
+                self.report.ticked(now_ns, time.monotonic_ns())
+                self._after_tick(alive)
+
+    def _sync(self, now_ns: int, due_ns: int) -> int:
+        """Send SYNC on the buses that are ours to drive; return when the next is due."""
+        if not self.pipeline.cycle.ticked:  # the window of the last one was overslept
+            self.pipeline.advance(self.pipeline.cycle.t_ns + self._period_ns, self.report.node_state)
+        for port in self._producers:
+            port.send(SYNC_ID, b"")
+        self.pipeline.begin(now_ns)
+        late_ns = now_ns - due_ns
+        if late_ns > self._period_ns:
+            self.report.overruns += late_ns // self._period_ns
+            due_ns += late_ns // self._period_ns * self._period_ns
+        return due_ns + self._period_ns
+
+    def _receive(self, ports: list[Port]) -> None:
+        for port in ports:
+            for can_id, data, t_ns in port.drain():
+                if can_id == SYNC_ID and not self._producers:
+                    self.pipeline.begin(t_ns)
+                else:
+                    self.master.handle(port.name, can_id, data, t_ns)
+
+    def _after_tick(self, alive: Callable[[], None]) -> None:
+        """What may wait until the contacts are out."""
+        now_ns = time.monotonic_ns()
+        self.master.poll(now_ns)
+        self.publisher.take_subscriptions()
+        self.report.poll(now_ns)
+        self.control.poll()
+        alive()
+
+
+def node_specs(deployment: Deployment) -> list[NodeSpec]:
+    """What the master has to know of every node, in the order of the slab."""
+    pads = [pad for hand in deployment.hands for pad in hand.pads]
+    kinds: Mapping[str, Any] = deployment.nodes
+    return [
+        NodeSpec(
+            slot=slot,
+            bus=pad.bus,
+            node_id=pad.node_id,
+            name=pad.link,
+            eds=kinds[pad.node].eds,
+            vendor_id=kinds[pad.node].vendor_id,
+            product_code=kinds[pad.node].product_code,
+            serial=pad.serial,
+            heartbeat_ms=kinds[pad.node].heartbeat_ms,
+            heartbeat_timeout_ms=kinds[pad.node].heartbeat_timeout_ms,
+        )
+        for slot, pad in enumerate(pads)
+    ]
+
+
+def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
+    """`handtouch run`: serve a deployment until SIGINT or SIGTERM; exit status 0, 1 (no bus), 2 (config)."""
+    from handtouch.config import with_bus
+
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("canopen").setLevel(logging.ERROR)
+    try:
+        deployment = load(config_path)
+        for bus in buses:
+            deployment = with_bus(deployment, bus)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    notifier = Notifier()
+    try:
+        daemon = Daemon(deployment)
+    except (BusError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    with daemon:
+        _announce(daemon)
+        notifier.send("READY=1", f"STATUS=serving {daemon.pipeline.model.size} pads")
+        daemon.run(stop, _watchdog(notifier))
+        notifier.send("STOPPING=1")
+    notifier.close()
+    return 0
+
+
+def _announce(daemon: Daemon) -> None:
+    where = ", ".join(f"{name} {endpoint}" for name, endpoint in daemon.publisher.endpoints.items())
+    hands = ", ".join(f"{hand.name} ({len(hand.pads)} pads)" for hand in daemon.deployment.hands)
+    buses = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in daemon.deployment.buses)
+    _log.info("hand %s on bus %s", hands, buses)
+    _log.info("%s, control %s", where, daemon.control.endpoint)
+
+
+def _watchdog(notifier: Notifier) -> Callable[[], None]:
+    """A function that reassures systemd's watchdog often enough, called after every tick."""
+    period_ns = int(os.environ.get("WATCHDOG_USEC", "0")) * 1000 // 3
+    last_ns = np.zeros(1, dtype=np.int64)
+
+    def alive() -> None:
+        now_ns = time.monotonic_ns()
+        if period_ns and now_ns - last_ns[0] >= period_ns:
+            last_ns[0] = now_ns
+            notifier.send("WATCHDOG=1")
+
+    return alive

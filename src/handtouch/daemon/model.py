@@ -1,0 +1,131 @@
+"""What the tick has to know of every pad, as columns over all hands; computed once from the deployment."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.config import Deployment
+from handtouch.field import LocatorBank, PointEstimate
+from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.strength import ContactLaw, Strength
+from handtouch.hand import Placed, Placement, mount_of, network_of, surface_of
+
+FloatArray = NDArray[np.float64]
+FULL_SCALE = 32767
+
+
+class PadModel:
+    """Columns of the n pads of a deployment, in its order; the same order as the slab's.
+
+    `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` and `noise_a` of a channel;
+    thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
+    middle of the pad; `begin_samples`, `end_samples`. `locator` finds contacts, `placement` puts them on
+    their links, `force` weighs them.
+    """
+
+    def __init__(self, deployment: Deployment) -> None:
+        entries = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
+        pads = [pad for _, pad in entries]
+        nodes = [deployment.nodes[pad.node] for pad in pads]
+        sheets = [deployment.sheets[pad.sheet] for pad in pads]
+        touches = [pad.touch or deployment.touch for pad in pads]
+        self.size = len(pads)
+        self.hands = [hand for hand, _ in entries]
+        self.links = [pad.link for pad in pads]
+        self.rows_of_hand = _rows(self.hands)
+        self.calibration = [_nominal(pad, deployment) for pad in pads]
+        self.ampere_per_count = np.array([node.full_scale_ma * 1e-3 / FULL_SCALE for node in nodes])
+        counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
+        self.noise_a = np.array(counts) * self.ampere_per_count
+        self.on_n = np.array([touch.on_n for touch in touches])
+        self.off_n = np.array([touch.off_n for touch in touches])
+        self.begin_samples = np.array([touch.begin_samples for touch in touches])
+        self.end_samples = np.array([touch.end_samples for touch in touches])
+        networks = _networks(pads, sheets)
+        self.locator = LocatorBank(networks)
+        self.placement = Placement([(surface_of(pad), *mount_of(pad)) for pad in pads])
+        self._drive_v = np.array([node.drive_v for node in nodes])
+        self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
+        self._series_ohm = np.array([pad.series_ohm for pad in pads])
+        self._has_series = np.array([any(pad.series_ohm) for pad in pads])
+        self._unmix = np.stack(
+            [_unmix(pad, net, s) for pad, net, s in zip(pads, networks, sheets, strict=True)]
+        )
+        self._law = ContactLaw(
+            np.array([sheet.contact_ohm_mm2 * 1e-6 for sheet in sheets]),
+            np.array([sheet.alpha for sheet in sheets]),
+            np.array([sheet.contact_radius_mm * 1e-3 for sheet in sheets]),
+            np.array([sheet.contact_radius_std_mm * 1e-3 for sheet in sheets]),
+            np.array([sheet.reference_kpa * 1e3 for sheet in sheets]),
+        )
+        self.on_a, self.off_a = (self._threshold(force, networks) for force in (self.on_n, self.off_n))
+
+    def force(
+        self, index: NDArray[np.intp], currents: FloatArray, found: PointEstimate, placed: Placed
+    ) -> Strength:
+        """Weigh contacts on the pads `index` (n,) by their currents (4, n) [A] at their places."""
+        radius_m = self.locator.conformal_radius(index, found.x, found.y) * placed.scale
+        return self._law.take(index).force(
+            found.total,
+            self._drive_v[index],
+            self._sheet_ohm[index],
+            radius_m,
+            self._resistors(index, currents),
+            current_std_a=np.sqrt(found.covariance[:, 2, 2]),
+        )
+
+    def _resistors(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray | float:
+        """What series resistors add to the way from contact to ground [ohm] (n,): sum of phi_i V_i / I."""
+        if not self._has_series[index].any():
+            return 0.0
+        ideal = np.einsum("nij,jn->in", self._unmix[index], currents)
+        total = currents.sum(axis=0)
+        dropped = (ideal * currents * self._series_ohm[index].T).sum(axis=0)
+        return np.asarray(dropped / np.where(total > 0, total, np.nan) ** 2)
+
+    def _threshold(self, force_n: FloatArray, networks: Sequence[ElectrodeNetwork]) -> FloatArray:
+        """Total current of a contact of that force in the middle of each pad."""
+        x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
+        pads = np.arange(self.size)
+        scale = self.placement.place(pads, x, y, np.zeros((self.size, 2, 2))).scale
+        radius_m = self.locator.conformal_radius(pads, x, y) * scale
+        resistors = self._resistors(pads, self.locator.fractions(pads, x, y))
+        return self._law.current(force_n, self._drive_v, self._sheet_ohm, radius_m, resistors)
+
+
+def _rows(hands: list[str]) -> dict[str, slice]:
+    """Rows of each hand; the pads of a hand follow one another."""
+    first = {hand: hands.index(hand) for hand in hands}
+    return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
+
+
+def _networks(pads: list[config.Pad], sheets: list[config.Sheet]) -> list[ElectrodeNetwork]:
+    """Electrodes of every pad; pads of one make share one object, and with it one table."""
+    made: dict[tuple[object, ...], ElectrodeNetwork] = {}
+    networks = []
+    for pad, sheet in zip(pads, sheets, strict=True):
+        make = (pad.surface, pad.gap_mm, pad.series_ohm, sheet.ohm_per_square)
+        if make not in made:
+            made[make] = network_of(pad, sheet)
+        networks.append(made[make])
+    return networks
+
+
+def _unmix(pad: config.Pad, network: ElectrodeNetwork, sheet: config.Sheet) -> FloatArray:
+    """What makes measured currents those of electrodes grounded directly: 1 + G R w / rho."""
+    if not any(pad.series_ohm):
+        return np.eye(4)
+    return np.asarray(np.eye(4) + network.conductance * (np.array(pad.series_ohm) / sheet.ohm_per_square))
+
+
+def _nominal(pad: config.Pad, deployment: Deployment) -> str:
+    """Name of the calibration that the deployment file itself is; it changes with the pad's tables."""
+    parts = (pad, deployment.nodes[pad.node], deployment.sheets[pad.sheet])
+    text = "".join(part.model_dump_json() for part in parts)
+    return "nominal-" + hashlib.sha256(text.encode()).hexdigest()[:12]

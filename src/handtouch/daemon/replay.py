@@ -1,0 +1,222 @@
+"""Feeds a recorded CAN log through the same pipeline as a live bus: identical contacts each time.
+
+Public names: `replay`, `Summary`, `run`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import can
+import numpy as np
+import zmq
+
+from handtouch import wire
+from handtouch.canbus.router import Counters, Router
+from handtouch.config import ConfigError, Deployment, load
+from handtouch.daemon.model import PadModel
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.publisher import Publisher
+from handtouch.wire import PadState
+
+_SYNC_ID = 0x80
+_TPDO2 = 0x280
+_QUIET_PERIODS = 8
+"""A pause in the log is ticked through for this many periods: long enough for every pad to go stale."""
+
+
+@dataclass
+class Summary:
+    """What a replay found: recorded time, ticks, contacts that began, and the counters of each bus."""
+
+    log_s: float = 0.0
+    ticks: int = 0
+    contacts: int = 0
+    buses: dict[str, Counters] = field(default_factory=dict)
+
+
+class _Outlet:
+    """Hands contacts to whoever called `replay`, and everything to subscribers if there is a publisher."""
+
+    def __init__(self, take: Callable[[wire.Contact], None], publisher: Publisher | None) -> None:
+        self._take = take
+        self._publisher = publisher
+        self._seq: dict[str, int] = {}
+        self.contacts = 0
+
+    def wants(self, topic: str) -> bool:
+        return topic.startswith("contact/") or (self._publisher is not None and self._publisher.wants(topic))
+
+    def next_seq(self, topic: str) -> int:
+        self._seq[topic] = self._seq.get(topic, 0) + 1
+        return self._seq[topic]
+
+    def send(self, message: wire.Message) -> None:
+        if isinstance(message, wire.Contact):
+            self.contacts += message.event == "begin"
+            self._take(message)
+        if self._publisher is not None:
+            self._publisher.send(message)
+
+
+class _Feeder:
+    """Drives a pipeline by the stamps of a log."""
+
+    def __init__(self, deployment: Deployment, outlet: _Outlet) -> None:
+        settings = deployment.daemon
+        self.pipeline = Pipeline(
+            PadModel(deployment), round(settings.sync_period_ms * 1e6), settings.window, outlet
+        )
+        self.routers = {bus.name: Router(self.pipeline.slab) for bus in deployment.buses}
+        self._by_channel = {str(bus.channel): self.routers[bus.name] for bus in deployment.buses}
+        self._only = next(iter(self.routers.values())) if len(self.routers) == 1 else None
+        self._up = np.full(self.pipeline.model.size, PadState.CLEAR, dtype=np.uint8)
+        pads = [pad for hand in deployment.hands for pad in hand.pads]
+        for slot, pad in enumerate(pads):
+            self.routers[pad.bus].route(_TPDO2 + pad.node_id, slot)
+
+    def feed(self, message: can.Message, t_ns: int) -> None:
+        """One frame of the log."""
+        cycle = self.pipeline.cycle
+        self._pass_time(t_ns)
+        if message.arbitration_id == _SYNC_ID and not message.is_extended_id and not message.is_error_frame:
+            if not cycle.ticked:
+                self.pipeline.advance(cycle.t_ns + cycle.period_ns, self._up)
+            self.pipeline.begin(t_ns)
+        elif router := self._only or self._by_channel.get(str(message.channel)):
+            router.accept_message(message, t_ns)
+            self.pipeline.advance(t_ns, self._up)
+
+    def _pass_time(self, t_ns: int) -> None:
+        """Tick what fell due before `t_ns`, by the timer where SYNC is missing."""
+        pipeline, cycle = self.pipeline, self.pipeline.cycle
+        if cycle.t_ns == 0:
+            cycle.t_ns = t_ns
+        pipeline.advance(t_ns, self._up)
+        for _ in range(_QUIET_PERIODS):
+            if not cycle.begin_overdue(t_ns):
+                return
+            pipeline.begin(cycle.t_ns + cycle.period_ns)
+            pipeline.advance(min(t_ns, cycle.t_ns + cycle.window_ns), self._up)
+        pipeline.begin(t_ns)
+
+
+def replay(
+    log: Path,
+    deployment: Deployment,
+    take: Callable[[wire.Contact], None],
+    *,
+    pace: Callable[[int], None] = lambda _: None,
+    publisher: Publisher | None = None,
+) -> Summary:
+    """Run the pipeline over a log in any format that python-can reads; `take` gets every contact message.
+
+    Times are the log's own stamps, in ns. A deployment's buses are told apart by their channel in the log;
+    where there is only one, all frames are its. `pace` is called with each frame's stamp before the frame is
+    fed: it may sleep to keep the recorded speed.
+
+    Raises ValueError naming the log when python-can can't read it, OSError when it isn't there.
+    """
+    outlet = _Outlet(take, publisher)
+    feeder = _Feeder(deployment, outlet)
+    first_ns = t_ns = 0
+    for message in _messages(log):
+        t_ns = round(message.timestamp * 1e9)
+        first_ns = first_ns or t_ns
+        pace(t_ns)
+        feeder.feed(message, t_ns)
+    feeder.pipeline.messages.end_all(t_ns, outlet)
+    counters = {name: router.counters for name, router in feeder.routers.items()}
+    return Summary((t_ns - first_ns) * 1e-9, feeder.pipeline.ticks, outlet.contacts, counters)
+
+
+def _messages(log: Path) -> Iterator[can.Message]:
+    if not log.is_file():
+        raise FileNotFoundError(f"{log}: no such log")
+    try:
+        with can.LogReader(log) as reader:
+            yield from reader
+    except (ValueError, KeyError, IndexError, can.CanError, EOFError) as error:
+        raise ValueError(
+            f"{log}: python-can can't read it ({error}); it reads candump .log, .asc, .blf, .csv, .db, .trc "
+            "and these with .gz"
+        ) from error
+
+
+def pacer(speed: float) -> Callable[[int], None]:
+    """A function that sleeps until a stamp is due at `speed` times the recorded speed; 0: never sleeps."""
+    if speed == 0:
+        return lambda _: None
+    start: list[int] = []
+
+    def pace(t_ns: int) -> None:
+        if not start:
+            start.extend((time.monotonic_ns(), t_ns))
+        ahead_s = (start[0] + (t_ns - start[1]) / speed - time.monotonic_ns()) * 1e-9
+        if ahead_s > 1e-3:
+            time.sleep(ahead_s)
+
+    return pace
+
+
+def run(
+    log: Path, config_path: Path, *, speed: float = 0, as_json: bool = False, publish: bool = False
+) -> int:
+    """`handtouch replay`: print contacts, or publish them too; exit status 0, 1 (log), 2 (config)."""
+    try:
+        deployment = load(config_path)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    with ExitStack() as stack:
+        publisher = None
+        try:
+            if publish:
+                context = stack.enter_context(zmq.Context())
+                publisher = Publisher(context, deployment.daemon.live, deployment.daemon.complete)
+                stack.callback(publisher.close)
+            pace = pacer(speed)
+            summary = replay(
+                log,
+                deployment,
+                _print_json if as_json else _print_line,
+                pace=_serving(pace, publisher) if publisher else pace,
+                publisher=publisher,
+            )
+        except (OSError, ValueError) as error:
+            print(error, file=sys.stderr)
+            return 1
+    counts = ", ".join(
+        f"{name}: {c.frames} frames, {c.samples} samples, {c.short} short"
+        for name, c in summary.buses.items()
+    )
+    print(
+        f"{summary.contacts} contacts in {summary.log_s:.1f} s of log, {summary.ticks} ticks; {counts}",
+        file=sys.stderr,
+    )
+    return 0
+
+
+def _serving(pace: Callable[[int], None], publisher: Publisher) -> Callable[[int], None]:
+    def serve(t_ns: int) -> None:
+        publisher.take_subscriptions()
+        pace(t_ns)
+
+    return serve
+
+
+def _print_json(contact: wire.Contact) -> None:
+    print(json.dumps(asdict(contact)))
+
+
+def _print_line(contact: wire.Contact) -> None:
+    from handtouch.view.lines import contact_line
+
+    if contact.event != "update":
+        print(contact_line(contact))

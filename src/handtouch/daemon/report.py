@@ -1,0 +1,202 @@
+"""How the daemon and every pad fare: health and service messages, and the answer to `status`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import __version__, wire
+from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.master import Master, NodeStatus
+from handtouch.canbus.port import Port
+from handtouch.config import Deployment
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.publisher import Publisher
+from handtouch.supervise.health import explain
+from handtouch.wire import PadState
+
+_SECOND_NS = 1_000_000_000
+_SERVICE_NS = _SECOND_NS // 2
+_log = logging.getLogger("handtouch.health")
+
+_PAD_OF_NODE = {
+    NodeState.OPERATIONAL: PadState.CLEAR,
+    NodeState.STALE: PadState.CLEAR,  # the tick sees by itself that no samples come
+    NodeState.FAULTED: PadState.FAULTED,
+}
+
+
+class Report:
+    """Watches pipeline, master, buses and publisher; `poll` it after every tick.
+
+    `node_state` (n,) uint8 is what the tick is to make of each node: PadState.CLEAR where its samples count.
+    `overruns` counts the periods that passed without a SYNC because the daemon was late.
+    """
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        pipeline: Pipeline,
+        master: Master,
+        ports: Mapping[str, Port],
+        publisher: Publisher,
+    ) -> None:
+        n = pipeline.model.size
+        self.node_state: NDArray[np.uint8] = np.full(n, PadState.STARTING, dtype=np.uint8)
+        self.overruns = 0
+        self._deployment = deployment
+        self._pipeline = pipeline
+        self._master = master
+        self._ports = ports
+        self._publisher = publisher
+        self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
+        self._told = np.full(n, PadState.STARTING, dtype=np.uint8)
+        self._samples = np.zeros(n, dtype=np.int64)
+        self._was_up = np.zeros(n, dtype=np.bool_)
+        self._started_ns = time.monotonic_ns()
+        self._second = _Window(self._started_ns, self._samples.copy())
+        self._half_second = _Window(self._started_ns, self._totals())
+        self._rate_hz = np.zeros(n)
+        self._speeds: dict[str, float] = {}
+        self._durations_ns: list[int] = []
+        self._tick_us: dict[str, float] = {}
+
+    def ticked(self, from_ns: int, to_ns: int) -> None:
+        """A tick took from `from_ns`, its last sample read, to `to_ns`, its messages out."""
+        self._durations_ns.append(to_ns - from_ns)
+        self._samples += self._pipeline.slab.fresh
+
+    def poll(self, now_ns: int) -> None:
+        """Take over the master's view of the nodes; tell what changed, and everything from time to time."""
+        events = self._master.take_events()
+        if events:
+            for event in events:
+                _log.info(
+                    "%s: %s -> %s: %s", self._pads[event.slot][1].link, event.old.name.lower(),
+                    event.new.name.lower(), event.reason,
+                )  # fmt: skip
+            self._translate()
+        state = self._pipeline.tick.columns.state
+        visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
+        changed = {event.slot for event in events} | set(np.flatnonzero(visible != self._told).tolist())
+        self._told[:] = visible
+        if now_ns - self._second.since_ns >= _SECOND_NS:
+            self._rate_hz = self._second.per_second(now_ns, self._samples)
+            changed = set(range(len(self._pads)))
+        if changed:
+            statuses = self._master.status()
+            for pad in sorted(changed):
+                self._publisher.send(self._health(pad, now_ns, statuses[pad]), lasting=True)
+        if now_ns - self._half_second.since_ns >= _SERVICE_NS:
+            rates = self._half_second.per_second(now_ns, self._totals())
+            self._speeds = dict(zip(["ticks", *self._ports], rates.tolist(), strict=True))
+            self._tick_us = _summary(self._durations_ns)
+            self._durations_ns.clear()
+            self._publisher.send(self._service(now_ns, self._publisher.next_seq("service")), lasting=True)
+
+    def status(self) -> dict[str, Any]:
+        """Everything about the daemon and every pad, for the control endpoint."""
+        now_ns = time.monotonic_ns()
+        statuses = self._master.status()
+        return {
+            "service": asdict(self._service(now_ns, 0)),
+            "pads": [asdict(self._health(pad, now_ns, status, 0)) for pad, status in enumerate(statuses)],
+        }
+
+    def _translate(self) -> None:
+        """From node states to what the tick makes of them; a node that was up and is absent is lost."""
+        for slot, state in enumerate(map(NodeState, self._master.states.tolist())):
+            self._was_up[slot] |= state == NodeState.OPERATIONAL
+            missing = PadState.LOST if self._was_up[slot] else PadState.STARTING
+            self.node_state[slot] = (
+                missing if state == NodeState.ABSENT else _PAD_OF_NODE.get(state, PadState.STARTING)
+            )
+
+    def _health(self, pad: int, now_ns: int, status: NodeStatus, seq: int | None = None) -> wire.Health:
+        hand, settings = self._pads[pad]
+        columns = self._pipeline.tick.columns
+        sample_ns = int(columns.sample_ns[pad])
+        state = PadState(int(columns.state[pad]))
+        topic = f"health/{hand}/{settings.link}"
+        return wire.Health(
+            v=wire.SCHEMA_VERSION,
+            seq=self._publisher.next_seq(topic) if seq is None else seq,
+            t_ns=now_ns,
+            hand=hand,
+            link=settings.link,
+            bus=settings.bus,
+            node_id=settings.node_id,
+            state=state.name.lower(),
+            node=status.state.name.lower(),
+            since_ns=status.since_ns,
+            reason=explain(state, status.state, status.reason, self._pipeline.slab.counts[pad]),
+            serial=status.serial,
+            rate_hz=float(self._rate_hz[pad]),
+            samples=int(self._samples[pad]),
+            missed=int(self._pipeline.tick.missed[pad]),
+            age_s=(now_ns - sample_ns) * 1e-9 if sample_ns else None,
+            emergencies=tuple(str(emergency) for emergency in status.emergencies),
+            repeat=False,
+        )
+
+    def _service(self, now_ns: int, seq: int) -> wire.Service:
+        bit_rates = {bus.name: bus.bitrate_bit_s for bus in self._deployment.buses}
+        return wire.Service(
+            v=wire.SCHEMA_VERSION,
+            seq=seq,
+            t_ns=now_ns,
+            wall_offset_ns=time.time_ns() - time.monotonic_ns(),
+            version=__version__,
+            pid=os.getpid(),
+            uptime_s=(now_ns - self._started_ns) * 1e-9,
+            period_s=self._deployment.daemon.sync_period_ms * 1e-3,
+            hands={hand.name: [pad.link for pad in hand.pads] for hand in self._deployment.hands},
+            ticks=self._pipeline.ticks,
+            overruns=self.overruns,
+            rate_hz=self._speeds.get("ticks", 0.0),
+            tick_us=self._tick_us,
+            buses={
+                name: {
+                    "load": self._speeds.get(name, 0.0) / bit_rates[name],
+                    "problem": port.problem,
+                    **asdict(port.counters),
+                }
+                for name, port in self._ports.items()
+            },
+            drops=dict(self._publisher.drops),
+            subscriptions=tuple(
+                sorted(prefix.decode("utf-8", "replace") for prefix in self._publisher.subscriptions)
+            ),
+            repeat=False,
+        )
+
+    def _totals(self) -> NDArray[np.int64]:
+        return np.array([self._pipeline.ticks, *(port.counters.bits for port in self._ports.values())])
+
+
+class _Window:
+    """Rates of counters that only grow, over the time since the last look."""
+
+    def __init__(self, since_ns: int, totals: NDArray[np.int64]) -> None:
+        self.since_ns = since_ns
+        self._totals = totals
+
+    def per_second(self, now_ns: int, totals: NDArray[np.int64]) -> NDArray[np.float64]:
+        rates = (totals - self._totals).astype(np.float64) * (_SECOND_NS / max(1, now_ns - self.since_ns))
+        self.since_ns, self._totals = now_ns, totals.copy()
+        return rates
+
+
+def _summary(durations_ns: Iterable[int]) -> dict[str, float]:
+    microseconds = np.fromiter(durations_ns, dtype=np.float64) * 1e-3
+    if not len(microseconds):
+        return {}
+    median, p99, worst = np.percentile(microseconds, [50, 99, 100]).tolist()
+    return {"p50": median, "p99": p99, "max": worst}

@@ -1,0 +1,164 @@
+"""The tick: one vectorised pass from the slab of counts to contacts of the whole hand.
+
+counts -> currents -> which pads are touched -> locate and weigh only those -> place on the link -> follow
+contacts. Pure but for the state it keeps; time is an argument.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.canbus.slab import Slab
+from handtouch.daemon.contacts import BoolArray, Contacts, IntArray
+from handtouch.daemon.model import PadModel
+from handtouch.field.strength import Status
+from handtouch.wire import PadState
+
+FloatArray = NDArray[np.float64]
+_STALE_PERIODS = 3
+_RAIL = 32767
+"""A channel at either end of its range measures nothing."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What is known of each of n pads; a row keeps its last values while no newer ones are there."""
+
+    state: NDArray[np.uint8]
+    """PadState"""
+    sample_ns: NDArray[np.int64]
+    """SYNC that the newest sample belongs to, 0 before the first"""
+    current_a: FloatArray
+    """total current"""
+    xy: FloatArray
+    """(n, 2) location on the pad's rectangle"""
+    position_m: FloatArray
+    """(n, 3) in the link frame; NaN where there is no valid location"""
+    normal: FloatArray
+    """(n, 3)"""
+    covariance_m2: FloatArray
+    """(n, 3, 3)"""
+    pad_m: FloatArray
+    """(n, 2) arc lengths from the electrodes x0 and y0"""
+    force_n: FloatArray
+    """NaN where there is no valid strength, a lower bound where it is saturated"""
+    force_std_n: FloatArray
+    saturated: NDArray[np.bool_]
+    residual: FloatArray
+    residual_std: FloatArray
+    """of a point contact, from the noise of the channels"""
+
+    @classmethod
+    def of(cls, n: int) -> Columns:
+        """Columns of n pads of which nothing is known."""
+
+        def unknown(*shape: int) -> FloatArray:
+            return np.full((n, *shape), np.nan)
+
+        return cls(
+            state=np.full(n, PadState.STARTING, dtype=np.uint8),
+            sample_ns=np.zeros(n, dtype=np.int64),
+            current_a=np.zeros(n),
+            xy=unknown(2),
+            position_m=unknown(3),
+            normal=unknown(3),
+            covariance_m2=unknown(3, 3),
+            pad_m=unknown(2),
+            force_n=unknown(),
+            force_std_n=unknown(),
+            saturated=np.zeros(n, dtype=np.bool_),
+            residual=unknown(),
+            residual_std=unknown(),
+        )
+
+
+@dataclass(frozen=True)
+class Ticked:
+    """What one tick changed: rows of the columns."""
+
+    t_ns: int
+    began: IntArray
+    updated: IntArray
+    """contacts with a new sample that didn't just begin"""
+    ended: IntArray
+
+
+class Tick:
+    """State of all pads of a daemon from tick to tick."""
+
+    def __init__(self, model: PadModel, period_ns: int) -> None:
+        self.model = model
+        self.columns = Columns.of(model.size)
+        self.contacts = Contacts(model.begin_samples, model.end_samples)
+        self.missed = np.zeros(model.size, dtype=np.int64)
+        """ticks without a sample of a pad that was expected"""
+        self._stale_ns = _STALE_PERIODS * period_ns
+        self._currents = np.zeros((model.size, 4))
+
+    def expected(self) -> NDArray[np.bool_]:
+        """Pads whose sample a tick should wait for: those that are alive."""
+        return self.columns.state <= PadState.TOUCHED
+
+    def step(self, slab: Slab, node_state: NDArray[np.uint8], t_ns: int, now_ns: int) -> Ticked:
+        """Take in the samples of the SYNC at `t_ns`; `now_ns` is the time of the tick.
+
+        `node_state` (n,): PadState.CLEAR where the node is up, else what its pad is instead.
+        """
+        model, columns, contacts = self.model, self.columns, self.contacts
+        operational: BoolArray = np.equal(node_state, PadState.CLEAR)
+        sampled = (slab.fresh != 0) & operational
+        self.missed += self.expected() & operational & ~sampled
+        columns.sample_ns[sampled] = t_ns
+        railed: BoolArray = (np.abs(slab.counts.astype(np.int32)) >= _RAIL).any(axis=1)
+        stale = np.asarray(now_ns - columns.sample_ns > self._stale_ns)
+        trusted: BoolArray = operational & ~railed & ~stale
+        np.multiply(slab.counts, model.ampere_per_count[:, None], out=self._currents)
+        np.copyto(columns.current_a, self._currents.sum(axis=1), where=sampled)
+        below_off = columns.current_a < model.off_a
+        changes = contacts.step(sampled, columns.current_a > model.on_a, below_off, trusted, t_ns)
+        self._resolve_states(node_state, operational, railed, stale)
+        # a sample below the threshold tells no place: until it is known whether more follow, the last holds
+        touched = contacts.touching & sampled & ~below_off
+        if len(changes.began):
+            columns.xy[changes.began] = np.nan  # no use to start from where the last contact was
+        if touched.any():
+            self._solve(np.flatnonzero(touched))
+            touched[changes.began] = False
+        return Ticked(t_ns, changes.began, np.flatnonzero(touched), changes.ended)
+
+    def _resolve_states(
+        self,
+        node_state: NDArray[np.uint8],
+        operational: BoolArray,
+        railed: BoolArray,
+        stale: BoolArray,
+    ) -> None:
+        state = self.columns.state
+        np.copyto(state, node_state)
+        state[operational & self.contacts.touching] = PadState.TOUCHED
+        state[operational & railed] = PadState.FAULTED
+        state[operational & stale] = PadState.STALE
+
+    def _solve(self, touched: IntArray) -> None:
+        """Locate, place and weigh the contacts on the pads `touched`."""
+        model, columns = self.model, self.columns
+        currents = self._currents[touched].T
+        found = model.locator.estimate(touched, currents, model.noise_a[touched], columns.xy[touched].T)
+        columns.xy[touched, 0], columns.xy[touched, 1] = found.x, found.y
+        columns.residual[touched] = found.residual
+        columns.residual_std[touched] = np.abs(found.residual) / np.sqrt(found.chi_squared)
+        placed = model.placement.place(touched, found.x, found.y, found.covariance[:, :2, :2])
+        columns.position_m[touched] = placed.position_m
+        columns.normal[touched] = placed.normal
+        columns.covariance_m2[touched] = placed.covariance_m2
+        columns.pad_m[touched] = placed.pad_m
+        strength = model.force(touched, currents, found, placed)
+        known = strength.status <= Status.SATURATED
+        columns.force_n[touched] = np.where(known, strength.force_n, np.nan)
+        columns.force_std_n[touched] = strength.std_n
+        columns.saturated[touched] = strength.status == Status.SATURATED
+        peak = self.contacts.peak_n
+        peak[touched] = np.fmax(peak[touched], columns.force_n[touched])

@@ -1,0 +1,1 @@
+"""Watches over every sensor: what is wrong with a pad, and what helps."""

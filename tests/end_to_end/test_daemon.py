@@ -1,0 +1,279 @@
+"""The main job: a hand is touched, contacts appear on the wire; and what happens when things go wrong.
+
+The nodes (`handtouch simulate`), the daemon (`handtouch run`) and the subscriber are processes of their own
+that meet on a udp_multicast bus and on ZeroMQ.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+from handtouch import wire
+
+LONGEST_S = 20.0
+
+
+def _contacts(
+    rig: Any, enough: Callable[[list[wire.Contact]], bool], longest_s: float = LONGEST_S
+) -> list[wire.Contact]:
+    """Contacts as a subscriber gets them until there are enough."""
+    got: list[wire.Contact] = []
+    end_s = time.monotonic() + longest_s
+    with rig.subscribe("contact/*/*") as messages:
+        while not enough(got):
+            assert time.monotonic() < end_s, f"only {len(got)} contact messages\n{rig.all_printed()}"
+            message = messages.recv(0.1)
+            if message is not None:
+                got.append(message)
+        assert messages.gaps == 0
+        assert messages.malformed == 0
+    return got
+
+
+def _ends(count: int) -> Callable[[list[wire.Contact]], bool]:
+    return lambda contacts: sum(contact.event == "end" for contact in contacts) >= count
+
+
+def _row(status: dict[str, Any], link: str) -> dict[str, Any]:
+    return next(pad for pad in status["pads"] if pad["link"] == link)
+
+
+def _send(rig: Any, can_id: int, data: bytes) -> None:
+    """Put a frame on the rig's bus, as a stranger."""
+    port = int(rig.bus[0].split("port=")[1])
+    script = (
+        "import can, sys\n"
+        f"with can.Bus('239.74.163.2', interface='udp_multicast', port={port}) as bus:\n"
+        f"    bus.send(can.Message(arbitration_id={can_id}, data={data!r}, is_extended_id=False))\n"
+    )
+    subprocess.run([*rig.command()[:-2], "-c", script], check=True, timeout=LONGEST_S)
+
+
+def test_a_touch_is_published_where_and_as_hard_as_it_is(rig: Any) -> None:
+    truth_file = rig.folder / "truth.jsonl"
+    rig.start("simulate", "--truth", str(truth_file))
+    rig.start("run")
+    rig.wait_operational()
+    contacts = _contacts(rig, _ends(3))
+    rig.end("run")
+    assert rig.end("simulate") == 0
+
+    life: dict[int, list[wire.Contact]] = {}
+    for contact in contacts:
+        life.setdefault(contact.id, []).append(contact)
+    whole = [c for c in life.values() if c[0].event == "begin" and c[-1].event == "end"]
+    assert len(whole) >= 2
+    for messages in whole:
+        assert [c.event for c in messages[1:-1]] == ["update"] * (len(messages) - 2)
+        assert [c.seq for c in messages] == list(range(messages[0].seq, messages[0].seq + len(messages)))
+        assert messages[-1].reason == "released"
+        assert messages[-1].duration_s > 0
+        assert messages[-1].peak_force_n == pytest.approx(max(c.force_n or 0 for c in messages))
+
+    truth = {}
+    for text in truth_file.read_text().splitlines():
+        row = json.loads(text)
+        truth.setdefault(row["link"], []).append(row)
+    errors = []
+    for contact in contacts:
+        if contact.event == "end" or contact.position_m is None or contact.force_n is None:
+            continue
+        nearest = min(truth[contact.link], key=lambda row: abs(row["t_ns"] - contact.t_ns))
+        assert abs(nearest["t_ns"] - contact.t_ns) < 2.5e6
+        covariance = np.reshape(contact.covariance_m2, (3, 3))
+        errors.append(
+            np.linalg.norm(np.subtract(contact.position_m, nearest["position_m"]))
+            / math.sqrt(np.trace(covariance))
+        )
+        assert np.dot(contact.normal, nearest["normal"]) > 0.99
+        assert abs(contact.force_n - nearest["force_n"]) < 5 * (contact.force_std_n or 0)
+    assert len(errors) > 100
+    assert math.sqrt(np.mean(np.square(errors))) < 1.5  # the noise bound that each message states
+
+
+def test_asyncio_subscribers_get_the_same_contacts(rig: Any) -> None:
+    rig.start("simulate")
+    rig.start("run")
+    rig.wait_operational()
+
+    async def first(count: int) -> list[wire.Contact]:
+        got = []
+        with rig.subscribe("contact/*/*") as messages:
+            async for message in messages:
+                got.append(message)
+                if len(got) == count:
+                    break
+        return got
+
+    contacts = asyncio.run(asyncio.wait_for(first(20), LONGEST_S))
+    assert len({contact.seq for contact in contacts if contact.link == contacts[0].link}) > 1
+
+
+def test_a_frame_of_the_wrong_length_and_one_from_a_stranger_are_counted_and_dropped(rig: Any) -> None:
+    rig.start("simulate")
+    rig.start("run")
+    before = rig.wait_operational()["service"]["buses"]["can0"]
+    _send(rig, 0x280 + 0x11, b"\x01\x02\x03")
+    _send(rig, 0x280 + 0x7F, bytes(8))
+    rig.wait(
+        "counted",
+        lambda status: (
+            status["service"]["buses"]["can0"]["short"] == before["short"] + 1
+            and status["service"]["buses"]["can0"]["foreign"] == before["foreign"] + 1
+        ),
+    )
+
+
+def test_a_node_that_vanishes_is_stale_then_lost_and_comes_back_without_a_restart(rig: Any) -> None:
+    rig.start("simulate")
+    rig.start("run")
+    rig.wait_operational()
+    with rig.subscribe("health/*/*") as messages:
+        states: list[str] = []
+        end_s = time.monotonic() + LONGEST_S
+        rig.end("simulate", signal.SIGKILL)
+        while "lost" not in states:
+            assert time.monotonic() < end_s, states
+            message = messages.recv(0.1)
+            if message is not None and message.link == "thumb_distal" and message.state not in states[-1:]:
+                states.append(message.state)
+                reason = message.reason
+        assert states[-2:] == ["stale", "lost"]
+        assert "heartbeat" in reason
+    rig.start("simulate")
+    rig.wait_operational()
+    _contacts(rig, _ends(1))
+
+
+def test_missing_nodes_are_reported_and_the_rest_of_the_hand_works(rig: Any) -> None:
+    text = rig.config.read_text()
+    others = rig.folder / "fewer.toml"
+    cut = text.index('[[hand.pad]]\nlink = "thumb_middle"')
+    upto = text.index("[[hand.pad]]", cut + 10)
+    others.write_text(text[:cut] + text[upto:])
+    buses = [word for bus in rig.bus for word in ("--bus", bus)]
+    rig.processes["simulate"] = subprocess.Popen(
+        rig.command("simulate", str(others), *buses), stdout=subprocess.DEVNULL
+    )
+    rig.start("run")
+    status = rig.wait_operational(14)
+    missing = _row(status, "thumb_middle")
+    assert missing["state"] == "starting"
+    assert missing["node"] == "absent"
+    assert missing["reason"]
+    _contacts(rig, _ends(1))
+
+
+def test_a_subscriber_that_stalls_or_dies_is_noticed_by_nobody(rig: Any) -> None:
+    rig.start("simulate")
+    rig.start("run")
+    rig.wait_operational()
+    context = zmq.Context()
+    stalled = context.socket(zmq.SUB)
+    stalled.setsockopt(zmq.RCVHWM, 1)
+    stalled.setsockopt(zmq.RCVBUF, 1024)
+    stalled.subscribe("")
+    stalled.connect(rig.endpoints["live"])
+    dying = subprocess.Popen(
+        rig.command("watch", "--json", "--endpoint", rig.endpoints["live"], "contact/*/*", "hand/*"),
+        stdout=subprocess.DEVNULL,
+    )
+    contacts = _contacts(rig, _ends(1))
+    dying.kill()
+    dying.wait()
+    before = rig.status()["service"]
+    contacts += _contacts(rig, _ends(1))
+    after = rig.status()["service"]
+    assert after["overruns"] - before["overruns"] <= 2
+    assert after["rate_hz"] > 150
+    stalled.close(0)
+    context.term()
+    assert contacts
+
+
+def test_sigterm_ends_contacts_and_stops_the_configured_nodes(rig: Any) -> None:
+    rig.start("simulate")
+    rig.start("run")
+    rig.wait_operational()
+    with rig.subscribe("contact/*/*") as messages:
+        begun = next(message for message in messages if message.event == "begin")
+        assert rig.end("run") == 0
+        last = begun
+        while (message := messages.recv(1.0)) is not None:
+            if message.link == begun.link:
+                last = message
+        assert (last.event, last.reason) == ("end", "stopped")
+    assert "Traceback" not in rig.all_printed()
+    rig.start("run")  # which finds the nodes stopped, and wakes them
+    rig.wait_operational()
+
+
+def test_after_sigkill_a_restart_finds_the_nodes_running_and_does_not_reset_them(rig: Any) -> None:
+    rig.start("simulate")
+    rig.start("run")
+    rig.wait_operational()
+    rig.end("run", signal.SIGKILL)
+    for endpoint in rig.endpoints.values():
+        os.unlink(endpoint.removeprefix("ipc://")) if os.path.exists(
+            endpoint.removeprefix("ipc://")
+        ) else None
+    rig.start("run")
+    status = rig.wait_operational()
+    assert all(pad["emergencies"] == [] for pad in status["pads"])
+    _contacts(rig, _ends(1))
+
+
+def test_a_config_error_ends_the_start_with_status_2_before_the_bus_is_touched(rig: Any) -> None:
+    rig.config.write_text(rig.config.read_text().replace("gap_mm = 0.8", "gap_mm = 80.0", 1))
+    done = subprocess.run(
+        rig.command("run", str(rig.config), "--bus", "can0=no_such_interface:can9"),
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+    )
+    assert done.returncode == 2
+    assert "hand.toml" in done.stderr
+    assert "gap_mm = 80" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_bus_that_is_not_there_ends_the_start_with_status_1_and_a_remedy(rig: Any) -> None:
+    done = subprocess.run(
+        rig.command("run", str(rig.config), "--bus", "can0=socketcan:can77"),
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+    )
+    assert done.returncode == 1
+    assert "can77" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("request_bytes", [b"", b"\xc1", b"\x80", b"\x93\x01\x02\x03"])
+def test_a_malformed_request_gets_an_error_and_the_tick_goes_on(rig: Any, request_bytes: bytes) -> None:
+    import msgpack
+
+    rig.start("run")
+    rig.status()
+    with zmq.Context() as context, context.socket(zmq.REQ) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(rig.endpoints["control"])
+        socket.send(request_bytes)
+        assert socket.poll(5000)
+        answer = msgpack.unpackb(socket.recv())
+    assert answer["ok"] is False
+    assert answer["error"]
+    ticks = rig.status()["service"]["ticks"]
+    rig.wait("ticking on", lambda status: status["service"]["ticks"] > ticks)
