@@ -1,4 +1,4 @@
-"""Fixtures for tests of whole processes: endpoints, CAN buses and networks that no other test shares."""
+"""Fixtures for tests of whole processes: endpoints and networks of their own, an installation."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import os
 import shutil
 import socket
 import subprocess
+import sys
+import sysconfig
 import tempfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[1]
 _STREAMS = ("live", "complete", "control", "inputs")
 
 
@@ -75,3 +79,68 @@ def network() -> Iterator[list[str]]:
         user = ["--user", "--preserve-credentials"] if rootless else []
         yield ["nsenter", "--target", str(keeper.pid), *user, "--net", "--"]
         keeper.stdin.close()
+
+
+@dataclass(frozen=True)
+class Installation:
+    """handtouch as services/install.sh leaves it on a controller, with `root` in place of /."""
+
+    root: Path
+
+    @property
+    def prefix(self) -> Path:
+        """PREFIX of the installation."""
+        return self.root / "usr"
+
+    @property
+    def settings(self) -> Path:
+        """Its folder for /etc/handtouch."""
+        return self.root / "etc/handtouch"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Variables to run it with: the packages it depends on are those of the tests."""
+        return {**os.environ, "PYTHONPATH": sysconfig.get_path("purelib")}
+
+    def install(self, wheel: Path, *arguments: str, **variables: str) -> str:
+        """Run services/install.sh; what it says."""
+        environment = {
+            **os.environ,
+            "PREFIX": str(self.prefix),
+            "SYSCONFDIR": str(self.root / "etc"),
+            "WHEEL": str(wheel),
+            "PYTHON": sys.executable,
+            "PIP_ARGS": "--no-deps --no-index",
+            **variables,
+        }
+        script = [str(ROOT / "services/install.sh"), *arguments]
+        done = subprocess.run(script, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+
+@pytest.fixture(scope="session")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the source archive, and the wheel built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    done = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.fixture(scope="session")
+def wheel(archives: Path) -> Path:
+    """The wheel."""
+    (found,) = archives.glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="session")
+def installation(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    """handtouch installed, by way of a staging folder as a package is built. Read only: tests share it."""
+    folder = tmp_path_factory.mktemp("installed")
+    installed, stage = Installation(folder / "root"), folder / "stage"
+    installed.install(wheel, DESTDIR=str(stage))
+    Path(f"{stage}{installed.root}").rename(installed.root)
+    return installed

@@ -1,0 +1,102 @@
+#!/bin/sh
+# Install handtouch on a robot controller, or take it away:
+#
+#   services/install.sh [all]       the program, the systemd units, and a deployment to start from
+#   services/install.sh program     the program alone (containers)
+#   services/install.sh uninstall   all of it but /etc/handtouch
+#
+# The program lives in a virtual environment of its own, PREFIX/lib/handtouch; PREFIX/bin/handtouch leads to it. Running
+# it again brings it up to date; files in SYSCONFDIR/handtouch that are there already stay as they are.
+#
+#   PREFIX      /usr/local      where programs and units go
+#   SYSCONFDIR  /etc            where deployments go
+#   DESTDIR     (empty)         put before both, to stage an image or a package
+#   WHEEL       (this source)   handtouch wheel to install
+#   PYTHON      python3         interpreter, 3.11 or later
+#   PIP_ARGS    (empty)         further arguments of pip install, e.g. --no-index --find-links /media/wheels
+set -eu
+
+here=$(cd "$(dirname "$0")" && pwd)
+PREFIX=${PREFIX:-/usr/local}
+SYSCONFDIR=${SYSCONFDIR:-/etc}
+DESTDIR=${DESTDIR:-}
+WHEEL=${WHEEL:-$here/..}
+PYTHON=${PYTHON:-python3}
+
+venv=$PREFIX/lib/handtouch
+units=$PREFIX/lib/systemd/system
+settings=$SYSCONFDIR/handtouch
+
+install_program() {
+  "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+    { echo "install.sh: $PYTHON is older than 3.11; set PYTHON to a later one" >&2; exit 1; }
+  "$PYTHON" -m venv "$DESTDIR$venv"
+  # shellcheck disable=SC2086  # PIP_ARGS is a list of words
+  pip_install() { "$DESTDIR$venv/bin/python" -m pip install --quiet --disable-pip-version-check ${PIP_ARGS:-} "$@"; }
+  pip_install --constraint "$here/../requirements.lock" "$WHEEL"
+  pip_install --no-deps --force-reinstall "$WHEEL" # the same version again, changed
+  if [ -n "$DESTDIR" ]; then # scripts name the environment by its path at the time
+    for script in "$DESTDIR$venv"/bin/*; do
+      [ -L "$script" ] || sed -i "s|$DESTDIR$venv|$venv|g" "$script"
+    done
+  fi
+  mkdir -p "$DESTDIR$PREFIX/bin"
+  ln -sf "../lib/handtouch/bin/handtouch" "$DESTDIR$PREFIX/bin/handtouch"
+}
+
+install_services() {
+  mkdir -p "$DESTDIR$units" "$DESTDIR$PREFIX/lib/sysctl.d" "$DESTDIR$settings"
+  for unit in handtouch@.service handtouch-can@.service; do
+    sed -e "s|@VENV@|$venv|g" -e "s|@SYSCONFDIR@|$SYSCONFDIR|g" "$here/$unit" >"$DESTDIR$units/$unit"
+  done
+  cp "$here/sysctl.conf" "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf"
+  cp "$here/../config/handtouch.schema.json" "$DESTDIR$settings/"
+  keep "$here/../config/utah_mit.toml" hand.toml
+  keep "$here/environment" environment
+  keep "$here/can0.env" can0.env
+}
+
+keep() { # copy a file that the owner edits, unless it is there
+  [ -e "$DESTDIR$settings/$2" ] || cp "$1" "$DESTDIR$settings/$2"
+}
+
+uninstall() {
+  rm -rf "$DESTDIR$venv"
+  rm -f "$DESTDIR$PREFIX/bin/handtouch" "$DESTDIR$units/handtouch@.service" "$DESTDIR$units/handtouch-can@.service" \
+    "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf"
+}
+
+reload() {
+  ! on_this_machine || systemctl daemon-reload
+  ! on_this_machine || systemctl try-restart systemd-sysctl.service
+}
+
+on_this_machine() { # is this where a running systemd looks, and may we tell it
+  [ -z "$DESTDIR" ] && { [ "$PREFIX" = /usr/local ] || [ "$PREFIX" = /usr ]; } &&
+    [ "$(id -u)" = 0 ] && [ -d /run/systemd/system ]
+}
+
+case ${1:-all} in
+all)
+  install_program
+  install_services
+  reload
+  echo "Edit $settings/hand.toml, look it over with \`handtouch check\` and \`handtouch doctor\`, then:"
+  echo "  systemctl enable --now handtouch-can@can0 handtouch@hand"
+  ;;
+program) install_program ;;
+uninstall)
+  if on_this_machine; then
+    for unit in $(systemctl list-units --all --plain --no-legend 'handtouch@*' 'handtouch-can@*' | cut -d' ' -f1); do
+      systemctl disable --now "$unit"
+    done
+  fi
+  uninstall
+  reload
+  echo "$settings is left as it is"
+  ;;
+*)
+  sed -n '2,/^set/s/^#\( \|$\)//p' "$0"
+  exit 2
+  ;;
+esac

@@ -1,0 +1,172 @@
+"""The image and the compose file, as far as they can be checked without an engine."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from handtouch.cli import build_parser
+
+from .conftest import ROOT, Installation
+
+COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker/compose.yaml").read_text())
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+
+
+def stages() -> list[list[tuple[str, str]]]:
+    """Instructions of the Dockerfile, by stage; what stands before the first FROM is left out."""
+    text = (ROOT / "docker/Dockerfile").read_text().replace("\\\n", " ")
+    found: list[list[tuple[str, str]]] = []
+    for line in text.splitlines():
+        name, _, rest = line.strip().partition(" ")
+        if name == "FROM":
+            found.append([])
+        if found and name and not name.startswith("#"):
+            found[-1].append((name, rest.strip()))
+    return found
+
+
+def ignored(path: str) -> bool:
+    """Whether the build context leaves a path out; the last rule that fits decides."""
+    verdict = False
+    for line in (ROOT / "docker/Dockerfile.dockerignore").read_text().splitlines():
+        rule = line.removeprefix("!")
+        if line and not line.startswith("#"):
+            parts = [str(parent) for parent in (Path(path), *Path(path).parents)]
+            if any(fnmatch.fnmatch(part, rule) for part in parts):
+                verdict = not line.startswith("!")
+    return verdict
+
+
+def copies() -> list[str]:
+    """Sources of every COPY from the build context."""
+    lines = [rest.split() for stage in stages() for name, rest in stage if name == "COPY"]
+    return [source for words in lines if not words[0].startswith("--from") for source in words[:-1]]
+
+
+def test_every_copied_file_exists_and_reaches_the_build() -> None:
+    assert copies()
+    for source in copies():
+        assert (ROOT / source).exists(), source
+        assert not ignored(source), source
+    assert ignored(".venv")
+    assert ignored("tests")
+
+
+def test_the_image_is_slim_and_not_run_by_root() -> None:
+    build, final = stages()
+    assert all(stage[0][1].split()[0].endswith("-slim") for stage in (build, final))
+    users = [rest for name, rest in final if name == "USER"]
+    assert users
+    assert int(users[-1].split(":")[0]) > 0
+    assert [name for name, _ in final].index("USER") > max(
+        index for index, (name, _) in enumerate(final) if name in ("RUN", "COPY")
+    )
+
+
+def test_the_image_installs_as_a_controller_does(wheel: Path, tmp_path: Path) -> None:
+    """Lays out what COPY brings, runs what RUN says, in a folder in place of /."""
+    _, final = stages()
+    (run,) = [rest for name, rest in final if name == "RUN"]
+    for name, rest in final:
+        words = rest.split()
+        if name == "COPY":
+            sources = [wheel] if words[0].startswith("--from") else [ROOT / word for word in words[:-1]]
+            for source in sources:
+                place = tmp_path / words[-1].lstrip("/")
+                place = place / source.name if words[-1].endswith(("/", "wheels")) else place
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(source, place)
+    assert "services/install.sh program" in run
+    offline = run.replace("PIP_ARGS=--no-cache-dir", "PIP_ARGS='--no-cache-dir --no-deps --no-index'")
+    assert offline != run
+    environment = {**os.environ, "PREFIX": f"{tmp_path}/usr", "PYTHON": sys.executable}
+    script = offline.replace("/install", f"{tmp_path}/install").replace(
+        f"services{tmp_path}/install", "services/install"
+    )
+    done = subprocess.run(["sh", "-ec", script], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "usr/bin/handtouch").exists()
+    assert (tmp_path / "etc/handtouch/hand.toml").exists()
+    assert not (tmp_path / "install").exists()
+
+
+def test_every_command_is_one_of_handtouch() -> None:
+    parser = build_parser()
+    default = next(rest for name, rest in stages()[-1] if name == "CMD")
+    commands = [yaml.safe_load(default), *(service["command"] for service in SERVICES.values())]
+    health = SERVICES["daemon"]["healthcheck"]["test"]
+    assert health[:2] == ["CMD", "handtouch"]
+    for words in [*commands, health[2:]]:
+        parser.parse_args(words)  # leaves with SystemExit if it isn't
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_a_service_has_no_privileges(name: str) -> None:
+    service = SERVICES[name]
+    assert (service["read_only"], service["cap_drop"]) == (True, ["ALL"])
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert "privileged" not in service
+
+
+def test_the_services_share_one_network_and_one_bus() -> None:
+    assert {name: service.get("network_mode") for name, service in SERVICES.items()} == {
+        "daemon": None,
+        "hand": "service:daemon",
+        "watch": "service:daemon",
+    }
+    buses = {name: SERVICES[name]["command"][-2:] for name in ("daemon", "hand")}
+    assert buses["daemon"] == buses["hand"]
+    assert shlex.join(buses["hand"]).startswith("--bus can0=udp_multicast:239.")
+
+
+def test_the_build_finds_its_dockerfile() -> None:
+    build = SERVICES["daemon"]["build"]
+    context = (ROOT / "docker" / build["context"]).resolve()
+    assert context == ROOT
+    assert (context / build["dockerfile"]).is_file()
+
+
+def test_the_composed_processes_find_one_another(
+    installation: Installation, network: list[str], tmp_path: Path
+) -> None:
+    """Starts what compose.yaml starts, in one network and without containers, until the daemon is healthy."""
+
+    def command(words: list[str]) -> list[str]:
+        settings = str(installation.settings)
+        return [*network, program, *(word.replace("/etc/handtouch", settings) for word in words)]
+
+    program = str(installation.prefix / "bin/handtouch")
+    healthy = command(SERVICES["daemon"]["healthcheck"]["test"][2:])
+    output = (tmp_path / "watched").open("w")
+    running: list[subprocess.Popen[bytes]] = []
+    with ExitStack() as stack:
+        stack.enter_context(output)
+        for name in ("daemon", "hand", "watch"):
+            process = subprocess.Popen(
+                command(SERVICES[name]["command"]), env=installation.environment, stdout=output
+            )
+            running.append(process)
+            stack.callback(process.wait, 15)
+            stack.callback(process.terminate)
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and all(process.poll() is None for process in running):
+            asked = subprocess.run(
+                healthy, env=installation.environment, capture_output=True, text=True, check=False
+            )
+            if asked.returncode == 0:
+                break
+            time.sleep(0.25)
+        assert [process.poll() for process in running] == [None, None, None], "one of them ended"
+        assert asked.returncode == 0, asked.stdout + asked.stderr

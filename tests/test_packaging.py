@@ -1,0 +1,129 @@
+"""What users download is whole: the wheel comes from the source archive, installs, and finds its files."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tarfile
+import time
+import tomllib
+import zipfile
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import handtouch
+
+from .conftest import ROOT, Installation
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def pins() -> dict[str, list[str]]:
+    """Versions in requirements.lock by package."""
+    found: dict[str, list[str]] = {}
+    for line in (ROOT / "requirements.lock").read_text().splitlines():
+        requirement = Requirement(line)
+        found.setdefault(canonicalize_name(requirement.name), []).append(str(requirement.specifier)[2:])
+    return found
+
+
+def test_the_source_archive_holds_what_building_and_testing_need(archives: Path) -> None:
+    (archive,) = archives.glob("*.tar.gz")
+    with tarfile.open(archive) as opened:
+        names = {name.partition("/")[2] for name in opened.getnames()}
+    assert {
+        "pyproject.toml",
+        "requirements.lock",
+        "Makefile",
+        "README.md",
+        "LICENSE",
+        "CHANGELOG.md",
+        "config/utah_mit.toml",
+        "services/install.sh",
+        "docker/Dockerfile",
+        "tests/socketcan/vcan-run",
+        "src/handtouch/py.typed",
+    } <= names
+    assert not [name for name in names if name.startswith((".venv", ".git/", "dist/"))]
+
+
+def test_the_wheel_holds_the_package_and_its_files_alone(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as opened:
+        names = set(opened.namelist())
+    shipped = {f"handtouch/shipped_files/{path.name}" for path in (ROOT / "config").glob("*.*")}
+    assert {"handtouch/cli.py", "handtouch/py.typed"} | shipped <= names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"handtouch"}
+
+
+def test_the_version_is_the_same_everywhere(wheel: Path) -> None:
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    newest = re.search(r"^## (\S+)", changes, re.MULTILINE)
+    assert newest is not None
+    assert {PROJECT["version"], newest[1], wheel.name.split("-")[1]} == {handtouch.__version__}
+
+
+def test_every_requirement_has_a_pin_that_satisfies_it() -> None:
+    extras = [item for extra in PROJECT["optional-dependencies"].values() for item in extra]
+    pinned = pins()
+    for text in [*PROJECT["dependencies"], *extras]:
+        requirement = Requirement(text)
+        name = canonicalize_name(requirement.name)
+        if name != "handtouch":
+            assert name in pinned, f"{name} is not in requirements.lock: run `make lock`"
+            assert all(requirement.specifier.contains(version) for version in pinned[name]), name
+
+
+def test_the_lock_names_no_place_to_download_from() -> None:
+    assert not re.search(r"://|^-", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
+
+
+def test_the_installed_program_helps_at_once(installation: Installation) -> None:
+    times_s = []
+    for _ in range(3):
+        start = time.perf_counter()
+        done = subprocess.run(
+            [installation.prefix / "bin/handtouch", "--help"],
+            env=installation.environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        times_s.append(time.perf_counter() - start)
+    assert "run" in done.stdout
+    assert "doctor" in done.stdout
+    assert min(times_s) < 1.0  # 0.1 s, where nothing else runs
+
+
+def test_help_loads_no_numerical_package(installation: Installation) -> None:
+    code = "import sys, handtouch.cli as cli; cli.build_parser().format_help(); print(*sys.modules)"
+    done = subprocess.run(
+        [installation.prefix / "lib/handtouch/bin/python", "-c", code],
+        env=installation.environment,
+        cwd="/",
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert not {"numpy", "scipy", "can", "zmq", "pydantic"} & set(done.stdout.split())
+
+
+def test_the_installed_program_finds_its_files(installation: Installation) -> None:
+    code = (
+        "from handtouch import config, shipped\n"
+        "path = shipped.path('utah_mit.toml')\n"
+        "print(path, len(config.load(path).hands[0].pads))"
+    )
+    done = subprocess.run(
+        [installation.prefix / "lib/handtouch/bin/python", "-c", code],
+        env=installation.environment,
+        cwd="/",
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    path, pads = done.stdout.split()
+    assert Path(path).is_relative_to(installation.root)
+    assert pads == "15"

@@ -1,0 +1,135 @@
+"""The services as installed: systemd accepts them, they restart when they should, and serve a deployment."""
+
+from __future__ import annotations
+
+import configparser
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from .conftest import ROOT, Installation
+
+UNITS = ("handtouch@.service", "handtouch-can@.service")
+
+
+def unit(installation: Installation, name: str) -> configparser.ConfigParser:
+    """A unit file as installed; of settings given twice the last counts."""
+    parser = configparser.ConfigParser(strict=False, interpolation=None, delimiters=["="])
+    parser.optionxform = str  # type: ignore[assignment, method-assign]  # the documented way
+    parser.read(installation.prefix / "lib/systemd/system" / name)
+    return parser
+
+
+def command(installation: Installation, deployment: str, options: str = "") -> list[str]:
+    """ExecStart of the daemon for a deployment, as systemd would expand it."""
+    line = unit(installation, UNITS[0])["Service"]["ExecStart"]
+    return shlex.split(line.replace("%i", deployment).replace("$HANDTOUCH_RUN_OPTIONS", options))
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_systemd_has_nothing_to_say(installation: Installation, name: str) -> None:
+    if shutil.which("systemd-analyze") is None:
+        assert os.environ.get("CI") != "true", "CI needs systemd-analyze"
+        pytest.skip("systemd-analyze is missing (Debian package systemd)")
+    path = installation.prefix / "lib/systemd/system" / name
+    done = subprocess.run(
+        ["systemd-analyze", "verify", str(path)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_no_path_of_the_stage_and_no_placeholder_is_left(installation: Installation) -> None:
+    scripts = (installation.prefix / "lib/handtouch/bin").iterdir()
+    units = (installation.prefix / "lib/systemd/system").iterdir()
+    for path in [*scripts, *units]:
+        if not path.is_symlink():
+            assert "/stage/" not in path.read_text(), path
+            assert not re.search("@[A-Z]+@", path.read_text()), path
+
+
+def test_a_stalled_or_failed_daemon_restarts_and_a_wrong_deployment_does_not(
+    installation: Installation,
+) -> None:
+    service = unit(installation, UNITS[0])["Service"]
+    assert (service["Type"], service["Restart"], service["WatchdogSec"]) == ("notify", "on-failure", "2")
+    assert service["RestartPreventExitStatus"] == "2"
+    assert unit(installation, UNITS[0])["Unit"]["StartLimitIntervalSec"] == "0"
+
+
+def test_a_wrong_deployment_ends_the_service_with_status_2(installation: Installation) -> None:
+    done = subprocess.run(
+        command(installation, "missing"),
+        env=installation.environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "missing.toml: the file: No such file" in done.stderr
+
+
+def test_the_service_reports_ready_feeds_its_watchdog_and_stops(
+    installation: Installation, network: list[str], tmp_path: Path, free_port: int
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(30)
+        environment = {
+            **installation.environment,
+            "NOTIFY_SOCKET": str(tmp_path / "notify"),
+            "WATCHDOG_USEC": "2000000",
+        }
+        run = command(installation, "hand", f"--bus can0=udp_multicast:239.74.163.2:{free_port}")
+        with subprocess.Popen([*network, *run], env=environment) as daemon:
+            try:
+                heard = ""
+                while "READY=1" not in heard or heard.count("WATCHDOG=1") < 2:
+                    heard += systemd.recv(4096).decode() + "\n"
+                assert heard.index("READY=1") < heard.rindex("WATCHDOG=1")
+                start = time.monotonic()
+                daemon.send_signal(signal.SIGTERM)
+                assert daemon.wait(10) == 0
+                assert time.monotonic() - start < 10
+            finally:
+                daemon.kill()
+
+
+def test_installing_again_keeps_what_the_owner_edited(installation: Installation, wheel: Path) -> None:
+    deployment = installation.settings / "hand.toml"
+    original = deployment.read_text()
+    edited = original.replace('name = "right"', 'name = "left"')
+    deployment.write_text(edited)
+    try:
+        installation.install(wheel)
+        assert deployment.read_text() == edited
+    finally:
+        deployment.write_text(original)
+
+
+def test_uninstalling_leaves_the_settings_alone(tmp_path: Path, wheel: Path) -> None:
+    fresh = Installation(tmp_path)
+    for path in ("usr/lib/handtouch/bin/python", "usr/bin/handtouch", "etc/handtouch/hand.toml"):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).touch()
+    for name in (*UNITS, "other.service"):
+        (tmp_path / "usr/lib/systemd/system").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "usr/lib/systemd/system" / name).touch()
+    fresh.install(wheel, "uninstall")
+    left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
+    assert left == ["etc/handtouch/hand.toml", "usr/lib/systemd/system/other.service"]
+
+
+@pytest.mark.parametrize("script", ["services/install.sh", ".ci/run"])
+def test_a_shell_script_is_one(script: str) -> None:
+    if not (ROOT / script).exists():
+        pytest.skip("not in the source archive")
+    subprocess.run(["sh", "-n", str(ROOT / script)], check=True)
