@@ -167,6 +167,7 @@ def test_resistors_obey_ohm(gap: float, series: list[float], s: float, t: float)
     )
     lift = ideal @ (np.array(series) * measured)
     assert pad.series_resistance(s * 1.3, t) == pytest.approx(lift, rel=1e-10, abs=1e-9)
+    assert measured @ pad.series_form @ measured == pytest.approx(lift, rel=1e-10, abs=1e-9)
 
 
 def test_switching_resistors_is_building_with_them() -> None:

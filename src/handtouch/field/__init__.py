@@ -5,11 +5,14 @@ from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.model import ForwardModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.rectangle import Location, Rectangle
+from handtouch.field.sandwich import Sandwich, SandwichStrength
+from handtouch.field.strength import ContactLaw, Status, Strength, contact_stack_resistance
 from handtouch.field.surface import Anisotropic, Cone, Cylinder, Plane, Prism, Revolution, Sphere, Surface
 
 __all__ = [
     "Anisotropic",
     "Cone",
+    "ContactLaw",
     "Cylinder",
     "Electrode",
     "ElectrodeNetwork",
@@ -21,7 +24,12 @@ __all__ = [
     "Prism",
     "Rectangle",
     "Revolution",
+    "Sandwich",
+    "SandwichStrength",
     "Sphere",
+    "Status",
+    "Strength",
     "Surface",
+    "contact_stack_resistance",
     "estimate",
 ]

@@ -150,6 +150,18 @@ class ElectrodeNetwork:
         ideal = self.ideal_fractions(x, y)
         return np.asarray(np.einsum("i...,ij,j...->...", ideal, self._lift, ideal))
 
+    @property
+    def series_form(self) -> FloatArray:
+        """What `series_resistance` is of measured fractions f: f @ series_form @ f [ohm], shape (m, m).
+
+        Raises ValueError where an electrode floats: its voltage does not follow from the currents.
+        """
+        if self._unmix is None:
+            raise ValueError(
+                "series_ohm: the voltage of a floating electrode does not follow from the currents"
+            )
+        return np.asarray(self._unmix.T * np.asarray(self.series_ohm))
+
     def locate(self, currents: npt.ArrayLike) -> Location:
         """The point contact that sends `currents` (m, ...), the exact inverse of `currents`.
 
