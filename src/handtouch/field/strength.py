@@ -186,20 +186,14 @@ class ContactLaw:
             log_radius = terms.log_radius - terms.growth * log_sheet
             spread = np.log(np.asarray(spreading_radius_m, np.float64)) - log_radius
             resistors = per_sheet * np.asarray(series_ohm, np.float64)
-            if self.hertz_n is None:
-                spread = np.maximum(spread, _LEAST_SPREAD)
-                least = (1 / NEAR_LIMIT - 1) * (spread + resistors)
-            else:
-                least = (
-                    stack_factor(np.exp((spread - _LEAST_SPREAD) / (2 * terms.growth)))
-                    - spread
-                    + _LEAST_SPREAD
-                )
+            spread, least = self._least_stack(spread, resistors)
             effective = np.maximum(np.maximum(current, noise), _NO_CURRENT)
             whole = per_sheet * np.asarray(drive_v, np.float64) / effective
             stack = whole - resistors - spread
             variance = (whole * noise / effective) ** 2 + np.asarray(spreading_std, np.float64) ** 2
-            doubt = SURE * np.sqrt(variance + terms.radius_weight**2 * terms.radius_variance)
+            # the bound belongs to the current less its noise: stack goes as its inverse
+            skew = effective / np.maximum(effective - SURE * noise, 0.1 * effective)
+            doubt = SURE * np.sqrt(skew**2 * variance + terms.radius_weight**2 * terms.radius_variance)
             saturated = stack - doubt <= least
             log_x2, slope = stack_inverse(terms.growth)(
                 np.where(saturated, np.maximum(stack + doubt, least), stack)
@@ -218,16 +212,21 @@ class ContactLaw:
                 np.exp(log_radius + terms.growth * log_x2),
             )
 
+    def _least_stack(self, spread: FloatArray, resistors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """ln(R / A) at x = 1, held off the edge, and the least stack factor that still tells a force."""
+        if self.hertz_n is None:
+            spread = np.maximum(spread, _LEAST_SPREAD)
+            return spread, (1 / NEAR_LIMIT - 1) * (spread + resistors)
+        beyond = spread - _LEAST_SPREAD
+        return spread, stack_factor(np.exp(beyond / (2 * self._terms.growth))) - beyond
+
     @cached_property
     def _terms(self) -> _Terms:
         layer, alpha, radius, spread, reference = (
             np.asarray(getattr(self, name), np.float64) for name in _COLUMNS
         )
-        log_k, log_s, variance = (
-            np.log(layer) + alpha * np.log(reference),
-            np.log(radius),
-            (spread / radius) ** 2,
-        )
+        log_k, log_s = np.log(layer) + alpha * np.log(reference), np.log(radius)
+        variance = (spread / radius) ** 2
         if self.hertz_n is None:
             offset = np.log(np.pi) + 2 * log_s + (log_k - 2 * log_s) / alpha
             return _Terms(1 / alpha, 0.0, offset, log_s, variance, np.ones_like(alpha), 2 - 2 / alpha)
