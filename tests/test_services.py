@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import contextlib
 import os
 import re
 import shlex
@@ -82,7 +83,7 @@ def test_the_service_reports_ready_feeds_its_watchdog_and_stops(
 ) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
-        systemd.settimeout(30)
+        systemd.settimeout(0.5)
         environment = {
             **installation.environment,
             "NOTIFY_SOCKET": str(tmp_path / "notify"),
@@ -92,8 +93,12 @@ def test_the_service_reports_ready_feeds_its_watchdog_and_stops(
         with subprocess.Popen([*network, *run], env=environment) as daemon:
             try:
                 heard = ""
+                deadline = time.monotonic() + 60
                 while "READY=1" not in heard or heard.count("WATCHDOG=1") < 2:
-                    heard += systemd.recv(4096).decode() + "\n"
+                    assert daemon.poll() is None, "it ended"
+                    assert time.monotonic() < deadline, heard
+                    with contextlib.suppress(TimeoutError):
+                        heard += systemd.recv(4096).decode() + "\n"
                 assert heard.index("READY=1") < heard.rindex("WATCHDOG=1")
                 start = time.monotonic()
                 daemon.send_signal(signal.SIGTERM)
