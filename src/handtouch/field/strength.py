@@ -190,11 +190,11 @@ class ContactLaw:
             effective = np.maximum(np.maximum(current, noise), _NO_CURRENT)
             whole = per_sheet * np.asarray(drive_v, np.float64) / effective
             stack = whole - resistors - spread
-            variance = (whole * noise / effective) ** 2 + np.asarray(spreading_std, np.float64) ** 2
-            # the bound belongs to the current less its noise: stack goes as its inverse
-            skew = effective / np.maximum(effective - SURE * noise, 0.1 * effective)
-            doubt = SURE * np.sqrt(skew**2 * variance + terms.radius_weight**2 * terms.radius_variance)
+            ratio = noise / effective
+            variance = (whole * ratio) ** 2 + np.asarray(spreading_std, np.float64) ** 2
+            doubt = SURE * np.sqrt(variance + terms.radius_weight**2 * terms.radius_variance)
             saturated = stack - doubt <= least
+            doubt = doubt / np.maximum(1 - SURE * ratio, 0.1)  # the stack goes as the inverse of the current
             log_x2, slope = stack_inverse(terms.growth)(
                 np.where(saturated, np.maximum(stack + doubt, least), stack)
             )
