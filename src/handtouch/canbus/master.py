@@ -133,9 +133,12 @@ class Master:
         self.poll(t_ns)
 
     def handle(self, bus_name: str, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take a frame that was no sample. What no configured node sends is counted as foreign."""
+        """Take a frame that was no sample. What no configured node sends is counted as foreign.
+
+        Before `start` and after `stop` nothing but that is done with it.
+        """
         owner = self._owners[bus_name][can_id]
-        if owner >= 0:
+        if owner >= 0 and self._worker is not None:
             self._from_node(self._nodes[owner], can_id & 0x780, data, t_ns)
         elif owner == _FOREIGN:
             self._ports[bus_name].counters.foreign += 1
@@ -144,6 +147,8 @@ class Master:
 
     def poll(self, t_ns: int) -> None:
         """Time-outs, retries and results of the worker; once a tick, after `drain` and `handle`."""
+        if self._worker is None:
+            return
         if self._results:
             self._collect(t_ns)
         self._watch_samples(t_ns)

@@ -1,0 +1,205 @@
+"""A hand of simulated nodes and the master in one thread, on a bus and a clock of the test's own."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch.canbus import boot, master
+from handtouch.canbus.device import Device, DeviceBus
+from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.master import Master, NodeEvent, NodeSpec, NodeStatus
+from handtouch.canbus.port import Port
+from handtouch.canbus.router import Frame, Router
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
+
+MS = 1_000_000
+SYNC_PERIOD_MS = 5
+
+
+class Jobs:
+    """The master's worker, whose jobs are done when `work` is called, in that thread."""
+
+    def __init__(self, **_: object) -> None:
+        self.waiting: deque[tuple[Callable[..., None], tuple[object, ...]]] = deque()
+
+    def submit(self, job: Callable[..., None], *arguments: object) -> None:
+        self.waiting.append((job, arguments))
+
+    def work(self) -> None:
+        for _ in range(len(self.waiting)):
+            job, arguments = self.waiting.popleft()
+            job(*arguments)
+
+    def shutdown(self, **_: object) -> None:
+        self.waiting.clear()
+
+
+class Wire:
+    """The bus between them: `DeviceBus` takes it for python-can's, `Port` for a receiver."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.problem = ""
+        self.to_master: deque[can.Message] = deque()
+        self.sent: list[tuple[int, bytes]] = []  # by the master
+        self.down = False
+        self.cut: set[int] = set()  # node ids whose cable is out
+        self._rig = rig
+
+    # the devices' side
+    def recv(self, timeout: float | None = None) -> None:
+        """Nothing: frames are brought to the devices when they are sent."""
+
+    def send(self, *frame: Any) -> None:
+        if len(frame) == 1:
+            if frame[0].arbitration_id & 0x7F not in self.cut:
+                self.to_master.append(_copy(frame[0]))
+        else:
+            self._from_master(*frame)
+
+    # the port's side
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def drain(self, router: Router) -> list[Frame]:
+        others = []
+        while self.to_master:
+            frame = router.accept_message(self.to_master.popleft(), self._rig.t_ns)
+            if frame is not None:
+                others.append(frame)
+        return others
+
+    def _from_master(self, can_id: int, data: bytes) -> None:
+        if self.down:
+            raise OSError("network is down")
+        self.sent.append((can_id, data))
+        if (data[1] if can_id == 0 else can_id & 0x7F) in self.cut:
+            return
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        self._rig.devices.handle(message, self._rig.t_ns)
+        if can_id > 0x600:
+            self._answer(can_id - 0x80)
+
+    def _answer(self, can_id: int) -> None:
+        """Bring the answers to an SDO request to the job that waits for them; those to a probe stay."""
+        sdo = self._rig.master._nodes[can_id - 0x581].sdo
+        if not sdo.waiting:
+            return
+        for message in [m for m in self.to_master if m.arbitration_id == can_id]:
+            self.to_master.remove(message)
+            sdo.deliver(bytes(message.data))
+
+
+class Rig:
+    """Nodes 1 to n in slots 0 to n - 1, the master, and time that passes when it is told to."""
+
+    def __init__(self, size: int = 3, **spec: Any) -> None:
+        self.t_ns = 1_000_000 * MS
+        self.size = size
+        self.counts = np.tile(np.array([10, 20, 30, 40], dtype=np.int16), (size, 1))
+        self.wire = Wire(self)
+        self.devices = DeviceBus(self.wire, self._sample, clock=lambda: self.t_ns)  # type: ignore[arg-type]
+        for number in range(1, size + 1):
+            self.devices.add(number, serial=100 + number)
+        self.slab = Slab(size)
+        self.port = Port(Bus(name="can", interface="virtual", channel="rig"), self.wire, self.slab)
+        self.specs = [self.spec(number, **spec) for number in range(1, size + 1)]
+        self.syncs = True
+        self.restart()
+
+    def restart(self) -> None:
+        """A new master, as after a restart of the daemon."""
+        self.master = Master({"can": self.port}, self.specs, SYNC_PERIOD_MS * MS)
+
+    def spec(self, number: int, **changes: Any) -> NodeSpec:
+        spec = NodeSpec(slot=number - 1, bus="can", node_id=number, name=f"pad{number}")
+        return replace(spec, **changes)
+
+    def node(self, number: int) -> Device:
+        return self.devices.devices[number]
+
+    def state(self, number: int) -> NodeState:
+        return NodeState(self.master.states[number - 1])
+
+    def status(self, number: int) -> NodeStatus:
+        return self.master.status()[number - 1]
+
+    def plug_all(self) -> None:
+        for device in self.devices.devices.values():
+            device.plug()
+
+    def start(self) -> None:
+        self.master.start(self.t_ns)
+
+    def boot(self) -> None:
+        """From power-up to a hand that is operational."""
+        self.plug_all()
+        self.start()
+        self.run(300)
+        assert (self.master.states == NodeState.OPERATIONAL).all(), self.master.status()
+        self.master.take_events()
+        self.wire.sent.clear()
+
+    def run(self, ms: int) -> list[NodeEvent]:
+        """Let time pass, in steps of a millisecond; what happened in the nodes' lives."""
+        for _ in range(ms):
+            self.t_ns += MS
+            if self.syncs and self.t_ns // MS % SYNC_PERIOD_MS == 0:
+                self.port.send(0x80, b"")
+            self.devices.advance(self.t_ns)
+            self.pump()
+            self.master.poll(self.t_ns)
+            if isinstance(self.master._worker, Jobs):
+                self.master._worker.work()
+        return self.master.take_events()
+
+    def pump(self) -> None:
+        for frame in self.port.drain():
+            self.master.handle("can", *frame)
+
+    def inject(self, can_id: int, data: bytes) -> None:
+        """A frame from somebody else."""
+        self.wire.to_master.append(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        self.pump()
+
+    def _sample(self, t_ns: int) -> NDArray[np.int16]:  # noqa: ARG002
+        return self.counts
+
+
+def _copy(message: can.Message) -> can.Message:
+    return can.Message(
+        arbitration_id=message.arbitration_id, data=bytes(message.data), is_extended_id=False, check=True
+    )
+
+
+@pytest.fixture
+def make_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
+    """Rigs by size and spec; silence of a node costs 5 ms of real time."""
+    monkeypatch.setattr(master, "ThreadPoolExecutor", Jobs)
+    monkeypatch.setattr(boot, "SDO_TIMEOUT_S", 0.005)
+    rigs: list[Rig] = []
+
+    def make(size: int = 3, **spec: Any) -> Rig:
+        rigs.append(Rig(size, **spec))
+        return rigs[-1]
+
+    yield make
+    for rig in rigs:
+        rig.master.stop(rig.t_ns)
+
+
+@pytest.fixture
+def rig(make_rig: Callable[..., Rig]) -> Rig:
+    """Three nodes, unplugged, and a master that hasn't started."""
+    return make_rig()

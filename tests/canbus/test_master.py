@@ -1,0 +1,464 @@
+"""The master boots a hand, watches it and brings its nodes back, whatever happens to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from canopen.sdo import SdoAbortedError
+
+from handtouch import shipped
+from handtouch.canbus.eds import EdsError
+from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.master import Master
+
+OPERATIONAL, ABSENT, FAULTED = NodeState.OPERATIONAL, NodeState.ABSENT, NodeState.FAULTED
+NMT_START, NMT_STOP, NMT_PREOPERATIONAL = 1, 2, 128
+Make = Callable[..., Any]
+
+
+def nmt(rig: Any) -> list[tuple[int, int]]:
+    """NMT commands the master has sent: (command, node id)."""
+    return [(data[0], data[1]) for can_id, data in rig.wire.sent if can_id == 0]
+
+
+def test_a_hand_becomes_operational_and_its_samples_are_in_the_slab(rig: Any) -> None:
+    rig.boot()
+    rig.counts[1] = (-1, 2, -3, 32767)
+    rig.run(10)
+    assert rig.slab.counts.tolist() == [[10, 20, 30, 40], [-1, 2, -3, 32767], [10, 20, 30, 40]]
+    assert [s.cob_id for s in rig.master.status()] == [0x281, 0x282, 0x283]
+    assert [s.serial for s in rig.master.status()] == [101, 102, 103]
+    assert rig.port.counters.foreign == 0
+
+
+def test_boot_goes_through_every_state_in_order(rig: Any) -> None:
+    rig.start()
+    rig.node(2).plug()
+    events = [e for e in rig.run(300) if e.slot == 1]
+    assert [e.new.name for e in events] == [
+        "BOOTING",
+        "IDENTIFIED",
+        "CONFIGURING",
+        "SETTLING",
+        "OPERATIONAL",
+    ]
+    assert all(e.old == previous for e, previous in zip(events[1:], [e.new for e in events], strict=False))
+    assert rig.state(1) is ABSENT
+
+
+def test_first_three_samples_after_start_are_not_trusted(rig: Any) -> None:
+    rig.plug_all()
+    rig.start()
+    trusted_at = None
+    before = 0
+    for _ in range(100):
+        rig.run(1)
+        if trusted_at is None and rig.state(1) is OPERATIONAL:
+            trusted_at = rig.port.counters.samples - before
+        if rig.state(1) in (NodeState.CONFIGURING, ABSENT, NodeState.IDENTIFIED):
+            before = rig.port.counters.samples
+    assert trusted_at == 3 * rig.size
+
+
+def test_heartbeat_time_of_the_configuration_is_set(make_rig: Make) -> None:
+    rig = make_rig(heartbeat_ms=50, heartbeat_timeout_ms=175)
+    rig.boot()
+    before = rig.status(1).heartbeats
+    rig.run(500)
+    assert rig.status(1).heartbeats - before == 10
+    assert rig.status(1).heartbeats_missed == 0
+
+
+def test_every_nmt_command_names_one_node(rig: Any) -> None:
+    rig.plug_all()
+    rig.start()
+    rig.run(300)
+    rig.node(1).reboot()
+    rig.run(300)
+    rig.master.stop(rig.t_ns)
+    commands = nmt(rig)
+    assert {node_id for _, node_id in commands} == {1, 2, 3}
+    assert [c for c in commands if c[0] == NMT_STOP] == [(NMT_STOP, 1), (NMT_STOP, 2), (NMT_STOP, 3)]
+    assert rig.node(1).state == "STOPPED"
+    assert rig.state(1) is NodeState.STOPPED
+
+
+def test_stop_leaves_a_stranger_alone(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.specs[1] = rig.spec(2, serial=999)
+    rig.restart()
+    rig.plug_all()
+    rig.start()
+    rig.run(300)
+    rig.master.stop(rig.t_ns)
+    assert [node_id for command, node_id in nmt(rig) if command == NMT_STOP] == [1, 3]
+
+
+def test_nothing_is_sent_before_start(rig: Any) -> None:
+    rig.plug_all()
+    assert rig.wire.sent == []
+
+
+def test_after_a_restart_running_nodes_go_on_untouched(rig: Any) -> None:
+    rig.boot()
+    rig.restart()
+    rig.start()
+    rig.run(300)
+    assert (rig.master.states == OPERATIONAL).all()
+    assert [c for c in nmt(rig) if c[0] != NMT_START] == []
+    writes = [data for can_id, data in rig.wire.sent if can_id > 0x600 and data[0] & 0xE0 == 0x20]
+    assert writes == []
+
+
+def test_running_node_is_halted_only_where_its_pdo_must_change(rig: Any) -> None:
+    rig.plug_all()
+    rig.node(1)._node.sdo[0x1801][2].raw = 10
+    rig.start()
+    rig.run(300)
+    assert (rig.master.states == OPERATIONAL).all()
+    assert rig.node(1)._node.sdo[0x1801][2].raw == 1
+
+
+def test_nodes_found_stopped_are_woken(rig: Any) -> None:
+    rig.boot()
+    rig.master.stop(rig.t_ns)
+    rig.restart()
+    rig.start()
+    rig.run(300)
+    assert (rig.master.states == OPERATIONAL).all()
+
+
+def test_missing_node_is_reported_and_asked_for_while_the_rest_works(rig: Any) -> None:
+    rig.start()
+    rig.node(1).plug()
+    rig.node(3).plug()
+    rig.run(2000)
+    assert [rig.state(n) for n in (1, 2, 3)] == [OPERATIONAL, ABSENT, OPERATIONAL]
+    assert rig.status(2).reason == "not heard yet"
+    probes = [can_id for can_id, _ in rig.wire.sent if can_id == 0x602]
+    assert 3 <= len(probes) <= 10  # again and again, but ever less often
+    rig.node(2).plug()
+    rig.run(300)
+    assert rig.state(2) is OPERATIONAL
+
+
+def test_node_that_sends_neither_boot_up_nor_heartbeat_is_found(rig: Any) -> None:
+    device = rig.node(1)
+    device.plug()
+    device._node.nmt.stop_heartbeat()
+    rig.wire.to_master.clear()
+    rig.start()
+    rig.run(300)
+    assert rig.state(1) is OPERATIONAL
+
+
+@pytest.mark.parametrize("found_by", ["power", "cable"])
+def test_vanished_node_is_stale_then_lost_then_back(rig: Any, found_by: str) -> None:
+    rig.boot()
+    device = rig.node(2)
+    if found_by == "power":
+        device.unplug()
+    else:
+        rig.wire.cut.add(2)
+    events = rig.run(600)
+    assert [e.new for e in events] == [NodeState.STALE, ABSENT]
+    assert "no heartbeat for 35" in events[1].reason
+    stale, lost = ((e.t_ns - (rig.t_ns - 600_000_000)) // 1_000_000 for e in events)
+    assert 15 <= stale <= 21
+    assert 250 <= lost <= 352
+    assert [rig.state(n) for n in (1, 3)] == [OPERATIONAL] * 2
+    device.plug()
+    rig.wire.cut.clear()
+    rig.run(300)
+    assert rig.state(2) is OPERATIONAL
+    assert rig.node(2).state == "OPERATIONAL"
+
+
+def test_data_without_heartbeat_is_lost_and_stays_so(rig: Any) -> None:
+    rig.boot()
+    rig.node(1).send_heartbeat = False
+    events = rig.run(10_000)
+    assert events[0].new is ABSENT
+    assert "no heartbeat" in events[0].reason
+    assert OPERATIONAL not in [e.new for e in events]
+    assert sum(e.new is ABSENT for e in events) < 10  # tried less and less often
+    rig.node(1).send_heartbeat = True
+    rig.run(300)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_heartbeat_without_data_is_stale_until_data_come(rig: Any) -> None:
+    rig.boot()
+    rig.node(1).send_data = False
+    rig.run(1000)
+    assert rig.state(1) is NodeState.STALE
+    rig.node(1).send_data = True
+    rig.run(6)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_without_sync_all_are_stale_and_come_back_with_it(rig: Any) -> None:
+    rig.boot()
+    rig.syncs = False
+    rig.run(1000)
+    assert (rig.master.states == NodeState.STALE).all()
+    rig.syncs = True
+    rig.run(6)
+    assert (rig.master.states == OPERATIONAL).all()
+
+
+def test_no_sync_from_the_start_is_told(rig: Any) -> None:
+    rig.syncs = False
+    rig.plug_all()
+    rig.start()
+    rig.run(1200)
+    assert rig.state(1) is NodeState.STALE
+    assert "SYNC" in rig.status(1).reason
+    rig.syncs = True
+    rig.run(30)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_node_that_reboots_by_itself_is_configured_again(rig: Any) -> None:
+    rig.boot()
+    rig.node(1).reboot()
+    events = rig.run(300)
+    assert (events[0].new, events[0].reason) == (NodeState.BOOTING, "rebooted by itself")
+    assert events[-1].new is OPERATIONAL
+    assert rig.status(1).reboots == 1
+    assert nmt(rig) == [(NMT_START, 1)]
+
+
+def test_reboot_whose_boot_up_message_is_lost_is_noticed(rig: Any) -> None:
+    rig.boot()
+    rig.run(300)  # so that the start is long past
+    rig.node(1).reboot()
+    rig.wire.to_master.clear()
+    rig.run(500)
+    assert rig.state(1) is OPERATIONAL
+    assert rig.node(1).state == "OPERATIONAL"
+
+
+def test_lost_start_command_is_repeated(rig: Any) -> None:
+    rig.plug_all()
+    rig.start()
+    rig.run(2)
+    while rig.state(1) is not NodeState.SETTLING:
+        rig.run(1)
+    rig.node(1).on_nmt(NMT_PREOPERATIONAL)  # as if it had not heard the command
+    rig.run(600)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_bus_that_is_down_is_survived(rig: Any) -> None:
+    rig.boot()
+    rig.wire.down = True
+    rig.wire.cut = {1, 2, 3}
+    rig.run(3000)
+    assert (rig.master.states == ABSENT).all()
+    assert rig.port.counters.send_failures > 3
+    rig.wire.down = False
+    rig.wire.cut = set()
+    rig.run(300)
+    assert (rig.master.states == OPERATIONAL).all()
+
+
+@pytest.mark.parametrize(
+    ("spec", "told"),
+    [
+        ({"vendor_id": 0x123}, "vendor id is 0 (0x0), configured is 291 (0x123)"),
+        ({"product_code": 7}, "product code is 1025 (0x401), configured is 7 (0x7)"),
+        ({"serial": 5}, "serial number is 101 (0x65), configured is 5 (0x5)"),
+    ],
+)
+def test_wrong_identity_is_a_fault_with_both_numbers(make_rig: Make, spec: dict[str, int], told: str) -> None:
+    rig = make_rig(1, **spec)
+    rig.plug_all()
+    rig.start()
+    rig.run(1000)
+    assert rig.state(1) is FAULTED
+    assert told in rig.status(1).reason
+    assert nmt(rig) == []  # it is not ours: neither started nor stopped
+
+
+def test_swapped_unit_is_faulted_until_the_right_one_is_back(make_rig: Make) -> None:
+    rig = make_rig(1, serial=101)
+    rig.boot()
+    rig.node(1).swap(7)
+    rig.run(500)
+    assert rig.state(1) is FAULTED
+    rig.node(1).swap(101)
+    rig.run(500)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_changed_serial_number_is_told_where_none_is_configured(rig: Any) -> None:
+    rig.boot()
+    rig.node(1).swap(7)
+    reasons = [e.reason for e in rig.run(500)]
+    assert "serial number was 101, is 7" in reasons
+    assert rig.status(1).serial == 7
+    assert rig.state(1) is OPERATIONAL
+
+
+STEPS = {
+    "vendor id": (0x1018, 1),
+    "mapping count": (0x1A01, 0),
+    "mapping entry": (0x1A01, 3),
+    "identifier": (0x1801, 1),
+    "transmission type": (0x1801, 2),
+    "heartbeat time": (0x1017, 0),
+}
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("kind", ["abort", "silence"])
+def test_failing_sdo_at_any_step_is_a_fault_with_its_object_and_is_retried(
+    rig: Any, step: str, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = rig.node(1)._node.sdo
+    answer = server.on_request
+
+    def faulty(can_id: int, data: bytes, t: float) -> None:
+        if (int.from_bytes(data[1:3], "little"), data[3]) != STEPS[step]:
+            answer(can_id, data, t)
+        elif kind == "abort":
+            server.network.send_message(0x581, b"\x80" + data[1:4] + b"\x00\x00\x00\x08")
+
+    monkeypatch.setattr(server, "on_request", faulty)
+    rig.plug_all()
+    rig.start()
+    rig.run(100)
+    assert rig.state(1) is FAULTED
+    index, sub = STEPS[step]
+    assert f"0x{index:04X}:{sub:02X}" in rig.status(1).reason
+    assert ("General error" if kind == "abort" else "no answer") in rig.status(1).reason
+    assert [rig.state(n) for n in (2, 3)] == [OPERATIONAL] * 2
+    monkeypatch.setattr(server, "on_request", answer)
+    rig.run(6000)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_refused_write_is_a_fault_in_words(rig: Any) -> None:
+    def refuse(index: int, **_: object) -> None:
+        if index == 0x1017:
+            raise SdoAbortedError(0x06010002)
+
+    rig.node(1)._node.add_write_callback(refuse)
+    rig.plug_all()
+    rig.start()
+    rig.run(100)
+    assert rig.status(1).reason == (
+        "writing heartbeat time, 0x1017:00: refused by the node "
+        "(Code 0x06010002, Attempt to write a read only object)"
+    )
+
+
+def test_clash_of_sample_identifiers_is_a_fault_of_the_second(rig: Any) -> None:
+    rig.node(1).plug()
+    rig.start()
+    rig.run(100)
+    rig.node(2).plug()
+    rig.node(2)._node.sdo[0x1801][1].raw = 0x281
+    rig.run(100)
+    assert rig.state(1) is OPERATIONAL
+    assert (rig.state(2), rig.status(2).reason) == (FAULTED, "TPDO2 has identifier 0x281, as has pad1")
+
+
+def test_moved_identifier_is_followed(rig: Any) -> None:
+    rig.plug_all()
+    rig.node(1)._node.sdo[0x1801][1].raw = 0x80000000 | 0x3F0  # another identifier, and switched off
+    rig.start()
+    rig.run(300)
+    assert rig.status(1).cob_id == 0x3F0
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_emergencies_are_kept_as_text_and_bounded(rig: Any) -> None:
+    rig.boot()
+    for code in range(0x2310, 0x2310 + 40):
+        rig.node(1).emergency(code, 2)
+        rig.pump()
+    rig.node(1).emergency(0x8120, 0x11)
+    rig.pump()
+    kept = rig.status(1).emergencies
+    assert len(kept) == 16
+    assert kept[-1].text == "0x8120 CAN in error passive mode (register: communication)"
+    assert rig.state(1) is OPERATIONAL
+
+
+@pytest.mark.parametrize("can_id", [0x7F, 0x181 + 40, 0x701 + 40, 0x7FF, 0x6A0])
+def test_frames_of_unknown_nodes_are_counted_and_dropped(rig: Any, can_id: int) -> None:
+    rig.boot()
+    rig.inject(can_id, b"\x05")
+    assert rig.port.counters.foreign == 1
+    assert (rig.master.states == OPERATIONAL).all()
+
+
+@pytest.mark.parametrize("can_id", [0x080, 0x000, 0x100, 0x601, 0x182])
+def test_the_masters_own_frames_and_known_ones_are_not_foreign(rig: Any, can_id: int) -> None:
+    rig.boot()
+    rig.inject(can_id, b"")
+    assert rig.port.counters.foreign == 0
+
+
+@pytest.mark.parametrize("can_id", [0x281, 0x701, 0x581, 0x081])
+@pytest.mark.parametrize("data", [b"", b"\x00" * 7, b"\x00" * 2])
+def test_wrong_length_is_counted_and_changes_nothing(rig: Any, can_id: int, data: bytes) -> None:
+    rig.boot()
+    before = rig.slab.counts.copy()
+    rig.inject(can_id, data)
+    assert rig.port.counters.short == 1
+    assert (rig.master.states == OPERATIONAL).all()
+    np.testing.assert_array_equal(rig.slab.counts, before)
+    assert rig.status(1).emergencies == ()
+
+
+def test_unasked_sdo_answers_leave_no_trace(rig: Any) -> None:
+    rig.boot()
+    for _ in range(100):
+        rig.inject(0x581, bytes(8))
+    assert rig.run(50) == []
+    assert rig.master._nodes[0].sdo._client.responses.qsize() == 0
+
+
+def test_events_nobody_takes_are_bounded(rig: Any) -> None:
+    rig.boot()
+    for _ in range(400):
+        rig.node(1).reboot()
+        rig.pump()
+        rig.master.poll(rig.t_ns)
+    assert len(rig.master.take_events()) <= 1024
+    assert rig.master.take_events() == []
+
+
+def test_shipped_eds_is_understood(make_rig: Make) -> None:
+    rig = make_rig(1, eds=str(shipped.path("handtouch-node.eds")))
+    rig.boot()
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_unusable_eds_is_named(make_rig: Make, tmp_path: Any) -> None:
+    (tmp_path / "broken.eds").write_text("[1000]\nParameterName\n")
+    with pytest.raises(EdsError, match=r"broken\.eds"):
+        make_rig(1, eds=str(tmp_path / "broken.eds"))
+    with pytest.raises(EdsError, match="No such file"):
+        make_rig(1, eds=str(tmp_path / "absent.eds"))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"bus": "other"}, "not open"),
+        ({"node_id": 0}, "outside 1 to 127"),
+        ({"slot": 9}, "outside the slab"),
+        ({"node_id": 1}, "given twice"),
+        ({"slot": 0}, "given twice"),
+    ],
+)
+def test_contradictory_nodes_are_refused(rig: Any, change: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        Master({"can": rig.port}, [rig.specs[0], rig.spec(2, **change)])
