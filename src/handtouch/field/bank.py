@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch.field._bank_table import GRIDS, RATIO_CELLS, RATIO_SPAN, TERMS, PadTable, log_ratios
-from handtouch.field.estimate import CORNER, LOST, PointEstimate
+from handtouch.field.estimate import CORNER, LOST, PointEstimate, best_direction
 from handtouch.field.model import FloatArray, ForwardModel
 
 IndexArray = NDArray[np.intp]
@@ -231,13 +231,30 @@ class LocatorBank:
         if not which.size:
             return
         index, sides, data, weight = index[which], sides[which], data[which], weight[which]
-        offset = nearest[which] * np.sqrt(radius / distance)[which, None]
-        point[which] = np.where(2 * point[which] > sides, sides - offset, offset)
-        s = self._coordinates(index, point[which])
+        far = 2 * point[which] > sides
+        corner, inward = np.where(far, sides, 0.0).T, np.where(far, -1.0, 1.0).T * np.sqrt(radius[which])
+        angle = np.arctan2(nearest[which, 1], nearest[which, 0])
+
+        def linearised(place: FloatArray) -> tuple[FloatArray, FloatArray]:
+            at, scale, best = self._linearise_at(index, place.T, data, weight)
+            slopes = at.rows[:, 1:3] - at.mixing * at.rows[:, :1]
+            misfit = at.rows[:, 3] - best[:, None] * at.rows[:, 0]
+            return misfit.T, np.moveaxis(slopes * (best[:, None] / scale)[:, :, None], 0, -1)
+
+        angle = best_direction(linearised, corner, inward, angle)
+        point[which] = (corner + inward * np.stack([np.cos(angle), np.sin(angle)])).T
+        at, scale, best = self._linearise_at(index, point[which], data, weight)
+        covariance[which] = at.covariance(best, scale)
+
+    def _linearise_at(
+        self, index: IndexArray, point: FloatArray, data: FloatArray, weight: FloatArray
+    ) -> tuple[_Normal, FloatArray, FloatArray]:
+        """Normal equations at points (n, 2), lengths of a cell there, (n, 2), and best totals."""
+        s = self._coordinates(index, point)
         fraction = self._grid.place(s)
-        scale = sides * fraction * (1 - fraction) * self._grid.width
         at = self._linearise(self._first_row(index), s, data, weight)
-        covariance[which] = at.covariance(total[which], scale)
+        scale = self._sides.take(index, axis=0) * fraction * (1 - fraction) * self._grid.width
+        return at, scale, at.gram[:, 0, 3] / at.gram[:, 0, 0]
 
 
 class _Normal(NamedTuple):

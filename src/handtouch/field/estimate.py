@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ _EDGE = 1e-9  # of a side: how near to an edge an estimate may come
 _LONGEST_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
 LOST = 1e3  # sides: a coordinate less certain than this is not known at all
 CORNER = 0.7  # shorter sides, times the root of the relative noise: how near a corner currents tell anything
+_ARC_STEPS = 6  # of the search for a direction from a corner
+_GRAZING = 0.02  # rad: an estimate near a corner keeps this far from its sides
 _GRID = 9  # points a side of the search that finds a start without a closed form
 
 
@@ -199,19 +202,28 @@ class _Fit:
         return self.result(point, best, converged)
 
     def leave_corner(self, point: FloatArray, at: _Linear, converged: BoolArray) -> NDArray[np.intp]:
-        """Move points too near a corner straight out, in place, to where currents tell; their indices.
+        """Move points too near a corner out, in place, to where currents begin to tell; their indices.
 
         Near a corner the two far currents vanish with the square of its distance r, so that all r up to
         sqrt(noise) sides are equally likely, and only the direction from the corner is known.
         """
         noise = 1 / np.sqrt((self.weight * self.weight).mean(0))
         radius = self.shortest * np.minimum(CORNER * np.sqrt(noise / np.maximum(at.total, 0)), 0.25)
-        corner = np.where(2 * point > self.low + self.high, self.low + self.high, 0.0)
-        offset = point - corner
-        distance = np.hypot(*offset)
-        index = np.flatnonzero(distance < radius)
-        point[:, index] = (corner + offset * (radius / distance))[:, index]
-        converged[index] = at.total[index] > 0
+        sides = self.low + self.high
+        far = 2 * point > sides
+        offset = np.where(far, sides - point, point)
+        index = np.flatnonzero(np.hypot(*offset) < radius)
+        if index.size:
+            corner = np.where(far, sides, 0.0)[:, index]
+            inward = np.where(far, -1.0, 1.0)[:, index] * radius[index]
+
+            def linearised(place: FloatArray) -> tuple[FloatArray, FloatArray]:
+                new = self.linearise(place, index)
+                return new.misfit, new.slopes * new.total
+
+            angle = best_direction(linearised, corner, inward, np.arctan2(*offset[::-1, index]))
+            point[:, index] = corner + inward * np.stack([np.cos(angle), np.sin(angle)])
+            converged[index] = at.total[index] > 0
         return index
 
     def result(self, point: FloatArray, at: _Linear, converged: BoolArray) -> PointEstimate:
@@ -232,6 +244,26 @@ class _Fit:
             covariance=covariance,
             converged=converged,
         )
+
+
+def best_direction(
+    linearised: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    corner: FloatArray,
+    inward: FloatArray,
+    angle: FloatArray,
+) -> FloatArray:
+    """The most likely direction (n,) from a corner, at a given distance from it.
+
+    linearised: places (2, n) to whitened misfits (channels, n) and slopes (2, channels, n). corner: places.
+    inward: (2, n), the distance, signed into the pad. angle: where to begin, 0 along x to pi / 2 along y.
+    """
+    for _ in range(_ARC_STEPS):
+        angle = np.clip(angle, _GRAZING, math.pi / 2 - _GRAZING)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        misfit, slopes = linearised(corner + inward * np.stack([cosine, sine]))
+        tangent = slopes[1] * (inward[1] * cosine) - slopes[0] * (inward[0] * sine)
+        angle = angle + np.clip((tangent * misfit).sum(0) / (tangent * tangent).sum(0), -0.3, 0.3)
+    return np.clip(angle, _GRAZING, math.pi / 2 - _GRAZING)
 
 
 def covariance_of(
