@@ -1,0 +1,336 @@
+"""A port receives and sends on any python-can bus and survives whatever that bus does."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import can
+import pytest
+
+from handtouch.canbus import receivers
+from handtouch.canbus.port import BusError, Port
+from handtouch.canbus.receivers import PolledReceiver, Retry, ThreadReceiver, monotonic_from_wall
+from handtouch.canbus.router import Router
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
+
+_channels = itertools.count()
+
+
+def frame(can_id: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+def eventually(what: Callable[[], bool], seconds: float = 2.0) -> bool:
+    """Wait for a reader thread."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if what():
+            return True
+        time.sleep(0.001)
+    return what()
+
+
+def readable(port: Port | ThreadReceiver | PolledReceiver, seconds: float = 0.0) -> bool:
+    return bool(select.select([port.fileno()], [], [], seconds)[0])
+
+
+@pytest.fixture
+def channel() -> str:
+    return f"port-{next(_channels)}"
+
+
+@pytest.fixture
+def port(channel: str) -> Iterator[Port]:
+    port = Port.open(Bus(name="palm", interface="virtual", channel=channel), Slab(2))
+    yield port
+    port.close()
+
+
+@pytest.fixture
+def other(channel: str) -> Iterator[can.BusABC]:
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        yield bus
+
+
+def test_samples_go_to_the_slab_and_the_rest_is_returned_in_order(port: Port, other: can.BusABC) -> None:
+    port.route(0x281, 1)
+    before = time.monotonic_ns()
+    for can_id, data in ((0x701, b"\x05"), (0x281, b"\x01\x00" * 4), (0x80, b""), (0x281, b"\x01")):
+        other.send(frame(can_id, data))
+    got: list[tuple[int, bytes, int]] = []
+
+    def all_came() -> bool:
+        got.extend(port.drain())
+        return port.counters.frames == 4
+
+    assert eventually(all_came)
+    assert [(can_id, data) for can_id, data, _ in got] == [(0x701, b"\x05"), (0x80, b"")]
+    assert all(before - 10**6 <= t_ns <= time.monotonic_ns() for _, _, t_ns in got)
+    assert before - 10**6 <= port.slab.t_ns[1] <= time.monotonic_ns()
+    assert port.slab.counts[1].tolist() == [1] * 4
+    assert (port.counters.samples, port.counters.short) == (1, 1)
+
+
+def test_descriptor_is_readable_exactly_while_frames_wait(port: Port, other: can.BusABC) -> None:
+    assert not readable(port)
+    other.send(frame(0x701, b"\x05"))
+    assert readable(port, 1.0)
+    port.drain()
+    assert not readable(port)
+    other.send(frame(0x701, b"\x05"))
+    assert readable(port, 1.0)
+
+
+def test_more_than_one_drain_can_take_is_not_forgotten(
+    port: Port, other: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receivers, "DRAIN_LIMIT", 10)
+    for _ in range(25):
+        other.send(frame(0x701, b"\x05"))
+    assert eventually(lambda: len(port._receiver._queue) == 25)  # type: ignore[attr-defined]  # the reader's
+    sizes = []
+    while readable(port):
+        sizes.append(len(port.drain()))
+    assert [size for size in sizes if size] == [10, 10, 5]
+
+
+def test_overflow_keeps_the_newest_and_is_counted(
+    channel: str, other: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receivers, "QUEUE_FRAMES", 8)
+    port = Port.open(Bus(name="palm", interface="virtual", channel=channel), Slab(1))
+    for number in range(20):
+        other.send(frame(0x700, bytes((number,))))
+    assert eventually(lambda: port._receiver._lost == 12)  # type: ignore[attr-defined]  # the reader's
+    assert [data[0] for _, data, _ in port.drain()] == list(range(12, 20))
+    assert port.counters.overflow == 12
+    port.close()
+
+
+def test_sent_frames_arrive_and_count_as_load(port: Port, other: can.BusABC) -> None:
+    assert port.send(0x601, b"\x40\x00\x10\x00\x00\x00\x00\x00")
+    received = other.recv(1.0)
+    assert received is not None
+    assert (received.arbitration_id, len(received.data), received.is_extended_id) == (0x601, 8, False)
+    assert (port.counters.sent, port.counters.bits) == (1, 135)
+
+
+def test_two_ports_may_share_a_slab() -> None:
+    slab = Slab(2)
+    names = [f"port-{next(_channels)}" for _ in range(2)]
+    ports = [Port.open(Bus(name=name, interface="virtual", channel=name), slab) for name in names]
+    for slot, (port, name) in enumerate(zip(ports, names, strict=True)):
+        port.route(0x281, slot)  # the same identifier on both buses
+        with can.Bus(interface="virtual", channel=name) as bus:
+            bus.send(frame(0x281, bytes((slot + 1, 0)) * 4))
+    assert eventually(lambda: not any(port.drain() for port in ports) and slab.fresh_count == 2)
+    assert slab.counts[:, 0].tolist() == [1, 2]
+    for port in ports:
+        port.close()
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "told"),
+    [
+        ("nonsense", "1", "must be one of python-can's"),
+        ("udp_multicast", "10.0.0.1", "multicast address"),
+        ("socketcan", "nocan7", "ip link set nocan7 up|no CAN support"),
+        ("slcan", "/dev/no-such-tty", "adapter plugged in|one of python-can's"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # python-can's half-made buses
+def test_bus_that_cannot_be_opened_is_named_with_a_remedy(interface: str, channel: str, told: str) -> None:
+    with pytest.raises(BusError, match=told) as caught:
+        Port.open(Bus(name="palm", interface=interface, channel=channel), Slab(1))
+    assert str(caught.value).startswith(f'bus "palm" (interface {interface}, channel {channel})')
+
+
+class FakeBus(can.BusABC):
+    """A bus that gives what `script` holds: frames, exceptions; then nothing. Readable all the time."""
+
+    def __init__(self, script: list[Any]) -> None:
+        self.script = script
+        self.ends = socket.socketpair()
+        self.ends[1].send(b"x")
+        self.closed = False
+        super().__init__("fake")
+
+    def fileno(self) -> int:
+        return self.ends[0].fileno()
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self.script:
+            time.sleep(min(timeout or 0, 0.001))
+            return None, False
+        item = self.script.pop(0)
+        if isinstance(item, Exception):
+            raise item
+        return item, False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
+        raise can.CanOperationError("Transmit buffer full")
+
+    def shutdown(self) -> None:
+        self.closed = True
+        for end in self.ends:
+            end.close()
+        super().shutdown()
+
+
+class Opener:
+    """Opens a new FakeBus for each script; a script that is an exception is an opening that fails."""
+
+    def __init__(self, *scripts: Any) -> None:
+        self.scripts = list(scripts)
+        self.opened: list[FakeBus] = []
+
+    def __call__(self) -> can.BusABC:
+        script = self.scripts.pop(0) if self.scripts else []
+        if isinstance(script, Exception):
+            raise script
+        self.opened.append(FakeBus(script))
+        return self.opened[-1]
+
+
+GONE = OSError(errno.ENODEV, "No such device")
+DOWN = can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN)
+MALFORMED = can.CanOperationError("could not unpack received message")
+SAMPLE = frame(0x281, bytes(8))
+
+
+@pytest.fixture(params=["polled", "thread"])
+def start(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Both receivers, with short pauses."""
+    monkeypatch.setattr(receivers, "_RETRY_FIRST_S", 0.002)
+    made: list[ThreadReceiver | PolledReceiver] = []
+
+    def start(opener: Opener) -> ThreadReceiver | PolledReceiver:
+        receiver: ThreadReceiver | PolledReceiver = (
+            PolledReceiver(opener) if request.param == "polled" else ThreadReceiver(opener, "fake")
+        )
+        made.append(receiver)
+        return receiver
+
+    yield start
+    for receiver in made:
+        receiver.close()
+
+
+@pytest.fixture
+def router() -> Router:
+    router = Router(Slab(1))
+    router.route(0x281, 0)
+    return router
+
+
+def drain_until(receiver: Any, router: Router, what: Callable[[], bool]) -> bool:
+    return eventually(lambda: not receiver.drain(router) and what())
+
+
+def test_malformed_datagrams_are_counted_and_the_rest_is_received(start: Any, router: Router) -> None:
+    opener = Opener([MALFORMED, SAMPLE, ValueError("bad hex"), SAMPLE, SAMPLE])
+    receiver = start(opener)
+    assert drain_until(receiver, router, lambda: router.counters.samples == 3)
+    assert router.counters.receive_errors == 2
+    assert len(opener.opened) == 1
+
+
+def test_interface_that_goes_down_and_up_is_used_again(start: Any, router: Router) -> None:
+    receiver = start(Opener([SAMPLE, DOWN, SAMPLE]))
+    assert drain_until(receiver, router, lambda: router.counters.samples == 2)
+    assert router.counters.receive_errors == 1
+    assert drain_until(receiver, router, lambda: receiver.problem == "")
+
+
+def test_adapter_that_is_unplugged_is_opened_again_when_it_is_back(start: Any, router: Router) -> None:
+    opener = Opener([SAMPLE, GONE, GONE, GONE], GONE, GONE, [SAMPLE])
+    receiver = start(opener)
+    descriptor = receiver.fileno()
+    assert drain_until(receiver, router, lambda: router.counters.samples == 2)
+    assert receiver.fileno() == descriptor
+    assert opener.opened[0].closed
+    assert router.counters.receive_errors >= 3
+
+
+def test_problem_is_told_while_the_bus_is_gone(start: Any, router: Router) -> None:
+    receiver = start(Opener([GONE, GONE, GONE], *[GONE] * 1000))
+    assert drain_until(receiver, router, lambda: "No such device" in receiver.problem)
+    with pytest.raises((OSError, can.CanError)):
+        receiver.send(0x80, b"")
+
+
+def test_full_transmit_queue_is_counted_never_raised(start: Any) -> None:
+    port = Port(Bus(name="palm", interface="fake", channel="1"), start(Opener()), Slab(1))
+    assert not port.send(0x80, b"")
+    assert (port.counters.sent, port.counters.send_failures, port.counters.bits) == (0, 1, 0)
+
+
+def test_closing_gives_everything_back() -> None:
+    """Descriptors are counted, as a leak of one per reconnection would end a long run."""
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(5):
+        receiver = ThreadReceiver(Opener(), "fake")
+        receiver.close()
+        PolledReceiver(Opener()).close()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_pauses_between_attempts_grow_to_a_limit() -> None:
+    retry, t_ns, tries = Retry(), 0, []
+    for t_ns in range(0, 20_000_000_000, 10_000_000):
+        if retry.due(t_ns):
+            tries.append(t_ns / 1e9)
+    pauses = [b - a for a, b in itertools.pairwise(tries)]
+    assert pauses[:3] == pytest.approx([0.1, 0.2, 0.4])
+    assert max(pauses) == pytest.approx(2.0)
+    retry.reset()
+    assert retry.due(t_ns)
+
+
+@pytest.mark.parametrize(
+    ("stamp_s", "t_ns"), [(99.0, 49 * 10**9), (101.0, 50 * 10**9), (0.0, 50 * 10**9), (89.0, 50 * 10**9)]
+)
+def test_stamps_that_cannot_be_are_replaced_by_now(stamp_s: float, t_ns: int) -> None:
+    now_ns, offset_ns = 50 * 10**9, -50 * 10**9  # the wall clock shows 100 s
+    assert monotonic_from_wall(stamp_s, now_ns, offset_ns) == t_ns
+
+
+UDP = """
+import time, can
+from handtouch.canbus.port import Port
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
+bus = Bus(name="palm", interface="udp_multicast", channel="239.74.163.2")
+port = Port.open(bus, Slab(1))
+port.route(0x281, 0)
+stranger = can.Bus(interface="udp_multicast", channel="239.74.163.2")
+stranger.send(can.Message(arbitration_id=0x281, data=b"\\x01\\x00" * 4, is_extended_id=False))
+stranger._multicast.send(b"no such thing as a frame")
+stranger.send(can.Message(arbitration_id=0x281, data=b"\\x02\\x00" * 4, is_extended_id=False))
+port.send(0x80, b"")
+others = []
+deadline = time.monotonic() + 5
+while not others and time.monotonic() < deadline:
+    others += port.drain()
+assert [(i, d) for i, d, _ in others] == [(0x80, b"")], others  # our own SYNC comes back
+assert port.slab.counts[0].tolist() == [2] * 4, port.slab.counts
+assert 0 <= time.monotonic_ns() - port.slab.t_ns[0] < 10**9
+c = port.counters
+assert (c.samples, c.receive_errors, c.sent, c.bits) == (2, 1, 1, 135 + 135 + 55), c
+port.close(); stranger.shutdown()
+"""
+
+
+def test_udp_multicast_between_two_buses(network: list[str]) -> None:
+    done = subprocess.run([*network, sys.executable, "-c", UDP], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
