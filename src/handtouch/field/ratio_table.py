@@ -20,7 +20,6 @@ from handtouch.field.rectangle import Rectangle
 
 _ERROR_WANTED = 1e-8  # of a side
 _FEWEST_CELLS, _MOST_CELLS = 256, 16384
-_LONGEST_ASPECT = 4.0  # beyond, the coordinate along the pad is too steep in u
 
 
 class RatioTable:
@@ -30,11 +29,13 @@ class RatioTable:
     nodes; below 1e-8 of the side. Raises ValueError for a longer pad.
     """
 
+    LONGEST_ASPECT = 4.0  # beyond, the coordinate along the pad is too steep in u
+
     def __init__(self, pad: Rectangle) -> None:
         aspect = max(pad.a / pad.b, pad.b / pad.a)
-        if aspect > _LONGEST_ASPECT:
+        if aspect > self.LONGEST_ASPECT:
             raise ValueError(
-                f"aspect {aspect:.3g}: a ratio table is for pads of at most {_LONGEST_ASPECT:g}:1"
+                f"aspect {aspect:.3g}: a ratio table is for pads of at most {self.LONGEST_ASPECT:g}:1"
             )
         cells = _FEWEST_CELLS
         self._tabulate(pad, cells)
