@@ -21,7 +21,7 @@ $(BIN)/python:
 
 $(VENV)/.run: pyproject.toml requirements.lock | $(BIN)/python
 	@echo "installing handtouch into $(VENV) ..."
-	@test -e $(VENV)/.dev || $(PIP) install -c requirements.lock -e .
+	@test -e $(VENV)/.dev || $(PIP) install --no-compile -c requirements.lock -e .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python

@@ -160,7 +160,7 @@ def test_the_composed_processes_find_one_another(
             running.append(process)
             stack.callback(process.wait, 15)
             stack.callback(process.terminate)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 90
         while time.monotonic() < deadline and all(process.poll() is None for process in running):
             asked = subprocess.run(
                 healthy, env=installation.environment, capture_output=True, text=True, check=False
