@@ -1,4 +1,4 @@
-"""Files that come with handtouch (deployments, scenarios, the node's EDS): where this installation keeps them."""
+"""Where this installation keeps the files that come with it: deployments, scenarios, the node's EDS."""
 
 from __future__ import annotations
 
