@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,6 +18,8 @@ Command = Callable[[argparse.Namespace], int]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; exit status 0 (well), 1 (it failed) or 2 (wrong usage or configuration)."""
+    # small arrays all through: threads of the linear algebra would only fight the hot thread for a core
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     asked = build_parser().parse_args(arguments)
     command: Command = asked.command
     try:
