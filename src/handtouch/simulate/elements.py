@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -18,18 +17,16 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-DEGREE: Final = 8
-"""Of the elements."""
 _RATIO = 0.25  # of successive elements towards a singular point, where the potential goes as a root
 _SMALLEST = 1e-3  # of those elements, as a fraction of the axis
 _LARGEST = 0.15  # of all elements, as a fraction of the axis
-_LOCAL = np.arange(DEGREE + 1)
 
 
 @dataclass(frozen=True)
 class Axis:
     """Elements along one coordinate: nodes, and the basis functions at quadrature points."""
 
+    degree: int
     breaks: FloatArray
     nodes: FloatArray
     at: FloatArray
@@ -38,20 +35,24 @@ class Axis:
     slopes: FloatArray
 
     @classmethod
-    def graded(cls, length: float, singular: Iterable[float]) -> Axis:
+    def graded(cls, length: float, singular: Iterable[float], degree: int) -> Axis:
         """Elements on [0, length], graded towards its ends and `singular` points in between."""
         breaks = _graded_breaks(sorted({0.0, *singular, length}), length)
-        reference, (abscissae, weights) = lobatto(DEGREE), legendre.leggauss(DEGREE + 2)
-        values, slopes = _lagrange(DEGREE, abscissae)
+        reference, (abscissae, weights) = lobatto(degree), legendre.leggauss(degree + 2)
+        values, slopes = _lagrange(degree, abscissae)
         half = np.diff(breaks) / 2
         middle = breaks[:-1] + half
-        first = DEGREE * np.arange(len(half))[:, None]
-        into = np.arange(half.size * abscissae.size).reshape(len(half), -1, 1), (first + _LOCAL)[:, None]
-        shape = (half.size * abscissae.size, DEGREE * half.size + 1)
+        first = degree * np.arange(len(half))[:, None]
+        into = (
+            np.arange(half.size * abscissae.size).reshape(len(half), -1, 1),
+            (first + np.arange(degree + 1))[:, None],
+        )
+        shape = (half.size * abscissae.size, degree * half.size + 1)
         all_values, all_slopes = np.zeros(shape), np.zeros(shape)
         all_values[into], all_slopes[into] = values, slopes / half[:, None, None]
         nodes = (middle[:, None] + half[:, None] * reference[:-1]).ravel()
         return cls(
+            degree,
             breaks,
             np.append(nodes, length),
             (middle[:, None] + half[:, None] * abscissae).ravel(),
@@ -73,8 +74,8 @@ class Axis:
         element = np.clip(np.searchsorted(self.breaks, points, side="right") - 1, 0, len(self.breaks) - 2)
         start, end = self.breaks[element], self.breaks[element + 1]
         basis = np.zeros((len(points), len(self.nodes)))
-        into = np.arange(len(points))[:, None], DEGREE * element[:, None] + _LOCAL
-        basis[into] = _lagrange(DEGREE, (2 * points - start - end) / (end - start))[0]
+        into = np.arange(len(points))[:, None], self.degree * element[:, None] + np.arange(self.degree + 1)
+        basis[into] = _lagrange(self.degree, (2 * points - start - end) / (end - start))[0]
         return basis
 
 

@@ -101,7 +101,7 @@ def score(contacts: Iterable[ContactLike], truth: Sequence[Truth]) -> Score:
         _tally(link if len(hands) == 1 else f"{hand}/{link}", [found])
         for (hand, link), found in compared.items()
     ]
-    return Score(tuple(tallies), _tally("all", list(compared.values())))
+    return Score(tuple(tallies), _tally("all", list(compared.values()) or [_Compared([], [], 0)]))
 
 
 class _Compared:

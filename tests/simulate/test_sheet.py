@@ -1,0 +1,129 @@
+"""The finite elements obey the laws of the sheet and agree with `handtouch.field`, found on another way."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.field import Electrode, ElectrodeNetwork, Rectangle
+from handtouch.hand import surface_of
+from handtouch.simulate.shape import Shape, shape_of
+from handtouch.simulate.sheet import INSET, Gaps, SheetBank, SheetMaps, solve
+
+SQUARE = Shape(1.0, 1.0, 1.0, flat=True)
+REFERENCE = json.loads((Path(__file__).parents[1] / "field" / "data" / "electrodes.json").read_text())
+FRACTIONS = np.array([0.03, 0.05, 0.1, 0.25, 0.5, 0.7, 0.92, 0.97])
+GRID = np.stack([grid.ravel() for grid in np.meshgrid(FRACTIONS, FRACTIONS)])
+
+
+def even(gap: float) -> Gaps:
+    return Gaps(*[(gap, gap)] * 4)
+
+
+def look_up(maps: SheetMaps, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    return SheetBank([maps]).look_up(np.zeros(x.shape, np.intp), x, y)[0]
+
+
+@pytest.mark.parametrize("row", range(4))
+def test_shares_and_spreading_agree_with_the_exact_solution_on_every_surface(
+    deployment: config.Deployment, row: int
+) -> None:
+    pad = deployment.hands[0].pads[row]
+    shape, surface = shape_of(pad.surface), surface_of(pad)
+    ends = shape.radius([0.0, shape.length_m])
+    bare = np.array([[0.7, 1.1], [0.9, 0.6], [0.8, 1.2], [1.0, 0.75]]) * 1e-3  # no two alike
+    gaps = Gaps(
+        (bare[0, 0] / ends[0], bare[0, 1] / ends[0]),
+        (bare[1, 0] / ends[1], bare[1, 1] / ends[1]),
+        (bare[2, 0], bare[2, 1]),
+        (bare[3, 0], bare[3, 1]),
+    )
+    stations = surface.to_rectangle([gaps.y0[0], shape.length_m - gaps.y0[1]], 0.0)[0].tolist()
+    others = surface.to_rectangle([gaps.yb[0], shape.length_m - gaps.yb[1]], 0.0)[0].tolist()
+    unit = surface.b / shape.arc
+    network = ElectrodeNetwork.from_electrodes(
+        surface.a,
+        surface.b,
+        [
+            Electrode("x0", gaps.x0[0] * unit, surface.b - gaps.x0[1] * unit),
+            Electrode("xa", gaps.xa[0] * unit, surface.b - gaps.xa[1] * unit),
+            Electrode("y0", *stations),
+            Electrode("yb", *others),
+        ],
+        2400.0,
+    )
+    s, phi = GRID[0] * shape.length_m, GRID[1] * shape.arc
+    x, y = surface.to_rectangle(s, phi * shape.radius(s))
+    found = solve(shape, gaps)
+    values = look_up(found, *GRID)
+    exact = network.fractions(x, y)
+    np.testing.assert_allclose(values[:4], exact, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(found.conductance, network.conductance, rtol=0, atol=1e-3)
+    inner = np.all((GRID > 0.04) & (GRID < 0.96), axis=0)
+    np.testing.assert_allclose(values[:4, inner], exact[:, inner], rtol=0, atol=1e-5)
+    radius = network.spreading_radius(x, y) * surface.scale(x, y)
+    np.testing.assert_allclose(values[4, inner], np.log(radius)[inner], rtol=0, atol=3e-3)
+
+
+@pytest.mark.parametrize("case", [c for c in REFERENCE if not any(c["series_ohm"])][:4], ids=str)
+def test_conductance_and_shares_are_those_of_the_reference(case: dict[str, float]) -> None:
+    a, b, gap = case["a"], case["b"], case["gap"]
+    found = solve(Shape(a, b, 1.0, flat=True), even(gap))
+    assert case["order"] == ["x0", "xa", "y0", "yb"]  # type: ignore[comparison-overlap]
+    np.testing.assert_allclose(found.conductance, case["conductance"], rtol=0, atol=1e-3)
+    x, y = np.array(case["x"]) / a, np.array(case["y"]) / b
+    inner = (np.minimum(x, 1 - x) > INSET) & (np.minimum(y, 1 - y) > INSET)
+    expected = np.array(case["fractions"])
+    expected = expected if expected.shape[0] == 4 else expected.T
+    np.testing.assert_allclose(look_up(found, x, y)[:4, inner], expected[:, inner], rtol=0, atol=2e-5)
+
+
+def test_shares_sum_to_one_and_follow_the_symmetry_of_the_pad() -> None:
+    x, y = GRID
+    values = look_up(solve(SQUARE, even(0.05)), x, y)
+    np.testing.assert_allclose(values[:4].sum(0), 1, rtol=0, atol=1e-12)
+    turned = look_up(solve(SQUARE, even(0.05)), y, x)
+    np.testing.assert_allclose(values[[2, 3, 0, 1, 4]], turned, rtol=0, atol=1e-6)
+    mirrored = look_up(solve(SQUARE, even(0.05)), 1 - x, y)
+    np.testing.assert_allclose(values[[1, 0, 2, 3, 4]], mirrored, rtol=0, atol=1e-6)
+
+
+def test_conductance_is_symmetric_and_conserves_current() -> None:
+    conductance = solve(SQUARE, Gaps((0.02, 0.05), (0.04, 0.03), (0.06, 0.02), (0.01, 0.05))).conductance
+    np.testing.assert_allclose(conductance, conductance.T, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(conductance.sum(1), 0, rtol=0, atol=1e-6)
+
+
+def test_the_error_falls_with_the_degree_of_the_elements() -> None:
+    network = ElectrodeNetwork(1.0, 1.0, 0.02, 1.0)
+    exact = network.fractions(*GRID)
+    errors = [
+        np.abs(look_up(solve(SQUARE, even(0.02), degree), *GRID)[:4] - exact).max() for degree in (3, 5, 8)
+    ]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+
+
+def test_a_vanishing_gap_gives_the_ideal_pad() -> None:
+    inner = (GRID > 0.04) & (GRID < 0.96)
+    x, y = GRID[:, inner.all(axis=0)]
+    values = look_up(solve(SQUARE, even(0.0)), x, y)
+    ideal = Rectangle(1.0, 1.0)
+    np.testing.assert_allclose(values[:4], ideal.side_fractions(x, y), rtol=0, atol=2e-5)
+    np.testing.assert_allclose(np.exp(values[4]), ideal.conformal_radius(x, y), rtol=3e-3)
+    centre = look_up(solve(SQUARE, even(0.0)), np.array([0.5]), np.array([0.5]))
+    assert np.exp(centre[4, 0]) == pytest.approx(0.5393526, rel=2e-4)
+
+
+def test_derivatives_are_those_of_the_values() -> None:
+    bank = SheetBank([solve(SQUARE, even(0.05)), solve(Shape(2.0, 1.0, 1.0, flat=True), even(0.05))])
+    sheet = np.array([0, 1, 1])
+    x, y, step = np.array([0.3, 0.44, 0.88]), np.array([0.06, 0.5, 0.7]), 1e-6
+    _, slopes = bank.look_up(sheet, x, y)
+    by_x = bank.look_up(sheet, x + step, y)[0] - bank.look_up(sheet, x - step, y)[0]
+    by_y = bank.look_up(sheet, x, y + step)[0] - bank.look_up(sheet, x, y - step)[0]
+    np.testing.assert_allclose(slopes, np.stack([by_x, by_y], axis=1) / (2 * step), rtol=0, atol=1e-7)
