@@ -15,6 +15,9 @@ from pathlib import Path
 
 import pytest
 
+# as `handtouch` sets it, before anything loads numpy: on busy cores those threads cost 20 times the time
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 ROOT = Path(__file__).parents[1]
 _STREAMS = ("live", "complete", "control", "inputs")
 
