@@ -47,8 +47,7 @@ class VirtualHand:
         ]
         self._scenario = scenario
         self._seed = world.seed, zlib.crc32((bus or "").encode())
-        solved: dict[tuple[Shape, Gaps], SheetMaps] = {}
-        self._rows = [_Row.of(deployment, hand, pad, world, solved) for hand, pad in self.pads]
+        self._rows = [_Row.of(deployment, hand, pad, world) for hand, pad in self.pads]
         self._bank = SheetBank([row.maps for row in self._rows])
         self._electric = _Electric(self._rows)
         self._noise = np.array([row.noise_counts for row in self._rows])
@@ -150,20 +149,10 @@ class _Row:
     noise_counts: float
 
     @classmethod
-    def of(
-        cls,
-        deployment: config.Deployment,
-        hand: str,
-        pad: config.Pad,
-        world: World,
-        solved: dict[tuple[Shape, Gaps], SheetMaps],
-    ) -> _Row:
+    def of(cls, deployment: config.Deployment, hand: str, pad: config.Pad, world: World) -> _Row:
         node, shape, parts = deployment.nodes[pad.node], shape_of(pad.surface), world.parts(hand, pad)
-        gaps = _gaps(shape, parts)
-        if (shape, gaps) not in solved:
-            solved[shape, gaps] = solve(shape, gaps)
+        maps, sheet = solve(shape, _gaps(shape, parts)), deployment.sheets[pad.sheet]
         noise = node.noise_counts if world.noise_counts is None else world.noise_counts
-        maps, sheet = solved[shape, gaps], deployment.sheets[pad.sheet]
         return cls(hand, pad, node, sheet, parts, shape, maps, *mount_of(pad), noise)
 
 
