@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from handtouch.field import ContactLaw, ElectrodeNetwork, Rectangle, contact_stack_resistance
+from handtouch.field.classic import log_ratio
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 INK, FAINT, ACCENT, ERRATUM = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c0392b"
 DPI = 150
 
+UNIT = Rectangle(1.0, 1.0)
 SHEET_OHM = 2400.0  # the paper's conducting polymer, ohm per square
 SQUARE_M, GAP_M = 0.125, 0.007  # between the electrodes of the large square; bare at its corners
 PLUG_OHM = 200.0  # of contact under the banana plug, as the paper guesses it
@@ -83,21 +85,15 @@ def tidy(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     axes.set_axisbelow(True)
 
 
-def _log_ratio(fractions: FloatArray) -> FloatArray:
-    """x_obs of eq. 8 for the unit square."""
-    return np.asarray(0.5 + np.log(fractions[1] / fractions[0]) / (2 * np.pi))
-
-
 def _observed_position() -> Figure:
     """Fig. 2: x_obs against x on the unit square."""
     figure = new_figure(5.2, 5.0)
     axes = figure.subplots()
-    pad = Rectangle(1.0, 1.0)
     x = np.linspace(0.004, 0.996, 400)
     for y, shade in ((0.5, INK), (0.7, "#4a7fae"), (0.9, "#7fb2d9")):
-        axes.plot(x, _log_ratio(pad.side_fractions(x, y)), color=shade, label=f"y = {y}")
+        axes.plot(x, log_ratio(UNIT, UNIT.side_fractions(x, y))[0], color=shade, label=f"y = {y}")
     axes.plot([0, 1], [0, 1], "--", color=FAINT, linewidth=1, label="x_obs = x")
-    here = float(_log_ratio(pad.side_fractions(0.6, 0.5)))
+    here = float(log_ratio(UNIT, UNIT.side_fractions(0.6, 0.5))[0])
     axes.plot(0.6, here, "o", color=ERRATUM, markersize=5)
     axes.annotate(
         f"point at x = 0.6: x_obs = {here:.4f},\nnot 0.608 (paper, section 3.3)",
@@ -116,12 +112,11 @@ def _observed_position() -> Figure:
 def _linearised_errors() -> Figure:
     """Fig. 3: displacements of a scaled log-ratio, and of the exact inverse."""
     figure = new_figure(9.6, 5.0)
-    pad = Rectangle(1.0, 1.0)
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 9), np.linspace(0.1, 0.9, 9))
-    fractions = pad.side_fractions(x, y)
-    seen_x, seen_y = _log_ratio(fractions) - 0.5, _log_ratio(fractions[[2, 3]]) - 0.5
+    fractions = UNIT.side_fractions(x, y)
+    seen_x, seen_y = (observed - 0.5 for observed in log_ratio(UNIT, fractions))
     scale = 0.5 / np.abs(seen_x).max()
-    exact = pad.locate(fractions)
+    exact = UNIT.locate(fractions)
     answers = (
         ("log-ratio, eq. 8, scaled into the pad", 0.5 + scale * seen_x, 0.5 + scale * seen_y),
         ("exact inverse", exact.x, exact.y),
@@ -204,7 +199,8 @@ def _along_the_centre_line() -> Figure:
     ):
         pad = ElectrodeNetwork(SQUARE_M, SQUARE_M, GAP_M, SHEET_OHM, (ohm,) * 4)
         drawn, sampled = (
-            _log_ratio(pad.currents(SQUARE_M / 2 + at, SQUARE_M / 2)) - 0.5 for at in (position, measured)
+            log_ratio(UNIT, pad.currents(SQUARE_M / 2 + at, SQUARE_M / 2))[0] - 0.5
+            for at in (position, measured)
         )
         bend = np.abs(sampled - np.polyval(np.polyfit(measured, sampled, 1), measured)).max()
         axes.plot(100 * position, drawn, color=colour, label=f"{text}; bend {bend:.3f}")
