@@ -69,6 +69,7 @@ class Surface(ABC):
         scales[j].
         """
 
+    @np.errstate(all="ignore")
     def scale(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """What divides a contact's radius [m] to give its radius on the rectangle: metres per rectangle unit.
 
@@ -109,15 +110,18 @@ class Revolved(Surface):
         middle = self._meridian(np.float64(self._middle) * np.ones(()))
         return float(middle.cosine), float(middle.sine)
 
+    @np.errstate(all="ignore")
     def from_rectangle(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         x, y = pair(x, y)
         return self._arc_length(x), np.asarray(y * self._meridian(x).scale)
 
+    @np.errstate(all="ignore")
     def to_rectangle(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         u, v = pair(u, v)
         x = self._conformal(u)
         return x, np.asarray(v / self._meridian(x).scale)
 
+    @np.errstate(all="ignore")
     def point(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         x, y = pair(x, y)
         at = self._meridian(x)
@@ -128,6 +132,7 @@ class Revolved(Surface):
         drop = at.scale * across * (angle / 2) * np.sinc(angle / (2 * np.pi)) ** 2
         return self._into_pad_frame(at.axial, aside, at.radial - drop)
 
+    @np.errstate(all="ignore")
     def tangents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         x, y = pair(x, y)
         at = self._meridian(x)
@@ -137,17 +142,20 @@ class Revolved(Surface):
         around = self._into_pad_frame(np.zeros_like(cos), cos, -sin)
         return np.stack([along, around])
 
+    @np.errstate(all="ignore")
     def normal(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         x, y = pair(x, y)
         at = self._meridian(x)
         angle = (y - self.b / 2) * self._curvature
         return self._into_pad_frame(-at.sine, at.cosine * np.sin(angle), at.cosine * np.cos(angle))
 
+    @np.errstate(all="ignore")
     def scales(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         x, y = pair(x, y)
         scale = self._meridian(x).scale
         return np.stack([scale, scale])
 
+    @np.errstate(all="ignore")
     def scale(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         x, y = pair(x, y)
         return self._meridian(x).scale
@@ -158,9 +166,9 @@ class Revolved(Surface):
 
 
 def pair(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Both as float64 arrays of one shape."""
+    """Both as float64 arrays of one shape, infinity as NaN."""
     one, two = np.broadcast_arrays(np.asarray(first, np.float64), np.asarray(second, np.float64))
-    return one, two
+    return np.where(np.isinf(one), np.nan, one), np.where(np.isinf(two), np.nan, two)
 
 
 def ratio_or_one(numerator: FloatArray, denominator: FloatArray) -> FloatArray:

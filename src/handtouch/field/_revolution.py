@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,7 +97,9 @@ class SplineProfile:
 
     def __init__(self, axial: FloatArray, radius: FloatArray) -> None:
         forward = 1.0 if axial[-1] >= axial[0] else -1.0
-        points = np.stack([forward * axial, radius], axis=1)
+        # a power of two brings any unit near 1, so that no square or quotient leaves the range of doubles
+        self._unit = math.ldexp(1.0, math.frexp(float(np.abs([axial, radius]).max()))[1])
+        points = np.stack([forward * axial, radius], axis=1) / self._unit
         knots = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         self._spline = CubicSpline(knots, points)
         steps = np.linspace(0, 1, _STEPS, endpoint=False)
@@ -119,7 +122,7 @@ class SplineProfile:
     @property
     def length(self) -> float:
         """Arc length of the whole profile."""
-        return float(self._arc(self._nodes[-1]))
+        return self._unit * float(self._arc(self._nodes[-1]))
 
     @property
     def conformal_length(self) -> float:
@@ -131,11 +134,11 @@ class SplineProfile:
         axial, radius = np.moveaxis(self._spline(t, extrapolate=False), -1, 0)
         forward, outward = np.moveaxis(self._spline(t, 1, extrapolate=False), -1, 0)
         speed = np.hypot(forward, outward)
-        return axial, radius, forward / speed, outward / speed
+        return self._unit * axial, self._unit * radius, forward / speed, outward / speed
 
     def arc_length(self, t: FloatArray) -> FloatArray:
         """Arc length from the start to t."""
-        return np.asarray(self._arc(t))
+        return np.asarray(self._unit * self._arc(t))
 
     def conformal(self, t: FloatArray) -> FloatArray:
         """Integral of ds / r from the start to t."""
@@ -143,7 +146,7 @@ class SplineProfile:
 
     def at_arc_length(self, length: FloatArray) -> FloatArray:
         """T where the arc length is as given."""
-        return _solve(self._arc, self._from_arc, length)
+        return _solve(self._arc, self._from_arc, length / self._unit)
 
     def at_conformal(self, value: FloatArray) -> FloatArray:
         """T where the conformal coordinate is as given."""

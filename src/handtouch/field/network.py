@@ -130,8 +130,9 @@ class ElectrodeNetwork:
 
     def fractions_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """`fractions` (m, ...), their derivatives by (x, y) (m, 2, ...), unbounded at electrodes' ends."""
-        ideal, jacobian = self._ideal_with_jacobian(x, y)
-        return self._mixed(ideal), self._mixed(jacobian)
+        ideal, jacobian = self._ideal_with_jacobian(self._to_disc(x, y))
+        with np.errstate(over="ignore"):
+            return self._mixed(ideal), self._mixed(jacobian) / self._unit
 
     def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """The radius R that gives the sheet's resistance, sheet / (2 pi) * ln(R / A), to a contact of
@@ -143,7 +144,8 @@ class ElectrodeNetwork:
         """
         defects = self._to_disc(x, y)
         with np.errstate(all="ignore"):
-            return np.asarray(self._disc.radius(defects) * np.exp(self._potentials.log_spread(defects)))
+            radius = self._disc.radius(defects) * np.exp(self._potentials.log_spread(defects))
+            return np.asarray(radius * self._unit)
 
     def series_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """What the resistors add between a contact and ground [ohm], shape (...): sum of phi_i V_i."""
@@ -209,8 +211,10 @@ class ElectrodeNetwork:
         self.sheet_ohm_per_square = float(sheet_ohm_per_square)
         order = _counter_clockwise(self.electrodes, a, b)
         self._place = np.argsort(order)
-        self._disc = DiscMap(a, b)
-        ends = np.array([_ends(self.electrodes[i], a, b) for i in order])  # (m, start and stop, x and y)
+        # a power of two brings any unit near 1, so that no product leaves the range of doubles
+        self._unit = math.ldexp(1.0, math.frexp(max(self.a, self.b))[1])
+        self._disc = DiscMap(self.a / self._unit, self.b / self._unit)
+        ends = np.array([_ends(self.electrodes[i], a, b) for i in order]) / self._unit  # (m, 2 ends, x and y)
         starts = CirclePoints(self._disc, self._disc.defects(*np.roll(ends[:, 0], -1, axis=0).T))
         stops = CirclePoints(self._disc, self._disc.defects(*ends[:, 1].T))
         self._potentials = ElectrodePotentials(stops, starts, self._disc.defects(*ends[0].mean(axis=0)))
@@ -246,14 +250,15 @@ class ElectrodeNetwork:
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         on_pad = (x >= 0) & (x <= self.a) & (y >= 0) & (y <= self.b)
         with np.errstate(all="ignore"):
-            return self._disc.defects(np.where(on_pad, x, np.nan), np.where(on_pad, y, np.nan))
+            x, y = (np.where(on_pad, coordinate, np.nan) / self._unit for coordinate in (x, y))
+            return self._disc.defects(x, y)
 
     def _mixed(self, ideal: FloatArray) -> FloatArray:
         return np.asarray(np.tensordot(self._mix, ideal, axes=1)) if any(self.series_ohm) else ideal
 
-    def _ideal_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def _ideal_with_jacobian(self, defects: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Potentials (m, ...) and their derivatives (m, 2, ...) by coordinates in `_unit`."""
         with np.errstate(all="ignore"):
-            defects = self._to_disc(x, y)
             values, slope = self._potentials.potentials_and_slope(defects)
             slope = slope * self._disc.derivative(defects)
         # phi = Im Phi: d/dx = Im Phi', d/dy = Im(i Phi') = Re Phi'
@@ -268,16 +273,17 @@ class ElectrodeNetwork:
     def _newton(self, sums: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
         """x and y (n,) where side sums (4, n) are as measured, from where a pad without gaps has them."""
         start = self._rectangle.locate(measured)
-        inset = 1e-9 * np.array([[self.a], [self.b]])
-        far = np.array([[self.a], [self.b]]) - inset
-        at = np.clip(np.stack([start.x, start.y]), inset, far)
+        sides = np.array([[self.a], [self.b]]) / self._unit
+        inset = 1e-9 * sides
+        far = sides - inset
+        at = np.clip(np.stack([start.x, start.y]) / self._unit, inset, far)
         wanted, _ = _log_ratios(measured)
         settled = np.zeros(at.shape[1], bool)
         for _ in range(_STEPS):
             moving = np.flatnonzero(~settled & np.isfinite(at).all(axis=0))
             if moving.size == 0:
                 break
-            values, jacobian = self._ideal_with_jacobian(*at[:, moving])
+            values, jacobian = self._ideal_with_jacobian(self._disc.defects(*at[:, moving]))
             ratios, slopes = _log_ratios(sums @ values)
             rates = slopes[:, None] * np.tensordot(sums, jacobian, axes=1)
             (xx, xy), (yx, yy) = rates[1] - rates[0], rates[3] - rates[2]
@@ -289,6 +295,7 @@ class ElectrodeNetwork:
             at[:, moving] = new
         on_edge = ((at == inset) | (at == far)).any(axis=0)
         at[:, on_edge] = np.nan
+        at *= self._unit
         return at[0], at[1]
 
 

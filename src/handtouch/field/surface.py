@@ -326,4 +326,5 @@ class Anisotropic(Surface):
         return np.stack([along / self._stretch, around])
 
     def _relaxed(self, x: npt.ArrayLike) -> FloatArray:
-        return np.asarray(np.asarray(x, np.float64) / self._stretch)
+        with np.errstate(all="ignore"):
+            return np.asarray(np.asarray(x, np.float64) / self._stretch)
