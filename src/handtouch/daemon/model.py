@@ -48,7 +48,8 @@ class PadModel:
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
         self.end_samples = np.array([touch.end_samples for touch in touches])
         networks = _networks(pads, sheets)
-        self.locator = LocatorBank(networks)
+        finest = min(node.noise_counts for node in nodes) / FULL_SCALE  # noise of the strongest contact
+        self.locator = LocatorBank(networks, tolerance=finest / 10)
         self.placement = Placement([(surface_of(pad), *mount_of(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
         self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])

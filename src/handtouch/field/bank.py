@@ -15,7 +15,6 @@ from handtouch.field.model import FloatArray, ForwardModel
 IndexArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-_ERROR_WANTED = 1e-6  # of a fraction; finer tables are tried until all models meet it
 _STEPS = 10
 _SETTLED = 1e-2  # squared Newton decrement, in variances: the step then taken leaves far less
 _LONGEST_STEP = 1.0  # in w, where places are 1 / (1 + exp(-w)) of a side
@@ -26,6 +25,7 @@ class LocatorBank:
     """Tables of one forward model for each pad, read for many contacts at once.
 
     models: one for each pad, with channels x0, xa, y0, yb; pads that share a model object share its table.
+    tolerance: of a tabulated fraction; finer tables, of 6 to 24 MB a model, are tried until all meet it.
     table_error: (pads,), the largest error of a tabulated fraction, as measured between the nodes, at 3 % of
         a side and farther from the edges. edge_error: the same up to the edges.
 
@@ -33,7 +33,7 @@ class LocatorBank:
     with other channels.
     """
 
-    def __init__(self, models: Sequence[ForwardModel]) -> None:
+    def __init__(self, models: Sequence[ForwardModel], tolerance: float = 1e-6) -> None:
         distinct = list({id(model): model for model in models}.values())
         for model in distinct:
             channels = len(model.fractions(model.a / 2, model.b / 2))
@@ -41,7 +41,7 @@ class LocatorBank:
                 raise ValueError(f"a bank takes models with four channels, one has {channels}")
         for grid in GRIDS:
             tables = [PadTable.of(model, grid) for model in distinct]
-            if all(table.error < _ERROR_WANTED for table in tables):
+            if all(table.error < tolerance for table in tables):
                 break
         order = {id(model): i for i, model in enumerate(distinct)}
         self._model = np.array([order[id(model)] for model in models], dtype=np.intp)
