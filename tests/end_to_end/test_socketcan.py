@@ -1,0 +1,94 @@
+"""The same hand on real SocketCAN: what candump shows a CANopen engineer, and contacts that come through."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+PERIOD_S = 0.02
+LONGEST_S = 60.0
+
+pytestmark = [pytest.mark.socketcan, pytest.mark.timeout(240)]
+
+
+def _record(rig: Any, seconds: float) -> list[can.Message]:
+    """What candump, as a stranger, sees on the bus."""
+    log = Path(rig.folder) / "session.log"
+    with log.open("w") as file:
+        candump = subprocess.Popen([shutil.which("candump") or "candump", "-L", "vcan0"], stdout=file)
+        time.sleep(seconds)
+        candump.terminate()
+        candump.wait()
+    with can.LogReader(log) as reader:
+        return list(reader)
+
+
+def test_the_hand_works_and_the_bus_looks_as_a_canopen_engineer_expects(vcan_rig: Any) -> None:
+    rig = vcan_rig
+    log = Path(rig.folder) / "boot.log"
+    with log.open("w") as file:
+        candump = subprocess.Popen([shutil.which("candump") or "candump", "-L", "vcan0"], stdout=file)
+        rig.simulate()
+        rig.start("run")
+        status = rig.wait_operational()
+        candump.terminate()
+        candump.wait()
+    nodes = {pad["node_id"] for pad in status["pads"]}
+    with can.LogReader(log) as reader:
+        boot = list(reader)
+    started = {bytes(m.data)[1] for m in boot if m.arbitration_id == 0 and m.data[0] == 1}
+    assert started == nodes  # each by its id: no broadcast, whose second byte is 0
+    assert {
+        m.arbitration_id - 0x700 for m in boot if m.arbitration_id > 0x700 and bytes(m.data) == b"\0"
+    } == nodes
+
+    messages = _record(rig, 2.0)
+    count = Counter(m.arbitration_id for m in messages)
+    syncs = [m for m in messages if m.arbitration_id == 0x80]
+    assert all(len(m.data) == 0 for m in syncs)
+    periods = np.diff([m.timestamp for m in syncs])
+    assert np.median(periods) == pytest.approx(PERIOD_S, rel=0.2)
+    for node in nodes:
+        assert abs(count[0x280 + node] - len(syncs)) <= 3
+        assert count[0x700 + node] >= 2.0 / 0.1 * 0.5  # a heartbeat every 100 ms
+    known = {0x80} | {base + node for node in nodes for base in (0x280, 0x700)}
+    assert set(count) <= known
+    assert {len(m.data) for m in messages if 0x280 < m.arbitration_id < 0x300} == {8}
+
+    with rig.subscribe("contact/*/*") as contacts:
+        events: Counter[str] = Counter()
+        end_s = time.monotonic() + LONGEST_S
+        while events["end"] < 2:
+            assert time.monotonic() < end_s, rig.all_printed()
+            contact = contacts.recv(0.5)
+            if contact is not None:
+                events[contact.event] += 1
+    assert events["begin"] >= 2
+    assert events["update"] > 20
+    bus = rig.status()["service"]["buses"]["can0"]
+    assert (bus["short"], bus["foreign"], bus["overflow"], bus["errors"]) == (0, 0, 0, 0)
+
+
+def test_sigterm_stops_each_node_by_its_id(vcan_rig: Any) -> None:
+    rig = vcan_rig
+    rig.simulate()
+    rig.start("run")
+    status = rig.wait_operational()
+    log = Path(rig.folder) / "stop.log"
+    with log.open("w") as file:
+        candump = subprocess.Popen([shutil.which("candump") or "candump", "-L", "vcan0,000:7FF"], stdout=file)
+        time.sleep(0.5)
+        assert rig.end("run") == 0
+        candump.terminate()
+        candump.wait()
+    with can.LogReader(log) as reader:
+        commands = [tuple(m.data) for m in reader]
+    assert sorted(commands) == sorted((2, pad["node_id"]) for pad in status["pads"])
