@@ -91,6 +91,31 @@ def test_descriptor_is_readable_exactly_while_frames_wait(port: Port, other: can
     assert readable(port, 1.0)
 
 
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_frame_that_comes_while_the_signal_is_lowered_is_not_forgotten(
+    port: Port, when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Read in another order, the signal of the second frame was taken and the third raised none."""
+    receiver: Any = port._receiver
+    lower = os.eventfd_read
+
+    def meanwhile(descriptor: int) -> int:
+        if when == "before":
+            receiver._put(frame(0x701, b"\x02"))
+        value = lower(descriptor)
+        if when == "after":
+            receiver._put(frame(0x701, b"\x02"))
+        return value
+
+    receiver._put(frame(0x701, b"\x01"))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "eventfd_read", meanwhile)
+        got = port.drain()
+    receiver._put(frame(0x701, b"\x03"))
+    assert readable(port)
+    assert [data for _, data, _ in got + port.drain()] == [b"\x01", b"\x02", b"\x03"]
+
+
 def test_more_than_one_drain_can_take_is_not_forgotten(
     port: Port, other: can.BusABC, monkeypatch: pytest.MonkeyPatch
 ) -> None:

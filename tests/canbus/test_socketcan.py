@@ -114,11 +114,11 @@ def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_flood_of_strangers_costs_no_sample(port: Port) -> None:
-    for number in range(50):
-        run(f"cangen vcan0 -g 0 -n 100 -I 700 -L 8; cansend vcan0 281#{number:02x}00020003000400")
+    for number in range(12):
+        run(f"cangen vcan0 -g 0 -n 400 -I 700 -L 8; cansend vcan0 281#{number:02x}00020003000400")
         port.drain()
-    assert (port.counters.frames, port.counters.samples, port.counters.overflow) == (5050, 50, 0)
-    assert port.slab.counts[0, 0] == 49
+    assert (port.counters.frames, port.counters.samples, port.counters.overflow) == (4812, 12, 0)
+    assert port.slab.counts[0, 0] == 11
 
 
 def test_a_hand_boots_within_two_seconds_and_survives_a_reboot() -> None:

@@ -244,7 +244,7 @@ class ThreadReceiver:
     def __init__(self, opener: Opener, interface: str) -> None:
         self._opener = opener
         self._stamped = interface in _WALL_STAMPED
-        self._queue: deque[tuple[can.Message, int]] = deque(maxlen=QUEUE_FRAMES)
+        self._queue: deque[can.Message] = deque(maxlen=QUEUE_FRAMES)
         self._lost = 0
         self._errors = 0
         self._counted = (0, 0)
@@ -276,15 +276,15 @@ class ThreadReceiver:
         others: list[Frame] = []
         self._lower_signal()
         popleft, accept = self._queue.popleft, router.accept_message
-        for _ in range(DRAIN_LIMIT):
-            try:
-                message, t_ns = popleft()
-            except IndexError:
-                break
-            frame = accept(message, t_ns)
+        count = min(len(self._queue), DRAIN_LIMIT)
+        now_ns = time.monotonic_ns()
+        offset_ns = now_ns - time.time_ns()
+        for _ in range(count):
+            message = popleft()
+            frame = accept(message, monotonic_from_wall(message.timestamp, now_ns, offset_ns))
             if frame is not None:
                 others.append(frame)
-        else:
+        if count == DRAIN_LIMIT:
             self._raise_signal()
         lost, errors = self._lost, self._errors
         router.counters.overflow += lost - self._counted[0]
@@ -293,10 +293,11 @@ class ThreadReceiver:
         return others
 
     def _lower_signal(self) -> None:
-        # Lowered before the queue is read: a frame that comes meanwhile raises it again, none is forgotten.
-        self._signalled = False
+        # In this order, and before the queue is read: a frame that comes meanwhile is either read below or
+        # raises the signal again. The other way round its signal could be taken and never raised any more.
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._eventfd)
+        self._signalled = False
 
     def _raise_signal(self) -> None:
         if not self._signalled:
@@ -326,13 +327,13 @@ class ThreadReceiver:
                 self._put(message)
 
     def _put(self, message: can.Message) -> None:
-        t_ns = time.monotonic_ns()
-        if self._stamped:
-            t_ns = monotonic_from_wall(message.timestamp, t_ns, t_ns - time.time_ns())
+        if not self._stamped:  # its stamps may be of the adapter's own clock
+            message.timestamp = time.time()
         if len(self._queue) == QUEUE_FRAMES:
             self._lost += 1
-        self._queue.append((message, t_ns))
-        self._raise_signal()
+        self._queue.append(message)
+        if not self._signalled:
+            self._raise_signal()
 
     def _failed(self, error: Exception) -> None:
         self._errors += 1

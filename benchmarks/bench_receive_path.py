@@ -1,0 +1,217 @@
+"""What a received frame costs: `Port.drain` against a bare receive-and-store loop on the same interface.
+
+For in-process buses and udp_multicast, or, where there is a vcan0, SocketCAN. Bursts of samples are put on
+the bus, then the time is taken until the last one is in the slab (in-process: processor time of all threads,
+as a reader thread takes part; else wall time, as only the caller works). The bare loop reads with the
+cheapest call there is for the interface, looks the slot up and stores data and arrival time: no counting, no
+checks, no routes. Both run in turns. Writes docs/benchmarks/receive_path.{md,json}.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import select
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+
+from handtouch.canbus.port import Port
+from handtouch.canbus.receivers import grow_receive_buffer
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
+
+OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
+PADS, BURST, TURNS = 15, 400, 100
+GROUP = "239.74.163.77"
+VCAN = Path("/sys/class/net/vcan0")
+ID0 = 0x281
+FRAME = struct.Struct("=IB3x8s")
+
+
+def store(slab: Slab) -> Callable[[int, bytes | bytearray], None]:
+    """The bare loop's store: slot of the identifier, data, arrival."""
+    slots = dict.fromkeys(range(ID0, ID0 + PADS), 0) | {ID0 + slot: slot for slot in range(PADS)}
+    data_of, t_ns_of, clock = memoryview(bytearray(8 * PADS)), slab.t_ns.data, time.monotonic_ns
+
+    def keep(can_id: int, data: bytes | bytearray) -> None:
+        slot = slots[can_id]
+        data_of[8 * slot : 8 * slot + 8] = data
+        t_ns_of[slot] = clock()
+
+    return keep
+
+
+def bare_recv(bus: can.BusABC, slab: Slab) -> int:
+    """Read with python-can's `recv` until nothing waits; frames read."""
+    keep, recv, count = store(slab), bus.recv, 0
+    while (message := recv(0)) is not None:
+        keep(message.arbitration_id, message.data)
+        count += 1
+    return count
+
+
+def bare_socket(bus: can.BusABC, slab: Slab) -> int:
+    """Read from SocketCAN's socket, without time stamps, until nothing waits; frames read."""
+    sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketcanBus has it
+    keep, recv, unpack, count = store(slab), sock.recv, FRAME.unpack, 0
+    while True:
+        try:
+            can_id, _, data = unpack(recv(16, socket.MSG_DONTWAIT))
+        except BlockingIOError:
+            return count
+        keep(can_id, data)
+        count += 1
+
+
+def fill(bus: can.BusABC) -> None:
+    """One burst, as fast as it goes."""
+    for number in range(BURST):
+        data = number.to_bytes(2, "little") * 4
+        bus.send(can.Message(arbitration_id=ID0 + number % PADS, data=data, is_extended_id=False))
+
+
+def drained(port: Port) -> None:
+    """Drain as the daemon does: wait on the descriptor, then read all."""
+    target = port.counters.samples + BURST
+    while port.counters.samples < target:
+        if not select.select([port.fileno()], [], [], 2)[0]:
+            raise RuntimeError(f"frames were lost: {port.counters}")
+        port.drain()
+
+
+def preload(bus: can.BusABC, messages: list[can.Message]) -> None:
+    """Put messages into an in-process bus's own queue: its `send` copies them, at three times the cost."""
+    for message in messages:
+        message.timestamp = time.time()
+        bus.queue.put(message)  # type: ignore[attr-defined]  # VirtualBus has it
+
+
+def in_process() -> dict[str, Any]:
+    """The reader thread begins with the queue full, so its work is measured too."""
+    messages = [
+        can.Message(arbitration_id=ID0 + n % PADS, data=bytes(8), is_extended_id=False) for n in range(BURST)
+    ]
+    slab = Slab(PADS)
+    bare, port_us = [], []
+    with can.Bus(interface="virtual", channel="bare") as bus:
+        port = Port.open(Bus(name="port", interface="virtual", channel="port"), slab)
+        route(port)
+        inner = port._receiver._bus  # type: ignore[attr-defined]  # to fill its queue
+        for _ in range(TURNS):
+            preload(bus, messages)
+            bare.append(cost(lambda: bare_recv(bus, slab), time.process_time_ns))
+            start = time.process_time_ns()
+            preload(inner, messages)
+            filling = time.process_time_ns() - start
+            start = time.process_time_ns()
+            drained(port)
+            # The reader has worked while the queue was filled: filling alone, measured below, is taken off.
+            port_us.append((filling + time.process_time_ns() - start) / BURST / 1e3)
+        alone = []
+        for _ in range(TURNS):
+            alone.append(cost(lambda: preload(bus, messages), time.process_time_ns))
+            bare_recv(bus, slab)
+        port.close()
+    filling_us = statistics.median(alone)
+    return summary("in-process", bare, [us - filling_us for us in port_us])
+
+
+def over_socket(
+    name: str, interface: str, channel: str, bare_loop: Callable[[can.BusABC, Slab], int]
+) -> dict[str, Any]:
+    """Both receivers are open all the time and each gets every frame."""
+    slab = Slab(PADS)
+    bare, port_us = [], []
+    sender = can.Bus(interface=interface, channel=channel)
+    bus = can.Bus(interface=interface, channel=channel)
+    grow_receive_buffer(bus.fileno())
+    port = Port.open(Bus(name="port", interface=interface, channel=channel), slab)
+    route(port)
+    for _ in range(TURNS):
+        fill(sender)
+        bare.append(cost(lambda: check(bare_loop(bus, slab))))
+        port_us.append(cost(lambda: drained(port)))
+        while sender.recv(0) is not None:  # udp_multicast gives back what was sent
+            pass
+    port.close()
+    bus.shutdown()
+    sender.shutdown()
+    return summary(name, bare, port_us)
+
+
+def check(count: int) -> None:
+    if count != BURST:
+        raise RuntimeError(f"the bare loop read {count} of {BURST} frames")
+
+
+def route(port: Port) -> None:
+    for slot in range(PADS):
+        port.route(ID0 + slot, slot)
+
+
+def cost(work: Callable[[], object], clock: Callable[[], int] = time.perf_counter_ns) -> float:
+    """Time of a burst, microseconds a frame."""
+    start = clock()
+    work()
+    return (clock() - start) / BURST / 1e3
+
+
+def summary(name: str, bare: list[float], port: list[float]) -> dict[str, Any]:
+    where = os.environ.get("VCAN_RUN", "host")
+    row = {
+        "interface": name,
+        "bare_us": round(statistics.median(bare), 3),
+        "port_us": round(statistics.median(port), 3),
+        "machine": f"{where}, {platform.machine()}, Python {platform.python_version()}",
+        "ratio": round(statistics.median(port) / statistics.median(bare), 3),
+    }
+    print(f"{name:14} bare {row['bare_us']:6.2f} us  port {row['port_us']:6.2f} us  ratio {row['ratio']:.2f}")
+    return row
+
+
+def report(rows: list[dict[str, Any]]) -> None:
+    """Add to what earlier runs, on other interfaces, have left."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    path = OUT / "receive_path.json"
+    kept = json.loads(path.read_text())["rows"] if path.exists() else []
+    names = {row["interface"] for row in rows}
+    rows = [row for row in kept if row["interface"] not in names] + rows
+    path.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+    lines = [
+        "# What a received frame costs",
+        "",
+        "`Port.drain` against a bare receive-and-store loop on the same interface, in the same run; medians.",
+        "Made by `benchmarks/bench_receive_path.py`; under `tests/socketcan/vcan-run` it measures SocketCAN.",
+        "",
+        "| interface | bare, us | port, us | ratio | on |",
+        "|---|---|---|---|---|",
+    ]
+    lines += ["| {interface} | {bare_us} | {port_us} | {ratio} | {machine} |".format(**row) for row in rows]
+    (OUT / "receive_path.md").write_text("\n".join(lines) + "\n")
+
+
+def main() -> None:
+    """In a network namespace of its own, but for SocketCAN."""
+    if VCAN.exists():
+        report([over_socket("socketcan", "socketcan", "vcan0", bare_socket)])
+        return
+    if "--in-namespace" not in sys.argv:
+        ready = "ip link set lo up && ip route add 239.0.0.0/8 dev lo"
+        rootless = [] if os.geteuid() == 0 else ["--map-root-user"]
+        shell = ["sh", "-c", f'{ready} && exec "$@"', "sh", sys.executable, __file__, "--in-namespace"]
+        sys.exit(subprocess.call(["unshare", "--net", *rootless, *shell]))
+    report([in_process(), over_socket("udp_multicast", "udp_multicast", GROUP, bare_recv)])
+
+
+if __name__ == "__main__":
+    main()
