@@ -84,7 +84,7 @@ class LogRatioTable:
         return np.asarray((offsets * ratios).sum(axis=(1, 2)) / (ratios * ratios).sum(axis=(1, 2)))
 
     @cached_property
-    def _table(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def table(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """True places (cells + 1, cells + 1, 2) of a grid of observed ones; its origin and its steps."""
         corner = self._observe(self.pad.side_fractions(*(0.02 * s for s in (self.pad.a, self.pad.b))))
         centre = np.array([self.pad.a, self.pad.b]) / 2
@@ -118,7 +118,7 @@ class LogRatioTable:
 
     def _correct(self, observed: FloatArray) -> FloatArray:
         """Bilinear reading of the table, (2, ...)."""
-        table, origin, steps = self._table
+        table, origin, steps = self.table
         shape = (2,) + (1,) * (observed.ndim - 1)
         with np.errstate(all="ignore"):
             position = (observed - origin.reshape(shape)) / steps.reshape(shape)

@@ -22,6 +22,7 @@ LOST = 1e3  # sides: a coordinate less certain than this is not known at all
 CORNER = 0.7  # shorter sides, times the root of the relative noise: how near a corner currents tell anything
 _ARC_STEPS = 6  # of the search for a direction from a corner
 _GRAZING = 0.02  # rad: an estimate near a corner keeps this far from its sides
+_GUESSED_AT_ONCE = 8192  # contacts, to bound memory
 _GRID = 9  # points a side of the search that finds a start without a closed form
 
 
@@ -130,15 +131,14 @@ class _Fit:
         x, y = (
             s.ravel() for s in np.meshgrid(self.model.a * fractions_of_side, self.model.b * fractions_of_side)
         )
-        table = self.model.fractions(x, y)
-        best = np.full(self.data.shape[1], -np.inf)
-        begin = np.full((2, len(best)), np.nan)
-        for px, py, fractions in zip(x, y, table.T, strict=True):
-            whitened = fractions[:, None] * self.weight
-            explained = np.maximum((whitened * self.data).sum(0), 0) ** 2 / (whitened * whitened).sum(0)
-            better = explained > best
-            best = np.where(better, explained, best)
-            begin[0, better], begin[1, better] = px, py
+        table = self.model.fractions(x, y).T
+        begin = np.empty((2, self.data.shape[1]))
+        for first in range(0, self.data.shape[1], _GUESSED_AT_ONCE):
+            some = slice(first, first + _GUESSED_AT_ONCE)
+            weight, data = self.weight[:, some], self.data[:, some]
+            along, norm = table @ (weight * data), (table * table) @ (weight * weight)
+            best = np.argmax(np.maximum(along, 0.0) ** 2 / norm, axis=0)
+            begin[:, some] = x[best], y[best]
         return begin
 
     def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> _Linear:
