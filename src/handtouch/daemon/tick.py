@@ -112,8 +112,8 @@ class Tick:
         sampled = (slab.fresh != 0) & operational
         self.missed += self.expected() & operational & ~sampled
         columns.sample_ns[sampled] = t_ns
-        railed: BoolArray = (np.abs(slab.counts.astype(np.int32)) >= _RAIL).any(axis=1)
-        stale = np.asarray(now_ns - columns.sample_ns > self._stale_ns)
+        railed: BoolArray = np.any(np.abs(slab.counts.astype(np.int32)) >= _RAIL, axis=1)
+        stale: BoolArray = np.subtract(now_ns, columns.sample_ns) > self._stale_ns
         trusted: BoolArray = operational & ~railed & ~stale
         np.multiply(slab.counts, model.ampere_per_count[:, None], out=self._currents)
         np.copyto(columns.current_a, self._currents.sum(axis=1), where=sampled)
