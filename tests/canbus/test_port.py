@@ -263,11 +263,17 @@ def drain_until(receiver: Any, router: Router, what: Callable[[], bool]) -> bool
 
 
 def test_malformed_datagrams_are_counted_and_the_rest_is_received(start: Any, router: Router) -> None:
-    opener = Opener([MALFORMED, SAMPLE, ValueError("bad hex"), SAMPLE, SAMPLE])
+    opener = Opener([MALFORMED, SAMPLE, ValueError("bad hex"), SAMPLE, *[MALFORMED] * 9, SAMPLE])
     receiver = start(opener)
     assert drain_until(receiver, router, lambda: router.counters.samples == 3)
-    assert router.counters.receive_errors == 2
+    assert router.counters.receive_errors == 11
     assert len(opener.opened) == 1
+
+
+def test_bus_that_does_nothing_but_fail_is_opened_again(start: Any, router: Router) -> None:
+    opener = Opener([MALFORMED] * 1000, [SAMPLE])
+    assert drain_until(start(opener), router, lambda: router.counters.samples == 1)
+    assert opener.opened[0].closed
 
 
 def test_interface_that_goes_down_and_up_is_used_again(start: Any, router: Router) -> None:

@@ -32,7 +32,7 @@ QUEUE_FRAMES = 16384
 
 _WALL_STAMPED = frozenset({"socketcan", "udp_multicast", "virtual"})
 _RETRY_FIRST_S, _RETRY_LAST_S = 0.1, 2.0
-_ERRORS_TO_REOPEN = 3
+_ERRORS_TO_REOPEN = 20  # in a row; a few bad datagrams or serial lines are no reason to lose what waits
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33
 _GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is of no more use
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
@@ -118,12 +118,14 @@ class _SocketReceiver:
         before = router.counters.frames
         try:
             self._read(bus, router, others)
+            failure = None
         except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; here it is counted
-            self._failed(router, error)
-        else:
-            if self.problem and router.counters.frames > before:
-                self.problem = ""
-                self._errors = 0
+            failure = error
+        if self.problem and router.counters.frames > before:
+            self.problem = ""
+            self._errors = 0
+        if failure is not None:
+            self._failed(router, failure)
         return others
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -142,16 +144,19 @@ class _SocketReceiver:
         self._epoll.register(bus.fileno(), select.EPOLLIN)
 
     def _drop(self) -> None:
-        if self._bus is not None:
-            self._bus.shutdown()  # closing the socket takes it out of the epoll
-            self._bus = None
+        bus, self._bus = self._bus, None
+        if bus is None:
+            return
+        try:
+            bus.shutdown()  # closing the socket takes it out of the epoll
+        except Exception as error:  # noqa: BLE001 - as above
+            self.problem = str(error) or type(error).__name__
 
     def _failed(self, router: Router, error: Exception) -> None:
         router.counters.receive_errors += 1
-        self.problem = str(error)
+        self.problem = str(error) or type(error).__name__
         self._errors += 1
-        code = getattr(error, "errno", None) or getattr(error, "error_code", None)
-        if code in _GONE or (code != errno.ENETDOWN and self._errors >= _ERRORS_TO_REOPEN):
+        if _is_hopeless(error, self._errors):
             self._drop()
 
     def _reopen(self, router: Router) -> can.BusABC | None:
@@ -161,7 +166,7 @@ class _SocketReceiver:
             self._use(self._opener())
         except Exception as error:  # noqa: BLE001 - as above
             router.counters.receive_errors += 1
-            self.problem = str(error)
+            self.problem = str(error) or type(error).__name__
             return None
         self._errors = 0
         self.problem = ""
@@ -316,15 +321,17 @@ class ThreadReceiver:
             except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; here it is counted
                 in_a_row += 1
                 self._failed(error)
-                if in_a_row >= _ERRORS_TO_REOPEN:
+                if _is_hopeless(error, in_a_row):
                     self._drop(self._bus)
                     in_a_row = 0
                 continue
-            if message is not None:
+            if message is None:
+                continue
+            self._put(message)
+            if self.problem:
                 in_a_row = 0
                 retry.reset()
                 self.problem = ""
-                self._put(message)
 
     def _put(self, message: can.Message) -> None:
         if not self._stamped:  # its stamps may be of the adapter's own clock
@@ -337,7 +344,7 @@ class ThreadReceiver:
 
     def _failed(self, error: Exception) -> None:
         self._errors += 1
-        self.problem = str(error)
+        self.problem = str(error) or type(error).__name__
         self._raise_signal()  # so that the count is taken
 
     def _drop(self, bus: can.BusABC) -> None:
@@ -355,6 +362,16 @@ class ThreadReceiver:
             self._bus = self._opener()
         except Exception as error:  # noqa: BLE001 - as above
             self._failed(error)
+        else:
+            self.problem = ""
+
+
+def _is_hopeless(error: Exception, in_a_row: int) -> bool:
+    """Whether a bus that has failed so many times in a row, last with this, has to be opened again."""
+    code = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    if code == errno.ENETDOWN:  # the same socket works again when the interface is up
+        return False
+    return code in _GONE or in_a_row >= _ERRORS_TO_REOPEN
 
 
 def grow_receive_buffer(target: socket.socket | int) -> int:

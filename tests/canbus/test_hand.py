@@ -1,0 +1,74 @@
+"""Ports, master, worker thread and nodes together, in real time: a hand boots, reboots and stops."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable
+
+import can
+import numpy as np
+import pytest
+
+from handtouch.canbus.device import DeviceBus
+from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.master import Master, NodeSpec
+from handtouch.canbus.port import Port
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
+
+NODES = 15
+
+
+def eventually(what: Callable[[], bool], seconds: float = 5.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while not what() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return what()
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel"),
+    [("virtual", "hand"), pytest.param("socketcan", "vcan0", marks=pytest.mark.socketcan)],
+)
+def test_a_hand_boots_within_two_seconds_and_survives_a_reboot(interface: str, channel: str) -> None:
+    slab = Slab(NODES)
+    port = Port.open(Bus(name="palm", interface=interface, channel=channel), slab)
+    counts = np.arange(4 * NODES, dtype=np.int16).reshape(NODES, 4)
+    with can.Bus(interface=interface, channel=channel) as bus:
+        devices = DeviceBus(bus, lambda _: counts)
+        for number in range(1, NODES + 1):
+            devices.add(number, serial=number)
+        devices.start()
+        specs = [NodeSpec(slot, "palm", slot + 1, f"pad{slot}", serial=slot + 1) for slot in range(NODES)]
+        master = Master({"palm": port}, specs, 20_000_000)
+        started = time.monotonic()
+        master.start(time.monotonic_ns())
+        assert _cycle(port, master, lambda: bool((master.states == NodeState.OPERATIONAL).all()), 10)
+        assert time.monotonic() - started < 2
+        devices.devices[3].reboot()
+        assert _cycle(port, master, lambda: master.status()[2].reboots == 1, 5)
+        assert _cycle(port, master, lambda: master.states[2] == NodeState.OPERATIONAL, 5)
+        np.testing.assert_array_equal(slab.counts, counts)
+        master.stop(time.monotonic_ns())
+        assert eventually(lambda: {d.state for d in devices.devices.values()} == {"STOPPED"})
+        devices.stop()
+    assert port.counters.foreign == port.counters.send_failures == port.counters.overflow == 0
+    port.close()
+
+
+def _cycle(port: Port, master: Master, what: Callable[[], bool], seconds: float) -> bool:
+    """The hot loop in small, with a SYNC every 10 ms."""
+    deadline = time.monotonic() + seconds
+    next_sync = time.monotonic()
+    while time.monotonic() < deadline:
+        if time.monotonic() >= next_sync:
+            port.send(0x80, b"")
+            next_sync += 0.01
+        select.select([port.fileno()], [], [], max(next_sync - time.monotonic(), 0))
+        for frame in port.drain():
+            master.handle("palm", *frame)
+        master.poll(time.monotonic_ns())
+        if what():
+            return True
+    return False
