@@ -338,7 +338,7 @@ class TestArguments:
             assert pad.fractions_with_jacobian(x, y)[0] == pytest.approx(pad.currents(x, y))
             assert pad.spreading_radius(0.5, 0.0) == 0
 
-    @pytest.mark.parametrize("scale", [1e-150, 1e-3, 1e150])
+    @pytest.mark.parametrize("scale", [1e-300, 1e-150, 1e-3, 1e150, 1e300])
     def test_the_unit_of_length_and_of_current_is_any(self, scale: float) -> None:
         pad = ElectrodeNetwork(1.5 * scale, scale, 0.05 * scale, SHEET, PAPER)
         small = network(1.5, 0.05, PAPER)

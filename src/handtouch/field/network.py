@@ -31,6 +31,7 @@ Side = Literal["x0", "xa", "y0", "yb"]
 SIDES: tuple[Side, ...] = ("x0", "xa", "y0", "yb")
 LONGEST_ASPECT = 50.0
 _STEPS = 30
+_SETTLED = 1e-8  # of a side; Newton's next step would be its square
 _LEAST = 1e-13  # a smaller fraction holds no digits of a place
 
 
@@ -180,12 +181,13 @@ class ElectrodeNetwork:
             raise ValueError("locate needs a connected electrode on every side; estimate does not")
         shape = currents.shape[1:]
         flat = currents.reshape(currents.shape[0], -1)
-        total = flat.sum(axis=0)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        with np.errstate(all="ignore"):
+            total = flat.sum(axis=0)
             measured = self._side_sums @ (self._unmix @ (flat / total))
         x, y = self._newton(self._side_sums, measured)
         expected = self.ideal_fractions(x, y)
-        residual = measured[:2].sum(axis=0) - (self._side_sums[:2] @ expected).sum(axis=0)
+        with np.errstate(all="ignore"):
+            residual = measured[:2].sum(axis=0) - (self._side_sums[:2] @ expected).sum(axis=0)
         return Location(*(v.reshape(shape)[()] for v in (x, y, total, residual)))
 
     def estimate(
@@ -291,7 +293,7 @@ class ElectrodeNetwork:
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - yx * miss_x]) / (xx * yy - xy * yx)
             new = np.clip(at[:, moving] + np.clip(step, -far / 4, far / 4), inset, far)
-            settled[moving] = (np.abs(new - at[:, moving]) < 1e-13 * far).all(axis=0)
+            settled[moving] = (np.abs(new - at[:, moving]) < _SETTLED * sides).all(axis=0)
             at[:, moving] = new
         on_edge = ((at == inset) | (at == far)).any(axis=0)
         at[:, on_edge] = np.nan
@@ -301,7 +303,7 @@ class ElectrodeNetwork:
 
 def _log_ratios(sides: FloatArray) -> tuple[FloatArray, FloatArray]:
     """ln of tan(pi f / 2) of the far side over that of the near one, (2, n), and d ln tan / df (4, n)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         sides = np.where(sides > _LEAST, sides, np.nan)
         logs = np.log(np.tan(np.pi / 2 * sides))
         return np.stack([logs[1] - logs[0], logs[3] - logs[2]]), np.pi / np.sin(np.pi * sides)
