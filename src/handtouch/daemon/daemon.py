@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 import zmq
 
+from handtouch.canbus import eds
 from handtouch.canbus.master import Master, NodeSpec
 from handtouch.canbus.port import BusError, Port
-from handtouch.config import ConfigError, Deployment, load
+from handtouch.config import ConfigError, Deployment, load, with_bus
 from handtouch.daemon.control import Control
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.notify import Notifier
@@ -60,7 +61,7 @@ class Daemon:
                 self.ports[bus.name] = port = Port.open(bus, self.pipeline.slab)
                 opened.callback(port.close)
             self._opened = opened.pop_all()
-        self.master = Master(self.ports, node_specs(deployment))
+        self.master = Master(self.ports, node_specs(deployment), period_ns)
         self.report = Report(deployment, self.pipeline, self.master, self.ports, self.publisher)
         self.control.commands["status"] = self.report.status
         self._producers = [self.ports[bus.name] for bus in deployment.buses if bus.sync == "producer"]
@@ -161,15 +162,16 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
 
 def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     """`handtouch run`: serve a deployment until SIGINT or SIGTERM; exit status 0, 1 (no bus), 2 (config)."""
-    from handtouch.config import with_bus
-
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("canopen").setLevel(logging.ERROR)
     try:
         deployment = load(config_path)
         for bus in buses:
             deployment = with_bus(deployment, bus)
-    except ConfigError as error:
+        for kind in deployment.nodes.values():
+            if kind.eds:
+                eds.load(kind.eds, 1)  # a mistake in it must show before a bus is touched
+    except (ConfigError, eds.EdsError) as error:
         print(error, file=sys.stderr)
         return 2
     stop = threading.Event()

@@ -1,0 +1,99 @@
+"""Replay: a recorded session through the live pipeline, the same contacts every time and in every format."""
+
+from __future__ import annotations
+
+import gzip
+from collections import Counter
+from pathlib import Path
+
+import can
+import pytest
+
+from handtouch import shipped
+from handtouch.config import Deployment, load
+from handtouch.daemon.replay import Summary, pacer, replay
+from handtouch.simulate.score import score
+from handtouch.simulate.truth import Truth, read
+from handtouch.wire import Contact
+
+DATA = Path(__file__).parents[1] / "data"
+PERIOD_MS = 20.0
+
+
+@pytest.fixture(scope="module")
+def deployment() -> Deployment:
+    made = load(shipped.path("utah_mit.toml"))
+    daemon = made.daemon.model_copy(update={"sync_period_ms": PERIOD_MS})
+    return made.model_copy(update={"daemon": daemon})
+
+
+@pytest.fixture(scope="module")
+def session(deployment: Deployment) -> tuple[list[Contact], Summary]:
+    contacts: list[Contact] = []
+    summary = replay(DATA / "session.log.gz", deployment, contacts.append)
+    return contacts, summary
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> list[Truth]:
+    file = tmp_path_factory.mktemp("truth") / "session.truth"
+    file.write_bytes(gzip.decompress((DATA / "session.truth.gz").read_bytes()))
+    return read(file, wall=True)
+
+
+def test_a_recorded_session_gives_its_touches_within_the_noise_bound(
+    session: tuple[list[Contact], Summary], truth: list[Truth]
+) -> None:
+    contacts, summary = session
+    result = score(contacts, truth)
+    assert result.total.missed == 0
+    assert result.total.invented == 0
+    assert result.total.rms_error_m < 1.5 * result.total.rms_bound_m
+    assert result.total.force_rms_n < 0.05
+    assert summary.contacts == sum(contact.event == "begin" for contact in contacts) == 24
+    assert {contact.reason for contact in contacts if contact.event == "end"} == {"released"}
+    assert summary.buses["can0"].short == 0
+
+
+def test_the_same_log_gives_identical_contacts_each_time(
+    session: tuple[list[Contact], Summary], deployment: Deployment
+) -> None:
+    again: list[Contact] = []
+    replay(DATA / "session.log.gz", deployment, again.append)
+    assert again == session[0]
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc", ".csv"])
+def test_other_formats_of_python_can_give_the_same_touches(
+    session: tuple[list[Contact], Summary], deployment: Deployment, tmp_path: Path, suffix: str
+) -> None:
+    copy = tmp_path / f"session{suffix}"
+    with can.LogReader(DATA / "session.log.gz") as reader, can.Logger(copy) as writer:
+        for message in reader:
+            message.channel = 0  # some formats know numbers only
+            writer.on_message_received(message)
+    got: list[Contact] = []
+    replay(copy, deployment, got.append)
+    assert Counter((c.link, c.event) for c in got) == Counter((c.link, c.event) for c in session[0])
+    assert [c.position_m for c in got] == [c.position_m for c in session[0]]
+
+
+def test_a_log_that_is_none_is_named_with_what_can_be_read(deployment: Deployment, tmp_path: Path) -> None:
+    log = tmp_path / "session.txt"
+    log.write_text("not a log")
+    with pytest.raises(ValueError, match=r"session\.txt.*candump"):
+        replay(log, deployment, lambda _: None)
+    with pytest.raises(OSError, match="no such log"):
+        replay(tmp_path / "absent.log", deployment, lambda _: None)
+
+
+def test_pacing_sleeps_until_a_stamp_is_due(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("time.sleep", slept.append)
+    monkeypatch.setattr("time.monotonic_ns", lambda: 7_000_000_000)
+    pace = pacer(2.0)
+    pace(1_000_000_000)
+    pace(3_000_000_000)
+    assert slept == [pytest.approx(1.0)]
+    pacer(0)(10**18)
+    assert len(slept) == 1

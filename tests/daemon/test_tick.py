@@ -1,0 +1,171 @@
+"""The tick: counts in, contacts of the whole hand out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from handtouch.canbus.slab import Slab
+from handtouch.daemon.tick import Tick, Ticked
+from handtouch.wire import PadState
+
+PERIOD_NS = 5_000_000
+UP = np.zeros(3, dtype=np.uint8)
+PLANE, ROUND, RESISTED = range(3)
+
+
+class Driver:
+    """Ticks a hand with given counts, a period at a time."""
+
+    def __init__(self, bench: Any) -> None:
+        self.bench = bench
+        self.slab = Slab(3)
+        self.tick = Tick(bench.model, PERIOD_NS)
+        self.t_ns = 1_000_000_000
+        self.node_state = UP.copy()
+
+    def step(self, counts: dict[int, Any], silent: tuple[int, ...] = ()) -> Ticked:
+        self.t_ns += PERIOD_NS
+        self.slab.begin_cycle()
+        for pad in range(3):
+            if pad not in silent:
+                data = np.asarray(counts.get(pad, np.zeros(4)), dtype="<i2").tobytes()
+                self.slab.write(pad, data, self.t_ns + 1000)
+        return self.tick.step(self.slab, self.node_state, self.t_ns, self.t_ns + 2_000_000)
+
+    def state(self, pad: int) -> PadState:
+        return PadState(int(self.tick.columns.state[pad]))
+
+
+@pytest.fixture
+def driver(bench: Any) -> Driver:
+    return Driver(bench)
+
+
+def test_a_touch_is_found_where_it_is_in_the_frame_of_its_link(driver: Driver) -> None:
+    touch = {PLANE: driver.bench.counts(PLANE, 0.7, 0.4, 1e-3)}
+    driver.step(touch)
+    ticked = driver.step(touch)
+    assert ticked.began.tolist() == [PLANE]
+    columns = driver.tick.columns
+    # 0.7 of 30 mm is 6 mm beyond the middle, 0.4 of 24 mm is 2.4 mm short of it; the mount turns x into y
+    np.testing.assert_allclose(columns.position_m[PLANE], [0.01 + 0.0024, 0.006, 0.005], atol=2e-5)
+    np.testing.assert_allclose(columns.normal[PLANE], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(columns.pad_m[PLANE], [0.021, 0.0096], atol=2e-5)
+    assert columns.force_n[PLANE] > driver.bench.model.on_n[PLANE]
+    assert columns.force_std_n[PLANE] > 0
+    assert abs(columns.residual[PLANE]) < 5 * columns.residual_std[PLANE]
+
+
+@pytest.mark.parametrize("pad", [PLANE, ROUND, RESISTED])
+@pytest.mark.parametrize("force_n", [0.2, 1.0, 3.0])
+def test_force_is_that_of_the_contact_law_with_or_without_resistors(
+    driver: Driver, pad: int, force_n: float
+) -> None:
+    model = driver.bench.model
+    current = model._threshold(np.full(3, force_n), _networks(driver))[pad]
+    touch = {pad: driver.bench.counts(pad, 0.5, 0.5, current)}
+    driver.step(touch)
+    driver.step(touch)
+    assert driver.tick.columns.force_n[pad] == pytest.approx(force_n, rel=0.01)
+
+
+def _networks(driver: Driver) -> Any:
+    from handtouch.hand import network_of
+
+    pads = driver.bench.deployment.hands[0].pads
+    return [network_of(pad, driver.bench.deployment.sheets["s"]) for pad in pads]
+
+
+def test_the_end_keeps_the_last_place_of_the_touch(driver: Driver) -> None:
+    touch = {ROUND: driver.bench.counts(ROUND, 0.3, 0.6, 1e-3)}
+    for _ in range(3):
+        driver.step(touch)
+    place = driver.tick.columns.position_m[ROUND].copy()
+    assert not len(driver.step({}).updated)
+    ticked = driver.step({})
+    assert ticked.ended.tolist() == [ROUND]
+    np.testing.assert_array_equal(driver.tick.columns.position_m[ROUND], place)
+
+
+def test_no_contact_stale_lost_and_faulted_are_four_things(driver: Driver) -> None:
+    driver.step({})
+    assert driver.state(PLANE) == PadState.CLEAR
+    for _ in range(2):
+        driver.step({}, silent=(PLANE,))
+        assert driver.state(PLANE) == PadState.CLEAR  # may just be late
+    driver.step({}, silent=(PLANE,))
+    assert driver.state(PLANE) == PadState.STALE
+    driver.node_state[PLANE] = PadState.LOST
+    driver.step({}, silent=(PLANE,))
+    assert driver.state(PLANE) == PadState.LOST
+    driver.node_state[PLANE] = PadState.CLEAR
+    driver.step({PLANE: [32767, 5, 5, 5]})
+    assert driver.state(PLANE) == PadState.FAULTED
+
+
+@pytest.mark.parametrize("full", [32767, -32767, -32768])
+def test_a_channel_at_the_end_of_its_range_is_a_fault_and_not_a_touch(driver: Driver, full: int) -> None:
+    for _ in range(4):
+        ticked = driver.step({PLANE: [full, 3000, 3000, 3000]})
+        assert not len(ticked.began)
+    assert driver.state(PLANE) == PadState.FAULTED
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda driver: [driver.step({}, silent=(PLANE,)) for _ in range(3)],
+        lambda driver: [driver.step({PLANE: [32767] * 4})],
+    ],
+    ids=["stale", "faulted"],
+)
+def test_a_contact_ends_when_its_pad_can_no_longer_be_trusted(
+    driver: Driver, spoil: Callable[[Driver], list[Ticked]]
+) -> None:
+    touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
+    driver.step(touch)
+    driver.step(touch)
+    assert spoil(driver)[-1].ended.tolist() == [PLANE]
+
+
+def test_samples_of_a_node_that_is_not_up_make_no_touch(driver: Driver) -> None:
+    driver.node_state[PLANE] = PadState.STARTING
+    touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
+    for _ in range(4):
+        assert not len(driver.step(touch).began)
+    assert driver.state(PLANE) == PadState.STARTING
+
+
+def test_a_missing_sample_is_counted_and_its_contact_goes_on(driver: Driver) -> None:
+    touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
+    driver.step(touch)
+    driver.step(touch)
+    ticked = driver.step(touch, silent=(PLANE,))
+    assert not len(ticked.updated)
+    assert not len(ticked.ended)
+    assert driver.tick.missed.tolist() == [1, 0, 0]
+    assert driver.step(touch).updated.tolist() == [PLANE]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.lists(st.integers(-32768, 32767), min_size=12, max_size=12), min_size=3, max_size=6))
+def test_no_reading_whatever_is_fatal_or_spoils_a_neighbour(bench: Any, readings: list[list[int]]) -> None:
+    driver = Driver(bench)
+    good = bench.counts(ROUND, 0.4, 0.4, 1e-3)
+    for reading in readings:
+        counts = np.reshape(reading, (3, 4)).astype(np.int16)
+        counts[ROUND] = good
+        driver.step(dict(enumerate(counts)))
+    alone = Driver(bench)
+    for _ in readings:
+        alone.step({ROUND: good})
+    np.testing.assert_allclose(
+        driver.tick.columns.position_m[ROUND], alone.tick.columns.position_m[ROUND], atol=1e-9
+    )
+    assert driver.state(ROUND) == PadState.TOUCHED
