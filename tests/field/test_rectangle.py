@@ -136,6 +136,22 @@ def test_edges_and_corners_have_their_limits() -> None:
     assert math.isnan(on_side.y)
 
 
+def test_minus_zero_is_zero() -> None:
+    """Once the sign of -0.0 turned a side's fraction negative."""
+    pad = Rectangle(1.0, 1.0)
+    assert pad.side_fractions(-0.0, 0.3).tolist() == [1, 0, 0, 0]
+    assert pad.side_fractions(-0.0, -0.0).tolist() == [0.5, 0, 0.5, 0]
+    assert pad.conformal_radius(-0.0, 0.5) == 0
+    assert pad.locate([1.0, -0.0, -0.0, -0.0]).x == 0
+
+
+@pytest.mark.parametrize("near", [1e-320, 1e-308, 7e-308, 1e-300, 1e-280])
+def test_current_is_conserved_next_to_a_corner(near: float) -> None:
+    """Once the ratios overflowed here, and half of the current was lost."""
+    for u in (1e-320, 3e-309, 1e-307, 1e-290):
+        assert Rectangle(1.0, 1.6).side_fractions(near, u).sum() == pytest.approx(1, abs=1e-15)
+
+
 def test_nan_stays_in_its_own_element() -> None:
     pad = Rectangle(1.0, 1.0)
     x = np.array([0.5, np.nan, -0.1, 1.1, np.inf, 0.5])

@@ -1,0 +1,52 @@
+"""The demo: one command, no hardware, and a summary of how near it came to the truth."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+
+
+def test_the_demo_finds_touches_within_the_noise_bound_and_ends_by_itself() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "handtouch", "demo", "--seconds", "9"],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"begin +right/index_distal", done.stdout)
+    total = done.stdout.splitlines()[-1].split()
+    assert total[0] == "all"
+    assert int(total[1]) > 20
+    ratio, invented = float(total[4]), int(total[-1])
+    assert ratio < 2.5  # a few weak samples carry it in so short a time; the whole session stays below 1.5
+    assert invented == 0
+
+
+def test_ctrl_c_ends_the_demo_with_its_summary() -> None:
+    demo = subprocess.Popen(
+        [sys.executable, "-m", "handtouch", "demo", "--plain"], stdout=subprocess.PIPE, text=True
+    )
+    assert demo.stdout is not None
+    try:
+        for text in demo.stdout:
+            if " begin " in text:
+                break
+        demo.send_signal(signal.SIGINT)
+        rest = demo.stdout.read()
+        assert demo.wait(30) == 0
+    finally:
+        demo.kill()
+        demo.stdout.close()
+        demo.wait()
+    assert "touches missed invented" in rest
+
+
+def test_two_demos_run_side_by_side() -> None:
+    command = [sys.executable, "-m", "handtouch", "demo", "--plain", "--seconds", "5"]
+    demos = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
+    end_s = time.monotonic() + 100
+    assert [demo.wait(end_s - time.monotonic()) for demo in demos] == [0, 0]

@@ -1,0 +1,123 @@
+"""The live page and the lines tell who is touched where, how hard, how sure; and how the nodes fare."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from handtouch import wire
+from handtouch.view.lines import line, location_std_m
+from handtouch.view.terminal import HandView
+from handtouch.view.watch import LineDisplay
+
+CONTACT = wire.Contact(
+    v=1, seq=1, t_ns=12_000_000_000, event="begin", id=7, hand="right", link="thumb_tip", frame="thumb_tip",
+    begin_ns=11_500_000_000, duration_s=0.5, age_s=0.001, position_m=(0.0123, -0.004, 0.0056),
+    normal=(0.0, 0.0, 1.0), covariance_m2=(4e-10, 0, 0, 0, 3e-10, 0, 0, 0, 2e-10), pad_m=(0.01, 0.02),
+    location="valid", force_n=1.234, force_std_n=0.056, peak_force_n=2.5, strength="valid", current_a=1e-3,
+    residual=0.0, residual_std=1e-4, on_n=0.06, off_n=0.03, calibration="nominal", reason="", repeat=False,
+)  # fmt: skip
+HEALTH = wire.Health(
+    v=1, seq=1, t_ns=12_000_000_000, hand="right", link="thumb_tip", bus="can0", node_id=19, state="clear",
+    node="operational", since_ns=0, reason="", serial=1003, rate_hz=200.0, samples=10, missed=0, age_s=0.001,
+    emergencies=(), repeat=False,
+)  # fmt: skip
+SERVICE = wire.Service(
+    v=1, seq=1, t_ns=12_000_000_000, wall_offset_ns=0, version="0", pid=1, uptime_s=3.0, period_s=0.005,
+    hands={"right": ["thumb_tip"]}, ticks=600, overruns=0, rate_hz=200.0,
+    tick_us={"p50": 250.0, "p99": 400.0, "max": 500.0}, buses={"can0": {"load": 0.43}}, drops={},
+    subscriptions=(), repeat=False,
+)  # fmt: skip
+
+
+def _page(view: HandView, alive: bool = True) -> str:
+    console = Console(width=120, height=40, force_terminal=False)
+    with console.capture() as captured:
+        console.print(view.render(alive))
+    return captured.get()
+
+
+def _view(*messages: wire.Message) -> HandView:
+    view = HandView("test")
+    for message in messages:
+        view.update(message)
+    return view
+
+
+def test_the_page_shows_a_touch_with_place_force_and_their_uncertainty() -> None:
+    page = _page(_view(HEALTH, SERVICE, CONTACT))
+    assert "12.30   -4.00    5.60" in page
+    assert "0.030" in page  # mm: root of the summed variances
+    assert "1.23 +- 0.06 N" in page
+    assert "touched" in page
+    assert "1/1 nodes operational" in page
+    assert "200 ticks/s" in page
+    assert "can0 43 %" in page
+
+
+def test_an_ended_contact_leaves_the_table_and_is_told_below_it() -> None:
+    page = _page(_view(HEALTH, CONTACT, replace(CONTACT, event="end", reason="released", seq=2)))
+    assert "12.30   -4.00    5.60" not in page
+    assert "#7 released after 0.50 s, peak 2.50 N" in page
+
+
+def test_a_lost_node_shows_with_its_reason() -> None:
+    lost = replace(HEALTH, seq=2, state="lost", node="absent", reason="lost: no heartbeat for 350 ms")
+    page = _page(_view(HEALTH, lost))
+    assert "lost" in page
+    assert "no heartbeat for 350 ms" in page
+    assert "0/1 nodes operational" in _page(_view(HEALTH, SERVICE, lost))
+
+
+def test_a_silent_daemon_is_told_apart_from_an_untouched_hand() -> None:
+    assert "silent" in _page(_view(HEALTH, SERVICE), alive=False)
+    assert "silent" not in _page(_view(HEALTH, SERVICE))
+
+
+@pytest.mark.parametrize(
+    ("contact", "text"),
+    [
+        (CONTACT, "at (  12.30,   -4.00,    5.60) mm +- 0.030"),
+        (replace(CONTACT, strength="saturated", force_std_n=None), "> 1.23 N (saturated)"),
+        (replace(CONTACT, strength="invalid", force_n=None), "strength invalid"),
+        (replace(CONTACT, position_m=None, covariance_m2=None), "location invalid"),
+        (replace(CONTACT, event="end", reason="lost"), "lost after 0.50 s, peak 2.50 N"),
+    ],
+)
+def test_a_line_says_what_is_known_and_what_is_not(contact: wire.Contact, text: str) -> None:
+    assert text in line(contact)
+
+
+def test_every_kind_of_message_has_a_line() -> None:
+    frame = wire.HandFrame(1, 1, 1, 5, "right", ("a", "b"), b"\1\0", b"", b"", b"", b"", b"", b"", b"", False)
+    raw = wire.Raw(1, 1, 1, 5, "right", ("a", "b"), b"", b"", b"\1\1", False)
+    assert "1 of 2 touched" in line(frame)
+    assert "2 fresh" in line(raw)
+    assert "600" not in line(HEALTH)
+    assert "serial 1003" in line(HEALTH)
+    assert "200 ticks/s" in line(SERVICE)
+
+
+def test_a_location_without_covariance_has_no_standard_deviation() -> None:
+    assert location_std_m(replace(CONTACT, covariance_m2=None)) != location_std_m(CONTACT)
+
+
+def test_plain_lines_leave_out_what_only_repeats_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    display = LineDisplay()
+    display.take(HEALTH)
+    display.take(replace(HEALTH, seq=2, samples=20))
+    display.take(replace(HEALTH, seq=3, state="stale", reason="no samples"))
+    for k in range(20):
+        display.take(replace(CONTACT, event="update", t_ns=CONTACT.t_ns + k * 5_000_000))
+    printed = capsys.readouterr().out.splitlines()
+    assert len([text for text in printed if "health" in text]) == 2
+    assert len([text for text in printed if "update" in text]) == 1
+
+
+def test_json_lines_hold_every_message_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    import json
+
+    LineDisplay(as_json=True).take(CONTACT)
+    assert json.loads(capsys.readouterr().out)["force_n"] == 1.234
