@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from handtouch.field.model import ForwardModel
@@ -72,6 +72,7 @@ def test_conductances_are_symmetric_and_nothing_flows_between_equals(aspect: flo
 
 
 @given(aspect=aspects, gap=st.floats(0.0, 0.3), series=resistances, s=inner, t=inner)
+@example(aspect=0.5, gap=7.5e-162, series=[0.0] * 4, s=0.5, t=0.5)
 def test_all_the_current_arrives_somewhere(
     aspect: float, gap: float, series: list[float], s: float, t: float
 ) -> None:

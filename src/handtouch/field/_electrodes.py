@@ -27,6 +27,7 @@ FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 _TERMS = (8, 16, 32, 64, 128, 256, 512)  # tried in turn
+_CLOSED = 1e-280  # rad: a gap of 1e-140 of a side, next to denormals
 _NEGLIGIBLE, _ROUNDING = 1e-14, 1e-9
 
 
@@ -43,7 +44,8 @@ class ElectrodePotentials:
         self.count = ends.angle.size
         self._ends = (ends, starts)
         width = np.diagonal(ends.angle_to(starts.corner, starts.angle))
-        self._half = np.where(width < 0, width + 2 * np.pi, width) / 2
+        width = np.where(width < 0, width + 2 * np.pi, width)
+        self._half = np.where(width > _CLOSED, width / 2, 0.0)
         self._kappa = np.exp(0.5j * self._half)
         # d K / d zeta = this / (s1 s2 D^2); the difference of the ends is formed without cancellation
         self._slope = self._kappa * ends.inverse * np.expm1(-2j * self._half)
