@@ -119,3 +119,16 @@ def test_a_start_saves_the_search_and_changes_nothing() -> None:
 def test_wrong_number_of_channels_is_named() -> None:
     with pytest.raises(ValueError, match="4 channels"):
         Rectangle(1, 1).estimate([1.0, 2.0, 3.0], 1.0)
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1e-120, 1e120, 1e290])
+def test_units_do_not_matter(scale: float) -> None:
+    currents = Rectangle(1.5, 1.0).fractions([0.4, 1.2], [0.3, 0.6]) + 1e-3
+    plain = Rectangle(1.5, 1.0).estimate(currents, 1e-3)
+    with np.errstate(all="raise"):
+        large = Rectangle(1.5 * scale, scale).estimate(currents, 1e-3)
+        strong = Rectangle(1.5, 1.0).estimate(currents * scale, 1e-3 * scale)
+    assert large.x / scale == pytest.approx(plain.x, rel=1e-9)
+    assert strong.x == pytest.approx(plain.x, rel=1e-9)
+    assert strong.total / scale == pytest.approx(plain.total, rel=1e-9)
+    assert strong.covariance[:, :2, :2] == pytest.approx(plain.covariance[:, :2, :2], rel=1e-6, abs=1e-12)

@@ -34,7 +34,7 @@ class PointEstimate:
         hold it: a standard deviation beyond a thousand sides, or no positive total.
     total: the current injected, in the unit of the currents.
     residual: signed excess of (x0 + xa) over that of this point, divided by the total; NaN for a model
-        with other channels than x0, xa, y0, yb.
+        with other channels than x0, xa, y0, yb, and where one of the two is left out.
     chi_squared: sum of squared misfits in standard deviations; channels - 3 degrees of freedom for a point.
     covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate.
     converged: False where the iteration stopped before the maximum, or found no positive total.
@@ -70,12 +70,15 @@ def estimate(
     flat = currents.reshape(channels, -1)
     sigma = np.broadcast_to(np.asarray(noise, dtype=np.float64), currents.shape).reshape(channels, -1)
     with np.errstate(all="ignore"):
-        fit = _Fit(model, flat, np.where(sigma > 0, sigma, np.nan))
+        unit = np.ldexp(1.0, np.frexp(np.abs(flat).max(axis=0, initial=0.0))[1])  # squares then stay in range
+        fit = _Fit(model, flat / unit, np.where(sigma > 0, sigma, np.nan) / unit)
         if start is None:
             begin = fit.guess()
         else:
-            begin = np.broadcast_to(np.asarray(start, dtype=np.float64), (2, *shape)).reshape(2, -1)
-        result = fit.run(begin)
+            begin = (
+                np.broadcast_to(np.asarray(start, dtype=np.float64), (2, *shape)).reshape(2, -1) / fit.sides
+            )
+        result = fit.run(begin, unit)
     return PointEstimate(
         x=result.x.reshape(shape)[()],
         y=result.y.reshape(shape)[()],
@@ -114,24 +117,20 @@ class _Linear:
 
 
 class _Fit:
-    """Many independent fits of one model at once; arrays are (..., n)."""
+    """Many independent fits of one model at once; arrays are (..., n), places in sides of the pad."""
 
     def __init__(self, model: ForwardModel, currents: FloatArray, noise: FloatArray) -> None:
         self.model, self.currents = model, currents
         self.weight = 1 / noise
         self.data = currents * self.weight
-        sides = np.array([[model.a], [model.b]])
-        self.low, self.high = _EDGE * sides, (1 - _EDGE) * sides
-        self.shortest = float(sides.min())
-        self.longest, self.smallest = _LONGEST_STEP * self.shortest, _SMALLEST_STEP * sides
+        self.sides = np.array([[model.a], [model.b]])
+        self.aspect = self.sides / self.sides.min()
 
     def guess(self) -> FloatArray:
         """A start from the currents alone, shape (2, n): the most likely of a grid of points."""
-        fractions_of_side = (np.arange(_GRID) + 0.5) / _GRID
-        x, y = (
-            s.ravel() for s in np.meshgrid(self.model.a * fractions_of_side, self.model.b * fractions_of_side)
-        )
-        table = self.model.fractions(x, y).T
+        side = (np.arange(_GRID) + 0.5) / _GRID
+        x, y = (place.ravel() for place in np.meshgrid(side, side))
+        table = self.model.fractions(self.model.a * x, self.model.b * y).T
         begin = np.empty((2, self.data.shape[1]))
         for first in range(0, self.data.shape[1], _GUESSED_AT_ONCE):
             some = slice(first, first + _GUESSED_AT_ONCE)
@@ -143,10 +142,10 @@ class _Fit:
 
     def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> _Linear:
         """Evaluate the model at `point`, shape (2, n), for the elements `index`."""
-        f, jacobian = self.model.fractions_with_jacobian(point[0], point[1])
+        f, jacobian = self.model.fractions_with_jacobian(*(point * self.sides))
         weight, data = self.weight[:, index], self.data[:, index]
         f = f * weight
-        slopes = np.moveaxis(jacobian, 1, 0) * weight
+        slopes = np.moveaxis(jacobian, 1, 0) * self.sides[:, :, None] * weight
         norm = (f * f).sum(0)
         total = (f * data).sum(0) / norm
         misfit = data - total * f
@@ -158,7 +157,7 @@ class _Fit:
         """Gauss-Newton step (2, n) and squared decrement (n,); coordinates held by an edge stay."""
         slopes = at.slopes * at.total
         gradient = (slopes * at.misfit).sum(1)
-        held = ((point <= self.low) & (gradient < 0)) | ((point >= self.high) & (gradient > 0))
+        held = ((point <= _EDGE) & (gradient < 0)) | ((point >= 1 - _EDGE) & (gradient > 0))
         slopes = np.where(held[:, None], 0.0, slopes)
         sx, sy = slopes
         xx = (sx * sx).sum(0)
@@ -169,14 +168,15 @@ class _Fit:
         dy = np.where(yy > 0, along_y / yy, 0.0)
         dx = np.where(xx > 0, along_x / xx, 0.0) - overlap * dy
         decrement = np.where(xx > 0, along_x**2 / xx, 0.0) + np.where(yy > 0, along_y**2 / yy, 0.0)
-        shrink = np.minimum(1.0, self.longest / np.maximum(np.maximum(abs(dx), abs(dy)), 1e-300))
-        return np.stack([dx, dy]) * shrink, decrement
+        step = np.stack([dx, dy])
+        length = np.maximum((np.abs(step) * self.aspect).max(0), 1e-300)
+        return step * np.minimum(1.0, _LONGEST_STEP / length), decrement
 
-    def run(self, begin: FloatArray) -> PointEstimate:
+    def run(self, begin: FloatArray, unit: FloatArray) -> PointEstimate:
         """Iterate every element to its maximum; elements that have settled are left alone."""
-        point = np.clip(begin, self.low, self.high)
+        point = np.clip(begin, _EDGE, 1 - _EDGE)
         known = np.isfinite(self.data).all(0) & np.isfinite(self.weight).all(0)
-        point = np.where(known, np.where(np.isfinite(point), point, (self.low + self.high) / 2), np.nan)
+        point = np.where(known, np.where(np.isfinite(point), point, 0.5), np.nan)
         best = self.linearise(point, slice(None))
         converged = np.zeros(point.shape[1], dtype=np.bool_)
         damping = np.ones(point.shape[1])
@@ -186,20 +186,20 @@ class _Fit:
                 break
             here, at = point[:, active], best.pick(active)
             step, decrement = self.step(at, here)
-            trial = np.clip(here + damping[active] * step, self.low, self.high)
+            trial = np.clip(here + damping[active] * step, _EDGE, 1 - _EDGE)
             new = self.linearise(trial, active)
             accept = (new.cost <= at.cost) & (new.total > 0) | (at.total <= 0)
             point[:, active[accept]] = trial[:, accept]
             best.put(active[accept], new.pick(accept))
             damping[active] = np.where(accept, np.minimum(1.0, 4 * damping[active]), damping[active] / 4)
-            moved = (abs(trial - here) > self.smallest).any(0)
+            moved = (np.abs(trial - here) > _SMALLEST_STEP).any(0)
             done = (accept & (decrement < _SETTLED)) | ~moved
             converged[active[done]] = best.total[active[done]] > 0
             active = active[~done]
         cornered = self.leave_corner(point, best, converged)
         if cornered.size:
             best.put(cornered, self.linearise(point[:, cornered], cornered))
-        return self.result(point, best, converged)
+        return self.result(point, best, converged, unit)
 
     def leave_corner(self, point: FloatArray, at: _Linear, converged: BoolArray) -> NDArray[np.intp]:
         """Move points too near a corner out, in place, to where currents begin to tell; their indices.
@@ -208,14 +208,13 @@ class _Fit:
         sqrt(noise) sides are equally likely, and only the direction from the corner is known.
         """
         noise = 1 / np.sqrt((self.weight * self.weight).mean(0))
-        radius = self.shortest * np.minimum(CORNER * np.sqrt(noise / np.maximum(at.total, 0)), 0.25)
-        sides = self.low + self.high
-        far = 2 * point > sides
-        offset = np.where(far, sides - point, point)
+        radius = np.minimum(CORNER * np.sqrt(noise / np.maximum(at.total, 0)), 0.25)  # in shorter sides
+        far = point > 0.5
+        offset = np.where(far, 1 - point, point) * self.aspect
         index = np.flatnonzero(np.hypot(*offset) < radius)
         if index.size:
-            corner = np.where(far, sides, 0.0)[:, index]
-            inward = np.where(far, -1.0, 1.0)[:, index] * radius[index]
+            corner = np.where(far, 1.0, 0.0)[:, index]
+            inward = np.where(far, -1.0, 1.0)[:, index] * radius[index] / self.aspect
 
             def linearised(place: FloatArray) -> tuple[FloatArray, FloatArray]:
                 new = self.linearise(place, index)
@@ -226,24 +225,18 @@ class _Fit:
             converged[index] = at.total[index] > 0
         return index
 
-    def result(self, point: FloatArray, at: _Linear, converged: BoolArray) -> PointEstimate:
-        """Covariance and residual at the points reached."""
+    def result(self, point: FloatArray, at: _Linear, converged: BoolArray, unit: FloatArray) -> PointEstimate:
+        """Covariance and residual at the points reached, in the units of the pad and the currents."""
         if len(self.currents) == 4:
-            pair = (at.misfit[:2] / self.weight[:2]).sum(0)
-            residual = pair / at.total
+            residual = (at.misfit[:2] / self.weight[:2]).sum(0) / at.total
         else:
             residual = np.full_like(at.total, math.nan)
-        covariance = covariance_of(at.slopes * at.total, at.mixing * at.total, at.fractions, self.high[:, 0])
-        held = np.isfinite(np.diagonal(covariance, axis1=1, axis2=2))
-        return PointEstimate(
-            x=np.where(held[:, 0], point[0], np.nan),
-            y=np.where(held[:, 1], point[1], np.nan),
-            total=at.total,
-            residual=residual,
-            chi_squared=at.cost,
-            covariance=covariance,
-            converged=converged,
-        )
+        covariance = covariance_of(at.slopes * at.total, at.mixing * at.total, at.fractions)
+        held = np.isfinite(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]).T
+        x, y = np.where(held, point * self.sides, np.nan)
+        units = np.stack([*np.broadcast_to(self.sides, point.shape), unit], axis=1)
+        covariance = np.where(covariance == 0, 0.0, covariance * units[:, :, None] * units[:, None, :])
+        return PointEstimate(x, y, at.total * unit, residual, at.cost, covariance, converged)
 
 
 def best_direction(
@@ -266,20 +259,18 @@ def best_direction(
     return np.clip(angle, _GRAZING, math.pi / 2 - _GRAZING)
 
 
-def covariance_of(
-    slopes: FloatArray, mixing: FloatArray, fractions: FloatArray, sides: FloatArray
-) -> FloatArray:
-    """Inverse Fisher information of (x, y, total), shape (n, 3, 3).
+def covariance_of(slopes: FloatArray, mixing: FloatArray, fractions: FloatArray) -> FloatArray:
+    """Inverse Fisher information of (x, y, total), shape (n, 3, 3), x and y in sides.
 
-    slopes, mixing: as in `_Linear`, times the total. fractions: whitened. sides: (2,), lengths of the pad.
-    A coordinate whose standard deviation exceeds `LOST` sides has infinite variance and no covariances.
+    slopes, mixing: as in `_Linear`, times the total. fractions: whitened. A coordinate whose standard
+    deviation exceeds `LOST` sides has infinite variance and no covariances.
     """
     sx, sy = slopes
     xx, yy, xy = (sx * sx).sum(0), (sy * sy).sum(0), (sx * sy).sum(0)
     # Each variance from what the other coordinate cannot explain: no difference of products.
     free = np.stack([((sx - (xy / yy) * sy) ** 2).sum(0), ((sy - (xy / xx) * sx) ** 2).sum(0)])
-    least = (LOST * sides[:, None]) ** -2.0
-    lost_x, lost_y = ~(xx > least[0]), ~(yy > least[1])
+    least = LOST**-2
+    lost_x, lost_y = ~(xx > least), ~(yy > least)
     free = np.where(np.stack([lost_y, lost_x]), np.stack([xx, yy]), free)
     held_x, held_y = free > least
     covariance = np.zeros((len(xx), 3, 3))

@@ -16,6 +16,7 @@ from handtouch.field.model import FloatArray
 
 _HALF_PI = math.pi / 2
 _SAFE_SCALE = 1e100  # sides within this factor of 1 need no scaling against overflow
+_ON_EDGE = 1e-300  # of a side: closer to an edge is on it
 _NEAREST = 1e-140  # of a side: closer to an edge, derivatives are taken here
 
 
@@ -191,6 +192,8 @@ class Rectangle:
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         with np.errstate(all="ignore"):
             on = (x >= 0) & (x <= self.a) & (y >= 0) & (y <= self.b)
+            # So near an edge that a ratio could overflow is on it, and so is -0.0.
+            x, y = np.where(x > _ON_EDGE * self.a, x, 0.0), np.where(y > _ON_EDGE * self.b, y, 0.0)
             return np.where(on, x, np.nan) * self._unit, np.where(on, y, np.nan) * self._unit
 
     def _ratios(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -251,7 +254,7 @@ class Rectangle:
 
 def _half_angle_tangents(pairs: FloatArray, total: FloatArray) -> tuple[FloatArray, FloatArray]:
     """T = tan(pi f / 2) of every current, shape (2 pairs, 2 sides, n), and the fraction in the first pair."""
-    fractions = np.where(pairs >= 0, pairs, np.nan) / total
+    fractions = np.where(pairs >= 0, np.abs(pairs), np.nan) / total  # -0.0 is not negative
     sums = fractions[:, 0] + fractions[:, 1]
     rest = fractions[:, ::-1] + sums[::-1, None]  # not 1 - f: what is left beside a large f keeps its digits
     tangents = np.tan(_HALF_PI * np.minimum(fractions, rest))
