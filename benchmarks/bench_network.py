@@ -234,7 +234,7 @@ def noise_cost(report: Report) -> None:
     )
     report.table(
         "Expected location error",
-        "Cramer-Rao bound of the root of var x + var y, in % of the short side, for noise of 1 % of the total "
+        "Cramer-Rao bound of the root of var x + var y, % of the short side; noise of 1 % of the total "
         "on every channel; 10 % of each side left out.",
         rows,
     )
