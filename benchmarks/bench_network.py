@@ -13,6 +13,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,15 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from handtouch.field import Electrode, ElectrodeNetwork, Rectangle, contact_stack_resistance
+from handtouch.field import (
+    ContactLaw,
+    Electrode,
+    ElectrodeNetwork,
+    Rectangle,
+    Sandwich,
+    Status,
+    contact_stack_resistance,
+)
 from handtouch.field.model import ForwardModel
 from handtouch.field.network import SIDES
 
@@ -154,6 +163,31 @@ def evaluate(report: Report) -> None:
         row["locate: worst error"] = float(np.hypot(found.x - x, found.y - y).max())
         rows.append(row)
     report.table("Using a network", "Unit square, gaps 5 %, 336 ohm; the whole call.", rows)
+
+
+def weigh(report: Report) -> None:
+    """Force of contacts on pads with laws of their own, noise and doubt included."""
+    rows, rng = [], np.random.default_rng(2)
+    pair = Sandwich((2e-2, 2e-2), (1.0, 2.0), (SHEET, SHEET))
+    for count in (1, 15, 60, 100_000):
+        layer, force = rng.uniform(1e-2, 3e-2, count), rng.uniform(0.05, 2.0, count)
+        law = ContactLaw(layer, np.full(count, 1.5), np.full(count, 2.5e-3), np.full(count, 5e-4))
+        current = law.current(force, 5.0, SHEET, 0.017, 50.0)
+        both = pair.currents(0.2 * force, 2.5e-3, 5.0, 0.017)
+        found = replace(law, radius_std_m=0.0).force(current, 5.0, SHEET, 0.017, 50.0)
+        valid = found.status == Status.VALID
+        calls: dict[str, Callable[[], object]] = {
+            "eq. 11": lambda c=layer: contact_stack_resistance(SHEET, c, 2.5e-3, 0.017),  # type: ignore[misc]
+            "ContactLaw.force": lambda law=law, i=current: law.force(  # type: ignore[misc]
+                i, 5.0, SHEET, 0.017, 50.0, current_std_a=1e-6, spreading_std=0.01, threshold_n=0.02
+            ),
+            "Sandwich.force": lambda i=both: pair.force(i, 5.0, 0.017),  # type: ignore[misc]
+        }
+        row: dict[str, Any] = {"contacts": count}
+        row |= {f"{name}, us": microseconds(call, 5)[0] for name, call in calls.items()}
+        row["force: worst relative error"] = float(np.abs(found.force_n / force - 1)[valid].max())
+        rows.append(row)
+    report.table("Weighing contacts", "The whole call; force by table, without iteration.", rows)
 
 
 def straightness(report: Report) -> None:
@@ -301,7 +335,7 @@ def curved(report: Report) -> None:
 
 def main() -> int:
     report = Report()
-    for part in (build, gaps, evaluate, straightness, noise_cost, curved):
+    for part in (build, gaps, evaluate, weigh, straightness, noise_cost, curved):
         part(report)
     report.write()
     return 0
