@@ -136,12 +136,11 @@ class ElectrodeNetwork:
             return self._mixed(ideal), self._mixed(jacobian) / self._unit
 
     def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """The radius R that gives the sheet's resistance, sheet / (2 pi) * ln(R / A), to a contact of
-        radius A.
+        """R of a place: the sheet's resistance there is sheet / (2 pi) ln(R / A) to a contact of radius A.
 
         Electrodes at ground, in the unit of a and b, shape (...). It is the conformal radius, enlarged by the
-        gaps: exact in the limit of a small contact (2 pi times the regular part of Green's function is ln
-        R). Zero at an electrode. For resistors see `series_resistance`.
+        gaps: ln R is 2 pi times the regular part of Green's function, so it is exact for small contacts. Zero
+        at an electrode. For resistors see `series_resistance`.
         """
         defects = self._to_disc(x, y)
         with np.errstate(all="ignore"):
