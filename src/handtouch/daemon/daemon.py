@@ -163,7 +163,7 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
 def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     """`handtouch run`: serve a deployment until SIGINT or SIGTERM; exit status 0, 1 (no bus), 2 (config)."""
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
-    logging.getLogger("canopen").setLevel(logging.ERROR)
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
     try:
         deployment = load(config_path)
         for bus in buses:

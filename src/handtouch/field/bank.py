@@ -95,7 +95,8 @@ class LocatorBank:
             weight = np.empty_like(data)
             np.divide(1.0, noise, out=weight)
             s = self._start(index, data, weight, start)
-            return self._iterate(index, s, data.T, weight.T)
+            sides = self._sides.take(index, axis=0)
+            return self._iterate(_Readings(index, self._first_row(index), sides, data.T, weight.T), s)
 
     # Details ----------------------------------------------------------------------------------------------
 
@@ -146,27 +147,21 @@ class LocatorBank:
         rows: FloatArray = np.matmul(basis[:, 0, None], by_y).reshape(-1, 4, 4)
         return rows
 
-    def _linearise(
-        self, first_row: IndexArray, s: FloatArray, data: FloatArray, weight: FloatArray
-    ) -> _Normal:
-        """Whitened normal equations at s, for data and weight of shape (n, 4)."""
-        rows = self._read(first_row, s)
-        rows[:, 3] = data
-        rows *= weight[:, None]
+    def _linearise(self, of: _Readings, s: FloatArray) -> _Normal:
+        """Whitened normal equations at s cells."""
+        rows = self._read(of.first_row, s)
+        rows[:, 3] = of.data
+        rows *= of.weight[:, None]
         gram = np.matmul(rows, rows.swapaxes(1, 2))
         mixing = gram[:, 1:3, :1] / gram[:, :1, :1]
         return _Normal(rows, gram, mixing, gram[:, 1:3] - mixing * gram[:, :1])
 
-    def _iterate(
-        self, index: IndexArray, s: FloatArray, data: FloatArray, weight: FloatArray
-    ) -> PointEstimate:
+    def _iterate(self, of: _Readings, s: FloatArray) -> PointEstimate:
         """Gauss-Newton on the cell coordinates, the total eliminated, all contacts in step."""
-        first_row = self._first_row(index)
         longest = _LONGEST_STEP / self._grid.width
         for _ in range(_STEPS):
-            at = self._linearise(first_row, s, data, weight)
-            total = at.gram[:, 0, 3] / at.gram[:, 0, 0]
-            step, decrement = at.step(total, s, self._top)
+            at = self._linearise(of, s)
+            step, decrement = at.step(s, self._top)
             np.minimum(np.maximum(step, -longest, out=step), longest, out=step)
             step += s
             np.minimum(np.maximum(step, 0.0, out=step), self._top, out=step)
@@ -174,87 +169,88 @@ class LocatorBank:
             unsettled = decrement > _SETTLED
             if not np.logical_or.reduce(unsettled):
                 break
-        return self._result(index, s, step, at, decrement, ~unsettled, data, weight)
+        return self._result(of, s, step, at, decrement, ~unsettled)
 
     def _result(
         self,
-        index: IndexArray,
+        of: _Readings,
         s: FloatArray,
         step: FloatArray,
         at: _Normal,
         decrement: FloatArray,
         settled: BoolArray,
-        data: FloatArray,
-        weight: FloatArray,
     ) -> PointEstimate:
         """The estimate at s, a last step away from where the model was read."""
-        gram = at.gram
-        total = gram[:, 0, 3] / gram[:, 0, 0]
+        total = at.total()
         step_x, step_y = step.T
-        chi_squared = gram[:, 3, 3] - total * gram[:, 0, 3] - decrement
+        chi_squared = at.gram[:, 3, 3] - total * at.gram[:, 0, 3] - decrement
         np.maximum(chi_squared, 0.0, out=chi_squared)
-        pair = at.rows[:, :3, 0] / weight[:, :1] + at.rows[:, :3, 1] / weight[:, 1:2]
+        pair = at.rows[:, :3, 0] / of.weight[:, :1] + at.rows[:, :3, 1] / of.weight[:, 1:2]
         total *= 1 - at.mixing[:, 0, 0] * step_x - at.mixing[:, 1, 0] * step_y
-        residual = (data[:, 0] + data[:, 1]) / total
+        residual = (of.data[:, 0] + of.data[:, 1]) / total
         residual -= pair[:, 0] + pair[:, 1] * step_x + pair[:, 2] * step_y
-        sides = self._sides.take(index, axis=0)
         fraction = self._grid.place(s)
-        point = sides * fraction
+        point = of.sides * fraction
         covariance = at.covariance(total, (self._grid.width * (1 - fraction)) * point)
         found = total > 0
         if not np.logical_and.reduce(found):
             point[~found] = covariance[~found] = np.nan
-        self._leave_corner(index, point, sides, total, data, weight, covariance)
-        _forget_lost(point, sides, covariance)
+        self._leave_corner(of, point, total, covariance)
+        _forget_lost(point, of.sides, covariance)
         return PointEstimate(
             point[:, 0], point[:, 1], total, residual, chi_squared, covariance, settled & found
         )
 
     def _leave_corner(
-        self,
-        index: IndexArray,
-        point: FloatArray,
-        sides: FloatArray,
-        total: FloatArray,
-        data: FloatArray,
-        weight: FloatArray,
-        covariance: FloatArray,
+        self, of: _Readings, point: FloatArray, total: FloatArray, covariance: FloatArray
     ) -> None:
         """As in `estimate`: out to where currents tell, in place, with the covariance of there."""
-        nearest = np.minimum(point, sides - point)
+        nearest = np.minimum(point, of.sides - point)
         distance = nearest[:, 0] ** 2 + nearest[:, 1] ** 2
-        if not np.logical_or.reduce(distance < 0.0625 * self._shortest.take(index)):
+        shortest = self._shortest.take(of.pad)
+        if not np.logical_or.reduce(distance < 0.0625 * shortest):
             return
-        noise = 2 / np.sqrt((weight * weight).sum(axis=1))
-        radius = self._shortest.take(index) * np.minimum(CORNER * CORNER * noise / total, 0.0625)
+        noise = 2 / np.sqrt((of.weight * of.weight).sum(axis=1))
+        radius = shortest * np.minimum(CORNER * CORNER * noise / total, 0.0625)
         which = np.flatnonzero(distance < radius)
         if not which.size:
             return
-        index, sides, data, weight = index[which], sides[which], data[which], weight[which]
-        far = 2 * point[which] > sides
-        corner, inward = np.where(far, sides, 0.0).T, np.where(far, -1.0, 1.0).T * np.sqrt(radius[which])
-        angle = np.arctan2(nearest[which, 1], nearest[which, 0])
+        of = of.some(which)
+        far = 2 * point[which] > of.sides
+        corner, inward = np.where(far, of.sides, 0.0).T, np.where(far, -1.0, 1.0).T * np.sqrt(radius[which])
 
         def linearised(place: FloatArray) -> tuple[FloatArray, FloatArray]:
-            at, scale, best = self._linearise_at(index, place.T, data, weight)
-            slopes = at.rows[:, 1:3] - at.mixing * at.rows[:, :1]
-            misfit = at.rows[:, 3] - best[:, None] * at.rows[:, 0]
-            return misfit.T, np.moveaxis(slopes * (best[:, None] / scale)[:, :, None], 0, -1)
+            at, scale = self._linearise_at(of, place.T)
+            best = at.total()[:, None]
+            slopes = (at.rows[:, 1:3] - at.mixing * at.rows[:, :1]) * (best / scale)[:, :, None]
+            return (at.rows[:, 3] - best * at.rows[:, 0]).T, np.moveaxis(slopes, 0, -1)
 
-        angle = best_direction(linearised, corner, inward, angle)
+        angle = best_direction(linearised, corner, inward, np.arctan2(nearest[which, 1], nearest[which, 0]))
         point[which] = (corner + inward * np.stack([np.cos(angle), np.sin(angle)])).T
-        at, scale, best = self._linearise_at(index, point[which], data, weight)
-        covariance[which] = at.covariance(best, scale)
+        at, scale = self._linearise_at(of, point[which])
+        covariance[which] = at.covariance(at.total(), scale)
 
-    def _linearise_at(
-        self, index: IndexArray, point: FloatArray, data: FloatArray, weight: FloatArray
-    ) -> tuple[_Normal, FloatArray, FloatArray]:
-        """Normal equations at points (n, 2), lengths of a cell there, (n, 2), and best totals."""
-        s = self._coordinates(index, point)
+    def _linearise_at(self, of: _Readings, point: FloatArray) -> tuple[_Normal, FloatArray]:
+        """Normal equations at points (n, 2), and lengths of a cell there, (n, 2)."""
+        s = self._coordinates(of.pad, point)
         fraction = self._grid.place(s)
-        at = self._linearise(self._first_row(index), s, data, weight)
-        scale = self._sides.take(index, axis=0) * fraction * (1 - fraction) * self._grid.width
-        return at, scale, at.gram[:, 0, 3] / at.gram[:, 0, 0]
+        return self._linearise(of, s), of.sides * fraction * (1 - fraction) * self._grid.width
+
+
+class _Readings(NamedTuple):
+    """What was measured: on which pads (n,), whose tables begin at rows (n,), with sides (n, 2); (n, 4)."""
+
+    pad: IndexArray
+    first_row: IndexArray
+    sides: FloatArray
+    data: FloatArray
+    weight: FloatArray
+
+    def some(self, which: IndexArray) -> _Readings:
+        """Those of the contacts `which`."""
+        return _Readings(
+            self.pad[which], self.first_row[which], self.sides[which], self.data[which], self.weight[which]
+        )
 
 
 class _Normal(NamedTuple):
@@ -270,7 +266,11 @@ class _Normal(NamedTuple):
     mixing: FloatArray
     reduced: FloatArray
 
-    def step(self, total: FloatArray, s: FloatArray, top: float) -> tuple[FloatArray, FloatArray]:
+    def total(self) -> FloatArray:
+        """The best total at this point, (n,)."""
+        return np.asarray(self.gram[:, 0, 3] / self.gram[:, 0, 0])
+
+    def step(self, s: FloatArray, top: float) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton step (n, 2) and squared decrement; coordinates held by the table's end stay."""
         reduced = self.reduced
         if np.fmin.reduce(s, axis=None, initial=top) <= 0 or np.fmax.reduce(s, axis=None, initial=0) >= top:
@@ -283,7 +283,7 @@ class _Normal(NamedTuple):
         np.subtract(xx * gradient_y, xy * gradient_x, out=step[:, 1])
         step /= (xx * yy - xy * xy)[:, None]
         decrement = step[:, 0] * gradient_x + step[:, 1] * gradient_y
-        step /= total[:, None]
+        step /= self.total()[:, None]
         return step, decrement
 
     def covariance(self, total: FloatArray, scale: FloatArray) -> FloatArray:
