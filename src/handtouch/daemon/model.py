@@ -53,11 +53,8 @@ class PadModel:
         self.placement = Placement([(surface_of(pad), *mount_of(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
         self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
-        self._series_ohm = np.array([pad.series_ohm for pad in pads])
+        self._series_form = np.stack([network.series_form for network in networks])
         self._has_series = np.array([any(pad.series_ohm) for pad in pads])
-        self._unmix = np.stack(
-            [_unmix(pad, net, s) for pad, net, s in zip(pads, networks, sheets, strict=True)]
-        )
         self._law = ContactLaw(
             np.array([sheet.contact_ohm_mm2 * 1e-6 for sheet in sheets]),
             np.array([sheet.alpha for sheet in sheets]),
@@ -85,10 +82,9 @@ class PadModel:
         """What series resistors add to the way from contact to ground [ohm] (n,): sum of phi_i V_i / I."""
         if not self._has_series[index].any():
             return 0.0
-        ideal = np.einsum("nij,jn->in", self._unmix[index], currents)
-        total = currents.sum(axis=0)
-        dropped = (ideal * currents * self._series_ohm[index].T).sum(axis=0)
-        return np.asarray(dropped / np.where(total > 0, total, np.nan) ** 2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fractions = currents / currents.sum(axis=0)
+        return np.asarray(np.einsum("in,nij,jn->n", fractions, self._series_form[index], fractions))
 
     def _threshold(self, force_n: FloatArray, networks: Sequence[ElectrodeNetwork]) -> FloatArray:
         """Total current of a contact of that force in the middle of each pad."""
@@ -116,13 +112,6 @@ def _networks(pads: list[config.Pad], sheets: list[config.Sheet]) -> list[Electr
             made[make] = network_of(pad, sheet)
         networks.append(made[make])
     return networks
-
-
-def _unmix(pad: config.Pad, network: ElectrodeNetwork, sheet: config.Sheet) -> FloatArray:
-    """What makes measured currents those of electrodes grounded directly: 1 + G R w / rho."""
-    if not any(pad.series_ohm):
-        return np.eye(4)
-    return np.asarray(np.eye(4) + network.conductance * (np.array(pad.series_ohm) / sheet.ohm_per_square))
 
 
 def _nominal(pad: config.Pad, deployment: Deployment) -> str:
