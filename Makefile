@@ -21,13 +21,13 @@ $(BIN)/python:
 
 $(VENV)/.run: pyproject.toml requirements.lock | $(BIN)/python
 	@echo "installing handtouch into $(VENV) ..."
-	@test -e $(VENV)/.dev || $(PIP) install --no-compile -c requirements.lock -e .
+	@$(PIP) install --no-compile -c requirements.lock -e .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python
 	@echo "installing handtouch and its tools into $(VENV) ..."
 	@$(PIP) install -c requirements.lock -e '.[dev]'
-	@touch $@
+	@touch $(VENV)/.run $@
 
 .PHONY: install dev
 install: $(VENV)/.run ## install into .venv what a robot needs
