@@ -41,13 +41,13 @@ class Cost:
 
 # Medians of benchmarks/field_accuracy.py (docs/benchmarks/field.md); only their order decides.
 COSTS: Mapping[str, Cost] = {
-    "log-ratio": Cost(9.0, 0.012),
-    "log-ratio, adjusted": Cost(12.0, 0.014),
-    "ratio table": Cost(15.0, 0.021),
-    "log-ratio, corrected": Cost(38.0, 0.12),
-    "exact": Cost(33.0, 0.10),
-    "likelihood, tabulated": Cost(190.0, 2.9),
-    "likelihood": Cost(2000.0, 3.5),
+    "log-ratio": Cost(4.1, 0.002),
+    "log-ratio, adjusted": Cost(4.5, 0.003),
+    "ratio table": Cost(15.0, 0.026),
+    "log-ratio, corrected": Cost(26.0, 0.062),
+    "exact": Cost(31.0, 0.07),
+    "likelihood, tabulated": Cost(130.0, 3.2),
+    "likelihood": Cost(2000.0, 4.5),
 }
 
 
