@@ -141,7 +141,7 @@ class Health:
     """samples per second over the last second"""
     samples: int
     missed: int
-    """ticks that had to do without a sample of this pad"""
+    """ticks that had to do without the sample of their SYNC: late or lost"""
     age_s: float | None
     emergencies: tuple[str, ...]
     """latest EMCY messages as text, newest last"""

@@ -30,13 +30,16 @@ class Driver:
         self.node_state = UP.copy()
 
     def step(self, counts: dict[int, Any], silent: tuple[int, ...] = ()) -> Ticked:
+        """`silent` pads answer no SYNC."""
         self.t_ns += PERIOD_NS
         self.slab.begin_cycle()
         for pad in range(3):
             if pad not in silent:
                 data = np.asarray(counts.get(pad, np.zeros(4)), dtype="<i2").tobytes()
                 self.slab.write(pad, data, self.t_ns + 1000)
-        return self.tick.step(self.slab, self.node_state, self.t_ns, self.t_ns + 2_000_000)
+        return self.tick.step(
+            self.slab, self.node_state, self.t_ns, self.t_ns - PERIOD_NS, self.t_ns + 2_000_000
+        )
 
     def state(self, pad: int) -> PadState:
         return PadState(int(self.tick.columns.state[pad]))
@@ -169,3 +172,21 @@ def test_no_reading_whatever_is_fatal_or_spoils_a_neighbour(bench: Any, readings
         driver.tick.columns.position_m[ROUND], alone.tick.columns.position_m[ROUND], atol=1e-9
     )
     assert driver.state(ROUND) == PadState.TOUCHED
+
+
+def test_a_pad_that_always_answers_late_is_neither_stale_nor_lost_to_the_tick(driver: Driver) -> None:
+    touch = driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)
+    for _ in range(5):
+        ticked = driver.step({}, silent=(PLANE,))
+        sync_ns = driver.t_ns
+        driver.slab.write(PLANE, touch.tobytes(), driver.t_ns + 4_000_000)  # after the tick
+    assert driver.state(PLANE) == PadState.TOUCHED
+    assert ticked.updated.tolist() == [PLANE]
+    assert driver.tick.columns.sample_ns[PLANE] == sync_ns - PERIOD_NS
+    assert driver.tick.missed[PLANE] >= 3
+
+
+def test_a_sample_is_used_once(driver: Driver) -> None:
+    touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
+    driver.step(touch)
+    assert not len(driver.step({}, silent=(PLANE,)).began)  # one sample is not two in a row

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 
 class Cycle:
-    """One SYNC period after another; `t_ns` is the present one's SYNC.
+    """One SYNC period after another; `t_ns` is the present one's SYNC, `previous_ns` the one before.
 
     Between two `begin`s exactly one tick falls due. Without a SYNC (none sent on this bus, or a producer
     that died) `begin_overdue` says when to go on by the timer, so that silence is noticed too.
@@ -16,12 +16,12 @@ class Cycle:
     def __init__(self, period_ns: int, window: float) -> None:
         self.period_ns = period_ns
         self.window_ns = round(period_ns * window)
-        self.t_ns = 0
+        self.t_ns = self.previous_ns = 0
         self.ticked = True
 
     def begin(self, t_ns: int) -> None:
         """A SYNC was sent or seen."""
-        self.t_ns = t_ns
+        self.previous_ns, self.t_ns = self.t_ns, t_ns
         self.ticked = False
 
     def tick_due(self, t_ns: int, complete: bool) -> bool:

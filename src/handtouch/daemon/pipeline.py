@@ -42,7 +42,7 @@ class Pipeline:
             return None
         self.cycle.ticked = True
         self.ticks += 1
-        ticked = self.tick.step(self.slab, node_state, self.cycle.t_ns, now_ns)
+        ticked = self.tick.step(self.slab, node_state, self.cycle.t_ns, self.cycle.previous_ns, now_ns)
         self.messages.send_contacts(ticked, now_ns, self._outlet)
         self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
         return ticked

@@ -99,24 +99,30 @@ class Tick:
         self.columns = Columns.of(model.size)
         self.contacts = Contacts(model.begin_samples, model.end_samples)
         self.missed = np.zeros(model.size, dtype=np.int64)
-        """ticks without a sample of a pad that was expected"""
+        """ticks that an expected sample came too late for, or never"""
         self._stale_ns = _STALE_PERIODS * period_ns
         self._currents = np.zeros((model.size, 4))
+        self._taken_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the samples that were used
 
     def expected(self) -> NDArray[np.bool_]:
         """Pads whose sample a tick should wait for: those that are alive."""
         return self.columns.state <= _TOUCHED
 
-    def step(self, slab: Slab, node_state: NDArray[np.uint8], t_ns: int, now_ns: int) -> Ticked:
-        """Take in the samples of the SYNC at `t_ns`; `now_ns` is the time of the tick.
+    def step(
+        self, slab: Slab, node_state: NDArray[np.uint8], t_ns: int, previous_ns: int, now_ns: int
+    ) -> Ticked:
+        """Take in the samples of the SYNC at `t_ns`, and those of the one at `previous_ns` that were late.
 
-        `node_state` (n,): PadState.CLEAR where the node is up, else what its pad is instead.
+        `now_ns` is the time of the tick. `node_state` (n,): PadState.CLEAR where the node is up, else what
+        its pad is instead.
         """
         model, columns, contacts = self.model, self.columns, self.contacts
         operational: BoolArray = np.equal(node_state, _CLEAR)
-        sampled = (slab.fresh != 0) & operational
-        self.missed += self.expected() & operational & ~sampled
-        columns.sample_ns[sampled] = t_ns
+        sampled = (slab.t_ns != self._taken_ns) & operational
+        np.copyto(self._taken_ns, slab.t_ns)
+        in_time = slab.fresh != 0
+        self.missed += self.expected() & operational & ~in_time
+        np.copyto(columns.sample_ns, np.where(in_time, t_ns, previous_ns), where=sampled)
         railed: BoolArray = np.any(np.abs(slab.counts.astype(np.int32)) >= _RAIL, axis=1)
         stale: BoolArray = np.subtract(now_ns, columns.sample_ns) > self._stale_ns
         trusted: BoolArray = operational & ~railed & ~stale

@@ -31,7 +31,7 @@ from handtouch.simulate.world import World
 
 _SESSION = "utah_mit_session.toml"
 _STATUS_EVERY_S = 5.0
-_WRITE_EVERY_S = 0.5
+_LOOK_EVERY_S = 0.5
 _NO_BIT_RATE = ("socketcan", "udp_multicast", "virtual")
 
 
@@ -207,17 +207,15 @@ def _play(
     hand.start()
     begin_s = time.monotonic()
     told_s, told_syncs = begin_s, 0
-    while not stop.wait(_WRITE_EVERY_S if seconds is None else min(_WRITE_EVERY_S, seconds / 4)):
+    while not stop.wait(_LOOK_EVERY_S if seconds is None else min(_LOOK_EVERY_S, seconds / 4)):
         now_s = time.monotonic()
-        if file:
-            truth_file.write(file, hand.take_truth())
         if seconds is not None and now_s - begin_s >= seconds:
             break
         if now_s - told_s >= _STATUS_EVERY_S:
             print(_status(hand, now_s - begin_s, (hand.syncs - told_syncs) / (now_s - told_s)), flush=True)
             told_s, told_syncs = now_s, hand.syncs
     hand.stop()
-    if file:
+    if file:  # not before: working it out would hold up the nodes
         truth_file.write(file, hand.take_truth())
     print(f"{hand.syncs} SYNCs answered", flush=True)
 
