@@ -39,17 +39,17 @@ TOUCHED = 5
 
 
 class StampedBus:
-    """A bus that remembers when the last frame of each answer to SYNC went out."""
+    """A bus that remembers when the last frame of each answer to SYNC was sent."""
 
     def __init__(self, bus: can.BusABC, last_id: int, stamps: Any) -> None:
         self._bus, self._last_id, self._stamps = bus, last_id, stamps
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
-        self._bus.send(message, timeout)
-        if message.arbitration_id == self._last_id:
+        if message.arbitration_id == self._last_id:  # before, for it may be answered before `send` returns
             count = int(self._stamps[0])
             self._stamps[1 + count % (len(self._stamps) - 1)] = time.monotonic_ns()
             self._stamps[0] = count + 1
+        self._bus.send(message, timeout)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._bus, name)
