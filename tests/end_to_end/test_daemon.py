@@ -7,6 +7,7 @@ that meet on a udp_multicast bus and on ZeroMQ.
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import os
 import signal
@@ -276,3 +277,22 @@ def test_a_malformed_request_gets_an_error_and_the_tick_goes_on(rig: Any, reques
     assert answer["error"]
     ticks = rig.status()["service"]["ticks"]
     rig.wait("ticking on", lambda status: status["service"]["ticks"] > ticks)
+
+
+def test_status_tells_people_and_programs_how_the_hand_fares(rig: Any) -> None:
+    rig.simulate()
+    rig.start("run")
+    rig.wait_operational()
+    ask = rig.command("status", "--endpoint", rig.endpoints["control"])
+    told = subprocess.run(ask, capture_output=True, text=True, timeout=LONGEST_S)
+    assert told.returncode == 0
+    assert "bus can0: load" in told.stdout
+    assert "right/thumb_distal" in told.stdout
+    assert told.stdout.count("operational") == 15
+    answer = json.loads(subprocess.run([*ask, "--json"], capture_output=True, timeout=LONGEST_S).stdout)
+    assert {pad["state"] for pad in answer["pads"]} <= {"clear", "touched"}
+    rig.end("simulate")
+    rig.wait("lost", lambda status: _row(status, "palm_heel")["state"] == "lost")
+    told = subprocess.run(ask, capture_output=True, text=True, timeout=LONGEST_S)
+    assert told.returncode == 1
+    assert "heartbeat" in told.stdout

@@ -160,7 +160,10 @@ class Tick:
         found = model.locator.estimate(touched, currents, model.noise_a[touched], columns.xy[touched].T)
         columns.xy[touched, 0], columns.xy[touched, 1] = found.x, found.y
         columns.residual[touched] = found.residual
-        columns.residual_std[touched] = np.abs(found.residual) / np.sqrt(found.chi_squared)
+        with np.errstate(
+            divide="ignore", invalid="ignore"
+        ):  # counts that fit a point exactly tell nothing of it
+            columns.residual_std[touched] = np.abs(found.residual) / np.sqrt(found.chi_squared)
         placed = model.placement.place(touched, found.x, found.y, found.covariance[:, :2, :2])
         columns.position_m[touched] = placed.position_m
         columns.normal[touched] = placed.normal

@@ -15,7 +15,7 @@ from handtouch.view.lines import location_std_m, strength_text
 
 _EVENTS = 6
 _FULL_BAR_N = 5.0
-_BAR = 12
+_BAR = 8
 _STYLE_OF_STATE = {
     "clear": "green",
     "touched": "bold cyan",
