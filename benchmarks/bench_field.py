@@ -305,7 +305,7 @@ def main() -> None:
     aims = verdicts(rows)
     print("\n".join(aims))
     machine = (
-        f"{os.cpu_count()} x {platform.machine()}, {platform.system()} {platform.release()}, "
+        f"{os.cpu_count()} x {platform.machine()}, {platform.system()}, "
         f"Python {platform.python_version()}, numpy {np.__version__}, scipy {scipy.__version__}, "
         f"scikit-fem {skfem.__version__}; load average {os.getloadavg()[0]:.1f}"
     )
