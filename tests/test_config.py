@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from handtouch import config, shipped
 from handtouch.config import ConfigError
-from handtouch.config_checks import rectangle_mm
+from handtouch.config.checks import rectangle_mm
 from handtouch.hand import surface_of
 
 CONFIG = Path(__file__).parents[1] / "config"

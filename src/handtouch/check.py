@@ -14,7 +14,7 @@ from typing import Any
 
 from handtouch import config
 from handtouch.canbus.load import burst_s, bus_load
-from handtouch.config_checks import rectangle_mm
+from handtouch.config.checks import rectangle_mm
 
 BUSY_LOAD = 0.7
 POOR_ASPECT = 3.0

@@ -14,7 +14,7 @@ import pytest
 
 from handtouch import config
 from handtouch.canbus.port import BusError
-from handtouch.config_problems import ConfigError
+from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.run import SimulatedHand, run

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import config, shipped
-from handtouch.config_problems import ConfigError
+from handtouch.config.problems import ConfigError
 from handtouch.simulate.scenario import Scenario, Touch
 
 fractions = st.floats(0.02, 0.98)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from handtouch import config, shipped
 from handtouch.canbus.device import Device, DeviceBus
 from handtouch.canbus.port import BusError
-from handtouch.config_problems import ConfigError
+from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.scenario import Scenario

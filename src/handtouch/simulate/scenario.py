@@ -16,8 +16,9 @@ from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, ValidationError
 
-from handtouch.config import Deployment, Name, Positive, Table
-from handtouch.config_problems import ConfigError, Problem, problems_of
+from handtouch.config import Deployment
+from handtouch.config.problems import ConfigError, Problem, problems_of
+from handtouch.config.tables import Name, Positive, Table
 
 _Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
 _Point = Annotated[tuple[_Fraction, _Fraction], Field(strict=False)]

@@ -1,7 +1,7 @@
 """Mistakes in a deployment file, in the words of the file: place, value, and what would be right.
 
 Public names: `Problem`, `ConfigError`, `problems_of`. The definitions of the tables are in
-`handtouch.config`.
+`handtouch.config.tables`.
 """
 
 from __future__ import annotations

@@ -10,12 +10,9 @@ import json
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from handtouch.config_problems import Problem
-
-if TYPE_CHECKING:
-    from handtouch.config import Bus, Daemon, Deployment, Node, Pad, Surface, Touch
+from handtouch.config.problems import Problem
+from handtouch.config.tables import Bus, Daemon, Deployment, Node, Pad, Surface, Touch
 
 _LOOPBACK = ("tcp://127.", "tcp://localhost:", "tcp://[::1]:")
 
