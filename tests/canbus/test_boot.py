@@ -175,6 +175,29 @@ def test_garbled_answer_is_an_error_not_a_value() -> None:
     assert not caught.value.silent
 
 
+def test_one_lost_answer_is_asked_for_again() -> None:
+    node = Node(identity(7))
+    plain, asked = node.answer, 0
+
+    def lossy(can_id: int, data: bytes) -> bool:
+        nonlocal asked
+        asked += data[0] != 0x80  # the client aborts what it gave up
+        return True if asked == 1 else plain(can_id, data)
+
+    node.sdo._client.network._send = lossy
+    assert node.sdo.read(0x1018, 1, "vendor id") == 7
+    assert asked == 2
+
+
+def test_attempt_that_is_outdated_meanwhile_does_not_ask_again() -> None:
+    node = Node(identity(1))
+    node.deaf.add(0x1018)
+    turns = iter([False, True])
+    node.sdo.outdated = lambda: next(turns)
+    with pytest.raises(Outdated):
+        node.sdo.read(0x1018, 1, "vendor id")
+
+
 def test_outdated_attempt_asks_nothing_more() -> None:
     node = Node(identity(1))
     node.sdo.outdated = lambda: True

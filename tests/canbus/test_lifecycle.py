@@ -184,6 +184,26 @@ def test_retries_pause_ever_longer_up_to_a_limit_and_forget_after_success() -> N
     assert advance(life(S, discard=1, failures=9), Sample(), NOW, TIMING)[0].failures == 0
 
 
+@pytest.mark.parametrize("heard", [BootUp(), Heartbeat(NMT_PREOPERATIONAL), Answer()])
+def test_probes_in_vain_do_not_lengthen_the_pause_after_a_failed_attempt(heard: Event) -> None:
+    now, absent = NOW, life(A, due_ns=NOW)
+    for _ in range(20):
+        absent, actions = advance(absent, Tick(), now, TIMING)
+        assert actions == (Action.PROBE,)
+        now = absent.due_ns
+    assert now - NOW > 60_000 * MS
+    booting, _ = advance(absent, heard, now, TIMING)
+    lost = failed(IDENTIFY, attempt=booting.attempt, silent=True)
+    faulted, _ = advance(booting, lost, now, TIMING)
+    assert (faulted.state, faulted.due_ns - now) == (F, 100 * MS)
+
+
+def test_attempts_before_a_reboot_do_not_lengthen_the_pause_after_it() -> None:
+    booting, _ = advance(life(F, failures=9), BootUp(), NOW, TIMING)
+    faulted, _ = advance(booting, failed(IDENTIFY, attempt=booting.attempt), NOW, TIMING)
+    assert faulted.due_ns - NOW == 100 * MS
+
+
 def test_reason_of_a_fault_stays_while_it_is_tried_again() -> None:
     faulted = advance(life(B), failed(IDENTIFY), NOW, TIMING)[0]
     again, _ = advance(faulted, Tick(), faulted.due_ns, TIMING)

@@ -145,6 +145,28 @@ def test_missing_node_is_reported_and_asked_for_while_the_rest_works(rig: Any) -
     assert rig.state(2) is OPERATIONAL
 
 
+@pytest.mark.parametrize("lost", [1, 2], ids=["one lost answer", "two lost answers"])
+def test_node_absent_for_long_is_up_within_half_a_second_of_its_boot_up(
+    rig: Any, lost: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.start()
+    rig.run(20_000)  # probes are 5 s apart by now
+    answers = rig.node(1)._node.sdo.on_request
+    left = lost
+
+    def lossy(can_id: int, data: bytes, t: float) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            answers(can_id, data, t)
+
+    monkeypatch.setattr(rig.node(1)._node.sdo, "on_request", lossy)
+    rig.node(1).plug()
+    rig.run(500)
+    assert left < 0
+    assert rig.state(1) is OPERATIONAL
+
+
 def test_node_that_sends_neither_boot_up_nor_heartbeat_is_found(rig: Any) -> None:
     device = rig.node(1)
     device.plug()

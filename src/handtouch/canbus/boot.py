@@ -15,6 +15,8 @@ from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 from .eds import ANALOGUE_INPUT
 
 SDO_TIMEOUT_S = 0.2
+SDO_ATTEMPTS = 2
+"""A lost frame costs one time-out; a node that answers neither attempt is silent."""
 SYNCHRONOUS = 1
 """Transmission type: with every SYNC."""
 CHANNELS = tuple(ANALOGUE_INPUT << 16 | sub << 8 | 16 for sub in (1, 2, 3, 4))
@@ -125,22 +127,26 @@ class Sdo:
     def _transfer(
         self, index: int, sub: int, doing: str, transfer: Callable[[SdoClient], bytes | None]
     ) -> bytes | None:
-        if self.outdated():
-            raise Outdated
         doing += f", 0x{index:04X}:{sub:02X}"
         self._object = index.to_bytes(2, "little") + bytes((sub,))
-        self._answered = False
-        self.waiting = True
-        try:
-            return transfer(self._client)
-        except SdoAbortedError as error:
-            raise BootError(f"{doing}: refused by the node ({error})") from error
-        except SdoCommunicationError as error:
-            if self._answered:
-                raise BootError(f"{doing}: {error}") from error
-            raise BootError(f"{doing}: no answer within {SDO_TIMEOUT_S * 1e3:.0f} ms", silent=True) from error
-        finally:
-            self.waiting = False
+        silence: SdoCommunicationError | None = None
+        for _ in range(SDO_ATTEMPTS):
+            if self.outdated():
+                raise Outdated
+            self._answered = False
+            self.waiting = True
+            try:
+                return transfer(self._client)
+            except SdoAbortedError as error:
+                raise BootError(f"{doing}: refused by the node ({error})") from error
+            except SdoCommunicationError as error:
+                if self._answered:
+                    raise BootError(f"{doing}: {error}") from error
+                silence = error
+            finally:
+                self.waiting = False
+        told = f"{doing}: no answer within {SDO_TIMEOUT_S * 1e3:.0f} ms, asked {SDO_ATTEMPTS} times"
+        raise BootError(told, silent=True) from silence
 
 
 def identify(sdo: Sdo, expected: Expected) -> Identity:

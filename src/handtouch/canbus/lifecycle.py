@@ -70,7 +70,8 @@ class Life:
     started_ns: int = 0
     due_ns: int = 0  # next probe (ABSENT), attempt (FAULTED) or end of patience (SETTLING)
     attempt: int = 0  # which boot this is; results of others are void
-    failures: int = 0  # in a row; they set the pause before the next attempt
+    failures: int = 0  # attempts in a row; they set the pause before the next
+    probes: int = 0  # unanswered in a row; they set the pause before the next
     discard: int = 0  # samples still to be discarded
     reboots: int = 0
     must_beat: bool = False  # lost for want of heartbeats: not trusted before it has sent one
@@ -188,7 +189,7 @@ def _enter(life: Life, state: NodeState, t_ns: int, reason: str) -> Life:
 def _boot(life: Life, t_ns: int, reason: str) -> Next:
     """Begin again, with the identity."""
     life = _enter(life, NodeState.BOOTING, t_ns, reason)
-    return replace(life, attempt=life.attempt + 1), _identify(life)
+    return replace(life, attempt=life.attempt + 1, probes=0), _identify(life)
 
 
 def _identify(life: Life) -> tuple[Action, ...]:
@@ -221,6 +222,7 @@ def _boot_up(life: Life, t_ns: int) -> Next:
         heard_ns=t_ns,
         heartbeat_ns=None,  # a restarted node's heartbeat time is its default, maybe none
         must_beat=False,
+        failures=0,  # those of its life before say nothing of this one
         reboots=life.reboots + by_itself,
     )
     return _boot(life, t_ns, "rebooted by itself" if by_itself else "boot-up message")
@@ -309,9 +311,8 @@ def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
     if t_ns < life.due_ns:
         return life, ()
     if life.state is NodeState.ABSENT:
-        failures = life.failures + 1
-        due = t_ns + timing.pause_ns(failures)
-        return replace(life, failures=failures, due_ns=due), (Action.PROBE,)
+        probes = life.probes + 1
+        return replace(life, probes=probes, due_ns=t_ns + timing.pause_ns(probes)), (Action.PROBE,)
     if life.state is NodeState.FAULTED:
         # It stays FAULTED, with its reason, until an attempt gets further.
         life = replace(life, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns)
