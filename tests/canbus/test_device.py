@@ -390,3 +390,12 @@ def test_nodes_live_on_a_real_bus_and_speak_with_the_librarys_own_master() -> No
             nodes.stop()
             network.notifier.stop()
     assert nodes.bus_errors == 0
+
+
+def test_frames_from_before_power_on_are_not_answered(wire: Wire, bus: DeviceBus) -> None:
+    probe = message(0x601, 0x40, 0x00, 0x10, 0, 0, 0, 0, 0)
+    wire.incoming = [message(0, 1, 0), SYNC, probe]
+    bus.start()
+    bus.stop()
+    assert bus.syncs == 0
+    assert wire.sent == [(0x700 + node_id, b"\x00") for node_id in (1, 2, 5)]

@@ -15,6 +15,7 @@ import pytest
 from handtouch import config
 from handtouch.canbus.port import BusError
 from handtouch.config.problems import ConfigError
+from handtouch.simulate import run as simulate_run
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.run import SimulatedHand, run
@@ -128,6 +129,25 @@ def test_fault_switches_are_reached_by_link(deployment: config.Deployment) -> No
         assert set(near.sync(2)) == {3, 4}
         hand.devices["right/flat"].unplug()
         assert set(near.sync(1)) == {4}
+
+
+def test_the_hand_is_built_before_its_buses_are_open(
+    deployment: config.Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    def building(*arguments: object) -> VirtualHand:
+        done.append("hand")
+        return VirtualHand(*arguments)  # type: ignore[arg-type]
+
+    def opening(bus: config.Bus) -> can.BusABC:
+        done.append("bus")
+        return can.Bus(interface="virtual", channel=bus.channel)
+
+    monkeypatch.setattr(simulate_run, "VirtualHand", building)
+    monkeypatch.setattr(simulate_run, "open_bus", opening)
+    SimulatedHand.open(deployment, Scenario.tour(deployment), IDEAL).stop()
+    assert done == ["hand", "hand", "bus", "bus"]
 
 
 def test_what_cannot_be_simulated_is_told_before_any_node_speaks(

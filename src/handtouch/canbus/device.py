@@ -39,6 +39,7 @@ _VALUE_RANGE_EXCEEDED = 0x06090030
 _CHANNELS, _TPDO2, _IDENTITY = 0x6401, 0x1801, 0x1018
 _PDO_OFF = 1 << 31
 _LONGEST_WAIT_S = 0.1  # so that `stop` is prompt whatever the heartbeats
+_MOST_WAITING = 100_000  # frames; a bus that never falls silent doesn't hold the start up
 _BACK_OFF_S = 0.1  # between attempts on a bus that fails
 
 _log = logging.getLogger(__name__)
@@ -303,9 +304,10 @@ class DeviceBus:
             frame = self._bus.recv(0.0)
 
     def start(self) -> None:
-        """Plug in every node and serve them from a thread of its own."""
+        """Plug in every node and serve them from a thread of its own; frames that wait already are dropped."""
         if self._thread is not None:
             raise RuntimeError("the nodes are already served")
+        self._drop_waiting()
         self.advance(self._clock())
         for device in self.devices.values():
             device.plug()
@@ -339,6 +341,15 @@ class DeviceBus:
     def now_ns(self) -> int:
         """Time of the latest `handle` or `advance`."""
         return self._now_ns
+
+    def _drop_waiting(self) -> None:
+        """A node without power hears nothing, so what came before it is plugged in gets no answer."""
+        try:
+            for _ in range(_MOST_WAITING):
+                if self._bus.recv(0.0) is None:
+                    break
+        except (can.CanError, OSError):
+            self.bus_errors += 1
 
     def _serve(self) -> None:
         while not self._stop.is_set():

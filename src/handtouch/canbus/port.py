@@ -1,6 +1,6 @@
 """One CAN bus: open it by python-can's interface name and channel, receive, send, count.
 
-Public names: `Port`, `BusError`.
+Public names: `Port`, `open_bus`, `BusError`.
 """
 
 from __future__ import annotations
@@ -44,16 +44,9 @@ class Port:
         """Open a bus; samples will be written to `slab`. Raises BusError if it can't be opened."""
 
         def opener() -> can.BusABC:
-            return _open_bus(bus)
+            return open_bus(bus)
 
-        try:
-            receiver = _receiver(bus.interface, opener)
-        except Exception as error:  # drivers raise anything; all of it means that the bus is not there
-            raise BusError(
-                f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: '
-                f"{error}; {_remedy(bus, error)}"
-            ) from error
-        return cls(bus, receiver, slab)
+        return cls(bus, _receiver(bus.interface, opener), slab)
 
     @property
     def slab(self) -> Slab:
@@ -105,19 +98,26 @@ class Port:
         self._receiver.close()
 
 
+def open_bus(bus: Bus) -> can.BusABC:
+    """python-can's bus for a bus of the deployment. Raises BusError if it can't be opened."""
+    options: dict[str, Any] = dict(bus.options)
+    if bus.interface not in _OWN_BIT_RATE:
+        options.setdefault("bitrate", bus.bitrate_bit_s)
+    try:
+        return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
+    except Exception as error:  # drivers raise anything; all of it means that the bus is not there
+        raise BusError(
+            f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: '
+            f"{error}; {_remedy(bus, error)}"
+        ) from error
+
+
 def _receiver(interface: str, opener: Callable[[], can.BusABC]) -> Receiver:
     if interface == "socketcan":
         return SocketcanReceiver(opener)
     if interface == "udp_multicast":
         return PolledReceiver(opener)
     return ThreadReceiver(opener, interface)
-
-
-def _open_bus(bus: Bus) -> can.BusABC:
-    options: dict[str, Any] = dict(bus.options)
-    if bus.interface not in _OWN_BIT_RATE:
-        options.setdefault("bitrate", bus.bitrate_bit_s)
-    return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
 
 
 def _remedy(bus: Bus, error: Exception) -> str:

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self, TextIO
+from typing import Self, TextIO
 
 import can
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from handtouch import config, shipped
 from handtouch.canbus.device import Device, DeviceBus
-from handtouch.canbus.port import BusError
+from handtouch.canbus.port import BusError, open_bus
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.hand import VirtualHand
@@ -32,7 +32,6 @@ from handtouch.simulate.world import World
 _SESSION = "utah_mit_session.toml"
 _STATUS_EVERY_S = 5.0
 _LOOK_EVERY_S = 0.5
-_NO_BIT_RATE = ("socketcan", "udp_multicast", "virtual")
 
 
 class SimulatedHand:
@@ -60,13 +59,15 @@ class SimulatedHand:
         scenario.check_links(pad.link for hand in deployment.hands for pad in hand.pads)
         start = _Start()
         stages: list[_Stage] = []
+        used = {pad.bus for hand in deployment.hands for pad in hand.pads}
+        buses = [bus for bus in deployment.buses if bus.name in used]
+        # Before any bus is open: the sheets take a second, and its frames would wait to be answered too late.
+        virtuals = [VirtualHand(deployment, scenario, world, bus.name) for bus in buses]
         with contextlib.ExitStack() as opened:
-            for bus in deployment.buses:
-                if any(pad.bus == bus.name for hand in deployment.hands for pad in hand.pads):
-                    wire = _open_bus(bus)
-                    opened.callback(wire.shutdown)
-                    virtual = VirtualHand(deployment, scenario, world, bus.name)
-                    stages.append(_Stage(deployment, wire, virtual, start, record))
+            for bus, virtual in zip(buses, virtuals, strict=True):
+                wire = open_bus(bus)
+                opened.callback(wire.shutdown)
+                stages.append(_Stage(deployment, wire, virtual, start, record))
             return cls(stages, opened.pop_all())
 
     def start(self) -> None:
@@ -241,15 +242,3 @@ def _stop_on_signal() -> threading.Event:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     return stop
-
-
-def _open_bus(bus: config.Bus) -> can.BusABC:
-    options: dict[str, Any] = dict(bus.options)
-    if bus.interface not in _NO_BIT_RATE:
-        options.setdefault("bitrate", bus.bitrate_bit_s)
-    try:
-        return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
-    except Exception as error:  # drivers raise anything; all of it means that the bus is not there
-        raise BusError(
-            f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: {error}'
-        ) from error
