@@ -304,7 +304,7 @@ class DeviceBus:
             frame = self._bus.recv(0.0)
 
     def start(self) -> None:
-        """Plug in every node and serve them from a thread of its own; frames that wait already are dropped."""
+        """Plug in every node and serve them from a thread of its own; what waits already is dropped."""
         if self._thread is not None:
             raise RuntimeError("the nodes are already served")
         self._drop_waiting()

@@ -46,7 +46,13 @@ class Port:
         def opener() -> can.BusABC:
             return open_bus(bus)
 
-        return cls(bus, _receiver(bus.interface, opener), slab)
+        try:
+            receiver = _receiver(bus.interface, opener)
+        except BusError:
+            raise
+        except Exception as error:  # as in `open_bus`: it is there, but can't be received from
+            raise _unopened(bus, error) from error
+        return cls(bus, receiver, slab)
 
     @property
     def slab(self) -> Slab:
@@ -106,10 +112,7 @@ def open_bus(bus: Bus) -> can.BusABC:
     try:
         return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
     except Exception as error:  # drivers raise anything; all of it means that the bus is not there
-        raise BusError(
-            f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: '
-            f"{error}; {_remedy(bus, error)}"
-        ) from error
+        raise _unopened(bus, error) from error
 
 
 def _receiver(interface: str, opener: Callable[[], can.BusABC]) -> Receiver:
@@ -118,6 +121,13 @@ def _receiver(interface: str, opener: Callable[[], can.BusABC]) -> Receiver:
     if interface == "udp_multicast":
         return PolledReceiver(opener)
     return ThreadReceiver(opener, interface)
+
+
+def _unopened(bus: Bus, error: Exception) -> BusError:
+    return BusError(
+        f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: '
+        f"{error}; {_remedy(bus, error)}"
+    )
 
 
 def _remedy(bus: Bus, error: Exception) -> str:
