@@ -32,7 +32,6 @@ def test_decoding_keeps_every_field(code: int, register: int, detail: bytes) -> 
     message = decode(code.to_bytes(2, "little") + bytes((register,)) + detail, 7)
     assert message is not None
     assert (message.t_ns, message.code, message.register, message.detail) == (7, code, register, detail)
-    assert message.is_reset == (code < 0x100)
 
 
 @given(st.binary(max_size=20).filter(lambda data: len(data) != 8))

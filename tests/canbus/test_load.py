@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from handtouch.canbus.load import burst_s, bus_load, frame_bits, shortest_period_s
+from handtouch.canbus.load import burst_s, bus_load, frame_bits
 
 
 def test_frame_bits_are_those_of_the_literature() -> None:
@@ -24,17 +22,6 @@ def test_fifteen_pads_at_500_hz_fill_a_bus_and_need_two_at_1_khz() -> None:
     assert 0.9 < bus_load(1e6, 15, 0.002, 0.1) < 1.15
     assert bus_load(1e6, 15, 0.005, 0.1) < 0.5
     assert bus_load(1e6, 15, 0.001, 0.1) > 2
-
-
-@given(st.integers(1, 100), st.floats(1e4, 1e6), st.floats(0.01, 10), st.floats(0.1, 1))
-def test_shortest_period_loads_the_bus_as_asked(
-    pads: int, rate: float, heartbeat: float, load: float
-) -> None:
-    period = shortest_period_s(rate, pads, heartbeat, load)
-    if period == float("inf"):
-        assert bus_load(rate, pads, 1e9, heartbeat) >= load * (1 - 1e-9)
-    else:
-        assert bus_load(rate, pads, period, heartbeat) == pytest.approx(load)
 
 
 def test_burst_of_a_hand_takes_two_milliseconds() -> None:

@@ -18,11 +18,6 @@ class Emergency:
     detail: bytes
     text: str
 
-    @property
-    def is_reset(self) -> bool:
-        """The node reports that its error is gone."""
-        return self.code >> 8 == 0
-
 
 def decode(data: bytes, t_ns: int) -> Emergency | None:
     """An EMCY message from its eight bytes of data; None if there aren't eight."""

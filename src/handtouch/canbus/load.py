@@ -1,6 +1,6 @@
 """Expected load of a CAN bus, from its bit rate, the pads on it and the periods of SYNC and heartbeat.
 
-Public names: `frame_bits`, `bus_load`, `burst_s`, `shortest_period_s`. Every figure is the worst case of bit
+Public names: `frame_bits`, `bus_load`, `burst_s`. Every figure is the worst case of bit
 stuffing, so a real bus carries somewhat less.
 """
 
@@ -34,9 +34,3 @@ def bus_load(bit_rate: float, pads: int, sync_period_s: float, heartbeat_s: floa
 def burst_s(bit_rate: float, pads: int) -> float:
     """Seconds from the start of SYNC until every pad's sample has passed, without other traffic."""
     return (frame_bits(0) + pads * frame_bits(SAMPLE_DATA_BYTES)) / bit_rate
-
-
-def shortest_period_s(bit_rate: float, pads: int, heartbeat_s: float, load: float = 0.8) -> float:
-    """SYNC period at which the bus is loaded to `load`; infinite where the heartbeats alone exceed that."""
-    free = load - pads * frame_bits(HEARTBEAT_DATA_BYTES) / heartbeat_s / bit_rate
-    return burst_s(bit_rate, pads) / free if free > 0 else float("inf")
