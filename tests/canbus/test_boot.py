@@ -92,7 +92,7 @@ def test_mapping_is_found_in_whatever_tpdo_carries_it() -> None:
         (tpdo(1, (), 0x185), "TPDO1 has nothing"),
         (
             tpdo(1, CHANNELS[:3], 0x185),
-            r"TPDO1 has 0x6401:01 \(16 bit\), 0x6401:02 \(16 bit\), 0x6401:03 \(16 bit\)$",
+            r"TPDO1 has 0x6401:01 \(16 bit\), 0x6401:02 \(16 bit\), 0x6401:03 \(16 bit\); map",
         ),
         (tpdo(1, CHANNELS[::-1], 0x185), r"TPDO1 has 0x6401:04 \(16 bit\)"),
         (tpdo(1, (0x64010120, 0x64010220), 0x185), r"0x6401:01 \(32 bit\)"),

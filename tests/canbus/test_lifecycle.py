@@ -165,9 +165,12 @@ def test_every_state_is_left_and_reached() -> None:
     assert {before for before, _ in changes} == set(NodeState) - {X}
 
 
-def test_time_out_tells_how_long_nothing_was_heard() -> None:
+def test_time_out_tells_how_long_nothing_was_heard_and_where_to_look() -> None:
     after, _ = advance(life(O, heartbeat_ns=NOW - 400 * MS), Tick(), NOW, TIMING)
-    assert after.reason == "lost: no heartbeat for 400 ms"
+    assert after.reason == (
+        "lost: no heartbeat for 400 ms; "
+        "check its power, cable, node id and the bit rate and termination of the bus"
+    )
 
 
 def test_retries_pause_ever_longer_up_to_a_limit_and_forget_after_success() -> None:

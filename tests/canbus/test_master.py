@@ -137,7 +137,7 @@ def test_missing_node_is_reported_and_asked_for_while_the_rest_works(rig: Any) -
     rig.node(3).plug()
     rig.run(2000)
     assert [rig.state(n) for n in (1, 2, 3)] == [OPERATIONAL, ABSENT, OPERATIONAL]
-    assert rig.status(2).reason == "not heard yet"
+    assert rig.status(2).reason.startswith("not heard yet; check its power, cable, node id")
     probes = [can_id for can_id, _ in rig.wire.sent if can_id == 0x602]
     assert 3 <= len(probes) <= 10  # again and again, but ever less often
     rig.node(2).plug()
@@ -303,6 +303,8 @@ def test_wrong_identity_is_a_fault_with_both_numbers(make_rig: Make, spec: dict[
     rig.run(1000)
     assert rig.state(1) is FAULTED
     assert told in rig.status(1).reason
+    assert f"put the right node there, or correct {next(iter(spec))} in the deploy" in rig.status(1).reason
+    assert "\n" not in rig.status(1).reason
     assert nmt(rig) == []  # it is not ours: neither started nor stopped
 
 
@@ -387,7 +389,8 @@ def test_clash_of_sample_identifiers_is_a_fault_of_the_second(rig: Any) -> None:
     rig.node(2)._node.sdo[0x1801][1].raw = 0x281
     rig.run(100)
     assert rig.state(1) is OPERATIONAL
-    assert (rig.state(2), rig.status(2).reason) == (FAULTED, "TPDO2 has identifier 0x281, as has pad1")
+    told = "TPDO2 has identifier 0x281, as has pad1; give one of them another, and store it"
+    assert (rig.state(2), rig.status(2).reason) == (FAULTED, told)
 
 
 def test_moved_identifier_is_followed(rig: Any) -> None:

@@ -145,7 +145,10 @@ class Sdo:
                 silence = error
             finally:
                 self.waiting = False
-        told = f"{doing}: no answer within {SDO_TIMEOUT_S * 1e3:.0f} ms, asked {SDO_ATTEMPTS} times"
+        told = (
+            f"{doing}: no answer within {SDO_TIMEOUT_S * 1e3:.0f} ms, asked {SDO_ATTEMPTS} times; "
+            "is its SDO server running, the bus overloaded?"
+        )
         raise BootError(told, silent=True) from silence
 
 
@@ -157,15 +160,17 @@ def identify(sdo: Sdo, expected: Expected) -> Identity:
         sdo.read_optional(_IDENTITY, 3, "revision"),
         sdo.read_optional(_IDENTITY, 4, "serial number"),
     )
-    for what, found, wanted in (
-        ("vendor id", identity.vendor_id, expected.vendor_id),
-        ("product code", identity.product_code, expected.product_code),
-        ("serial number", identity.serial, expected.serial),
+    for what, key, found, wanted in (
+        ("vendor id", "vendor_id", identity.vendor_id, expected.vendor_id),
+        ("product code", "product_code", identity.product_code, expected.product_code),
+        ("serial number", "serial", identity.serial, expected.serial),
     ):
         if wanted is not None and found != wanted:
             told = "none" if found is None else f"{found} (0x{found:X})"
             raise BootError(
-                f"another device: {what} is {told}, configured is {wanted} (0x{wanted:X})", stranger=True
+                f"another device: {what} is {told}, configured is {wanted} (0x{wanted:X}); "
+                f"put the right node there, or correct {key} in the deployment",
+                stranger=True,
             )
     return identity
 
@@ -190,6 +195,7 @@ def read_mapping(sdo: Sdo, numbers: Sequence[int]) -> Tpdo:
     raise BootError(
         "no TPDO carries 0x6401:01 to :04 as four 16-bit values in this order: "
         + ("; ".join(seen) or "the node has no TPDO")
+        + "; map them in the node, and store the mapping"
     )
 
 

@@ -57,13 +57,16 @@ class Timing:
         return min(self.retry_first_ns << min(max(failures - 1, 0), 16), self.retry_last_ns)
 
 
+_LOOK_AT = "check its power, cable, node id and the bit rate and termination of the bus"
+
+
 @dataclass(frozen=True, slots=True)
 class Life:
     """A node's life so far."""
 
     state: NodeState = NodeState.ABSENT
     since_ns: int = 0
-    reason: str = "not heard yet"
+    reason: str = f"not heard yet; {_LOOK_AT}"
     nmt: int | None = None  # NMT state that it last told
     heard_ns: int | None = None  # boot-up, heartbeat or answer
     heartbeat_ns: int | None = None  # the last one, or since when one is due; None: not supervised
@@ -293,7 +296,8 @@ def _sample(life: Life, t_ns: int, timing: Timing) -> Next:
 def _silence(life: Life, age_ns: int, t_ns: int) -> Next:
     if life.state is not NodeState.OPERATIONAL:
         return life, ()
-    return _enter(life, NodeState.STALE, t_ns, f"no sample for {age_ns / 1e6:.0f} ms, heartbeat is there"), ()
+    told = f"no sample for {age_ns / 1e6:.0f} ms, heartbeat is there"
+    return _enter(life, NodeState.STALE, t_ns, f"{told}; is there a SYNC?"), ()
 
 
 def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
@@ -303,7 +307,8 @@ def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
         if quiet_ns > timing.heartbeat_timeout_ns:
             # One that never sends heartbeats, though it was told to, is probed less and less often.
             failures = life.failures + 1 if life.must_beat else 0
-            life = _enter(life, NodeState.ABSENT, t_ns, f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms")
+            told = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms; {_LOOK_AT}"
+            life = _enter(life, NodeState.ABSENT, t_ns, told)
             due = t_ns + timing.pause_ns(failures)
             return replace(
                 life, heartbeat_ns=None, nmt=None, must_beat=True, failures=failures, due_ns=due

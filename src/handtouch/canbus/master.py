@@ -293,7 +293,8 @@ class Master:
         owner = router.slot(tpdo.cob_id)
         if owner not in (NOBODY, slot):
             return (
-                f"TPDO{tpdo.number} has identifier 0x{tpdo.cob_id:X}, as has {self._by_slot[owner].spec.name}"
+                f"TPDO{tpdo.number} has identifier 0x{tpdo.cob_id:X}, as has "
+                f"{self._by_slot[owner].spec.name}; give one of them another, and store it"
             )
         if node.tpdo is not None and node.tpdo.cob_id != tpdo.cob_id:
             router.route(node.tpdo.cob_id, NOBODY)
