@@ -58,13 +58,13 @@ def play(deployment: Deployment, model: PadModel, scenario: Scenario, world: Wor
     taken = Collector()
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
     pipeline = Pipeline(model, period_ns, deployment.daemon.window, taken)
-    up = np.full(model.size, PadState.CLEAR, dtype=np.uint8)
+    pipeline.node_state[:] = PadState.CLEAR
     truth = []
     for t_ns in range(period_ns, round(scenario.duration_s * 1e9), period_ns):
-        pipeline.begin(t_ns)
+        pipeline.begin(t_ns, t_ns)
         for pad, counts in enumerate(hand.sample(t_ns * 1e-9)):
             pipeline.slab.write(pad, counts.astype("<i2").tobytes(), t_ns + 1)
-        pipeline.advance(t_ns + period_ns, up)
+        pipeline.advance(t_ns + period_ns)
         truth += hand.truth(t_ns * 1e-9, t_ns)
     return score(taken.contacts, truth)
 

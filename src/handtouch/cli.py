@@ -13,6 +13,10 @@ from handtouch import __version__
 LIVE = "tcp://127.0.0.1:5580"
 CONTROL = "tcp://127.0.0.1:5581"
 
+_EXIT = (
+    "Exit status: 0 all is well, 1 something failed or is not well (check: warnings), 2 wrong usage or file."
+)
+
 Command = Callable[[argparse.Namespace], int]
 
 
@@ -35,6 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = argparse.ArgumentParser(
         prog="handtouch",
+        epilog=_EXIT,
         description="Gives a robot hand a sense of touch: CANopen touch sensors in, contacts out.",
     )
     parser.add_argument("--version", action="version", version=f"handtouch {__version__}")
@@ -54,7 +59,7 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     demo.add_argument(
         "--tolerances", action="store_true", help="hide tolerances of parts from the estimator too"
     )
-    demo.add_argument("--seed", type=int, default=1, help="seed of noise and tolerances (default: 1)")
+    demo.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
     demo.add_argument("--config", type=Path, help="deployment to simulate (default: the shipped hand)")
 
     run = _command(commands, "run", _run, "serve the pads of a deployment until told to stop")
@@ -70,7 +75,7 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     simulate.add_argument("--truth", type=Path, help="write what really happened to this file, as JSON lines")
     simulate.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     simulate.add_argument("--tolerances", action="store_true", help="tolerances of parts besides the noise")
-    simulate.add_argument("--seed", type=int, default=1, help="seed of noise and tolerances (default: 1)")
+    simulate.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
 
     replay = _command(commands, "replay", _replay, "feed a recorded CAN log through the same pipeline")
     replay.add_argument(
@@ -124,7 +129,8 @@ def _add_checking(commands: argparse._SubParsersAction[argparse.ArgumentParser])
 def _command(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, function: Command, text: str
 ) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    description = text[0].upper() + text[1:] + "."
+    parser = commands.add_parser(name, help=text, description=description, epilog=_EXIT)
     parser.set_defaults(command=function)
     return parser
 
@@ -220,10 +226,19 @@ def _design(asked: argparse.Namespace) -> int:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text}: must be above 0")
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: must be a number above 0")
     return value
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, 0 or above")
+    return int(text)
 
 
 def _speed(text: str) -> float:

@@ -34,7 +34,7 @@ def connect(*patterns: str, endpoint: str = LIVE, queue: int = 1000) -> Subscrib
     while this side is busy; beyond it the newest are lost, and counted as gaps. The connection comes back
     by itself when a daemon restarts.
 
-    Raises ValueError for a pattern that no topic could match.
+    Raises ValueError for a pattern that no topic could match, or an endpoint that is none.
     """
     return Subscriber(patterns or ("contact/*/*",), endpoint, queue)
 
@@ -57,6 +57,7 @@ class Subscriber:
         """messages dropped because they don't keep the contract"""
         self._last_seq: dict[str, int] = {}
         self._heard_s = time.monotonic()
+        self._ever = False
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
         self._socket.setsockopt(zmq.RCVHWM, queue)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -66,7 +67,7 @@ class Subscriber:
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         for prefix in {_literal_prefix(pattern) for pattern in patterns} | {"service"}:
             self._socket.subscribe(prefix)
-        self._socket.connect(endpoint)
+        _connect(self._socket, endpoint)
 
     def recv(self, timeout_s: float | None = None) -> Any:
         """The next message that matches, or None after `timeout_s` seconds without one."""
@@ -78,6 +79,11 @@ class Subscriber:
             message = self._accept(self._socket.recv_multipart())
             if message is not None:
                 return message
+
+    @property
+    def heard(self) -> bool:
+        """Whether anything ever came from the daemon, its heartbeat at least."""
+        return self._ever
 
     @property
     def alive(self) -> bool:
@@ -109,7 +115,7 @@ class Subscriber:
         self._socket.close()
 
     def _accept(self, parts: list[bytes]) -> wire.Message | None:
-        self._heard_s = time.monotonic()
+        self._heard_s, self._ever = time.monotonic(), True
         topic = parts[0].decode("utf-8", "replace") if parts else ""
         wanted = any(_matches(pattern, topic) for pattern in self.patterns)
         if not wanted:
@@ -133,12 +139,13 @@ def request(
 ) -> dict[str, Any]:
     """Send a command to the daemon's control endpoint and return its answer.
 
-    Raises TimeoutError when no daemon answers and RuntimeError with its words when it refuses.
+    Raises TimeoutError when no daemon answers, RuntimeError with its words when it refuses, ValueError for an
+    endpoint that is none.
     """
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
     try:
         socket.setsockopt(zmq.LINGER, 0)
-        socket.connect(endpoint)
+        _connect(socket, endpoint)
         socket.send(msgpack.packb({"v": wire.SCHEMA_VERSION, "command": command, **arguments}))
         if not socket.poll(round(timeout_s * 1000)):
             raise TimeoutError(f"no daemon answers at {endpoint} within {timeout_s} s; is handtouch run up?")
@@ -148,6 +155,16 @@ def request(
     if not isinstance(answer, dict) or not answer.get("ok"):
         raise RuntimeError(answer.get("error", "refused") if isinstance(answer, dict) else "malformed answer")
     return answer
+
+
+def _connect(socket: zmq.Socket[bytes], endpoint: str) -> None:
+    try:
+        socket.connect(endpoint)
+    except zmq.ZMQError as error:
+        socket.close()
+        raise ValueError(
+            f"{endpoint!r} is no ZeroMQ endpoint ({error.strerror}); one looks like tcp://127.0.0.1:5580"
+        ) from error
 
 
 def _literal_prefix(pattern: str) -> str:

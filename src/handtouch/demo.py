@@ -106,7 +106,12 @@ def in_process(deployment: Deployment) -> Deployment:
     """The deployment with its buses inside this process and its endpoints on free ports."""
     buses = tuple(
         bus.model_copy(
-            update={"interface": "virtual", "channel": f"handtouch-{os.getpid()}-{bus.name}", "options": {}}
+            update={
+                "interface": "virtual",
+                "channel": f"handtouch-{os.getpid()}-{bus.name}",
+                "options": {},
+                "sync": "producer",
+            }
         )
         for bus in deployment.buses
     )

@@ -83,7 +83,7 @@ class Contact:
     off_n: float
     calibration: str
     reason: str
-    """why a contact ended: released, stale, lost, faulted or stopped; else empty"""
+    """why a contact ended: released, stale, lost, faulted, restarted or stopped; else empty"""
     repeat: bool
     """sent again for a late joiner, under the seq of the original"""
 
@@ -131,7 +131,7 @@ class Health:
     state: str
     """the pad, as PadState in small letters"""
     node: str
-    """the node's state: absent, booting, identified, configuring, settling, operational, faulted, stopped"""
+    """absent, booting, identified, configuring, settling, operational, stale, faulted or stopped"""
     since_ns: int
     """when the node entered its state"""
     reason: str
@@ -143,6 +143,9 @@ class Health:
     missed: int
     """ticks that had to do without the sample of their SYNC: late or lost"""
     age_s: float | None
+    reboots: int
+    """boot-up messages of its node, after the first"""
+    heartbeats_missed: int
     emergencies: tuple[str, ...]
     """latest EMCY messages as text, newest last"""
     repeat: bool
@@ -184,14 +187,14 @@ class Service:
     """hand -> list of its links"""
     ticks: int
     overruns: int
-    """ticks that were not done when the next was due"""
+    """periods that passed without a tick because the daemon was late"""
     rate_hz: float
     tick_us: dict[str, Any]
     """median, p99 and max of the last half second's ticks, from the last sample to the last message"""
     buses: dict[str, Any]
     """bus -> load (part of the bit rate) and counters by cause"""
     drops: dict[str, Any]
-    """messages dropped by cause"""
+    """stream -> messages that some subscriber's full queue couldn't take"""
     subscriptions: tuple[str, ...]
     repeat: bool
 

@@ -20,7 +20,9 @@ def _step(
     contacts: Contacts, level: float, t_ns: int = 0, sampled: bool = True, trusted: bool = True
 ) -> Changes:
     one = np.ones(1, dtype=np.bool_)
-    return contacts.step(one & sampled, one & (level > ON), one & (level < OFF), one & trusted, t_ns)
+    return contacts.step(
+        one & sampled, one & (level > ON), one & (level < OFF), one & trusted, np.array([t_ns])
+    )
 
 
 def test_a_contact_begins_after_the_debounce_and_is_dated_to_its_first_sample() -> None:
@@ -88,5 +90,4 @@ def test_a_cycle_ticks_once_when_complete_or_when_its_window_has_passed() -> Non
     assert cycle.tick_due(5001, complete=True)
     cycle.ticked = True
     assert not cycle.tick_due(5600, complete=True)
-    assert not cycle.begin_overdue(6499)
-    assert cycle.begin_overdue(6500)
+    assert cycle.overdue_ns == 6500

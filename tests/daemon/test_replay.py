@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 from collections import Counter
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from handtouch import shipped
 from handtouch.config import Deployment, load
-from handtouch.daemon.replay import Summary, pacer, replay
+from handtouch.daemon.replay import Summary, pacer, replay, run
 from handtouch.simulate.score import score
 from handtouch.simulate.truth import Truth, read
 from handtouch.wire import Contact
@@ -97,3 +98,38 @@ def test_pacing_sleeps_until_a_stamp_is_due(monkeypatch: pytest.MonkeyPatch) -> 
     assert slept == [pytest.approx(1.0)]
     pacer(0)(10**18)
     assert len(slept) == 1
+
+
+def test_the_period_is_the_logs_own(session: tuple[list[Contact], Summary]) -> None:
+    again: list[Contact] = []
+    summary = replay(DATA / "session.log.gz", load(shipped.path("utah_mit.toml")), again.append)  # says 5 ms
+    assert summary.period_s == pytest.approx(PERIOD_MS * 1e-3, rel=0.05)
+    assert [c.position_m for c in again] == [c.position_m for c in session[0]]
+
+
+def test_a_log_without_a_sample_of_the_deployment_is_status_1_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "other.log"
+    log.write_text("(1.000000) can7 080#\n(1.000500) can7 1F1#00\n(1.020000) can7 080#\n")
+    assert run(log, shipped.path("utah_mit.toml")) == 1
+    told = capsys.readouterr().err
+    assert "no frame is a sample" in told
+    assert "1 foreign" in told
+
+
+def test_a_log_without_sync_is_ticked_by_the_timer(deployment: Deployment, tmp_path: Path) -> None:
+    log = tmp_path / "event_driven.log"
+    with can.LogReader(DATA / "session.log.gz") as reader, can.Logger(log) as writer:
+        for message in reader:
+            if message.arbitration_id != 0x80:
+                writer.on_message_received(message)
+    got: list[Contact] = []
+    summary = replay(log, deployment, got.append)
+    assert summary.contacts == 24
+
+
+def test_replay_prints_contacts_or_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(DATA / "session.log.gz", shipped.path("utah_mit.toml"), as_json=True) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(json.loads(text)["event"] == "begin" for text in lines) == 24

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handtouch.canbus.slab import Slab
+from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.tick import Tick, Ticked
 from handtouch.wire import PadState
 
@@ -27,19 +28,19 @@ class Driver:
         self.slab = Slab(3)
         self.tick = Tick(bench.model, PERIOD_NS)
         self.t_ns = 1_000_000_000
+        self.cycle = Cycle(PERIOD_NS, 0.6)
         self.node_state = UP.copy()
 
     def step(self, counts: dict[int, Any], silent: tuple[int, ...] = ()) -> Ticked:
         """`silent` pads answer no SYNC."""
         self.t_ns += PERIOD_NS
-        self.slab.begin_cycle()
+        self.slab.begin_cycle(self.t_ns)
+        self.cycle.begin(self.t_ns)
         for pad in range(3):
             if pad not in silent:
                 data = np.asarray(counts.get(pad, np.zeros(4)), dtype="<i2").tobytes()
                 self.slab.write(pad, data, self.t_ns + 1000)
-        return self.tick.step(
-            self.slab, self.node_state, self.t_ns, self.t_ns - PERIOD_NS, self.t_ns + 2_000_000
-        )
+        return self.tick.step(self.slab, self.node_state, self.cycle, self.t_ns + 2_000_000)
 
     def state(self, pad: int) -> PadState:
         return PadState(int(self.tick.columns.state[pad]))
@@ -190,3 +191,49 @@ def test_a_sample_is_used_once(driver: Driver) -> None:
     touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
     driver.step(touch)
     assert not len(driver.step({}, silent=(PLANE,)).began)  # one sample is not two in a row
+
+
+def test_a_contact_is_dated_to_the_samples_own_sync_even_if_it_came_late(driver: Driver) -> None:
+    touch = driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)
+    driver.step({}, silent=(PLANE,))
+    first_ns = driver.t_ns
+    driver.slab.write(PLANE, touch.tobytes(), driver.t_ns + 4_000_000)  # after the tick
+    driver.step({PLANE: touch}, silent=(PLANE,))
+    assert driver.step({PLANE: touch}).began.tolist() == [PLANE]
+    assert driver.tick.contacts.begin_ns[PLANE] == first_ns
+
+
+def test_a_channel_that_gives_current_is_a_fault_and_not_a_touch(driver: Driver) -> None:
+    for _ in range(4):
+        assert not len(driver.step({PLANE: [20000, -15000, 20000, 1000]}).began)
+    assert driver.state(PLANE) == PadState.FAULTED
+    driver.step({PLANE: [-8, 5, -3, 2]})  # noise about zero
+    assert driver.state(PLANE) == PadState.CLEAR
+
+
+def test_samples_that_came_with_their_sync_in_one_batch_belong_to_it(driver: Driver) -> None:
+    touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
+    driver.step(touch)
+    sync_ns = driver.t_ns + PERIOD_NS
+    driver.slab.write(PLANE, touch[PLANE].tobytes(), sync_ns + 500)  # drained before its SYNC was handled
+    driver.slab.begin_cycle(sync_ns)
+    assert driver.slab.fresh.tolist() == [1, 0, 0]
+    driver.cycle.begin(sync_ns)
+    driver.tick.step(driver.slab, driver.node_state, driver.cycle, sync_ns + 1_000_000)
+    assert driver.tick.columns.sample_ns[PLANE] == sync_ns
+
+
+def test_a_belated_tick_leaves_the_samples_of_the_next_cycle_alone(driver: Driver) -> None:
+    touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
+    driver.step(touch)
+    before_ns = driver.t_ns
+    next_ns = before_ns + 2 * PERIOD_NS
+    driver.slab.write(PLANE, touch[PLANE].tobytes(), next_ns + 500)
+    driver.tick.step(driver.slab, driver.node_state, driver.cycle, next_ns + 600, until_ns=next_ns)
+    assert driver.tick.columns.sample_ns[PLANE] == before_ns
+    driver.slab.begin_cycle(next_ns)
+    driver.cycle.begin(next_ns)
+    assert driver.tick.step(driver.slab, driver.node_state, driver.cycle, next_ns + 700).began.tolist() == [
+        PLANE
+    ]
+    assert driver.tick.columns.sample_ns[PLANE] == next_ns

@@ -22,7 +22,7 @@ CONTACT = wire.Contact(
 HEALTH = wire.Health(
     v=1, seq=1, t_ns=12_000_000_000, hand="right", link="thumb_tip", bus="can0", node_id=19, state="clear",
     node="operational", since_ns=0, reason="", serial=1003, rate_hz=200.0, samples=10, missed=0, age_s=0.001,
-    emergencies=(), repeat=False,
+    reboots=0, heartbeats_missed=0, emergencies=(), repeat=False,
 )  # fmt: skip
 SERVICE = wire.Service(
     v=1, seq=1, t_ns=12_000_000_000, wall_offset_ns=0, version="0", pid=1, uptime_s=3.0, period_s=0.005,
@@ -32,10 +32,11 @@ SERVICE = wire.Service(
 )  # fmt: skip
 
 
-def _page(view: HandView, alive: bool = True) -> str:
-    console = Console(width=120, height=40, force_terminal=False)
+def _page(view: HandView, alive: bool = True, width: int = 120, height: int = 40) -> str:
+    console = Console(width=width, height=height, force_terminal=False)
+    view.alive = alive
     with console.capture() as captured:
-        console.print(view.render(alive))
+        console.print(view, height=height)
     return captured.get()
 
 
@@ -121,3 +122,30 @@ def test_json_lines_hold_every_message_whole(capsys: pytest.CaptureFixture[str])
 
     LineDisplay(as_json=True).take(CONTACT)
     assert json.loads(capsys.readouterr().out)["force_n"] == 1.234
+
+
+def _hand(pads: int, touched: int) -> HandView:
+    messages: list[wire.Message] = [SERVICE]
+    messages += [replace(HEALTH, link=f"middle_proximal_{k}") for k in range(pads)]
+    messages += [replace(CONTACT, link=f"middle_proximal_{k}") for k in range(pads - touched, pads)]
+    return _view(*messages)
+
+
+@pytest.mark.parametrize(("width", "height"), [(160, 50), (120, 30), (100, 24), (80, 24), (60, 24), (40, 10)])
+def test_the_page_fits_any_terminal_and_names_who_is_touched(width: int, height: int) -> None:
+    lines = _page(_hand(15, 2), width=width, height=height).splitlines()
+    assert len(lines) <= height
+    assert all(len(text) <= width for text in lines)
+    text = "\n".join(lines)
+    assert "middle_proxi" in text
+    assert "touched" in text
+    if width >= 80:
+        assert "middle_proximal_14" in text
+        assert "1.23 +- 0.06 N" in text
+        assert "12.30   -4.00    5.60" in text
+
+
+def test_where_there_is_no_room_for_all_the_touched_pads_come_first() -> None:
+    page = _page(_hand(40, 3), width=100, height=20)
+    assert all(f"middle_proximal_{k} " in page for k in (37, 38, 39))
+    assert "more" in page

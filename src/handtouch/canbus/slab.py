@@ -35,7 +35,7 @@ class Slab:
             self._fresh[slot] = 1
             self.fresh_count += 1
 
-    def begin_cycle(self) -> None:
-        """Forget which pads are fresh: a SYNC went out."""
-        self.fresh[:] = 0
-        self.fresh_count = 0
+    def begin_cycle(self, t_ns: int) -> None:
+        """A SYNC at `t_ns`: fresh is from here on what arrived since then, some of which may be here already."""
+        np.greater_equal(self.t_ns, t_ns, out=self.fresh, casting="unsafe")
+        self.fresh_count = int(np.count_nonzero(self.fresh))

@@ -38,14 +38,20 @@ class Contacts:
         self._next_id = 1
 
     def step(
-        self, sampled: BoolArray, above_on: BoolArray, below_off: BoolArray, trusted: BoolArray, t_ns: int
+        self,
+        sampled: BoolArray,
+        above_on: BoolArray,
+        below_off: BoolArray,
+        trusted: BoolArray,
+        sample_ns: NDArray[np.int64],
     ) -> Changes:
-        """Take in one tick: which pads were `sampled`, where they stand to their thresholds, which to trust.
+        """Take in one tick: which pads were `sampled` and when, how they stand to their
+        thresholds, which to trust.
 
         A contact on a pad that is no longer trusted ends at once; a pad without a sample is left as it is.
         """
         against = sampled & trusted & np.where(self.touching, below_off, above_on)
-        self._first_ns[against & (self._against == 0)] = t_ns
+        np.copyto(self._first_ns, sample_ns, where=against & (self._against == 0))
         self._against[against] += 1
         self._against[~against & (sampled | ~trusted)] = 0
         flips = against & (self._against >= np.where(self.touching, self._need[1], self._need[0]))

@@ -10,7 +10,7 @@ class Cycle:
     """One SYNC period after another; `t_ns` is the present one's SYNC, `previous_ns` the one before.
 
     Between two `begin`s exactly one tick falls due. Without a SYNC (none sent on this bus, or a producer
-    that died) `begin_overdue` says when to go on by the timer, so that silence is noticed too.
+    that died) `overdue_ns` says when to go on by the timer, so that silence is noticed too.
     """
 
     def __init__(self, period_ns: int, window: float) -> None:
@@ -28,6 +28,7 @@ class Cycle:
         """Whether to tick now; `complete` says that every expected sample has arrived."""
         return not self.ticked and (complete or t_ns - self.t_ns >= self.window_ns)
 
-    def begin_overdue(self, t_ns: int) -> bool:
-        """Whether a foreign SYNC is so late that the timer has to take its place."""
-        return t_ns - self.t_ns >= self.period_ns + self.period_ns // 2
+    @property
+    def overdue_ns(self) -> int:
+        """When a foreign SYNC is so late that the timer has to take its place."""
+        return self.t_ns + self.period_ns + self.period_ns // 2

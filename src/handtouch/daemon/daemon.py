@@ -65,6 +65,7 @@ class Daemon:
         self.report = Report(deployment, self.pipeline, self.master, self.ports, self.publisher)
         self.control.commands["status"] = self.report.status
         self._producers = [self.ports[bus.name] for bus in deployment.buses if bus.sync == "producer"]
+        self._clock = None if self._producers else deployment.buses[0].name  # the bus whose SYNC is followed
         self._period_ns = period_ns
 
     def __enter__(self) -> Daemon:
@@ -86,7 +87,7 @@ class Daemon:
             self._loop(stop, alive)
         finally:
             now_ns = time.monotonic_ns()
-            self.pipeline.messages.end_all(now_ns, self.publisher)
+            self.pipeline.end(now_ns)
             self.master.stop(now_ns)
             gc.unfreeze()
 
@@ -97,24 +98,24 @@ class Daemon:
             now_ns = time.monotonic_ns()
             if self._producers and now_ns >= next_sync_ns:
                 next_sync_ns = self._sync(now_ns, next_sync_ns)
-            elif not self._producers and cycle.begin_overdue(now_ns):
-                pipeline.begin(now_ns)
-            wake_ns = cycle.t_ns + (self._period_ns if cycle.ticked else cycle.window_ns)
-            wait_s = max(0, min(wake_ns, next_sync_ns if self._producers else wake_ns) - now_ns) * 1e-9
+            elif not self._producers and now_ns >= cycle.overdue_ns:
+                pipeline.begin(now_ns, now_ns)
+            wake_ns = next_sync_ns if self._producers else cycle.overdue_ns
+            if not cycle.ticked:
+                wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns)
+            wait_s = max(0, wake_ns - now_ns) * 1e-9
             select.select(ports, (), (), wait_s)
             self._receive(ports)
             now_ns = time.monotonic_ns()
-            if pipeline.advance(now_ns, self.report.node_state) is not None:
+            if pipeline.advance(now_ns) is not None:
                 self.report.ticked(now_ns, time.monotonic_ns())
                 self._after_tick(alive)
 
     def _sync(self, now_ns: int, due_ns: int) -> int:
         """Send SYNC on the buses that are ours to drive; return when the next is due."""
-        if not self.pipeline.cycle.ticked:  # the window of the last one was overslept
-            self.pipeline.advance(self.pipeline.cycle.t_ns + self._period_ns, self.report.node_state)
         for port in self._producers:
             port.send(SYNC_ID, b"")
-        self.pipeline.begin(now_ns)
+        self.pipeline.begin(now_ns, now_ns)
         late_ns = now_ns - due_ns
         if late_ns > self._period_ns:
             self.report.overruns += late_ns // self._period_ns
@@ -124,8 +125,9 @@ class Daemon:
     def _receive(self, ports: list[Port]) -> None:
         for port in ports:
             for can_id, data, t_ns in port.drain():
-                if can_id == SYNC_ID and not self._producers:
-                    self.pipeline.begin(t_ns)
+                if can_id == SYNC_ID:
+                    if port.name == self._clock:
+                        self.pipeline.begin(t_ns, time.monotonic_ns())
                 else:
                     self.master.handle(port.name, can_id, data, t_ns)
 
@@ -141,14 +143,14 @@ class Daemon:
 
 def node_specs(deployment: Deployment) -> list[NodeSpec]:
     """What the master has to know of every node, in the order of the slab."""
-    pads = [pad for hand in deployment.hands for pad in hand.pads]
+    pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
     kinds: Mapping[str, Any] = deployment.nodes
     return [
         NodeSpec(
             slot=slot,
             bus=pad.bus,
             node_id=pad.node_id,
-            name=pad.link,
+            name=f"{hand}/{pad.link}",
             eds=kinds[pad.node].eds,
             vendor_id=kinds[pad.node].vendor_id,
             product_code=kinds[pad.node].product_code,
@@ -156,7 +158,7 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
             heartbeat_ms=kinds[pad.node].heartbeat_ms,
             heartbeat_timeout_ms=kinds[pad.node].heartbeat_timeout_ms,
         )
-        for slot, pad in enumerate(pads)
+        for slot, (hand, pad) in enumerate(pads)
     ]
 
 

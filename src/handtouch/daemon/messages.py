@@ -18,9 +18,10 @@ REASONS = {
     PadState.STALE: "stale",
     PadState.LOST: "lost",
     PadState.FAULTED: "faulted",
-    PadState.STARTING: "stopped",
+    PadState.STARTING: "restarted",
 }
 """Why a contact ended, by what became of its pad; any other is released."""
+_STOPPED = "stopped"
 
 
 class Outlet(Protocol):
@@ -42,6 +43,7 @@ class Messages:
     def __init__(self, model: PadModel, tick: Tick) -> None:
         self._model = model
         self._tick = tick
+        self._reason = ""  # why all contacts end, once the daemon stops
         self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
 
     def send_contacts(self, ticked: Ticked, now_ns: int, outlet: Outlet) -> None:
@@ -55,9 +57,11 @@ class Messages:
     def end_all(self, t_ns: int, outlet: Outlet) -> None:
         """Send the end of every contact, for the daemon stops."""
         touching = np.flatnonzero(self._tick.contacts.touching)
-        self._tick.columns.state[touching] = PadState.STARTING
+        self._reason = _STOPPED
         none = np.zeros(0, dtype=np.intp)
         self.send_contacts(Ticked(t_ns, none, none, touching), t_ns, outlet)
+        self._tick.contacts.touching[:] = False
+        self._tick.columns.state[:] = PadState.STARTING
 
     def send_frames(self, slab: Slab, tick_number: int, t_ns: int, outlet: Outlet) -> None:
         """Send the columns of every hand, and their raw counts, where somebody wants them."""
@@ -137,7 +141,7 @@ class Messages:
             on_n=float(model.on_n[pad]),
             off_n=float(model.off_n[pad]),
             calibration=model.calibration[pad],
-            reason=REASONS.get(state, "released") if event == "end" else "",
+            reason=self._reason or REASONS.get(state, "released") if event == "end" else "",
             repeat=False,
         )
 

@@ -23,7 +23,8 @@ FULL_SCALE = 32767
 class PadModel:
     """Columns of the n pads of a deployment, in its order; the same order as the slab's.
 
-    `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` and `noise_a` of a channel;
+    `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` of a channel, its noise as
+    `noise_counts` and `noise_a`;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
     middle of the pad; `begin_samples`, `end_samples`. `locator` finds contacts, `placement` puts them on
     their links, `force` weighs them.
@@ -42,7 +43,8 @@ class PadModel:
         self.calibration = [_nominal(pad, deployment) for pad in pads]
         self.ampere_per_count = np.array([node.full_scale_ma * 1e-3 / FULL_SCALE for node in nodes])
         counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
-        self.noise_a = np.array(counts) * self.ampere_per_count
+        self.noise_counts = np.array(counts)
+        self.noise_a = self.noise_counts * self.ampere_per_count
         self.on_n = np.array([touch.on_n for touch in touches])
         self.off_n = np.array([touch.off_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])

@@ -10,12 +10,16 @@ from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.messages import Messages, Outlet
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.tick import Tick, Ticked
+from handtouch.wire import PadState
+
+_FOREVER_NS = np.iinfo(np.int64).max
 
 
 class Pipeline:
     """Slab, cycle, tick and messages of all hands of a deployment; whoever owns the bus drives it.
 
-    Call `begin` at each SYNC, write samples into `slab`, and `advance` as time passes.
+    Call `begin` at each SYNC, write samples into `slab`, and `advance` as time passes. `node_state` (n,)
+    uint8 is for the owner to keep: PadState.CLEAR where a node is up, else what its pad is instead.
     """
 
     def __init__(self, model: PadModel, period_ns: int, window: float, outlet: Outlet) -> None:
@@ -24,25 +28,39 @@ class Pipeline:
         self.cycle = Cycle(period_ns, window)
         self.tick = Tick(model, period_ns)
         self.messages = Messages(model, self.tick)
+        self.node_state: NDArray[np.uint8] = np.full(model.size, PadState.STARTING, dtype=np.uint8)
         self.ticks = 0
         self._outlet = outlet
         self._expected = self.tick.expected()
         self._expected_count = 0
 
-    def begin(self, t_ns: int) -> None:
-        """A SYNC was sent or seen at `t_ns`: samples from here on belong to it."""
-        self.slab.begin_cycle()
+    def begin(self, t_ns: int, now_ns: int) -> None:
+        """A SYNC was sent or seen at `t_ns`: samples that arrived since then belong to it.
+
+        If nobody got round to the tick of the cycle before, that comes first.
+        """
+        if not self.cycle.ticked:
+            self._tick(now_ns, t_ns)
+        self.slab.begin_cycle(t_ns)
         self.cycle.begin(t_ns)
         self._expected = self.tick.expected()
         self._expected_count = int(np.count_nonzero(self._expected))
 
-    def advance(self, now_ns: int, node_state: NDArray[np.uint8]) -> Ticked | None:
+    def advance(self, now_ns: int) -> Ticked | None:
         """Tick and send the messages if all expected samples are there or their window has passed."""
         if not self.cycle.tick_due(now_ns, self._complete()):
             return None
+        return self._tick(now_ns, _FOREVER_NS)
+
+    def end(self, now_ns: int) -> None:
+        """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""
+        self.messages.end_all(now_ns, self._outlet)
+        self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
+
+    def _tick(self, now_ns: int, until_ns: int) -> Ticked:
         self.cycle.ticked = True
         self.ticks += 1
-        ticked = self.tick.step(self.slab, node_state, self.cycle.t_ns, self.cycle.previous_ns, now_ns)
+        ticked = self.tick.step(self.slab, self.node_state, self.cycle, now_ns, until_ns)
         self.messages.send_contacts(ticked, now_ns, self._outlet)
         self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
         return ticked

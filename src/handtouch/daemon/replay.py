@@ -5,6 +5,7 @@ Public names: `replay`, `Summary`, `run`.
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 import time
@@ -14,10 +15,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import can
-import numpy as np
 import zmq
 
 from handtouch import wire
+from handtouch.canbus import eds
 from handtouch.canbus.router import Counters, Router
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.model import PadModel
@@ -27,18 +28,32 @@ from handtouch.wire import PadState
 
 _SYNC_ID = 0x80
 _TPDO2 = 0x280
+_SERVICES = (0x080, 0x580, 0x600, 0x700)
+"""EMCY, SDO and heartbeat of our nodes are no strangers."""
+_RHYTHM_SYNCS = 50
 _QUIET_PERIODS = 8
 """A pause in the log is ticked through for this many periods: long enough for every pad to go stale."""
 
 
 @dataclass
 class Summary:
-    """What a replay found: recorded time, ticks, contacts that began, and the counters of each bus."""
+    """What a replay found: recorded time, ticks, contacts that began, and the counters of each bus.
 
+    `period_s` is the log's own, from its SYNCs. `unmatched` counts the frames of channels that no bus of the
+    deployment has.
+    """
+
+    period_s: float
     log_s: float = 0.0
     ticks: int = 0
     contacts: int = 0
     buses: dict[str, Counters] = field(default_factory=dict)
+    unmatched: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        """Of all buses."""
+        return sum(counters.samples for counters in self.buses.values())
 
 
 class _Outlet:
@@ -66,45 +81,51 @@ class _Outlet:
 
 
 class _Feeder:
-    """Drives a pipeline by the stamps of a log."""
+    """Drives a pipeline by the stamps of a log; the SYNC of the channel `clock` is the one that counts."""
 
-    def __init__(self, deployment: Deployment, outlet: _Outlet) -> None:
-        settings = deployment.daemon
-        self.pipeline = Pipeline(
-            PadModel(deployment), round(settings.sync_period_ms * 1e6), settings.window, outlet
-        )
+    def __init__(self, deployment: Deployment, outlet: _Outlet, period_ns: int, clock: str | None) -> None:
+        self.pipeline = Pipeline(PadModel(deployment), period_ns, deployment.daemon.window, outlet)
         self.routers = {bus.name: Router(self.pipeline.slab) for bus in deployment.buses}
+        self.unmatched: dict[str, int] = {}
         self._by_channel = {str(bus.channel): self.routers[bus.name] for bus in deployment.buses}
         self._only = next(iter(self.routers.values())) if len(self.routers) == 1 else None
-        self._up = np.full(self.pipeline.model.size, PadState.CLEAR, dtype=np.uint8)
+        self._clock = clock
+        self._known = {_SYNC_ID}
         pads = [pad for hand in deployment.hands for pad in hand.pads]
         for slot, pad in enumerate(pads):
-            self.routers[pad.bus].route(_TPDO2 + pad.node_id, slot)
+            self.routers[pad.bus].route(_sample_id(deployment.nodes[pad.node].eds, pad.node_id), slot)
+            self._known |= {base + pad.node_id for base in _SERVICES}
+        self.pipeline.node_state[:] = PadState.CLEAR
 
     def feed(self, message: can.Message, t_ns: int) -> None:
         """One frame of the log."""
-        cycle = self.pipeline.cycle
         self._pass_time(t_ns)
-        if message.arbitration_id == _SYNC_ID and not message.is_extended_id and not message.is_error_frame:
-            if not cycle.ticked:
-                self.pipeline.advance(cycle.t_ns + cycle.period_ns, self._up)
-            self.pipeline.begin(t_ns)
-        elif router := self._only or self._by_channel.get(str(message.channel)):
-            router.accept_message(message, t_ns)
-            self.pipeline.advance(t_ns, self._up)
+        if _is_sync(message) and str(message.channel) == self._clock:
+            self.pipeline.begin(t_ns, t_ns)
+            return
+        router = self._only or self._by_channel.get(str(message.channel))
+        if router is None:
+            channel = str(message.channel)
+            self.unmatched[channel] = self.unmatched.get(channel, 0) + 1
+            return
+        frame = router.accept_message(message, t_ns)
+        if frame is not None and frame[0] not in self._known and frame[0] != 0:
+            router.counters.foreign += 1
+        self.pipeline.advance(t_ns)
 
     def _pass_time(self, t_ns: int) -> None:
         """Tick what fell due before `t_ns`, by the timer where SYNC is missing."""
         pipeline, cycle = self.pipeline, self.pipeline.cycle
         if cycle.t_ns == 0:
             cycle.t_ns = t_ns
-        pipeline.advance(t_ns, self._up)
+        pipeline.advance(t_ns)
         for _ in range(_QUIET_PERIODS):
-            if not cycle.begin_overdue(t_ns):
+            if t_ns < cycle.overdue_ns:
                 return
-            pipeline.begin(cycle.t_ns + cycle.period_ns)
-            pipeline.advance(min(t_ns, cycle.t_ns + cycle.window_ns), self._up)
-        pipeline.begin(t_ns)
+            sync_ns = cycle.t_ns + cycle.period_ns
+            pipeline.begin(sync_ns, sync_ns)
+            pipeline.advance(min(t_ns, sync_ns + cycle.window_ns))
+        pipeline.begin(t_ns, t_ns)
 
 
 def replay(
@@ -117,23 +138,58 @@ def replay(
 ) -> Summary:
     """Run the pipeline over a log in any format that python-can reads; `take` gets every contact message.
 
-    Times are the log's own stamps, in ns. A deployment's buses are told apart by their channel in the log;
-    where there is only one, all frames are its. `pace` is called with each frame's stamp before the frame is
-    fed: it may sleep to keep the recorded speed.
+    Times are the log's own stamps, in ns, and so is the period, where the log has SYNCs. A deployment's buses
+    are told apart by their channel in the log; where there is only one, all frames are its. `pace` is called
+    with each frame's stamp before the frame is fed: it may sleep to keep the recorded speed.
 
     Raises ValueError naming the log when python-can can't read it, OSError when it isn't there.
     """
+    period_ns, clock = _rhythm(log, round(deployment.daemon.sync_period_ms * 1e6))
     outlet = _Outlet(take, publisher)
-    feeder = _Feeder(deployment, outlet)
+    feeder = _Feeder(deployment, outlet, period_ns, clock)
     first_ns = t_ns = 0
     for message in _messages(log):
         t_ns = round(message.timestamp * 1e9)
         first_ns = first_ns or t_ns
         pace(t_ns)
         feeder.feed(message, t_ns)
-    feeder.pipeline.messages.end_all(t_ns, outlet)
-    counters = {name: router.counters for name, router in feeder.routers.items()}
-    return Summary((t_ns - first_ns) * 1e-9, feeder.pipeline.ticks, outlet.contacts, counters)
+    feeder.pipeline.end(t_ns)
+    return Summary(
+        period_s=period_ns * 1e-9,
+        log_s=(t_ns - first_ns) * 1e-9,
+        ticks=feeder.pipeline.ticks,
+        contacts=outlet.contacts,
+        buses={name: router.counters for name, router in feeder.routers.items()},
+        unmatched=feeder.unmatched,
+    )
+
+
+def _rhythm(log: Path, period_ns: int) -> tuple[int, str | None]:
+    """Period and channel of the log's first SYNCs; the period given and None if it has none."""
+    stamps: list[float] = []
+    channel: str | None = None
+    for message in _messages(log):
+        if _is_sync(message) and channel in (None, str(message.channel)):
+            channel = str(message.channel)
+            stamps.append(message.timestamp)
+            if len(stamps) > _RHYTHM_SYNCS:
+                break
+    steps = sorted(later - earlier for earlier, later in itertools.pairwise(stamps))
+    return (round(steps[len(steps) // 2] * 1e9) if steps else period_ns), channel
+
+
+def _is_sync(message: can.Message) -> bool:
+    special = message.is_extended_id or message.is_error_frame or message.is_remote_frame
+    return message.arbitration_id == _SYNC_ID and not special
+
+
+def _sample_id(eds_path: str | None, node_id: int) -> int:
+    """Identifier of a node's samples by its EDS, as it comes from the factory."""
+    if eds_path is None:
+        return _TPDO2 + node_id
+    objects = eds.load(eds_path, node_id)
+    number = eds.tpdo_numbers(objects)[0]
+    return int(objects[0x1800 + number - 1][1].default) & 0x7FF
 
 
 def _messages(log: Path) -> Iterator[can.Message]:
@@ -142,7 +198,7 @@ def _messages(log: Path) -> Iterator[can.Message]:
     try:
         with can.LogReader(log) as reader:
             yield from reader
-    except (ValueError, KeyError, IndexError, can.CanError, EOFError) as error:
+    except Exception as error:  # readers raise anything, and all of it means that the log can't be read
         raise ValueError(
             f"{log}: python-can can't read it ({error}); it reads candump .log, .asc, .blf, .csv, .db, .trc "
             "and these with .gz"
@@ -168,7 +224,10 @@ def pacer(speed: float) -> Callable[[int], None]:
 def run(
     log: Path, config_path: Path, *, speed: float = 0, as_json: bool = False, publish: bool = False
 ) -> int:
-    """`handtouch replay`: print contacts, or publish them too; exit status 0, 1 (log), 2 (config)."""
+    """`handtouch replay`: print contacts, or publish them too.
+
+    Exit status 0, 1 (a log that can't be read or holds no sample of the deployment), 2 (config).
+    """
     try:
         deployment = load(config_path)
     except ConfigError as error:
@@ -193,14 +252,23 @@ def run(
             print(error, file=sys.stderr)
             return 1
     counts = ", ".join(
-        f"{name}: {c.frames} frames, {c.samples} samples, {c.short} short"
+        f"{name}: {c.frames} frames, {c.samples} samples, {c.short} short, {c.foreign} foreign"
         for name, c in summary.buses.items()
     )
     print(
-        f"{summary.contacts} contacts in {summary.log_s:.1f} s of log, {summary.ticks} ticks; {counts}",
+        f"{summary.contacts} contacts in {summary.log_s:.1f} s of log, {summary.ticks} ticks "
+        f"of {1e3 * summary.period_s:.4g} ms; {counts}",
         file=sys.stderr,
     )
-    return 0
+    if summary.samples:
+        return 0
+    others = ", ".join(f"{channel} ({count} frames)" for channel, count in summary.unmatched.items())
+    print(
+        f"{log}: no frame is a sample of {config_path}; do its buses' channels and node ids fit the log?"
+        + (f" Channels of the log that it doesn't have: {others}" if others else ""),
+        file=sys.stderr,
+    )
+    return 1
 
 
 def _serving(pace: Callable[[int], None], publisher: Publisher) -> Callable[[int], None]:

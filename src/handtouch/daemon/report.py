@@ -36,7 +36,7 @@ _PAD_OF_NODE = {
 class Report:
     """Watches pipeline, master, buses and publisher; `poll` it after every tick.
 
-    `node_state` (n,) uint8 is what the tick is to make of each node: PadState.CLEAR where its samples count.
+    It keeps the pipeline's `node_state`: what the tick is to make of each node.
     `overruns` counts the periods that passed without a SYNC because the daemon was late.
     """
 
@@ -49,7 +49,6 @@ class Report:
         publisher: Publisher,
     ) -> None:
         n = pipeline.model.size
-        self.node_state: NDArray[np.uint8] = np.full(n, PadState.STARTING, dtype=np.uint8)
         self.overruns = 0
         self._deployment = deployment
         self._pipeline = pipeline
@@ -57,11 +56,12 @@ class Report:
         self._ports = ports
         self._publisher = publisher
         self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
+        self._names = [(hand, pad.link) for hand, pad in self._pads]
+        self._events_before: set[int] = set()
         self._told = np.full(n, PadState.STARTING, dtype=np.uint8)
-        self._samples = np.zeros(n, dtype=np.int64)
         self._was_up = np.zeros(n, dtype=np.bool_)
         self._started_ns = time.monotonic_ns()
-        self._second = _Window(self._started_ns, self._samples.copy())
+        self._second = _Window(self._started_ns, np.zeros(n, dtype=np.int64))
         self._half_second = _Window(self._started_ns, self._totals())
         self._rate_hz = np.zeros(n)
         self._speeds: dict[str, float] = {}
@@ -71,7 +71,6 @@ class Report:
     def ticked(self, from_ns: int, to_ns: int) -> None:
         """A tick took from `from_ns`, its last sample read, to `to_ns`, its messages out."""
         self._durations_ns.append(to_ns - from_ns)
-        self._samples += self._pipeline.slab.fresh
 
     def poll(self, now_ns: int) -> None:
         """Take over the master's view of the nodes; tell what changed, and everything from time to time."""
@@ -79,16 +78,17 @@ class Report:
         if events:
             for event in events:
                 _log.info(
-                    "%s: %s -> %s: %s", self._pads[event.slot][1].link, event.old.name.lower(),
+                    "%s: %s -> %s: %s", "/".join(self._names[event.slot]), event.old.name.lower(),
                     event.new.name.lower(), event.reason,
                 )  # fmt: skip
             self._translate()
         state = self._pipeline.tick.columns.state
         visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
-        changed = {event.slot for event in events} | set(np.flatnonzero(visible != self._told).tolist())
+        changed = self._events_before | set(np.flatnonzero(visible != self._told).tolist())
+        self._events_before = {event.slot for event in events}  # told when a tick has taken them in
         self._told[:] = visible
         if now_ns - self._second.since_ns >= _SECOND_NS:
-            self._rate_hz = self._second.per_second(now_ns, self._samples)
+            self._rate_hz = self._second.per_second(now_ns, self._pipeline.tick.samples)
             changed = set(range(len(self._pads)))
         if changed:
             statuses = self._master.status()
@@ -115,7 +115,7 @@ class Report:
         for slot, state in enumerate(map(NodeState, self._master.states.tolist())):
             self._was_up[slot] |= state == NodeState.OPERATIONAL
             missing = PadState.LOST if self._was_up[slot] else PadState.STARTING
-            self.node_state[slot] = (
+            self._pipeline.node_state[slot] = (
                 missing if state == NodeState.ABSENT else _PAD_OF_NODE.get(state, PadState.STARTING)
             )
 
@@ -138,10 +138,12 @@ class Report:
             since_ns=status.since_ns,
             reason=explain(state, status.state, status.reason, self._pipeline.slab.counts[pad]),
             serial=status.serial,
-            rate_hz=float(self._rate_hz[pad]),
-            samples=int(self._samples[pad]),
+            rate_hz=float(self._rate_hz[pad]) if state <= PadState.TOUCHED else 0.0,
+            samples=int(self._pipeline.tick.samples[pad]),
             missed=int(self._pipeline.tick.missed[pad]),
             age_s=(now_ns - sample_ns) * 1e-9 if sample_ns else None,
+            reboots=status.reboots,
+            heartbeats_missed=status.heartbeats_missed,
             emergencies=tuple(str(emergency) for emergency in status.emergencies),
             repeat=False,
         )

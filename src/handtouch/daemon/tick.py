@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from handtouch.canbus.slab import Slab
 from handtouch.daemon.contacts import BoolArray, Contacts, IntArray
+from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.model import PadModel
 from handtouch.field.strength import Status
 from handtouch.wire import PadState
@@ -21,6 +22,8 @@ FloatArray = NDArray[np.float64]
 _STALE_PERIODS = 3
 _RAIL = 32767
 """A channel at either end of its range measures nothing."""
+_SOURCE_STD, _SOURCE_PART = 10.0, 0.02
+"""How far below zero a channel may be: standard deviations of noise, and part of all channels."""
 # plain numbers: looking up members of an enumeration costs a microsecond each
 _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
     int, (PadState.CLEAR, PadState.TOUCHED, PadState.STALE, PadState.FAULTED)
@@ -98,6 +101,8 @@ class Tick:
         self.model = model
         self.columns = Columns.of(model.size)
         self.contacts = Contacts(model.begin_samples, model.end_samples)
+        self.samples = np.zeros(model.size, dtype=np.int64)
+        """samples taken in"""
         self.missed = np.zeros(model.size, dtype=np.int64)
         """ticks that an expected sample came too late for, or never"""
         self._stale_ns = _STALE_PERIODS * period_ns
@@ -109,28 +114,36 @@ class Tick:
         return self.columns.state <= _TOUCHED
 
     def step(
-        self, slab: Slab, node_state: NDArray[np.uint8], t_ns: int, previous_ns: int, now_ns: int
+        self,
+        slab: Slab,
+        node_state: NDArray[np.uint8],
+        cycle: Cycle,
+        now_ns: int,
+        until_ns: int = np.iinfo(np.int64).max,
     ) -> Ticked:
-        """Take in the samples of the SYNC at `t_ns`, and those of the one at `previous_ns` that were late.
+        """Take in the samples of a cycle, and those of the one before that came too late for its tick.
 
-        `now_ns` is the time of the tick. `node_state` (n,): PadState.CLEAR where the node is up, else what
-        its pad is instead.
+        `now_ns` is the time of the tick; samples that arrived at `until_ns` or later are of the next cycle.
+        `node_state` (n,): PadState.CLEAR where the node is up, else what its pad is instead.
         """
         model, columns, contacts = self.model, self.columns, self.contacts
         operational: BoolArray = np.equal(node_state, _CLEAR)
-        sampled = (slab.t_ns != self._taken_ns) & operational
-        np.copyto(self._taken_ns, slab.t_ns)
-        in_time = slab.fresh != 0
+        here = slab.t_ns < until_ns
+        sampled: BoolArray = here & (slab.t_ns != self._taken_ns) & operational
+        np.copyto(self._taken_ns, slab.t_ns, where=here)
+        in_time = here & (slab.fresh != 0)
         self.missed += self.expected() & operational & ~in_time
-        np.copyto(columns.sample_ns, np.where(in_time, t_ns, previous_ns), where=sampled)
-        railed: BoolArray = np.any(np.abs(slab.counts.astype(np.int32)) >= _RAIL, axis=1)
+        self.samples += sampled
+        np.copyto(columns.sample_ns, np.where(in_time, cycle.t_ns, cycle.previous_ns), where=sampled)
+        absurd = self._absurd(slab.counts.astype(np.int32))
         stale: BoolArray = np.subtract(now_ns, columns.sample_ns) > self._stale_ns
-        trusted: BoolArray = operational & ~railed & ~stale
+        trusted: BoolArray = operational & ~absurd & ~stale
         np.multiply(slab.counts, model.ampere_per_count[:, None], out=self._currents)
         np.copyto(columns.current_a, self._currents.sum(axis=1), where=sampled)
         below_off = columns.current_a < model.off_a
-        changes = contacts.step(sampled, columns.current_a > model.on_a, below_off, trusted, t_ns)
-        self._resolve_states(node_state, operational, railed, stale)
+        above_on = columns.current_a > model.on_a
+        changes = contacts.step(sampled, above_on, below_off, trusted, columns.sample_ns)
+        self._resolve_states(node_state, operational, absurd, stale)
         # a sample below the threshold tells no place: until it is known whether more follow, the last holds
         touched = contacts.touching & sampled & ~below_off
         if len(changes.began):
@@ -138,19 +151,25 @@ class Tick:
         if touched.any():
             self._solve(np.flatnonzero(touched))
             touched[changes.began] = False
-        return Ticked(t_ns, changes.began, np.flatnonzero(touched), changes.ended)
+        return Ticked(cycle.t_ns, changes.began, np.flatnonzero(touched), changes.ended)
+
+    def _absurd(self, counts: NDArray[np.int32]) -> BoolArray:
+        """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take."""
+        size = np.abs(counts)
+        source = _SOURCE_STD * self.model.noise_counts + _SOURCE_PART * size.sum(axis=1)
+        return np.asarray((size.max(axis=1) >= _RAIL) | (counts.min(axis=1) < -source))
 
     def _resolve_states(
         self,
         node_state: NDArray[np.uint8],
         operational: BoolArray,
-        railed: BoolArray,
+        absurd: BoolArray,
         stale: BoolArray,
     ) -> None:
         state = self.columns.state
         np.copyto(state, node_state)
         state[operational & self.contacts.touching] = _TOUCHED
-        state[operational & railed] = _FAULTED
+        state[operational & absurd] = _FAULTED
         state[operational & stale] = _STALE
 
     def _solve(self, touched: IntArray) -> None:

@@ -17,14 +17,19 @@ def explain(state: PadState, node: NodeState, node_reason: str, counts: NDArray[
 
     `node_reason` is the master's word on the node, `counts` (4,) the pad's newest sample.
     """
-    if state <= PadState.TOUCHED:
+    if state <= PadState.TOUCHED or (state == PadState.STARTING and node == NodeState.OPERATIONAL):
         return ""
     if node not in (NodeState.OPERATIONAL, NodeState.STALE):
         return node_reason
     if state == PadState.FAULTED:
-        railed = [name for name, count in zip(CHANNELS, counts.tolist(), strict=True) if abs(count) >= _RAIL]
+        channels = dict(zip(CHANNELS, counts.tolist(), strict=True))
+        if railed := [name for name, count in channels.items() if abs(count) >= _RAIL]:
+            return (
+                f"channel {' and '.join(railed)} at the end of its range: "
+                "look for a short, a loose electrode or a force beyond full scale"
+            )
         return (
-            f"channel {' and '.join(railed) or 'unknown'} at the end of its range: "
-            "look for a short, a loose electrode or a force beyond full scale"
+            f"channel {min(channels, key=channels.__getitem__)} reads {min(channels.values())} counts, and "
+            "no electrode can give current: look at its amplifier and its wiring"
         )
     return "its heartbeat comes, its samples don't: look at its SYNC and PDO settings and at the bus load"

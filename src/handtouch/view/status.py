@@ -11,18 +11,24 @@ from rich.table import Table
 
 from handtouch.client import CONTROL, request
 
+_WIDE = 200
+"""Columns where there is no terminal to ask: a line a pad, for grep."""
+
 
 def run(*, endpoint: str = CONTROL, as_json: bool = False) -> int:
-    """Print the status; exit status 0 if every pad is well, 1 if not or if no daemon answers."""
+    """Print the status; exit status 0 if every pad is well, 1 if not or if no daemon answers, 2 (usage)."""
     try:
         answer = request("status", endpoint=endpoint)
     except (TimeoutError, RuntimeError) as error:
         print(error, file=sys.stderr)
         return 1
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
     if as_json:
         print(json.dumps(answer, indent=2))
     else:
-        _show(answer, Console(soft_wrap=True))
+        _show(answer, Console(width=None if sys.stdout.isatty() else _WIDE))
     return 0 if all(pad["state"] in ("clear", "touched") for pad in answer["pads"]) else 1
 
 
@@ -43,8 +49,9 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         problem = f" [red]{bus['problem']}[/red]" if bus["problem"] else ""
         console.print(f"bus {name}: load {100 * bus['load']:.0f} %, {counts}{problem}")
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in ("link", "pad", "node", "id", "serial", "Hz", "missed", "why"):
-        table.add_column(column, justify="right" if column in ("id", "serial", "Hz", "missed") else "left")
+    for column in ("link", "pad", "node", "id", "serial", "Hz", "missed", "reboots", "why"):
+        number = column in ("id", "serial", "Hz", "missed", "reboots")
+        table.add_column(column, justify="right" if number else "left", no_wrap=column != "why")
     for pad in answer["pads"]:
         table.add_row(
             f"{pad['hand']}/{pad['link']}",
@@ -54,6 +61,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
             "" if pad["serial"] is None else str(pad["serial"]),
             f"{pad['rate_hz']:.0f}",
             str(pad["missed"]),
+            str(pad["reboots"]),
             "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]])),
         )
     console.print(table)

@@ -37,13 +37,14 @@ class LiveDisplay:
         from handtouch.view.terminal import HandView
 
         self._view = HandView(title)
-        self._live = Live(self._view.render(), screen=True, auto_refresh=False)
+        self._live = Live(self._view, screen=True, auto_refresh=False)
 
     def take(self, message: wire.Message) -> None:
         self._view.update(message)
 
     def frame(self, alive: bool) -> None:
-        self._live.update(self._view.render(alive), refresh=True)
+        self._view.alive = alive
+        self._live.refresh()
 
     def __enter__(self) -> Self:
         self._live.start()
@@ -58,8 +59,8 @@ class LineDisplay:
 
     def __init__(self, as_json: bool = False) -> None:
         self._as_json = as_json
-        self._printed_ns: dict[str, int] = {}
-        self._health: dict[str, tuple[str, ...]] = {}
+        self._printed_ns: dict[tuple[str, str], int] = {}
+        self._health: dict[tuple[str, str], tuple[str, ...]] = {}
         self._alive = True
 
     def take(self, message: wire.Message) -> None:
@@ -73,13 +74,15 @@ class LineDisplay:
         if isinstance(message, wire.Health):
             pad_state = "clear" if message.state == "touched" else message.state
             state = (pad_state, message.node, message.reason, *message.emergencies)
-            known, self._health[message.link] = self._health.get(message.link), state
+            pad = (message.hand, message.link)
+            known, self._health[pad] = self._health.get(pad), state
             return state != known
         if isinstance(message, wire.Contact):
-            thinned = message.event == "update"
-            if thinned and message.t_ns - self._printed_ns.get(message.link, 0) < 1e9 / _UPDATE_LINES_PER_S:
+            pad = (message.hand, message.link)
+            since_ns = message.t_ns - self._printed_ns.get(pad, 0)
+            if message.event == "update" and since_ns < 1e9 / _UPDATE_LINES_PER_S:
                 return False
-            self._printed_ns[message.link] = message.t_ns
+            self._printed_ns[pad] = message.t_ns
         return True
 
     def frame(self, alive: bool) -> None:
@@ -110,9 +113,10 @@ def follow(messages: Subscriber, display: Display, done: Callable[[], bool]) -> 
 
 
 def run(patterns: tuple[str, ...], *, endpoint: str = LIVE, style: str = "auto", seconds: float = 0) -> int:
-    """Show messages until Ctrl-C, or for `seconds`; `style`: auto, plain or json. Exit status 0, 2 (usage).
+    """Show messages until Ctrl-C, or for `seconds`; `style`: auto, plain or json.
 
-    Without a pattern, contacts and health; on a terminal that is the live page.
+    Exit status 0, 1 if nothing was heard in that time, 2 for wrong usage. Without a pattern, contacts and
+    health; on a terminal that is the live page.
     """
     live = style == "auto" and sys.stdout.isatty() and not patterns
     wanted = patterns or (("contact/*/*", "health/*/*", "service") if live else ("contact/*/*", "health/*/*"))
@@ -125,7 +129,10 @@ def run(patterns: tuple[str, ...], *, endpoint: str = LIVE, style: str = "auto",
     display: Display = LiveDisplay(f"handtouch at {endpoint}") if live else LineDisplay(style == "json")
     with messages, display:
         follow(messages, display, lambda: time.monotonic() > end_s)
-    return 0
+        heard = messages.heard
+    if not heard:
+        print(f"nothing was heard at {endpoint}: is handtouch run up?", file=sys.stderr)
+    return 0 if heard else 1
 
 
 def _plain(value: Any) -> Any:

@@ -1,0 +1,106 @@
+"""The pipeline from SYNC to messages: one tick a cycle, every contact ended with its reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from handtouch import wire
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.wire import PadState
+
+PERIOD_NS = 5_000_000
+PLANE = 0
+
+
+class Taker:
+    """Keeps all messages."""
+
+    def __init__(self) -> None:
+        self.messages: list[Any] = []
+
+    def wants(self, _: str) -> bool:
+        return True
+
+    def next_seq(self, _: str) -> int:
+        return len(self.messages) + 1
+
+    def send(self, message: wire.Message) -> None:
+        self.messages.append(message)
+
+    def contacts(self) -> list[wire.Contact]:
+        return [message for message in self.messages if isinstance(message, wire.Contact)]
+
+
+class Rig:
+    """A touched pad, SYNC after SYNC."""
+
+    def __init__(self, bench: Any) -> None:
+        self.taken = Taker()
+        self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self.taken)
+        self.pipeline.node_state[:] = PadState.CLEAR
+        self.touch = bench.counts(PLANE, 0.5, 0.5, 1e-3).tobytes()
+        self.t_ns = 10**9
+
+    def cycle(self, pads: tuple[int, ...] = (0, 1, 2)) -> None:
+        self.t_ns += PERIOD_NS
+        self.pipeline.begin(self.t_ns, self.t_ns)
+        for pad in pads:
+            self.pipeline.slab.write(pad, self.touch if pad == PLANE else bytes(8), self.t_ns + 1000 + pad)
+        self.pipeline.advance(self.t_ns + 2000)
+
+
+@pytest.fixture
+def rig(bench: Any) -> Rig:
+    made = Rig(bench)
+    made.cycle()
+    made.pipeline.advance(made.t_ns + PERIOD_NS // 2 + PERIOD_NS // 4)
+    for _ in range(3):
+        made.cycle()
+    assert made.taken.contacts()[0].event == "begin"
+    return made
+
+
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        (PadState.LOST, "lost"),
+        (PadState.FAULTED, "faulted"),
+        (PadState.STARTING, "restarted"),
+        (PadState.STALE, "stale"),
+    ],
+)
+def test_a_contact_ends_with_what_became_of_its_node(rig: Rig, state: PadState, reason: str) -> None:
+    rig.pipeline.node_state[PLANE] = state
+    rig.cycle()
+    last = rig.taken.contacts()[-1]
+    assert (last.event, last.reason) == ("end", reason)
+
+
+def test_when_the_daemon_stops_contacts_end_and_the_last_frame_says_so(rig: Rig) -> None:
+    rig.pipeline.end(rig.t_ns + PERIOD_NS)
+    last = rig.taken.contacts()[-1]
+    assert (last.event, last.reason) == ("end", "stopped")
+    frames = [message for message in rig.taken.messages if isinstance(message, wire.HandFrame)]
+    assert set(frames[-1].state) == {PadState.STARTING}
+    assert not any(frames[-1].contact)
+
+
+def test_every_cycle_is_ticked_once_even_if_nobody_got_round_to_it(rig: Rig) -> None:
+    ticks = rig.pipeline.ticks
+    for _ in range(4):
+        rig.t_ns += PERIOD_NS
+        rig.pipeline.begin(rig.t_ns, rig.t_ns)
+    assert rig.pipeline.ticks == ticks + 3
+
+
+def test_the_tick_comes_with_the_last_sample_that_is_expected(rig: Rig) -> None:
+    ticks = rig.pipeline.ticks
+    rig.t_ns += PERIOD_NS
+    rig.pipeline.begin(rig.t_ns, rig.t_ns)
+    for pad in range(3):
+        assert rig.pipeline.advance(rig.t_ns + pad) is None
+        rig.pipeline.slab.write(pad, bytes(8), rig.t_ns + 1000 + pad)
+    assert rig.pipeline.advance(rig.t_ns + 3) is not None
+    assert rig.pipeline.ticks == ticks + 1
