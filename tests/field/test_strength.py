@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from handtouch.field.network import ElectrodeNetwork
@@ -269,14 +269,58 @@ class TestSandwich:
         assert found.force_n == pytest.approx(force, rel=1e-7)
         assert found.radius_m == pytest.approx(radius, rel=1e-7)
 
-    def test_where_two_radii_fit_there_is_no_answer_rather_than_a_guess(self) -> None:
+    @given(
+        force=st.floats(0.01, 1e5),
+        radius=st.floats(3e-4, 8e-3),
+        alpha=st.sampled_from([(1.5, 0.7), (0.7, 1.5), (1.0, 2.0), (0.5, 0.6)]),
+    )
+    @example(force=1.5, radius=5e-4, alpha=(1.5, 0.7))
+    @example(force=1e3, radius=5e-4, alpha=(1.5, 0.7))
+    @example(force=84995.0, radius=3e-4, alpha=(1.0, 2.0))
+    def test_a_force_comes_back_or_is_saturated_with_a_lower_bound(
+        self, force: float, radius: float, alpha: tuple[float, float]
+    ) -> None:
+        pair = Sandwich((2e-2, 3e-2), alpha, (2400.0, 3000.0))
+        found = pair.force(pair.currents(force, radius, 12.0, 2e-2), 12.0, 2e-2)
+        assert found.status in (Status.VALID, Status.SATURATED)
+        if found.status == Status.VALID:
+            assert found.force_n == pytest.approx(force, rel=1e-6)
+            assert found.radius_m == pytest.approx(radius, rel=1e-6)
+        else:
+            assert 0 < found.force_n <= force * (1 + 1e-8)
+            assert np.isinf(np.diagonal(found.covariance)).all()
+
+    def test_more_than_the_sheets_can_carry_is_saturated_at_no_less_than_what_they_carry(self) -> None:
+        pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
+        most = pair.currents(1e9, 1e-2, 12.0, 2e-2)
+        found = pair.force(most[:, None] * [0.7, 1.1, 5.0, 1e6], 12.0, 2e-2)
+        assert (found.status == Status.SATURATED).all()
+        assert (found.force_n > 1).all()
+        assert np.isfinite(found.force_n).all()
+
+    def test_what_no_contact_can_be_is_invalid_and_nothing_is_below(self) -> None:
+        good = self.PAIR.currents(0.2, 2e-3, DRIVE, SPREADING)
+        readings = np.stack([good, good * [1, math.nan], good * [1, 0], good * [1, -1], good * [1e-3, 1]], 1)
+        found = self.PAIR.force(readings, DRIVE, SPREADING, current_std_a=1e-9)
+        assert list(found.status) == [
+            Status.VALID,
+            Status.INVALID,
+            Status.BELOW,
+            Status.BELOW,
+            Status.INVALID,
+        ]
+        assert (np.isnan(found.force_n) == (found.status != Status.VALID)).all()
+
+    def test_where_two_radii_fit_the_lesser_force_is_a_bound(self) -> None:
         force, radius = np.meshgrid(np.geomspace(0.01, 100, 25), np.geomspace(5e-4, 8e-3, 15))
         found = self.PAIR.force(self.PAIR.currents(force, radius, DRIVE, SPREADING), DRIVE, SPREADING)
-        known = np.isfinite(found.force_n)
+        known = found.status == Status.VALID
         assert known[force < 0.3].all()
         assert not known.all()
         assert found.force_n[known] == pytest.approx(force[known], rel=1e-6)
         assert found.radius_m[known] == pytest.approx(radius[known], rel=1e-6)
+        assert (found.status[~known] == Status.SATURATED).all()
+        assert (found.force_n[~known] <= force[~known] * (1 + 1e-8)).all()
 
     def test_covariance_is_what_a_simulation_scatters(self) -> None:
         currents = self.PAIR.currents(0.2, 2e-3, DRIVE, SPREADING)
