@@ -70,7 +70,6 @@ def test_neither_file_nor_schema_is_wrong_usage() -> None:
         ([("sync_period_ms = 5.0", "sync_period_ms = 1.0")], "the bus can't carry this"),
         ([("bitrate_bit_s = 1_000_000", "bitrate_bit_s = 500_000")], "the last come a period late"),
         ([("heartbeat_timeout_ms = 350", "heartbeat_timeout_ms = 150")], "one late heartbeat of 100 ms"),
-        ([("serial = 1002", "serial = 1001")], "right/thumb_middle: serial = 1001: is that of thumb_prox"),
         ([("length_mm = 42.0", "length_mm = 120.0")], "3.8 times longer along x than along y"),
         ([("contact_radius_mm = 2.5", "contact_radius_mm = 8")], "a contact covers the pad of 16.6 mm"),
         ([("off_n = 0.03", "off_n = 0.0005")], "below what noise alone can read"),

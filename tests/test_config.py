@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import json
 import math
 import tomllib
@@ -112,6 +113,19 @@ MISTAKES = {
         ("radius_mm = 12.0,", "radius = 12.0,"),
         THUMB + 'surface.radius = 12.0: unknown key; did you mean "radius_mm"? Keys carry their unit',
     ),
+    "another unit": (
+        ("gap_mm = 0.8\nmount", "gap_cm = 0.08\nmount"),
+        THUMB + 'gap_cm = 0.08: unknown key; did you mean "gap_mm"? Keys carry their unit',
+    ),
+    "two pads with one serial number": (
+        (
+            "gap_mm = 0.8\nmount",
+            'serial = 7\ngap_mm = 0.8\n[[hand.pad]]\nserial = 7\nlink = "ring"\nbus = "can0"\n'
+            'node_id = 9\nnode = "four"\nsheet = "firm"\ngap_mm = 0.8\n'
+            'surface = { kind = "plane", length_mm = 30.0, width_mm = 20.0 }\nmount',
+        ),
+        '2 "right/ring": serial = 7: is already that of "right/thumb"; a serial number belongs to one node',
+    ),
     "missing key": (("gap_mm = 0.8\nmount", "mount"), THUMB + "gap_mm: is missing (gap_mm: bare length"),
     "unknown table": (("[touch]", "[tuch]"), "hand.toml: [tuch]: unknown table; did you mean [touch]?"),
     "one table for many": (("[[bus]]", "[bus]"), "hand.toml: [bus]: must be a list of tables: write [[bus]]"),
@@ -197,6 +211,22 @@ MISTAKES = {
         ("[node.four]", '[[bus]]\nname = "b"\ninterface = "socketcan"\nchannel = "can0"\n[node.four]'),
         '[[bus]] 2 "b": channel = "can0": is the wire of bus "can0" too; name each once',
     ),
+    "two buses on one UDP port, in two groups": (
+        (
+            'interface = "socketcan"\nchannel = "can0"',
+            'interface = "udp_multicast"\nchannel = "239.74.163.2"\n[[bus]]\nname = "b"\n'
+            'interface = "udp_multicast"\nchannel = "239.74.163.3"\noptions.port = 43113',
+        ),
+        '[[bus]] 2 "b": options.port = 43113: bus "can0" has UDP port 43113 too, and groups don\'t separate '
+        "buses on one port; give each its own, e.g. options = { port = 43114 }",
+    ),
+    "no UDP port": (
+        (
+            'interface = "socketcan"\nchannel = "can0"',
+            'interface = "udp_multicast"\nchannel = "239.74.163.2"\noptions.port = 99999',
+        ),
+        '[[bus]] 1 "can0": options.port = 99999: must be a UDP port, 1 to 65535',
+    ),
     "hasty time-out": (
         ("noise_counts = 1.0", "noise_counts = 1.0\nheartbeat_timeout_ms = 90"),
         "[node.four]: heartbeat_timeout_ms = 90: must be longer than heartbeat_ms = 100",
@@ -225,6 +255,22 @@ MISTAKES = {
         ("[[bus]]", '[daemon]\nlive = "5580"\n[[bus]]'),
         '[daemon]: live = "5580": must be a ZeroMQ endpoint such as tcp://127.0.0.1:5580',
     ),
+    "endpoint without a port": (
+        ("[[bus]]", '[daemon]\nlive = "tcp://127.0.0.1"\n[[bus]]'),
+        '[daemon]: live = "tcp://127.0.0.1": needs a port: tcp://127.0.0.1:5580, or :*',
+    ),
+    "endpoint on a port that can't be": (
+        ("[[bus]]", '[daemon]\nlive = "tcp://127.0.0.1:99999"\n[[bus]]'),
+        '[daemon]: live = "tcp://127.0.0.1:99999": must end in a port, 1 to 65535, or *',
+    ),
+    "endpoint of a host that looks like loopback": (
+        ("[[bus]]", '[daemon]\nlive = "tcp://127.evil.example:5580"\n[[bus]]'),
+        '[daemon]: live = "tcp://127.evil.example:5580": reaches beyond this machine; only loopback',
+    ),
+    "one endpoint by two names": (
+        ("[[bus]]", '[daemon]\nlive = "tcp://localhost:5582"\n[[bus]]'),
+        '[daemon]: complete = "tcp://127.0.0.1:5582": is the endpoint of live too',
+    ),
     "no TOML": (("[touch]", "[touch"), "hand.toml: TOML: Expected ']'"),
 }
 
@@ -235,6 +281,44 @@ def test_a_mistake_is_named(change: tuple[str, str], expected: str) -> None:
     said = complaint(SMALL.replace(*change, 1))
     assert expected in said
     assert len(said.splitlines()) == 1, "one mistake, one line"
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp://127.0.0.1:*", "tcp://127.8.9.1:1", "tcp://localhost:65535", "ipc:///x"],
+)
+def test_endpoints_on_this_machine_are_taken(endpoint: str) -> None:
+    text = SMALL.replace("[[bus]]", f'[daemon]\nlive = "{endpoint}"\n[[bus]]', 1)
+    assert config.parse(text).daemon.live == endpoint
+
+
+@given(st.from_regex(r"tcp://[\[\]0-9a-z.:*]{0,20}", fullmatch=True))
+def test_no_endpoint_reaches_beyond_this_machine(endpoint: str) -> None:
+    with contextlib.suppress(ConfigError):
+        host, _, port = (
+            config.parse(SMALL.replace("[[bus]]", f'[daemon]\nlive = "{endpoint}"\n[[bus]]', 1))
+            .daemon.live[6:]
+            .rpartition(":")
+        )
+        assert port == "*" or 0 < int(port) < 65536
+        assert host == "localhost" or ipaddress.IPv4Address(host).is_loopback
+
+
+def test_an_empty_file_is_told_which_tables_it_needs() -> None:
+    assert complaint("").splitlines() == [
+        f"hand.toml: {key}: is missing; it is a table of its own, under a line {header}"
+        for key, header in (
+            ("bus", "[[bus]]"),
+            ("node", "[node.NAME]"),
+            ("sheet", "[sheet.NAME]"),
+            ("hand", "[[hand]]"),
+        )
+    ]
+
+
+def test_a_hand_without_pads_is_told_how_to_write_one() -> None:
+    said = complaint(SMALL[: SMALL.index("[[hand.pad]]")])
+    assert '[[hand]] 1 "right": pad: is missing; it is a table of its own, under a line [[hand.pad]]' in said
 
 
 def test_every_mistake_is_named_at_once() -> None:
@@ -333,6 +417,14 @@ def test_a_wrong_wire_is_named(text: str, expected: str) -> None:
         config.with_bus(config.parse(SMALL), text)
     assert str(caught.value).startswith(f"--bus {text}: ")
     assert expected in str(caught.value)
+
+
+def test_two_buses_are_put_on_one_multicast_group_by_different_ports_only() -> None:
+    second = '[[bus]]\nname = "can1"\ninterface = "socketcan"\nchannel = "can1"\n[node.four]'
+    one = config.with_bus(config.parse(SMALL.replace("[node.four]", second)), "can0=udp_multicast:239.0.0.1")
+    assert config.with_bus(one, "can1=udp_multicast:239.0.0.1:43114").buses[1].options == {"port": 43114}
+    with pytest.raises(ConfigError, match=r"can0.* has UDP port 43113 too, .*give each its own"):
+        config.with_bus(one, "can1=udp_multicast:239.0.0.2")
 
 
 # --- properties

@@ -120,13 +120,6 @@ def _serial_warnings(hand: config.Hand) -> Iterator[str]:
     without = [pad.link for pad in hand.pads if pad.serial is None]
     if without:
         yield f"{hand.name}: no serial for {', '.join(without)}: a replaced sensor goes unnoticed"
-    seen: dict[tuple[int, str], str] = {}
-    for pad in hand.pads:
-        if pad.serial is None:
-            continue
-        other = seen.setdefault((pad.serial, pad.node), pad.link)
-        if other != pad.link:
-            yield f"{hand.name}/{pad.link}: serial = {pad.serial}: is that of {other} too"
 
 
 def _pad_warnings(name: str, pad: config.Pad, deployment: config.Deployment) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """What no single key of a deployment shows: names used twice, references to nothing, shapes that can't be.
 
-Public names: `problems_in`, `rectangle_mm`.
+Public names: `problems_in`, `rectangle_mm`, `UDP_MULTICAST_PORT`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from pathlib import Path
 from handtouch.config.problems import Problem
 from handtouch.config.tables import Bus, Daemon, Deployment, Node, Pad, Surface, Touch
 
-_LOOPBACK = ("tcp://127.", "tcp://localhost:", "tcp://[::1]:")
+UDP_MULTICAST_PORT = 43113
+"""python-can's port of a udp_multicast bus that names none."""
 
 
 def problems_in(deployment: Deployment) -> Iterator[Problem]:
@@ -27,6 +28,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
     yield from _check_touch("[touch]: ", deployment.touch)
     yield from _check_names("[[hand]]", "name", [hand.name for hand in deployment.hands])
     taken: dict[tuple[str, int], str] = {}
+    owners: dict[int, str] = {}
     for hand in deployment.hands:
         yield from _check_names("[[hand.pad]]", "link", [pad.link for pad in hand.pads])
         for number, pad in enumerate(hand.pads, 1):
@@ -44,6 +46,12 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
                     "every node needs an id of its own",
                 )
             taken.setdefault((pad.bus, pad.node_id), name)
+            if pad.serial is not None and owners.setdefault(pad.serial, name) != name:
+                yield Problem(
+                    f"{place}serial",
+                    f" = {pad.serial}",
+                    f'is already that of "{owners[pad.serial]}"; a serial number belongs to one node',
+                )
 
 
 def rectangle_mm(surface: Surface) -> tuple[float, float]:
@@ -80,19 +88,38 @@ def _check_endpoints(daemon: Daemon) -> Iterator[Problem]:
     for key in ("live", "complete", "control", "inputs"):
         endpoint = getattr(daemon, key)
         place, value = f"[daemon]: {key}", _is(endpoint)
-        if not endpoint.startswith(("tcp://", "ipc://")):
-            yield Problem(
-                place,
-                value,
-                "must be a ZeroMQ endpoint such as tcp://127.0.0.1:5580 or ipc:///run/handtouch/live",
-            )
-        elif endpoint.startswith("tcp://") and not endpoint.startswith(_LOOPBACK):
-            yield Problem(
-                place, value, "reaches beyond this machine; only loopback (127.0.0.1) is open without keys"
-            )
-        elif endpoint in seen and not endpoint.endswith(":*"):
-            yield Problem(place, value, f"is the endpoint of {seen[endpoint]} too; give each its own port")
-        seen[endpoint] = key
+        same = endpoint.replace("//localhost:", "//127.0.0.1:")
+        if trouble := _endpoint_trouble(endpoint):
+            yield Problem(place, value, trouble)
+        elif same in seen and not endpoint.endswith(":*"):
+            yield Problem(place, value, f"is the endpoint of {seen[same]} too; give each its own")
+        seen.setdefault(same, key)
+
+
+def _endpoint_trouble(endpoint: str) -> str:
+    """What is wrong with a ZeroMQ endpoint, with what would be right; empty if nothing is."""
+    transport, _, address = endpoint.partition("://")
+    if transport == "ipc" and address:
+        return ""
+    if transport != "tcp" or not address:
+        return "must be a ZeroMQ endpoint such as tcp://127.0.0.1:5580 or ipc:///run/handtouch/hand/live"
+    host, colon, port = address.rpartition(":")
+    if not colon:
+        return f"needs a port: tcp://{address}:5580, or :* for any that is free"
+    if port != "*" and not (port.isascii() and port.isdigit() and 1 <= int(port[:6]) <= 65535):
+        return "must end in a port, 1 to 65535, or * for any that is free"
+    if not _is_loopback(host):
+        return "reaches beyond this machine; only loopback (127.0.0.1) is open without keys"
+    return ""
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.IPv4Address(host).is_loopback  # the sockets do without IPv6
+    except ValueError:
+        return False
 
 
 def _check_buses(buses: Iterable[Bus]) -> Iterator[Problem]:
@@ -108,13 +135,34 @@ def _check_buses(buses: Iterable[Bus]) -> Iterator[Problem]:
             yield Problem(
                 f"{place}channel", _is(bus.channel), "must be a multicast address such as 239.74.163.2"
             )
-        port = bus.options.get("port") if bus.interface == "udp_multicast" else None
-        wire = json.dumps([bus.interface, bus.channel, port])
+        if bus.interface == "udp_multicast":
+            yield from _check_port(place, bus, seen)
+            continue
+        wire = json.dumps([bus.interface, bus.channel])
         if wire in seen:
             yield Problem(
                 f"{place}channel", _is(bus.channel), f'is the wire of bus "{seen[wire]}" too; name each once'
             )
         seen.setdefault(wire, bus.name)
+
+
+def _check_port(place: str, bus: Bus, seen: dict[str, str]) -> Iterator[Problem]:
+    """A socket of udp_multicast hears every group on its port, so the port alone makes a wire."""
+    port = bus.options.get("port", UDP_MULTICAST_PORT)
+    if isinstance(port, bool) or not isinstance(port, int) or not 1 <= port <= 65535:
+        yield Problem(f"{place}options.port", _is(port), "must be a UDP port, 1 to 65535")
+        return
+    wire = f"udp port {port}"
+    if wire in seen:
+        free = next(p for p in range(UDP_MULTICAST_PORT, 65536) if f"udp port {p}" not in seen)
+        told = f" = {port}" if "port" in bus.options else ""
+        yield Problem(
+            f"{place}options.port",
+            told,
+            f'bus "{seen[wire]}" has UDP port {port} too, and groups don\'t separate buses on one port; '
+            f"give each its own, e.g. options = {{ port = {free} }}",
+        )
+    seen.setdefault(wire, bus.name)
 
 
 def _is_multicast(channel: str) -> bool:

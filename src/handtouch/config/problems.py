@@ -18,6 +18,9 @@ Tables = Mapping[str, type[BaseModel]]
 """Definition of each table by its dotted path; "*" stands for a name that the user chose."""
 
 _UNITS = ("_mm", "_ms", "_deg", "_n", "_v", "_ma", "_ohm", "_bit_s", "_mm2", "_kpa", "_counts", "_samples")
+_OTHER_UNITS = frozenset(
+    {"m", "cm", "um", "in", "s", "us", "hz", "khz", "rad", "kn", "mv", "a", "ua", "kohm", "pa", "mpa"}
+)
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,7 @@ class _Mistake:
         self.error = error
         self.kinds = kinds
         path, self.section, self.shown, self.table = _locate(raw, loc[:-1] if self.union else loc)
+        self.path, self.tables = path, tables
         self.key = path[-1] if path else ""
         self.model = _model(path[:-1], self.table, tables, kinds)
         known = list(_keys(self.model))
@@ -88,7 +92,7 @@ class _Mistake:
         if self.kind == "extra_forbidden":
             return self._unknown(value)
         if self.kind == "missing":
-            return Problem(self.place, "", f"is missing{self._meaning()}")
+            return Problem(self.place, "", f"is missing{self._header() or self._meaning()}")
         if self.kind.startswith("union_tag"):
             given = self.error["input"].get("kind") if isinstance(self.error["input"], dict) else None
             at, value = (".kind", f" = {_show(given)}") if given is not None else ("", value)
@@ -117,10 +121,18 @@ class _Mistake:
             return Problem(f"[{self.key}]", "", f"unknown table; {remedy}")
         if not self.meant:
             return Problem(self.place, value, f"unknown key; known here: {', '.join(_keys(self.model))}")
-        unit = " Keys carry their unit" if self.meant in [self.key + unit for unit in _UNITS] else ""
+        unit = " Keys carry their unit" if _without_unit(self.key) == _without_unit(self.meant) else ""
         return Problem(
             self.place, value, f'unknown key; did you mean "{self.meant}"?{unit}{self._meaning(self.meant)}'
         )
+
+    def _header(self) -> str:
+        """How the file writes the table that is missing; empty where it is a plain key."""
+        path = ".".join(self.path)
+        header = (
+            f"[[{path}]]" if path in self.tables else f"[{path}.NAME]" if f"{path}.*" in self.tables else ""
+        )
+        return f"; it is a table of its own, under a line {header}" if header else ""
 
     def _meaning(self, key: str = "") -> str:
         key = key or self.key
@@ -182,6 +194,15 @@ def _near(key: str, candidates: list[str]) -> str | None:
         if any(candidate == key + unit or key == candidate + unit for unit in _UNITS):
             return candidate
     return next(iter(difflib.get_close_matches(key, candidates, n=1, cutoff=0.6)), None)
+
+
+def _without_unit(key: str) -> str:
+    """The quantity that a key names; what follows its last _ counts as a unit, known here or not."""
+    known = next((unit for unit in sorted(_UNITS, key=len, reverse=True) if key.endswith(unit)), "")
+    if known:
+        return key.removesuffix(known)
+    stem, _, last = key.rpartition("_")
+    return stem if last in _OTHER_UNITS else key
 
 
 def _either(alternatives: Iterator[str]) -> str:

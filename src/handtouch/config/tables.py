@@ -87,7 +87,7 @@ class Plane(Table):
 
     kind: Literal["plane"]
     length_mm: Positive = Field(description="from electrode x0 to electrode xa")
-    width_mm: Positive = Field(description="from electrode y0 to electrode yb; 360: all round")
+    width_mm: Positive = Field(description="from electrode y0 to electrode yb")
 
 
 class Cylinder(Table):
