@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import socket
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from handtouch import config, doctor, shipped
 from handtouch.doctor import Finding, Machine
 
+TROUBLE_OPENING_RAW = doctor._trouble_opening_raw
 HAND = shipped.path("utah_mit.toml")
 
 
@@ -95,7 +97,7 @@ def test_small_buffers_and_slow_clocks_are_found(tmp_path: Path) -> None:
     clock.mkdir(parents=True)
     (clock / "current_clocksource").write_text("hpet\n")
     (room,) = doctor.buffer_findings(machine)
-    assert (room.state, room.remedy.split(",")[0]) == ("warn", "sysctl -w net.core.rmem_max=4194304")
+    assert (room.state, room.remedy.split(" (")[0]) == ("warn", "sysctl -w net.core.rmem_max=4194304")
     (ticking,) = doctor.clock_findings(machine)
     assert (ticking.state, ticking.detail) == ("warn", "hpet is slow to read")
 
@@ -109,6 +111,44 @@ def test_a_taken_port_is_found() -> None:
     assert findings[0].state == "fail"
     assert "address already in use" in findings[0].detail
     assert "handtouch status" in findings[0].remedy
+
+
+def test_an_ipc_endpoint_is_free_only_while_nobody_answers_there(tmp_path: Path) -> None:
+    def look() -> Finding:
+        return next(doctor.endpoint_findings(config.Daemon(live=f"ipc://{tmp_path}/live")))
+
+    assert look() == Finding("endpoint live", "ok", f"ipc://{tmp_path}/live is free")
+    with socket.socket(socket.AF_UNIX) as taken:
+        taken.bind(str(tmp_path / "live"))
+        taken.listen()
+        finding = look()
+    assert (finding.state, finding.detail) == ("fail", f"ipc://{tmp_path}/live: somebody answers there")
+    assert "handtouch status" in finding.remedy
+    assert look().state == "ok", "a file left behind is in nobody's way"
+
+
+def test_a_missing_folder_of_an_ipc_endpoint_is_named(tmp_path: Path) -> None:
+    finding = next(doctor.endpoint_findings(config.Daemon(live=f"ipc://{tmp_path}/no/live")))
+    assert (finding.state, finding.detail) == ("fail", f"there is no folder {tmp_path}/no")
+    assert finding.remedy.startswith(f"mkdir -p {tmp_path}/no")
+
+
+def test_an_ipc_path_too_long_for_a_socket_is_found(tmp_path: Path) -> None:
+    finding = next(doctor.endpoint_findings(config.Daemon(live=f"ipc://{tmp_path}/{'x' * 120}")))
+    assert (finding.state, finding.remedy[:4]) == ("fail", "give")
+
+
+def test_a_kernel_without_socketcan_is_one_failure_with_a_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr(doctor, "_trouble_opening_raw", TROUBLE_OPENING_RAW)
+    monkeypatch.setattr(socket, "socket", refuse)
+    (finding,) = doctor.bus_findings(bus(channel="can7"), fake(tmp_path))
+    assert (finding.state, "no SocketCAN" in finding.detail) == ("fail", True)
+    assert "udp_multicast" in finding.remedy
 
 
 def test_a_multicast_group_that_cant_be_reached_is_found() -> None:

@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from handtouch import config
+
 from .conftest import ROOT, Installation
 
 UNITS = ("handtouch@.service", "handtouch-can@.service")
@@ -63,6 +65,16 @@ def test_a_stalled_or_failed_daemon_restarts_and_a_wrong_deployment_does_not(
     assert (service["Type"], service["Restart"], service["WatchdogSec"]) == ("notify", "on-failure", "2")
     assert service["RestartPreventExitStatus"] == "2"
     assert unit(installation, UNITS[0])["Unit"]["StartLimitIntervalSec"] == "0"
+
+
+def test_the_ipc_endpoint_that_is_given_as_an_example_lies_where_the_service_may_write(
+    installation: Installation,
+) -> None:
+    folder = unit(installation, UNITS[0])["Service"]["RuntimeDirectory"].replace("%i", "hand")
+    with pytest.raises(config.ConfigError, match=re.escape(f" ipc:///run/{folder}/live")):
+        config.parse(
+            (ROOT / "config/utah_mit.toml").read_text().replace("[daemon]", '[daemon]\nlive = "5580"')
+        )
 
 
 def test_a_wrong_deployment_ends_the_service_with_status_2(installation: Installation) -> None:

@@ -13,7 +13,6 @@ import json as json_text
 import os
 import platform
 import re
-import resource
 import socket
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from handtouch import config
 from handtouch.canbus.receivers import RECEIVE_BUFFER_BYTES
 
 State = Literal["ok", "warn", "fail"]
+_TAKEN = "is a daemon running (`handtouch status`)? Else choose another in [daemon]"
 EXACT_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock")
 
 
@@ -94,7 +94,6 @@ def examine(deployment: config.Deployment | None, machine: Machine | None = None
     machine = machine or Machine()
     yield from python_findings()
     yield from clock_findings(machine)
-    yield from scheduling_findings()
     yield from buffer_findings(machine)
     for bus in deployment.buses if deployment else ():
         yield from bus_findings(bus, machine)
@@ -135,20 +134,6 @@ def clock_findings(machine: Machine) -> Iterator[Finding]:
         )
 
 
-def scheduling_findings() -> Iterator[Finding]:
-    """Whether the daemon may be given priority over other programs."""
-    _, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    if os.geteuid() == 0 or hard > 0 or hard == resource.RLIM_INFINITY:
-        yield Finding("real-time priority", "ok", "may be asked for")
-    else:
-        yield Finding(
-            "real-time priority",
-            "warn",
-            "not allowed for this user; other programs can delay contacts by milliseconds",
-            "run it as the systemd service, or set rtprio in /etc/security/limits.d/",
-        )
-
-
 def buffer_findings(machine: Machine) -> Iterator[Finding]:
     """The room for frames that wait: the default holds 17 ms of a busy bus."""
     limit = machine.number("net/core/rmem_max")
@@ -161,7 +146,7 @@ def buffer_findings(machine: Machine) -> Iterator[Finding]:
             "receive buffer",
             "warn",
             f"limited to {limit >> 10} of {RECEIVE_BUFFER_BYTES >> 10} KiB: a busy machine loses frames",
-            f"sysctl -w net.core.rmem_max={RECEIVE_BUFFER_BYTES}, or grant CAP_NET_ADMIN as the service does",
+            f"sysctl -w net.core.rmem_max={RECEIVE_BUFFER_BYTES} (services/install.sh makes it last)",
         )
 
 
@@ -191,21 +176,17 @@ def endpoint_findings(daemon: config.Daemon) -> Iterator[Finding]:
         endpoint = getattr(daemon, name)
         subject = f"endpoint {name}"
         if endpoint.startswith("ipc://"):
-            folder = Path(endpoint.removeprefix("ipc://")).parent
-            if not os.access(folder, os.W_OK):
-                yield Finding(subject, "fail", f"{folder} can't be written", "create it, or give its rights")
-                continue
+            yield _ipc_finding(subject, Path(endpoint.removeprefix("ipc://")))
         elif trouble := _trouble_binding(endpoint):
-            remedy = "is a daemon running (`handtouch status`)? Else choose another port in [daemon]"
-            yield Finding(subject, "fail", f"{endpoint}: {trouble}", remedy)
-            continue
-        yield Finding(subject, "ok", f"{endpoint} is free")
+            yield Finding(subject, "fail", f"{endpoint}: {trouble}", _TAKEN)
+        else:
+            yield Finding(subject, "ok", f"{endpoint} is free")
 
 
 def _socketcan_findings(subject: str, bus: config.Bus, machine: Machine) -> Iterator[Finding]:
-    trouble = _trouble_opening_raw()
-    if trouble:
+    if trouble := _trouble_opening_raw():  # no interface could mend that
         yield Finding(subject, "fail", *trouble)
+        return
     name = str(bus.channel)
     bring_up = f"ip link set {name} up type can bitrate {bus.bitrate_bit_s} restart-ms 100"
     if not (machine.sys / "class/net" / name).exists():
@@ -272,7 +253,11 @@ def _trouble_opening_raw() -> tuple[str, str] | None:
                 "raw CAN sockets are not allowed here",
                 "start it outside the sandbox, or allow AF_CAN in it",
             )
-        return f"the kernel has no SocketCAN ({error.strerror})", "modprobe can_raw, or use another interface"
+        return (
+            f"the kernel has no SocketCAN ({error.strerror})",
+            "modprobe can_raw; where the kernel is built without it, as in many containers, another interface "
+            "works: --bus NAME=udp_multicast:239.74.163.2, or slcan with a serial adapter",
+        )
     return None
 
 
@@ -297,6 +282,32 @@ def _device_findings(subject: str, bus: config.Bus) -> Iterator[Finding]:
         yield Finding(subject, "fail", f"{device} may not be opened", "add the user to the group dialout")
     else:
         yield Finding(subject, "ok", f"{device} is there")
+
+
+def _ipc_finding(subject: str, path: Path) -> Finding:
+    """A socket file: one that a daemon has left behind is in nobody's way, one that answers is taken."""
+    folder = path.parent
+    if not folder.is_dir():
+        return Finding(
+            subject,
+            "fail",
+            f"there is no folder {folder}",
+            f"mkdir -p {folder}; the service handtouch@NAME makes /run/handtouch/NAME by itself",
+        )
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+            return Finding(subject, "fail", f"ipc://{path}: somebody answers there", _TAKEN)
+        except (FileNotFoundError, ConnectionRefusedError):
+            pass
+        except OSError as error:
+            told = f"ipc://{path}: {str(error.strerror or error).lower()}"
+            return Finding(subject, "fail", told, "give its rights, or choose another path in [daemon]")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return Finding(
+            subject, "fail", f"{folder} can't be written", f"give this user its rights: ls -ld {folder}"
+        )
+    return Finding(subject, "ok", f"ipc://{path} is free")
 
 
 def _trouble_binding(endpoint: str) -> str | None:
