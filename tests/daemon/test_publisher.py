@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import zmq
@@ -105,3 +106,19 @@ def test_a_taken_port_is_named_with_its_remedy(publisher: Publisher) -> None:
     taken = publisher.endpoints["live"]
     with zmq.Context() as context, pytest.raises(OSError, match=taken):
         Publisher(context, taken, "tcp://127.0.0.1:*")
+
+
+def test_an_ipc_endpoint_is_not_taken_away_from_a_daemon_that_has_it(
+    endpoints: dict[str, str], tmp_path: Path
+) -> None:
+    with zmq.Context() as others, zmq.Context() as context:
+        first = Publisher(others, endpoints["live"], endpoints["complete"])
+        with pytest.raises(OSError, match="another daemon has it"):
+            Publisher(context, endpoints["live"], "tcp://127.0.0.1:*")
+        first.close()
+    with zmq.Context() as context:
+        Publisher(
+            context, endpoints["live"], endpoints["complete"]
+        ).close()  # what is left of it is no matter
+        with pytest.raises(OSError, match="create it"):
+            Publisher(context, f"ipc://{tmp_path}/absent/live", "tcp://127.0.0.1:*")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import socket as stdlib_socket
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import zmq
 
@@ -115,6 +117,7 @@ class Publisher:
 
 def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str) -> str:
     """Bind and return the endpoint with its real port; OSError names purpose, endpoint and remedy."""
+    _check_file(endpoint, purpose)
     try:
         socket.bind(endpoint)
     except zmq.ZMQError as error:
@@ -123,3 +126,18 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str) -> str:
             "`handtouch doctor CONFIG` tells, and [daemon] in the deployment sets another endpoint"
         ) from error
     return socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+
+def _check_file(endpoint: str, purpose: str) -> None:
+    """ZeroMQ takes an ipc endpoint away from whoever has it, and doesn't say that its folder is missing."""
+    if not endpoint.startswith("ipc:///"):
+        return
+    path = Path(endpoint.removeprefix("ipc://"))
+    if not path.parent.is_dir():
+        raise OSError(f"{purpose} can't be opened at {endpoint}: there is no folder {path.parent}; create it")
+    with stdlib_socket.socket(stdlib_socket.AF_UNIX) as probe:
+        if probe.connect_ex(str(path)) == 0:
+            raise OSError(
+                f"{purpose} can't be opened at {endpoint}: another daemon has it; stop that one, or set "
+                "another endpoint in [daemon] of the deployment"
+            )
