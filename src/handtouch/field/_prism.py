@@ -24,6 +24,7 @@ class Prism(Surface):
     aside_m: tuple[float, ...]
     up_m: tuple[float, ...]
 
+    @np.errstate(all="ignore")
     def __post_init__(self) -> None:
         check_lengths(length_m=self.length_m)
         if len(self.aside_m) < 2 or not np.isfinite(self.aside_m).all():
@@ -81,6 +82,7 @@ class Prism(Surface):
         u, v = pair(u, v)
         return +u, +v
 
+    @np.errstate(all="ignore")
     def point(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         x, y = pair(x, y)
         aside, up = self._section(y)
@@ -88,12 +90,14 @@ class Prism(Surface):
             [x - self.length_m / 2, *self._turned(aside - self._centre[0][0], up - self._centre[0][1])]
         )
 
+    @np.errstate(all="ignore")
     def tangents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         x, y = pair(x, y)
         cos, sin = self._turned(*self._faces[1][:, self._face(y)[0]])
         zero, one = np.zeros_like(x), np.ones_like(x)
         return np.stack([np.stack([one, zero, zero]), np.stack([zero, cos, sin])])
 
+    @np.errstate(all="ignore")
     def normal(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         _, (zero, cos, sin) = self.tangents(x, y)
         return np.stack([zero, -sin, cos])

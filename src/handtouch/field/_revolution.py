@@ -95,6 +95,7 @@ class SplineProfile:
     The axis is taken in the direction of travel, so that the outside is always the side away from it.
     """
 
+    @np.errstate(all="ignore")
     def __init__(self, axial: FloatArray, radius: FloatArray) -> None:
         forward = 1.0 if axial[-1] >= axial[0] else -1.0
         # a power of two brings any unit near 1, so that no square or quotient leaves the range of doubles

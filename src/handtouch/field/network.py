@@ -121,6 +121,7 @@ class ElectrodeNetwork:
         with np.errstate(all="ignore"):  # NaN in gives NaN out
             return np.asarray(self._potentials.potentials(self._to_disc(x, y))[self._place])
 
+    @np.errstate(all="ignore")
     def fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Measured fractions of the contact's current, resistors included, shape (m, ...), summing to 1."""
         return self._mixed(self.ideal_fractions(x, y))
@@ -129,11 +130,11 @@ class ElectrodeNetwork:
         """`fractions`, by its other name."""
         return self.fractions(x, y)
 
+    @np.errstate(all="ignore")
     def fractions_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """`fractions` (m, ...), their derivatives by (x, y) (m, 2, ...), unbounded at electrodes' ends."""
         ideal, jacobian = self._ideal_with_jacobian(self._to_disc(x, y))
-        with np.errstate(over="ignore"):
-            return self._mixed(ideal), self._mixed(jacobian) / self._unit
+        return self._mixed(ideal), self._mixed(jacobian) / self._unit
 
     def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """R of a place: the sheet's resistance there is sheet / (2 pi) ln(R / A) to a contact of radius A.
@@ -147,6 +148,7 @@ class ElectrodeNetwork:
             radius = self._disc.radius(defects) * np.exp(self._potentials.log_spread(defects))
             return np.asarray(radius * self._unit)
 
+    @np.errstate(all="ignore")
     def series_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """What the resistors add between a contact and ground [ohm], shape (...): sum of phi_i V_i."""
         ideal = self.ideal_fractions(x, y)
@@ -164,6 +166,7 @@ class ElectrodeNetwork:
             )
         return np.asarray(self._unmix.T * np.asarray(self.series_ohm))
 
+    @np.errstate(all="ignore")
     def locate(self, currents: npt.ArrayLike) -> Location:
         """The point contact that sends `currents` (m, ...), the exact inverse of `currents`.
 
@@ -180,13 +183,11 @@ class ElectrodeNetwork:
             raise ValueError("locate needs a connected electrode on every side; estimate does not")
         shape = currents.shape[1:]
         flat = currents.reshape(currents.shape[0], -1)
-        with np.errstate(all="ignore"):
-            total = flat.sum(axis=0)
-            measured = self._side_sums @ (self._unmix @ (flat / total))
+        total = flat.sum(axis=0)
+        measured = self._side_sums @ (self._unmix @ (flat / total))
         x, y = self._newton(self._side_sums, measured)
         expected = self.ideal_fractions(x, y)
-        with np.errstate(all="ignore"):
-            residual = measured[:2].sum(axis=0) - (self._side_sums[:2] @ expected).sum(axis=0)
+        residual = measured[:2].sum(axis=0) - (self._side_sums[:2] @ expected).sum(axis=0)
         return Location(*(v.reshape(shape)[()] for v in (x, y, total, residual)))
 
     def estimate(
@@ -195,6 +196,7 @@ class ElectrodeNetwork:
         """The maximum-likelihood contact from all noisy currents (m, ...); see `handtouch.field.estimate`."""
         return estimate(self, currents, noise, start)
 
+    @np.errstate(all="ignore")
     def _build(
         self,
         a: float,
@@ -223,6 +225,7 @@ class ElectrodeNetwork:
         self._side_sums = sums if sums.any(axis=1).all() else None
         self._connect(series_ohm)
 
+    @np.errstate(all="ignore")
     def _connect(self, series_ohm: Sequence[float]) -> None:
         """Matrices of the resistors: currents from phi and back, and voltages per ampere from phi."""
         resistance = np.asarray(series_ohm, np.float64)

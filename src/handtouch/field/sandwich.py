@@ -87,6 +87,7 @@ class Sandwich:
                 )
         return np.stack(currents)
 
+    @np.errstate(all="ignore")
     def force(
         self,
         currents_a: npt.ArrayLike,
@@ -111,34 +112,33 @@ class Sandwich:
             for v in (spreading_radius_m, series_ohm, drive_v)
         )
         noise = np.broadcast_to(np.asarray(current_std_a, np.float64), currents.shape).reshape(2, -1)
-        with np.errstate(all="ignore"):
-            read = currents.reshape(2, -1)
-            current = np.where(read > 0, read, np.nan)
-            whole = 2 * np.pi / sheets * drive / current
-            resistors, largest = 2 * np.pi / sheets * series, np.log(outer) - np.log(LEAST_RATIO)
-            stack = whole - resistors - np.log(outer)  # and ln radius
-            least = _NEAR * (np.log(LEAST_RATIO) + resistors) - largest
-            beyond = (stack < least).any(axis=0)
-            log_radius, bounded = self._common_radius(np.maximum(stack, least), largest, beyond)
-            # where both sheets are near their limits, the force at which they come near is all that is known
-            near = _NEAR / (1 + _NEAR) * whole - log_radius
-            limited = beyond | (stack < near).all(axis=0)
-            log_force, by_radius, by_stack = self._log_force(
-                np.where(limited, np.maximum(np.maximum(stack, least), near), stack), log_radius
-            )
-            force, radius = np.exp(log_force[0]), np.exp(log_radius)
-            saturated = limited | bounded
-            force = np.where(saturated, np.exp(log_force.max(axis=0)), force)
-            by_current = -by_stack * whole  # d ln force / d ln current at given radius
-            radius_rate = np.stack([-by_current[0], by_current[1]]) / (by_radius[0] - by_radius[1])
-            force_rate = by_radius[0] * radius_rate + np.stack([by_current[0], np.zeros_like(by_current[0])])
-            rates = np.stack([force * force_rate, radius * radius_rate]) * noise / current
-            covariance = np.einsum("ikn,jkn->nij", rates, rates)
-            covariance[saturated] = [[np.inf, 0.0], [0.0, np.inf]]
-            status = np.where(
-                np.isfinite(force), np.where(saturated, Status.SATURATED, Status.VALID), Status.INVALID
-            )
-            status = np.where((read <= SURE * noise).any(axis=0), Status.BELOW, status)
+        read = currents.reshape(2, -1)
+        current = np.where(read > 0, read, np.nan)
+        whole = 2 * np.pi / sheets * drive / current
+        resistors, largest = 2 * np.pi / sheets * series, np.log(outer) - np.log(LEAST_RATIO)
+        stack = whole - resistors - np.log(outer)  # and ln radius
+        least = _NEAR * (np.log(LEAST_RATIO) + resistors) - largest
+        beyond = (stack < least).any(axis=0)
+        log_radius, bounded = self._common_radius(np.maximum(stack, least), largest, beyond)
+        # where both sheets are near their limits, the force at which they come near is all that is known
+        near = _NEAR / (1 + _NEAR) * whole - log_radius
+        limited = beyond | (stack < near).all(axis=0)
+        log_force, by_radius, by_stack = self._log_force(
+            np.where(limited, np.maximum(np.maximum(stack, least), near), stack), log_radius
+        )
+        force, radius = np.exp(log_force[0]), np.exp(log_radius)
+        saturated = limited | bounded
+        force = np.where(saturated, np.exp(log_force.max(axis=0)), force)
+        by_current = -by_stack * whole  # d ln force / d ln current at given radius
+        radius_rate = np.stack([-by_current[0], by_current[1]]) / (by_radius[0] - by_radius[1])
+        force_rate = by_radius[0] * radius_rate + np.stack([by_current[0], np.zeros_like(by_current[0])])
+        rates = np.stack([force * force_rate, radius * radius_rate]) * noise / current
+        covariance = np.einsum("ikn,jkn->nij", rates, rates)
+        covariance[saturated] = [[np.inf, 0.0], [0.0, np.inf]]
+        status = np.where(
+            np.isfinite(force), np.where(saturated, Status.SATURATED, Status.VALID), Status.INVALID
+        )
+        status = np.where((read <= SURE * noise).any(axis=0), Status.BELOW, status)
         return SandwichStrength(
             force.reshape(shape),
             radius.reshape(shape),

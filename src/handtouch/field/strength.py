@@ -58,9 +58,7 @@ class Status(IntEnum):
     """What a force is worth."""
 
     VALID = 0
-    SATURATED = (
-        1  # the sheet carries what it can: the force is a lower bound, its standard deviation infinite
-    )
+    SATURATED = 1  # the sheet carries what it can: force_n is a lower bound (2 sigma), std_n infinite
     BELOW = 2  # not told from nothing, or below the threshold of useful response
     INVALID = 3  # an input was NaN, or no contact carries such a current
 
@@ -69,9 +67,9 @@ class Status(IntEnum):
 class Strength:
     """Force of contacts; arrays of one shape (...).
 
-    force_n: newton; a lower bound where saturated, 0 where no current flows. std_n: its standard deviation
-    from noise of the current, of the radius and of the place. status: of `Status`. radius_m: the contact
-    radius that the law assumed.
+    force_n: newton; where saturated a lower bound of 2 sigma, 0 where no current flows. std_n: its standard
+    deviation from noise of the current, of the radius and of the place. status: of `Status`. radius_m: the
+    contact radius that the law assumed.
     """
 
     force_n: FloatArray
@@ -121,21 +119,22 @@ class ContactLaw:
         law.__dict__.update(taken, hertz_n=self.hertz_n, _terms=self._terms.take(index))
         return law
 
+    @np.errstate(all="ignore")
     def radius(self, force_n: npt.ArrayLike) -> FloatArray:
         """Radius of the contact [m] at a force [N]."""
         force = np.asarray(force_n, np.float64)
         radius = np.asarray(self.radius_m, np.float64)
         if self.hertz_n is None:
-            return np.asarray(radius + 0 * force)
+            return np.asarray(np.where(np.isnan(force), np.nan, radius))
         return np.asarray(radius * np.cbrt(force / self.hertz_n))
 
+    @np.errstate(all="ignore")
     def resistivity(self, force_n: npt.ArrayLike) -> FloatArray:
         """Specific resistance of the layer [ohm m^2] under a force [N]; infinite under none."""
         force = np.asarray(force_n, np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pressure = np.where(force == 0, 0.0, force / (np.pi * self.radius(force) ** 2))
-            ratio = np.asarray(self.reference_pa, np.float64) / pressure
-            return np.asarray(np.asarray(self.contact_ohm_m2, np.float64) * ratio ** np.asarray(self.alpha))
+        pressure = np.where(force == 0, 0.0, force / (np.pi * self.radius(force) ** 2))
+        ratio = np.asarray(self.reference_pa, np.float64) / pressure
+        return np.asarray(np.asarray(self.contact_ohm_m2, np.float64) * ratio ** np.asarray(self.alpha))
 
     def current(
         self,
@@ -174,8 +173,9 @@ class ContactLaw:
         standard deviation of ln R, from that of the place. threshold_n: least force of useful response. All
         broadcast to the answer's shape.
 
-        Where the current, or current and noise, reach what the sheet can carry, the force is `SATURATED`: a
-        lower bound. Contacts nearer an edge than their own radius are weighed as if at that distance.
+        Where the current, or the current and two standard deviations of noise, reach what the sheet can
+        carry, the force is `SATURATED`: a lower bound with a margin of two standard deviations (of noise,
+        place and radius). Contacts nearer an edge than their own radius are weighed as if at that distance.
         """
         terms = self._terms
         with np.errstate(all="ignore"):
@@ -221,6 +221,7 @@ class ContactLaw:
         return spread, stack_factor(np.exp(beyond / (2 * self._terms.growth))) - beyond
 
     @cached_property
+    @np.errstate(all="ignore")
     def _terms(self) -> _Terms:
         layer, alpha, radius, spread, reference = (
             np.asarray(getattr(self, name), np.float64) for name in _COLUMNS

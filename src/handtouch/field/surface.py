@@ -308,6 +308,7 @@ class Anisotropic(Surface):
     def from_rectangle(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         return self.surface.from_rectangle(self._relaxed(x), y)
 
+    @np.errstate(all="ignore")
     def to_rectangle(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         x, y = self.surface.to_rectangle(u, v)
         return np.asarray(x * self._stretch), y
@@ -321,6 +322,7 @@ class Anisotropic(Surface):
     def normal(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         return self.surface.normal(self._relaxed(x), y)
 
+    @np.errstate(all="ignore")
     def scales(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         along, around = self.surface.scales(self._relaxed(x), y)
         return np.stack([along / self._stretch, around])
