@@ -255,8 +255,8 @@ def _trouble_opening_raw() -> tuple[str, str] | None:
             )
         return (
             f"the kernel has no SocketCAN ({error.strerror})",
-            "modprobe can_raw; where the kernel is built without it, as in many containers, another interface "
-            "works: --bus NAME=udp_multicast:239.74.163.2, or slcan with a serial adapter",
+            "modprobe can_raw; where the kernel is built without it, as in many containers, another "
+            "interface works: --bus NAME=udp_multicast:239.74.163.2, or slcan with a serial adapter",
         )
     return None
 
