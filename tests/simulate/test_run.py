@@ -216,6 +216,39 @@ def test_a_run_ends_by_itself_after_its_seconds(files: Path) -> None:
     assert time.monotonic() - begin < 10
 
 
+def test_a_bus_without_sync_is_told_with_who_must_send_it(
+    files: Path, deployment_text: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulate_run, "_STATUS_EVERY_S", 0.01)
+    consumer = deployment_text.replace('name = "far"', 'name = "far"\nsync = "consumer"')
+    (files / "hand.toml").write_text(consumer)
+    assert run(files / "hand.toml", seconds=0.2, stop=threading.Event()) == 0
+    said = capsys.readouterr().out
+    assert 'no SYNC yet: on near `handtouch run` sends it (sync = "producer")' in said
+    assert 'no SYNC yet: on far somebody else must send it (sync = "consumer")' in said
+
+
+def test_a_hand_that_hears_sync_on_every_bus_says_nothing_of_it(deployment: config.Deployment) -> None:
+    with (
+        master(deployment, 0) as near,
+        master(deployment, 1) as far,
+        SimulatedHand.open(deployment, Scenario.tour(deployment), IDEAL) as hand,
+    ):
+        hand.start()
+        near.send(0, 1, 0)
+        near.sync(2)
+        assert hand.without_sync == ["far"]
+        far.send(0, 1, 0)
+        far.sync(2)
+        assert hand.without_sync == []
+
+
+def test_a_negative_seed_is_named() -> None:
+    for make in (World, World.ideal_parts):
+        with pytest.raises(ValueError, match="seed = -1: must be 0 or more"):
+            make(seed=-1)
+
+
 @pytest.mark.parametrize(
     ("change", "status", "words"),
     [

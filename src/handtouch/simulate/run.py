@@ -67,7 +67,7 @@ class SimulatedHand:
             for bus, virtual in zip(buses, virtuals, strict=True):
                 wire = open_bus(bus)
                 opened.callback(wire.shutdown)
-                stages.append(_Stage(deployment, wire, virtual, start, record))
+                stages.append(_Stage(deployment, bus.name, wire, virtual, start, record))
             return cls(stages, opened.pop_all())
 
     def start(self) -> None:
@@ -94,6 +94,11 @@ class SimulatedHand:
     def syncs(self) -> int:
         """SYNCs answered, all buses together."""
         return sum(stage.nodes.syncs for stage in self._stages)
+
+    @property
+    def without_sync(self) -> list[str]:
+        """Names of the buses on which no SYNC has come yet."""
+        return [stage.name for stage in self._stages if not stage.nodes.syncs]
 
     def __enter__(self) -> Self:
         return self
@@ -122,11 +127,13 @@ class _Stage:
     def __init__(
         self,
         deployment: config.Deployment,
+        name: str,
         bus: can.BusABC,
         virtual: VirtualHand,
         start: _Start,
         record: bool,
     ) -> None:
+        self.name = name
         self.times_ns: deque[int] = deque()
         self.devices: dict[str, Device] = {}
         self._virtual, self._start, self._record = virtual, start, record
@@ -213,7 +220,8 @@ def _play(
         if seconds is not None and now_s - begin_s >= seconds:
             break
         if now_s - told_s >= _STATUS_EVERY_S:
-            print(_status(hand, now_s - begin_s, (hand.syncs - told_syncs) / (now_s - told_s)), flush=True)
+            rate_hz = (hand.syncs - told_syncs) / (now_s - told_s)
+            print(_status(hand, deployment, now_s - begin_s, rate_hz), flush=True)
             told_s, told_syncs = now_s, hand.syncs
     hand.stop()
     if file:  # not before: working it out would hold up the nodes
@@ -221,11 +229,21 @@ def _play(
     print(f"{hand.syncs} SYNCs answered", flush=True)
 
 
-def _status(hand: SimulatedHand, since_s: float, rate_hz: float) -> str:
+def _status(hand: SimulatedHand, deployment: config.Deployment, since_s: float, rate_hz: float) -> str:
     states = [device.state for device in hand.devices.values()]
-    return (
-        f"{since_s:6.0f} s  {rate_hz:5.0f} SYNC/s  {states.count('OPERATIONAL')} of {len(states)} operational"
-    )
+    parts = [
+        f"{since_s:6.0f} s",
+        f"{rate_hz:5.0f} SYNC/s",
+        f"{states.count('OPERATIONAL')} of {len(states)} operational",
+    ]
+    silent = hand.without_sync
+    for sync, sender in (
+        ("producer", "`handtouch run` sends it"),
+        ("consumer", "somebody else must send it"),
+    ):
+        if names := [bus.name for bus in deployment.buses if bus.name in silent and bus.sync == sync]:
+            parts.append(f'no SYNC yet: on {", ".join(names)} {sender} (sync = "{sync}")')
+    return "  ".join(parts)
 
 
 def _usual(deployment: config.Deployment) -> Scenario:

@@ -33,7 +33,8 @@ class Parts:
 class World:
     """How reality differs from the deployment file; the same seed makes the same world.
 
-    Parts are spread evenly within their tolerances, contact radii normally.
+    Parts are spread evenly within their tolerances, contact radii normally. Raises ValueError for a seed
+    below 0.
     """
 
     seed: int = 1
@@ -44,6 +45,10 @@ class World:
     resistor_tolerance: float = 0.05
     radius_spread: float = 1.0
     """Standard deviation of a contact's radius, in units of the sheet's contact_radius_std_mm."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"seed = {self.seed}: must be 0 or more")
 
     @classmethod
     def ideal_parts(cls, seed: int = 1) -> World:
