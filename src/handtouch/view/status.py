@@ -49,8 +49,8 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         problem = f" [red]{bus['problem']}[/red]" if bus["problem"] else ""
         console.print(f"bus {name}: load {100 * bus['load']:.0f} %, {counts}{problem}")
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in ("link", "pad", "node", "id", "serial", "Hz", "missed", "reboots", "why"):
-        number = column in ("id", "serial", "Hz", "missed", "reboots")
+    for column in ("link", "pad", "node", "id", "serial", "Hz", "missed", "beats missed", "reboots", "why"):
+        number = column in ("id", "serial", "Hz", "missed", "beats missed", "reboots")
         table.add_column(column, justify="right" if number else "left", no_wrap=column != "why")
     for pad in answer["pads"]:
         table.add_row(
@@ -61,6 +61,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
             "" if pad["serial"] is None else str(pad["serial"]),
             f"{pad['rate_hz']:.0f}",
             str(pad["missed"]),
+            str(pad["heartbeats_missed"]),
             str(pad["reboots"]),
             "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]])),
         )
