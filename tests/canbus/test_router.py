@@ -45,8 +45,18 @@ def test_fresh_counts_pads_not_samples_and_starts_again_with_each_cycle() -> Non
     slab.write(0, bytes(8), 2)
     slab.write(2, bytes(8), 3)
     assert slab.fresh_count == 2
-    slab.begin_cycle()
+    slab.begin_cycle(4)
     assert (slab.fresh_count, slab.fresh.tolist()) == (0, [0, 0, 0])
+
+
+def test_sample_that_overtakes_the_news_of_its_sync_is_fresh_in_that_cycle() -> None:
+    slab = Slab(3)
+    slab.write(0, bytes(8), 4)
+    slab.write(1, bytes(8), 6)
+    slab.begin_cycle(5)
+    assert (slab.fresh_count, slab.fresh.tolist()) == (1, [0, 1, 0])
+    slab.write(1, bytes(8), 7)
+    assert slab.fresh_count == 1
 
 
 def test_route_can_be_taken_away() -> None:

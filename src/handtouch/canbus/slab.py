@@ -36,6 +36,6 @@ class Slab:
             self.fresh_count += 1
 
     def begin_cycle(self, t_ns: int) -> None:
-        """A SYNC at `t_ns`: fresh is from here on what arrived since then, some of which may be here already."""
+        """A SYNC at `t_ns`: fresh is what arrived since then, some of which may be here already."""
         np.greater_equal(self.t_ns, t_ns, out=self.fresh, casting="unsafe")
         self.fresh_count = int(np.count_nonzero(self.fresh))
