@@ -133,6 +133,46 @@ def test_location_survives_the_way_there_and_back(
     assert abs(where.residual) < 1e-10
 
 
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(("aspect", "error"), [(5.0, 1e-10), (8.0, 2e-9), (10.0, 2e-8), (14.0, 2e-5)])
+def test_long_pads_are_located_as_well_as_the_near_currents_hold_them(
+    aspect: float, error: float, turned: bool
+) -> None:
+    a, b = (1.0, aspect) if turned else (aspect, 1.0)
+    s, t = np.random.default_rng(5).uniform(0.03, 0.97, (2, 1000))
+    for gap in (0.01, 0.1):
+        pad = ElectrodeNetwork(a, b, gap, SHEET)
+        where = pad.locate(pad.currents(s * a, t * b))
+        assert np.hypot(where.x - s * a, where.y - t * b).max() < error
+        assert np.abs(where.residual).max() < 1e-12
+
+
+def test_a_coordinate_that_is_not_held_leaves_the_other_alone() -> None:
+    s, t = np.random.default_rng(6).uniform(0.03, 0.97, (2, 1000))
+    pad = ElectrodeNetwork(20.0, 1.0, 0.1, SHEET)
+    where = pad.locate(pad.currents(20 * s, t))
+    middle, ends = np.abs(s - 0.5) < 0.03, np.abs(s - 0.5) > 0.1
+    assert np.isnan(where.x[middle]).all()
+    assert np.abs(where.x - 20 * s)[ends].max() < 1e-3
+    assert np.abs(where.y - t).max() < 1e-12
+
+
+def test_an_iteration_that_does_not_settle_gives_no_place() -> None:
+    """Gaps of 45 %: small electrodes, where Newton's method from the ideal place may go round."""
+    pad = network(1.0, 0.45)
+    s, t = np.random.default_rng(7).uniform(0.0, 1.0, (2, 5000))
+    where = pad.locate(pad.currents(s, t))
+    known = np.isfinite(where.x)
+    assert known.mean() > 0.95
+    assert np.hypot(where.x - s, where.y - t)[known].max() < 1e-7
+
+
+def test_currents_of_no_point_have_no_place() -> None:
+    where = network(1.0, 0.05).locate(np.array([[0.0, 0.3], [0.3, -1e-3], [0.4, 0.3], [0.3, 0.4]]))
+    assert np.isnan(where.x).all()
+    assert np.isnan(where.y).all()
+
+
 @pytest.mark.parametrize("aspect", [0.05, 0.7, 1.0, 4.0, 40.0])
 def test_without_gaps_it_is_the_ideal_rectangle(aspect: float) -> None:
     pad, ideal = network(aspect, 0.0), Rectangle(aspect, 1.0)

@@ -30,9 +30,12 @@ Side = Literal["x0", "xa", "y0", "yb"]
 
 SIDES: tuple[Side, ...] = ("x0", "xa", "y0", "yb")
 LONGEST_ASPECT = 50.0
-_STEPS = 30
+_STEPS = 45
 _SETTLED = 1e-8  # of a side; Newton's next step would be its square
-_LEAST = 1e-13  # a smaller fraction holds no digits of a place
+_LEAST = 1e-12  # where both fractions of a coordinate are smaller they do not hold it
+_SMALL = 1e-5  # a smaller fraction is left out where the opposite side has ten times as much
+_ROUNDING = 2e-15  # of a fraction, at most: steps that come from it say nothing
+_FLOOR = 1e-17  # what starts the search where a fraction is rounding
 
 
 @dataclass(frozen=True)
@@ -171,11 +174,12 @@ class ElectrodeNetwork:
         """The point contact that sends `currents` (m, ...), the exact inverse of `currents`.
 
         x follows from the currents of sides x0 and xa, y from those of y0 and yb, resistors undone, as in
-        `Rectangle.locate`, to which this tends for small gaps; the residual is what is left. Error, 3 % or
-        farther from the edges: 1e-12 of the short side up to 3:1, 1e-9 at 5:1, 1e-3 at 10:1, as the far
-        electrode's fraction sinks towards rounding. NaN where an undone fraction is less than 1e-13, or no
-        point of the pad fits. Raises ValueError if a side has no electrode, or an electrode floats: see
-        `estimate`.
+        `Rectangle.locate`, to which this tends for small gaps; the residual is what is left. Where the far
+        side's fraction is below 1e-5 and a tenth of the near one's, the near side decides alone, so the error
+        is rounding over the near fraction: for gaps of 10 %, 3 % or farther from the edges, 1e-12 of the
+        short side up to 3:1, 1e-10 at 5:1, 1e-8 at 10:1. NaN for a coordinate whose sides both have less than
+        1e-12 (mid-length of a pad of 20:1), for both where no point of the pad fits or the iteration does
+        not settle. Raises ValueError if a side has no electrode, or an electrode floats: see `estimate`.
         """
         currents = np.asarray(currents, np.float64)
         self._check_channels(currents)
@@ -275,40 +279,70 @@ class ElectrodeNetwork:
             )
 
     def _newton(self, sums: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """x and y (n,) where side sums (4, n) are as measured, from where a pad without gaps has them."""
-        start = self._rectangle.locate(measured)
+        """x and y (n,) where side sums (4, n) are as measured, from where a pad without gaps has them.
+
+        A coordinate whose two sums are below rounding is NaN; one where only the far sum is, or is nearly,
+        follows from the near sum alone.
+        """
+        held, weights = _weights(measured)
+        start = self._rectangle.locate(np.where(np.abs(measured) < _LEAST, _FLOOR, measured))
         sides = np.array([[self.a], [self.b]]) / self._unit
         inset = 1e-9 * sides
         far = sides - inset
-        at = np.clip(np.stack([start.x, start.y]) / self._unit, inset, far)
-        wanted, _ = _log_ratios(measured)
+        at = np.where(held, np.stack([start.x, start.y]) / self._unit, sides / 2)
+        at = np.clip(at, inset, far)
+        wanted = _weighted(weights, _log_tangents(measured)[0])
         settled = np.zeros(at.shape[1], bool)
-        for _ in range(_STEPS):
+        rounding = _ROUNDING / np.maximum(measured[::2], measured[1::2]) * sides.min()
+        enough = _SETTLED * sides + np.where(held, rounding, 0.0)
+        for step_number in range(_STEPS):
             moving = np.flatnonzero(~settled & np.isfinite(at).all(axis=0))
             if moving.size == 0:
                 break
             values, jacobian = self._ideal_with_jacobian(self._disc.defects(*at[:, moving]))
-            ratios, slopes = _log_ratios(sums @ values)
+            logs, slopes = _log_tangents(sums @ values)
             rates = slopes[:, None] * np.tensordot(sums, jacobian, axes=1)
-            (xx, xy), (yx, yy) = rates[1] - rates[0], rates[3] - rates[2]
-            miss_x, miss_y = wanted[:, moving] - ratios
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - yx * miss_x]) / (xx * yy - xy * yx)
+            active, known = weights[:, moving], held[:, moving]
+            rates_of = [_weighted(active, rates[:, axis]) for axis in range(2)]
+            xx, yx = (np.where(known[i], rates_of[0][i], 1.0 - i) for i in range(2))
+            xy, yy = (np.where(known[i], rates_of[1][i], float(i)) for i in range(2))
+            miss_x, miss_y = np.where(known, wanted[:, moving] - _weighted(active, logs), 0.0)
+            step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - yx * miss_x]) / (xx * yy - xy * yx)
+            if step_number > _STEPS / 3:  # it may go round in circles
+                step *= np.where((np.abs(step) > sides / 100).any(axis=0), 0.5, 1.0)
             new = np.clip(at[:, moving] + np.clip(step, -far / 4, far / 4), inset, far)
-            settled[moving] = (np.abs(new - at[:, moving]) < _SETTLED * sides).all(axis=0)
+            settled[moving] = (np.abs(new - at[:, moving]) < enough[:, moving]).all(axis=0)
             at[:, moving] = new
-        on_edge = ((at == inset) | (at == far)).any(axis=0)
-        at[:, on_edge] = np.nan
-        at *= self._unit
+        on_edge = (held & ((at == inset) | (at == far))).any(axis=0)
+        at[:, on_edge | ~settled] = np.nan
+        # a sum that was left out must be as small there as it was measured
+        left_out = (weights == 0) & (
+            sums @ self._ideal_with_jacobian(self._disc.defects(*at))[0] > 10 * _SMALL
+        )
+        at = np.where(held & ~left_out.any(axis=0), at, np.nan) * self._unit
         return at[0], at[1]
 
 
-def _log_ratios(sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """ln of tan(pi f / 2) of the far side over that of the near one, (2, n), and d ln tan / df (4, n)."""
-    with np.errstate(all="ignore"):
-        sides = np.where(sides > _LEAST, sides, np.nan)
-        logs = np.log(np.tan(np.pi / 2 * sides))
-        return np.stack([logs[1] - logs[0], logs[3] - logs[2]]), np.pi / np.sin(np.pi * sides)
+def _weights(sides: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+    """Which coordinates the sums of sides hold (2, n), and by what each sum counts (4, n): 0 or 1."""
+    weights = []
+    for near, far in ((0, 1), (1, 0), (2, 3), (3, 2)):
+        vain = (sides[near] < _SMALL) & (sides[near] < sides[far] / 10)
+        weights.append(np.where(vain & (sides[near] > -_LEAST), 0.0, 1.0))
+    least = np.maximum(np.abs(sides[::2]), np.abs(sides[1::2]))
+    return ~(least < _LEAST), np.stack(weights)
+
+
+def _weighted(weights: FloatArray, sides: FloatArray) -> FloatArray:
+    """Far side less near side of either pair, (2, n), without those of weight 0."""
+    counted = np.where(weights > 0, sides, 0.0)
+    return np.asarray(counted[1::2] - counted[::2])
+
+
+def _log_tangents(sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """ln tan(pi f / 2) of every side (4, n), NaN where f holds no digits, and its derivative by f."""
+    sides = np.where(sides > _LEAST / 100, sides, np.nan)
+    return np.log(np.tan(np.pi / 2 * sides)), np.pi / np.sin(np.pi * sides)
 
 
 def _counter_clockwise(electrodes: Sequence[Electrode], a: float, b: float) -> list[int]:
