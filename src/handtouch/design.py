@@ -113,6 +113,7 @@ def draw_map(pad: PadDesign) -> Figure:
         bar.ax.minorticks_off()
         bar.set_ticks(levels)
         bar.ax.tick_params(labelsize=8)
+        bar.set_label("expected error, mm", fontsize=8)
         middle, worst = (1e3 * value for value in summary_of(pad, force))
         title = f"{force:g} N: median {middle:.2g}, worst {worst:.2g} mm"
         tidy(axes, title, "from electrode x0, mm", "from the middle, mm")
@@ -196,21 +197,21 @@ def design_of(deployment: config.Deployment, link: str | None = None) -> PadDesi
 def run(config_path: Path, out: Path, *, link: str | None = None) -> int:
     """`handtouch design CONFIG`: draw one pad and say where; exit status.
 
-    2 for a file or a link that is wrong, 1 without matplotlib.
+    2 for a file or a link that is wrong, 1 without matplotlib or where `out` cannot be written.
     """
     try:
         pad = design_of(config.load(config_path), link)
     except (config.ConfigError, ValueError) as problem:
         print(f"handtouch design: {problem}", file=sys.stderr)
         return 2
-    out.mkdir(parents=True, exist_ok=True)
     drawings: dict[str, Callable[[PadDesign], Figure]] = {"error": draw_map, "choices": draw_choices}
     try:
+        out.mkdir(parents=True, exist_ok=True)
         for kind, draw in drawings.items():
             path = out / f"{pad.name}_{kind}.png"
             draw(pad).savefig(path, dpi=DPI)
             print(path)
-    except ImportError as problem:
+    except (ImportError, OSError) as problem:
         print(f"handtouch design: {problem}", file=sys.stderr)
         return 1
     for force in (pad.light_n, FIRM_N):

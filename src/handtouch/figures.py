@@ -5,6 +5,7 @@ Public names: `draw_figures`, `run`. Needs matplotlib, the extra `figures`.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,8 +58,8 @@ def run(out: Path) -> int:
     """`handtouch figures`: draw, and say where; exit status."""
     try:
         paths = draw_figures(out)
-    except ImportError as problem:
-        print(problem)
+    except (ImportError, OSError) as problem:
+        print(f"handtouch figures: {problem}", file=sys.stderr)
         return 1
     for path in paths:
         print(path)
@@ -136,7 +137,7 @@ def _linearised_errors() -> Figure:
 
 def _current_against_area() -> Figure:
     """Fig. 4: eq. 11 over four decades of radius."""
-    figure = new_figure(4.6, 5.6)
+    figure = new_figure(5.6, 5.6)
     axes = figure.subplots()
     outer = 1.0
     radius = np.geomspace(0.4e-4, 0.4, 300) * outer
@@ -145,7 +146,7 @@ def _current_against_area() -> Figure:
     axes.loglog(area, area / 1e-3, "--", color=FAINT, linewidth=1, label="contact alone: unit slope")
     limit = 2 * np.pi / np.log(outer / radius)
     axes.loglog(area, limit, ":", color=FAINT, linewidth=1.2, label="sheet alone")
-    axes.set(ylim=(1e-6, 30), aspect="equal")
+    axes.set(xlim=(area[0], area[-1]), ylim=(3e-6, 30))
     axes.legend(fontsize=8, frameon=False, loc="lower right")
     tidy(
         axes,
@@ -227,12 +228,12 @@ def _resistance_of_the_plane() -> Figure:
     fraction = 0.5 + position / SQUARE_M
     pad = ElectrodeNetwork(SQUARE_M, SQUARE_M, GAP_M, SHEET_OHM)
     radius = pad.spreading_radius(fraction * SQUARE_M, np.full_like(fraction, SQUARE_M / 2))
-    for limit, colour in ((45, INK), (531, ACCENT)):
+    for limit, colour, shade_of_sum in ((45, INK, "#c9c9c9"), (531, ACCENT, "#bcd9ef")):
         plane = _double_sum(fraction, limit)
         contact = radius[120] * np.exp(-2 * np.pi * plane[120])  # the disc that has as much in the middle
         closed = np.log(radius / contact) / (2 * np.pi)
         for curve, shade, width, text in (
-            (plane, "#c9c9c9", 4.0, f"eq. 2, cut off at {limit} terms"),
+            (plane, shade_of_sum, 4.0, f"eq. 2, cut off at {limit} terms"),
             (closed, colour, 1.2, f"ln(R / A) / 2 pi, A = {1e3 * contact:.2f} mm"),
         ):
             kohm = (SHEET_OHM * curve + PLUG_OHM) / 1e3

@@ -34,7 +34,17 @@ def test_without_matplotlib_the_extra_is_named(
 
     monkeypatch.setattr(builtins, "__import__", refuse)
     assert figures.run(tmp_path) == 1
-    assert "handtouch[figures]" in capsys.readouterr().out
+    assert "handtouch[figures]" in capsys.readouterr().err
+
+
+def test_where_nothing_can_be_written_one_line_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert figures.run(tmp_path / "file" / "folder") == 1
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "folder" in said
 
 
 def test_the_cut_off_sum_of_fig_7_is_a_contact_radius() -> None:

@@ -87,3 +87,13 @@ def test_a_wrong_file_or_link_is_a_matter_of_usage(
     assert "none.toml" in said
     assert "tail" in said
     assert "thumb_distal" in said
+
+
+def test_where_nothing_can_be_written_one_line_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert design.run(CONFIG, tmp_path / "file" / "folder") == 1
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "folder" in said
