@@ -363,7 +363,8 @@ def arguments() -> Iterator[Row]:
         together = np.asarray(function(x, y), float)
         for i in range(x.size):
             alone = np.asarray(function(x[[i]], y[[i]]), float)[..., 0]
-            same = np.isclose(together[..., i], alone, rtol=1e-12, atol=1e-14, equal_nan=True)
+            with np.errstate(under="ignore"):  # of the comparison itself
+                same = np.isclose(together[..., i], alone, rtol=1e-12, atol=1e-14, equal_nan=True)
             worst.add(0.0 if same.all() else math.inf, 1, (name, x[i], y[i]))
         plain = np.asarray(function(xs.astype(float), 0.5), float)
         same32 = np.array_equal(np.asarray(function(xs, 0.5)), plain, equal_nan=True)
