@@ -18,7 +18,26 @@ from handtouch.client import Subscriber
 def _parts(seq: int, link: str = "thumb", repeat: bool = False) -> list[bytes]:
     return wire.encode(
         wire.Health(
-            1, seq, 1, "h", link, "can0", 1, "clear", "operational", 0, "", None, 0.0, 0, 0, None, 0, 0, (), repeat
+            1,
+            seq,
+            1,
+            "h",
+            link,
+            "can0",
+            1,
+            "clear",
+            "operational",
+            0,
+            "",
+            None,
+            0.0,
+            0,
+            0,
+            None,
+            0,
+            0,
+            (),
+            repeat,
         )
     )
 
