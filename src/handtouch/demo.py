@@ -57,23 +57,28 @@ def run(
         signal.signal(number, lambda *_: stop.set())
     sys.setswitchinterval(_GIL_SWITCH_S)
     print("building the simulated hand ...", file=sys.stderr)
-    hand = SimulatedHand.open(
-        deployment, scenario, World(seed=seed) if tolerances else World.ideal_parts(seed)
-    )
     display = (
         LineDisplay() if plain or not sys.stdout.isatty() else LiveDisplay("handtouch demo: Ctrl-C ends it")
     )
     keeper = _Keeper(display)
-    with Daemon(deployment) as daemon, _subscribe(daemon) as messages:
-        hand.start()
-        served = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
-        served.start()
-        end_s = time.monotonic() + (seconds or scenario.duration_s + _BOOT_S)
-        with keeper:
-            follow(messages, keeper, lambda: stop.is_set() or time.monotonic() > end_s)
-        stop.set()
-        served.join()
-    hand.stop()
+    try:
+        hand = SimulatedHand.open(
+            deployment, scenario, World(seed=seed) if tolerances else World.ideal_parts(seed)
+        )
+        with hand, Daemon(deployment) as daemon, _subscribe(daemon) as messages:
+            hand.start()
+            served = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
+            served.start()
+            end_s = time.monotonic() + (seconds or scenario.duration_s + _BOOT_S)
+            try:
+                with keeper:
+                    follow(messages, keeper, lambda: stop.is_set() or time.monotonic() > end_s)
+            finally:  # also when nobody reads our lines any more
+                stop.set()
+                served.join()
+    except ValueError as error:  # a scenario for another hand, an EDS that can't be simulated
+        print(error, file=sys.stderr)
+        return 2
     print(score(keeper.contacts, hand.truth))
     return 0 if keeper.contacts else 1
 
