@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.field import ForwardModel, Rectangle, estimate
+from handtouch.field import ForwardModel, LocatorBank, Rectangle, estimate
 from handtouch.field.model import FloatArray
 
 
@@ -132,3 +132,40 @@ def test_units_do_not_matter(scale: float) -> None:
     assert strong.x == pytest.approx(plain.x, rel=1e-9)
     assert strong.total / scale == pytest.approx(plain.total, rel=1e-9)
     assert strong.covariance[:, :2, :2] == pytest.approx(plain.covariance[:, :2, :2], rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("contacts", [1, 4, 5])
+def test_noise_of_one_dimension_is_that_of_the_channels(contacts: int) -> None:
+    pad = Rectangle(1.5, 1.0)
+    noise = np.array([1e-3, 2e-3, 1e-4, 3e-3])
+    x, y = np.linspace(0.3, 1.2, contacts), np.linspace(0.7, 0.4, contacts)
+    currents = pad.fractions(x, y) + 1e-4 * np.arange(4)[:, None]
+    found = pad.estimate(currents, noise)
+    for k in range(contacts):
+        alone = pad.estimate(currents[:, k], noise)
+        np.testing.assert_allclose(found.x[k], alone.x, rtol=1e-9)
+        np.testing.assert_allclose(found.covariance[k], alone.covariance, rtol=1e-6)
+    bank = LocatorBank([pad])
+    in_bank = bank.estimate(np.zeros(contacts, dtype=np.intp), currents, noise)
+    np.testing.assert_allclose(in_bank.x, found.x, atol=1e-5)
+    np.testing.assert_allclose(in_bank.covariance, found.covariance, rtol=1e-2, atol=1e-9)
+
+
+def test_no_positive_total_is_no_place() -> None:
+    for currents in ([-1.0] * 4, [0.0] * 4):
+        found = Rectangle(1.0, 1.0).estimate(currents, 1e-2)
+        assert np.isnan(found.x)
+        assert np.isnan(found.y)
+        assert np.isinf(found.covariance[0, 0])
+        assert np.isinf(found.covariance[1, 1])
+
+
+def test_a_dead_channel_left_out_by_infinite_noise_spoils_nothing() -> None:
+    pad = Rectangle(1.0, 1.0)
+    currents = pad.fractions(0.4, 0.6)
+    currents[1] = np.nan
+    noise = [1e-3, np.inf, 1e-3, 1e-3]
+    found = pad.estimate(currents, noise)
+    np.testing.assert_allclose([found.x, found.y], [0.4, 0.6], atol=1e-6)
+    in_bank = LocatorBank([pad]).estimate(np.zeros(1, dtype=np.intp), currents[:, None], noise)
+    np.testing.assert_allclose([in_bank.x[0], in_bank.y[0]], [0.4, 0.6], atol=1e-4)

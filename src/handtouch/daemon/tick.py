@@ -176,7 +176,7 @@ class Tick:
         """Locate, place and weigh the contacts on the pads `touched`."""
         model, columns = self.model, self.columns
         currents = self._currents[touched].T
-        found = model.locator.estimate(touched, currents, model.noise_a[touched], columns.xy[touched].T)
+        found = model.locator.estimate(touched, currents, model.noise_a[None, touched], columns.xy[touched].T)
         columns.xy[touched, 0], columns.xy[touched, 1] = found.x, found.y
         columns.residual[touched] = found.residual
         with np.errstate(

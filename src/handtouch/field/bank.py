@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch.field._bank_table import GRIDS, RATIO_CELLS, RATIO_SPAN, TERMS, PadTable, log_ratios
 from handtouch.field.estimate import CORNER, LOST, PointEstimate, best_direction
-from handtouch.field.model import FloatArray, ForwardModel
+from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
 IndexArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
@@ -82,7 +82,7 @@ class LocatorBank:
     ) -> PointEstimate:
         """Return the most likely contacts, arrays (n,), for currents (4, n) of the pads `index` (n,).
 
-        noise: standard deviations, same unit, broadcastable against `currents`; an infinite one leaves its
+        noise: standard deviations, same unit, one a channel or broadcastable; an infinite one leaves its
             channel out. start: (2, n), the last (x, y) of contacts being followed, NaN for new ones.
 
         The same likelihood, clamps and covariance as `handtouch.field.estimate`. Never raises for any
@@ -93,7 +93,9 @@ class LocatorBank:
         data = np.asarray(currents, dtype=np.float64)
         with np.errstate(all="ignore"):
             weight = np.empty_like(data)
-            np.divide(1.0, noise, out=weight)
+            np.divide(1.0, channel_noise(noise, data.shape), out=weight)
+            if not weight.all():
+                data = np.where(weight == 0, 0.0, data)  # whatever a channel that is left out reads
             s = self._start(index, data, weight, start)
             sides = self._sides.take(index, axis=0)
             return self._iterate(_Readings(index, self._first_row(index), sides, data.T, weight.T), s)
@@ -120,6 +122,7 @@ class LocatorBank:
             s[fresh] = self._start(index[fresh], data[:, fresh], weight[:, fresh], None)
             return s
         ratios = log_ratios(np.maximum(data, 0.3 / weight))
+        ratios = np.where(np.isnan(ratios), 0.0, ratios)  # a channel is left out: from the middle
         position = (RATIO_SPAN - ratios) * (RATIO_CELLS / (2 * RATIO_SPAN))
         position = np.minimum(np.maximum(position, 0.0), RATIO_CELLS - 1e-9).T
         cell = position.astype(np.intp)

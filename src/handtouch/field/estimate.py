@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field.model import FloatArray, ForwardModel
+from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
 BoolArray = NDArray[np.bool_]
 
@@ -30,11 +30,12 @@ _GRID = 9  # points a side of the search that finds a start without a closed for
 class PointEstimate:
     """The most likely point contact; arrays of one shape (...), or scalars.
 
-    x, y: position in the unit of the pad, on the pad; NaN with infinite variance where the currents do not
-        hold it: a standard deviation beyond a thousand sides, or no positive total.
-    total: the current injected, in the unit of the currents.
+    x, y: position in the unit of the pad, on the pad; NaN, with infinite variance and no covariances, where
+        the currents do not hold it: a standard deviation beyond a thousand sides, or no positive total.
+    total: the current injected, in the unit of the currents; where no place makes it positive, that of a
+        contact at the centre.
     residual: signed excess of (x0 + xa) over that of this point, divided by the total; NaN for a model
-        with other channels than x0, xa, y0, yb, and where one of the two is left out.
+        with other channels than x0, xa, y0, yb, where one of the two is left out, and without a location.
     chi_squared: sum of squared misfits in standard deviations; channels - 3 degrees of freedom for a point.
     covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate.
     converged: False where the iteration stopped before the maximum, or found no positive total.
@@ -55,7 +56,8 @@ def estimate(
     """Return the point contact that makes `currents` most likely under independent normal noise.
 
     currents: shape (channels, ...), any unit; negative and zero readings are ordinary noise.
-    noise: standard deviation of each current, same unit, broadcastable against `currents`. An infinite one
+    noise: standard deviation of each current, same unit, one for each channel or broadcastable against
+        `currents`. An infinite one
         leaves its channel out; one that is not positive gives NaN.
     start: (x, y), shape (2, ...), where to begin; found from the currents if absent.
 
@@ -68,10 +70,14 @@ def estimate(
         raise ValueError(f"currents have shape {currents.shape}: the first axis is the {channels} channels")
     shape = currents.shape[1:]
     flat = currents.reshape(channels, -1)
-    sigma = np.broadcast_to(np.asarray(noise, dtype=np.float64), currents.shape).reshape(channels, -1)
+    sigma = channel_noise(noise, currents.shape).reshape(channels, -1)
     with np.errstate(all="ignore"):
-        unit = np.ldexp(1.0, np.frexp(np.abs(flat).max(axis=0, initial=0.0))[1])  # squares then stay in range
-        fit = _Fit(model, flat / unit, np.where(sigma > 0, sigma, np.nan) / unit)
+        sigma = np.where(sigma > 0, sigma, np.nan)
+        flat = np.where(np.isinf(sigma), 0.0, flat)  # whatever a channel that is left out reads
+        # Currents and noise each in a unit of their own, so that squares stay in range.
+        unit = np.ldexp(1.0, np.frexp(np.abs(flat).max(axis=0, initial=0.0))[1])
+        exponent = np.frexp(sigma.min(axis=0, initial=np.inf))[1]
+        fit = _Fit(model, flat / unit, np.ldexp(sigma, -exponent), np.ldexp(1.0, exponent) / unit)
         if start is None:
             begin = fit.guess()
         else:
@@ -117,10 +123,15 @@ class _Linear:
 
 
 class _Fit:
-    """Many independent fits of one model at once; arrays are (..., n), places in sides of the pad."""
+    """Many independent fits of one model at once; arrays are (..., n), places in sides of the pad.
 
-    def __init__(self, model: ForwardModel, currents: FloatArray, noise: FloatArray) -> None:
-        self.model, self.currents = model, currents
+    noise: standard deviations of the currents (channels, n), in units of `noise_unit` (n,).
+    """
+
+    def __init__(
+        self, model: ForwardModel, currents: FloatArray, noise: FloatArray, noise_unit: FloatArray
+    ) -> None:
+        self.model, self.currents, self.noise_unit = model, currents, noise_unit
         self.weight = 1 / noise
         self.data = currents * self.weight
         self.sides = np.array([[model.a], [model.b]])
@@ -180,6 +191,7 @@ class _Fit:
         best = self.linearise(point, slice(None))
         converged = np.zeros(point.shape[1], dtype=np.bool_)
         damping = np.ones(point.shape[1])
+        settled = _SETTLED * self.noise_unit**2
         active = np.flatnonzero(known)
         for _ in range(_MAX_STEPS):
             if not active.size:
@@ -193,12 +205,12 @@ class _Fit:
             best.put(active[accept], new.pick(accept))
             damping[active] = np.where(accept, np.minimum(1.0, 4 * damping[active]), damping[active] / 4)
             moved = (np.abs(trial - here) > _SMALLEST_STEP).any(0)
-            done = (accept & (decrement < _SETTLED)) | ~moved
+            done = (accept & (decrement < settled[active])) | ~moved
             converged[active[done]] = best.total[active[done]] > 0
             active = active[~done]
-        cornered = self.leave_corner(point, best, converged)
-        if cornered.size:
-            best.put(cornered, self.linearise(point[:, cornered], cornered))
+        moved_out = np.concatenate([self.leave_corner(point, best, converged), self.give_up(point, best)])
+        if moved_out.size:
+            best.put(moved_out, self.linearise(point[:, moved_out], moved_out))
         return self.result(point, best, converged, unit)
 
     def leave_corner(self, point: FloatArray, at: _Linear, converged: BoolArray) -> NDArray[np.intp]:
@@ -207,8 +219,8 @@ class _Fit:
         Near a corner the two far currents vanish with the square of its distance r, so that all r up to
         sqrt(noise) sides are equally likely, and only the direction from the corner is known.
         """
-        noise = 1 / np.sqrt((self.weight * self.weight).mean(0))
-        radius = np.minimum(CORNER * np.sqrt(noise / np.maximum(at.total, 0)), 0.25)  # in shorter sides
+        noise = self.noise_unit / np.sqrt((self.weight * self.weight).mean(0))
+        radius = np.minimum(CORNER * np.sqrt(noise / at.total), 0.25)  # in shorter sides; NaN for no contact
         far = point > 0.5
         offset = np.where(far, 1 - point, point) * self.aspect
         index = np.flatnonzero(np.hypot(*offset) < radius)
@@ -225,18 +237,29 @@ class _Fit:
             converged[index] = at.total[index] > 0
         return index
 
+    def give_up(self, point: FloatArray, at: _Linear) -> NDArray[np.intp]:
+        """Move points without a positive total to the centre, in place; their indices."""
+        index = np.flatnonzero(at.total <= 0)
+        point[:, index] = 0.5
+        return index
+
     def result(self, point: FloatArray, at: _Linear, converged: BoolArray, unit: FloatArray) -> PointEstimate:
         """Covariance and residual at the points reached, in the units of the pad and the currents."""
+        found = at.total > 0
         if len(self.currents) == 4:
             residual = (at.misfit[:2] / self.weight[:2]).sum(0) / at.total
+            residual[~found] = np.nan
         else:
             residual = np.full_like(at.total, math.nan)
-        covariance = covariance_of(at.slopes * at.total, at.mixing * at.total, at.fractions)
+        least = (self.noise_unit / LOST) ** 2
+        slopes = np.where(found, at.slopes * at.total, 0.0)
+        covariance = covariance_of(slopes, at.mixing * at.total, at.fractions, least)
         held = np.isfinite(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]).T
         x, y = np.where(held, point * self.sides, np.nan)
-        units = np.stack([*np.broadcast_to(self.sides, point.shape), unit], axis=1)
+        units = np.stack([*np.broadcast_to(self.sides, point.shape), unit], axis=1) * self.noise_unit[:, None]
         covariance = np.where(covariance == 0, 0.0, covariance * units[:, :, None] * units[:, None, :])
-        return PointEstimate(x, y, at.total * unit, residual, at.cost, covariance, converged)
+        chi_squared = np.where(at.cost == 0, 0.0, (np.sqrt(at.cost) / self.noise_unit) ** 2)
+        return PointEstimate(x, y, at.total * unit, residual, chi_squared, covariance, converged)
 
 
 def best_direction(
@@ -259,28 +282,33 @@ def best_direction(
     return np.clip(angle, _GRAZING, math.pi / 2 - _GRAZING)
 
 
-def covariance_of(slopes: FloatArray, mixing: FloatArray, fractions: FloatArray) -> FloatArray:
+def covariance_of(
+    slopes: FloatArray, mixing: FloatArray, fractions: FloatArray, least: FloatArray
+) -> FloatArray:
     """Inverse Fisher information of (x, y, total), shape (n, 3, 3), x and y in sides.
 
-    slopes, mixing: as in `_Linear`, times the total. fractions: whitened. A coordinate whose standard
-    deviation exceeds `LOST` sides has infinite variance and no covariances.
+    slopes, mixing: as in `_Linear`, times the total. fractions: whitened. least: information per side^2 (n,)
+    that a coordinate needs; with less, it has infinite variance and no covariances.
+
+    A factor F of the covariance is found first, and the covariance is F F^T: positive semidefinite whatever
+    cancels.
     """
     sx, sy = slopes
     xx, yy, xy = (sx * sx).sum(0), (sy * sy).sum(0), (sx * sy).sum(0)
     # Each variance from what the other coordinate cannot explain: no difference of products.
-    free = np.stack([((sx - (xy / yy) * sy) ** 2).sum(0), ((sy - (xy / xx) * sx) ** 2).sum(0)])
-    least = LOST**-2
-    lost_x, lost_y = ~(xx > least), ~(yy > least)
-    free = np.where(np.stack([lost_y, lost_x]), np.stack([xx, yy]), free)
-    held_x, held_y = free > least
-    covariance = np.zeros((len(xx), 3, 3))
-    covariance[:, 0, 0] = np.where(held_x, 1 / free[0], np.inf)
-    covariance[:, 1, 1] = np.where(held_y, 1 / free[1], np.inf)
-    covariance[:, 0, 1] = covariance[:, 1, 0] = np.where(held_x & held_y, -xy / (xx * free[1]), 0.0)
-    finite = np.where(np.isfinite(covariance), covariance, 0.0)
-    for i in range(2):
-        covariance[:, i, 2] = covariance[:, 2, i] = -(finite[:, i, :2] * mixing.T).sum(1)
-    spread = -(covariance[:, :2, 2] * mixing.T).sum(1)
-    covariance[:, 2, 2] = 1 / (fractions * fractions).sum(0) + spread
+    free_x, free_y = ((sx - (xy / yy) * sy) ** 2).sum(0), ((sy - (xy / xx) * sx) ** 2).sum(0)
+    free_x, free_y = np.where(yy > least, free_x, xx), np.where(xx > least, free_y, yy)
+    held_x, held_y = free_x > least, free_y > least
+    both = held_x & held_y
+    factor = np.zeros((len(xx), 3, 3))
+    factor[:, 0, 0] = np.where(held_x, 1 / np.sqrt(np.where(both, xx, free_x)), 0.0)
+    factor[:, 1, 1] = np.where(held_y, 1 / np.sqrt(free_y), 0.0)
+    factor[:, 0, 1] = np.where(both, -(xy / xx) * factor[:, 1, 1], 0.0)
+    factor[:, 2, :2] = -(np.where(factor[:, :2] == 0, 0.0, factor[:, :2] * mixing.T[:, :, None])).sum(1)[
+        :, :2
+    ]
+    factor[:, 2, 2] = 1 / np.sqrt((fractions * fractions).sum(0))
+    covariance: FloatArray = factor @ factor.swapaxes(1, 2)
+    covariance[~held_x, 0, 0] = covariance[~held_y, 1, 1] = np.inf
     covariance[np.isnan(covariance[:, 2, 2])] = np.nan
     return covariance

@@ -39,3 +39,15 @@ class ForwardModel(Protocol):
     def fractions_with_jacobian(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return `fractions` and their derivatives by (x, y), shape (channels, 2, ...)."""
         ...
+
+
+def channel_noise(noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Standard deviations for currents of shape (channels, ...), broadcast to it.
+
+    noise: one for all, one a channel (channels,), or whatever broadcasts against the currents. One dimension
+    as long as there are channels always means one a channel; for one a contact give (1, n).
+    """
+    sigma = np.asarray(noise, dtype=np.float64)
+    if sigma.ndim == 1 and len(shape) > 1 and len(sigma) == shape[0]:
+        sigma = sigma.reshape(-1, *(1,) * (len(shape) - 1))
+    return np.broadcast_to(sigma, shape)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from handtouch.field.estimate import BoolArray, PointEstimate, estimate
-from handtouch.field.model import FloatArray, ForwardModel
+from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
 _DIFFERENCE = 1e-4  # of the distance to the nearest edge: step of the second derivatives
 _BISECTIONS = 24
@@ -62,7 +62,7 @@ def point_test(
     currents = np.asarray(currents, dtype=np.float64)
     if found is None:
         found = estimate(model, currents, noise)
-    sigma = np.broadcast_to(np.asarray(noise, dtype=np.float64), currents.shape)
+    sigma = channel_noise(noise, currents.shape)
     with np.errstate(all="ignore"):
         view = _View.at(model, np.asarray(found.x), np.asarray(found.y), np.asarray(found.total), sigma)
         score = np.einsum("...c,c...->...", view.null, currents / sigma)
@@ -98,7 +98,7 @@ def resolvable_separation(
             for p, side, d in ((x, model.a, direction[0]), (y, model.b, direction[1]))
         ]
         longest = 2 * np.minimum(*room) * (1 - 1e-9)
-        sigma = np.broadcast_to(np.asarray(noise, dtype=np.float64), (4, *x.shape))
+        sigma = channel_noise(noise, (4, *x.shape))
 
         def score(distance: FloatArray) -> FloatArray:
             half = [distance / 2 * d for d in direction]
