@@ -83,3 +83,13 @@ def test_bad_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="false_alarm"):
         point_test(SQUARE, [0.25] * 4, 1e-3, false_alarm=0)
     assert math.isnan(point_test(SQUARE, [math.nan, 1, 1, 1], 1e-3).score)
+
+
+def test_what_has_no_location_is_not_called_more_than_a_point() -> None:
+    pad = Rectangle(1.0, 1.0)
+    rng = np.random.default_rng(5)
+    x, y = rng.random((2, 40_000))  # up to the edges, where some estimates are lost
+    currents = pad.fractions(x, y) + 1e-2 * rng.normal(size=(4, x.size))
+    alarms = ~point_test(pad, currents, 1e-2, 1e-2).is_point
+    assert 0.008 < alarms.mean() < 0.012
+    assert point_test(pad, [-1.0] * 4, 1e-2).is_point

@@ -37,7 +37,8 @@ class PointEstimate:
     residual: signed excess of (x0 + xa) over that of this point, divided by the total; NaN for a model
         with other channels than x0, xa, y0, yb, where one of the two is left out, and without a location.
     chi_squared: sum of squared misfits in standard deviations; channels - 3 degrees of freedom for a point.
-    covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate.
+    covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate. True to a few per
+        cent where it is small against the distance from the edges; nearer to them it is too confident.
     converged: False where the iteration stopped before the maximum, or found no positive total.
     """
 

@@ -55,7 +55,8 @@ def point_test(
     """Return whether `currents` (4, ...) with standard deviations `noise` come from point contacts.
 
     false_alarm: the part of true points that may fail, 0 < false_alarm < 1, both signs together. found: the
-    estimates of the same currents, if there are any yet. A score is NaN where the estimate is.
+    estimates of the same currents, if there are any yet. A score is NaN where the estimate is, and then
+    nothing speaks against a point: `is_point` is True.
     Raises ValueError for a false-alarm rate that cannot be, or a model with other channels.
     """
     threshold = _threshold(false_alarm)
@@ -71,7 +72,7 @@ def point_test(
         axis = np.where(score < 0, axis - math.pi / 2, axis)
         axis = np.where(axis <= -math.pi / 2, axis + math.pi, axis)
         extent = np.sqrt(4 * np.abs(score) / strength)
-    return PointTest(score[()], (np.abs(score) <= threshold)[()], axis[()], extent[()], view.deviation[()])
+    return PointTest(score[()], (~(np.abs(score) > threshold))[()], axis[()], extent[()], view.deviation[()])
 
 
 def resolvable_separation(
