@@ -249,19 +249,29 @@ def noise_cost(report: Report) -> None:
         ("3 : 1, ideal", Rectangle(3.0, 1.0)),
         ("3 : 1, gaps 5 %", ElectrodeNetwork(3.0, 1.0, 0.05, SHEET)),
         (
+            "3 : 1, gaps 0.01 %, 0.1 sheet on the long sides",
+            ElectrodeNetwork(3.0, 1.0, 1e-4, SHEET, (0, 0, tenth, tenth)),
+        ),
+        (
             "3 : 1, gaps 5 %, 0.1 sheet on the long sides",
             ElectrodeNetwork(3.0, 1.0, 0.05, SHEET, (0, 0, tenth, tenth)),
         ),
         ("3 : 1, long sides in three", divided(3.0, 1, 3)),
     ]
     rows = [
-        {"pad": name, "median, %": float(100 * np.median(error)), "worst, %": float(100 * error.max())}
-        for name, error in ((name, expected_error(model)) for name, model in cases)
+        {
+            "pad": name,
+            "G": neighbours(model),
+            "median, %": float(100 * np.median(error)),
+            "worst, %": float(100 * error.max()),
+        }
+        for name, model, error in ((name, model, expected_error(model)) for name, model in cases)
     ]
     stretched = expected_error_anisotropic(3.0)
     rows.append(
         {
             "pad": "3 : 1, anisotropic to be electrically square",
+            "G": "",
             "median, %": float(100 * np.median(stretched)),
             "worst, %": float(100 * stretched.max()),
         }
@@ -269,9 +279,17 @@ def noise_cost(report: Report) -> None:
     report.table(
         "Expected location error",
         "Cramer-Rao bound of the root of var x + var y, % of the short side; noise of 1 % of the total "
-        "on every channel; 10 % of each side left out.",
+        "on every channel; 10 % of each side left out. G: conductance between neighbours, for one ohm per "
+        "square. It grows without limit as gaps close, and what resistors mix, and so cost, grows with it.",
         rows,
     )
+
+
+def neighbours(model: ForwardModel) -> float | str:
+    """Conductance between electrodes x0 and y0; nothing to say of divided sides, or without gaps."""
+    if isinstance(model, ElectrodeNetwork) and len(model.electrodes) == len(SIDES):
+        return float(-model.conductance[0, 2])
+    return ""
 
 
 def divided(aspect: float, across: int, along: int | None = None) -> ElectrodeNetwork:
