@@ -8,6 +8,7 @@ network's is an Abelian integral on the half plane, 3 coefficients from its peri
 
 from __future__ import annotations
 
+import json
 import math
 import platform
 import sys
@@ -241,6 +242,28 @@ def networks() -> Iterator[Row]:
         yield worst.row
 
 
+def conductance() -> Iterator[Row]:
+    """Against the reference, which has ten decimals; symmetric, and rows that sum to zero, for any gaps."""
+    given = Worst("ElectrodeNetwork.conductance", "reference, to its ten decimals", 1e-10 / EPS)
+    for case in json.loads((ROOT / "tests" / "field" / "data" / "electrodes.json").read_text()):
+        pad = ElectrodeNetwork(case["a"], case["b"], case["gap"], case["sheet_ohm_per_square"])
+        off = np.abs(pad.conductance - case["conductance"]).max()
+        given.add(off, 1.0, (case["a"], case["b"], case["gap"]))
+    yield given.row
+    rng = np.random.default_rng(6)
+    region = "50:1 to 1:50, gaps 1e-6 to 0.49 of the short side"
+    mirrored = Worst("ElectrodeNetwork.conductance, asymmetry", region, 40)
+    sums = Worst("ElectrodeNetwork.conductance, sums of rows", region, 40)
+    for _ in range(400):
+        a, gap = 50.0 ** rng.uniform(-1, 1), 10.0 ** rng.uniform(-6, math.log10(0.49))
+        found = ElectrodeNetwork(a, 1.0, gap * min(a, 1.0), 1.0).conductance
+        largest = float(np.abs(found).max())
+        mirrored.add(np.abs(found - found.T).max(), largest, (a, gap))
+        sums.add(np.abs(found.sum(axis=1)).max(), largest, (a, gap))
+    yield mirrored.row
+    yield sums.row
+
+
 def ideal_limit() -> Iterator[Row]:
     """Without gaps: against `Rectangle`, which is proven to 50 digits, over aspects, edges and corners."""
     rng = np.random.default_rng(4)
@@ -390,7 +413,7 @@ def main() -> int:
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     print("\n".join(lines))
     failed = 0
-    for part in (stack, law, surfaces, ideal_limit, round_trip, networks, arguments):
+    for part in (stack, law, surfaces, conductance, ideal_limit, round_trip, networks, arguments):
         for row in part():
             failed += row.worst > row.limit
             mark = " **!**" if row.worst > row.limit else ""
