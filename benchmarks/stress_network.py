@@ -1,4 +1,4 @@
-"""Stress networks, surfaces and strength: against 30-digit references and with arguments of every kind.
+"""Stress networks, surfaces and strength: against 50-digit references and with arguments of every kind.
 
 Prints and writes to docs/benchmarks/stress_network.md, for each function and region, the worst error in units
 of eps times the condition of the problem (how far rounding of the arguments alone moves the answer) and where
@@ -20,6 +20,8 @@ from typing import Any, NamedTuple
 import mpmath as mp
 import numpy as np
 import numpy.typing as npt
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from handtouch.field import (
     Anisotropic,
@@ -43,7 +45,7 @@ from handtouch.field.network import SIDES
 FloatArray = npt.NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
 ROOT = Path(__file__).parent.parent
-mp.mp.dps = 30
+mp.mp.dps = 50
 
 
 class Row(NamedTuple):
@@ -405,6 +407,119 @@ def _stacked(
     return lambda x, y: np.stack(function(x, y))
 
 
+SEARCH = settings(max_examples=400, deadline=None, derandomize=True, database=None)
+anything = st.floats(width=64) | st.sampled_from([0.0, -0.0, math.inf, -math.inf, math.nan, 5e-324, 1e308])
+part = st.floats(0.03, 0.97)
+
+
+def searches() -> Iterator[Row]:
+    """What hypothesis finds when it looks for trouble; any floating-point warning is trouble too."""
+    yield from (_search_networks(), _search_points(), _search_surfaces(), _search_law(), _search_sandwich())
+
+
+def _search_networks() -> Row:
+    worst = Worst(
+        "ElectrodeNetwork, fractions, locate, estimate", "any gaps to 45 %, 1:3 to 3:1 (hypothesis)", 1e5
+    )
+
+    @SEARCH
+    @given(st.floats(1 / 3, 3), st.lists(st.floats(1e-3, 0.45), min_size=4, max_size=4), part, part)
+    def attempt(aspect: float, gaps: list[float], u: float, v: float) -> None:
+        short = min(aspect, 1.0)
+        pad = ElectrodeNetwork(aspect, 1.0, [gap * short for gap in gaps], 1.0)
+        x, y = u * pad.a, v * pad.b
+        shares = pad.fractions(x, y)
+        worst.add(float(shares.sum()) - 1, 1, (aspect, gaps, u, v))
+        found, likely = pad.locate(shares), pad.estimate(shares, 1e-6)
+        condition = _condition(pad, x, y)
+        if not np.isnan(found.x + found.y):
+            worst.add(math.hypot(found.x - x, found.y - y), condition, (aspect, gaps, u, v))
+        worst.add(
+            min(math.hypot(likely.x - x, likely.y - y), 1e-6), max(condition, 1e5), (aspect, gaps, u, v)
+        )
+
+    attempt()
+    return worst.row
+
+
+def _search_points() -> Row:
+    worst = Worst(
+        "ElectrodeNetwork, spoilt neighbours", "any numbers for places and currents (hypothesis)", 0.5
+    )
+    pad = ElectrodeNetwork(1.5, 1.0, 0.05, 2400.0, (10.0, 0.0, 336.0, 0.0))
+    good = pad.fractions(0.4, 0.6)
+
+    @SEARCH
+    @given(anything, anything, st.lists(anything, min_size=4, max_size=4))
+    def attempt(x: float, y: float, readings: list[float]) -> None:
+        shares = pad.fractions(np.array([x, 0.4]), np.array([y, 0.6]))
+        worst.add(EPS * float(not np.allclose(shares[:, 1], good, rtol=1e-12)), 1, (x, y))
+        found = pad.locate(np.stack([readings, good], axis=1))
+        worst.add(EPS * float(not np.isclose(found.x[1], 0.4, rtol=1e-9)), 1, readings)
+
+    attempt()
+    return worst.row
+
+
+def _search_surfaces() -> Row:
+    worst = Worst("Cylinder, Cone, Sphere, Anisotropic", "there and back, any shape (hypothesis)", 1e4)
+
+    @SEARCH
+    @given(st.floats(0.1, 10), st.floats(0.1, 10), st.floats(0.05, 6.2), part, part)
+    def attempt(near: float, far: float, arc: float, u: float, v: float) -> None:
+        made: list[Surface] = [
+            Cylinder(near, far, arc),
+            Cone(near, far, abs(far - near) + near, arc),
+            Sphere(near, -0.1 * min(far, 10) * 0.9, 0.1 * near, arc),
+        ]
+        for surface in [*made, *(Anisotropic(other, far) for other in made)]:
+            x, y = u * surface.a, v * surface.b
+            again = surface.to_rectangle(*surface.from_rectangle(x, y))
+            worst.add(float(again[0] - x) / surface.a, 1, (type(surface).__name__, near, far, arc, u, v))
+            worst.add(float(again[1] - y) / surface.b, 1, (type(surface).__name__, near, far, arc, u, v))
+            along, around = surface.tangents(x, y)
+            worst.add(float(along @ around), 1, (type(surface).__name__, near, far, arc, u, v))
+            worst.add(float(np.linalg.norm(surface.normal(x, y))) - 1, 1, (near, far, arc, u, v))
+
+    attempt()
+    return worst.row
+
+
+def _search_law() -> Row:
+    worst = Worst("ContactLaw, force of current", "any force, layer, exponent, where valid (hypothesis)", 1e8)
+    powers = st.floats(-6, 3)
+
+    @SEARCH
+    @given(powers, powers, st.floats(0.3, 3), st.floats(1.5, 4), st.booleans())
+    def attempt(force: float, layer: float, alpha: float, spread: float, hertz: bool) -> None:
+        law = ContactLaw(10**layer, alpha, 1e-3, hertz_n=1.0 if hertz else None)
+        radius = float(law.radius(10**force)) * 10**spread
+        current = law.current(10**force, 5.0, 2400.0, radius)
+        found = law.force(current, 5.0, 2400.0, radius)
+        if found.status == Status.VALID:
+            worst.add(float(found.force_n) / 10**force - 1, 1, (force, layer, alpha, spread, hertz))
+
+    attempt()
+    return worst.row
+
+
+def _search_sandwich() -> Row:
+    worst = Worst(
+        "Sandwich, force of its own currents", "any force and radius, where valid (hypothesis)", 1e11
+    )
+    pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
+
+    @SEARCH
+    @given(st.floats(-2, 1), st.floats(-3.5, -2.5))
+    def attempt(force: float, radius: float) -> None:
+        found = pair.force(pair.currents(10**force, 10**radius, 12.0, 0.02), 12.0, 0.02)
+        if found.status == Status.VALID:
+            worst.add(float(found.force_n) / 10**force - 1, 1, (force, radius))
+
+    attempt()
+    return worst.row
+
+
 def main() -> int:
     """Run all parts; 1 if one is beyond its limit."""
     warnings.simplefilter("error")
@@ -413,7 +528,7 @@ def main() -> int:
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     print("\n".join(lines))
     failed = 0
-    for part in (stack, law, surfaces, conductance, ideal_limit, round_trip, networks, arguments):
+    for part in (stack, law, surfaces, conductance, ideal_limit, round_trip, networks, arguments, searches):
         for row in part():
             failed += row.worst > row.limit
             mark = " **!**" if row.worst > row.limit else ""
