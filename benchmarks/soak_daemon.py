@@ -1,0 +1,92 @@
+"""The real daemon and a simulated hand for a long time: memory, descriptors, losses; status 1 if they grow.
+
+Nodes, daemon and a subscriber to everything on a udp_multicast bus, the session played again and again.
+ARGS="--minutes 60" sets how long.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from bench_latency import CHANNEL, PORT, in_own_network
+
+from handtouch import shipped
+from handtouch.client import connect, request
+from handtouch.config import load
+
+SETTLED_S = 20.0
+GROWTH_MB = 5.0
+
+
+def resident_mb(pid: int) -> float:
+    """Memory of a process that is in RAM."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * 4096 / 1e6
+
+
+def descriptors(pid: int) -> int:
+    """Open files of a process."""
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+def soak(config: Path, minutes: float) -> int:
+    """Run it; 1 if something grew or was lost."""
+    endpoints = load(config).daemon
+    nodes = subprocess.Popen([sys.executable, "-m", "handtouch", "simulate", str(config)])
+    daemon = subprocess.Popen([sys.executable, "-m", "handtouch", "run", str(config)])
+    try:
+        with connect(
+            "contact/*/*", "hand/*", "health/*/*", endpoint=endpoints.complete, queue=100_000
+        ) as all_of_it:
+            end_s = time.monotonic() + SETTLED_S
+            while time.monotonic() < end_s:
+                all_of_it.recv(1)
+            before = (resident_mb(daemon.pid), descriptors(daemon.pid))
+            ticks, next_s = request("status", endpoint=endpoints.control)["service"]["ticks"], 0.0
+            end_s = time.monotonic() + 60 * minutes
+            while time.monotonic() < end_s:
+                all_of_it.recv(1)
+                if time.monotonic() >= next_s:
+                    next_s = time.monotonic() + max(5.0, 3 * minutes)
+                    left = (end_s - time.monotonic()) / 60
+                    now = (resident_mb(daemon.pid), descriptors(daemon.pid))
+                    print(f"{left:6.1f} min to go: {now[0]:.1f} MB, {now[1]} descriptors")
+            lost = all_of_it.gaps
+        after = (resident_mb(daemon.pid), descriptors(daemon.pid))
+        status = request("status", endpoint=endpoints.control)
+        service, missed = status["service"], sum(pad["missed"] for pad in status["pads"])
+        print(
+            f"{service['ticks'] - ticks} ticks, {service['overruns']} overruns, {missed} samples missed, "
+            f"{lost} messages lost; memory {before[0]:.1f} -> {after[0]:.1f} MB, descriptors {before[1]} -> {after[1]}"
+        )
+    finally:
+        for process in (daemon, nodes):
+            process.terminate()
+            process.wait()
+    return int(lost > 0 or after[0] - before[0] > GROWTH_MB or after[1] > before[1])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    asked = parser.parse_args()
+    in_own_network()
+    with tempfile.TemporaryDirectory(prefix="ht.") as folder:
+        config = Path(folder) / "hand.toml"
+        endpoints = "\n".join(
+            f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs")
+        )
+        text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{endpoints}\n")
+        text = text.replace('"socketcan"', '"udp_multicast"')
+        channel = f'channel = "{CHANNEL}"\noptions = {{ port = {PORT + 1} }}'
+        config.write_text(text.replace('channel = "can0"', channel))
+        return soak(config, asked.minutes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
