@@ -62,7 +62,8 @@ def soak(config: Path, minutes: float) -> int:
         service, missed = status["service"], sum(pad["missed"] for pad in status["pads"])
         print(
             f"{service['ticks'] - ticks} ticks, {service['overruns']} overruns, {missed} samples missed, "
-            f"{lost} messages lost; memory {before[0]:.1f} -> {after[0]:.1f} MB, descriptors {before[1]} -> {after[1]}"
+            f"{lost} messages lost; memory {before[0]:.1f} -> {after[0]:.1f} MB, "
+            f"descriptors {before[1]} -> {after[1]}"
         )
     finally:
         for process in (daemon, nodes):
