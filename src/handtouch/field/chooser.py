@@ -39,7 +39,7 @@ class Cost:
         return self.call_us + self.contact_us * contacts
 
 
-# Medians of benchmarks/field_accuracy.py (docs/benchmarks/field.md); only their order decides.
+# Medians of benchmarks/bench_field.py (docs/benchmarks/field.md); only their order decides.
 COSTS: Mapping[str, Cost] = {
     "log-ratio": Cost(4.1, 0.002),
     "log-ratio, adjusted": Cost(4.5, 0.003),

@@ -37,8 +37,8 @@ class PointEstimate:
     residual: signed excess of (x0 + xa) over that of this point, divided by the total; NaN for a model
         with other channels than x0, xa, y0, yb, where one of the two is left out, and without a location.
     chi_squared: sum of squared misfits in standard deviations; channels - 3 degrees of freedom for a point.
-    covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate. True to a few per
-        cent where it is small against the distance from the edges; nearer to them it is too confident.
+    covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate. Near the edges,
+        within a few standard deviations of them, it is too confident.
     converged: False where the iteration stopped before the maximum, or found no positive total.
     """
 
@@ -58,8 +58,7 @@ def estimate(
 
     currents: shape (channels, ...), any unit; negative and zero readings are ordinary noise.
     noise: standard deviation of each current, same unit, one for each channel or broadcastable against
-        `currents`. An infinite one
-        leaves its channel out; one that is not positive gives NaN.
+        `currents`. An infinite one leaves its channel out; one that is not positive gives NaN.
     start: (x, y), shape (2, ...), where to begin; found from the currents if absent.
 
     Gauss-Newton on (x, y) with the total eliminated (variable projection), halved until the likelihood rises.
