@@ -271,21 +271,24 @@ def in_own_network() -> None:
     os.execvp("unshare", command)
 
 
+def on_loopback(folder: Path, port: int) -> Path:
+    """The shipped hand on a udp_multicast bus, its endpoints in `folder`; path of the deployment."""
+    endpoints = "\n".join(f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs"))
+    text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{endpoints}\n")
+    channel = f'channel = "{CHANNEL}"\noptions = {{ port = {port} }}'
+    text = text.replace('"socketcan"', '"udp_multicast"').replace('channel = "can0"', channel)
+    config = folder / "hand.toml"
+    config.write_text(text)
+    return config
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=30.0)
     asked = parser.parse_args()
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        config = Path(folder) / "hand.toml"
-        endpoints = "\n".join(
-            f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs")
-        )
-        text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{endpoints}\n")
-        text = text.replace('"socketcan"', '"udp_multicast"').replace(
-            'channel = "can0"', f'channel = "{CHANNEL}"\noptions = {{ port = {PORT} }}'
-        )
-        config.write_text(text)
+        config = on_loopback(Path(folder), PORT)
         deployment = load(config)
         period_s = deployment.daemon.sync_period_ms * 1e-3
         pads = sum(len(hand.pads) for hand in deployment.hands)

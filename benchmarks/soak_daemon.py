@@ -13,9 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench_latency import CHANNEL, PORT, in_own_network
+from bench_latency import PORT, in_own_network, on_loopback
 
-from handtouch import shipped
 from handtouch.client import connect, request
 from handtouch.config import load
 
@@ -78,15 +77,7 @@ def main() -> int:
     asked = parser.parse_args()
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        config = Path(folder) / "hand.toml"
-        endpoints = "\n".join(
-            f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs")
-        )
-        text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{endpoints}\n")
-        text = text.replace('"socketcan"', '"udp_multicast"')
-        channel = f'channel = "{CHANNEL}"\noptions = {{ port = {PORT + 1} }}'
-        config.write_text(text.replace('channel = "can0"', channel))
-        return soak(config, asked.minutes)
+        return soak(on_loopback(Path(folder), PORT + 1), asked.minutes)
 
 
 if __name__ == "__main__":

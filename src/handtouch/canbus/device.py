@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import can
 import canopen
@@ -26,11 +26,11 @@ from canopen.sdo import SdoAbortedError
 from numpy.typing import NDArray
 
 from handtouch import shipped
+from handtouch.canbus.slab import FULL_SCALE
 
 Sampler = Callable[[int], NDArray[np.int16]]
 """Host's monotonic time [ns] of a SYNC -> counts (n, 4), one row a node in the order they were added."""
 
-FULL_SCALE: Final = 32767
 _NMT_ID, _SYNC_ID, _SDO_ID = 0x000, 0x080, 0x600
 _OPERATIONAL, _PRE_OPERATIONAL = 5, 127
 _RESET_NODE, _RESET_COMMUNICATION, _ENTER_PRE_OPERATIONAL = 129, 130, 128

@@ -14,6 +14,7 @@ from .slab import SAMPLE_BYTES, Slab
 
 IDENTIFIERS = 2048
 """CANopen uses 11-bit identifiers."""
+SYNC_ID = 0x80
 NOBODY = -1
 
 Frame = tuple[int, bytes, int]

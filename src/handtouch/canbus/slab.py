@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+FULL_SCALE = 32767
+"""Greatest count of a channel; at it, or at its negative, a channel is at the end of its range."""
 SAMPLE_BYTES = 8
 """A sample is one TPDO of four little-endian int16 (CiA 401: object 0x6401 sub 1-4)."""
 

@@ -18,12 +18,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import zmq
 
 from handtouch.canbus import eds
 from handtouch.canbus.master import Master, NodeSpec
 from handtouch.canbus.port import BusError, Port
+from handtouch.canbus.router import SYNC_ID
 from handtouch.config import ConfigError, Deployment, load, with_bus
 from handtouch.daemon.control import Control
 from handtouch.daemon.model import PadModel
@@ -32,7 +32,6 @@ from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.report import Report
 
-SYNC_ID = 0x80
 _log = logging.getLogger("handtouch.daemon")
 
 
@@ -205,12 +204,13 @@ def _announce(daemon: Daemon) -> None:
 def _watchdog(notifier: Notifier) -> Callable[[], None]:
     """A function that reassures systemd's watchdog often enough, called after every tick."""
     period_ns = int(os.environ.get("WATCHDOG_USEC", "0")) * 1000 // 3
-    last_ns = np.zeros(1, dtype=np.int64)
+    last_ns = 0
 
     def alive() -> None:
+        nonlocal last_ns
         now_ns = time.monotonic_ns()
-        if period_ns and now_ns - last_ns[0] >= period_ns:
-            last_ns[0] = now_ns
+        if period_ns and now_ns - last_ns >= period_ns:
+            last_ns = now_ns
             notifier.send("WATCHDOG=1")
 
     return alive

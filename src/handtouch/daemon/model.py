@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.canbus.slab import FULL_SCALE
 from handtouch.config import Deployment
 from handtouch.field import LocatorBank, PointEstimate
 from handtouch.field.network import ElectrodeNetwork
@@ -17,7 +18,6 @@ from handtouch.field.strength import ContactLaw, Strength
 from handtouch.hand import Placed, Placement, mount_of, network_of, surface_of
 
 FloatArray = NDArray[np.float64]
-FULL_SCALE = 32767
 
 
 class PadModel:

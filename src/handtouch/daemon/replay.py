@@ -19,14 +19,13 @@ import zmq
 
 from handtouch import wire
 from handtouch.canbus import eds
-from handtouch.canbus.router import Counters, Router
+from handtouch.canbus.router import SYNC_ID, Counters, Router
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.wire import PadState
 
-_SYNC_ID = 0x80
 _TPDO2 = 0x280
 _SERVICES = (0x080, 0x580, 0x600, 0x700)
 """EMCY, SDO and heartbeat of our nodes are no strangers."""
@@ -90,7 +89,7 @@ class _Feeder:
         self._by_channel = {str(bus.channel): self.routers[bus.name] for bus in deployment.buses}
         self._only = next(iter(self.routers.values())) if len(self.routers) == 1 else None
         self._clock = clock
-        self._known = {_SYNC_ID}
+        self._known = {SYNC_ID}
         pads = [pad for hand in deployment.hands for pad in hand.pads]
         for slot, pad in enumerate(pads):
             self.routers[pad.bus].route(_sample_id(deployment.nodes[pad.node].eds, pad.node_id), slot)
@@ -180,7 +179,7 @@ def _rhythm(log: Path, period_ns: int) -> tuple[int, str | None]:
 
 def _is_sync(message: can.Message) -> bool:
     special = message.is_extended_id or message.is_error_frame or message.is_remote_frame
-    return message.arbitration_id == _SYNC_ID and not special
+    return message.arbitration_id == SYNC_ID and not special
 
 
 def _sample_id(eds_path: str | None, node_id: int) -> int:

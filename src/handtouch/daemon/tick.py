@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.slab import FULL_SCALE, Slab
 from handtouch.daemon.contacts import BoolArray, Contacts, IntArray
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.model import PadModel
@@ -20,8 +20,6 @@ from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
 _STALE_PERIODS = 3
-_RAIL = 32767
-"""A channel at either end of its range measures nothing."""
 _SOURCE_STD, _SOURCE_PART = 10.0, 0.02
 """How far below zero a channel may be: standard deviations of noise, and part of all channels."""
 # plain numbers: looking up members of an enumeration costs a microsecond each
@@ -157,7 +155,7 @@ class Tick:
         """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take."""
         size = np.abs(counts)
         source = _SOURCE_STD * self.model.noise_counts + _SOURCE_PART * size.sum(axis=1)
-        return np.asarray((size.max(axis=1) >= _RAIL) | (counts.min(axis=1) < -source))
+        return np.asarray((size.max(axis=1) >= FULL_SCALE) | (counts.min(axis=1) < -source))
 
     def _resolve_states(
         self,

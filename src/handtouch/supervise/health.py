@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.slab import FULL_SCALE
 from handtouch.wire import PadState
 
 CHANNELS = ("x0", "xa", "y0", "yb")
-_RAIL = 32767
 
 
 def explain(state: PadState, node: NodeState, node_reason: str, counts: NDArray[np.int16]) -> str:
@@ -23,7 +23,7 @@ def explain(state: PadState, node: NodeState, node_reason: str, counts: NDArray[
         return node_reason
     if state == PadState.FAULTED:
         channels = dict(zip(CHANNELS, counts.tolist(), strict=True))
-        if railed := [name for name, count in channels.items() if abs(count) >= _RAIL]:
+        if railed := [name for name, count in channels.items() if abs(count) >= FULL_SCALE]:
             return (
                 f"channel {' and '.join(railed)} at the end of its range: "
                 "look for a short, a loose electrode or a force beyond full scale"
