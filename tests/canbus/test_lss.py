@@ -1,0 +1,326 @@
+"""LSS: all nodes without an id are found, in seconds, and each gets one; by a bus of simulated time."""
+
+from __future__ import annotations
+
+import heapq
+import random
+import struct
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from handtouch.canbus.lss import LssAddress, LssError, LssMaster, LssSlave
+
+VENDOR, PRODUCT, REVISION = 0x2F1, 0x401, 0x10000
+
+
+class Bus:
+    """Slaves that answer after a time of their own each, and a clock that only their answers move."""
+
+    def __init__(
+        self,
+        slaves: Sequence[LssSlave],
+        delays_s: Sequence[float] = (0.0005,),
+        *,
+        merging: bool = False,
+        lost: float = 0.0,
+    ) -> None:
+        self.slaves = slaves
+        self.t_ns = 1_000_000_000
+        self.sent: list[bytes] = []
+        self._delays_s = delays_s
+        self._merging = merging
+        self._lost = lost
+        self._coming: list[tuple[int, bytes]] = []
+        self._random = random.Random(7)
+
+    def exchange(self, request: bytes | None, timeout_s: float) -> bytes | None:
+        if request is not None:
+            self._send(request)
+        end_ns = self.t_ns + round(timeout_s * 1e9)
+        if self._coming and self._coming[0][0] <= end_ns:
+            at_ns, answer = heapq.heappop(self._coming)
+            while self._merging and (at_ns, answer) in self._coming:  # the same bits at the same time are one
+                self._coming.remove((at_ns, answer))
+                heapq.heapify(self._coming)
+            self.t_ns = max(self.t_ns, at_ns)
+            return answer
+        self.t_ns = end_ns
+        return None
+
+    def _send(self, request: bytes) -> None:
+        self.sent.append(request)
+        self._coming = [item for item in self._coming if item[0] > self.t_ns]
+        heapq.heapify(self._coming)
+        for number, slave in enumerate(self.slaves):
+            answer = slave.handle(request)
+            if answer is not None and self._random.random() >= self._lost:
+                delay_s = self._delays_s[number % len(self._delays_s)]
+                heapq.heappush(self._coming, (self.t_ns + round(delay_s * 1e9), answer))
+
+    def master(self, least_wait_s: float = 0.005) -> LssMaster:
+        return LssMaster(self.exchange, least_wait_s, clock=lambda: self.t_ns)
+
+    @property
+    def seconds(self) -> float:
+        return self.t_ns * 1e-9 - 1.0
+
+
+def address(serial: int, revision: int = REVISION) -> LssAddress:
+    return LssAddress(VENDOR, PRODUCT, revision, serial)
+
+
+def pads(count: int) -> list[LssSlave]:
+    """As they leave the factory: serial numbers all over 32 bits."""
+    numbers = random.Random(3)
+    return [LssSlave(address(numbers.getrandbits(32))) for _ in range(count)]
+
+
+def frame(*values: int) -> bytes:
+    return bytes(values).ljust(8, b"\0")
+
+
+words = st.one_of(
+    st.integers(0, 0xFFFFFFFF),
+    st.integers(1000, 1015),
+    st.integers(0, 31).map(lambda bit: 1 << bit),
+    st.sampled_from([0, 0xFFFFFFFF, 0xFFFFFFFE, 0x80000000]),
+)
+addresses = st.builds(
+    LssAddress, st.sampled_from([VENDOR, VENDOR ^ 1, 0]), st.sampled_from([PRODUCT, 0]), words, words
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    present=st.sets(addresses, min_size=1, max_size=12),
+    delays_s=st.lists(st.floats(0.0001, 0.02), min_size=1, max_size=4),
+    merging=st.booleans(),
+)
+def test_any_set_of_nodes_is_found_completely_and_named_uniquely(
+    present: set[LssAddress], delays_s: list[float], merging: bool
+) -> None:
+    slaves = [LssSlave(each) for each in sorted(present, key=hash)]
+    bus = Bus(slaves, delays_s, merging=merging)
+    master = bus.master()
+    found = master.scan(vendor_ids=[VENDOR])
+    assert found == sorted(present)
+    assert master.problem == ""
+    for node_id, each in enumerate(found, 0x20):
+        assert master.assign(each, node_id) == ""
+    assert {slave.address: slave.node_id for slave in slaves} == {
+        each: node_id for node_id, each in enumerate(found, 0x20)
+    }
+    assert all(slave.stored_id == slave.node_id and not slave.configuring for slave in slaves)
+    assert master.scan() == []
+
+
+@settings(max_examples=40, deadline=None)
+@given(present=st.sets(addresses, min_size=1, max_size=6))
+def test_a_scan_changes_no_node(present: set[LssAddress]) -> None:
+    slaves = [LssSlave(each) for each in present] + [LssSlave(address(77), node_id=5)]
+    master = Bus(slaves).master()
+    assert master.scan() == sorted(present)
+    assert master.scan() == sorted(present)
+    assert [slave.node_id for slave in slaves] == [None] * len(present) + [5]
+    assert not any(slave.configuring for slave in slaves)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_lost_answers_cost_time_but_no_node(seed: int) -> None:
+    bus = Bus(pads(6), (0.0004, 0.0011), lost=0.01)
+    bus._random.seed(seed)
+    assert bus.master().scan() == sorted(slave.address for slave in bus.slaves)
+
+
+def test_eight_nodes_are_found_within_three_seconds_on_a_bus_that_answers_in_half_a_millisecond() -> None:
+    bus = Bus(pads(8), (0.0005, 0.0007, 0.0009))
+    assert len(bus.master().scan()) == 8
+    assert bus.seconds < 3.0
+
+
+def test_known_values_are_tried_whole() -> None:
+    blind, told = Bus(pads(1)), Bus(pads(1))
+    assert blind.master().scan() == told.master().scan([9, VENDOR], [PRODUCT], [REVISION])
+    assert len(told.sent) < len(blind.sent) - 90  # three parts in four requests instead of 99
+
+
+def test_no_node_is_told_after_the_first_wait() -> None:
+    bus = Bus([])
+    assert bus.master().scan() == []
+    assert bus.seconds < 0.3
+
+
+def test_slow_nodes_are_waited_for_and_fast_ones_not() -> None:
+    fast, slow = Bus(pads(1), (0.0005,)), Bus(pads(1), (0.03,))
+    for bus in (fast, slow):
+        assert bus.master().scan() == [bus.slaves[0].address]
+    assert slow.seconds > 4 * fast.seconds
+
+
+def test_the_least_wait_is_kept() -> None:
+    bus = Bus(pads(1))
+    master = bus.master(least_wait_s=0.02)
+    master.scan()
+    assert master.wait_s >= 0.02
+
+
+def test_a_node_that_cannot_store_is_told_and_uses_its_id_until_power_off() -> None:
+    slave = LssSlave(address(1), can_store=False)
+    master = Bus([slave]).master()
+    assert master.assign(slave.address, 9) == "it has no memory for it"
+    assert slave.node_id == 9
+    slave.power_on()
+    assert slave.node_id is None
+
+
+def test_a_node_keeps_a_stored_id() -> None:
+    slave = LssSlave(address(1))
+    assert Bus([slave]).master().assign(slave.address, 9) == ""
+    slave.power_on()
+    assert slave.node_id == 9
+
+
+def test_a_node_that_has_an_id_tells_it_and_takes_another_at_its_next_reset() -> None:
+    slave = LssSlave(address(1), node_id=5)
+    master = Bus([LssSlave(address(2)), slave]).master()
+    assert master.inquire(slave.address) == 5
+    assert master.inquire(address(2)) is None
+    assert master.assign(slave.address, 6) == ""
+    assert slave.node_id == 5
+    slave.reset()
+    assert slave.node_id == 6
+
+
+def test_a_node_that_is_gone_is_named() -> None:
+    master = Bus([LssSlave(address(1))]).master()
+    with pytest.raises(LssError, match=r"serial 2 doesn't answer"):
+        master.assign(address(2), 9)
+    with pytest.raises(LssError, match=r"serial 2 doesn't answer"):
+        master.inquire(address(2))
+
+
+@pytest.mark.parametrize("node_id", [0, 128, 255])
+def test_an_id_that_cannot_be_is_refused_before_anything_is_sent(node_id: int) -> None:
+    bus = Bus([LssSlave(address(1))])
+    with pytest.raises(ValueError, match="1 to 127"):
+        bus.master().assign(address(1), node_id)
+    assert bus.sent == []
+
+
+def test_bit_timing_is_never_touched() -> None:
+    bus = Bus(pads(3))
+    master = bus.master()
+    for each in master.scan():
+        master.assign(each, 5)
+    assert not {request[0] for request in bus.sent} & {0x13, 0x15}
+
+
+class Restless(LssSlave):
+    """Forgets that it was found."""
+
+    def handle(self, data: bytes) -> bytes | None:
+        answer = super().handle(data)
+        if data[0] == 0x51:
+            self.configuring = False
+        return answer
+
+
+def test_a_node_that_takes_part_again_after_it_was_found_is_told() -> None:
+    master = Bus([Restless(address(1))]).master()
+    assert master.scan() == [address(1)]
+    assert "after it was found" in master.problem
+
+
+class Contrary(LssSlave):
+    """Says yes to every bit, and no to the value."""
+
+    def handle(self, data: bytes) -> bytes | None:
+        return frame(0x4F) if data[0] == 0x51 and data[6] == data[7] else None
+
+
+def test_a_node_that_contradicts_itself_ends_the_scan_with_a_reason() -> None:
+    master = Bus([Contrary(address(1))]).master()
+    assert master.scan() == []
+    assert "not so that its identity can be told" in master.problem
+
+
+# The slave alone: what CiA 305 says of each request.
+
+
+def test_a_fast_scan_is_for_nodes_without_an_id_in_the_waiting_state() -> None:
+    confirm = frame(0x51, 0, 0, 0, 0, 0x80)
+    slave = LssSlave(address(1))
+    assert slave.handle(confirm) == frame(0x4F)
+    slave.handle(frame(0x04, 1))
+    assert slave.handle(confirm) is None
+    assert LssSlave(address(1), node_id=3).handle(confirm) is None
+
+
+def test_a_fast_scan_goes_through_the_parts_in_their_order_only() -> None:
+    slave = LssSlave(address(1))
+    wrong = struct.pack("<BIBBB", 0x51, PRODUCT, 0, 1, 2)
+    assert slave.handle(wrong) is None
+    assert slave.handle(struct.pack("<BIBBB", 0x51, VENDOR, 0, 0, 1)) == frame(0x4F)
+    assert slave.handle(wrong) == frame(0x4F)
+
+
+def test_only_the_node_that_is_named_is_selected() -> None:
+    slaves = [LssSlave(address(1)), LssSlave(address(2))]
+    answers = [
+        [slave.handle(struct.pack("<BI3x", command, value)) for slave in slaves]
+        for command, value in zip((0x40, 0x41, 0x42, 0x43), address(2).parts, strict=True)
+    ]
+    assert answers == [[None, None]] * 3 + [[None, frame(0x44)]]
+    assert [slave.configuring for slave in slaves] == [False, True]
+
+
+def test_a_name_in_pieces_out_of_order_selects_nobody() -> None:
+    slave = LssSlave(address(1))
+    for command, value in zip((0x40, 0x42, 0x41, 0x43), address(1).parts, strict=True):
+        assert slave.handle(struct.pack("<BI3x", command, value)) is None
+    assert not slave.configuring
+
+
+@pytest.mark.parametrize(
+    ("serials", "expected"), [((1, 5), 0x4F), ((3, 3), 0x4F), ((4, 9), None), ((0, 2), None)]
+)
+def test_a_node_in_the_range_asked_for_answers(serials: tuple[int, int], expected: int | None) -> None:
+    slave = LssSlave(address(3), node_id=8)
+    values = (VENDOR, PRODUCT, 0, 0xFFFFFFFF, *serials)
+    answers = [slave.handle(struct.pack("<BI3x", 0x46 + n, value)) for n, value in enumerate(values)]
+    assert answers == [None] * 5 + [frame(expected) if expected else None]
+
+
+def test_nodes_without_an_id_say_so() -> None:
+    assert LssSlave(address(1)).handle(frame(0x4C)) == frame(0x50)
+    assert LssSlave(address(1), node_id=1).handle(frame(0x4C)) is None
+
+
+def test_identity_and_id_are_told_in_the_configuration_state_only() -> None:
+    slave = LssSlave(address(0x01020304), node_id=7)
+    assert slave.handle(frame(0x5D)) is None
+    slave.handle(frame(0x04, 1))
+    assert slave.handle(frame(0x5D)) == frame(0x5D, 4, 3, 2, 1)
+    assert slave.handle(frame(0x5A)) == frame(0x5A, 0xF1, 0x02)
+    assert slave.handle(frame(0x5E)) == frame(0x5E, 7)
+
+
+@pytest.mark.parametrize("node_id", [0, 128, 254])
+def test_a_slave_refuses_an_id_out_of_range(node_id: int) -> None:
+    slave = LssSlave(address(1))
+    slave.handle(frame(0x04, 1))
+    assert slave.handle(frame(0x11, node_id)) == frame(0x11, 1)
+    slave.handle(frame(0x04, 0))
+    assert slave.node_id is None
+
+
+@given(st.binary(max_size=12), st.booleans())
+def test_no_frame_upsets_a_slave(data: bytes, configuring: bool) -> None:
+    slave = LssSlave(address(1))
+    slave.configuring = configuring
+    answer = slave.handle(data)
+    assert answer is None or len(answer) == 8
+    assert len(data) == 8 or (answer is None and slave.rejected == 1)
