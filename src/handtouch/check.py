@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from handtouch import config
+from handtouch.canbus.channels import full_scale_counts
 from handtouch.canbus.load import burst_s, bus_load
 from handtouch.config.checks import rectangle_mm
 
@@ -137,7 +138,8 @@ def _pad_warnings(name: str, pad: config.Pad, deployment: config.Deployment) -> 
             f"{name}: contact_radius_mm = {sheet.contact_radius_mm}: a contact covers the pad of "
             f"{min(a, b):.1f} mm, and forces are wrong near its edges"
         )
-    noise_n = _force_of_current(sheet, node, 3 * node.noise_counts * node.full_scale_ma / 32767)
+    noise_ma = node.noise_counts * node.full_scale_ma / full_scale_counts(node)
+    noise_n = _force_of_current(sheet, node, 3 * noise_ma)
     if touch.off_n < noise_n:
         yield f"{name}: off_n = {touch.off_n}: below what noise alone can read, {noise_n:.3g} N"
 

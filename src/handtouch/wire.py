@@ -162,7 +162,7 @@ class Raw:
     hand: str
     links: tuple[str, ...]
     counts: bytes
-    """int16 x 4 (x0, xa, y0, yb), little-endian, one row per link"""
+    """int64 x 4 (x0, xa, y0, yb), little-endian, one row per link"""
     sample_ns: bytes
     """int64"""
     fresh: bytes

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.canbus import boot, master
+from handtouch.canbus import master, sdo
+from handtouch.canbus.bus_state import Trouble
 from handtouch.canbus.device import Device, DeviceBus
 from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master, NodeEvent, NodeSpec, NodeStatus
+from handtouch.canbus.master import Master, NodeEvent, NodeSpec, NodeStatus, SerialChanged
 from handtouch.canbus.port import Port
 from handtouch.canbus.router import Frame, Router
 from handtouch.canbus.slab import Slab
@@ -47,7 +48,7 @@ class Wire:
     """The bus between them: `DeviceBus` takes it for python-can's, `Port` for a receiver."""
 
     def __init__(self, rig: Rig) -> None:
-        self.problem = ""
+        self.trouble: Trouble | None = None
         self.to_master: deque[can.Message] = deque()
         self.sent: list[tuple[int, bytes]] = []  # by the master
         self.down = False
@@ -63,7 +64,7 @@ class Wire:
             if frame[0].arbitration_id & 0x7F not in self.cut:
                 self.to_master.append(_copy(frame[0]))
         else:
-            self._from_master(*frame)
+            self._from_master(*frame[:2])
 
     # the port's side
     def fileno(self) -> int:
@@ -71,6 +72,9 @@ class Wire:
 
     def close(self) -> None:
         """Nothing to give back."""
+
+    def send_cyclically(self, *_: object) -> None:
+        """Nobody but us could do it."""
 
     def drain(self, router: Router) -> list[Frame]:
         others = []
@@ -151,7 +155,7 @@ class Rig:
         self.master.take_events()
         self.wire.sent.clear()
 
-    def run(self, ms: int) -> list[NodeEvent]:
+    def run(self, ms: int) -> list[NodeEvent | SerialChanged]:
         """Let time pass, in steps of a millisecond; what happened in the nodes' lives."""
         for _ in range(ms):
             self.t_ns += MS
@@ -160,8 +164,8 @@ class Rig:
             self.devices.advance(self.t_ns)
             self.pump()
             self.master.poll(self.t_ns)
-            if isinstance(self.master._worker, Jobs):
-                self.master._worker.work()
+            if isinstance(self.master._workers, Jobs):
+                self.master._workers.work()
         return self.master.take_events()
 
     def pump(self) -> None:
@@ -187,7 +191,7 @@ def _copy(message: can.Message) -> can.Message:
 def make_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
     """Rigs by size and spec; silence of a node costs 5 ms of real time."""
     monkeypatch.setattr(master, "ThreadPoolExecutor", Jobs)
-    monkeypatch.setattr(boot, "SDO_TIMEOUT_S", 0.005)
+    monkeypatch.setattr(sdo, "SDO_TIMEOUT_S", 0.005)
     rigs: list[Rig] = []
 
     def make(size: int = 3, **spec: Any) -> Rig:

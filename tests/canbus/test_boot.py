@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from handtouch.canbus.boot import (
-    BootError,
-    Expected,
-    Identity,
-    Outdated,
-    Sdo,
-    Tpdo,
-    configure,
-    identify,
-    read_mapping,
-)
+from handtouch.canbus.boot import Expected, Identity, configure, identify
+from handtouch.canbus.channels import STANDARD_CHANNELS, Channel, Channels
+from handtouch.canbus.mapping import Mapping, Tpdo, read_mapping
+from handtouch.canbus.sdo import Outdated, Sdo, StepError
+from handtouch.canbus.slab import STANDARD, Field
 
 CHANNELS = (0x64010110, 0x64010210, 0x64010310, 0x64010410)
 ABORT_NO_OBJECT, ABORT_NO_SUB = 0x06020000, 0x06090011
@@ -26,6 +20,7 @@ class Node:
     def __init__(self, objects: dict[tuple[int, int], tuple[int, int]]) -> None:
         self.objects = objects  # (index, sub) -> (value, size)
         self.writes: list[tuple[int, int, int]] = []
+        self.halts: list[bool] = []
         self.deaf: set[int] = set()
         self.forgets: set[int] = set()
         self.sdo = Sdo(5, self.answer)
@@ -62,12 +57,16 @@ def tpdo(
     return {(0x1A00 + number - 1, 0): (len(entries), 1)} | mapping | communication
 
 
+def found(enabled: bool = True, transmission: int = 1) -> Tpdo:
+    return Tpdo(2, 0x285, enabled, transmission, CHANNELS)
+
+
 def identity(*values: int) -> dict[tuple[int, int], tuple[int, int]]:
     return {(0x1018, sub): (value, 4) for sub, value in enumerate(values, 1)}
 
 
 def test_identity_is_read_whole() -> None:
-    assert identify(Node(identity(1, 2, 3, 4)).sdo, Expected(1, 2, 4)) == Identity(1, 2, 3, 4)
+    assert identify(Node(identity(1, 2, 3, 4)).sdo, Expected(1, 2, 3, 4)) == Identity(1, 2, 3, 4)
 
 
 def test_only_the_vendor_id_is_mandatory() -> None:
@@ -75,14 +74,46 @@ def test_only_the_vendor_id_is_mandatory() -> None:
 
 
 def test_node_without_serial_number_is_not_the_one_with_the_configured_one() -> None:
-    with pytest.raises(BootError, match="serial number is none, configured is 4") as caught:
+    with pytest.raises(StepError, match="serial number is none, configured is 4") as caught:
         identify(Node(identity(1, 2, 3)).sdo, Expected(serial=4))
     assert caught.value.stranger
 
 
+WIDE: Channels = (
+    Channel(0x9130, 1, 32),
+    Channel(0x9130, 2, 32),
+    Channel(0x9130, 3, 32),
+    Channel(0x9130, 4, 32),
+)
+
+
+def mapping_of(node: Node, channels: Channels = STANDARD_CHANNELS, remap: bool = False) -> Mapping:
+    halt = (lambda: node.halts.append(True)) if remap else None
+    return read_mapping(node.sdo, 5, (2, 1, 3, 4), channels, halt)
+
+
 def test_mapping_is_found_in_whatever_tpdo_carries_it() -> None:
     node = Node(tpdo(1, (0x60000108,), 0x185) | tpdo(3, CHANNELS, 0x385, 255))
-    assert read_mapping(node.sdo, (2, 1, 3, 4)) == Tpdo(3, 0x385, True, 255)
+    assert mapping_of(node) == Mapping((Tpdo(3, 0x385, True, 255, CHANNELS),), STANDARD)
+
+
+def test_channels_are_found_in_any_order_between_other_objects() -> None:
+    """A status byte, a dummy of 8 bits, and the channels backwards."""
+    entries = (0x20000108, 0x64010410, 0x64010310, 0x00050008, 0x64010210)
+    node = Node(tpdo(1, (0x64010110, 0x20000208), 0x185) | tpdo(2, entries, 0x285))
+    found = mapping_of(node)
+    assert [(t.number, t.size) for t in found.tpdos] == [(2, 8), (1, 3)]
+    assert found.layout == (
+        Field(1, 0, 16, True),
+        Field(0, 48, 16, True),
+        Field(0, 24, 16, True),
+        Field(0, 8, 16, True),
+    )
+
+
+def test_one_tpdo_with_all_channels_goes_before_several() -> None:
+    node = Node(tpdo(2, CHANNELS[:2], 0x285) | tpdo(1, CHANNELS, 0x185))
+    assert [t.number for t in mapping_of(node).tpdos] == [1]
 
 
 @pytest.mark.parametrize(
@@ -94,27 +125,57 @@ def test_mapping_is_found_in_whatever_tpdo_carries_it() -> None:
             tpdo(1, CHANNELS[:3], 0x185),
             r"TPDO1 has 0x6401:01 \(16 bit\), 0x6401:02 \(16 bit\), 0x6401:03 \(16 bit\); map",
         ),
-        (tpdo(1, CHANNELS[::-1], 0x185), r"TPDO1 has 0x6401:04 \(16 bit\)"),
-        (tpdo(1, (0x64010120, 0x64010220), 0x185), r"0x6401:01 \(32 bit\)"),
+        (tpdo(1, (0x64010120, 0x64010220), 0x185), r"TPDO1 carries 0x6401:01 \(16 bit\) with 32 bits"),
         (tpdo(2, CHANNELS, 0x20000285), "no 11-bit identifier"),
         (tpdo(2, CHANNELS, 0x80000000), "no 11-bit identifier"),
+        ({(0x1A01, 0): (255, 1)}, "TPDO2 has nothing"),
     ],
 )
 def test_unusable_mapping_is_told_as_it_is(
     objects: dict[tuple[int, int], tuple[int, int]], told: str
 ) -> None:
-    with pytest.raises(BootError, match=told):
-        read_mapping(Node(objects).sdo, (1, 2))
+    with pytest.raises(StepError, match=told):
+        mapping_of(Node(objects))
+
+
+def test_channels_in_no_tpdo_are_mapped_to_one_that_carries_nothing_else() -> None:
+    """As CiA 301 has it: off, emptied, filled, counted; and only after the node was halted."""
+    node = Node(tpdo(2, (0x60000108,), 0x285) | tpdo(3, (), 0x80000385, 255))
+    node.objects |= {(0x1A02, sub): (0, 4) for sub in (1, 2, 3, 4)}
+    found = mapping_of(node, remap=True)
+    assert found == Mapping((Tpdo(3, 0x385, False, 255, CHANNELS),), STANDARD)
+    assert node.halts == [True]
+    assert node.writes == [*((0x1A02, sub, entry) for sub, entry in enumerate(CHANNELS, 1)), (0x1A02, 0, 4)]
+    assert node.objects[0x1A01, 1] == (0x60000108, 4)
+
+
+def test_channels_too_wide_for_one_tpdo_are_mapped_to_two() -> None:
+    node = Node(tpdo(1, (), 0x80000185) | tpdo(2, (0x91300120,), 0x285) | tpdo(4, (0x60000108,), 0x485))
+    node.objects |= {(index, sub): (0, 4) for index in (0x1A00, 0x1A01) for sub in (1, 2)}
+    found = mapping_of(node, WIDE, remap=True)
+    assert [(t.number, t.cob_id, t.size, t.enabled) for t in found.tpdos] == [
+        (2, 0x285, 8, False),
+        (1, 0x185, 8, False),
+    ]
+    assert [(field.pdo, field.bit) for field in found.layout] == [(0, 0), (0, 32), (1, 0), (1, 32)]
+
+
+def test_tpdos_with_other_objects_are_never_mapped_anew() -> None:
+    node = Node(tpdo(1, (0x60000108,), 0x185) | tpdo(2, (0x64010110, 0x20000108), 0x285))
+    with pytest.raises(StepError, match="1 that carry nothing else are needed"):
+        mapping_of(node, remap=True)
+    assert node.writes == []
+    assert node.halts == []
 
 
 @pytest.mark.parametrize(
     ("found", "heartbeat", "writes", "halts"),
     [
-        (Tpdo(2, 0x285, True, 1), 100, [], 0),
-        (Tpdo(2, 0x285, True, 1), 0, [(0x1017, 0, 100)], 0),
-        (Tpdo(2, 0x285, True, 255), 100, [(0x1801, 2, 1)], 1),
-        (Tpdo(2, 0x285, False, 1), 100, [(0x1801, 1, 0x285)], 1),
-        (Tpdo(2, 0x285, False, 0), 0, [(0x1801, 2, 1), (0x1801, 1, 0x285), (0x1017, 0, 100)], 1),
+        (found(), 100, [], 0),
+        (found(), 0, [(0x1017, 0, 100)], 0),
+        (found(transmission=255), 100, [(0x1801, 2, 1)], 1),
+        (found(enabled=False), 100, [(0x1801, 1, 0x285)], 1),
+        (found(enabled=False, transmission=0), 0, [(0x1801, 2, 1), (0x1801, 1, 0x285), (0x1017, 0, 100)], 1),
     ],
 )
 def test_only_what_differs_is_written_and_only_pdo_changes_halt(
@@ -123,25 +184,51 @@ def test_only_what_differs_is_written_and_only_pdo_changes_halt(
     cob_id = found.cob_id | (0 if found.enabled else 1 << 31)
     node = Node(tpdo(2, CHANNELS, cob_id, found.transmission) | {(0x1017, 0): (heartbeat, 2)})
     halted: list[bool] = []
-    configure(node.sdo, found, 100, lambda: halted.append(True))
+    assert not configure(node.sdo, Mapping((found,), STANDARD), 100, lambda: halted.append(True)).guarded
     assert (node.writes, len(halted)) == (writes, halts)
+
+
+def test_node_without_heartbeat_gets_it_as_guard_time() -> None:
+    node = Node(tpdo(2, CHANNELS, 0x285) | {(0x100C, 0): (0, 2), (0x100D, 0): (0, 1)})
+    assert configure(node.sdo, Mapping((found(),), STANDARD), 150, lambda: None).guarded
+    assert node.writes == [(0x100C, 0, 150), (0x100D, 0, 3)]
+
+
+def test_node_that_has_neither_is_guarded_all_the_same() -> None:
+    assert configure(Node({}).sdo, Mapping((found(),), STANDARD), 150, lambda: None).guarded
+
+
+def test_transmission_type_of_a_strict_node_is_changed_while_its_pdo_is_off() -> None:
+    node = Node(tpdo(2, CHANNELS, 0x285, 255) | {(0x1017, 0): (100, 2)})
+    plain = node.answer
+
+    def strict(can_id: int, data: bytes) -> bool:
+        valid = not node.objects[0x1801, 1][0] >> 31
+        if data[0] & 0xE0 == 0x20 and data[1:4] == b"\x01\x18\x02" and valid:
+            node.sdo.deliver(b"\x80\x01\x18\x02" + (0x08000022).to_bytes(4, "little"))
+            return True
+        return plain(can_id, data)
+
+    node.sdo._client.network._send = strict
+    configure(node.sdo, Mapping((found(transmission=255),), STANDARD), 100, lambda: None)
+    assert node.writes == [(0x1801, 1, 0x80000285), (0x1801, 2, 1), (0x1801, 1, 0x285)]
 
 
 def test_value_that_does_not_stick_is_an_error() -> None:
     node = Node({(0x1017, 0): (0, 2)})
     node.forgets.add(0x1017)
-    with pytest.raises(BootError, match="heartbeat time, 0x1017:00, was set to 100 but reads 0"):
-        configure(node.sdo, Tpdo(2, 0x285, True, 1), 100, lambda: None)
+    with pytest.raises(StepError, match="heartbeat time, 0x1017:00, was set to 100 but reads 0"):
+        configure(node.sdo, Mapping((found(),), STANDARD), 100, lambda: None)
 
 
 def test_silence_and_refusal_are_told_apart() -> None:
     node = Node(identity(1))
     node.deaf.add(0x1018)
-    with pytest.raises(BootError, match="reading vendor id, 0x1018:01: no answer") as silence:
+    with pytest.raises(StepError, match="reading vendor id, 0x1018:01: no answer") as silence:
         identify(node.sdo, Expected())
     assert silence.value.silent
     with pytest.raises(
-        BootError, match=r"refused by the node \(Code 0x06020000, Object does not exist\)"
+        StepError, match=r"refused by the node \(Code 0x06020000, Object does not exist\)"
     ) as refusal:
         Node({}).sdo.read(0x1017, 0, "heartbeat time")
     assert not refusal.value.silent
@@ -170,7 +257,7 @@ def test_garbled_answer_is_an_error_not_a_value() -> None:
         return True
 
     node.sdo._client.network._send = garbled
-    with pytest.raises(BootError, match="Unexpected response 0xFF") as caught:
+    with pytest.raises(StepError, match="Unexpected response 0xFF") as caught:
         node.sdo.read(0x1017, 0, "heartbeat time")
     assert not caught.value.silent
 

@@ -28,7 +28,7 @@ def test_a_hand_becomes_operational_and_its_samples_are_in_the_slab(rig: Any) ->
     rig.boot()
     rig.counts[1] = (-1, 2, -3, 32767)
     rig.run(10)
-    assert rig.slab.counts.tolist() == [[10, 20, 30, 40], [-1, 2, -3, 32767], [10, 20, 30, 40]]
+    assert rig.slab.read().tolist() == [[10, 20, 30, 40], [-1, 2, -3, 32767], [10, 20, 30, 40]]
     assert [s.cob_id for s in rig.master.status()] == [0x281, 0x282, 0x283]
     assert [s.serial for s in rig.master.status()] == [101, 102, 103]
     assert rig.port.counters.foreign == 0
@@ -434,11 +434,11 @@ def test_the_masters_own_frames_and_known_ones_are_not_foreign(rig: Any, can_id:
 @pytest.mark.parametrize("data", [b"", b"\x00" * 7, b"\x00" * 2])
 def test_wrong_length_is_counted_and_changes_nothing(rig: Any, can_id: int, data: bytes) -> None:
     rig.boot()
-    before = rig.slab.counts.copy()
+    before = rig.slab.read().copy()
     rig.inject(can_id, data)
     assert rig.port.counters.short == 1
     assert (rig.master.states == OPERATIONAL).all()
-    np.testing.assert_array_equal(rig.slab.counts, before)
+    np.testing.assert_array_equal(rig.slab.read(), before)
     assert rig.status(1).emergencies == ()
 
 

@@ -41,12 +41,21 @@ NMT_BOOT_UP, NMT_STOPPED, NMT_OPERATIONAL, NMT_PREOPERATIONAL = 0, 4, 5, 127
 NMT_NAMES = {NMT_STOPPED: "stopped", NMT_OPERATIONAL: "operational", NMT_PREOPERATIONAL: "pre-operational"}
 
 
+class Role(Enum):
+    """What part we take on a node's bus."""
+
+    MASTER = "master"  # we configure and start the node
+    GUEST = "guest"  # we configure it; another NMT master starts it
+    LISTENER = "listener"  # we send nothing
+
+
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Times of one node, ns."""
+    """Times of one node [ns], and our part on its bus."""
 
     heartbeat_ns: int
     heartbeat_timeout_ns: int
+    role: Role = Role.MASTER
     settle_samples: int = 3
     settle_timeout_ns: int = 1_000_000_000
     retry_first_ns: int = 100_000_000
@@ -57,6 +66,15 @@ class Timing:
         return min(self.retry_first_ns << min(max(failures - 1, 0), 16), self.retry_last_ns)
 
 
+_NEVER_NS = 1 << 62
+_NO_HEARTBEAT = (
+    "answers over SDO, but sends no heartbeat, though it was told to (0x1017): its firmware may hang; "
+    "power-cycle it"
+)
+_TWINS = (
+    "two nodes have its id, for heartbeats come twice as often as they should: unplug one and give it "
+    "another id (`handtouch scan` tells the serial numbers)"
+)
 _LOOK_AT = "check its power, cable, node id and the bit rate and termination of the bus"
 
 
@@ -79,6 +97,7 @@ class Life:
     reboots: int = 0
     must_beat: bool = False  # lost for want of heartbeats: not trusted before it has sent one
     stranger: bool = False  # at its last identification it was not the configured node
+    twins: bool = False  # two nodes have its id
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +149,13 @@ class Silence:
 
 
 @dataclass(frozen=True, slots=True)
+class Beats:
+    """How often its heartbeats came over a while: `twice`, as if two nodes had its id, or as they should."""
+
+    twice: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """Time has passed."""
 
@@ -139,7 +165,7 @@ class Stop:
     """The node is not wanted any more."""
 
 
-Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Tick | Stop
+Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Beats | Tick | Stop
 Next = tuple[Life, tuple[Action, ...]]
 
 _IN_BOOT = frozenset({NodeState.BOOTING, NodeState.IDENTIFIED, NodeState.CONFIGURING})
@@ -154,9 +180,9 @@ def advance(life: Life, event: Event, t_ns: int, timing: Timing) -> Next:
         case Heartbeat(nmt):
             return _heartbeat(life, nmt, t_ns, timing)
         case BootUp():
-            return _boot_up(life, t_ns)
+            return _boot_up(life, t_ns, timing)
         case Answer():
-            return _answer(life, t_ns)
+            return _answer(life, t_ns, timing)
         case Done():
             return _done(life, event, t_ns, timing)
         case Failed():
@@ -165,11 +191,15 @@ def advance(life: Life, event: Event, t_ns: int, timing: Timing) -> Next:
             return _sample(life, t_ns, timing)
         case Silence(age_ns):
             return _silence(life, age_ns, t_ns)
+        case Beats(twice):
+            return _beats(life, twice, t_ns, timing)
         case Tick():
             return _tick(life, t_ns, timing)
         case Stop():
-            wanted = () if life.stranger else (Action.STOP,)  # a stranger at its id is not ours to stop
-            return _enter(life, NodeState.STOPPED, t_ns, "stopped by handtouch"), wanted
+            # a stranger at its id is not ours to stop
+            wanted = (Action.STOP,) if timing.role is Role.MASTER and not life.stranger else ()
+            told = "stopped by handtouch" if wanted else "left as it was when handtouch ended"
+            return _enter(life, NodeState.STOPPED, t_ns, told), wanted
         case _:
             assert_never(event)
 
@@ -189,35 +219,41 @@ def _enter(life: Life, state: NodeState, t_ns: int, reason: str) -> Life:
     return replace(life, state=state, since_ns=since_ns, reason=reason)
 
 
-def _boot(life: Life, t_ns: int, reason: str) -> Next:
-    """Begin again, with the identity."""
+def _boot(life: Life, t_ns: int, reason: str, timing: Timing) -> Next:
+    """Begin again, with the identity; a listener has to believe what it hears."""
+    if timing.role is Role.LISTENER:
+        life = _enter(life, NodeState.SETTLING, t_ns, f"{reason}; we only listen, its identity isn't checked")
+        return replace(life, started_ns=t_ns, discard=timing.settle_samples, due_ns=_NEVER_NS), ()
     life = _enter(life, NodeState.BOOTING, t_ns, reason)
-    return replace(life, attempt=life.attempt + 1, probes=0), _identify(life)
+    return replace(life, attempt=life.attempt + 1, probes=0), _identify(life, timing)
 
 
-def _identify(life: Life) -> tuple[Action, ...]:
+def _identify(life: Life, timing: Timing) -> tuple[Action, ...]:
     """A stopped node doesn't serve SDO: first it is made to."""
-    if life.nmt == NMT_STOPPED and not life.stranger:
+    if life.nmt == NMT_STOPPED and not life.stranger and timing.role is Role.MASTER:
         return Action.ENTER_PREOPERATIONAL, Action.IDENTIFY
     return (Action.IDENTIFY,)
 
 
 def _heartbeat(life: Life, nmt: int, t_ns: int, timing: Timing) -> Next:
-    if life.heartbeat_ns is not None:
+    if life.heartbeat_ns is not None or timing.role is Role.LISTENER:
         life = replace(life, heartbeat_ns=t_ns)
     just_stopped = nmt == NMT_STOPPED != life.nmt
     life = replace(life, nmt=nmt, heard_ns=t_ns, must_beat=False)
     told = f"heartbeat: node is {NMT_NAMES.get(nmt, f'in NMT state {nmt}')}"
     if life.state is NodeState.ABSENT or (life.state in _IN_BOOT and just_stopped):
-        return _boot(life, t_ns, told)
+        return _boot(life, t_ns, told, timing)
     # A heartbeat sent before our start command may still arrive after it.
     settled = t_ns - life.started_ns > 2 * timing.heartbeat_ns
     if life.state in _STARTED and nmt != NMT_OPERATIONAL and settled:
-        return _boot(life, t_ns, f"{told}, though it was started")
+        if timing.role is Role.MASTER:
+            return _boot(life, t_ns, f"{told}, though it was started", timing)
+        life = _enter(life, NodeState.SETTLING, t_ns, f"{told}; another master has to start it")
+        return replace(life, discard=timing.settle_samples, due_ns=_NEVER_NS), ()
     return life, ()
 
 
-def _boot_up(life: Life, t_ns: int) -> Next:
+def _boot_up(life: Life, t_ns: int, timing: Timing) -> Next:
     by_itself = life.state is not NodeState.ABSENT
     life = replace(
         life,
@@ -228,14 +264,14 @@ def _boot_up(life: Life, t_ns: int) -> Next:
         failures=0,  # those of its life before say nothing of this one
         reboots=life.reboots + by_itself,
     )
-    return _boot(life, t_ns, "rebooted by itself" if by_itself else "boot-up message")
+    return _boot(life, t_ns, "rebooted by itself" if by_itself else "boot-up message", timing)
 
 
-def _answer(life: Life, t_ns: int) -> Next:
+def _answer(life: Life, t_ns: int, timing: Timing) -> Next:
     life = replace(life, heard_ns=t_ns)
     if life.state is not NodeState.ABSENT:
         return life, ()
-    return _boot(replace(life, nmt=None), t_ns, "answers over SDO")
+    return _boot(replace(life, nmt=None), t_ns, "answers over SDO", timing)
 
 
 def _done(life: Life, event: Done, t_ns: int, timing: Timing) -> Next:
@@ -257,15 +293,17 @@ def _done(life: Life, event: Done, t_ns: int, timing: Timing) -> Next:
 def _start(life: Life, t_ns: int, timing: Timing) -> Next:
     """Trust begins after some samples; a node found running is left running."""
     running = life.nmt == NMT_OPERATIONAL
-    life = _enter(life, NodeState.SETTLING, t_ns, "found running" if running else "started")
+    ours = timing.role is Role.MASTER
+    told = "found running" if running else "started" if ours else "configured; another master has to start it"
+    life = _enter(life, NodeState.SETTLING, t_ns, told)
     life = replace(
         life,
         heartbeat_ns=t_ns,
         started_ns=t_ns,
         discard=timing.settle_samples,
-        due_ns=t_ns + timing.settle_timeout_ns,
+        due_ns=t_ns + timing.settle_timeout_ns if running or ours else _NEVER_NS,
     )
-    return life, () if running else (Action.START,)
+    return life, () if running or not ours else (Action.START,)
 
 
 def _failed(life: Life, event: Failed, t_ns: int, timing: Timing) -> Next:
@@ -282,6 +320,8 @@ def _failed(life: Life, event: Failed, t_ns: int, timing: Timing) -> Next:
 
 
 def _sample(life: Life, t_ns: int, timing: Timing) -> Next:
+    if life.state is NodeState.ABSENT and timing.role is Role.LISTENER:
+        return _boot(life, t_ns, "samples came", timing)
     if life.state not in (NodeState.SETTLING, NodeState.STALE):
         return life, ()
     discard = max(life.discard - 1, 0) if life.state is NodeState.SETTLING else life.discard
@@ -300,13 +340,27 @@ def _silence(life: Life, age_ns: int, t_ns: int) -> Next:
     return _enter(life, NodeState.STALE, t_ns, f"{told}; is there a SYNC?"), ()
 
 
+def _beats(life: Life, twice: bool, t_ns: int, timing: Timing) -> Next:
+    if not twice:
+        return replace(life, twins=False), ()
+    if life.state is NodeState.ABSENT:
+        return life, ()
+    life = _enter(life, NodeState.FAULTED, t_ns, _TWINS)
+    return replace(life, twins=True, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns), ()
+
+
 def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
     supervised = life.heartbeat_ns is not None and life.state is not NodeState.ABSENT
     if supervised and life.heartbeat_ns is not None:
         quiet_ns = t_ns - life.heartbeat_ns
         if quiet_ns > timing.heartbeat_timeout_ns:
-            # One that never sends heartbeats, though it was told to, is probed less and less often.
-            failures = life.failures + 1 if life.must_beat else 0
+            if life.must_beat and timing.role is not Role.LISTENER:
+                # alive, for it was just configured: tried again less and less often
+                failures = life.failures + 1
+                life = _enter(life, NodeState.FAULTED, t_ns, _NO_HEARTBEAT)
+                due = t_ns + timing.pause_ns(failures)
+                return replace(life, heartbeat_ns=None, failures=failures, due_ns=due), ()
+            failures = 0
             told = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms; {_LOOK_AT}"
             life = _enter(life, NodeState.ABSENT, t_ns, told)
             due = t_ns + timing.pause_ns(failures)
@@ -315,13 +369,15 @@ def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
             ), ()
     if t_ns < life.due_ns:
         return life, ()
+    if life.state is NodeState.ABSENT and timing.role is Role.LISTENER:
+        return replace(life, due_ns=_NEVER_NS), ()
     if life.state is NodeState.ABSENT:
         probes = life.probes + 1
         return replace(life, probes=probes, due_ns=t_ns + timing.pause_ns(probes)), (Action.PROBE,)
     if life.state is NodeState.FAULTED:
         # It stays FAULTED, with its reason, until an attempt gets further.
         life = replace(life, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns)
-        return life, _identify(life)
+        return life, () if life.twins else _identify(life, timing)
     if life.state is NodeState.SETTLING:
         return _enter(life, NodeState.STALE, t_ns, "started, but no sample came: is there a SYNC?"), ()
     return life, ()

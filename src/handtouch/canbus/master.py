@@ -1,8 +1,9 @@
 """The master's side of a hand's CANopen nodes: boots each one, watches it, brings it back when it was away.
 
-Public names: `Master`, `NodeSpec`, `NodeStatus`, `NodeEvent`. One thread receives and calls `handle` and
-`poll`; whatever has to wait for a node's answer is done in one worker thread of the master's own. Nodes are
-addressed one by one, never by a broadcast.
+Public names: `Master`, `NodeSpec`, `NodeStatus`, `NodeEvent`, `SerialChanged`. One thread receives and calls
+`handle` and `poll`; whatever has to wait for a node's answer is done in worker threads of the master's own,
+so that one that is silent keeps none of the others waiting. Nodes are addressed one by one, never by a
+broadcast.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from . import boot, eds, emergency
+from . import boot, emergency
 from .lifecycle import (
     NMT_BOOT_UP,
     NMT_PREOPERATIONAL,
     Action,
     Answer,
+    Beats,
     BootUp,
     Done,
     Event,
@@ -28,6 +30,7 @@ from .lifecycle import (
     Heartbeat,
     Life,
     NodeState,
+    Role,
     Sample,
     Silence,
     Stop,
@@ -36,15 +39,22 @@ from .lifecycle import (
     advance,
     due_ns,
 )
-from .nodes import NodeEvent, NodeSpec, NodeStatus
+from .mapping import Mapping as PdoMapping
+from .mapping import from_eds, read_mapping, tpdo_numbers
+from .nodes import NodeEvent, NodeSpec, NodeStatus, SerialChanged
 from .port import Port
 from .router import IDENTIFIERS, NOBODY
+from .sdo import Outdated, Sdo, StepError
 
-__all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus"]
+__all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus", "SerialChanged"]
 
 STALE_PERIODS = 3
 """Periods without a sample after which an operational node is stale."""
 EMERGENCIES_KEPT = 16
+BEATS_WATCHED = 10
+"""Heartbeat periods over which it is judged whether they come twice as often as they should."""
+_TWICE = 1.6  # times as many
+_WORKERS = 32
 _EVENTS_KEPT = 1024
 _NEVER_NS = 1 << 62
 
@@ -57,9 +67,10 @@ _PROBE = bytes(
 _NMT_COMMANDS = {Action.START: 1, Action.STOP: 2, Action.ENTER_PREOPERATIONAL: 128}
 
 _FOREIGN, _IGNORED = -1, -2
+_GUARDED = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
 _NOBODY_WAITS = (NodeState.ABSENT, NodeState.STOPPED)
 Outcome = Done | Failed
-Result = boot.Identity | boot.Tpdo | None
+Result = boot.Identity | PdoMapping | boot.Configured
 
 
 @dataclass(slots=True, eq=False)
@@ -70,12 +81,15 @@ class _Node:
     port: Port
     timing: Timing
     tpdos: tuple[int, ...]
-    sdo: boot.Sdo
+    sdo: Sdo
     life: Life = field(default_factory=Life)
     identity: boot.Identity | None = None
-    tpdo: boot.Tpdo | None = None
+    mapping: PdoMapping | None = None
+    guarded: bool = False
+    guard_ns: int = 0  # when to ask a guarded node next
     heartbeats: int = 0
     missed: int = 0
+    watched: tuple[int, int] = (0, 0)  # since when, and how many heartbeats had come then
     emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
 
     def status(self) -> NodeStatus:
@@ -88,7 +102,8 @@ class _Node:
             self.life.since_ns,
             self.life.reason,
             self.identity,
-            self.tpdo.cob_id if self.tpdo else None,
+            tuple(tpdo.cob_id for tpdo in self.mapping.tpdos) if self.mapping else (),
+            self.guarded,
             self.heartbeats,
             self.missed,
             self.life.reboots,
@@ -122,13 +137,19 @@ class Master:
         self._owners = _owners(ports, self._nodes)
         self._waiting: dict[int, int] = {}  # slots whose next sample matters -> stamp of the last one
         self._next_due_ns = 0
-        self._events: deque[NodeEvent] = deque(maxlen=_EVENTS_KEPT)
-        self._results: deque[tuple[_Node, Outcome, Result]] = deque()  # from the worker
-        self._worker: ThreadPoolExecutor | None = None
+        self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_EVENTS_KEPT)
+        self._results: deque[tuple[_Node, Outcome, Result | None]] = deque()  # from the workers
+        self._workers: ThreadPoolExecutor | None = None
 
     def start(self, t_ns: int) -> None:
         """Begin to look for the nodes."""
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="canopen-sdo")
+        self._workers = ThreadPoolExecutor(
+            max_workers=min(_WORKERS, max(len(self._nodes), 1)), thread_name_prefix="canopen-sdo"
+        )
+        for node in self._nodes:
+            if node.timing.role is Role.LISTENER and node.mapping is not None:
+                self._route(node, node.mapping)
+                self._changed(node)
         self._next_due_ns = t_ns
         self.poll(t_ns)
 
@@ -138,7 +159,7 @@ class Master:
         Before `start` and after `stop` nothing but that is done with it.
         """
         owner = self._owners[bus_name][can_id]
-        if owner >= 0 and self._worker is not None:
+        if owner >= 0 and self._workers is not None:
             self._from_node(self._nodes[owner], can_id & 0x780, data, t_ns)
         elif owner == _FOREIGN:
             self._ports[bus_name].counters.foreign += 1
@@ -147,7 +168,7 @@ class Master:
 
     def poll(self, t_ns: int) -> None:
         """Time-outs, retries and results of the worker; once a tick, after `drain` and `handle`."""
-        if self._worker is None:
+        if self._workers is None:
             return
         if self._results:
             self._collect(t_ns)
@@ -159,19 +180,19 @@ class Master:
         """Every node as it is now, in the order given."""
         return [node.status() for node in self._nodes]
 
-    def take_events(self) -> list[NodeEvent]:
+    def take_events(self) -> list[NodeEvent | SerialChanged]:
         """What has happened since the last call, oldest first; the latest thousand if nobody asked."""
         events = list(self._events)
         self._events.clear()
         return events
 
     def stop(self, t_ns: int) -> None:
-        """NMT stop to each configured node, one by one; returns when the worker has ended (0.2 s at most)."""
+        """NMT stop to each configured node, one by one; returns when the workers have ended (in 0.2 s)."""
         for node in self._nodes:
             self._advance(node, Stop(), t_ns)
-        if self._worker is not None:
-            self._worker.shutdown(wait=True, cancel_futures=True)
-            self._worker = None
+        if self._workers is not None:
+            self._workers.shutdown(wait=True, cancel_futures=True)
+            self._workers = None
         self._results.clear()
 
     def _from_node(self, node: _Node, service: int, data: bytes, t_ns: int) -> None:
@@ -193,9 +214,23 @@ class Master:
             self._advance(node, BootUp(), t_ns)
             return
         node.heartbeats += 1
+        self._watch_rate(node, t_ns)
         if node.life.heartbeat_ns is not None:
             node.missed += max(round((t_ns - node.life.heartbeat_ns) / node.timing.heartbeat_ns) - 1, 0)
         self._advance(node, Heartbeat(nmt), t_ns)
+
+    def _watch_rate(self, node: _Node, t_ns: int) -> None:
+        """Two nodes of one id give themselves away by their heartbeats, which come twice as often."""
+        if node.guarded:
+            return
+        since_ns, before = node.watched
+        periods = (t_ns - since_ns) / node.timing.heartbeat_ns
+        if periods < BEATS_WATCHED:
+            return
+        node.watched = (t_ns, node.heartbeats)
+        set_by_us = node.life.started_ns and node.life.started_ns <= since_ns
+        if set_by_us and periods < 2 * BEATS_WATCHED:
+            self._advance(node, Beats(node.heartbeats - before > _TWICE * periods), t_ns)
 
     def _watch_samples(self, t_ns: int) -> None:
         stamps = self._slab.t_ns
@@ -217,8 +252,17 @@ class Master:
             if due is not None and due <= t_ns:
                 self._advance(node, Tick(), t_ns)
                 due = due_ns(node.life, node.timing)
+            if node.guarded and node.life.state in _GUARDED:
+                self._guard(node, t_ns)
+                due = min(node.guard_ns, due) if due is not None else node.guard_ns
             if due is not None:
                 self._next_due_ns = min(self._next_due_ns, due)
+
+    def _guard(self, node: _Node, t_ns: int) -> None:
+        """Ask a node that has no heartbeat for its state, once a period."""
+        if t_ns >= node.guard_ns:
+            node.port.send(_HEARTBEAT + node.spec.node_id, b"", remote=True)
+            node.guard_ns = t_ns + node.timing.heartbeat_ns
 
     def _advance(self, node: _Node, event: Event, t_ns: int) -> None:
         before = node.life
@@ -237,7 +281,8 @@ class Master:
         """Keep what is derived from a node's state."""
         slot, state = node.spec.slot, node.life.state
         self.states[slot] = state
-        if state in (NodeState.SETTLING, NodeState.STALE):
+        overheard = node.timing.role is Role.LISTENER and state is NodeState.ABSENT
+        if overheard or state in (NodeState.SETTLING, NodeState.STALE):
             self._waiting.setdefault(slot, int(self._slab.t_ns[slot]))
         else:
             self._waiting.pop(slot, None)
@@ -250,19 +295,19 @@ class Master:
             _command(node, action)
         elif action is Action.PROBE:
             node.port.send(_SDO_REQUEST + node.spec.node_id, _PROBE)
-        elif self._worker is not None:
-            self._worker.submit(self._work, node, action, node.life.attempt)
+        elif self._workers is not None:
+            self._workers.submit(self._work, node, action, node.life.attempt)
 
     def _work(self, node: _Node, step: Action, attempt: int) -> None:
-        """In the worker: carry out a step; its outcome goes to the receiving thread."""
+        """In a worker: carry out a step; its outcome goes to the receiving thread."""
         node.sdo.outdated = lambda: node.life.attempt != attempt or node.life.state in _NOBODY_WAITS
-        result: Result = None
+        result: Result | None = None
         outcome: Outcome = Done(step, attempt)
         try:
             result = _carry_out(node, step)
-        except boot.Outdated:
+        except Outdated:
             return
-        except boot.BootError as error:
+        except StepError as error:
             outcome = Failed(step, attempt, str(error), error.silent, error.stranger)
         except Exception as error:  # noqa: BLE001 - a future would swallow it; here it becomes the node's reason
             outcome = Failed(step, attempt, f"unexpected {type(error).__name__}: {error}")
@@ -275,7 +320,10 @@ class Master:
                 continue
             if isinstance(result, boot.Identity):
                 self._take_identity(node, result, t_ns)
-            elif isinstance(result, boot.Tpdo) and (clash := self._take_tpdo(node, result)):
+            elif isinstance(result, boot.Configured):
+                node.guarded = result.guarded
+                self._next_due_ns = t_ns
+            elif isinstance(result, PdoMapping) and (clash := self._route(node, result)):
                 outcome = Failed(outcome.step, outcome.attempt, clash)
             self._advance(node, outcome, t_ns)
 
@@ -283,41 +331,44 @@ class Master:
         before = node.identity
         node.identity = identity
         if before is not None and before.serial != identity.serial:
-            self._tell(
-                node, node.life.state, f"serial number was {before.serial}, is {identity.serial}", t_ns
-            )
+            self._events.append(SerialChanged(node.spec.slot, t_ns, before.serial, identity.serial))
 
-    def _take_tpdo(self, node: _Node, tpdo: boot.Tpdo) -> str:
-        """Route the node's samples; the reason where its identifier is another node's already."""
+    def _route(self, node: _Node, mapping: PdoMapping) -> str:
+        """Route the node's samples; the reason where an identifier of theirs is another node's already."""
         router, slot = node.port.router, node.spec.slot
-        owner = router.slot(tpdo.cob_id)
-        if owner not in (NOBODY, slot):
-            return (
-                f"TPDO{tpdo.number} has identifier 0x{tpdo.cob_id:X}, as has "
-                f"{self._by_slot[owner].spec.name}; give one of them another, and store it"
-            )
-        if node.tpdo is not None and node.tpdo.cob_id != tpdo.cob_id:
-            router.route(node.tpdo.cob_id, NOBODY)
-        router.route(tpdo.cob_id, slot)
-        node.tpdo = tpdo
+        for tpdo in mapping.tpdos:
+            owner = router.slot(tpdo.cob_id)
+            if owner not in (NOBODY, slot):
+                return (
+                    f"TPDO{tpdo.number} has identifier 0x{tpdo.cob_id:X}, as has "
+                    f"{self._by_slot[owner].spec.name}; give one of them another, and store it"
+                )
+        for tpdo in node.mapping.tpdos if node.mapping else ():
+            router.route(tpdo.cob_id, NOBODY)
+        if node.mapping is None or node.mapping.layout != mapping.layout:
+            node.port.slab.arrange(slot, mapping.layout)
+        for number, tpdo in enumerate(mapping.tpdos):
+            router.route(tpdo.cob_id, slot, number, tpdo.size)
+        node.mapping = mapping
         return ""
 
 
 def _carry_out(node: _Node, step: Action) -> Result:
     spec = node.spec
     if step is Action.IDENTIFY:
-        return boot.identify(node.sdo, boot.Expected(spec.vendor_id, spec.product_code, spec.serial))
-    if step is Action.READ_MAPPING:
-        return boot.read_mapping(node.sdo, node.tpdos)
-    if node.tpdo is None:
-        raise boot.BootError("no PDO mapping to configure")
+        expected = boot.Expected(spec.vendor_id, spec.product_code, spec.revision, spec.serial)
+        return boot.identify(node.sdo, expected)
 
     def halt() -> None:
-        if node.life.nmt != NMT_PREOPERATIONAL:
+        if node.life.nmt != NMT_PREOPERATIONAL and node.timing.role is Role.MASTER:
             _command(node, Action.ENTER_PREOPERATIONAL)
 
-    boot.configure(node.sdo, node.tpdo, spec.heartbeat_ms, halt)
-    return None
+    if step is Action.READ_MAPPING:
+        may = halt if spec.remap else None
+        return read_mapping(node.sdo, spec.node_id, node.tpdos, spec.channels, may)
+    if node.mapping is None:
+        raise StepError("no PDO mapping to configure")
+    return boot.configure(node.sdo, node.mapping, spec.heartbeat_ms, halt)
 
 
 def _command(node: _Node, action: Action) -> None:
@@ -337,9 +388,12 @@ def _node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns: int) -> _No
         heartbeat_ns=spec.heartbeat_ms * 1_000_000,
         heartbeat_timeout_ns=spec.heartbeat_timeout_ms * 1_000_000,
         settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
+        role=Role(port.bus.role),
     )
-    numbers = eds.tpdo_numbers(eds.load(spec.eds, spec.node_id)) if spec.eds else eds.DEFAULT_TPDOS
-    return _Node(spec, port, timing, numbers, boot.Sdo(spec.node_id, port.send))
+    node = _Node(spec, port, timing, tpdo_numbers(spec.eds, spec.channels), Sdo(spec.node_id, port.send))
+    if timing.role is Role.LISTENER:  # nothing can be asked
+        node.mapping = from_eds(spec.eds, spec.node_id, spec.channels)
+    return node
 
 
 def _owners(ports: Mapping[str, Port], nodes: Sequence[_Node]) -> dict[str, list[int]]:

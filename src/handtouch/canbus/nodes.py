@@ -1,17 +1,24 @@
-"""What the master is told of a node and what it tells: `NodeSpec`, `NodeStatus`, `NodeEvent`."""
+"""What the master is told of a node and what it tells.
+
+Public names: `NodeSpec`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from .boot import Identity
+from .channels import STANDARD_CHANNELS, Channels
 from .emergency import Emergency
 from .lifecycle import NodeState
 
 
 @dataclass(frozen=True, slots=True)
 class NodeSpec:
-    """A node as the configuration describes it; identity fields left None are not checked."""
+    """A node as the configuration describes it; identity fields left None are not checked.
+
+    `channels` are those of the electrodes x0, xa, y0, yb. `remap`: they may be mapped to a TPDO over SDO.
+    """
 
     slot: int
     bus: str
@@ -21,13 +28,19 @@ class NodeSpec:
     vendor_id: int | None = None
     product_code: int | None = None
     serial: int | None = None
+    revision: int | None = None
+    channels: Channels = STANDARD_CHANNELS
+    remap: bool = True
     heartbeat_ms: int = 100
     heartbeat_timeout_ms: int = 350
 
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """A node as it is now. `identity` and `cob_id` are what was last read from it, None before."""
+    """A node as it is now. `identity` and `cob_ids` are what was last read from it, None and () before.
+
+    `guarded`: it has no heartbeat, and is asked for its state instead.
+    """
 
     slot: int
     name: str
@@ -37,7 +50,8 @@ class NodeStatus:
     since_ns: int
     reason: str
     identity: Identity | None
-    cob_id: int | None
+    cob_ids: tuple[int, ...]
+    guarded: bool
     heartbeats: int
     heartbeats_missed: int
     reboots: int
@@ -58,3 +72,19 @@ class NodeEvent:
     old: NodeState
     new: NodeState
     reason: str
+
+    def __str__(self) -> str:
+        return f"{self.old.name.lower()} -> {self.new.name.lower()}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class SerialChanged:
+    """Another unit answers in a node's place: its calibration is another's."""
+
+    slot: int
+    t_ns: int
+    before: int | None
+    after: int | None
+
+    def __str__(self) -> str:
+        return f"serial number was {self.before}, is {self.after}: another unit, not the one calibrated here"

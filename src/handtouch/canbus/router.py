@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import can
 
+from .bus_state import BusState
 from .load import frame_bits
-from .slab import SAMPLE_BYTES, Slab
+from .slab import PDO_BYTES, PDOS, Slab
 
 IDENTIFIERS = 2048
 """CANopen uses 11-bit identifiers."""
@@ -30,11 +31,12 @@ class Counters:
     frames: int = 0  # data frames with an 11-bit identifier that were received
     sent: int = 0
     bits: int = 0  # of received and sent frames, worst case of bit stuffing: their rate is the bus load
-    samples: int = 0
+    samples: int = 0  # PDOs that carry channels
     short: int = 0  # of a known identifier but the wrong length: dropped
     foreign: int = 0  # of nobody that we know, or of a kind that CANopen doesn't use: dropped
     errors: int = 0  # error frames
-    send_failures: int = 0
+    send_failures: int = 0  # other than those of a full queue
+    queue_full: int = 0  # frames not sent because the transmit queue had no room
     receive_errors: int = 0
     overflow: int = 0  # frames lost between the controller and us, in the kernel's queue or our own
 
@@ -45,19 +47,27 @@ class Router:
     def __init__(self, slab: Slab) -> None:
         self.slab = slab
         self.counters = Counters()
+        self.state = BusState()
         self._slots = [NOBODY] * IDENTIFIERS
+        self._pdos = bytearray(IDENTIFIERS)
+        self._sizes = bytearray(IDENTIFIERS)
         self._write = slab.write
 
-    def route(self, can_id: int, slot: int) -> None:
-        """Frames with this identifier are samples for that slot of the slab; NOBODY takes the route away.
+    def route(self, can_id: int, slot: int, pdo: int = 0, size: int = PDO_BYTES) -> None:
+        """Frames with this identifier, of `size` bytes, are that PDO of a slot of the slab.
 
-        Raises ValueError for an identifier beyond 11 bits or a slot beyond the slab.
+        NOBODY for the slot takes the route away. Raises ValueError for an identifier beyond 11 bits or a slot
+        or PDO beyond the slab.
         """
         if not 0 <= can_id < IDENTIFIERS:
             raise ValueError(f"identifier 0x{can_id:X} has more than 11 bits")
         if not NOBODY <= slot < self.slab.size:
             raise ValueError(f"slot {slot} is outside the slab of {self.slab.size}")
-        self._slots[can_id] = slot
+        if not 0 <= pdo < PDOS or not 0 < size <= PDO_BYTES:
+            raise ValueError(
+                f"PDO {pdo} of {size} bytes is outside 0 to {PDOS - 1} of 1 to {PDO_BYTES} bytes"
+            )
+        self._slots[can_id], self._pdos[can_id], self._sizes[can_id] = slot, pdo, size
 
     def slot(self, can_id: int) -> int:
         """Slot that frames with this identifier are written to, NOBODY without a route."""
@@ -75,19 +85,26 @@ class Router:
         slot = self._slots[can_id]
         if slot < 0:
             return False
-        if size == SAMPLE_BYTES:
-            self._write(slot, data, t_ns)
+        if size == self._sizes[can_id]:
+            self._write(slot, data, t_ns, self._pdos[can_id])
             counters.samples += 1
         else:
             counters.short += 1
         return True
 
+    def error(self, can_id: int, data: bytes | bytearray, t_ns: int) -> None:
+        """Take an error frame, its classes in the identifier."""
+        counters = self.counters
+        counters.errors += 1
+        self.state.error_frame(can_id, data, t_ns, counters.frames, counters.sent)
+
     def accept_message(self, message: can.Message, t_ns: int) -> Frame | None:
         """Take any frame as python-can gives it; what isn't ours to store or to drop is returned."""
+        can_id = message.arbitration_id
         if message.is_error_frame:
-            self.counters.errors += 1
-        elif message.is_extended_id or message.is_remote_frame or message.is_fd or len(message.data) > 8:
+            self.error(can_id, message.data, t_ns)
+        elif message.is_extended_id or message.is_remote_frame or message.is_fd or len(message.data) > 8 or not 0 <= can_id < IDENTIFIERS:
             self.counters.foreign += 1
-        elif not self.accept(message.arbitration_id, message.data, t_ns):
-            return message.arbitration_id, bytes(message.data), t_ns
+        elif not self.accept(can_id, message.data, t_ns):
+            return can_id, bytes(message.data), t_ns
         return None

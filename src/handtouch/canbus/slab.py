@@ -1,43 +1,166 @@
-"""The slab: the latest sample of every pad in one contiguous array, written straight from the bus."""
+"""The slab: the latest sample of every pad, written straight from the bus and unpacked once a tick.
+
+A PDO's data is a little-endian word of 64 bits, and a channel a run of bits of one such word, so that samples
+of any width and mapping are stored as they come and unpacked for the whole hand at once.
+
+Public names: `Slab`, `Field`, `Layout`, `STANDARD`, `PDOS`.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-FULL_SCALE = 32767
-"""Greatest count of a channel; at it, or at its negative, a channel is at the end of its range."""
-SAMPLE_BYTES = 8
-"""A sample is one TPDO of four little-endian int16 (CiA 401: object 0x6401 sub 1-4)."""
+PDOS = 4
+"""The four channels of a pad come in at most this many PDOs."""
+PDO_BYTES = 8
+_WORD_BITS = 8 * PDO_BYTES
+_SAMPLE_BYTES = PDOS * PDO_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """Where a channel is: which of its pad's PDOs (0 to 3), its first bit there, and its integer type."""
+
+    pdo: int
+    bit: int
+    bits: int
+    signed: bool
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """Least and greatest count that the channel can show."""
+        return limits(self.bits, self.signed)
+
+
+Layout = tuple[Field, Field, Field, Field]
+"""Fields of the electrodes x0, xa, y0, yb."""
+
+STANDARD: Layout = (
+    Field(0, 0, 16, True),
+    Field(0, 16, 16, True),
+    Field(0, 32, 16, True),
+    Field(0, 48, 16, True),
+)
+"""Four int16 in one PDO (CiA 401: object 0x6401 sub 1 to 4)."""
+
+
+def limits(bits: int, signed: bool) -> tuple[int, int]:
+    """Least and greatest value of an integer type."""
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
 
 
 class Slab:
-    """Latest sample of each of `size` pads, as arrays that share memory with what the receive path writes.
+    """Latest whole sample of each of `size` pads, as arrays in the memory that the receive path writes.
 
-    `counts` (size, 4) int16, channel order x0, xa, y0, yb; `t_ns` (size,) int64 arrival on the host's
-    monotonic clock, 0 before the first sample; `fresh` (size,) uint8, 1 where one came since `begin_cycle`.
+    `t_ns` (size,) int64 arrival of its last PDO on the host's monotonic clock, 0 before the first; `fresh`
+    (size,) uint8, 1 where one came since `begin_cycle`; `repeats` (size,) int64, samples that came when there
+    was a fresh one already.
     """
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._bytes = bytearray(size * SAMPLE_BYTES)
-        self.counts: NDArray[np.int16] = np.frombuffer(self._bytes, dtype="<i2").reshape(size, 4)
         self.t_ns: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
-        self._t_ns = self.t_ns.data  # item assignment without numpy's scalar boxing: 50 ns
+        self.repeats: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
+        self.fresh_count = 0
+        self._bytes = bytearray(size * _SAMPLE_BYTES)
+        self._words: NDArray[np.int64] = np.frombuffer(self._bytes, dtype="<i8")
+        self._t_ns, self._repeats = self.t_ns.data, self.repeats.data  # no boxing of numpy's scalars: 50 ns
         self._fresh = bytearray(size)
         self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
-        self.fresh_count = 0
+        self._whole = [1] * size  # bit set of the PDOs that make a sample
+        self._parts: dict[int, _Parts] = {}  # of pads with several PDOs
+        self._cells = np.zeros((size, 4), dtype=np.intp)
+        self._left = np.zeros((size, 4), dtype=np.int64)
+        self._right = np.zeros((size, 4), dtype=np.int64)
+        self._unsigned: NDArray[np.int64] | None = None  # what is left of a channel after the shifts
+        self._bottom = np.zeros((size, 4), dtype=np.int64)
+        self._top = np.zeros((size, 4), dtype=np.int64)
+        self._counts = np.zeros((size, 4), dtype=np.int64)
+        for slot in range(size):
+            self.arrange(slot, STANDARD)
 
-    def write(self, slot: int, data: bytes | bytearray, t_ns: int) -> None:
-        """Store a sample of SAMPLE_BYTES bytes; a second one within a cycle replaces the first."""
-        start = slot * SAMPLE_BYTES
-        self._bytes[start : start + SAMPLE_BYTES] = data
+    def arrange(self, slot: int, layout: Layout) -> None:
+        """Say where the four channels of a slot are; until then it is STANDARD. What it held is forgotten."""
+        for channel, field in enumerate(layout):
+            self._cells[slot, channel] = slot * PDOS + field.pdo
+            self._left[slot, channel] = _WORD_BITS - field.bit - field.bits
+            self._right[slot, channel] = _WORD_BITS - field.bits
+            low, high = field.limits
+            # an amplifier at its end gives either of the two lowest counts; zero is no end of a current
+            self._bottom[slot, channel] = low + 1 if field.signed else -1
+            self._top[slot, channel] = high
+        whole = 0
+        for field in layout:
+            whole |= 1 << field.pdo
+        self._whole[slot] = whole
+        self._parts.pop(slot, None)
+        if whole != 1:
+            self._parts[slot] = _Parts()
+        self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = bytes(_SAMPLE_BYTES)
+        unsigned = self._bottom == -1
+        self._unsigned = np.where(unsigned, self._top, -1) if unsigned.any() else None
+
+    def write(self, slot: int, data: bytes | bytearray, t_ns: int, pdo: int = 0) -> None:
+        """Store a PDO of a slot, at most 8 bytes; `pdo` as the slot's layout counts them.
+
+        A sample counts when all its PDOs have come; a second one within a cycle replaces the first.
+        """
+        if self._whole[slot] == 1:
+            start = slot * _SAMPLE_BYTES
+            self._bytes[start : start + len(data)] = data
+        elif not self._complete(slot, pdo, data, t_ns):
+            return
         self._t_ns[slot] = t_ns
-        if not self._fresh[slot]:
+        if self._fresh[slot]:
+            self._repeats[slot] += 1
+        else:
             self._fresh[slot] = 1
             self.fresh_count += 1
+
+    def read(self) -> NDArray[np.int64]:
+        """Counts (size, 4) of the electrodes x0, xa, y0, yb; one array, good until the next `read`."""
+        counts = self._counts
+        np.take(self._words, self._cells, out=counts, mode="clip")
+        np.left_shift(counts, self._left, out=counts)
+        np.right_shift(counts, self._right, out=counts)
+        if self._unsigned is not None:
+            np.bitwise_and(counts, self._unsigned, out=counts)
+        return counts
+
+    def railed(self, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the counts (size, 4) are at an end of their channel's range."""
+        return (counts >= self._top) | (counts <= self._bottom)
 
     def begin_cycle(self, t_ns: int) -> None:
         """A SYNC at `t_ns`: fresh is what arrived since then, some of which may be here already."""
         np.greater_equal(self.t_ns, t_ns, out=self.fresh, casting="unsafe")
         self.fresh_count = int(np.count_nonzero(self.fresh))
+        for parts in self._parts.values():
+            parts.forget_before(t_ns)
+
+    def _complete(self, slot: int, pdo: int, data: bytes | bytearray, t_ns: int) -> bool:
+        """Keep a part of a sample; True when the sample is whole, and in its place."""
+        parts = self._parts[slot]
+        start = pdo * PDO_BYTES
+        parts.data[start : start + len(data)] = data
+        parts.t_ns[pdo] = t_ns
+        if sum(1 << number for number in parts.t_ns) != self._whole[slot]:
+            return False
+        parts.t_ns.clear()
+        self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = parts.data
+        return True
+
+
+class _Parts:
+    """A sample of several PDOs while it is incomplete."""
+
+    def __init__(self) -> None:
+        self.data = bytearray(_SAMPLE_BYTES)
+        self.t_ns: dict[int, int] = {}  # PDO -> arrival
+
+    def forget_before(self, t_ns: int) -> None:
+        """Parts that came before a SYNC don't belong with those after it."""
+        self.t_ns = {pdo: at for pdo, at in self.t_ns.items() if at >= t_ns}

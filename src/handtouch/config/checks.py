@@ -36,6 +36,10 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
             place = f'[[hand.pad]] {number} "{name}": '
             yield from _check_references(place, pad, deployment)
             yield from _check_shape(place, pad)
+            if len(set(pad.electrodes)) < 4:
+                yield Problem(
+                    f"{place}electrodes", _is(pad.electrodes), "must name each of x0, xa, y0, yb once"
+                )
             if pad.touch:
                 yield from _check_touch(f"{place}touch.", pad.touch)
             if (pad.bus, pad.node_id) in taken:

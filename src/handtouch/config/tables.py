@@ -14,6 +14,8 @@ NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
+Electrode = Literal["x0", "xa", "y0", "yb"]
+Four = Annotated[tuple[Positive, Positive, Positive, Positive], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
@@ -47,6 +49,11 @@ class Bus(Table):
     sync: Literal["producer", "consumer"] = Field(
         "producer", description="who sends SYNC on this bus: this daemon, or somebody else"
     )
+    role: Literal["master", "guest", "listener"] = Field(
+        "master",
+        description="master: configures and starts our nodes; guest: configures them, and another master "
+        "starts them; listener: sends nothing at all",
+    )
     options: dict[str, str | int | float | bool] = Field(
         default_factory=dict, description="further options of the python-can interface, passed on as they are"
     )
@@ -60,10 +67,31 @@ class Node(Table):
     )
     vendor_id: Unsigned32 | None = Field(None, description="checked against 0x1018 sub 1 when given")
     product_code: Unsigned32 | None = Field(None, description="checked against 0x1018 sub 2 when given")
+    channels: Annotated[tuple[str, str, str, str], Field(strict=False)] = Field(
+        ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"),
+        description="objects of the four channels, INDEX:SUB; with a type (i16, u24 …) where no EDS tells it",
+    )
+    remap: bool = Field(
+        True, description="map the channels to a TPDO over SDO where the node has them in none and allows it"
+    )
+    revision: Unsigned32 | None = Field(None, description="checked against 0x1018 sub 3 when given")
     drive_v: Positive = Field(description="potential of the conducting layer against the electrodes, volt")
-    full_scale_ma: Positive = Field(description="electrode current at the greatest positive count")
+    full_scale_ma: Positive = Field(description="electrode current at full_scale_counts")
+    full_scale_counts: Annotated[int, Field(ge=1)] | None = Field(
+        None,
+        description="count at full_scale_ma; left out: the greatest of the channel's type (32767 for i16)",
+    )
+    channel_scale: Four = Field(
+        (1.0, 1.0, 1.0, 1.0),
+        description="current per count of each channel, relative to that of full_scale_ma",
+    )
     noise_counts: Positive = Field(description="standard deviation of one channel's reading, counts")
-    heartbeat_ms: int = Field(100, ge=10, le=60_000, description="producer heartbeat time, written to 0x1017")
+    heartbeat_ms: int = Field(
+        100,
+        ge=10,
+        le=60_000,
+        description="producer heartbeat time, written to 0x1017; guard time of a node that has none",
+    )
     heartbeat_timeout_ms: int = Field(
         350, ge=20, le=300_000, description="silence after which a node is lost"
     )
@@ -154,6 +182,9 @@ class Pad(Table):
         None, description="serial number (0x1018 sub 4) of the node calibrated here"
     )
     node: Name = Field(description="kind of node, a [node.NAME] table")
+    electrodes: Annotated[tuple[Electrode, Electrode, Electrode, Electrode], Field(strict=False)] = Field(
+        ("x0", "xa", "y0", "yb"), description="what the node's four channels are wired to, in their order"
+    )
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
     surface: Surface = Field(description="shape of the sensing surface")
     gap_mm: NonNegative = Field(description="bare length of each side next to its corners, along the surface")

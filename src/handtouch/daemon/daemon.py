@@ -21,6 +21,7 @@ from typing import Any
 import zmq
 
 from handtouch.canbus import eds
+from handtouch.canbus.channels import channels_of, in_order
 from handtouch.canbus.master import Master, NodeSpec
 from handtouch.canbus.port import BusError, Port
 from handtouch.canbus.router import SYNC_ID
@@ -154,6 +155,9 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
             vendor_id=kinds[pad.node].vendor_id,
             product_code=kinds[pad.node].product_code,
             serial=pad.serial,
+            revision=kinds[pad.node].revision,
+            channels=in_order(channels_of(kinds[pad.node].channels, kinds[pad.node].eds), pad.electrodes),
+            remap=kinds[pad.node].remap,
             heartbeat_ms=kinds[pad.node].heartbeat_ms,
             heartbeat_timeout_ms=kinds[pad.node].heartbeat_timeout_ms,
         )
@@ -170,8 +174,7 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
         for bus in buses:
             deployment = with_bus(deployment, bus)
         for kind in deployment.nodes.values():
-            if kind.eds:
-                eds.load(kind.eds, 1)  # a mistake in it must show before a bus is touched
+            channels_of(kind.channels, kind.eds)  # a mistake in it must show before a bus is touched
     except (ConfigError, eds.EdsError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -98,7 +98,7 @@ class Messages:
                         tick=tick_number,
                         hand=hand,
                         links=links,
-                        counts=slab.counts[rows].tobytes(),
+                        counts=self._tick.counts[rows].astype("<i8").tobytes(),
                         sample_ns=columns.sample_ns[rows].astype("<i8").tobytes(),
                         fresh=slab.fresh[rows].tobytes(),
                         repeat=False,

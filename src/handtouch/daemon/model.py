@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.canbus.slab import FULL_SCALE
+from handtouch.canbus.channels import ELECTRODES, Channels, channels_of, in_order
 from handtouch.config import Deployment
 from handtouch.field import LocatorBank, PointEstimate
 from handtouch.field.network import ElectrodeNetwork
@@ -23,8 +23,8 @@ FloatArray = NDArray[np.float64]
 class PadModel:
     """Columns of the n pads of a deployment, in its order; the same order as the slab's.
 
-    `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` of a channel, its noise as
-    `noise_counts` and `noise_a`;
+    `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` (n, 4) of the electrodes
+    x0, xa, y0, yb, their noise as `noise_counts` (n,) and `noise_a` (n, 4);
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
     middle of the pad; `begin_samples`, `end_samples`. `locator` finds contacts, `placement` puts them on
     their links, `force` weighs them.
@@ -41,16 +41,20 @@ class PadModel:
         self.links = [pad.link for pad in pads]
         self.rows_of_hand = _rows(self.hands)
         self.calibration = [_nominal(pad, deployment) for pad in pads]
-        self.ampere_per_count = np.array([node.full_scale_ma * 1e-3 / FULL_SCALE for node in nodes])
+        kinds = {name: channels_of(node.channels, node.eds) for name, node in deployment.nodes.items()}
+        self.ampere_per_count = np.array(
+            [_ampere_per_count(pad, deployment, kinds[pad.node]) for pad in pads]
+        )
         counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
         self.noise_counts = np.array(counts)
-        self.noise_a = self.noise_counts * self.ampere_per_count
+        self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
         self.on_n = np.array([touch.on_n for touch in touches])
         self.off_n = np.array([touch.off_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
         self.end_samples = np.array([touch.end_samples for touch in touches])
         networks = _networks(pads, sheets)
-        finest = min(node.noise_counts for node in nodes) / FULL_SCALE  # noise of the strongest contact
+        full_scale_a = np.array([node.full_scale_ma * 1e-3 for node in nodes])
+        finest = float((self.noise_a.min(axis=1) / full_scale_a).min())  # noise of the strongest contact
         self.locator = LocatorBank(networks, tolerance=finest / 10)
         self.placement = Placement([(surface_of(pad), *mount_of(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
@@ -96,6 +100,16 @@ class PadModel:
         radius_m = self.locator.conformal_radius(pads, x, y) * scale
         resistors = self._resistors(pads, self.locator.fractions(pads, x, y))
         return self._law.current(force_n, self._drive_v, self._sheet_ohm, radius_m, resistors)
+
+
+def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:
+    """Of the electrodes x0, xa, y0, yb."""
+    node = deployment.nodes[pad.node]
+    scale = [node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES]
+    return [
+        node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor
+        for channel, factor in zip(in_order(channels, pad.electrodes), scale, strict=True)
+    ]
 
 
 def _rows(hands: list[str]) -> dict[str, slice]:

@@ -18,7 +18,8 @@ import can
 import zmq
 
 from handtouch import wire
-from handtouch.canbus import eds
+from handtouch.canbus.channels import channels_of, in_order
+from handtouch.canbus.mapping import from_eds
 from handtouch.canbus.router import SYNC_ID, Counters, Router
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.model import PadModel
@@ -26,7 +27,6 @@ from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.wire import PadState
 
-_TPDO2 = 0x280
 _SERVICES = (0x080, 0x580, 0x600, 0x700)
 """EMCY, SDO and heartbeat of our nodes are no strangers."""
 _RHYTHM_SYNCS = 50
@@ -92,7 +92,12 @@ class _Feeder:
         self._known = {SYNC_ID}
         pads = [pad for hand in deployment.hands for pad in hand.pads]
         for slot, pad in enumerate(pads):
-            self.routers[pad.bus].route(_sample_id(deployment.nodes[pad.node].eds, pad.node_id), slot)
+            kind = deployment.nodes[pad.node]
+            channels = in_order(channels_of(kind.channels, kind.eds), pad.electrodes)
+            mapping = from_eds(kind.eds, pad.node_id, channels)
+            self.pipeline.slab.arrange(slot, mapping.layout)
+            for number, tpdo in enumerate(mapping.tpdos):
+                self.routers[pad.bus].route(tpdo.cob_id, slot, number, tpdo.size)
             self._known |= {base + pad.node_id for base in _SERVICES}
         self.pipeline.node_state[:] = PadState.CLEAR
 
@@ -180,15 +185,6 @@ def _rhythm(log: Path, period_ns: int) -> tuple[int, str | None]:
 def _is_sync(message: can.Message) -> bool:
     special = message.is_extended_id or message.is_error_frame or message.is_remote_frame
     return message.arbitration_id == SYNC_ID and not special
-
-
-def _sample_id(eds_path: str | None, node_id: int) -> int:
-    """Identifier of a node's samples by its EDS, as it comes from the factory."""
-    if eds_path is None:
-        return _TPDO2 + node_id
-    objects = eds.load(eds_path, node_id)
-    number = eds.tpdo_numbers(objects)[0]
-    return int(objects[0x1800 + number - 1][1].default) & 0x7FF
 
 
 def _messages(log: Path) -> Iterator[can.Message]:

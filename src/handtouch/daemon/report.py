@@ -77,10 +77,7 @@ class Report:
         events = self._master.take_events()
         if events:
             for event in events:
-                _log.info(
-                    "%s: %s -> %s: %s", "/".join(self._names[event.slot]), event.old.name.lower(),
-                    event.new.name.lower(), event.reason,
-                )  # fmt: skip
+                _log.info("%s: %s", "/".join(self._names[event.slot]), event)
             self._translate()
         state = self._pipeline.tick.columns.state
         visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
@@ -124,6 +121,8 @@ class Report:
         columns = self._pipeline.tick.columns
         sample_ns = int(columns.sample_ns[pad])
         state = PadState(int(columns.state[pad]))
+        counts = self._pipeline.tick.counts[pad]
+        railed = self._pipeline.slab.railed(self._pipeline.tick.counts)[pad]
         topic = f"health/{hand}/{settings.link}"
         return wire.Health(
             v=wire.SCHEMA_VERSION,
@@ -136,7 +135,7 @@ class Report:
             state=state.name.lower(),
             node=status.state.name.lower(),
             since_ns=status.since_ns,
-            reason=explain(state, status.state, status.reason, self._pipeline.slab.counts[pad]),
+            reason=explain(state, status.state, status.reason, counts, railed),
             serial=status.serial,
             rate_hz=float(self._rate_hz[pad]) if state <= PadState.TOUCHED else 0.0,
             samples=int(self._pipeline.tick.samples[pad]),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.slab import FULL_SCALE, Slab
+from handtouch.canbus.slab import Slab
 from handtouch.daemon.contacts import BoolArray, Contacts, IntArray
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.model import PadModel
@@ -99,6 +99,8 @@ class Tick:
         self.model = model
         self.columns = Columns.of(model.size)
         self.contacts = Contacts(model.begin_samples, model.end_samples)
+        self.counts: NDArray[np.int64] = np.zeros((model.size, 4), dtype=np.int64)
+        """of the last tick"""
         self.samples = np.zeros(model.size, dtype=np.int64)
         """samples taken in"""
         self.missed = np.zeros(model.size, dtype=np.int64)
@@ -133,10 +135,11 @@ class Tick:
         self.missed += self.expected() & operational & ~in_time
         self.samples += sampled
         np.copyto(columns.sample_ns, np.where(in_time, cycle.t_ns, cycle.previous_ns), where=sampled)
-        absurd = self._absurd(slab.counts.astype(np.int32))
+        self.counts = counts = slab.read()
+        absurd = self._absurd(counts, slab)
         stale: BoolArray = np.subtract(now_ns, columns.sample_ns) > self._stale_ns
         trusted: BoolArray = operational & ~absurd & ~stale
-        np.multiply(slab.counts, model.ampere_per_count[:, None], out=self._currents)
+        np.multiply(counts, model.ampere_per_count, out=self._currents)
         np.copyto(columns.current_a, self._currents.sum(axis=1), where=sampled)
         below_off = columns.current_a < model.off_a
         above_on = columns.current_a > model.on_a
@@ -151,11 +154,10 @@ class Tick:
             touched[changes.began] = False
         return Ticked(cycle.t_ns, changes.began, np.flatnonzero(touched), changes.ended)
 
-    def _absurd(self, counts: NDArray[np.int32]) -> BoolArray:
+    def _absurd(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
         """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take."""
-        size = np.abs(counts)
-        source = _SOURCE_STD * self.model.noise_counts + _SOURCE_PART * size.sum(axis=1)
-        return np.asarray((size.max(axis=1) >= FULL_SCALE) | (counts.min(axis=1) < -source))
+        source = _SOURCE_STD * self.model.noise_counts + _SOURCE_PART * np.abs(counts).sum(axis=1)
+        return np.asarray(slab.railed(counts).any(axis=1) | (counts.min(axis=1) < -source))
 
     def _resolve_states(
         self,
@@ -174,7 +176,7 @@ class Tick:
         """Locate, place and weigh the contacts on the pads `touched`."""
         model, columns = self.model, self.columns
         currents = self._currents[touched].T
-        found = model.locator.estimate(touched, currents, model.noise_a[None, touched], columns.xy[touched].T)
+        found = model.locator.estimate(touched, currents, model.noise_a[touched].T, columns.xy[touched].T)
         columns.xy[touched, 0], columns.xy[touched, 1] = found.x, found.y
         columns.residual[touched] = found.residual
         with np.errstate(

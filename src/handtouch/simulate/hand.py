@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import i0e, i1e
 
 from handtouch import config
+from handtouch.canbus.channels import ELECTRODES, Channels, channels_of
 from handtouch.hand import mount_of
 from handtouch.simulate.scenario import Pressing, Scenario
 from handtouch.simulate.shape import Shape, shape_of
@@ -29,7 +30,6 @@ from handtouch.simulate.truth import Truth, Vector
 from handtouch.simulate.world import Parts, World
 
 FloatArray = NDArray[np.float64]
-FULL_SCALE = 32767
 _QUANTISATION_VARIANCE = 1 / 12  # of a rounded count
 
 
@@ -51,6 +51,9 @@ class VirtualHand:
         self._bank = SheetBank([row.maps for row in self._rows])
         self._electric = _Electric(self._rows)
         self._noise = np.array([row.noise_counts for row in self._rows])
+        self._wiring = np.array([[ELECTRODES.index(e) for e in row.pad.electrodes] for row in self._rows])
+        limits = np.array([[channel.limits for channel in row.channels] for row in self._rows])
+        self._low, self._high = limits[:, :, 0], limits[:, :, 1]
         self._contacts = [
             [
                 (number, 1e-3 * (touch.radius_mm or world.radius_mm(row.sheet, index)))
@@ -60,8 +63,8 @@ class VirtualHand:
             for index, touch in enumerate(scenario.touches)
         ]
 
-    def sample(self, t_s: float) -> NDArray[np.int16]:
-        """Counts (pads, 4) of the channels x0, xa, y0, yb, `t_s` after the start of the scenario."""
+    def sample(self, t_s: float) -> NDArray[np.int64]:
+        """Counts (pads, 4) of each node's channels, in its order, `t_s` after the start of the scenario."""
         moment = max(round(t_s * 1e9), 0)
         counts = np.random.default_rng((*self._seed, moment)).standard_normal((len(self._rows), 4))
         counts *= self._noise[:, None]
@@ -69,7 +72,8 @@ class VirtualHand:
             currents, _ = self._currents(contacts)
             rows = [contact.row for contact in contacts]
             counts[rows] += currents * self._electric.counts_per_ampere[rows]
-        return np.clip(np.rint(counts), -FULL_SCALE - 1, FULL_SCALE).astype(np.int16)
+        wired = np.take_along_axis(np.rint(counts), self._wiring, axis=1)
+        return np.asarray(np.clip(wired, self._low, self._high), dtype=np.int64)
 
     def truth(self, t_s: float, t_ns: int = 0) -> list[Truth]:
         """The contacts of the sample at `t_s`; `t_ns` is the host's time of it."""
@@ -140,6 +144,7 @@ class _Row:
     hand: str
     pad: config.Pad
     node: config.Node
+    channels: Channels
     sheet: config.Sheet
     parts: Parts
     shape: Shape
@@ -153,7 +158,16 @@ class _Row:
         node, shape, parts = deployment.nodes[pad.node], shape_of(pad.surface), world.parts(hand, pad)
         maps, sheet = solve(shape, _gaps(shape, parts)), deployment.sheets[pad.sheet]
         noise = node.noise_counts if world.noise_counts is None else world.noise_counts
-        return cls(hand, pad, node, sheet, parts, shape, maps, *mount_of(pad), noise)
+        channels = channels_of(node.channels, node.eds)
+        return cls(hand, pad, node, channels, sheet, parts, shape, maps, *mount_of(pad), noise)
+
+    @property
+    def counts_per_ampere(self) -> FloatArray:
+        """(4,) of the electrodes x0, xa, y0, yb."""
+        full = [self.node.full_scale_counts or channel.limits[1] for channel in self.channels]
+        of_channel = np.array(full) / (self.node.full_scale_ma * 1e-3) / np.array(self.node.channel_scale)
+        order = [self.pad.electrodes.index(name) for name in ELECTRODES]
+        return np.asarray(of_channel[order] * np.array(self.parts.gain))
 
 
 class _Electric:
@@ -166,8 +180,7 @@ class _Electric:
         self._reference_pa = np.array([row.sheet.reference_kpa * 1e3 for row in rows])
         self._contact_ohm_m2 = np.array([row.sheet.contact_ohm_mm2 * 1e-6 for row in rows])
         self._series_ohm = np.array([row.parts.series_ohm for row in rows])
-        full_scale_a = np.array([[row.node.full_scale_ma * 1e-3] for row in rows])
-        self.counts_per_ampere = np.array([row.parts.gain for row in rows]) * FULL_SCALE / full_scale_a
+        self.counts_per_ampere = np.array([row.counts_per_ampere for row in rows])
         conductance = np.stack([row.maps.conductance for row in rows])
         mixing = conductance * self._series_ohm[:, None, :] / self._sheet_ohm[:, None, None]
         self.spread = np.linalg.inv(np.eye(4) + mixing)

@@ -5,27 +5,32 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.canbus.channels import ELECTRODES
 from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.slab import FULL_SCALE
 from handtouch.wire import PadState
 
-CHANNELS = ("x0", "xa", "y0", "yb")
 
-
-def explain(state: PadState, node: NodeState, node_reason: str, counts: NDArray[np.int16]) -> str:
+def explain(
+    state: PadState,
+    node: NodeState,
+    node_reason: str,
+    counts: NDArray[np.int64],
+    railed: NDArray[np.bool_],
+) -> str:
     """Why a pad is in its state and what helps; empty when all is well.
 
-    `node_reason` is the master's word on the node, `counts` (4,) the pad's newest sample.
+    `node_reason` is the master's word on the node, `counts` (4,) the pad's newest sample, `railed` (4,)
+    which of them are at the end of their range.
     """
     if state <= PadState.TOUCHED or (state == PadState.STARTING and node == NodeState.OPERATIONAL):
         return ""
     if node not in (NodeState.OPERATIONAL, NodeState.STALE):
         return node_reason
     if state == PadState.FAULTED:
-        channels = dict(zip(CHANNELS, counts.tolist(), strict=True))
-        if railed := [name for name, count in channels.items() if abs(count) >= FULL_SCALE]:
+        channels = dict(zip(ELECTRODES, counts.tolist(), strict=True))
+        if at_end := [name for name, at in zip(ELECTRODES, railed.tolist(), strict=True) if at]:
             return (
-                f"channel {' and '.join(railed)} at the end of its range: "
+                f"channel {' and '.join(at_end)} at the end of its range: "
                 "look for a short, a loose electrode or a force beyond full scale"
             )
         return (
