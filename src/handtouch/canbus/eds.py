@@ -1,57 +1,115 @@
-"""Electronic data sheets: which PDOs of a node may carry its four channels.
+"""Electronic data sheets (CiA 306): a node's objects, its TPDOs and the types of what these carry.
 
-Public names: `load`, `tpdo_numbers`, `EdsError`.
+Public names: `load`, `tpdos`, `TpdoDefault`, `integer_type`, `tpdo_numbers`, `EdsError`.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from canopen.objectdictionary.eds import import_eds
+from canopen import ObjectDictionary
+
+from .eds_file import INTEGERS, MAPPINGS, PDOS, TYPE_NAMES, EdsError, entries, parse, raw_value, variable_at
+
+__all__ = [
+    "ANALOGUE_INPUT",
+    "DEFAULT_TPDOS",
+    "EdsError",
+    "TpdoDefault",
+    "integer_type",
+    "load",
+    "tpdo_numbers",
+    "tpdos",
+]
 
 ANALOGUE_INPUT = 0x6401
 """CiA 401: read analogue input, 16 bit."""
 DEFAULT_TPDOS = (2, 1, 3, 4)
 """Without an EDS: the four of the predefined connection set, that of CiA 401's analogue inputs first."""
-_COMMUNICATION, _MAPPING, _TPDOS = 0x1800, 0x1A00, 512
+_EVENT_DRIVEN = 255
 
 
-class EdsError(ValueError):
-    """An EDS file that can't be used; `str` names the file and what is wrong."""
+@dataclass(frozen=True, slots=True)
+class TpdoDefault:
+    """A TPDO as the node has it after power-on.
+
+    `number` : from 1
+    `cob_id` : identifier, 11 bits; 0 where the EDS gives none and CiA 301 has none for this number
+    `enabled` : the node sends it, with an 11-bit identifier
+    `transmission` : transmission type, CiA 301 table 69; 255, event-driven, where the EDS is silent
+    `entries` : (index, sub-index, bits) in the order of transfer, up to the first that the EDS leaves empty;
+        indices 1 to 7 are dummy entries, gaps of that length
+    `remappable` : its mapping may be written
+    """
+
+    number: int
+    cob_id: int
+    enabled: bool
+    transmission: int
+    entries: tuple[tuple[int, int, int], ...]
+    remappable: bool
 
 
-def load(path: Path | str, node_id: int) -> Mapping[int, Any]:
-    """Object dictionary of an EDS file, `canopen.ObjectDictionary`, for one node id.
+def load(path: Path | str, node_id: int) -> ObjectDictionary:
+    """Object dictionary of an EDS or DCF file for one node id (1-127), as `canopen.LocalNode` takes it.
 
-    Vendors' files come in UTF-8 and in Latin-1. Raises EdsError.
+    UTF-8, Latin-1 and UTF-16. Of keys and sections that come twice the first counts, as in Windows' own INI
+    functions, with which most vendors' tools read them. Raises EdsError.
     """
     try:
         raw = Path(path).read_bytes()
-    except OSError as error:
-        raise EdsError(f"{path}: {error.strerror}") from error
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    try:
-        dictionary: Mapping[int, Any] = import_eds(io.StringIO(text), node_id)
-    except Exception as error:  # the parser raises whatever its input makes it stumble over
-        raise EdsError(f"{path}: is no EDS that can be read: {error}") from error
-    return dictionary
+    except (OSError, ValueError) as error:  # ValueError: no path at all, as with a NUL in it
+        raise EdsError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    return parse(str(path), raw, node_id)
 
 
-def tpdo_numbers(dictionary: Mapping[int, Any]) -> tuple[int, ...]:
+def tpdos(dictionary: ObjectDictionary) -> tuple[TpdoDefault, ...]:
+    """All TPDOs of an object dictionary from `load`, by number; a DCF's values count before defaults."""
+    return tuple(_tpdo(dictionary, index - PDOS.start + 1) for index in PDOS if index in dictionary)
+
+
+def tpdo_numbers(dictionary: ObjectDictionary) -> tuple[int, ...]:
     """Numbers (from 1) of the TPDOs in an object dictionary; first those with analogue inputs by default."""
-    numbers = [n for n in range(1, _TPDOS + 1) if _COMMUNICATION + n - 1 in dictionary]
-    return tuple(sorted(numbers, key=lambda n: not _carries_inputs(dictionary.get(_MAPPING + n - 1))))
+    found = tpdos(dictionary)
+    carrying = sorted(found, key=lambda tpdo: all(entry[0] != ANALOGUE_INPUT for entry in tpdo.entries))
+    return tuple(tpdo.number for tpdo in carrying)
 
 
-def _carries_inputs(mapping: Any) -> bool:
-    """Whether a mapping record's defaults name object 0x6401."""
-    if mapping is None or not hasattr(mapping, "values"):
-        return False
-    entries = (entry for entry in mapping.values() if entry.subindex)
-    return any(isinstance(e.default, int) and e.default >> 16 == ANALOGUE_INPUT for e in entries)
+def integer_type(dictionary: ObjectDictionary, index: int, sub: int) -> tuple[int, bool] | None:
+    """(bits, signed) of an integer object; None where the dictionary hasn't the object.
+
+    8 to 64 bits in steps of 8. Raises EdsError for any other type, naming object and type.
+    """
+    variable = variable_at(dictionary, index, sub)
+    if variable is None:
+        return None
+    kind = variable.data_type
+    if kind not in INTEGERS:
+        name = TYPE_NAMES.get(kind, f"of type {kind}")
+        raise EdsError(
+            f'object 0x{index:04X} sub {sub} "{variable.name}" is {name}; an integer is needed here'
+        )
+    return INTEGERS[kind]
+
+
+def _tpdo(dictionary: ObjectDictionary, number: int) -> TpdoDefault:
+    communication, mapping = PDOS[number - 1], MAPPINGS[number - 1]
+    node_id = dictionary.node_id or 0
+    predefined = 0x80 + 0x100 * number if number <= len(DEFAULT_TPDOS) else 0
+    cob_id = raw_value(dictionary, communication, 1)
+    if cob_id is None:
+        cob_id = predefined
+    if predefined and cob_id & 0x7FF == predefined:  # some files leave the node id to the firmware
+        cob_id += node_id
+    transmission = raw_value(dictionary, communication, 2)
+    subs = [variable_at(dictionary, mapping, sub) for sub in (0, 1)]
+    writable = [bool(variable.writable) for variable in subs if variable is not None]
+    return TpdoDefault(
+        number=number,
+        cob_id=cob_id & 0x7FF,
+        enabled=bool(cob_id & 0x7FF) and not cob_id & (1 << 31 | 1 << 29),
+        transmission=_EVENT_DRIVEN if transmission is None else transmission,
+        entries=tuple(entries(dictionary, mapping)),
+        remappable=bool(writable) and all(writable),
+    )
