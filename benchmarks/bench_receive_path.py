@@ -134,7 +134,8 @@ def over_socket(
     bare, port_us = [], []
     sender = can.Bus(interface=interface, channel=channel)
     bus = can.Bus(interface=interface, channel=channel)
-    grow_receive_buffer(bus.fileno())
+    with socket.socket(fileno=os.dup(bus.fileno())) as same:
+        grow_receive_buffer(same)
     port = Port.open(Bus(name="port", interface=interface, channel=channel), slab)
     route(port)
     for _ in range(TURNS):

@@ -6,6 +6,8 @@ Public names: `Port`, `open_bus`, `BusError`.
 from __future__ import annotations
 
 import errno
+import json
+import subprocess
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -14,10 +16,12 @@ import can
 
 from handtouch.config import Bus
 
+from .bus_state import BusState, Condition, code_of, is_queue_full, trouble_of
 from .load import frame_bits
-from .receivers import PolledReceiver, Receiver, SocketcanReceiver, ThreadReceiver
+from .receivers import CyclicSender, Receiver, ThreadReceiver
 from .router import Counters, Frame, Router
 from .slab import Slab
+from .sockets import PolledReceiver, SocketcanReceiver
 
 _ECHOES = frozenset({"udp_multicast"})  # what we send comes back and is counted there
 _OWN_BIT_RATE = frozenset({"socketcan", "udp_multicast", "virtual"})  # python-can can't set it there
@@ -28,16 +32,21 @@ class BusError(OSError):
 
 
 class Port:
-    """A bus in use. Receive in one thread; `send` is safe from any."""
+    """A bus in use. Receive in one thread; `send` is safe from any.
+
+    `echoes` says whether frames that we send are received, too.
+    """
 
     def __init__(self, bus: Bus, receiver: Receiver, slab: Slab) -> None:
         """Use a receiver that is open already; `Port.open` makes one from a bus's description."""
         self.name = bus.name
         self.bus = bus
         self.router = Router(slab)
+        self.router.state = BusState(bus.interface, str(bus.channel))
+        self.echoes = bus.interface in _ECHOES
         self._receiver = receiver
         self._send_lock = threading.Lock()
-        self._echoes = bus.interface in _ECHOES
+        self._was_off = False
 
     @classmethod
     def open(cls, bus: Bus, slab: Slab) -> Port:
@@ -65,9 +74,24 @@ class Port:
         return self.router.counters
 
     @property
+    def state(self) -> BusState:
+        """How the bus fares, as of the last `look`."""
+        return self.router.state
+
+    @property
     def problem(self) -> str:
-        """What is wrong with the bus now (interface down, adapter gone …); empty when nothing is."""
-        return self._receiver.problem
+        """What is wrong with the bus (interface down, bus-off …) and what helps; empty when nothing is."""
+        return self.state.problem
+
+    def look(self, t_ns: int) -> BusState:
+        """Take in what has happened to the bus since the last look; cheap enough for every tick."""
+        counters, state = self.router.counters, self.router.state
+        state.look(t_ns, counters.frames, counters.sent, counters.queue_full, self._receiver.trouble)
+        off = state.condition is Condition.BUS_OFF
+        if off and not self._was_off and self.bus.interface == "socketcan":
+            threading.Thread(target=self._ask_restart, name="can-restart-ms", daemon=True).start()
+        self._was_off = off
+        return state
 
     def fileno(self) -> int:
         """Descriptor that is readable while frames wait; the same for the port's whole life."""
@@ -85,23 +109,53 @@ class Port:
         """
         return self._receiver.drain(self.router)
 
-    def send(self, can_id: int, data: bytes) -> bool:
-        """Send a frame; a full queue or a bus that is down is counted, never raised. True if it went out."""
-        counters = self.router.counters
+    def send(self, can_id: int, data: bytes, remote: bool = False) -> bool:
+        """Send a frame; a full queue or a bus that is down is counted, never raised. True if it went out.
+
+        A remote frame asks for as many bytes as `data` has, whatever they are.
+        """
+        counters, receiver = self.router.counters, self._receiver
         with self._send_lock:
             try:
-                self._receiver.send(can_id, data)
-            except Exception:  # noqa: BLE001 - drivers raise anything; it is counted, and `problem` has more
-                counters.send_failures += 1
+                receiver.send(can_id, data, remote)
+            except Exception as error:  # noqa: BLE001 - drivers raise anything; it is counted, and told in `look`
+                self._not_sent(error)
                 return False
             counters.sent += 1
-            if not self._echoes:
-                counters.bits += frame_bits(len(data))
+            if not self.echoes:
+                counters.bits += frame_bits(0 if remote else len(data))
+        if receiver.trouble is not None and receiver.trouble.condition is Condition.DOWN:
+            receiver.trouble = None  # where nobody sends, no frame will show that the interface is up again
         return True
+
+    def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
+        """Have the kernel send a frame now and every `period_s` seconds, if there is a kernel that can.
+
+        None if not; then `problem` may say why.
+        """
+        try:
+            return self._receiver.send_cyclically(can_id, data, period_s)
+        except Exception as error:  # noqa: BLE001 - as above
+            self._not_sent(error)
+            return None
 
     def close(self) -> None:
         """Give the bus back."""
         self._receiver.close()
+
+    def _not_sent(self, error: Exception) -> None:
+        """Count it; a send also shows sooner than `recv` that the bus is down."""
+        if is_queue_full(error):
+            self.router.counters.queue_full += 1
+            return
+        self.router.counters.send_failures += 1
+        told = trouble_of(error)
+        if told.condition is not Condition.ACTIVE and self._receiver.trouble is None:
+            self._receiver.trouble = told
+
+    def _ask_restart(self) -> None:
+        """In a thread of its own: starting a program takes milliseconds."""
+        self.state.restart_ms = restart_ms(str(self.bus.channel))
 
 
 def open_bus(bus: Bus) -> can.BusABC:
@@ -113,6 +167,20 @@ def open_bus(bus: Bus) -> can.BusABC:
         return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
     except Exception as error:  # drivers raise anything; all of it means that the bus is not there
         raise _unopened(bus, error) from error
+
+
+def restart_ms(channel: str) -> int | None:
+    """After how long the kernel restarts a SocketCAN interface by itself after bus-off, ms; 0: never.
+
+    None where that isn't known: without iproute2, or an interface that can't go bus-off.
+    """
+    command = ["ip", "-details", "-json", "link", "show", "dev", channel]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        link = json.loads(done.stdout)[0]["linkinfo"]
+        return int(link["info_data"].get("restart_ms", 0)) if link["info_kind"] == "can" else None
+    except (OSError, ValueError, LookupError, TypeError, subprocess.SubprocessError):
+        return None
 
 
 def _receiver(interface: str, opener: Callable[[], can.BusABC]) -> Receiver:
@@ -134,7 +202,7 @@ def _remedy(bus: Bus, error: Exception) -> str:
     if isinstance(error, NotImplementedError | ImportError):
         known = ", ".join(sorted(can.VALID_INTERFACES))
         return f"interface must be one of python-can's, with its driver installed: {known}"
-    code = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    code = code_of(error)
     if bus.interface == "socketcan":
         if code == errno.EAFNOSUPPORT:
             return "this kernel has no CAN support (modprobe can can_raw); udp_multicast works without"

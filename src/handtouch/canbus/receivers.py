@@ -1,8 +1,11 @@
-"""Three ways to read a CAN bus without blocking: SocketCAN's socket, a bus that can be polled, any other.
+"""Reading a CAN bus without blocking: what a receiver is, and one for any python-can bus.
 
-Each has a file descriptor that becomes readable when frames wait and stays the same when the bus is opened
-anew, and `drain`, which hands all that waits to a router. None of them ever raises for what the bus does:
-errors are counted, told in `problem`, and the bus is opened again with growing pauses.
+A receiver has a file descriptor that becomes readable when frames wait and stays the same when the bus is
+opened anew, and `drain`, which hands all that waits to a router. None ever raises for what the bus does:
+errors are counted, told in `trouble`, and the bus is opened again with growing pauses. Two more: `sockets`.
+
+Public names: `Receiver`, `CyclicSender`, `ThreadReceiver`, `Retry`, `RECEIVE_BUFFER_BYTES`, `DRAIN_LIMIT`,
+`QUEUE_FRAMES`.
 """
 
 from __future__ import annotations
@@ -10,9 +13,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import select
 import socket
-import struct
 import threading
 import time
 from collections import deque
@@ -21,40 +22,58 @@ from typing import Protocol
 
 import can
 
+from .bus_state import Condition, Trouble, code_of, trouble_of
 from .router import Frame, Router
 
 RECEIVE_BUFFER_BYTES = 4 << 20
-"""Socket receive buffer asked for. The kernel books about 800 bytes a frame: half a second of a full bus."""
+"""Socket receive buffer asked for; the kernel doubles it and books 768 bytes a frame: 10,900 frames, 1.3 s of
+a full 1 Mbit/s bus. After a pause of that length every heartbeat is overdue: nothing longer need be bridged.
+"""
 DRAIN_LIMIT = 4096
 """Frames read in one go at most, so that a flood can't keep the caller from its tick."""
 QUEUE_FRAMES = 16384
-"""Frames that a reader thread holds at most; older ones are dropped and counted."""
+"""Frames that a reader thread holds at most, 1.9 s of a full bus; older ones are dropped and counted."""
 
 _WALL_STAMPED = frozenset({"socketcan", "udp_multicast", "virtual"})
+_TELLS_STATE = frozenset({"ixxat", "etas"})  # elsewhere python-can's `state` is what was asked for
+_SEND_TIMEOUT_S = 0.01  # an adapter that hangs must not hold up the other buses for longer
 _RETRY_FIRST_S, _RETRY_LAST_S = 0.1, 2.0
 _ERRORS_TO_REOPEN = 20  # in a row; a few bad datagrams or serial lines are no reason to lose what waits
-_SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33
+_SO_RCVBUFFORCE = 33
 _GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is of no more use
-_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
-_TIMESPEC = struct.Struct("@ll")
-_ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
-_EXTENDED_OR_REMOTE, _ERROR_FRAME = 0xC0000000, 0x20000000
 _OLDEST_STAMP_NS = 10_000_000_000
+_OFFSET_NS = 5_000
 
 Opener = Callable[[], can.BusABC]
+
+
+class CyclicSender(Protocol):
+    """A frame that somebody else, such as the kernel, sends again and again."""
+
+    def set_period(self, period_s: float) -> None:
+        """Send it now, and with this period from now on. Raises CanError or OSError."""
+        ...
+
+    def stop(self) -> None:
+        """Raises CanError or OSError."""
+        ...
 
 
 class Receiver(Protocol):
     """What a port needs of a receiver."""
 
-    problem: str  # what is wrong with the bus now, empty when nothing is
+    trouble: Trouble | None  # what is wrong with the bus now, if anything
 
     def fileno(self) -> int: ...
 
     def drain(self, router: Router) -> list[Frame]: ...
 
-    def send(self, can_id: int, data: bytes) -> None:
-        """Raises CanError or OSError."""
+    def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Raises whatever the driver raises."""
+        ...
+
+    def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
+        """None where nobody but us could do it. Raises CanError or OSError."""
         ...
 
     def close(self) -> None: ...
@@ -87,160 +106,13 @@ def monotonic_from_wall(stamp_s: float, now_ns: int, offset_ns: int) -> int:
     return t_ns if now_ns - _OLDEST_STAMP_NS < t_ns <= now_ns else now_ns
 
 
-class _SocketReceiver:
-    """A bus with a socket, read in the caller's thread; behind an epoll, so its descriptor never changes."""
-
-    def __init__(self, opener: Opener) -> None:
-        self._opener = opener
-        self._epoll = select.epoll()
-        self._retry = Retry()
-        self._errors = 0
-        self._bus: can.BusABC | None = None
-        self.problem = ""
-        try:
-            self._use(opener())
-        except BaseException:
-            self._epoll.close()
-            raise
-
-    def fileno(self) -> int:
-        return self._epoll.fileno()
-
-    def close(self) -> None:
-        self._drop()
-        self._epoll.close()
-
-    def drain(self, router: Router) -> list[Frame]:
-        others: list[Frame] = []
-        bus = self._bus or self._reopen(router)
-        if bus is None:
-            return others
-        before = router.counters.frames
-        try:
-            self._read(bus, router, others)
-            failure = None
-        except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; here it is counted
-            failure = error
-        if self.problem and router.counters.frames > before:
-            self.problem = ""
-            self._errors = 0
-        if failure is not None:
-            self._failed(router, failure)
-        return others
-
-    def send(self, can_id: int, data: bytes) -> None:
-        if self._bus is None:
-            raise OSError(errno.ENODEV, self.problem)
-        self._send(self._bus, can_id, data)
-
-    def _read(self, bus: can.BusABC, router: Router, others: list[Frame]) -> None:
-        raise NotImplementedError
-
-    def _send(self, bus: can.BusABC, can_id: int, data: bytes) -> None:
-        bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-
-    def _use(self, bus: can.BusABC) -> None:
-        self._bus = bus
-        self._epoll.register(bus.fileno(), select.EPOLLIN)
-
-    def _drop(self) -> None:
-        bus, self._bus = self._bus, None
-        if bus is None:
-            return
-        try:
-            bus.shutdown()  # closing the socket takes it out of the epoll
-        except Exception as error:  # noqa: BLE001 - as above
-            self.problem = str(error) or type(error).__name__
-
-    def _failed(self, router: Router, error: Exception) -> None:
-        router.counters.receive_errors += 1
-        self.problem = str(error) or type(error).__name__
-        self._errors += 1
-        if _is_hopeless(error, self._errors):
-            self._drop()
-
-    def _reopen(self, router: Router) -> can.BusABC | None:
-        if not self._retry.due(time.monotonic_ns()):
-            return None
-        try:
-            self._use(self._opener())
-        except Exception as error:  # noqa: BLE001 - as above
-            router.counters.receive_errors += 1
-            self.problem = str(error) or type(error).__name__
-            return None
-        self._errors = 0
-        self.problem = ""
-        self._retry.reset()
-        return self._bus
-
-
-class SocketcanReceiver(_SocketReceiver):
-    """SocketCAN by its socket: kernel stamps and drop counts, a third of the cost of python-can's `recv`."""
-
-    def _use(self, bus: can.BusABC) -> None:
-        self._socket: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketcanBus has it; BusABC not
-        grow_receive_buffer(self._socket)
-        self._dropped = 0
-        super()._use(bus)
-
-    def _read(self, bus: can.BusABC, router: Router, others: list[Frame]) -> None:  # noqa: ARG002
-        recvmsg, unpack, accept = self._socket.recvmsg, _FRAME.unpack_from, router.accept
-        stamp = _TIMESPEC.unpack_from
-        offset_ns = time.monotonic_ns() - time.time_ns()
-        for _ in range(DRAIN_LIMIT):
-            try:
-                frame, ancillary, _, _ = recvmsg(16, _ANCILLARY, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                return
-            t_ns = 0
-            for _, kind, value in ancillary:
-                if kind == _SO_TIMESTAMPNS:
-                    seconds, nanoseconds = stamp(value)
-                    t_ns = seconds * 1_000_000_000 + nanoseconds + offset_ns
-                elif kind == _SO_RXQ_OVFL:
-                    self._count_dropped(router, int.from_bytes(value[:4], "little"))
-            can_id, size, data = unpack(frame)
-            if can_id >= 0x800:
-                self._count_odd(router, can_id)
-                continue
-            if size != 8:
-                data = data[:size]
-            if not accept(can_id, data, t_ns):
-                others.append((can_id, data, t_ns))
-
-    def _send(self, bus: can.BusABC, can_id: int, data: bytes) -> None:  # noqa: ARG002
-        self._socket.send(_FRAME.pack(can_id, len(data), data), socket.MSG_DONTWAIT)
-
-    def _count_dropped(self, router: Router, total: int) -> None:
-        """The kernel tells how many frames this socket has lost since it was opened."""
-        router.counters.overflow += total - self._dropped & 0xFFFFFFFF
-        self._dropped = total
-
-    def _count_odd(self, router: Router, can_id: int) -> None:
-        if can_id & _ERROR_FRAME:
-            router.counters.errors += 1
-        elif can_id & _EXTENDED_OR_REMOTE:
-            router.counters.foreign += 1
-
-
-class PolledReceiver(_SocketReceiver):
-    """A bus whose `recv(0)` never blocks and whose descriptor tells when frames wait: udp_multicast."""
-
-    def _use(self, bus: can.BusABC) -> None:
-        grow_receive_buffer(bus.fileno())
-        super()._use(bus)
-
-    def _read(self, bus: can.BusABC, router: Router, others: list[Frame]) -> None:
-        now_ns = time.monotonic_ns()
-        offset_ns = now_ns - time.time_ns()
-        for _ in range(DRAIN_LIMIT):
-            message = bus.recv(0)
-            if message is None:
-                return
-            now_ns = time.monotonic_ns()
-            frame = router.accept_message(message, monotonic_from_wall(message.timestamp, now_ns, offset_ns))
-            if frame is not None:
-                others.append(frame)
+def clock_offset_ns() -> int:
+    """Monotonic minus wall clock; taken again where something came between the readings."""
+    for _ in range(3):
+        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after - before < _OFFSET_NS:
+            break
+    return (before + after) // 2 - wall
 
 
 class ThreadReceiver:
@@ -249,11 +121,12 @@ class ThreadReceiver:
     def __init__(self, opener: Opener, interface: str) -> None:
         self._opener = opener
         self._stamped = interface in _WALL_STAMPED
+        self._tells_state = interface in _TELLS_STATE
         self._queue: deque[can.Message] = deque(maxlen=QUEUE_FRAMES)
         self._lost = 0
         self._errors = 0
         self._counted = (0, 0)
-        self.problem = ""
+        self.trouble: Trouble | None = None
         self._bus: can.BusABC | None = opener()
         self._eventfd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._signalled = False
@@ -271,11 +144,14 @@ class ThreadReceiver:
             self._bus.shutdown()
         os.close(self._eventfd)
 
-    def send(self, can_id: int, data: bytes) -> None:
+    def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
         bus = self._bus
         if bus is None:
-            raise OSError(errno.ENODEV, self.problem)
-        bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            raise OSError(errno.ENODEV, self.trouble.text if self.trouble else "closed")
+        bus.send(message(can_id, data, remote), _SEND_TIMEOUT_S)
+
+    def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:  # noqa: ARG002
+        return None  # python-can would do it in a thread of its own, which is worse than our loop
 
     def drain(self, router: Router) -> list[Frame]:
         others: list[Frame] = []
@@ -313,25 +189,33 @@ class ThreadReceiver:
         retry = Retry()
         in_a_row = 0
         while not self._closing.is_set():
-            if self._bus is None:
+            bus = self._bus
+            if bus is None:
+                in_a_row = 0
                 self._reopen(retry)
                 continue
+            if self.trouble is not None and self.trouble.condition is Condition.BUS_OFF:  # told by `send`
+                self._drop(bus)
+                continue
             try:
-                message = self._bus.recv(0.1)
+                message = bus.recv(0.1)
+                if message is None and self._tells_state and bus.state is can.BusState.ERROR:
+                    raise can.CanOperationError("bus-off")
             except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; here it is counted
                 in_a_row += 1
-                self._failed(error)
-                if _is_hopeless(error, in_a_row):
-                    self._drop(self._bus)
-                    in_a_row = 0
+                self._failed(trouble_of(error))
+                _forget_line(bus)
+                if is_hopeless(error, in_a_row):
+                    self._drop(bus)
+                    self.trouble = given_up(error)
                 continue
             if message is None:
                 continue
             self._put(message)
-            if self.problem:
+            if in_a_row or self.trouble is not None:
                 in_a_row = 0
                 retry.reset()
-                self.problem = ""
+                self.trouble = None
 
     def _put(self, message: can.Message) -> None:
         if not self._stamped:  # its stamps may be of the adapter's own clock
@@ -342,9 +226,9 @@ class ThreadReceiver:
         if not self._signalled:
             self._raise_signal()
 
-    def _failed(self, error: Exception) -> None:
+    def _failed(self, trouble: Trouble) -> None:
         self._errors += 1
-        self.problem = str(error) or type(error).__name__
+        self.trouble = trouble
         self._raise_signal()  # so that the count is taken
 
     def _drop(self, bus: can.BusABC) -> None:
@@ -352,7 +236,7 @@ class ThreadReceiver:
         try:
             bus.shutdown()
         except Exception as error:  # noqa: BLE001 - as above
-            self._failed(error)
+            self._failed(trouble_of(error))
 
     def _reopen(self, retry: Retry) -> None:
         if not retry.due(time.monotonic_ns()):
@@ -361,30 +245,43 @@ class ThreadReceiver:
         try:
             self._bus = self._opener()
         except Exception as error:  # noqa: BLE001 - as above
-            self._failed(error)
+            self._failed(given_up(error))
         else:
-            self.problem = ""
+            self.trouble = None
 
 
-def _is_hopeless(error: Exception, in_a_row: int) -> bool:
+def message(can_id: int, data: bytes, remote: bool = False) -> can.Message:
+    """python-can's message; a remote frame asks for as many bytes as `data` has."""
+    if remote:
+        return can.Message(arbitration_id=can_id, dlc=len(data), is_remote_frame=True, is_extended_id=False)
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+def _forget_line(bus: can.BusABC) -> None:
+    """slcan keeps a line that is no text, and fails on it again with every line to come."""
+    buffer = getattr(bus, "_buffer", None)
+    if isinstance(buffer, bytearray):
+        buffer.clear()
+
+
+def given_up(error: Exception) -> Trouble:
+    """What to tell of a bus that has been given up with this error, until it is open again."""
+    told = trouble_of(error)
+    return told if told.condition is Condition.BUS_OFF else Trouble(Condition.DOWN, told.text)
+
+
+def is_hopeless(error: Exception, in_a_row: int) -> bool:
     """Whether a bus that has failed so many times in a row, last with this, has to be opened again."""
-    code = getattr(error, "errno", None) or getattr(error, "error_code", None)
-    if code == errno.ENETDOWN:  # the same socket works again when the interface is up
+    if code_of(error) == errno.ENETDOWN:  # the same socket works again when the interface is up
         return False
-    return code in _GONE or in_a_row >= _ERRORS_TO_REOPEN
+    off = trouble_of(error).condition is Condition.BUS_OFF
+    return off or code_of(error) in _GONE or in_a_row >= _ERRORS_TO_REOPEN
 
 
-def grow_receive_buffer(target: socket.socket | int) -> int:
-    """Ask for RECEIVE_BUFFER_BYTES on a socket (or its descriptor), past the system's limit where allowed.
-
-    Returns what the kernel granted, bytes.
-    """
-    if isinstance(target, int):
-        with socket.socket(fileno=os.dup(target)) as same:
-            return grow_receive_buffer(same)
+def grow_receive_buffer(target: socket.socket) -> int:
+    """Ask for RECEIVE_BUFFER_BYTES on a socket, past the system's limit where allowed; bytes granted."""
     try:
         target.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
     except PermissionError:  # needs CAP_NET_ADMIN
         target.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-    target.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
     return target.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
