@@ -314,12 +314,12 @@ def _number(text: str, node_id: int) -> int | None:
     plain = _plain(_uncommented(text))
     if not plain:
         return None
-    terms = plain.split("+")
+    terms = plain.removeprefix("+").split("+")
     numbers = [_literal(term) for term in terms if not _NODE_ID.fullmatch(term)]
     node_ids = len(terms) - len(numbers)
-    if None in numbers or len(numbers) > 1 or node_ids > 1:
+    if None in numbers or node_ids > 1:
         raise ValueError(f'"{text}" is neither a number nor $NODEID+number')
-    return (numbers[0] or 0 if numbers else 0) + node_ids * node_id
+    return sum(number for number in numbers if number is not None) + node_ids * node_id
 
 
 def _literal(text: str) -> int | None:
