@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import pytest
 
-from handtouch.canbus.boot import Expected, Identity, configure, identify
-from handtouch.canbus.channels import STANDARD_CHANNELS, Channel, Channels
+from handtouch.canbus.boot import Expected, Identity, Idle, configure, identify
+from handtouch.canbus.channels import STANDARD_CHANNELS, Channel, Channels, Object
 from handtouch.canbus.mapping import Mapping, Tpdo, read_mapping
 from handtouch.canbus.sdo import Outdated, Sdo, StepError
 from handtouch.canbus.slab import STANDARD, Field
@@ -55,6 +57,13 @@ def tpdo(
     mapping = {(0x1A00 + number - 1, sub): (entry, 4) for sub, entry in enumerate(entries, 1)}
     communication = {(0x1800 + number - 1, 1): (cob_id, 4), (0x1800 + number - 1, 2): (transmission, 1)}
     return {(0x1A00 + number - 1, 0): (len(entries), 1)} | mapping | communication
+
+
+@dataclass
+class Wanted:
+    heartbeat_ms: int
+    idle: Idle | None = None
+    excitation: Object | None = None
 
 
 def found(enabled: bool = True, transmission: int = 1) -> Tpdo:
@@ -184,18 +193,19 @@ def test_only_what_differs_is_written_and_only_pdo_changes_halt(
     cob_id = found.cob_id | (0 if found.enabled else 1 << 31)
     node = Node(tpdo(2, CHANNELS, cob_id, found.transmission) | {(0x1017, 0): (heartbeat, 2)})
     halted: list[bool] = []
-    assert not configure(node.sdo, Mapping((found,), STANDARD), 100, lambda: halted.append(True)).guarded
+    made = configure(node.sdo, Mapping((found,), STANDARD), Wanted(100), lambda: halted.append(True))
+    assert not made.guarded
     assert (node.writes, len(halted)) == (writes, halts)
 
 
 def test_node_without_heartbeat_gets_it_as_guard_time() -> None:
     node = Node(tpdo(2, CHANNELS, 0x285) | {(0x100C, 0): (0, 2), (0x100D, 0): (0, 1)})
-    assert configure(node.sdo, Mapping((found(),), STANDARD), 150, lambda: None).guarded
+    assert configure(node.sdo, Mapping((found(),), STANDARD), Wanted(150), lambda: None).guarded
     assert node.writes == [(0x100C, 0, 150), (0x100D, 0, 3)]
 
 
 def test_node_that_has_neither_is_guarded_all_the_same() -> None:
-    assert configure(Node({}).sdo, Mapping((found(),), STANDARD), 150, lambda: None).guarded
+    assert configure(Node({}).sdo, Mapping((found(),), STANDARD), Wanted(150), lambda: None).guarded
 
 
 def test_transmission_type_of_a_strict_node_is_changed_while_its_pdo_is_off() -> None:
@@ -210,7 +220,7 @@ def test_transmission_type_of_a_strict_node_is_changed_while_its_pdo_is_off() ->
         return plain(can_id, data)
 
     node.sdo._client.network._send = strict
-    configure(node.sdo, Mapping((found(transmission=255),), STANDARD), 100, lambda: None)
+    configure(node.sdo, Mapping((found(transmission=255),), STANDARD), Wanted(100), lambda: None)
     assert node.writes == [(0x1801, 1, 0x80000285), (0x1801, 2, 1), (0x1801, 1, 0x285)]
 
 
@@ -218,7 +228,7 @@ def test_value_that_does_not_stick_is_an_error() -> None:
     node = Node({(0x1017, 0): (0, 2)})
     node.forgets.add(0x1017)
     with pytest.raises(StepError, match="heartbeat time, 0x1017:00, was set to 100 but reads 0"):
-        configure(node.sdo, Mapping((found(),), STANDARD), 100, lambda: None)
+        configure(node.sdo, Mapping((found(),), STANDARD), Wanted(100), lambda: None)
 
 
 def test_silence_and_refusal_are_told_apart() -> None:

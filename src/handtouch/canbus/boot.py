@@ -7,12 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
-from .mapping import COMMUNICATION, NOT_VALID, Mapping
+from .channels import Object
+from .mapping import COMMUNICATION, NOT_VALID, Mapping, Tpdo
 from .sdo import Sdo, StepError
 
 SYNCHRONOUS = 1
 """Transmission type: with every SYNC."""
+EVENT_DRIVEN = 255
+"""Transmission type: by the device profile's events."""
 LIFE_TIME_FACTOR = 3
 """Guard times that a guarded node waits for our remote frame before it tells an error."""
 
@@ -40,11 +44,44 @@ class Expected:
 
 
 @dataclass(frozen=True, slots=True)
+class Idle:
+    """What a node does while nothing touches its pad: sends when a channel moved, and now and then."""
+
+    delta_counts: int
+    period_ms: int
+    inhibit_100us: int
+    deltas: tuple[Object, ...]
+    enable: Object | None
+
+
+class Settings(Protocol):
+    """What a node is configured with."""
+
+    @property
+    def heartbeat_ms(self) -> int: ...
+
+    @property
+    def idle(self) -> Idle | None: ...
+
+    @property
+    def excitation(self) -> Object | None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Paced:
+    """A node was made event-driven, or synchronous again."""
+
+    idle: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Configured:
     """What a node was made to do."""
 
     guarded: bool
     """it has no heartbeat and has to be asked for its state"""
+    may_idle: bool
+    """it can be made event-driven"""
 
 
 def identify(sdo: Sdo, expected: Expected) -> Identity:
@@ -71,7 +108,7 @@ def identify(sdo: Sdo, expected: Expected) -> Identity:
     return identity
 
 
-def configure(sdo: Sdo, mapping: Mapping, heartbeat_ms: int, halt: Callable[[], None]) -> Configured:
+def configure(sdo: Sdo, mapping: Mapping, wanted: Settings, halt: Callable[[], None]) -> Configured:
     """Set what differs: PDOs enabled and synchronous, heartbeat time; each is read back.
 
     A node without heartbeat gets it as guard time. `halt` makes the node pre-operational; called only if a
@@ -80,24 +117,62 @@ def configure(sdo: Sdo, mapping: Mapping, heartbeat_ms: int, halt: Callable[[], 
     if any(not tpdo.enabled or tpdo.transmission != SYNCHRONOUS for tpdo in mapping.tpdos):
         halt()
     for tpdo in mapping.tpdos:
-        index = COMMUNICATION + tpdo.number - 1
         if tpdo.transmission != SYNCHRONOUS:
-            _set_transmission(sdo, index, tpdo.number, tpdo.cob_id, tpdo.enabled)
-        if not tpdo.enabled or tpdo.transmission != SYNCHRONOUS:
-            sdo.set(index, 1, tpdo.cob_id, 4, f"identifier of TPDO{tpdo.number}")
-    return Configured(_supervise(sdo, heartbeat_ms))
+            _set_transmission(sdo, tpdo, SYNCHRONOUS)
+        if not tpdo.enabled:
+            name = f"identifier of TPDO{tpdo.number}"
+            sdo.set(COMMUNICATION + tpdo.number - 1, 1, tpdo.cob_id, 4, name)
+    may_idle = wanted.idle is not None and len(mapping.tpdos) == 1  # several would come one by one
+    if wanted.idle is not None and may_idle:
+        prepare_idle(sdo, mapping.tpdos[0], wanted.idle, halt)
+    excite(sdo, wanted.excitation, True)
+    return Configured(_supervise(sdo, wanted.heartbeat_ms), may_idle)
 
 
-def _set_transmission(sdo: Sdo, index: int, number: int, cob_id: int, enabled: bool) -> None:
+def prepare_idle(sdo: Sdo, tpdo: Tpdo, idle: Idle, halt: Callable[[], None]) -> None:
+    """Set what an event-driven TPDO goes by: inhibit time, event timer, and the channels' deltas."""
+    index = COMMUNICATION + tpdo.number - 1
+    wanted = ((3, idle.inhibit_100us, "inhibit time"), (5, idle.period_ms, "event timer"))
+    changes = [
+        (sub, value, f"{what} of TPDO{tpdo.number}")
+        for sub, value, what in wanted
+        if sdo.read(index, sub, f"{what} of TPDO{tpdo.number}") != value
+    ]
+    if changes:  # CiA 301: not while the PDO is valid
+        halt()
+        sdo.write(index, 1, NOT_VALID | tpdo.cob_id, 4, f"identifier of TPDO{tpdo.number}")
+        for sub, value, what in changes:
+            sdo.write(index, sub, value, 2, what)
+        sdo.write(index, 1, tpdo.cob_id, 4, f"identifier of TPDO{tpdo.number}")
+    for delta in idle.deltas:
+        sdo.set(delta.index, delta.sub, idle.delta_counts, delta.size, "delta of a channel")
+    if idle.enable is not None:
+        sdo.set(idle.enable.index, idle.enable.sub, 1, idle.enable.size, "sending of changes")
+
+
+def set_pace(sdo: Sdo, tpdo: Tpdo, idle: bool) -> None:
+    """Make a running node's TPDO event-driven (`idle`) or synchronous."""
+    _set_transmission(sdo, tpdo, EVENT_DRIVEN if idle else SYNCHRONOUS)
+
+
+def excite(sdo: Sdo, excitation: Object | None, on: bool) -> None:
+    """Switch the potential of a pad on or off, where the node can."""
+    if excitation is not None:
+        sdo.set(excitation.index, excitation.sub, int(on), excitation.size, "excitation")
+
+
+def _set_transmission(sdo: Sdo, tpdo: Tpdo, kind: int) -> None:
     """Some nodes let it be changed only while the PDO is off."""
-    what = f"transmission type of TPDO{number}"
+    index = COMMUNICATION + tpdo.number - 1
+    what, identifier = f"transmission type of TPDO{tpdo.number}", f"identifier of TPDO{tpdo.number}"
     try:
-        sdo.write(index, 2, SYNCHRONOUS, 1, what)
+        sdo.write(index, 2, kind, 1, what)
     except StepError as error:
-        if error.silent or not enabled:
+        if error.silent or not tpdo.enabled:
             raise
-        sdo.write(index, 1, NOT_VALID | cob_id, 4, f"identifier of TPDO{number}")
-        sdo.write(index, 2, SYNCHRONOUS, 1, what)
+        sdo.write(index, 1, NOT_VALID | tpdo.cob_id, 4, identifier)
+        sdo.write(index, 2, kind, 1, what)
+        sdo.write(index, 1, tpdo.cob_id, 4, identifier)
 
 
 def _supervise(sdo: Sdo, period_ms: int) -> bool:

@@ -55,6 +55,15 @@ class Channel:
         return f"0x{self.index:04X}:{self.sub:02X} ({'' if self.signed else 'unsigned '}{self.bits} bit)"
 
 
+@dataclass(frozen=True, slots=True)
+class Object:
+    """An object of a node's dictionary that we write, `size` bytes."""
+
+    index: int
+    sub: int
+    size: int
+
+
 Channels = tuple[Channel, Channel, Channel, Channel]
 
 STANDARD_CHANNELS: Channels = (
@@ -105,6 +114,14 @@ def channels_of(objects: Sequence[str], path: Path | str | None) -> Channels:
         made.append(Channel(index, sub, *kind))
     first, second, third, fourth = made
     return first, second, third, fourth
+
+
+def written(text: str) -> Object:
+    """An object that we write, INDEX:SUB:TYPE. Raises EdsError where the type is left out."""
+    index, sub, kind = parse(text)
+    if kind is None:
+        raise eds.EdsError(f'"{text}": its type is not told; write it: "{text}:u8"')
+    return Object(index, sub, kind[0] // 8)
 
 
 def in_order(channels: Channels, electrodes: Sequence[str]) -> Channels:

@@ -22,7 +22,7 @@ class NodeState(IntEnum):
     OPERATIONAL = 5
     STALE = 6  # it is alive, but no samples come
     FAULTED = 7  # it can't be used, for the reason given; tried again from time to time
-    STOPPED = 8  # by us
+    STOPPED = 8  # by us: handtouch has ended, or nobody needs the node now
 
 
 class Action(Enum):
@@ -35,6 +35,8 @@ class Action(Enum):
     ENTER_PREOPERATIONAL = auto()  # these three: NMT, to this node alone
     START = auto()
     STOP = auto()
+    POWER_DOWN = auto()  # excitation off, where it can be, then STOP
+    PACE = auto()  # event-driven or synchronous; asked for by the master itself
 
 
 NMT_BOOT_UP, NMT_STOPPED, NMT_OPERATIONAL, NMT_PREOPERATIONAL = 0, 4, 5, 127
@@ -98,6 +100,7 @@ class Life:
     must_beat: bool = False  # lost for want of heartbeats: not trusted before it has sent one
     stranger: bool = False  # at its last identification it was not the configured node
     twins: bool = False  # two nodes have its id
+    resting: bool = False  # not needed now: configured, but stopped instead of started
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,11 +164,18 @@ class Tick:
 
 
 @dataclass(frozen=True, slots=True)
+class Rest:
+    """The node isn't needed for now (`resting`), or is again."""
+
+    resting: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """The node is not wanted any more."""
 
 
-Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Beats | Tick | Stop
+Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Beats | Rest | Tick | Stop
 Next = tuple[Life, tuple[Action, ...]]
 
 _IN_BOOT = frozenset({NodeState.BOOTING, NodeState.IDENTIFIED, NodeState.CONFIGURING})
@@ -174,7 +184,7 @@ _STARTED = frozenset({NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE
 
 def advance(life: Life, event: Event, t_ns: int, timing: Timing) -> Next:
     """The life after an event at `t_ns`, and what is to be done now."""
-    if life.state is NodeState.STOPPED:
+    if life.state is NodeState.STOPPED and not life.resting:
         return life, ()
     match event:
         case Heartbeat(nmt):
@@ -193,13 +203,15 @@ def advance(life: Life, event: Event, t_ns: int, timing: Timing) -> Next:
             return _silence(life, age_ns, t_ns)
         case Beats(twice):
             return _beats(life, twice, t_ns, timing)
+        case Rest(resting):
+            return _rest(life, resting, t_ns, timing)
         case Tick():
             return _tick(life, t_ns, timing)
         case Stop():
             # a stranger at its id is not ours to stop
             wanted = (Action.STOP,) if timing.role is Role.MASTER and not life.stranger else ()
             told = "stopped by handtouch" if wanted else "left as it was when handtouch ended"
-            return _enter(life, NodeState.STOPPED, t_ns, told), wanted
+            return replace(_enter(life, NodeState.STOPPED, t_ns, told), resting=False), wanted
         case _:
             assert_never(event)
 
@@ -209,7 +221,8 @@ def due_ns(life: Life, timing: Timing) -> int | None:
     dues = []
     if life.state in (NodeState.ABSENT, NodeState.FAULTED, NodeState.SETTLING):
         dues.append(life.due_ns)
-    if life.heartbeat_ns is not None and life.state not in (NodeState.ABSENT, NodeState.STOPPED):
+    ended = life.state is NodeState.STOPPED and not life.resting
+    if life.heartbeat_ns is not None and life.state is not NodeState.ABSENT and not ended:
         dues.append(life.heartbeat_ns + timing.heartbeat_timeout_ns)
     return min(dues, default=None)
 
@@ -291,7 +304,10 @@ def _done(life: Life, event: Done, t_ns: int, timing: Timing) -> Next:
 
 
 def _start(life: Life, t_ns: int, timing: Timing) -> Next:
-    """Trust begins after some samples; a node found running is left running."""
+    """Trust begins after some samples; a node found running is left running, one not needed is stopped."""
+    if life.resting:
+        life = replace(life, heartbeat_ns=t_ns, started_ns=t_ns)
+        return _rest(_enter(life, NodeState.SETTLING, t_ns, ""), True, t_ns, timing)
     running = life.nmt == NMT_OPERATIONAL
     ours = timing.role is Role.MASTER
     told = "found running" if running else "started" if ours else "configured; another master has to start it"
@@ -338,6 +354,18 @@ def _silence(life: Life, age_ns: int, t_ns: int) -> Next:
         return life, ()
     told = f"no sample for {age_ns / 1e6:.0f} ms, heartbeat is there"
     return _enter(life, NodeState.STALE, t_ns, f"{told}; is there a SYNC?"), ()
+
+
+def _rest(life: Life, resting: bool, t_ns: int, timing: Timing) -> Next:
+    if timing.role is not Role.MASTER:  # it isn't ours to stop
+        return life, ()
+    life = replace(life, resting=resting)
+    if resting and life.state in _STARTED:
+        life = _enter(life, NodeState.STOPPED, t_ns, "outside the scene: switched off until it is needed")
+        return replace(life, nmt=NMT_STOPPED, started_ns=t_ns), (Action.POWER_DOWN,)
+    if not resting and life.state is NodeState.STOPPED:
+        return _boot(life, t_ns, "needed again", timing)
+    return life, ()
 
 
 def _beats(life: Life, twice: bool, t_ns: int, timing: Timing) -> Next:

@@ -8,6 +8,7 @@ broadcast.
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +31,7 @@ from .lifecycle import (
     Heartbeat,
     Life,
     NodeState,
+    Rest,
     Role,
     Sample,
     Silence,
@@ -70,7 +72,7 @@ _FOREIGN, _IGNORED = -1, -2
 _GUARDED = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
 _NOBODY_WAITS = (NodeState.ABSENT, NodeState.STOPPED)
 Outcome = Done | Failed
-Result = boot.Identity | PdoMapping | boot.Configured
+Result = boot.Identity | PdoMapping | boot.Configured | boot.Paced
 
 
 @dataclass(slots=True, eq=False)
@@ -85,10 +87,15 @@ class _Node:
     life: Life = field(default_factory=Life)
     identity: boot.Identity | None = None
     mapping: PdoMapping | None = None
+    working: threading.Lock = field(default_factory=threading.Lock)  # one transfer at a time
     guarded: bool = False
     guard_ns: int = 0  # when to ask a guarded node next
     heartbeats: int = 0
     missed: int = 0
+    may_idle: bool = False  # it could be made event-driven
+    idle: bool = False  # it is
+    pacing: bool = False  # a change of that is under way
+    paced_ns: int = 0  # since when it is so
     watched: tuple[int, int] = (0, 0)  # since when, and how many heartbeats had come then
     emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
 
@@ -104,6 +111,7 @@ class _Node:
             self.identity,
             tuple(tpdo.cob_id for tpdo in self.mapping.tpdos) if self.mapping else (),
             self.guarded,
+            self.idle,
             self.heartbeats,
             self.missed,
             self.life.reboots,
@@ -115,6 +123,8 @@ class Master:
     """Boots and watches nodes on one or several buses that share a slab.
 
     `states` (slots,) uint8 holds the NodeState of each slot; samples are to be trusted in OPERATIONAL alone.
+    `period_ns` (slots,) int64 is how long it is between two samples at most: a SYNC period, or longer for an
+    event-driven node; `paced_ns` since when.
     """
 
     def __init__(
@@ -131,14 +141,16 @@ class Master:
         (self._slab,) = slabs.values()
         self._ports = ports
         self.states: NDArray[np.uint8] = np.zeros(self._slab.size, dtype=np.uint8)
-        self._stale_ns = STALE_PERIODS * sync_period_ns if sync_period_ns else 0
+        self._sync_period_ns = sync_period_ns or 0
+        self.period_ns: NDArray[np.int64] = np.full(self._slab.size, self._sync_period_ns, dtype=np.int64)
+        self.paced_ns: NDArray[np.int64] = np.zeros(self._slab.size, dtype=np.int64)
         self._nodes = [_node(spec, ports, sync_period_ns or 0) for spec in nodes]
         self._by_slot = {node.spec.slot: node for node in self._nodes}
         self._owners = _owners(ports, self._nodes)
         self._waiting: dict[int, int] = {}  # slots whose next sample matters -> stamp of the last one
         self._next_due_ns = 0
         self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_EVENTS_KEPT)
-        self._results: deque[tuple[_Node, Outcome, Result | None]] = deque()  # from the workers
+        self._results: deque[tuple[_Node, Outcome | None, Result | None]] = deque()  # from the workers
         self._workers: ThreadPoolExecutor | None = None
 
     def start(self, t_ns: int) -> None:
@@ -175,6 +187,25 @@ class Master:
         self._watch_samples(t_ns)
         if t_ns >= self._next_due_ns:
             self._tick(t_ns)
+
+    def rest(self, slot: int, resting: bool, t_ns: int) -> None:
+        """A node isn't needed for now: excitation off, stopped; or it is again."""
+        node = self._by_slot[slot]
+        if node.life.resting != resting:
+            self._advance(node, Rest(resting), t_ns)
+
+    def pace(self, slot: int, idle: bool) -> None:
+        """Make an operational node event-driven (`idle`), where it can be, or synchronous again."""
+        node = self._by_slot[slot]
+        if node.idle == idle or node.pacing or not self.can_idle(slot) or self._workers is None:
+            return
+        node.pacing = True
+        self._workers.submit(self._work, node, Action.PACE, node.life.attempt, idle)
+
+    def can_idle(self, slot: int) -> bool:
+        """Whether the node can be made event-driven: configured so, operational, and it hasn't refused."""
+        node = self._by_slot[slot]
+        return node.may_idle and node.life.state is NodeState.OPERATIONAL
 
     def status(self) -> list[NodeStatus]:
         """Every node as it is now, in the order given."""
@@ -238,9 +269,9 @@ class Master:
             if stamps[slot] != seen_ns:
                 self._waiting[slot] = int(stamps[slot])
                 self._advance(self._by_slot[slot], Sample(), t_ns)
-        if self._stale_ns:
-            ages = t_ns - stamps
-            silent = (self.states == NodeState.OPERATIONAL) & (ages > self._stale_ns)
+        if self._sync_period_ns:
+            ages = t_ns - np.maximum(stamps, self.paced_ns)
+            silent = (self.states == NodeState.OPERATIONAL) & (ages > STALE_PERIODS * self.period_ns)
             if silent.any():
                 for slot in np.flatnonzero(silent).tolist():
                     self._advance(self._by_slot[slot], Silence(int(ages[slot])), t_ns)
@@ -298,34 +329,64 @@ class Master:
         elif self._workers is not None:
             self._workers.submit(self._work, node, action, node.life.attempt)
 
-    def _work(self, node: _Node, step: Action, attempt: int) -> None:
+    def _work(self, node: _Node, step: Action, attempt: int, idle: bool = False) -> None:
         """In a worker: carry out a step; its outcome goes to the receiving thread."""
-        node.sdo.outdated = lambda: node.life.attempt != attempt or node.life.state in _NOBODY_WAITS
+        with node.working:
+            self._results.append((node, *self._outcome(node, step, attempt, idle)))
+
+    def _outcome(
+        self, node: _Node, step: Action, attempt: int, idle: bool
+    ) -> tuple[Outcome | None, Result | None]:
+        def outdated() -> bool:
+            gone = not node.life.resting if step is Action.POWER_DOWN else node.life.state in _NOBODY_WAITS
+            return gone or node.life.attempt != attempt
+
+        node.sdo.outdated = outdated
         result: Result | None = None
         outcome: Outcome = Done(step, attempt)
         try:
-            result = _carry_out(node, step)
+            result = _carry_out(node, step, idle)
         except Outdated:
-            return
+            return None, None
         except StepError as error:
             outcome = Failed(step, attempt, str(error), error.silent, error.stranger)
         except Exception as error:  # noqa: BLE001 - a future would swallow it; here it becomes the node's reason
             outcome = Failed(step, attempt, f"unexpected {type(error).__name__}: {error}")
-        self._results.append((node, outcome, result))
+        return outcome, result
 
     def _collect(self, t_ns: int) -> None:
         while self._results:
             node, outcome, result = self._results.popleft()
-            if outcome.attempt != node.life.attempt:
+            if outcome is None or outcome.attempt != node.life.attempt:
+                continue
+            if outcome.step is Action.PACE:
+                self._paced(node, outcome, result, t_ns)
                 continue
             if isinstance(result, boot.Identity):
                 self._take_identity(node, result, t_ns)
             elif isinstance(result, boot.Configured):
                 node.guarded = result.guarded
+                node.may_idle = result.may_idle
+                self._set_pace(node, False, t_ns)
                 self._next_due_ns = t_ns
             elif isinstance(result, PdoMapping) and (clash := self._route(node, result)):
                 outcome = Failed(outcome.step, outcome.attempt, clash)
             self._advance(node, outcome, t_ns)
+
+    def _paced(self, node: _Node, outcome: Outcome, result: Result | None, t_ns: int) -> None:
+        node.pacing = False
+        if isinstance(result, boot.Paced):
+            self._set_pace(node, result.idle, t_ns)
+        elif isinstance(outcome, Failed):
+            node.may_idle = False  # until it boots again
+            self._tell(node, node.life.state, f"stays as it is between samples: {outcome.reason}", t_ns)
+
+    def _set_pace(self, node: _Node, idle: bool, t_ns: int) -> None:
+        slot, spec = node.spec.slot, node.spec
+        node.idle, node.pacing = idle, False
+        period_ns = spec.idle.period_ms * 1_000_000 if idle and spec.idle else 0
+        self.period_ns[slot] = max(period_ns, self._sync_period_ns)
+        self.paced_ns[slot] = t_ns
 
     def _take_identity(self, node: _Node, identity: boot.Identity, t_ns: int) -> None:
         before = node.identity
@@ -353,7 +414,7 @@ class Master:
         return ""
 
 
-def _carry_out(node: _Node, step: Action) -> Result:
+def _carry_out(node: _Node, step: Action, idle: bool) -> Result | None:
     spec = node.spec
     if step is Action.IDENTIFY:
         expected = boot.Expected(spec.vendor_id, spec.product_code, spec.revision, spec.serial)
@@ -366,9 +427,16 @@ def _carry_out(node: _Node, step: Action) -> Result:
     if step is Action.READ_MAPPING:
         may = halt if spec.remap else None
         return read_mapping(node.sdo, spec.node_id, node.tpdos, spec.channels, may)
+    if step is Action.POWER_DOWN:
+        boot.excite(node.sdo, spec.excitation, False)
+        _command(node, Action.STOP)
+        return None
     if node.mapping is None:
         raise StepError("no PDO mapping to configure")
-    return boot.configure(node.sdo, node.mapping, spec.heartbeat_ms, halt)
+    if step is Action.PACE:
+        boot.set_pace(node.sdo, node.mapping.tpdos[0], idle)
+        return boot.Paced(idle)
+    return boot.configure(node.sdo, node.mapping, spec, halt)
 
 
 def _command(node: _Node, action: Action) -> None:

@@ -1,14 +1,16 @@
 """What the master is told of a node and what it tells.
 
-Public names: `NodeSpec`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
+Public names: `NodeSpec`, `node_specs`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .boot import Identity
-from .channels import STANDARD_CHANNELS, Channels
+from handtouch.config import Deployment, Node
+
+from .boot import Identity, Idle
+from .channels import STANDARD_CHANNELS, Channels, Object, channels_of, in_order, written
 from .emergency import Emergency
 from .lifecycle import NodeState
 
@@ -31,15 +33,59 @@ class NodeSpec:
     revision: int | None = None
     channels: Channels = STANDARD_CHANNELS
     remap: bool = True
+    idle: Idle | None = None
+    excitation: Object | None = None
     heartbeat_ms: int = 100
     heartbeat_timeout_ms: int = 350
+
+
+def node_specs(deployment: Deployment) -> list[NodeSpec]:
+    """What a deployment says of every node, in the order of its pads. Raises EdsError."""
+    pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
+    specs = []
+    for slot, (hand, pad) in enumerate(pads):
+        kind = deployment.nodes[pad.node]
+        specs.append(
+            NodeSpec(
+                slot=slot,
+                bus=pad.bus,
+                node_id=pad.node_id,
+                name=f"{hand}/{pad.link}",
+                eds=kind.eds,
+                vendor_id=kind.vendor_id,
+                product_code=kind.product_code,
+                revision=kind.revision,
+                serial=pad.serial,
+                channels=in_order(channels_of(kind.channels, kind.eds), pad.electrodes),
+                remap=kind.remap,
+                idle=_idle(kind, deployment.daemon.sync_period_ms),
+                excitation=written(kind.excitation) if kind.excitation else None,
+                heartbeat_ms=kind.heartbeat_ms,
+                heartbeat_timeout_ms=kind.heartbeat_timeout_ms,
+            )
+        )
+    return specs
+
+
+def _idle(kind: Node, sync_period_ms: float) -> Idle | None:
+    """Events come no faster than samples would."""
+    if kind.idle is None:
+        return None
+    enable = kind.idle.enable_object
+    return Idle(
+        kind.idle.delta_counts,
+        kind.idle.period_ms,
+        round(sync_period_ms * 10),
+        tuple(map(written, kind.idle.delta_objects)),
+        written(enable) if enable else None,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
     """A node as it is now. `identity` and `cob_ids` are what was last read from it, None and () before.
 
-    `guarded`: it has no heartbeat, and is asked for its state instead.
+    `guarded`: it has no heartbeat, and is asked for its state instead. `idle`: it is event-driven for now.
     """
 
     slot: int
@@ -52,6 +98,7 @@ class NodeStatus:
     identity: Identity | None
     cob_ids: tuple[int, ...]
     guarded: bool
+    idle: bool
     heartbeats: int
     heartbeats_missed: int
     reboots: int

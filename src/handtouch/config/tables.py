@@ -59,6 +59,24 @@ class Bus(Table):
     )
 
 
+class Idle(Table):
+    """`[node.NAME.idle]`: a pad in the scene that nothing touches sends when a channel moves, not with SYNC."""
+
+    delta_counts: Annotated[int, Field(ge=1)] = Field(
+        description="change of a channel after which the node sends at once; some five times noise_counts"
+    )
+    period_ms: Annotated[int, Field(ge=10, le=65_535)] = Field(
+        100, description="and it sends this often in any case, by its event timer (0x1800 + n sub 5)"
+    )
+    delta_objects: Annotated[tuple[str, str, str, str], Field(strict=False)] = Field(
+        ("0x6426:1:u32", "0x6426:2:u32", "0x6426:3:u32", "0x6426:4:u32"),
+        description="objects that delta_counts is written to, one a channel",
+    )
+    enable_object: str | None = Field(
+        "0x6423:0:u8", description="object that a 1 is written to, so that changes are sent; none: left out"
+    )
+
+
 class Node(Table):
     """`[node.NAME]`: a kind of sensor node, its electronics and its supervision."""
 
@@ -86,6 +104,10 @@ class Node(Table):
         description="current per count of each channel, relative to that of full_scale_ma",
     )
     noise_counts: Positive = Field(description="standard deviation of one channel's reading, counts")
+    idle: Idle | None = Field(None, description="event-driven while untouched; left out: always with SYNC")
+    excitation: str | None = Field(
+        None, description="object that 0 switches the pad's excitation off with and 1 on, e.g. 0x2100:0:u8"
+    )
     heartbeat_ms: int = Field(
         100,
         ge=10,
@@ -202,10 +224,25 @@ class Hand(Table):
     pads: Annotated[tuple[Pad, ...], Field(strict=False, min_length=1)] = Field(alias="pad")
 
 
+class Scene(Table):
+    """`[scene]`: what the task at hand needs; pads outside it are switched off."""
+
+    links: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        ("*",), description='links in use, as patterns: "thumb_*", "left/index_distal"'
+    )
+    idle_after_s: Positive = Field(
+        2.0, description="a pad untouched for so long becomes event-driven, where its node can"
+    )
+    idle_sync_period_ms: float = Field(
+        50.0, ge=1, le=1000, description="period of SYNC while every pad in the scene is event-driven"
+    )
+
+
 class Deployment(Table):
     """The whole file."""
 
     daemon: Daemon = Daemon()
+    scene: Scene = Scene()
     buses: Annotated[tuple[Bus, ...], Field(strict=False, min_length=1)] = Field(alias="bus")
     nodes: dict[Name, Node] = Field(alias="node")
     sheets: dict[Name, Sheet] = Field(alias="sheet")
@@ -218,7 +255,9 @@ TABLES: dict[str, type[Table]] = {
     "": Deployment,
     "daemon": Daemon,
     "bus": Bus,
+    "scene": Scene,
     "node.*": Node,
+    "node.*.idle": Idle,
     "sheet.*": Sheet,
     "touch": Touch,
     "hand": Hand,
