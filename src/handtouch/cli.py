@@ -117,6 +117,8 @@ def _add_checking(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     doctor.add_argument("config", type=Path, nargs="?", help="deployment file")
     doctor.add_argument("--json", action="store_true", help="as JSON")
 
+    _add_scan(commands)
+
     figures = _command(commands, "figures", _figures, "redraw the paper's theoretical figures")
     figures.add_argument("--out", type=Path, default=Path("figures"), help="folder (default: figures)")
 
@@ -124,6 +126,34 @@ def _add_checking(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     _add_config(design)
     design.add_argument("--link", help="pad to draw (default: the first)")
     design.add_argument("--out", type=Path, default=Path("design"), help="folder (default: design)")
+
+
+def _add_scan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    scan = _command(
+        commands, "scan", _scan, "who is on the buses, with what a deployment file needs to know of them"
+    )
+    scan.add_argument("config", type=Path, nargs="?", help="deployment file to compare with")
+    _add_bus(scan, "a bus to look at, or another python-can interface for one of the deployment")
+    scan.add_argument(
+        "--seconds", type=_positive, help="listen for so long first (default: 1, with --listen 5)"
+    )
+    scan.add_argument("--json", action="store_true", help="as JSON")
+    asking = scan.add_mutually_exclusive_group()
+    asking.add_argument("--listen", action="store_true", help="send nothing at all")
+    asking.add_argument("--lss", action="store_true", help="find nodes without an id too; changes none")
+    asking.add_argument(
+        "--assign",
+        type=_node_id,
+        metavar="FIRST_ID",
+        help="find nodes without an id and give them one, which they store: that of the deployment for their "
+        "serial number, else the first free one from FIRST_ID upwards, in the order of their serial numbers",
+    )
+    scan.add_argument(
+        "--lss-wait-ms",
+        type=_positive,
+        default=5.0,
+        help="wait at least so long for LSS answers (default: 5)",
+    )
 
 
 def _command(
@@ -139,13 +169,16 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, help="deployment file (TOML)")
 
 
-def _add_bus(parser: argparse.ArgumentParser) -> None:
+def _add_bus(
+    parser: argparse.ArgumentParser,
+    text: str = "use another python-can interface for a bus of the deployment",
+) -> None:
     parser.add_argument(
         "--bus",
         action="append",
         default=[],
         metavar="NAME=INTERFACE:CHANNEL[,OPTION=VALUE...]",
-        help="use another python-can interface for a bus of the deployment",
+        help=text,
     )
 
 
@@ -213,6 +246,19 @@ def _doctor(asked: argparse.Namespace) -> int:
     return doctor.run(asked.config, json=asked.json)
 
 
+def _scan(asked: argparse.Namespace) -> int:
+    from handtouch import scan
+
+    request = scan.Request(
+        listen_only=asked.listen,
+        lss=asked.lss or asked.assign is not None,
+        assign=asked.assign,
+        seconds=asked.seconds or (5.0 if asked.listen else 1.0),
+        lss_wait_s=asked.lss_wait_ms * 1e-3,
+    )
+    return scan.run(asked.config, asked.bus, request, as_json=asked.json)
+
+
 def _figures(asked: argparse.Namespace) -> int:
     from handtouch import figures
 
@@ -232,6 +278,16 @@ def _positive(text: str) -> float:
         value = 0.0
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text}: must be a number above 0")
+    return value
+
+
+def _node_id(text: str) -> int:
+    try:
+        value = int(text, 0)
+    except ValueError:
+        value = 0
+    if not 1 <= value <= 127:
+        raise argparse.ArgumentTypeError(f"{text}: must be a node id, 1 to 127 (0x01 to 0x7F)")
     return value
 
 
