@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import shipped
-from handtouch.canbus.eds import EdsError, TpdoDefault, integer_type, load, tpdo_numbers, tpdos
+from handtouch.canbus.eds import EdsError, TpdoDefault, integer_type, load, tpdos
 from handtouch.canbus.eds_file import parse
 
 FILES = sorted((Path(__file__).parent.parent / "data" / "eds").iterdir())
@@ -192,6 +192,19 @@ def test_signed_values_may_be_given_as_their_bits(text: str, value: int) -> None
     assert read(OBJECT.format("6401", 3, text))[0x6401].default == value
 
 
+def test_values_that_are_no_integers_are_read_in_their_type() -> None:
+    values = [
+        (8, "0.5", 0.5),
+        (9, '"a b"  ; c', "a b"),
+        (0xA, "01 fe", b"\1\xfe"),
+        (0xB, "Ω", "Ω"),
+        (0xC, "1", None),
+    ]
+    for kind, text, value in values:
+        assert read(OBJECT.format("2000", kind, text))[0x2000].default == value
+    assert read("[2000]\nObjectType=2\nDefaultValue=01\n")[0x2000].default == b"\1"
+
+
 @pytest.mark.parametrize(
     ("broken", "line", "what"),
     [
@@ -333,11 +346,6 @@ def test_integer_types_are_all_known_and_others_named() -> None:
     array = read("[2000]\nObjectType=8\n[2000sub1]\nDataType=3\n[3000]\nDataType=3\n")
     absent = [(0x2000, 2), (0x3000, 1), (0x4000, 0)]
     assert [integer_type(array, *place) for place in absent] == [None, None, None]
-
-
-def test_tpdos_with_analogue_inputs_come_first() -> None:
-    assert tpdo_numbers(load(FILES[0].parent / "feldmann-ai4w.eds", NODE_ID)) == (2, 1)
-    assert tpdo_numbers(load(shipped.path("handtouch-node.eds"), NODE_ID)) == (2,)
 
 
 def test_a_tpdo_without_mapping_can_be_served() -> None:

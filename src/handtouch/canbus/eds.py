@@ -1,6 +1,6 @@
 """Electronic data sheets (CiA 306): a node's objects, its TPDOs and the types of what these carry.
 
-Public names: `load`, `tpdos`, `TpdoDefault`, `integer_type`, `tpdo_numbers`, `EdsError`.
+Public names: `load`, `tpdos`, `TpdoDefault`, `integer_type`, `EdsError`.
 """
 
 from __future__ import annotations
@@ -12,21 +12,9 @@ from canopen import ObjectDictionary
 
 from .eds_file import INTEGERS, MAPPINGS, PDOS, TYPE_NAMES, EdsError, entries, parse, raw_value, variable_at
 
-__all__ = [
-    "ANALOGUE_INPUT",
-    "DEFAULT_TPDOS",
-    "EdsError",
-    "TpdoDefault",
-    "integer_type",
-    "load",
-    "tpdo_numbers",
-    "tpdos",
-]
+__all__ = ["EdsError", "TpdoDefault", "integer_type", "load", "tpdos"]
 
-ANALOGUE_INPUT = 0x6401
-"""CiA 401: read analogue input, 16 bit."""
-DEFAULT_TPDOS = (2, 1, 3, 4)
-"""Without an EDS: the four of the predefined connection set, that of CiA 401's analogue inputs first."""
+_PREDEFINED_TPDOS = 4
 _EVENT_DRIVEN = 255
 
 
@@ -37,7 +25,7 @@ class TpdoDefault:
     `number` : from 1
     `cob_id` : identifier, 11 bits; 0 where the EDS gives none and CiA 301 has none for this number
     `enabled` : the node sends it, with an 11-bit identifier
-    `transmission` : transmission type, CiA 301 table 69; 255, event-driven, where the EDS is silent
+    `transmission` : transmission type as in CiA 301; 255, event-driven, where the EDS is silent
     `entries` : (index, sub-index, bits) in the order of transfer, up to the first that the EDS leaves empty;
         indices 1 to 7 are dummy entries, gaps of that length
     `remappable` : its mapping may be written
@@ -69,13 +57,6 @@ def tpdos(dictionary: ObjectDictionary) -> tuple[TpdoDefault, ...]:
     return tuple(_tpdo(dictionary, index - PDOS.start + 1) for index in PDOS if index in dictionary)
 
 
-def tpdo_numbers(dictionary: ObjectDictionary) -> tuple[int, ...]:
-    """Numbers (from 1) of the TPDOs in an object dictionary; first those with analogue inputs by default."""
-    found = tpdos(dictionary)
-    carrying = sorted(found, key=lambda tpdo: all(entry[0] != ANALOGUE_INPUT for entry in tpdo.entries))
-    return tuple(tpdo.number for tpdo in carrying)
-
-
 def integer_type(dictionary: ObjectDictionary, index: int, sub: int) -> tuple[int, bool] | None:
     """(bits, signed) of an integer object; None where the dictionary hasn't the object.
 
@@ -96,7 +77,7 @@ def integer_type(dictionary: ObjectDictionary, index: int, sub: int) -> tuple[in
 def _tpdo(dictionary: ObjectDictionary, number: int) -> TpdoDefault:
     communication, mapping = PDOS[number - 1], MAPPINGS[number - 1]
     node_id = dictionary.node_id or 0
-    predefined = 0x80 + 0x100 * number if number <= len(DEFAULT_TPDOS) else 0
+    predefined = 0x80 + 0x100 * number if number <= _PREDEFINED_TPDOS else 0
     cob_id = raw_value(dictionary, communication, 1)
     if cob_id is None:
         cob_id = predefined

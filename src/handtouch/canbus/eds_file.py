@@ -326,11 +326,9 @@ def _literal(text: str) -> int | None:
     found = _LITERAL.fullmatch(text)
     if not found:
         return None
-    sign, prefixed, suffixed, octal, decimal = found.groups()
-    for digits, base in ((prefixed, 16), (suffixed, 16), (octal, 8), (decimal, 10)):
-        if digits:
-            return -int(digits, base) if sign else int(digits, base)
-    return None
+    sign, *groups = found.groups()
+    digits, base = next((g, b) for g, b in zip(groups, (16, 16, 8, 10), strict=True) if g)
+    return int(sign + digits, base)
 
 
 def _fit(number: int, kind: int) -> int:
