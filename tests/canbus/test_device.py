@@ -218,7 +218,8 @@ def test_a_pdo_is_moved_and_switched_off_by_its_cob_id(
 @pytest.mark.parametrize(
     ("index", "sub", "value", "code"),
     [
-        (0x1801, 2, b"\xff", 0x06090030),  # event driven: not offered
+        (0x1801, 2, b"\xf1", 0x06090030),  # reserved
+        (0x1801, 1, b"\x01\x06\0\0", 0x06090030),  # an identifier that is SDO's
         (0x1801, 1, b"\x81\x02\x00\x20", 0x06090030),  # a 29-bit identifier
         (0x1018, 4, b"\1\0\0\0", 0x06010002),  # read only
         (0x1017, 0, b"\1\0\0\0", 0x06070010),  # wrong length

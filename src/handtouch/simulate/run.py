@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config, shipped
+from handtouch.canbus.channels import ELECTRODES, channels_of, parse
 from handtouch.canbus.device import Device, DeviceBus
 from handtouch.canbus.port import BusError, open_bus
 from handtouch.config.problems import ConfigError
@@ -140,13 +141,17 @@ class _Stage:
         self.nodes = DeviceBus(bus, self._sample)
         for hand, pad in virtual.pads:
             node = deployment.nodes[pad.node]
-            self.devices[f"{hand}/{pad.link}"] = self.nodes.add(
+            device = self.nodes.add(
                 pad.node_id,
                 eds=node.eds,
                 vendor_id=node.vendor_id,
                 product_code=node.product_code,
                 serial=pad.serial,
+                channels=tuple((c.index, c.sub) for c in channels_of(node.channels, node.eds)),
+                excitation=parse(node.excitation)[:2] if node.excitation else None,
             )
+            device.wired = tuple(map(ELECTRODES.index, pad.electrodes))
+            self.devices[f"{hand}/{pad.link}"] = device
 
     def truth(self, times_ns: Sequence[int]) -> list[Truth]:
         return [
@@ -156,7 +161,7 @@ class _Stage:
     def take_times(self) -> list[int]:
         return [self.times_ns.popleft() for _ in range(len(self.times_ns))]
 
-    def _sample(self, t_ns: int) -> NDArray[np.int16]:
+    def _sample(self, t_ns: int) -> NDArray[np.int64]:
         if self._record:
             self.times_ns.append(t_ns)
         return self._virtual.sample(self._start.since_s(t_ns))
