@@ -121,10 +121,10 @@ def in_process(deployment: Deployment) -> Deployment:
         for bus in deployment.buses
     )
     settings = dict.fromkeys(("live", "complete", "control", "inputs"), "tcp://127.0.0.1:*")
-    daemon = deployment.daemon.model_copy(update={**settings, "window": _WINDOW})
+    daemon = deployment.daemon.model_copy(update={**settings, "keys": None, "window": _WINDOW})
     return deployment.model_copy(update={"buses": buses, "daemon": daemon})
 
 
 def _subscribe(daemon: Daemon) -> Subscriber:
     endpoint = daemon.publisher.endpoints["live"]
-    return connect("contact/*/*", "health/*/*", "service", endpoint=endpoint, queue=100_000)
+    return connect("contact/*/*", "health/*/*", "service", endpoint=endpoint, key="", queue=100_000)

@@ -62,7 +62,7 @@ __all__ = [
 
 
 def load(path: Path | str) -> Deployment:
-    """Read and check a deployment file; EDS paths in it become absolute.
+    """Read and check a deployment file; paths in it start in its folder.
 
     Raises ConfigError naming every mistake, also when the file can't be read or isn't TOML.
     """
@@ -91,7 +91,10 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
         name: node.model_copy(update={"eds": str((folder or Path()) / node.eds)}) if node.eds else node
         for name, node in deployment.nodes.items()
     }
-    return _checked(deployment.model_copy(update={"nodes": nodes}), file)
+    daemon = deployment.daemon
+    if daemon.keys:
+        daemon = daemon.model_copy(update={"keys": str((folder or Path()) / daemon.keys)})
+    return _checked(deployment.model_copy(update={"nodes": nodes, "daemon": daemon}), file)
 
 
 def with_bus(deployment: Deployment, text: str) -> Deployment:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -88,19 +89,37 @@ def _check_names(section: str, key: str, names: list[str]) -> Iterator[Problem]:
 
 
 def _check_endpoints(daemon: Daemon) -> Iterator[Problem]:
+    if daemon.keys is not None and not Path(daemon.keys).is_dir():
+        yield Problem(
+            "[daemon]: keys",
+            _is(daemon.keys),
+            f"no such folder; `handtouch keys make {daemon.keys or 'keys'}` makes it",
+        )
     seen: dict[str, str] = {}
     for key in ("live", "complete", "control", "inputs"):
         endpoint = getattr(daemon, key)
         place, value = f"[daemon]: {key}", _is(endpoint)
-        same = endpoint.replace("//localhost:", "//127.0.0.1:")
-        if trouble := _endpoint_trouble(endpoint):
+        same = endpoint.replace("//localhost:", "//127.0.0.1:").replace("//0.0.0.0:", "//*:")
+        if trouble := _endpoint_trouble(endpoint, daemon.keys is not None):
             yield Problem(place, value, trouble)
-        elif same in seen and not endpoint.endswith(":*"):
-            yield Problem(place, value, f"is the endpoint of {seen[same]} too; give each its own")
+        elif other := _taken(same, seen):
+            yield Problem(place, value, f"is the endpoint of {other} too; give each its own")
         seen.setdefault(same, key)
 
 
-def _endpoint_trouble(endpoint: str) -> str:
+def _taken(endpoint: str, seen: dict[str, str]) -> str:
+    """Which endpoint is this one, or takes its port on all interfaces or on one of them."""
+    host, _, port = endpoint.rpartition(":")
+    if port == "*":
+        return ""
+    for known, key in seen.items():
+        on, _, theirs = known.rpartition(":")
+        if known == endpoint or (port == theirs and "tcp://*" in (host, on)):
+            return key
+    return ""
+
+
+def _endpoint_trouble(endpoint: str, keys: bool) -> str:
     """What is wrong with a ZeroMQ endpoint, with what would be right; empty if nothing is."""
     transport, _, address = endpoint.partition("://")
     if transport == "ipc" and address:
@@ -112,8 +131,13 @@ def _endpoint_trouble(endpoint: str) -> str:
         return f"needs a port: tcp://{address}:5580, or :* for any that is free"
     if port != "*" and not (port.isascii() and port.isdigit() and 1 <= int(port[:6]) <= 65535):
         return "must end in a port, 1 to 65535, or * for any that is free"
-    if not _is_loopback(host):
-        return "reaches beyond this machine; only loopback (127.0.0.1) is open without keys"
+    if not keys and not _is_loopback(host):
+        return (
+            "reaches beyond this machine; only loopback (127.0.0.1) is open without keys: make some with "
+            '`handtouch keys make FOLDER` beside this file, and give keys = "FOLDER" in [daemon]'
+        )
+    if not re.fullmatch(r"\*|[A-Za-z0-9][A-Za-z0-9_.\-]*", host):
+        return "needs the IPv4 address or the name of a network interface, such as eth0, or * for all"
     return ""
 
 

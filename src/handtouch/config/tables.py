@@ -35,6 +35,11 @@ class Daemon(Table):
     complete: str = Field("tcp://127.0.0.1:5582", description="ZeroMQ endpoint of the complete stream")
     control: str = Field("tcp://127.0.0.1:5581", description="ZeroMQ endpoint of request-reply control")
     inputs: str = Field("tcp://127.0.0.1:5583", description="ZeroMQ endpoint of joint states and forces")
+    keys: str | None = Field(
+        None,
+        description="folder, beside this file, of the keys that TCP clients need (`handtouch keys make`); "
+        "left out: any local client may connect, and no other machine can",
+    )
     sync_period_ms: float = Field(5.0, ge=0.5, le=1000, description="period of SYNC and of the tick")
     window: Fraction = Field(0.6, description="part of the period after SYNC that a tick waits for samples")
 

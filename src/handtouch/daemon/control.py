@@ -10,6 +10,7 @@ import msgpack
 import zmq
 
 from handtouch.daemon.publisher import bind
+from handtouch.daemon.security import Gate
 from handtouch.wire import SCHEMA_VERSION
 
 _REQUESTS_PER_POLL = 2
@@ -21,17 +22,20 @@ Command = Callable[[], dict[str, Any]]
 class Control:
     """Answers requests {"v", "command"} from `commands`, a few per tick, without ever waiting.
 
-    Raises OSError naming the endpoint when it can't be bound.
+    Whoever connects passes the `gate`. Raises OSError naming the endpoint when it can't be bound.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, gate: Gate | None = None
+    ) -> None:
         self.commands: dict[str, Command] = {}
         self.refused = 0
         """requests that were malformed or unknown"""
         self._socket: zmq.Socket[bytes] = context.socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 0)
         try:
-            self.endpoint = bind(self._socket, endpoint, "the control endpoint")
+            gate = gate or Gate(context)
+            self.endpoint = bind(self._socket, endpoint, "the control endpoint", gate, "control")
         except OSError:
             self._socket.close()
             raise

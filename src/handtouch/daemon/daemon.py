@@ -32,6 +32,8 @@ from handtouch.daemon.notify import Notifier
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.report import Report
+from handtouch.daemon.security import Gate
+from handtouch.keys import KeysError
 
 _log = logging.getLogger("handtouch.daemon")
 
@@ -40,7 +42,7 @@ class Daemon:
     """A deployment at work: `open` it, `run` it in one thread until told to stop, `close` it.
 
     Raises BusError or OSError, each naming what is missing and a remedy, when a bus or an endpoint can't be
-    opened.
+    opened; KeysError for keys that can't be used.
     """
 
     def __init__(self, deployment: Deployment, model: PadModel | None = None) -> None:
@@ -49,9 +51,11 @@ class Daemon:
         period_ns = round(settings.sync_period_ms * 1e6)
         with ExitStack() as opened:
             context = opened.enter_context(zmq.Context())
-            self.publisher = Publisher(context, settings.live, settings.complete)
+            self.gate = Gate(context, Path(settings.keys) if settings.keys else None)
+            opened.callback(self.gate.close)
+            self.publisher = Publisher(context, settings.live, settings.complete, self.gate)
             opened.callback(self.publisher.close)
-            self.control = Control(context, settings.control)
+            self.control = Control(context, settings.control, self.gate)
             opened.callback(self.control.close)
             self.pipeline = Pipeline(
                 model or PadModel(deployment), period_ns, settings.window, self.publisher
@@ -135,6 +139,7 @@ class Daemon:
         """What may wait until the contacts are out."""
         now_ns = time.monotonic_ns()
         self.master.poll(now_ns)
+        self.gate.poll(now_ns)
         self.publisher.take_subscriptions()
         self.report.poll(now_ns)
         self.control.poll()
@@ -184,6 +189,9 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     notifier = Notifier()
     try:
         daemon = Daemon(deployment)
+    except KeysError as error:  # no restart mends it
+        print(error, file=sys.stderr)
+        return 2
     except (BusError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

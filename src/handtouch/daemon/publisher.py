@@ -10,11 +10,13 @@ from pathlib import Path
 import zmq
 
 from handtouch import wire
+from handtouch.daemon.security import Gate
 
 LIVE_QUEUE = 64
 """Messages kept for a slow subscriber of the live stream: a few ticks, the newest matter."""
 COMPLETE_QUEUE = 20_000
 """Messages kept on the complete stream: seconds."""
+_SUBSCRIPTIONS_PER_POLL = 100
 
 
 class Publisher:
@@ -23,10 +25,13 @@ class Publisher:
     `endpoints` (stream -> endpoint as bound, with its real port), `drops` (stream -> messages that a full
     queue of some subscriber couldn't take), `subscriptions` (prefixes that somebody asked for).
 
-    Raises OSError naming the endpoint when it can't be bound.
+    Whoever connects passes the `gate`. Raises OSError naming the endpoint when it can't be bound.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], live: str, complete: str) -> None:
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], live: str, complete: str, gate: Gate | None = None
+    ) -> None:
+        gate = gate or Gate(context)
         self.drops: Counter[str] = Counter()
         self.subscriptions: frozenset[bytes] = frozenset()
         self.endpoints: dict[str, str] = {}
@@ -45,7 +50,9 @@ class Publisher:
             socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
             socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
             try:
-                self.endpoints[stream] = bind(socket, endpoint, f"the {stream} stream")
+                self.endpoints[stream] = bind(
+                    socket, endpoint, f"the {stream} stream", gate, "read"
+                )
             except OSError:
                 self.close()
                 raise
@@ -53,7 +60,7 @@ class Publisher:
     def take_subscriptions(self) -> None:
         """Read what subscribers asked for or gave up; repeat lasting messages for those who come late."""
         for stream, socket in self._sockets.items():
-            while True:
+            for _ in range(_SUBSCRIPTIONS_PER_POLL):  # who asks without end must not stop the tick
                 try:
                     request = socket.recv(zmq.NOBLOCK)
                 except zmq.Again:
@@ -115,9 +122,13 @@ class Publisher:
             socket.setsockopt(zmq.XPUB_NODROP, 1)
 
 
-def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str) -> str:
-    """Bind and return the endpoint with its real port; OSError names purpose, endpoint and remedy."""
+def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str, gate: Gate, right: str) -> str:
+    """Bind and return the endpoint with its real port; OSError names purpose, endpoint and remedy.
+
+    The gate lets in those with the right ("read", "control").
+    """
     _check_file(endpoint, purpose)
+    gate.guard(socket, endpoint, right)
     try:
         socket.bind(endpoint)
     except zmq.ZMQError as error:

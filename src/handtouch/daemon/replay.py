@@ -25,6 +25,8 @@ from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
+from handtouch.daemon.security import Gate
+from handtouch.keys import KeysError
 from handtouch.wire import PadState
 
 _SERVICES = (0x080, 0x580, 0x600, 0x700)
@@ -229,20 +231,26 @@ def run(
         print(error, file=sys.stderr)
         return 2
     with ExitStack() as stack:
-        publisher = None
+        publisher = gate = None
         try:
             if publish:
                 context = stack.enter_context(zmq.Context())
-                publisher = Publisher(context, deployment.daemon.live, deployment.daemon.complete)
+                settings = deployment.daemon
+                gate = Gate(context, Path(settings.keys) if settings.keys else None)
+                stack.callback(gate.close)
+                publisher = Publisher(context, settings.live, settings.complete, gate)
                 stack.callback(publisher.close)
             pace = pacer(speed)
             summary = replay(
                 log,
                 deployment,
                 _print_json if as_json else _print_line,
-                pace=_serving(pace, publisher) if publisher else pace,
+                pace=_serving(pace, publisher, gate) if publisher and gate else pace,
                 publisher=publisher,
             )
+        except KeysError as error:
+            print(error, file=sys.stderr)
+            return 2
         except (OSError, ValueError) as error:
             print(error, file=sys.stderr)
             return 1
@@ -266,8 +274,9 @@ def run(
     return 1
 
 
-def _serving(pace: Callable[[int], None], publisher: Publisher) -> Callable[[int], None]:
+def _serving(pace: Callable[[int], None], publisher: Publisher, gate: Gate) -> Callable[[int], None]:
     def serve(t_ns: int) -> None:
+        gate.poll(time.monotonic_ns())
         publisher.take_subscriptions()
         pace(t_ns)
 
