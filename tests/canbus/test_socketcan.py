@@ -7,11 +7,14 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 
+import can
 import pytest
 
 from handtouch.canbus import receivers
+from handtouch.canbus.bus_state import BusState, Condition
 from handtouch.canbus.port import Port
 from handtouch.canbus.slab import Slab
+from handtouch.canbus.sync import Sync
 from handtouch.config import Bus
 
 pytestmark = pytest.mark.socketcan
@@ -30,6 +33,10 @@ def eventually(port: Port, what: Callable[[], bool], seconds: float = 10.0) -> b
             return True
         time.sleep(0.005)
     return False
+
+
+def look(port: Port) -> BusState:
+    return port.look(time.monotonic_ns())
 
 
 def open_port(slots: int = 1) -> Port:
@@ -71,25 +78,37 @@ def test_interface_may_go_down_and_come_up(port: Port) -> None:
     run("ip link set vcan0 down")
     try:
         assert eventually(port, lambda: port.counters.receive_errors == 1)
-        assert "down" in port.problem
+        assert "ip link set vcan0 up" in look(port).problem
+        assert port.state.condition is Condition.DOWN
         assert not port.send(0x80, b"")
+        assert (port.counters.send_failures, port.counters.queue_full) == (1, 0)
     finally:
         run("ip link set vcan0 up")
     run("cansend vcan0 281#0100020003000400")
     assert eventually(port, lambda: port.counters.samples == 1)
-    assert port.problem == ""
+    assert look(port).problem == ""
     assert port.send(0x80, b"")
+
+
+def test_interface_is_seen_to_be_up_again_where_nobody_else_sends(port: Port) -> None:
+    run("ip link set vcan0 down")
+    try:
+        assert eventually(port, lambda: look(port).condition is Condition.DOWN)
+    finally:
+        run("ip link set vcan0 up")
+    assert eventually(port, lambda: port.send(0x80, b""))
+    assert look(port).condition is Condition.ACTIVE
 
 
 def test_interface_may_be_unplugged_and_plugged_in_again(port: Port) -> None:
     descriptor = port.fileno()
     run("ip link del vcan0")
     try:
-        assert eventually(port, lambda: "No such device" in port.problem)
+        assert eventually(port, lambda: "No such device" in look(port).problem)
         assert not port.send(0x80, b"")
     finally:
         run("ip link add vcan0 type vcan && ip link set vcan0 up")
-    assert eventually(port, lambda: port.problem == "")
+    assert eventually(port, lambda: look(port).problem == "")
     run("cansend vcan0 281#0100020003000400")
     assert select.select([port.fileno()], [], [], 1.0)[0]
     assert eventually(port, lambda: port.counters.samples == 1)
@@ -101,10 +120,106 @@ def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> No
     port = open_port()
     run("cangen vcan0 -g 0 -n 500 -I 700 -L 8 -D i")
     port.drain()
-    run("cansend vcan0 281#0100020003000400")  # the count comes with the next frame
-    assert eventually(port, lambda: port.counters.samples == 1)
-    assert port.counters.overflow == 501 - port.counters.frames > 0
+    assert port.counters.overflow == 500 - port.counters.frames > 0
     port.close()
+
+
+def test_error_frames_are_told_in_words(port: Port) -> None:
+    """By cansend, in the layout of <linux/can/error.h>; vcan itself makes none."""
+    run("cansend vcan0 20000204#0020000000008803; cansend vcan0 20000020#; cansend vcan0 20000002#0B")
+    assert eventually(port, lambda: port.counters.errors == 3)
+    figures = look(port).figures()
+    assert figures["state"] == "passive"
+    assert (figures["transmit_errors"], figures["receive_errors"]) == (0x88, 3)
+    assert figures["causes"] == {"transmit passive": 1, "no acknowledge": 1, "lost arbitration": 1}
+    run("cansend vcan0 20000040#0000000000000000")
+    assert eventually(port, lambda: look(port).condition is Condition.BUS_OFF)
+    assert "restart-ms 100" in port.problem
+    run("cansend vcan0 20000100#0000000000000000")
+    assert eventually(port, lambda: look(port).condition is Condition.ACTIVE)
+    assert port.problem == ""
+
+
+def test_remote_frame_is_sent_as_one(port: Port) -> None:
+    with can.Bus(interface="socketcan", channel="vcan0") as stranger:
+        assert port.send(0x701, bytes(1), remote=True)
+        got = stranger.recv(2.0)
+    assert got is not None
+    assert (got.arbitration_id, got.is_remote_frame, got.dlc, got.data) == (0x701, True, 1, b"")
+
+
+def produce(sync: Sync, port: Port, seconds: float) -> int:
+    """What the daemon's loop does; the number of cycles."""
+    cycles, end_s = 0, time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        now_ns = time.monotonic_ns()
+        cycles += sync.poll(now_ns) is not None
+        select.select([port.fileno()], [], [], max(0.0, (sync.wake_ns - now_ns) * 1e-9))
+        for can_id, _, t_ns in port.drain():
+            assert can_id == 0x80
+            cycles += sync.seen(port.name, t_ns, time.monotonic_ns()) is not None
+        port.look(time.monotonic_ns())
+    return cycles
+
+
+def syncs_of(stranger: can.BusABC) -> int:
+    count = 0
+    while (message := stranger.recv(0)) is not None:
+        count += message.arbitration_id == 0x80
+    return count
+
+
+def test_kernel_sends_sync_at_changing_periods_and_stops(port: Port) -> None:
+    sync = Sync([port], 20_000_000)
+    with can.Bus(interface="socketcan", channel="vcan0") as stranger:
+        sync.start(time.monotonic_ns())
+        for period_ns, seconds in ((20_000_000, 1.0), (100_000_000, 2.0), (20_000_000, 1.0)):
+            sync.set_period(period_ns, time.monotonic_ns())
+            cycles = produce(sync, port, seconds)
+            expected = seconds * 1e9 / period_ns
+            assert expected / 2 < cycles < expected + 3
+            assert expected / 2 < syncs_of(stranger) < expected + 3
+        assert sync.figures("palm", time.monotonic_ns())["by"] == "kernel"
+        assert port.counters.sent == 0  # by the loop
+        assert sync.figures("palm", time.monotonic_ns())["others"] == 0
+        assert sync.figures("palm", time.monotonic_ns())["jitter_us"]["p50"] < 20_000
+        sync.stop()
+        syncs_of(stranger)
+        time.sleep(0.1)  # long enough for five more
+        assert syncs_of(stranger) == 0
+
+
+def test_loop_takes_over_while_the_interface_is_gone_and_one_sender_is_left(port: Port) -> None:
+    sync = Sync([port], 20_000_000)
+    sync.start(time.monotonic_ns())
+    produce(sync, port, 0.3)
+    run("ip link del vcan0")
+    try:
+        cycles = produce(sync, port, 1.0)
+        assert cycles > 20  # silence of the bus is no silence of the hand
+        assert sync.figures("palm", time.monotonic_ns())["by"] == "loop"
+        assert port.counters.send_failures > 0
+    finally:
+        run("ip link add vcan0 type vcan && ip link set vcan0 up")
+    produce(sync, port, 6.5)
+    with can.Bus(interface="socketcan", channel="vcan0") as stranger:
+        produce(sync, port, 1.0)
+        assert 25 < syncs_of(stranger) < 54
+    assert sync.figures("palm", time.monotonic_ns())["by"] == "kernel"
+    assert sync.figures("palm", time.monotonic_ns())["others"] == 0
+    sync.stop()
+
+
+def test_another_sync_producer_is_told(port: Port) -> None:
+    sync = Sync([port], 20_000_000)
+    sync.start(time.monotonic_ns())
+    other = subprocess.Popen(["cangen", "vcan0", "-g", "10", "-I", "080", "-L", "0", "-n", "150"])
+    produce(sync, port, 2.5)
+    other.wait()
+    figures = sync.figures("palm", time.monotonic_ns())
+    assert figures["others"] > 20
+    assert 'sync = "consumer"' in figures["problem"]
+    sync.stop()
 
 
 def test_a_flood_of_strangers_costs_no_sample(port: Port) -> None:

@@ -1,7 +1,7 @@
 """SYNC on all buses: produced by the kernel or by the loop, or followed; its jitter; somebody else's SYNC.
 
 One SYNC time serves all buses. Where the kernel has a cyclic sender (SocketCAN) it sends, and the SYNC of
-the first such bus, looped back with the kernel's stamp, begins the cycle; the loop sends on the others when it
+the first such bus, looped back with its stamp, begins the cycle; the loop sends on the others when it
 sees that one. Without such a sender, or when its SYNC stays away, the loop's timer takes its place.
 
 Public names: `Sync`, `Jitter`.
@@ -108,8 +108,6 @@ class Sync:
 
     def poll(self, now_ns: int) -> int | None:
         """Send what is due; the time of a cycle that begins now, be its SYNC ours or one that is late."""
-        for bus in self._produced:
-            bus.judge(now_ns, self.period_ns)
         if now_ns < self._due_ns:
             return None
         for bus in self._produced:
@@ -150,6 +148,8 @@ class Sync:
         for bus in self._produced:
             if bus.sender is None:
                 bus.send(now_ns, self.period_ns)
+        for bus in self._produced:
+            bus.judge(now_ns, self.period_ns)
         self._choose_clock()
         self._begun_ns = t_ns
         self._due_ns = self._next_due_ns(t_ns)

@@ -45,9 +45,20 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         f"messages dropped: {drops}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
     )
     for name, bus in service["buses"].items():
-        counts = ", ".join(f"{key} {value}" for key, value in bus.items() if key not in ("load", "problem"))
-        problem = f" [red]{bus['problem']}[/red]" if bus["problem"] else ""
-        console.print(f"bus {name}: load {100 * bus['load']:.0f} %, {counts}{problem}")
+        sync = bus["sync"]
+        counts = ", ".join(
+            f"{key} {value}" for key, value in bus.items() if isinstance(value, int) and key != "since_ns"
+        )
+        told = [f"{cause} {count}" for cause, count in bus["causes"].items()]
+        problems = "; ".join(filter(None, [bus["problem"], sync["problem"]]))
+        jitter = sync["jitter_us"]
+        console.print(
+            f"bus {name}: {bus['state']}, load {100 * bus['load']:.0f} %, SYNC by {sync['by']}"
+            + (f" (jitter p99 {jitter['p99']:.0f} us, max {jitter['max']:.0f})" if jitter else "")
+            + f", {counts}"
+            + (f"; error frames: {', '.join(told)}" if told else "")
+            + (f" [red]{problems}[/red]" if problems else "")
+        )
     table = Table(box=None, pad_edge=False, header_style="dim")
     for column in ("link", "pad", "node", "id", "serial", "Hz", "missed", "beats missed", "reboots", "why"):
         number = column in ("id", "serial", "Hz", "missed", "beats missed", "reboots")

@@ -1,0 +1,328 @@
+"""One SYNC time for all buses, one sender on each, whatever the kernel and strangers do."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from handtouch.canbus.bus_state import Condition, Trouble
+from handtouch.canbus.port import Port
+from handtouch.canbus.router import SYNC_ID, Frame, Router
+from handtouch.canbus.slab import Slab
+from handtouch.canbus.sync import Jitter, Sync
+from handtouch.config import Bus
+
+MS = 1_000_000
+P = 5 * MS
+T0 = 1_000_000 * MS
+
+
+class Kernel:
+    """A receiver whose kernel may send cyclically; time is the test's."""
+
+    def __init__(self, able: bool = True) -> None:
+        self.trouble: Trouble | None = None
+        self.able = able
+        self.broken = False  # takes tasks, sends nothing
+        self.sent: list[int] = []  # by us, at these times
+        self.period_ns: int | None = None  # of the kernel's task
+        self.next_ns = 0
+        self.started = 0
+        self.now_ns = T0
+
+    def fileno(self) -> int:
+        return -1
+
+    def drain(self, router: Router) -> list[Frame]:  # noqa: ARG002
+        return []
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        assert (can_id, data, remote) == (SYNC_ID, b"", False)
+        assert self.period_ns is None, "two senders at once"
+        if self.trouble is not None:
+            raise OSError(self.trouble.text)
+        self.sent.append(self.now_ns)
+
+    def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> Kernel | None:
+        assert (can_id, data) == (SYNC_ID, b"")
+        assert self.period_ns is None, "two senders at once"
+        if not self.able:
+            return None
+        self.started += 1
+        self.set_period(period_s)
+        return self
+
+    def set_period(self, period_s: float) -> None:
+        if not self.able:
+            raise can.CanOperationError("no such task")
+        self.period_ns = round(period_s * 1e9)
+        self.next_ns = self.now_ns
+
+    def stop(self) -> None:
+        self.period_ns = None
+
+
+class Rig:
+    """Ports on such receivers, and a loop that does what the daemon's does."""
+
+    def __init__(self, *kernels: Kernel, interface: str = "socketcan", **bus: Any) -> None:
+        self.kernels = kernels
+        self.ports = [
+            Port(Bus(name=f"can{n}", interface=interface, channel=f"can{n}", **bus), kernel, Slab(1))
+            for n, kernel in enumerate(kernels)
+        ]
+        self.sync = Sync(self.ports, P)
+        self.now_ns = T0
+        self.cycles: list[int] = []
+        self.delay_ns = 50_000  # from a SYNC until the loop sees it
+        self.sync.start(T0)
+
+    def run(self, seconds: float, step_ns: int = 100_000, foreign_ns: int = 0) -> None:
+        """Let time pass; a stranger may send SYNC on the first bus with a period of its own."""
+        end_ns = self.now_ns + round(seconds * 1e9)
+        next_foreign_ns = self.now_ns + foreign_ns // 3
+        while self.now_ns < end_ns:
+            for kernel in self.kernels:
+                kernel.now_ns = self.now_ns
+            if self.now_ns >= self.sync.wake_ns:
+                self._took(self.sync.poll(self.now_ns))
+            for port, kernel in zip(self.ports, self.kernels, strict=True):
+                while kernel.period_ns is not None and kernel.next_ns <= self.now_ns - self.delay_ns:
+                    t_ns, kernel.next_ns = kernel.next_ns, kernel.next_ns + kernel.period_ns
+                    if not kernel.broken:
+                        self._took(self.sync.seen(port.name, t_ns, self.now_ns))
+            if foreign_ns and self.now_ns >= next_foreign_ns:
+                next_foreign_ns += foreign_ns
+                self._took(self.sync.seen("can0", self.now_ns, self.now_ns))
+            self.now_ns += step_ns
+
+    def figures(self, bus: str = "can0") -> dict[str, Any]:
+        return self.sync.figures(bus, self.now_ns)
+
+    def _took(self, t_ns: int | None) -> None:
+        if t_ns is not None:
+            self.cycles.append(t_ns)
+
+
+def intervals(times: list[int]) -> set[int]:
+    return {b - a for a, b in itertools.pairwise(times)}
+
+
+def test_loop_sends_every_period_where_no_kernel_can() -> None:
+    rig = Rig(Kernel(able=False), Kernel(able=False))
+    rig.run(1.0)
+    assert len(rig.cycles) == 200
+    assert rig.kernels[0].sent == rig.kernels[1].sent
+    assert intervals(rig.kernels[0].sent) == {P}
+    assert rig.figures()["by"] == "loop"
+    assert rig.figures()["jitter_us"] == {"p50": 0, "p99": 0, "max": 0}
+    assert rig.sync.overruns == 0
+
+
+def test_late_loop_counts_what_it_missed_and_keeps_the_grid() -> None:
+    rig = Rig(Kernel(able=False))
+    rig.run(0.0101)
+    rig.now_ns = T0 + 33 * MS
+    rig.run(0.03)
+    sent = [(t - T0) // MS for t in rig.kernels[0].sent]
+    assert sent[:5] == [0, 5, 10, 33, 35]
+    assert rig.sync.overruns == 3  # 15, 20 and 25 passed without a SYNC, 30 was sent late
+
+
+def test_kernel_sends_where_it_can_and_its_stamp_begins_the_cycle() -> None:
+    rig = Rig(Kernel())
+    rig.run(1.0)
+    assert rig.kernels[0].sent == []
+    assert rig.kernels[0].started == 1
+    assert intervals(rig.cycles) == {P}
+    assert len(rig.cycles) == 200
+    assert rig.figures() == {
+        "by": "kernel", "jitter_us": {"p50": 0, "p99": 0, "max": 0}, "others": 0, "problem": ""
+    }  # fmt: skip
+
+
+def test_loop_follows_the_kernel_on_buses_without_one() -> None:
+    rig = Rig(Kernel(able=False), Kernel())
+    rig.run(1.0)
+    assert len(rig.cycles) == 200
+    assert len(rig.kernels[0].sent) == 200
+    lags = {sent - cycle for sent, cycle in zip(rig.kernels[0].sent, rig.cycles, strict=True)}
+    assert max(lags) <= 100_000
+
+
+def test_all_kernels_start_together() -> None:
+    rig = Rig(Kernel(), Kernel(), Kernel())
+    rig.run(0.5)
+    assert len(rig.cycles) == 100
+    assert [kernel.started for kernel in rig.kernels] == [1, 1, 1]
+    assert len({kernel.next_ns % P for kernel in rig.kernels}) == 1
+
+
+def test_loop_takes_over_from_a_kernel_that_stops_sending_and_gives_back(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    rig = Rig(Kernel())
+    rig.run(0.5)
+    rig.kernels[0].broken = True
+    rig.run(1.0)
+    assert 190 < len(rig.kernels[0].sent) < 200
+    assert rig.figures()["by"] == "loop"
+    assert "stays away" in rig.figures()["problem"]
+    assert "stays away" in caplog.text
+    assert rig.figures()["others"] == 0
+    rig.kernels[0].broken = False
+    rig.run(6.0)
+    assert rig.figures()["by"] == "kernel"
+    assert rig.figures()["problem"] == ""
+    assert rig.figures()["others"] == 0
+    assert max(intervals(rig.cycles)) <= 2 * P
+
+
+def test_kernel_that_is_away_on_one_bus_leaves_the_others_alone() -> None:
+    rig = Rig(Kernel(), Kernel())
+    rig.run(0.5)
+    rig.kernels[0].broken = True
+    rig.run(0.5)
+    assert (rig.figures("can0")["by"], rig.figures("can1")["by"]) == ("loop", "kernel")
+    assert len(rig.kernels[0].sent) > 90
+    rig.kernels[1].broken = True
+    rig.run(0.5)
+    assert (rig.figures("can0")["by"], rig.figures("can1")["by"]) == ("loop", "loop")
+
+
+def test_kernel_is_not_tried_while_the_bus_is_down() -> None:
+    rig = Rig(Kernel())
+    rig.run(0.1)
+    kernel, port = rig.kernels[0], rig.ports[0]
+    kernel.broken, kernel.trouble = True, Trouble(Condition.DOWN, "Network is down")
+    port.look(rig.now_ns)
+    rig.run(12.0)
+    assert kernel.started == 1
+    assert max(intervals(rig.cycles)) <= 2 * P  # silence on the bus is no silence of the hand
+    kernel.broken, kernel.trouble = False, None
+    port.look(rig.now_ns)
+    rig.run(6.0)
+    assert rig.figures()["by"] == "kernel"
+
+
+@pytest.mark.parametrize("able", [True, False])
+def test_period_may_change_at_any_time_with_one_sender(able: bool) -> None:
+    rig = Rig(Kernel(able))
+    rig.run(0.5)
+    for period in (40 * MS, 2 * MS, P):
+        rig.sync.set_period(period, rig.now_ns)
+        changed_ns = rig.now_ns
+        count = len(rig.cycles)
+        rig.run(0.8)
+        times = rig.cycles[count:]
+        assert intervals(times[1:]) == {period}
+        assert times[0] - changed_ns <= max(P, period)
+        assert rig.figures()["jitter_us"]["max"] == 0
+    assert rig.kernels[0].started == able
+    assert rig.figures()["others"] == 0
+
+
+def test_full_rate_is_back_within_two_periods() -> None:
+    for able in (True, False):
+        rig = Rig(Kernel(able))
+        rig.sync.set_period(100 * MS, T0)
+        rig.run(0.345)
+        asked_ns = rig.now_ns
+        rig.sync.set_period(P, asked_ns)
+        rig.run(0.05)
+        assert min(t for t in rig.cycles if t >= asked_ns) - asked_ns <= 2 * P
+
+
+def test_kernel_that_refuses_a_period_is_taken_over() -> None:
+    rig = Rig(Kernel())
+    rig.run(0.1)
+    rig.kernels[0].able = False
+    rig.sync.set_period(10 * MS, rig.now_ns)
+    rig.run(1.0)
+    assert rig.figures()["by"] == "loop"
+    assert intervals(rig.kernels[0].sent) == {10 * MS}
+
+
+def test_nobody_sends_after_the_end() -> None:
+    rig = Rig(Kernel(), Kernel(able=False))
+    rig.run(0.1)
+    rig.sync.stop()
+    assert rig.kernels[0].period_ns is None
+
+
+@pytest.mark.parametrize("bus", [{"sync": "consumer"}, {"role": "listener"}])
+def test_somebody_elses_sync_is_followed_and_its_jitter_measured(bus: dict[str, Any]) -> None:
+    rig = Rig(Kernel(), Kernel(), **bus)
+    rig.run(1.0, foreign_ns=P + 100_000)
+    assert rig.kernels[0].sent == rig.kernels[1].sent == []
+    assert rig.kernels[0].started == 0
+    assert 190 < len(rig.cycles) < 200
+    assert rig.figures()["by"] == "another"
+    assert rig.figures()["jitter_us"]["p50"] == pytest.approx(100, rel=0.1)
+    assert rig.figures("can1")["jitter_us"] == {}
+    assert rig.figures()["others"] == 0
+
+
+def test_cycles_go_on_when_the_followed_sync_is_silent() -> None:
+    rig = Rig(Kernel(), sync="consumer")
+    rig.run(0.75)
+    assert intervals(rig.cycles[1:]) == {P + P // 2}
+
+
+@pytest.mark.parametrize("able", [True, False])
+def test_another_producer_is_counted_and_told(able: bool, caplog: pytest.LogCaptureFixture) -> None:
+    rig = Rig(Kernel(able))
+    rig.run(3.0, foreign_ns=7 * MS)
+    figures = rig.figures()
+    assert figures["others"] == pytest.approx(3 / 0.007, rel=0.4)
+    assert 'set sync = "consumer"' in figures["problem"]
+    assert caplog.text.count("another SYNC producer") == 1
+    rig.run(2.5)
+    assert rig.figures()["problem"] == ""
+
+
+def test_echo_of_our_own_sync_is_not_another_producer() -> None:
+    rig = Rig(Kernel(able=False), interface="udp_multicast")
+    sent = rig.kernels[0].sent
+    echoed = 0
+    for foreign_ns, others in ((0, 0), (7 * MS, 3 / 0.007)):
+        for _ in range(300):
+            rig.run(0.01, foreign_ns=foreign_ns)
+            while echoed < len(sent) - 1:  # the last one is still on its way
+                echoed += 1
+                assert rig.sync.seen("can0", rig.now_ns, rig.now_ns) is None
+        assert rig.figures()["others"] == pytest.approx(others, rel=0.4)
+
+
+def test_flood_of_sync_is_no_flood_of_ticks() -> None:
+    for options in ({"sync": "consumer"}, {}):
+        rig = Rig(Kernel(), **options)
+        rig.run(1.0, step_ns=50_000, foreign_ns=50_000)
+        assert len(rig.cycles) <= 4 * 200 + 1
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(-P // 2, P // 2), min_size=3, max_size=150))
+def test_jitter_is_the_deviation_from_the_period(deviations: list[int]) -> None:
+    jitter, t_ns = Jitter(), T0
+    jitter.add(t_ns, P)
+    for deviation in deviations:
+        t_ns += P + deviation
+        jitter.add(t_ns, P)
+    figures = jitter.figures(t_ns)
+    recent, back = [], 0
+    for deviation in reversed(deviations):
+        if back <= 1_000_000_000:
+            recent.append(abs(deviation))
+        back += P + deviation
+    assert figures["max"] == pytest.approx(max(recent) * 1e-3)
+    assert 0 <= figures["p50"] <= figures["p99"] <= figures["max"]
+    assert jitter.figures(t_ns + 1_100_000_000) == {}
