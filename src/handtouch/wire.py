@@ -41,6 +41,8 @@ class PadState(IntEnum):
     """samples that can't be trusted: see the pad's health"""
     STARTING = 5
     """the node hasn't been brought up yet"""
+    OFF = 6
+    """switched off: outside the scene"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,7 +124,7 @@ class Master:
 
     `states` (slots,) uint8 holds the NodeState of each slot; samples are to be trusted in OPERATIONAL alone.
     `period_ns` (slots,) int64 is how long it is between two samples at most: a SYNC period, or longer for an
-    event-driven node; `paced_ns` since when.
+    event-driven node, `idle`; `paced_ns` since when. `paces` counts the changes.
     """
 
     def __init__(
@@ -144,6 +144,8 @@ class Master:
         self._sync_period_ns = sync_period_ns or 0
         self.period_ns: NDArray[np.int64] = np.full(self._slab.size, self._sync_period_ns, dtype=np.int64)
         self.paced_ns: NDArray[np.int64] = np.zeros(self._slab.size, dtype=np.int64)
+        self.idle: NDArray[np.bool_] = np.zeros(self._slab.size, dtype=np.bool_)
+        self.paces = 0
         self._nodes = [_node(spec, ports, sync_period_ns or 0) for spec in nodes]
         self._by_slot = {node.spec.slot: node for node in self._nodes}
         self._owners = _owners(ports, self._nodes)
@@ -387,6 +389,8 @@ class Master:
         period_ns = spec.idle.period_ms * 1_000_000 if idle and spec.idle else 0
         self.period_ns[slot] = max(period_ns, self._sync_period_ns)
         self.paced_ns[slot] = t_ns
+        self.idle[slot] = idle
+        self.paces += 1
 
     def _take_identity(self, node: _Node, identity: boot.Identity, t_ns: int) -> None:
         before = node.identity

@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from handtouch.config.problems import Problem
@@ -28,6 +29,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
         yield from _check_node(f"[node.{name}]", node)
     yield from _check_touch("[touch]: ", deployment.touch)
     yield from _check_names("[[hand]]", "name", [hand.name for hand in deployment.hands])
+    yield from _check_scene(deployment)
     taken: dict[tuple[str, int], str] = {}
     owners: dict[int, str] = {}
     for hand in deployment.hands:
@@ -57,6 +59,18 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
                     f" = {pad.serial}",
                     f'is already that of "{owners[pad.serial]}"; a serial number belongs to one node',
                 )
+
+
+def _check_scene(deployment: Deployment) -> Iterator[Problem]:
+    names = [f"{hand.name}/{pad.link}" for hand in deployment.hands for pad in hand.pads]
+    for pattern in deployment.scene.links:
+        full = pattern if "/" in pattern else f"*/{pattern}"
+        if not any(fnmatchcase(name, full) for name in names):
+            yield Problem("[scene]: links", _is(pattern), f"matches no pad; there are {', '.join(names)}")
+    period_ms, idle_ms = deployment.daemon.sync_period_ms, deployment.scene.idle_sync_period_ms
+    if idle_ms < period_ms:
+        told = f"must not be shorter than sync_period_ms = {period_ms}"
+        yield Problem("[scene]: idle_sync_period_ms", _is(idle_ms), told)
 
 
 def rectangle_mm(surface: Surface) -> tuple[float, float]:

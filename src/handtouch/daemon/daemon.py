@@ -13,22 +13,24 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import zmq
 
 from handtouch.canbus import eds
-from handtouch.canbus.channels import channels_of, in_order
-from handtouch.canbus.master import Master, NodeSpec
+from handtouch.canbus.channels import channels_of
+from handtouch.canbus.master import Master
+from handtouch.canbus.nodes import node_specs
 from handtouch.canbus.port import BusError, Port
 from handtouch.canbus.router import SYNC_ID
+from handtouch.canbus.sync import Sync
 from handtouch.config import ConfigError, Deployment, load, with_bus
 from handtouch.daemon.control import Control
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.notify import Notifier
+from handtouch.daemon.pacer import Pacer
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.report import Report
@@ -66,11 +68,10 @@ class Daemon:
                 opened.callback(port.close)
             self._opened = opened.pop_all()
         self.master = Master(self.ports, node_specs(deployment), period_ns)
-        self.report = Report(deployment, self.pipeline, self.master, self.ports, self.publisher)
+        self.sync = Sync(list(self.ports.values()), period_ns)
+        self.report = Report(deployment, self.pipeline, self.master, self.ports, self.sync, self.publisher)
+        self.pacer = Pacer(deployment, self.pipeline, self.master, self.sync)
         self.control.commands["status"] = self.report.status
-        self._producers = [self.ports[bus.name] for bus in deployment.buses if bus.sync == "producer"]
-        self._clock = None if self._producers else deployment.buses[0].name  # the bus whose SYNC is followed
-        self._period_ns = period_ns
 
     def __enter__(self) -> Daemon:
         return self
@@ -91,47 +92,40 @@ class Daemon:
             self._loop(stop, alive)
         finally:
             now_ns = time.monotonic_ns()
+            self.sync.stop()
             self.pipeline.end(now_ns)
             self.master.stop(now_ns)
             gc.unfreeze()
 
     def _loop(self, stop: threading.Event, alive: Callable[[], None]) -> None:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
-        next_sync_ns = time.monotonic_ns()
+        sync, pacer = self.sync, self.pacer
+        sync.start(time.monotonic_ns())
         while not stop.is_set():
             now_ns = time.monotonic_ns()
-            if self._producers and now_ns >= next_sync_ns:
-                next_sync_ns = self._sync(now_ns, next_sync_ns)
-            elif not self._producers and now_ns >= cycle.overdue_ns:
-                pipeline.begin(now_ns, now_ns)
-            wake_ns = next_sync_ns if self._producers else cycle.overdue_ns
+            if (sync_ns := sync.poll(now_ns)) is not None:
+                pipeline.begin(sync_ns, now_ns)
+            wake_ns = sync.wake_ns
             if not cycle.ticked:
                 wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns)
             wait_s = max(0, wake_ns - now_ns) * 1e-9
             select.select(ports, (), (), wait_s)
             self._receive(ports)
             now_ns = time.monotonic_ns()
-            if pipeline.advance(now_ns) is not None:
+            ticked = pipeline.advance(now_ns)
+            if ticked is None and pacer.slow and pipeline.slab.fresh_count:
+                ticked = pipeline.tick_now(now_ns)
+            if ticked is not None:
                 self.report.ticked(now_ns, time.monotonic_ns())
                 self._after_tick(alive)
-
-    def _sync(self, now_ns: int, due_ns: int) -> int:
-        """Send SYNC on the buses that are ours to drive; return when the next is due."""
-        for port in self._producers:
-            port.send(SYNC_ID, b"")
-        self.pipeline.begin(now_ns, now_ns)
-        late_ns = now_ns - due_ns
-        if late_ns > self._period_ns:
-            self.report.overruns += late_ns // self._period_ns
-            due_ns += late_ns // self._period_ns * self._period_ns
-        return due_ns + self._period_ns
 
     def _receive(self, ports: list[Port]) -> None:
         for port in ports:
             for can_id, data, t_ns in port.drain():
                 if can_id == SYNC_ID:
-                    if port.name == self._clock:
-                        self.pipeline.begin(t_ns, time.monotonic_ns())
+                    now_ns = time.monotonic_ns()
+                    if (sync_ns := self.sync.seen(port.name, t_ns, now_ns)) is not None:
+                        self.pipeline.begin(sync_ns, now_ns)
                 else:
                     self.master.handle(port.name, can_id, data, t_ns)
 
@@ -139,35 +133,14 @@ class Daemon:
         """What may wait until the contacts are out."""
         now_ns = time.monotonic_ns()
         self.master.poll(now_ns)
+        self.pacer.step(now_ns)
+        for port in self.ports.values():
+            port.look(now_ns)
         self.gate.poll(now_ns)
         self.publisher.take_subscriptions()
         self.report.poll(now_ns)
         self.control.poll()
         alive()
-
-
-def node_specs(deployment: Deployment) -> list[NodeSpec]:
-    """What the master has to know of every node, in the order of the slab."""
-    pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
-    kinds: Mapping[str, Any] = deployment.nodes
-    return [
-        NodeSpec(
-            slot=slot,
-            bus=pad.bus,
-            node_id=pad.node_id,
-            name=f"{hand}/{pad.link}",
-            eds=kinds[pad.node].eds,
-            vendor_id=kinds[pad.node].vendor_id,
-            product_code=kinds[pad.node].product_code,
-            serial=pad.serial,
-            revision=kinds[pad.node].revision,
-            channels=in_order(channels_of(kinds[pad.node].channels, kinds[pad.node].eds), pad.electrodes),
-            remap=kinds[pad.node].remap,
-            heartbeat_ms=kinds[pad.node].heartbeat_ms,
-            heartbeat_timeout_ms=kinds[pad.node].heartbeat_timeout_ms,
-        )
-        for slot, (hand, pad) in enumerate(pads)
-    ]
 
 
 def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:

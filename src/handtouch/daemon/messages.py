@@ -19,6 +19,7 @@ REASONS = {
     PadState.LOST: "lost",
     PadState.FAULTED: "faulted",
     PadState.STARTING: "restarted",
+    PadState.OFF: "off",
 }
 """Why a contact ended, by what became of its pad; any other is released."""
 _STOPPED = "stopped"

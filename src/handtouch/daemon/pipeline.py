@@ -52,6 +52,11 @@ class Pipeline:
             return None
         return self._tick(now_ns, _FOREVER_NS)
 
+    def tick_now(self, now_ns: int) -> Ticked:
+        """A cycle without SYNC, for samples that came because something moved."""
+        self.begin(now_ns, now_ns)
+        return self._tick(now_ns, _FOREVER_NS)
+
     def end(self, now_ns: int) -> None:
         """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""
         self.messages.end_all(now_ns, self._outlet)

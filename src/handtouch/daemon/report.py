@@ -16,6 +16,7 @@ from handtouch import __version__, wire
 from handtouch.canbus.lifecycle import NodeState
 from handtouch.canbus.master import Master, NodeStatus
 from handtouch.canbus.port import Port
+from handtouch.canbus.sync import Sync
 from handtouch.config import Deployment
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
@@ -30,6 +31,7 @@ _PAD_OF_NODE = {
     NodeState.OPERATIONAL: PadState.CLEAR,
     NodeState.STALE: PadState.CLEAR,  # the tick sees by itself that no samples come
     NodeState.FAULTED: PadState.FAULTED,
+    NodeState.STOPPED: PadState.OFF,
 }
 
 
@@ -37,7 +39,6 @@ class Report:
     """Watches pipeline, master, buses and publisher; `poll` it after every tick.
 
     It keeps the pipeline's `node_state`: what the tick is to make of each node.
-    `overruns` counts the periods that passed without a SYNC because the daemon was late.
     """
 
     def __init__(
@@ -46,14 +47,15 @@ class Report:
         pipeline: Pipeline,
         master: Master,
         ports: Mapping[str, Port],
+        sync: Sync,
         publisher: Publisher,
     ) -> None:
         n = pipeline.model.size
-        self.overruns = 0
         self._deployment = deployment
         self._pipeline = pipeline
         self._master = master
         self._ports = ports
+        self._sync = sync
         self._publisher = publisher
         self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
         self._names = [(hand, pad.link) for hand, pad in self._pads]
@@ -160,13 +162,14 @@ class Report:
             period_s=self._deployment.daemon.sync_period_ms * 1e-3,
             hands={hand.name: [pad.link for pad in hand.pads] for hand in self._deployment.hands},
             ticks=self._pipeline.ticks,
-            overruns=self.overruns,
+            overruns=self._sync.overruns,
             rate_hz=self._speeds.get("ticks", 0.0),
             tick_us=self._tick_us,
             buses={
                 name: {
                     "load": self._speeds.get(name, 0.0) / bit_rates[name],
-                    "problem": port.problem,
+                    **port.state.figures(),
+                    "sync": self._sync.figures(name, now_ns),
                     **asdict(port.counters),
                 }
                 for name, port in self._ports.items()

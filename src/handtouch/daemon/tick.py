@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from handtouch.canbus.slab import Slab
 from handtouch.daemon.contacts import BoolArray, Contacts, IntArray
 from handtouch.daemon.cycle import Cycle
+from handtouch.daemon.follow import FORCE, NEAR, NORMAL, PAD, POSITION, RESIDUAL, VALUES, XY, Follower, Solved
 from handtouch.daemon.model import PadModel
-from handtouch.field.strength import Status
 from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
@@ -26,7 +26,9 @@ _SOURCE_STD, _SOURCE_PART = 10.0, 0.02
 _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
     int, (PadState.CLEAR, PadState.TOUCHED, PadState.STALE, PadState.FAULTED)
 )
-_VALID, _SATURATED = int(Status.VALID), int(Status.SATURATED)
+_LEAVING = 0.5
+"""Of a map's trust: beyond it, it is drawn anew before the contact leaves it."""
+_NOTHING_READ = np.zeros(0, dtype=np.intp), np.zeros((0, 4)), np.zeros((0, VALUES)), np.zeros((0, 3))
 
 
 @dataclass(frozen=True)
@@ -39,21 +41,23 @@ class Columns:
     """SYNC that the newest sample belongs to, 0 before the first"""
     current_a: FloatArray
     """total current"""
+    values: FloatArray
+    """(n, VALUES) what follows from the currents of each tick; the six below are views of it"""
     xy: FloatArray
     """(n, 2) location on the pad's rectangle"""
     position_m: FloatArray
     """(n, 3) in the link frame; NaN where there is no valid location"""
     normal: FloatArray
     """(n, 3)"""
-    covariance_m2: FloatArray
-    """(n, 3, 3)"""
     pad_m: FloatArray
     """(n, 2) arc lengths from the electrodes x0 and y0"""
+    residual: FloatArray
     force_n: FloatArray
     """NaN where there is no valid strength, a lower bound where it is saturated"""
+    covariance_m2: FloatArray
+    """(n, 3, 3); this and the following are of the contact's last solution"""
     force_std_n: FloatArray
     saturated: NDArray[np.bool_]
-    residual: FloatArray
     residual_std: FloatArray
     """of a point contact, from the noise of the channels"""
 
@@ -64,19 +68,21 @@ class Columns:
         def unknown(*shape: int) -> FloatArray:
             return np.full((n, *shape), np.nan)
 
+        values = unknown(VALUES)
         return cls(
             state=np.full(n, PadState.STARTING, dtype=np.uint8),
             sample_ns=np.zeros(n, dtype=np.int64),
             current_a=np.zeros(n),
-            xy=unknown(2),
-            position_m=unknown(3),
-            normal=unknown(3),
+            values=values,
+            xy=values[:, XY],
+            position_m=values[:, POSITION],
+            normal=values[:, NORMAL],
+            pad_m=values[:, PAD],
+            residual=values[:, RESIDUAL],
+            force_n=values[:, FORCE],
             covariance_m2=unknown(3, 3),
-            pad_m=unknown(2),
-            force_n=unknown(),
             force_std_n=unknown(),
             saturated=np.zeros(n, dtype=np.bool_),
-            residual=unknown(),
             residual_std=unknown(),
         )
 
@@ -105,13 +111,20 @@ class Tick:
         """samples taken in"""
         self.missed = np.zeros(model.size, dtype=np.int64)
         """ticks that an expected sample came too late for, or never"""
-        self._stale_ns = _STALE_PERIODS * period_ns
+        self.period_ns = np.full(model.size, period_ns, dtype=np.int64)
+        """longest time between two samples of each pad"""
+        self.paced_ns = np.zeros(model.size, dtype=np.int64)
+        """since when that is so"""
+        self.synchronous = np.ones(model.size, dtype=np.bool_)
+        """pads that sample with SYNC; the others when something moves, and are not waited for"""
+        self.follower = Follower(model)
+        self._read = _NOTHING_READ  # contacts of the last step: pads, currents, values, how far from trusted
         self._currents = np.zeros((model.size, 4))
         self._taken_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the samples that were used
 
     def expected(self) -> NDArray[np.bool_]:
         """Pads whose sample a tick should wait for: those that are alive."""
-        return self.columns.state <= _TOUCHED
+        return np.asarray((self.columns.state <= _TOUCHED) & self.synchronous)
 
     def step(
         self,
@@ -134,10 +147,12 @@ class Tick:
         in_time = here & (slab.fresh != 0)
         self.missed += self.expected() & operational & ~in_time
         self.samples += sampled
-        np.copyto(columns.sample_ns, np.where(in_time, cycle.t_ns, cycle.previous_ns), where=sampled)
+        sync_ns = np.where(in_time, cycle.t_ns, cycle.previous_ns)
+        np.copyto(columns.sample_ns, np.where(self.synchronous, sync_ns, slab.t_ns), where=sampled)
         self.counts = counts = slab.read()
         absurd = self._absurd(counts, slab)
-        stale: BoolArray = np.subtract(now_ns, columns.sample_ns) > self._stale_ns
+        quiet_ns = now_ns - np.maximum(columns.sample_ns, self.paced_ns)
+        stale: BoolArray = quiet_ns > _STALE_PERIODS * self.period_ns
         trusted: BoolArray = operational & ~absurd & ~stale
         np.multiply(counts, model.ampere_per_count, out=self._currents)
         np.copyto(columns.current_a, self._currents.sum(axis=1), where=sampled)
@@ -148,7 +163,8 @@ class Tick:
         # a sample below the threshold tells no place: until it is known whether more follow, the last holds
         touched = contacts.touching & sampled & ~below_off
         if len(changes.began):
-            columns.xy[changes.began] = np.nan  # no use to start from where the last contact was
+            columns.values[changes.began] = np.nan  # no use to start from where the last contact was
+            self.follower.forget(changes.began)
         if touched.any():
             self._solve(np.flatnonzero(touched))
             touched[changes.began] = False
@@ -174,24 +190,45 @@ class Tick:
 
     def _solve(self, touched: IntArray) -> None:
         """Locate, place and weigh the contacts on the pads `touched`."""
-        model, columns = self.model, self.columns
-        currents = self._currents[touched].T
-        found = model.locator.estimate(touched, currents, model.noise_a[touched].T, columns.xy[touched].T)
-        columns.xy[touched, 0], columns.xy[touched, 1] = found.x, found.y
-        columns.residual[touched] = found.residual
-        with np.errstate(
-            divide="ignore", invalid="ignore"
-        ):  # counts that fit a point exactly tell nothing of it
-            columns.residual_std[touched] = np.abs(found.residual) / np.sqrt(found.chi_squared)
-        placed = model.placement.place(touched, found.x, found.y, found.covariance[:, :2, :2])
-        columns.position_m[touched] = placed.position_m
-        columns.normal[touched] = placed.normal
-        columns.covariance_m2[touched] = placed.covariance_m2
-        columns.pad_m[touched] = placed.pad_m
-        strength = model.force(touched, currents, found, placed)
-        known = (strength.status == _VALID) | (strength.status == _SATURATED)
-        columns.force_n[touched] = np.where(known, strength.force_n, np.nan)
-        columns.force_std_n[touched] = strength.std_n
-        columns.saturated[touched] = strength.status == _SATURATED
+        currents = self._currents.take(touched, axis=0)
+        values, off = self.follower.read(touched, currents)
+        if not np.maximum.reduce(off, axis=None) <= 1:  # or NaN
+            self._solve_anew(touched, currents, values, off)
+        self._read = touched, currents, values, off
+        self.columns.values[touched] = values
         peak = self.contacts.peak_n
-        peak[touched] = np.fmax(peak[touched], columns.force_n[touched])
+        peak[touched] = np.fmax(peak.take(touched), values[:, FORCE])
+
+    def _solve_anew(self, pads: IntArray, currents: FloatArray, values: FloatArray, off: FloatArray) -> None:
+        """Put into `values` and `off` what holds of contacts whose maps no longer do."""
+        far = off.max(axis=1)
+        near = np.flatnonzero((far > 1) & (far <= NEAR))
+        if len(near):
+            self._draw(pads[near], currents[near], values[near, XY])
+            values[near], off[near] = self.follower.read(pads[near], currents[near])
+        lost = np.flatnonzero(~(off.max(axis=1) <= 1))
+        if len(lost):
+            some = pads[lost]
+            self._keep(some, self.follower.solve(some, currents[lost], self.columns.xy[some]))
+            values[lost], off[lost] = self.follower.read(some, currents[lost])
+
+    def settle(self) -> None:
+        """Draw anew, where contacts are now, the maps that they are about to leave.
+
+        Call it between two steps, when nobody waits: it makes the next step cheap, and changes no contact.
+        """
+        pads, currents, values, off = self._read
+        self._read = _NOTHING_READ
+        leaving = np.flatnonzero(off.max(axis=1) > _LEAVING)
+        if len(leaving):
+            self._draw(pads[leaving], currents[leaving], values[leaving, XY])
+
+    def _draw(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> None:
+        self._keep(pads, self.follower.draw(pads, currents, xy))
+
+    def _keep(self, pads: IntArray, solved: Solved) -> None:
+        columns = self.columns
+        columns.covariance_m2[pads] = solved.covariance_m2
+        columns.force_std_n[pads] = solved.force_std_n
+        columns.saturated[pads] = solved.saturated
+        columns.residual_std[pads] = solved.residual_std
