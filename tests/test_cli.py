@@ -10,7 +10,10 @@ import pytest
 
 from handtouch.cli import build_parser, main
 
-COMMANDS = ["demo", "run", "simulate", "replay", "watch", "status", "check", "doctor", "figures", "design"]
+COMMANDS = [
+    *("demo", "run", "simulate", "replay", "watch", "status", "keys"),
+    *("check", "doctor", "figures", "design"),
+]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -46,6 +46,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_serving(commands)
     _add_looking(commands)
+    _add_keys(commands)
     _add_checking(commands)
     return parser
 
@@ -92,7 +93,7 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     watch = _command(commands, "watch", _watch, "show what a running daemon publishes")
     watch.add_argument("pattern", nargs="*", help='topics such as "contact/*/thumb_*", "hand/*", "service"')
-    watch.add_argument("--endpoint", default=LIVE, help=f"stream to listen to (default: {LIVE})")
+    _add_endpoint(watch, LIVE, "stream to listen to")
     style = watch.add_mutually_exclusive_group()
     style.add_argument(
         "--plain", dest="style", action="store_const", const="plain", help="lines, in a terminal too"
@@ -101,8 +102,47 @@ def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     watch.add_argument("--seconds", type=_positive, default=0.0, help="end after so long")
 
     status = _command(commands, "status", _status, "how the daemon, its buses and its pads fare")
-    status.add_argument("--endpoint", default=CONTROL, help=f"control endpoint (default: {CONTROL})")
+    _add_endpoint(status, CONTROL, "control endpoint")
     status.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _add_endpoint(parser: argparse.ArgumentParser, default: str, text: str) -> None:
+    parser.add_argument("--endpoint", default=default, help=f"{text} (default: {default})")
+    parser.add_argument(
+        "--key",
+        metavar="FILE",
+        help="key for a daemon that asks for one (default: the file that HANDTOUCH_KEY names, if set)",
+    )
+
+
+def _add_keys(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    keys = commands.add_parser(
+        "keys",
+        help="keys for a daemon that other machines reach",
+        description="Keys for a daemon that other machines reach, and for its clients.",
+        epilog=_EXIT,
+    )
+    actions = keys.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    make = _command(actions, "make", _keys_make, "make a daemon's keys, in a new folder")
+    make.add_argument("folder", type=Path, help="to make; [daemon] keys in the deployment names it")
+    make.add_argument("--name", help="what clients call this daemon (default: the name of this machine)")
+
+    client = _command(actions, "client", _keys_client, "make a client's key, and let it in")
+    client.add_argument("folder", type=Path, help="the daemon's keys")
+    client.add_argument("name", help="what the daemon calls the client")
+    client.add_argument(
+        "--rights", choices=("read", "control"), default="read", help="control includes read (default: read)"
+    )
+    client.add_argument("--out", type=Path, help="file for the client to take along (default: NAME.key)")
+
+    listed = _command(actions, "list", _keys_list, "who is let in")
+    listed.add_argument("folder", type=Path, help="the daemon's keys")
+    listed.add_argument("--json", action="store_true", help="as JSON")
+
+    revoke = _command(actions, "revoke", _keys_revoke, "let a client in no more")
+    revoke.add_argument("folder", type=Path, help="the daemon's keys")
+    revoke.add_argument("name", help="of the client")
 
 
 def _add_checking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -224,14 +264,44 @@ def _watch(asked: argparse.Namespace) -> int:
     from handtouch.view import watch
 
     return watch.run(
-        tuple(asked.pattern), endpoint=asked.endpoint, style=asked.style or "auto", seconds=asked.seconds
+        tuple(asked.pattern),
+        endpoint=asked.endpoint,
+        key=asked.key,
+        style=asked.style or "auto",
+        seconds=asked.seconds,
     )
 
 
 def _status(asked: argparse.Namespace) -> int:
     from handtouch.view import status
 
-    return status.run(endpoint=asked.endpoint, as_json=asked.json)
+    return status.run(endpoint=asked.endpoint, key=asked.key, as_json=asked.json)
+
+
+def _keys_make(asked: argparse.Namespace) -> int:
+    import platform
+
+    from handtouch import keys
+
+    return keys.run_make(asked.folder, asked.name or platform.node())
+
+
+def _keys_client(asked: argparse.Namespace) -> int:
+    from handtouch import keys
+
+    return keys.run_client(asked.folder, asked.name, asked.rights, asked.out)
+
+
+def _keys_list(asked: argparse.Namespace) -> int:
+    from handtouch import keys
+
+    return keys.run_list(asked.folder, asked.json)
+
+
+def _keys_revoke(asked: argparse.Namespace) -> int:
+    from handtouch import keys
+
+    return keys.run_revoke(asked.folder, asked.name)
 
 
 def _check(asked: argparse.Namespace) -> int:

@@ -9,16 +9,21 @@ Public names: `connect`, `Subscriber`, `request`.
 
 from __future__ import annotations
 
+import asyncio
+import os
 import time
 from collections.abc import AsyncIterator, Iterator
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any, Self
 
 import msgpack
 import zmq
 import zmq.asyncio
+from zmq.utils.monitor import parse_monitor_message
 
 from handtouch import wire
+from handtouch.keys import ClientKey, load_client
 
 LIVE = "tcp://127.0.0.1:5580"
 CONTROL = "tcp://127.0.0.1:5581"
@@ -26,23 +31,29 @@ SILENCE_S = 1.5
 """The daemon says `service` twice a second; three missed ones mean that it is gone."""
 
 
-def connect(*patterns: str, endpoint: str = LIVE, queue: int = 1000) -> Subscriber:
+def connect(
+    *patterns: str, endpoint: str = LIVE, key: Path | str | None = None, queue: int = 1000
+) -> Subscriber:
     """Subscribe to the topics that match any of the patterns.
 
     A pattern is a topic whose parts may hold the wildcards * and ?: "contact/*/*" (the default),
     "contact/left/thumb_tip", "hand/*", "health/*/index_*", "service". `queue` bounds the messages kept
     while this side is busy; beyond it the newest are lost, and counted as gaps. The connection comes back
-    by itself when a daemon restarts.
+    by itself when a daemon restarts. `key` is the file of this client's key for a daemon that asks for one
+    (`handtouch keys`); left out: the file that the environment variable HANDTOUCH_KEY names; "" for none.
 
-    Raises ValueError for a pattern that no topic could match, or an endpoint that is none.
+    Raises ValueError for a pattern that no topic could match, an endpoint that is none, or a key file that
+    can't be used. Receiving raises PermissionError when the daemon doesn't let this client in.
     """
-    return Subscriber(patterns or ("contact/*/*",), endpoint, queue)
+    return Subscriber(patterns or ("contact/*/*",), endpoint, queue, key)
 
 
 class Subscriber:
     """Messages of a daemon as typed objects: an iterator, an asynchronous iterator and a context manager."""
 
-    def __init__(self, patterns: tuple[str, ...], endpoint: str, queue: int) -> None:
+    def __init__(
+        self, patterns: tuple[str, ...], endpoint: str, queue: int, key: Path | str | None = None
+    ) -> None:
         known = {topic.prefix: topic for topic in wire.TOPICS}
         for pattern in patterns:
             parts = pattern.split("/")
@@ -67,15 +78,21 @@ class Subscriber:
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         for prefix in {_literal_prefix(pattern) for pattern in patterns} | {"service"}:
             self._socket.subscribe(prefix)
-        _connect(self._socket, endpoint)
+        self._door = _Door(self._socket, endpoint, key)
 
     def recv(self, timeout_s: float | None = None) -> Any:
-        """The next message that matches, or None after `timeout_s` seconds without one."""
+        """The next message that matches, or None after `timeout_s` seconds without one.
+
+        Raises PermissionError when the daemon doesn't let this client in.
+        """
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             wait_ms = None if end_s is None else max(0, round((end_s - time.monotonic()) * 1000))
-            if not self._socket.poll(wait_ms):
+            ready = self._door.poll(wait_ms)
+            if not ready:
                 return None
+            if self._socket not in ready:
+                continue
             message = self._accept(self._socket.recv_multipart())
             if message is not None:
                 return message
@@ -99,10 +116,21 @@ class Subscriber:
 
     async def __aiter__(self) -> AsyncIterator[Any]:
         socket = zmq.asyncio.Socket.shadow(self._socket)
-        while True:
-            message = self._accept(await socket.recv_multipart())
-            if message is not None:
-                yield message
+        refused = asyncio.ensure_future(self._door.refused())
+        try:
+            while True:
+                coming = asyncio.ensure_future(socket.recv_multipart())
+                try:
+                    await asyncio.wait((coming, refused), return_when=asyncio.FIRST_COMPLETED)
+                    if not coming.done():
+                        refused.result()
+                finally:
+                    coming.cancel()
+                message = self._accept(coming.result())
+                if message is not None:
+                    yield message
+        finally:
+            refused.cancel()
 
     def __enter__(self) -> Self:
         return self
@@ -112,6 +140,7 @@ class Subscriber:
 
     def close(self) -> None:
         """Leave; the daemon notices within milliseconds."""
+        self._door.close()
         self._socket.close()
 
     def _accept(self, parts: list[bytes]) -> wire.Message | None:
@@ -135,36 +164,120 @@ class Subscriber:
 
 
 def request(
-    command: str, *, endpoint: str = CONTROL, timeout_s: float = 2.0, **arguments: Any
+    command: str,
+    *,
+    endpoint: str = CONTROL,
+    key: Path | str | None = None,
+    timeout_s: float = 2.0,
+    **arguments: Any,
 ) -> dict[str, Any]:
-    """Send a command to the daemon's control endpoint and return its answer.
+    """Send a command to the daemon's control endpoint and return its answer; `key` as for `connect`.
 
-    Raises TimeoutError when no daemon answers, RuntimeError with its words when it refuses, ValueError for an
-    endpoint that is none.
+    Raises TimeoutError when no daemon answers, PermissionError when it doesn't let this client in,
+    RuntimeError with its words when it refuses, ValueError for an endpoint that is none or a key file that
+    can't be used.
     """
+    door = None
+    end_s = time.monotonic() + timeout_s
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
     try:
         socket.setsockopt(zmq.LINGER, 0)
-        _connect(socket, endpoint)
+        door = _Door(socket, endpoint, key)
         socket.send(msgpack.packb({"v": wire.SCHEMA_VERSION, "command": command, **arguments}))
-        if not socket.poll(round(timeout_s * 1000)):
-            raise TimeoutError(f"no daemon answers at {endpoint} within {timeout_s} s; is handtouch run up?")
+        ready: set[zmq.Socket[bytes]] = set()
+        while socket not in ready:
+            ready = door.poll(max(0, round((end_s - time.monotonic()) * 1000)))
+            if not ready:
+                raise TimeoutError(
+                    f"no daemon answers at {endpoint} within {timeout_s} s; is handtouch run up?"
+                )
         answer = msgpack.unpackb(socket.recv())
     finally:
+        if door is not None:
+            door.close()
         socket.close()
     if not isinstance(answer, dict) or not answer.get("ok"):
         raise RuntimeError(answer.get("error", "refused") if isinstance(answer, dict) else "malformed answer")
     return answer
 
 
-def _connect(socket: zmq.Socket[bytes], endpoint: str) -> None:
-    try:
-        socket.connect(endpoint)
-    except zmq.ZMQError as error:
-        socket.close()
-        raise ValueError(
-            f"{endpoint!r} is no ZeroMQ endpoint ({error.strerror}); one looks like tcp://127.0.0.1:5580"
-        ) from error
+class _Door:
+    """Connects a socket, with a key over TCP, and hears when it isn't let in."""
+
+    def __init__(self, socket: zmq.Socket[bytes], endpoint: str, key: Path | str | None) -> None:
+        self._endpoint = endpoint
+        self._socket = socket
+        self._failures = 0
+        self._key: ClientKey | None = None
+        self._poller = zmq.Poller()
+        self._poller.register(socket, zmq.POLLIN)
+        file = os.environ.get("HANDTOUCH_KEY", "") if key is None else key
+        try:
+            if file and endpoint.startswith("tcp://"):
+                self._key = load_client(Path(file))
+                socket.setsockopt(zmq.CURVE_SERVERKEY, self._key.server_key.encode())
+                socket.setsockopt(zmq.CURVE_PUBLICKEY, self._key.public_key.encode())
+                socket.setsockopt(zmq.CURVE_SECRETKEY, self._key.secret_key.encode())
+            self._monitor = socket.get_monitor_socket(_HANDSHAKES)
+            socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            socket.close()
+            raise ValueError(
+                f"{endpoint!r} is no ZeroMQ endpoint ({error.strerror}); one looks like tcp://127.0.0.1:5580"
+            ) from error
+        except ValueError:
+            socket.close()
+            raise
+        self._poller.register(self._monitor, zmq.POLLIN)
+
+    def poll(self, wait_ms: int | None) -> set[zmq.Socket[bytes]]:
+        """What is ready, nothing after `wait_ms`. Raises PermissionError."""
+        ready = {socket for socket, _ in self._poller.poll(wait_ms)}
+        if self._monitor in ready and self._socket not in ready:
+            self._hear(self._monitor.recv_multipart())
+        return ready
+
+    async def refused(self) -> None:
+        """Raises PermissionError when the daemon doesn't let this client in."""
+        monitor = zmq.asyncio.Socket.shadow(self._monitor)
+        while True:
+            self._hear(await monitor.recv_multipart())
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._poller.unregister(self._monitor)
+        self._socket.disable_monitor()
+        self._monitor.close()
+
+    def _hear(self, parts: list[bytes]) -> None:
+        event = parse_monitor_message(parts)["event"]
+        self._failures = 0 if event == zmq.Event.HANDSHAKE_SUCCEEDED else self._failures + 1
+        if event == zmq.Event.HANDSHAKE_FAILED_AUTH and self._key is not None:
+            raise PermissionError(
+                f"{self._endpoint} doesn't let {self._key.name} in: its key is not known there, or has no right "
+                "to this endpoint; `handtouch keys list FOLDER` on the daemon's machine tells"
+            )
+        if self._failures < _FAILURES:
+            return  # a daemon that goes down while we connect looks the same once
+        if self._key is None:
+            raise PermissionError(
+                f"{self._endpoint} lets nobody in without a key: `handtouch keys client FOLDER NAME` on the "
+                "daemon's machine makes one; give its file by --key, key= or HANDTOUCH_KEY"
+            )
+        raise PermissionError(
+            f"{self._endpoint} can't be spoken to with the key of {self._key.name} for {self._key.server}: this "
+            "is another daemon, or it has new keys, or none"
+        )
+
+
+_HANDSHAKES = (
+    zmq.Event.HANDSHAKE_SUCCEEDED
+    | zmq.Event.HANDSHAKE_FAILED_AUTH
+    | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
+    | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
+)
+_FAILURES = 3
+"""Failed handshakes in a row after which it is no accident."""
 
 
 def _literal_prefix(pattern: str) -> str:

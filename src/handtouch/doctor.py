@@ -21,7 +21,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from handtouch import config
+import zmq
+
+from handtouch import config, keys
 from handtouch.canbus.receivers import RECEIVE_BUFFER_BYTES
 
 State = Literal["ok", "warn", "fail"]
@@ -98,6 +100,26 @@ def examine(deployment: config.Deployment | None, machine: Machine | None = None
     for bus in deployment.buses if deployment else ():
         yield from bus_findings(bus, machine)
     yield from endpoint_findings(deployment.daemon if deployment else config.Daemon())
+    yield from key_findings(deployment.daemon if deployment else config.Daemon())
+
+
+def key_findings(daemon: config.Daemon) -> Iterator[Finding]:
+    """Whether the daemon could use its keys, and whether there is the cryptography for any."""
+    if not zmq.has("curve"):
+        state: State = "fail" if daemon.keys else "warn"
+        yield Finding(
+            "keys", state, "this pyzmq was built without CURVE", "pip install --force-reinstall pyzmq"
+        )
+    elif daemon.keys:
+        clients, problems = keys.clients_in(Path(daemon.keys))
+        try:
+            keys.load_server(Path(daemon.keys))
+        except keys.KeysError as error:
+            problems.insert(0, str(error))
+        for problem in dict.fromkeys(problems):
+            yield Finding("keys", "fail", *problem.split(": ", 1))
+        if not problems:
+            yield Finding("keys", "ok", f"{daemon.keys} lets {len(clients)} clients in")
 
 
 def python_findings() -> Iterator[Finding]:

@@ -37,6 +37,7 @@ class Daemon(Table):
     inputs: str = Field("tcp://127.0.0.1:5583", description="ZeroMQ endpoint of joint states and forces")
     keys: str | None = Field(
         None,
+        min_length=1,
         description="folder, beside this file, of the keys that TCP clients need (`handtouch keys make`); "
         "left out: any local client may connect, and no other machine can",
     )

@@ -15,11 +15,11 @@ _WIDE = 200
 """Columns where there is no terminal to ask: a line a pad, for grep."""
 
 
-def run(*, endpoint: str = CONTROL, as_json: bool = False) -> int:
+def run(*, endpoint: str = CONTROL, key: str | None = None, as_json: bool = False) -> int:
     """Print the status; exit status 0 if every pad is well, 1 if not or if no daemon answers, 2 (usage)."""
     try:
-        answer = request("status", endpoint=endpoint)
-    except (TimeoutError, RuntimeError) as error:
+        answer = request("status", endpoint=endpoint, key=key)
+    except (OSError, RuntimeError) as error:
         print(error, file=sys.stderr)
         return 1
     except ValueError as error:

@@ -112,24 +112,35 @@ def follow(messages: Subscriber, display: Display, done: Callable[[], bool]) -> 
             next_frame_s = time.monotonic() + 1 / _FRAMES_PER_S
 
 
-def run(patterns: tuple[str, ...], *, endpoint: str = LIVE, style: str = "auto", seconds: float = 0) -> int:
+def run(
+    patterns: tuple[str, ...],
+    *,
+    endpoint: str = LIVE,
+    key: str | None = None,
+    style: str = "auto",
+    seconds: float = 0,
+) -> int:
     """Show messages until Ctrl-C, or for `seconds`; `style`: auto, plain or json.
 
-    Exit status 0, 1 if nothing was heard in that time, 2 for wrong usage. Without a pattern, contacts and
+    Exit status 0, 1 if nothing was heard in that time or the daemon doesn't let us in, 2 for wrong usage. Without a pattern, contacts and
     health; on a terminal that is the live page.
     """
     live = style == "auto" and sys.stdout.isatty() and not patterns
     wanted = patterns or (("contact/*/*", "health/*/*", "service") if live else ("contact/*/*", "health/*/*"))
     end_s = time.monotonic() + seconds if seconds else float("inf")
     try:
-        messages = connect(*wanted, endpoint=endpoint)
+        messages = connect(*wanted, endpoint=endpoint, key=key)
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
     display: Display = LiveDisplay(f"handtouch at {endpoint}") if live else LineDisplay(style == "json")
-    with messages, display:
-        follow(messages, display, lambda: time.monotonic() > end_s)
-        heard = messages.heard
+    try:
+        with messages, display:
+            follow(messages, display, lambda: time.monotonic() > end_s)
+            heard = messages.heard
+    except PermissionError as error:
+        print(error, file=sys.stderr)
+        return 1
     if not heard:
         print(f"nothing was heard at {endpoint}: is handtouch run up?", file=sys.stderr)
     return 0 if heard else 1
