@@ -106,11 +106,8 @@ class Device(Switches):
             )
         with self._bus.lock:
             self.unplug()
-            now_ns, power = self._bus.now_ns, self._power
-            self._bus.at(now_ns + away_ns, partial(self._power_back, power))
-            if times > 1:
-                again = partial(self._brown_again, power + 1, away_ns, times - 1, every_ns)
-                self._bus.at(now_ns + every_ns, again)
+            back = partial(self._power_back, self._power, (away_ns, times - 1, every_ns))
+            self._bus.at(self._bus.now_ns + away_ns, back)
 
     def bus_off(self, away_ns: int, *, boots: bool = False) -> None:
         """Neither send nor hear for `away_ns`; then go on as it was, or boot if `boots`."""
@@ -161,7 +158,7 @@ class Device(Switches):
                 self._send(cob_id & _IDENTIFIER, struct.pack("<HB5s", code, register, data))
 
     def babble(self, rate_hz: float, identifier: int | None = None, data: bytes = bytes(8)) -> None:
-        """Flood the bus with one frame, by default as its first TPDO, until `hush` or without power."""
+        """Flood the bus with one frame, by default as its first TPDO, whatever its state, until `hush`."""
         if rate_hz <= 0 or not 0 <= (identifier or 0) <= _IDENTIFIER:
             raise ValueError(f"need rate_hz > 0 and an 11-bit identifier, got {rate_hz} and {identifier}")
         with self._bus.lock:
@@ -342,13 +339,17 @@ class Device(Switches):
         self.transmit(frame, is_data=True)
         return max(due_ns + period_ns, t_ns - _LONGEST_ARREARS_NS)
 
-    def _power_back(self, power: int, *_: int) -> None:
-        if power == self._power:
-            self.plug()
+    def _power_back(self, power: int, again: tuple[int, int, int], due_ns: int, _t_ns: int) -> None:
+        if power != self._power:
+            return  # somebody has switched it since
+        self.plug()
+        away_ns, times, every_ns = again
+        if times:
+            self._bus.at(due_ns + every_ns - away_ns, partial(self._brown_again, self._power, again))
 
-    def _brown_again(self, power: int, away_ns: int, times: int, every_ns: int, *_: int) -> None:
-        if power == self._power:  # nobody has switched it since
-            self.brown_out(away_ns, times=times, every_ns=every_ns)
+    def _brown_again(self, power: int, again: tuple[int, int, int], *_: int) -> None:
+        if power == self._power:
+            self.brown_out(again[0], times=again[1], every_ns=again[2])
 
     def _bus_back(self, power: int, boots: bool, *_: int) -> None:
         if power != self._power or not self._off_bus:
