@@ -14,7 +14,7 @@ from pathlib import Path
 from pydantic import ValidationError
 from rich.console import Console
 
-from handtouch import config
+from handtouch import config, shipped
 from handtouch.canbus.port import BusError
 from handtouch.doctor import Machine
 
@@ -65,9 +65,12 @@ def _without_deployment(buses: Sequence[str]) -> tuple[config.Bus, ...]:
     if not buses:
         raise config.ConfigError("handtouch scan", (config.Problem("no bus", "", _NO_BUS),))
     blank = tuple(_bus(text, name=text.partition("=")[0], channel=text) for text in buses)
-    deployment = config.Deployment.model_construct(
-        daemon=config.Daemon(), buses=blank, nodes={}, sheets={}, touch=config.Touch(), hands=()
-    )
+    # the shipped hand with its first pad, so that `with_bus` reads and checks buses here as everywhere
+    shipped_one = config.load(shipped.path("utah_mit.toml"))
+    hand = shipped_one.hands[0]
+    pad = hand.pads[0].model_copy(update={"bus": blank[0].name})
+    hand = hand.model_copy(update={"pads": (pad,)})
+    deployment = shipped_one.model_copy(update={"buses": blank, "hands": (hand,)})
     wires = zip(_with(deployment, buses), buses, strict=True)
     return tuple(_bus(text, **_with_bit_rate(bus)) for bus, text in wires)
 

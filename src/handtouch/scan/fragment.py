@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from handtouch import config
@@ -131,6 +132,7 @@ def _kind(node: NodeFacts, channels: tuple[str, ...]) -> Iterator[str]:
 
 
 def _pads(found: Found, kinds: _Kinds) -> Iterator[str]:
+    serials = Counter(node.serial for _, nodes in found for node in nodes)
     number = 0
     for bus, nodes in found:
         for node in nodes:
@@ -139,8 +141,11 @@ def _pads(found: Found, kinds: _Kinds) -> Iterator[str]:
             yield f'link = "name_me_{number}"  # the link that carries it; press the pad to see which'
             yield f'bus = "{bus.name}"'
             yield f"node_id = 0x{node.node_id:02X}"
-            if node.serial is not None:
+            if node.serial and serials[node.serial] == 1:
                 yield f"serial = {node.serial}"
+            else:
+                told = "no serial number" if not node.serial else f"serial number {node.serial}, as others do"
+                yield f"# it has {told}: if it is replaced, that goes unnoticed"
             yield f'node = "{kinds.name(node)}"'
             yield from _to_fill_in(_PAD)
             yield ""

@@ -1,6 +1,6 @@
 """Does what a scan found fit the deployment?
 
-Public names: `judge`, `Verdict`.
+Public names: `judge`, `Verdict`, `names_by_serial`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ def _judge_bus(
         elif node.conflict or (node.trouble and pad):
             wrong = node.conflict or node.trouble
         elif pad is None or deployment is None:
-            remark = "not in the deployment" if deployment else ""
+            owner = names_by_serial(deployment).get(node.serial or 0)
+            remark = f"serial {node.serial} belongs to {owner}" if owner else ""
+            remark = remark or ("not in the deployment" if deployment else "")
             yield Verdict(bus, node_id, "", "", "; ".join(filter(None, (remark, node.trouble))))
             continue
         elif not node.answers:
@@ -61,6 +63,12 @@ def _judge_bus(
         if wrong and pad and elsewhere and (node is None or node.serial != pad.serial):
             wrong += f"; serial {pad.serial} is that of {elsewhere}"
         yield Verdict(bus, node_id, name, wrong)
+
+
+def names_by_serial(deployment: config.Deployment | None) -> dict[int, str]:
+    """Names of the pads whose serial number is configured."""
+    hands = deployment.hands if deployment else ()
+    return {pad.serial: f"{hand.name}/{pad.link}" for hand in hands for pad in hand.pads if pad.serial}
 
 
 def _difference(node: NodeFacts, pad: config.Pad, kind: config.Node) -> str:

@@ -21,7 +21,7 @@ from handtouch.canbus.survey import NodeFacts, TpdoFacts, four_channels
 from handtouch.canbus.traffic import meaning
 
 from .fragment import Found, channel_names, fragment
-from .judge import Verdict
+from .judge import Verdict, names_by_serial
 from .look import BusReport
 
 _WIDE = 200
@@ -39,7 +39,7 @@ def as_json(
         "ok": well,
         "buses": [_plain(report) for report in reports],
         "verdicts": [asdict(verdict) for verdict in verdicts],
-        "fragment": fragment(_new(reports, verdicts), deployment),
+        "fragment": fragment(_new(reports, verdicts, deployment), deployment),
     }
     return json.dumps(report, indent=2) + "\n"
 
@@ -56,7 +56,7 @@ def as_text(
         _show_bus(console, report, {v.node_id: v for v in verdicts if v.bus == report.bus.name})
     for problem in (problem for report in reports for problem in report.problems):
         console.print(Text(problem, "red"))
-    text = fragment(_new(reports, verdicts), deployment)
+    text = fragment(_new(reports, verdicts, deployment), deployment)
     if text:
         console.print("\nFor the deployment file:\n")
         console.print(Text(text), soft_wrap=True)
@@ -64,16 +64,15 @@ def as_text(
     return file.getvalue()
 
 
-def _new(reports: Sequence[BusReport], verdicts: Sequence[Verdict]) -> Found:
-    """Nodes that no pad of the deployment has, and of which there is one."""
+def _new(reports: Sequence[BusReport], verdicts: Sequence[Verdict], deployment: Deployment) -> Found:
+    """Nodes that no pad of the deployment has, by id or by serial number, and of which there is one."""
     known = {(verdict.bus, verdict.node_id) for verdict in verdicts if verdict.pad}
-    return [
-        (
-            report.bus,
-            [n for n in report.nodes if (report.bus.name, n.node_id) not in known and not n.conflict],
-        )
-        for report in reports
-    ]
+    serials = set(names_by_serial(deployment))
+
+    def new(bus: str, node: NodeFacts) -> bool:
+        return (bus, node.node_id) not in known and node.serial not in serials and not node.conflict
+
+    return [(report.bus, [n for n in report.nodes if new(report.bus.name, n)]) for report in reports]
 
 
 def _show_bus(console: Console, report: BusReport, verdicts: dict[int, Verdict]) -> None:
