@@ -254,8 +254,8 @@ class _Door:
         self._failures = 0 if event == zmq.Event.HANDSHAKE_SUCCEEDED else self._failures + 1
         if event == zmq.Event.HANDSHAKE_FAILED_AUTH and self._key is not None:
             raise PermissionError(
-                f"{self._endpoint} doesn't let {self._key.name} in: its key is not known there, or has no right "
-                "to this endpoint; `handtouch keys list FOLDER` on the daemon's machine tells"
+                f"{self._endpoint} doesn't let {self._key.name} in: its key is not known there, or has no "
+                "right to this endpoint; `handtouch keys list FOLDER` on the daemon's machine tells"
             )
         if self._failures < _FAILURES:
             return  # a daemon that goes down while we connect looks the same once
@@ -265,8 +265,8 @@ class _Door:
                 "daemon's machine makes one; give its file by --key, key= or HANDTOUCH_KEY"
             )
         raise PermissionError(
-            f"{self._endpoint} can't be spoken to with the key of {self._key.name} for {self._key.server}: this "
-            "is another daemon, or it has new keys, or none"
+            f"{self._endpoint} can't be spoken to with the key of {self._key.name} for {self._key.server}: "
+            "this is another daemon, or it has new keys, or none"
         )
 
 

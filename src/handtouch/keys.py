@@ -148,7 +148,8 @@ def load_server(folder: Path) -> ServerKey:
         values = _parse(path, path.read_bytes())  # its rights are the service manager's business
     else:
         values = _parse(path, _read_secret(path))
-    return ServerKey(*_texts(path, values, "name"), *_checked_pair(path, values))
+    (name,) = _texts(path, values, "name")
+    return ServerKey(name, *_checked_pair(path, values))
 
 
 def load_client(path: Path) -> ClientKey:

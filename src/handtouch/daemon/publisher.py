@@ -50,9 +50,7 @@ class Publisher:
             socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
             socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
             try:
-                self.endpoints[stream] = bind(
-                    socket, endpoint, f"the {stream} stream", gate, "read"
-                )
+                self.endpoints[stream] = bind(socket, endpoint, f"the {stream} stream", gate, "read")
             except OSError:
                 self.close()
                 raise

@@ -92,12 +92,12 @@ class Gate:
         if self._folder is None:
             return
         for _ in range(_HANDSHAKES_PER_POLL):
-            if not self._zap.getsockopt(zmq.EVENTS) & zmq.POLLIN:
+            if not _ready(self._zap):
                 break
             self._answer(self._zap.recv_multipart(zmq.NOBLOCK), now_ns)
         for monitor in self._monitors:
             for _ in range(_EVENTS_PER_POLL):
-                if not monitor.getsockopt(zmq.EVENTS) & zmq.POLLIN:
+                if not _ready(monitor):
                     break
                 value = recv_monitor_message(monitor, zmq.NOBLOCK)["value"]
                 cause = {_MECHANISM_MISMATCH: "no_key", _CRYPTOGRAPHIC: "wrong_server_key"}
@@ -116,16 +116,16 @@ class Gate:
         self._refresh()
         key = z85.encode(credentials[0]).decode() if mechanism == b"CURVE" else ""
         client = self._clients.get(key)
-        who, where = "", f"from {address.decode('ascii', 'replace')}"
+        who, where = b"", f"from {address.decode('ascii', 'replace')}"
         if client is None:
             self._refuse("unknown_key", f"{key} {where}", now_ns)
         elif right == b"control" and client.rights != "control":
             self._refuse("no_right", f"{client.name} {where}", now_ns)
         else:
-            who = client.name
-            _log.debug("%s connected %s, to %s", who, where, right.decode())
+            who = client.name.encode()
+            _log.debug("%s connected %s, to %s", client.name, where, right.decode())
         answer = (b"200", b"OK") if who else (b"400", b"NO ACCESS")
-        self._zap.send_multipart([version, number, *answer, who.encode(), b""], zmq.NOBLOCK)
+        self._zap.send_multipart([version, number, *answer, who, b""], zmq.NOBLOCK)
 
     def _refuse(self, cause: str, detail: str, now_ns: int) -> None:
         """Count, and tell: the first at once, then from time to time with the number since."""
@@ -151,6 +151,10 @@ class Gate:
             _log.error("not let in: %s", problem)
         if not self._clients:
             _log.warning("nobody is let in: handtouch keys client %s NAME makes a client's key", self._folder)
+
+
+def _ready(socket: zmq.Socket[bytes]) -> bool:
+    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
 
 
 def _state(folder: Path) -> object:

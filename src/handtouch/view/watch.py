@@ -122,8 +122,8 @@ def run(
 ) -> int:
     """Show messages until Ctrl-C, or for `seconds`; `style`: auto, plain or json.
 
-    Exit status 0, 1 if nothing was heard in that time or the daemon doesn't let us in, 2 for wrong usage. Without a pattern, contacts and
-    health; on a terminal that is the live page.
+    Exit status 0, 1 if nothing was heard in that time or the daemon doesn't let us in, 2 for wrong usage.
+    Without a pattern, contacts and health; on a terminal that is the live page.
     """
     live = style == "auto" and sys.stdout.isatty() and not patterns
     wanted = patterns or (("contact/*/*", "health/*/*", "service") if live else ("contact/*/*", "health/*/*"))
