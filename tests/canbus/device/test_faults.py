@@ -289,6 +289,15 @@ def test_a_failing_object_is_aborted_with_its_code_or_met_with_silence(bench: An
     assert bench.read(1, 0x1801, 2) == 1
 
 
+def test_a_refused_write_leaves_reading_alone(bench: Any) -> None:
+    node = bench.running()
+    node.sdo.fail_write[0x1017, 0] = 0x06010002
+    assert bench.write(1, 0x1017, 0, 50, 2) == 0x06010002
+    assert bench.read(1, 0x1017, 0) == 200
+    node.sdo.fail_write.clear()
+    assert bench.write(1, 0x1017, 0, 50, 2) == 0
+
+
 def test_any_step_of_a_sequence_can_fail_once(bench: Any) -> None:
     node = bench.running()
     for step in range(5):

@@ -92,8 +92,10 @@ class DeviceBus:
         The EDS is the shipped one unless another is given, the identity that of the EDS. `channels` are the
         objects (index, sub-index) that carry the four channels, `excitation` the one that switches the supply
         of the sheet, by default 0x2100 where the EDS calls that so. A `strict_pdo` node refuses to change a
-        PDO's transmission type, timers or identifier while the PDO is valid. Raises ValueError for a node id out of
-        range or taken, and for an EDS that can't be read or without the objects of such a node.
+        PDO's transmission type, timers or identifier while the PDO is valid.
+
+        Raises ValueError for a node id out of range or taken, and for an EDS that can't be read or without
+        the objects of such a node.
         """
         if not 1 <= node_id <= 127 or node_id in self.devices:
             raise ValueError(f"node_id must be 1 to 127 and used once, got {node_id}")

@@ -30,6 +30,7 @@ class Server:
 
     `frozen` : answers nothing
     `fail` : object -> abort code with which every request for it is answered, None for silence
+    `fail_write` : the same for writing alone; the object can be read
     `fail_nth` : number of a request, as `requests` counts them -> abort code or None, as in `fail`
     `garble` : answers are wrong: "toggle" bits of segments, the "object" that they name, or all is "noise"
 
@@ -39,6 +40,7 @@ class Server:
     def __init__(self, node_id: int, objects: Objects, send: Callable[[int, bytes], None]) -> None:
         self.frozen = False
         self.fail: dict[Address, int | None] = {}
+        self.fail_write: dict[Address, int | None] = {}
         self.fail_nth: dict[int, int | None] = {}
         self.garble: Garble | None = None
         self.requests = 0
@@ -82,10 +84,13 @@ class Server:
 
     def _fault(self, control: int) -> int | None:
         """Abort code or _SILENCE; None to answer as usual."""
+        address = (self._server._index, self._server._subindex)
         if self.requests in self.fail_nth:
             code = self.fail_nth[self.requests]
-        elif control in _NAMES_OBJECT and (self._server._index, self._server._subindex) in self.fail:
-            code = self.fail[self._server._index, self._server._subindex]
+        elif control in _NAMES_OBJECT and address in self.fail:
+            code = self.fail[address]
+        elif control == sdo.REQUEST_DOWNLOAD and address in self.fail_write:
+            code = self.fail_write[address]
         else:
             return None
         return _SILENCE if code is None else code
