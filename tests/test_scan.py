@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import random
 import re
 import threading
 import time
@@ -18,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import cli, config, scan, shipped
+from handtouch.canbus import survey
 from handtouch.canbus.device import DeviceBus
 from handtouch.canbus.survey import NodeFacts, TpdoFacts, four_channels
 from handtouch.canbus.traffic import Traffic, meaning
@@ -279,6 +281,86 @@ def test_several_buses_are_looked_at_together() -> None:
     finally:
         for wire in wires:
             wire.close()
+
+
+def test_two_tpdos_with_one_identifier_are_told(wire: Wire) -> None:
+    started(wire, 2)
+    for data in ([0x23, 0x01, 0x18, 0x01, 0x91, 0x02, 0, 0x80], [0x23, 0x01, 0x18, 0x01, 0x91, 0x02, 0, 0]):
+        wire.ear.send(can.Message(arbitration_id=0x612, data=data, is_extended_id=False))
+    (report,) = look_at([wire.bus], QUICK)
+    assert report.problems == ["can0: identifier 0x291 is used by TPDO2 of node 17 and TPDO2 of node 18"]
+
+
+def test_reboots_and_emergencies_are_told(wire: Wire) -> None:
+    nodes = started(wire, 1)
+
+    def suffer(over: threading.Event) -> None:
+        while not over.wait(0.02):
+            nodes.devices[0x11].reboot()
+            nodes.devices[0x11].emergency(0x3100, 1)
+
+    end = on_thread(suffer)
+    try:
+        (report,) = look_at([wire.bus], Request(listen_only=True, seconds=0.2))
+    finally:
+        end()
+    (verdict,) = judge(None, [report])
+    assert re.search(r"booted \d+ times; EMCY 0x3100 mains voltage", verdict.remark)
+
+
+# Nodes that misbehave
+
+
+def answering(wire: Wire, node_id: int, answer: Callable[[bytes], bytes | None]) -> Callable[[], None]:
+    """A node whose SDO server does as `answer` says."""
+    bus = wire.open()
+
+    def serve(over: threading.Event) -> None:
+        while not over.is_set():
+            request = bus.recv(0.05)
+            data = (
+                answer(bytes(request.data)) if request and request.arbitration_id == 0x600 + node_id else None
+            )
+            if data is not None:
+                bus.send(can.Message(arbitration_id=0x580 + node_id, data=data, is_extended_id=False))
+
+    return on_thread(serve)
+
+
+def test_a_transfer_that_never_ends_does_not_hold_the_scan_up(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(survey, "READ_S", 0.5)
+
+    def endless(request: bytes) -> bytes | None:
+        if request[0] == 0x40:
+            return bytes((0x40,)) + request[1:4] + bytes(4)
+        return bytes((request[0] & 0x10,)) + b"for ever"[:7] if request[0] & 0xE0 == 0x60 else None
+
+    end = answering(wire, 9, endless)
+    try:
+        (report,) = look_at([wire.bus], QUICK)
+    finally:
+        end()
+    (node,) = report.nodes
+    assert "no answer" in node.trouble
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_a_node_answers_the_scan_ends_and_tells_what_it_could_read(wire: Wire, seed: int) -> None:
+    chance = random.Random(seed)
+
+    def babble(request: bytes) -> bytes | None:
+        command = chance.choice((0x40, 0x41, 0x43, 0x4F, 0x00, 0x01, 0x10, 0x80, chance.getrandbits(8)))
+        return bytes((command,)) + request[1:4] + chance.randbytes(chance.choice((0, 4, 4, 4)))
+
+    end = answering(wire, 9, babble)
+    try:
+        reports = look_at([wire.bus], QUICK)
+    finally:
+        end()
+    assert len(judge(None, reports)) == len(reports[0].nodes) <= 1
+    assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.05"]) == 1  # nobody there any more
 
 
 # Nodes without an id

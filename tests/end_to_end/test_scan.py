@@ -1,4 +1,4 @@
-"""`handtouch scan` as a process of its own: on a bus with the nodes of a whole hand, and beside the daemon."""
+"""`handtouch scan` as a process: on a bus with the nodes of a whole hand, and beside the daemon."""
 
 from __future__ import annotations
 

@@ -23,6 +23,8 @@ from .traffic import NMT_STATES, Traffic
 
 ANSWER_WAIT_S = 0.2
 """A node that is asked for an object answers within this."""
+READ_S = 30.0
+"""All that nodes tell is read within this, on the slowest bus."""
 
 _ANSWER, _REQUEST = 0x580, 0x600
 _DEVICE_TYPE, _IDENTITY, _HEARTBEAT, _INPUTS = 0x1000, 0x1018, 0x1017, 0x6401
@@ -52,9 +54,9 @@ class TpdoFacts:
 class NodeFacts:
     """What a node tells of itself; None where it hasn't got the object.
 
-    `state` is the NMT state of its heartbeat, empty where none was heard; `conflict` tells two nodes with one
-    id, `trouble` why it couldn't be read, both in words and empty when all is well. `inputs` is the number of
-    analogue inputs (0x6401 sub 0).
+    `state` is the NMT state of its heartbeat, empty where none was heard; `boots` its boot-up messages;
+    `emergency` its latest EMCY message, `conflict` that two nodes have this id, `trouble` why it couldn't be
+    read, all in words and empty when all is well. `inputs` is the number of analogue inputs (0x6401 sub 0).
     """
 
     node_id: int
@@ -71,6 +73,8 @@ class NodeFacts:
     heartbeat_ms: int | None = None
     tpdos: tuple[TpdoFacts, ...] = ()
     inputs: int | None = None
+    boots: int = 0
+    emergency: str = ""
     conflict: str = ""
     trouble: str = ""
 
@@ -124,8 +128,11 @@ class Survey:
         self._readers = {node_id: Sdo(node_id, self._send) for node_id in ids}
         with ThreadPoolExecutor(len(ids), "sdo") as pool:
             jobs = [pool.submit(_read_node, node_id, sdo) for node_id, sdo in self._readers.items()]
+            end_ns = self._clock() + round(READ_S * 1e9)
             while not self.listen(0.1, lambda: all(job.done() for job in jobs)):
                 told(sum(job.done() for job in jobs))
+                if self._clock() > end_ns:
+                    self._readers = {}  # a transfer that never ends is cut off here, and times out
         self.listen(0.01)  # for a second node's answer to the last request
         self._readers = {}
         return [self._complete(job.result()) for job in jobs]
@@ -173,7 +180,13 @@ class Survey:
         assert isinstance(node_id, int)
         state = self.traffic.states.get(node_id)
         name = "" if state is None else _state_name(state)
-        return NodeFacts(**facts, state=name, conflict=self._conflict(node_id))  # type: ignore[arg-type]
+        return NodeFacts(
+            **facts,  # type: ignore[arg-type]
+            state=name,
+            boots=self.traffic.boots.get(node_id, 0),
+            emergency=self.traffic.emergencies.get(node_id, ""),
+            conflict=self._conflict(node_id),
+        )
 
     def _conflict(self, node_id: int) -> str:
         """Two nodes with this id give themselves away by two answers to what is constant in a node."""
@@ -263,7 +276,13 @@ def _tpdos(sdo: Sdo) -> Iterator[TpdoFacts]:
 
 
 def _number(sdo: Sdo, index: int, sub: int) -> int | None:
-    """Value of an unsigned object, None if the node refuses to tell it. Raises StepError if it is silent."""
+    """As `_value`, 32 bits of it."""
+    value = _value(sdo, index, sub)
+    return None if value is None else value & 0xFFFFFFFF
+
+
+def _value(sdo: Sdo, index: int, sub: int) -> int | None:
+    """An object of any length, None if the node refuses to tell it. Raises StepError if it is silent."""
     try:
         return sdo.read(index, sub, "an object")
     except StepError as error:
@@ -274,6 +293,6 @@ def _number(sdo: Sdo, index: int, sub: int) -> int | None:
 
 def _text(sdo: Sdo, index: int) -> str:
     """A string object, printable; empty if the node hasn't got it. Raises StepError if it is silent."""
-    value = _number(sdo, index, 0) or 0
+    value = _value(sdo, index, 0) or 0
     data = value.to_bytes((value.bit_length() + 7) // 8, "little")
     return "".join(c if c.isprintable() else " " for c in data.decode("utf-8", "replace")).strip()[:80]

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .emergency import decode
+
 NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
 
 _FIXED = {0x000: "NMT command", 0x080: "SYNC", 0x100: "TIME", 0x7E4: "LSS answer", 0x7E5: "LSS request"}
@@ -46,13 +48,14 @@ class Traffic:
     """Takes every frame; only those of 11-bit identifiers come here.
 
     `streams` : identifier -> its frames; `states` : node id -> NMT state that its latest heartbeat told;
-    `boots` : node id -> boot-up messages
+    `boots` : node id -> boot-up messages; `emergencies` : node id -> its latest EMCY message in words
     """
 
     def __init__(self) -> None:
         self.streams: dict[int, Stream] = {}
         self.states: dict[int, int] = {}
         self.boots: dict[int, int] = {}
+        self.emergencies: dict[int, str] = {}
 
     def handle(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Take a frame."""
@@ -67,6 +70,8 @@ class Traffic:
             self.states[can_id - 0x700] = state
             if data[0] == 0:
                 self.boots[can_id - 0x700] = self.boots.get(can_id - 0x700, 0) + 1
+        elif 0x80 < can_id < 0x100 and (emergency := decode(data, t_ns)) is not None:
+            self.emergencies[can_id - 0x80] = emergency.text
 
     def nodes(self) -> set[int]:
         """Ids of which something came that only the node itself sends, by the predefined connection set."""

@@ -53,7 +53,7 @@ def _judge_bus(
             owner = names_by_serial(deployment).get(node.serial or 0)
             remark = f"serial {node.serial} belongs to {owner}" if owner else ""
             remark = remark or ("not in the deployment" if deployment else "")
-            yield Verdict(bus, node_id, "", "", "; ".join(filter(None, (remark, node.trouble))))
+            yield Verdict(bus, node_id, "", "", "; ".join(filter(None, (remark, node.trouble, _life(node)))))
             continue
         elif not node.answers:
             wrong = "heard, but its SDO server doesn't answer" if "ask" in report.took_s else ""
@@ -62,7 +62,13 @@ def _judge_bus(
         elsewhere = serials.get(pad.serial) if pad and pad.serial else None
         if wrong and pad and elsewhere and (node is None or node.serial != pad.serial):
             wrong += f"; serial {pad.serial} is that of {elsewhere}"
-        yield Verdict(bus, node_id, name, wrong)
+        yield Verdict(bus, node_id, name, wrong, _life(node) if node else "")
+
+
+def _life(node: NodeFacts) -> str:
+    """What a node told by itself."""
+    booted = f"booted {node.boots} times" if node.boots > 1 else ""
+    return "; ".join(filter(None, (booted, node.emergency and f"EMCY {node.emergency}")))
 
 
 def names_by_serial(deployment: config.Deployment | None) -> dict[int, str]:

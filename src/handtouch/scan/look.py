@@ -96,6 +96,7 @@ def look(
                 _name_nodes(survey, report, request, deployment, progress)
     report.nodes += [survey.silent(node_id) for node_id in sorted(survey.traffic.nodes() - _ids(report))]
     report.nodes.sort(key=lambda node: node.node_id)
+    report.problems += _clashes(report)
     counters = port.counters
     report.others, report.error_frames = counters.foreign, counters.errors
     if port.problem:
@@ -107,6 +108,18 @@ def look(
             + ("" if request.lss or silent else " Nodes without an id are found with --lss")
         )
     return report
+
+
+def _clashes(report: BusReport) -> Iterator[str]:
+    """Identifiers that TPDOs of several nodes have: their frames would destroy one another."""
+    users: dict[int, list[str]] = {}
+    for node in report.nodes:
+        for tpdo in node.tpdos:
+            if tpdo.enabled and tpdo.cob_id is not None:
+                users.setdefault(tpdo.cob_id, []).append(f"TPDO{tpdo.number} of node {node.node_id}")
+    for cob_id, names in users.items():
+        if len(names) > 1:
+            yield f"{report.bus.name}: identifier 0x{cob_id:X} is used by {' and '.join(names)}"
 
 
 def _listen(survey: Survey, seconds: float, report: BusReport) -> None:

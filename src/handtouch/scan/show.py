@@ -112,10 +112,11 @@ def _cells(node: NodeFacts, verdict: Verdict | None, asked: bool) -> Iterator[Te
     yield Text(node.name)
     yield Text(_channels(node) if node.answers else "no SDO answer" if asked else "not asked")
     yield Text(verdict.pad if verdict else "")
-    if verdict and verdict.wrong:
-        yield Text(verdict.wrong, "red")
-    else:
-        yield Text(verdict.remark if verdict else "")
+    yield (
+        Text.assemble((verdict.wrong, "red"), " " * bool(verdict.wrong), verdict.remark)
+        if verdict
+        else Text()
+    )
 
 
 def _channels(node: NodeFacts) -> str:
