@@ -5,12 +5,14 @@ These block until the node answers, so they run in a worker thread of the master
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
 from .channels import Object
-from .mapping import COMMUNICATION, NOT_VALID, Mapping, Tpdo
+from .mapping import COMMUNICATION, Mapping, Tpdo
 from .sdo import Sdo, StepError
 
 SYNCHRONOUS = 1
@@ -82,6 +84,8 @@ class Configured:
     """it has no heartbeat and has to be asked for its state"""
     may_idle: bool
     """it can be made event-driven"""
+    refusal: str = ""
+    """why not, though it should"""
 
 
 def identify(sdo: Sdo, expected: Expected) -> Identity:
@@ -120,13 +124,18 @@ def configure(sdo: Sdo, mapping: Mapping, wanted: Settings, halt: Callable[[], N
         if tpdo.transmission != SYNCHRONOUS:
             _set_transmission(sdo, tpdo, SYNCHRONOUS)
         if not tpdo.enabled:
-            name = f"identifier of TPDO{tpdo.number}"
-            sdo.set(COMMUNICATION + tpdo.number - 1, 1, tpdo.cob_id, 4, name)
+            sdo.set(COMMUNICATION + tpdo.number - 1, 1, tpdo.on, 4, _identifier(tpdo))
     may_idle = wanted.idle is not None and len(mapping.tpdos) == 1  # several would come one by one
+    refusal = ""
     if wanted.idle is not None and may_idle:
-        prepare_idle(sdo, mapping.tpdos[0], wanted.idle, halt)
+        try:
+            prepare_idle(sdo, mapping.tpdos[0], wanted.idle, halt)
+        except StepError as error:  # it does without
+            if error.silent:
+                raise
+            may_idle, refusal = False, str(error)
     excite(sdo, wanted.excitation, True)
-    return Configured(_supervise(sdo, wanted.heartbeat_ms), may_idle)
+    return Configured(_supervise(sdo, wanted.heartbeat_ms), may_idle, refusal)
 
 
 def prepare_idle(sdo: Sdo, tpdo: Tpdo, idle: Idle, halt: Callable[[], None]) -> None:
@@ -140,10 +149,9 @@ def prepare_idle(sdo: Sdo, tpdo: Tpdo, idle: Idle, halt: Callable[[], None]) -> 
     ]
     if changes:  # CiA 301: not while the PDO is valid
         halt()
-        sdo.write(index, 1, NOT_VALID | tpdo.cob_id, 4, f"identifier of TPDO{tpdo.number}")
-        for sub, value, what in changes:
-            sdo.write(index, sub, value, 2, what)
-        sdo.write(index, 1, tpdo.cob_id, 4, f"identifier of TPDO{tpdo.number}")
+        with _switched_off(sdo, tpdo):
+            for sub, value, what in changes:
+                sdo.write(index, sub, value, 2, what)
     for delta in idle.deltas:
         sdo.set(delta.index, delta.sub, idle.delta_counts, delta.size, "delta of a channel")
     if idle.enable is not None:
@@ -155,6 +163,11 @@ def set_pace(sdo: Sdo, tpdo: Tpdo, idle: bool) -> None:
     _set_transmission(sdo, tpdo, EVENT_DRIVEN if idle else SYNCHRONOUS)
 
 
+def synchronous_request(tpdo: Tpdo) -> bytes:
+    """The SDO request by which `set_pace` makes a TPDO synchronous: an expedited download of one byte."""
+    return struct.pack("<BHBB3x", 0x2F, COMMUNICATION + tpdo.number - 1, 2, SYNCHRONOUS)
+
+
 def excite(sdo: Sdo, excitation: Object | None, on: bool) -> None:
     """Switch the potential of a pad on or off, where the node can."""
     if excitation is not None:
@@ -164,15 +177,32 @@ def excite(sdo: Sdo, excitation: Object | None, on: bool) -> None:
 def _set_transmission(sdo: Sdo, tpdo: Tpdo, kind: int) -> None:
     """Some nodes let it be changed only while the PDO is off."""
     index = COMMUNICATION + tpdo.number - 1
-    what, identifier = f"transmission type of TPDO{tpdo.number}", f"identifier of TPDO{tpdo.number}"
+    what = f"transmission type of TPDO{tpdo.number}"
     try:
         sdo.write(index, 2, kind, 1, what)
     except StepError as error:
         if error.silent or not tpdo.enabled:
             raise
-        sdo.write(index, 1, NOT_VALID | tpdo.cob_id, 4, identifier)
-        sdo.write(index, 2, kind, 1, what)
-        sdo.write(index, 1, tpdo.cob_id, 4, identifier)
+        with _switched_off(sdo, tpdo):
+            sdo.write(index, 2, kind, 1, what)
+
+
+@contextmanager
+def _switched_off(sdo: Sdo, tpdo: Tpdo) -> Iterator[None]:
+    """A TPDO isn't sent meanwhile; it is again afterwards, also if what was tried is refused."""
+    index = COMMUNICATION + tpdo.number - 1
+    sdo.write(index, 1, tpdo.off, 4, _identifier(tpdo))
+    try:
+        yield
+    except StepError as error:
+        if not error.silent:
+            sdo.write(index, 1, tpdo.on, 4, _identifier(tpdo))
+        raise
+    sdo.write(index, 1, tpdo.on, 4, _identifier(tpdo))
+
+
+def _identifier(tpdo: Tpdo) -> str:
+    return f"identifier of TPDO{tpdo.number}"
 
 
 def _supervise(sdo: Sdo, period_ms: int) -> bool:

@@ -59,6 +59,9 @@ _TWICE = 1.6  # times as many
 _WORKERS = 32
 _EVENTS_KEPT = 1024
 _NEVER_NS = 1 << 62
+_HASTE_NS = 30_000_000
+"""How long an answer to a request of the receiving thread's own is waited for."""
+_SDO_WRITTEN = 0x60
 
 _NMT, _SYNC, _TIME, _LSS_ANSWER, _LSS_REQUEST = 0x000, 0x080, 0x100, 0x7E4, 0x7E5
 _EMCY, _SDO_ANSWER, _SDO_REQUEST, _HEARTBEAT = 0x080, 0x580, 0x600, 0x700
@@ -95,6 +98,8 @@ class _Node:
     may_idle: bool = False  # it could be made event-driven
     idle: bool = False  # it is
     pacing: bool = False  # a change of that is under way
+    asked_ns: int = 0  # when the receiving thread itself asked for it, 0 if it hasn't
+    request: bytes = b""  # and how
     paced_ns: int = 0  # since when it is so
     watched: tuple[int, int] = (0, 0)  # since when, and how many heartbeats had come then
     emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
@@ -196,13 +201,24 @@ class Master:
         if node.life.resting != resting:
             self._advance(node, Rest(resting), t_ns)
 
-    def pace(self, slot: int, idle: bool) -> None:
-        """Make an operational node event-driven (`idle`), where it can be, or synchronous again."""
+    def pace(self, slot: int, idle: bool, t_ns: int) -> None:
+        """Make an operational node event-driven (`idle`), where it can be, or synchronous again.
+
+        Back to synchronous is asked for at once, before the next SYNC; ask again until `idle` tells that it
+        is so. Whatever else has to be said to the node is said by a worker.
+        """
         node = self._by_slot[slot]
-        if node.idle == idle or node.pacing or not self.can_idle(slot) or self._workers is None:
+        if self._workers is None or node.idle == idle or not self.can_idle(slot):
             return
-        node.pacing = True
-        self._workers.submit(self._work, node, Action.PACE, node.life.attempt, idle)
+        unanswered = node.asked_ns and t_ns - node.asked_ns > _HASTE_NS
+        if node.pacing and not unanswered:
+            return
+        node.pacing, node.asked_ns = True, 0
+        if idle or unanswered or node.working.locked() or node.mapping is None:
+            self._workers.submit(self._work, node, Action.PACE, node.life.attempt, idle)
+            return
+        node.asked_ns, node.request = t_ns, boot.synchronous_request(node.mapping.tpdos[0])
+        node.port.send(_SDO_REQUEST + node.spec.node_id, node.request)
 
     def can_idle(self, slot: int) -> bool:
         """Whether the node can be made event-driven: configured so, operational, and it hasn't refused."""
@@ -240,6 +256,8 @@ class Master:
         elif node.sdo.waiting:
             node.sdo.deliver(data)
         else:
+            if node.asked_ns and data[0] == _SDO_WRITTEN and data[1:4] == node.request[1:4]:
+                self._set_pace(node, False, t_ns)
             self._advance(node, Answer(), t_ns)
 
     def _heartbeat(self, node: _Node, nmt: int, t_ns: int) -> None:
@@ -380,12 +398,14 @@ class Master:
         if isinstance(result, boot.Paced):
             self._set_pace(node, result.idle, t_ns)
         elif isinstance(outcome, Failed):
-            node.may_idle = False  # until it boots again
-            self._tell(node, node.life.state, f"stays as it is between samples: {outcome.reason}", t_ns)
+            # one that refuses to be event-driven isn't asked again until it boots
+            node.may_idle = node.idle or outcome.silent
+            kind = "event-driven" if node.idle else "synchronous"
+            self._tell(node, node.life.state, f"stays {kind}: {outcome.reason}", t_ns)
 
     def _set_pace(self, node: _Node, idle: bool, t_ns: int) -> None:
         slot, spec = node.spec.slot, node.spec
-        node.idle, node.pacing = idle, False
+        node.idle, node.pacing, node.asked_ns = idle, False, 0
         period_ns = spec.idle.period_ms * 1_000_000 if idle and spec.idle else 0
         self.period_ns[slot] = max(period_ns, self._sync_period_ns)
         self.paced_ns[slot] = t_ns

@@ -1,4 +1,4 @@
-"""What a scene doesn't need, nodes and buses don't do: pads outside it rest, untouched ones send when touched.
+"""What a scene doesn't need isn't done: pads outside it rest, untouched ones send when something moves.
 
 Public names: `Pacer`, `select`.
 """
@@ -93,7 +93,7 @@ class Pacer:
             self._active_ns[active] = now_ns
             np.copyto(self._quiet, tick.counts, where=active[:, None])
             for slot in np.flatnonzero(active & ~tick.synchronous).tolist():
-                self._master.pace(slot, False)
+                self._master.pace(slot, False, now_ns)
             if self.slow:
                 self._set_slow(False, now_ns)
 
@@ -106,7 +106,9 @@ class Pacer:
         untouched = now_ns - self._active_ns > self._idle_after_ns
         for slot in np.flatnonzero(self.needed & untouched & tick.synchronous).tolist():
             self._quiet[slot] = tick.counts[slot]
-            master.pace(slot, True)
+            master.pace(slot, True, now_ns)
+        for slot in np.flatnonzero(self.needed & ~untouched & ~tick.synchronous).tolist():
+            master.pace(slot, False, now_ns)
         up = self.needed & (master.states == NodeState.OPERATIONAL)
         self._set_slow(bool(up.any()) and not (tick.synchronous & up).any(), now_ns)
 
