@@ -7,11 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import can
+import canopen
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from handtouch.canbus import eds
 from handtouch.canbus.device import DeviceBus
 
 FOUR = tuple((0x2001, sub) for sub in (1, 2, 3, 4))
@@ -206,6 +209,35 @@ def test_an_eds_without_pdo_is_told(bench: Any, write_eds: Callable[..., Path]) 
     path = write_eds([(0x2001, sub, 16, True) for sub in (1, 2, 3, 4)], [])
     with pytest.raises(ValueError, match="no TPDO"):
         bench.bus.add(1, eds=path, channels=FOUR)
+
+
+def test_the_librarys_own_master_maps_and_receives(write_eds: Callable[..., Path]) -> None:
+    kinds = [(0x2001, sub, bits, True) for sub, bits in enumerate((16, 24, 16, 8), 1)]
+    path = write_eds(kinds, [[(0x2001, 1, 16)]])
+    with can.Bus("maps", interface="virtual") as side, can.Bus("maps", interface="virtual") as other:
+        nodes = DeviceBus(side, lambda _: np.array([[-1, 70000, 3, -4]]))
+        nodes.add(2, eds=path, channels=FOUR)
+        network = canopen.Network(other)
+        network.connect()
+        try:
+            remote = network.add_node(2, eds.load(path, 2))
+            nodes.start()
+            tpdo = remote.tpdo[1]
+            tpdo.read()
+            tpdo.clear()
+            for sub in (4, 2, 1, 3):
+                tpdo.add_variable(0x2001, sub)
+            tpdo.save()
+            remote.nmt.state = "OPERATIONAL"
+            for _ in range(50):
+                network.sync.transmit()
+                if tpdo.wait_for_reception(0.1) is not None:
+                    break
+            assert [variable.raw for variable in tpdo] == [-4, 70000, -1, 3]
+        finally:
+            nodes.stop()
+            network.notifier.stop()
+    assert nodes.bus_errors == nodes.rejected == 0
 
 
 def test_what_the_node_keeps_outlasts_its_power(bench: Any) -> None:

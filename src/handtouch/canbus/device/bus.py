@@ -68,6 +68,7 @@ class DeviceBus:
         self._agenda = Agenda()
         self._look_ns = 0  # when event-driven nodes sample next
         self._counts: NDArray[np.signedinteger[Any]] = np.zeros((0, CHANNELS), np.int64)
+        self._listed: list[list[int]] | None = None  # the same, once somebody asks
         self._changed = True
         self._usual: list[tuple[can.Message, int]] = []  # four int16 at every SYNC, and where these begin
         self._on_sync: list[tuple[Device, Tpdo]] = []
@@ -223,8 +224,9 @@ class DeviceBus:
 
     def electrodes(self, row: int) -> list[int]:
         """Counts of a row at the latest sample, 0 before the first."""
-        counts: list[int] = self._counts[row].tolist() if row < len(self._counts) else [0] * CHANNELS
-        return counts
+        if self._listed is None:
+            self._listed = self._counts.tolist()
+        return self._listed[row] if row < len(self._listed) else [0] * CHANNELS
 
     def transmit(self, message: can.Message) -> None:
         """Send; a bus that doesn't take it costs the frame and nothing else, as on a real node."""
@@ -288,7 +290,7 @@ class DeviceBus:
                 self._changed = True
 
     def _measure(self, t_ns: int) -> None:
-        self._counts = self._sample(t_ns)
+        self._counts, self._listed = self._sample(t_ns), None
         self.number += 1
         self._look_ns = t_ns + self._sample_period_ns
 

@@ -34,12 +34,17 @@ def read(
     """
     values = [0] * CHANNELS
     if excited:
-        values = [
-            round(noise.gauss(0.0, _NOISE_COUNTS)) if electrode in dead else electrodes[electrode]
-            for electrode in wired
-        ]
+        values = [electrodes[electrode] for electrode in wired]
+        if dead:
+            values = [
+                round(noise.gauss(0.0, _NOISE_COUNTS)) if electrode in dead else value
+                for electrode, value in zip(wired, values, strict=True)
+            ]
         if settled < SETTLE_SAMPLES:
             values = [v + (high >> 3 + settled) for v, (_, high) in zip(values, limits, strict=True)]
     if held:
         values = [held.get(channel, value) for channel, value in enumerate(values)]
-    return [min(max(v, low), high) for v, (low, high) in zip(values, limits, strict=True)]
+    return [
+        v if low <= v <= high else min(max(v, low), high)
+        for v, (low, high) in zip(values, limits, strict=True)
+    ]

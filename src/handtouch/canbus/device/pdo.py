@@ -174,12 +174,10 @@ class Tpdo:
 
     def _moved(self, counts: Sequence[int]) -> bool:
         """Whether a channel in it is further from what was sent last than its delta."""
-        last = self._last
-        return (
-            last is not None
-            and self._reports
-            and any(abs(counts[c] - last[c]) > self._deltas[c] for c, _, _ in self._counts)
-        )
+        last, deltas = self._last, self._deltas
+        if last is None or not self._reports:
+            return False
+        return any(abs(counts[c] - last[c]) > deltas[c] for c, _, _ in self._counts)
 
     def _fill(self, t_ns: int) -> can.Message:
         counts = self._sample()
