@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,14 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class Changes:
+class Changes(NamedTuple):
     """What one step changed: pads whose contact began, and pads whose contact ended."""
 
     began: IntArray
     ended: IntArray
+
+
+_NOTHING = Changes(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp))
 
 
 class Contacts:
@@ -35,6 +37,7 @@ class Contacts:
         self._need = np.stack([begin_samples, end_samples])
         self._against = np.zeros(n, dtype=np.int64)  # samples in a row that contradict `touching`
         self._first_ns = np.zeros(n, dtype=np.int64)
+        self._unsettled = False  # whether any of them is not 0
         self._next_id = 1
 
     def step(
@@ -51,12 +54,15 @@ class Contacts:
         A contact on a pad that is no longer trusted ends at once; a pad without a sample is left as it is.
         """
         against = sampled & trusted & np.where(self.touching, below_off, above_on)
+        lost = self.touching & ~trusted
+        if not (self._unsettled or np.count_nonzero(against) or np.count_nonzero(lost)):
+            return _NOTHING
         np.copyto(self._first_ns, sample_ns, where=against & (self._against == 0))
         self._against[against] += 1
         self._against[~against & (sampled | ~trusted)] = 0
         flips = against & (self._against >= np.where(self.touching, self._need[1], self._need[0]))
         began = np.flatnonzero(flips & ~self.touching)
-        ended = np.flatnonzero((flips | ~trusted) & self.touching)
+        ended = np.flatnonzero(flips & self.touching | lost)
         if len(began):
             self.touching[began] = True
             self.id[began] = np.arange(self._next_id, self._next_id + len(began))
@@ -67,6 +73,7 @@ class Contacts:
         if len(ended):
             self.touching[ended] = False
             self._against[ended] = 0
+        self._unsettled = bool(self._against.any())
         return Changes(began, ended)
 
     def forget(self, ended: IntArray) -> None:

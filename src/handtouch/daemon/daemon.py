@@ -131,6 +131,7 @@ class Daemon:
 
     def _after_tick(self, alive: Callable[[], None]) -> None:
         """What may wait until the contacts are out."""
+        self.pipeline.settle()
         now_ns = time.monotonic_ns()
         self.master.poll(now_ns)
         self.pacer.step(now_ns)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.canbus.channels import ELECTRODES, Channels, channels_of, in_order
 from handtouch.config import Deployment
-from handtouch.field import LocatorBank, PointEstimate
+from handtouch.field import LocatorBank
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.strength import ContactLaw, Strength
-from handtouch.hand import Placed, Placement, mount_of, network_of, surface_of
+from handtouch.hand import Placement, mount_of, network_of, surface_of
 
 FloatArray = NDArray[np.float64]
 
@@ -71,17 +71,24 @@ class PadModel:
         self.on_a, self.off_a = (self._threshold(force, networks) for force in (self.on_n, self.off_n))
 
     def force(
-        self, index: NDArray[np.intp], currents: FloatArray, found: PointEstimate, placed: Placed
+        self,
+        index: NDArray[np.intp],
+        currents: FloatArray,
+        total_a: FloatArray,
+        total_std_a: FloatArray,
+        radius_m: FloatArray,
     ) -> Strength:
-        """Weigh contacts on the pads `index` (n,) by their currents (4, n) [A] at their places."""
-        radius_m = self.locator.conformal_radius(index, found.x, found.y) * placed.scale
+        """Weigh contacts on the pads `index` (n,) by their totals, with standard deviation, and place.
+
+        The place is told by currents (4, n), in any unit, and the spreading radius there.
+        """
         return self._law.take(index).force(
-            found.total,
+            total_a,
             self._drive_v[index],
             self._sheet_ohm[index],
             radius_m,
             self._resistors(index, currents),
-            current_std_a=np.sqrt(found.covariance[:, 2, 2]),
+            current_std_a=total_std_a,
         )
 
     def _resistors(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray | float:

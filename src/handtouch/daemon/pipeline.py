@@ -41,6 +41,7 @@ class Pipeline:
         """
         if not self.cycle.ticked:
             self._tick(now_ns, t_ns)
+        self.settle()
         self.slab.begin_cycle(t_ns)
         self.cycle.begin(t_ns)
         self._expected = self.tick.expected()
@@ -56,6 +57,10 @@ class Pipeline:
         """A cycle without SYNC, for samples that came because something moved."""
         self.begin(now_ns, now_ns)
         return self._tick(now_ns, _FOREVER_NS)
+
+    def settle(self) -> None:
+        """Do what makes the next tick quick and can wait until messages are out; `begin` does it at last."""
+        self.tick.settle()
 
     def end(self, now_ns: int) -> None:
         """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""

@@ -7,6 +7,7 @@ contacts. Pure but for the state it keeps; time is an argument.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ _SOURCE_STD, _SOURCE_PART = 10.0, 0.02
 _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
     int, (PadState.CLEAR, PadState.TOUCHED, PadState.STALE, PadState.FAULTED)
 )
+_FOREVER_NS = np.iinfo(np.int64).max
+_ALL_CHANNELS = np.ones(4)
 _LEAVING = 0.5
 """Of a map's trust: beyond it, it is drawn anew before the contact leaves it."""
 _NOTHING_READ = np.zeros(0, dtype=np.intp), np.zeros((0, 4)), np.zeros((0, VALUES)), np.zeros((0, 3))
@@ -87,8 +90,7 @@ class Columns:
         )
 
 
-@dataclass(frozen=True)
-class Ticked:
+class Ticked(NamedTuple):
     """What one tick changed: rows of the columns."""
 
     t_ns: int
@@ -119,6 +121,8 @@ class Tick:
         """pads that sample with SYNC; the others when something moves, and are not waited for"""
         self.follower = Follower(model)
         self._read = _NOTHING_READ  # contacts of the last step: pads, currents, values, how far from trusted
+        self._none = np.zeros(model.size, dtype=np.bool_)
+        self._least_counts = -_SOURCE_STD * model.noise_counts[:, None]
         self._currents = np.zeros((model.size, 4))
         self._taken_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the samples that were used
 
@@ -132,7 +136,7 @@ class Tick:
         node_state: NDArray[np.uint8],
         cycle: Cycle,
         now_ns: int,
-        until_ns: int = np.iinfo(np.int64).max,
+        until_ns: int = _FOREVER_NS,
     ) -> Ticked:
         """Take in the samples of a cycle, and those of the one before that came too late for its tick.
 
@@ -141,39 +145,63 @@ class Tick:
         """
         model, columns, contacts = self.model, self.columns, self.contacts
         operational: BoolArray = np.equal(node_state, _CLEAR)
-        here = slab.t_ns < until_ns
-        sampled: BoolArray = here & (slab.t_ns != self._taken_ns) & operational
-        np.copyto(self._taken_ns, slab.t_ns, where=here)
-        in_time = here & (slab.fresh != 0)
-        self.missed += self.expected() & operational & ~in_time
-        self.samples += sampled
-        sync_ns = np.where(in_time, cycle.t_ns, cycle.previous_ns)
-        np.copyto(columns.sample_ns, np.where(self.synchronous, sync_ns, slab.t_ns), where=sampled)
+        sampled = self._take_in(slab, operational, cycle, until_ns)
         self.counts = counts = slab.read()
-        absurd = self._absurd(counts, slab)
-        quiet_ns = now_ns - np.maximum(columns.sample_ns, self.paced_ns)
-        stale: BoolArray = quiet_ns > _STALE_PERIODS * self.period_ns
-        trusted: BoolArray = operational & ~absurd & ~stale
+        absurd, stale = self._absurd(counts, slab), self._stale(now_ns)
+        trusted = operational & ~(absurd | stale)
         np.multiply(counts, model.ampere_per_count, out=self._currents)
-        np.copyto(columns.current_a, self._currents.sum(axis=1), where=sampled)
+        np.copyto(columns.current_a, self._currents @ _ALL_CHANNELS, where=sampled)
         below_off = columns.current_a < model.off_a
-        above_on = columns.current_a > model.on_a
-        changes = contacts.step(sampled, above_on, below_off, trusted, columns.sample_ns)
+        changes = contacts.step(
+            sampled, columns.current_a > model.on_a, below_off, trusted, columns.sample_ns
+        )
         self._resolve_states(node_state, operational, absurd, stale)
-        # a sample below the threshold tells no place: until it is known whether more follow, the last holds
-        touched = contacts.touching & sampled & ~below_off
         if len(changes.began):
             columns.values[changes.began] = np.nan  # no use to start from where the last contact was
             self.follower.forget(changes.began)
-        if touched.any():
-            self._solve(np.flatnonzero(touched))
-            touched[changes.began] = False
-        return Ticked(cycle.t_ns, changes.began, np.flatnonzero(touched), changes.ended)
+        # a sample below the threshold tells no place: until it is known whether more follow, the last holds
+        solved = np.flatnonzero(contacts.touching & sampled & ~below_off)
+        if len(solved):
+            self._solve(solved)
+        updated = np.setdiff1d(solved, changes.began) if len(changes.began) else solved
+        return Ticked(cycle.t_ns, changes.began, updated, changes.ended)
+
+    # Details, for every tick: ufuncs of few elements cost what their calls cost, so what is rare is asked
+    # about first, by `count_nonzero`, the quickest of numpy's calls ----------------------------------------
+
+    def _take_in(self, slab: Slab, operational: BoolArray, cycle: Cycle, until_ns: int) -> BoolArray:
+        """Note which samples are new and when they were taken; the pads (n,) that have one."""
+        columns, size = self.columns, self.model.size
+        sampled: BoolArray = (slab.t_ns != self._taken_ns) & operational
+        in_time = slab.fresh.view(np.bool_)
+        if until_ns == _FOREVER_NS:
+            np.copyto(self._taken_ns, slab.t_ns)
+        else:
+            here = slab.t_ns < until_ns
+            sampled &= here
+            in_time = in_time & here
+            np.copyto(self._taken_ns, slab.t_ns, where=here)
+        self.samples += sampled
+        np.copyto(columns.sample_ns, cycle.t_ns, where=sampled)
+        if np.count_nonzero(in_time) < size:
+            self.missed += self.expected() & operational & ~in_time
+            np.copyto(columns.sample_ns, cycle.previous_ns, where=sampled & ~in_time)
+        if np.count_nonzero(self.synchronous) < size:
+            np.copyto(columns.sample_ns, slab.t_ns, where=sampled & ~self.synchronous)
+        return sampled
 
     def _absurd(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
         """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take."""
-        source = _SOURCE_STD * self.model.noise_counts + _SOURCE_PART * np.abs(counts).sum(axis=1)
-        return np.asarray(slab.railed(counts).any(axis=1) | (counts.min(axis=1) < -source))
+        railed, least = slab.railed(counts), self._least_counts
+        if not np.count_nonzero(railed) and not np.count_nonzero(counts < least):
+            return self._none
+        source = _SOURCE_PART * np.abs(counts).sum(axis=1) - least[:, 0]
+        return np.asarray(railed.any(axis=1) | (counts.min(axis=1) < -source))
+
+    def _stale(self, now_ns: int) -> BoolArray:
+        """Pads (n,) that have been quiet for too long."""
+        since_ns = np.maximum(self.columns.sample_ns, self.paced_ns)
+        return np.asarray(now_ns - since_ns > _STALE_PERIODS * self.period_ns)
 
     def _resolve_states(
         self,
@@ -184,9 +212,9 @@ class Tick:
     ) -> None:
         state = self.columns.state
         np.copyto(state, node_state)
-        state[operational & self.contacts.touching] = _TOUCHED
-        state[operational & absurd] = _FAULTED
-        state[operational & stale] = _STALE
+        np.copyto(state, _TOUCHED, where=operational & self.contacts.touching)
+        np.copyto(state, _FAULTED, where=operational & absurd)
+        np.copyto(state, _STALE, where=operational & stale)
 
     def _solve(self, touched: IntArray) -> None:
         """Locate, place and weigh the contacts on the pads `touched`."""
@@ -200,7 +228,7 @@ class Tick:
         peak[touched] = np.fmax(peak.take(touched), values[:, FORCE])
 
     def _solve_anew(self, pads: IntArray, currents: FloatArray, values: FloatArray, off: FloatArray) -> None:
-        """Put into `values` and `off` what holds of contacts whose maps no longer do."""
+        """Put into `values` and `off` what holds of contacts whose maps don't."""
         far = off.max(axis=1)
         near = np.flatnonzero((far > 1) & (far <= NEAR))
         if len(near):

@@ -16,6 +16,7 @@ from scipy.interpolate import make_interp_spline
 from handtouch.field.model import FloatArray, ForwardModel
 
 TERMS = 6  # coefficients of a quintic
+COLUMNS = 5  # four fractions and ln of the spreading radius
 RATIO_CELLS = 128  # of the table that gives a start
 RATIO_SPAN = 16.0  # it covers |ln(T0 / T1)| up to this
 MARGIN = 0.03  # of a side: from here inwards the error is promised
@@ -85,13 +86,12 @@ def start_table(model: ForwardModel, grid: Grid) -> FloatArray:
 class PadTable:
     """One model tabulated on a grid.
 
-    fractions: (cells^2, TERMS, 4 TERMS): by cell (y, x), power of y, power of x and channel. log_radius:
-    (cells^2, TERMS, TERMS). error: the largest of a fraction, measured between the nodes, from `MARGIN`
-    inwards; edge_error: the largest anywhere.
+    columns: (cells^2, TERMS, COLUMNS TERMS): by cell (y, x), power of y, power of x and column: the fraction
+    of each channel and ln of the spreading radius. error: the largest of a fraction, measured between the
+    nodes, from `MARGIN` inwards; edge_error: the largest anywhere.
     """
 
-    fractions: FloatArray
-    log_radius: FloatArray
+    columns: FloatArray
     starts: FloatArray
     error: float
     edge_error: float
@@ -100,16 +100,15 @@ class PadTable:
     def of(cls, model: ForwardModel, grid: Grid) -> PadTable:
         """Tabulate `model` and measure what that costs."""
         x, y = grid.points(model, np.arange(grid.cells + 1.0))
-        fractions = tabulate(np.moveaxis(model.fractions(x, y), 0, -1))
-        log_radius = tabulate(np.log(_spreading_radius(model, x, y))[..., None])
+        values = np.stack([*model.fractions(x, y), np.log(_spreading_radius(model, x, y))], axis=-1)
+        columns = tabulate(values)
         between = np.arange(0.5, grid.cells)
         halves = 0.5 ** np.arange(TERMS)
-        found = np.einsum("ijpqm,p,q->mij", fractions, halves, halves, optimize=True)
+        found = np.einsum("ijpqm,p,q->mij", columns[..., :4], halves, halves, optimize=True)
         error = np.abs(found - model.fractions(*grid.points(model, between))).max(axis=0)
         inside = np.abs(grid.place(between) - 0.5) <= 0.5 - MARGIN
         return cls(
-            fractions.reshape(-1, TERMS, TERMS * 4),
-            log_radius.reshape(-1, TERMS, TERMS),
+            columns.reshape(-1, TERMS, TERMS * COLUMNS),
             start_table(model, grid),
             float(error[np.ix_(inside, inside)].max()),
             float(error.max()),

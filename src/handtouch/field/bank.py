@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field._bank_table import GRIDS, RATIO_CELLS, RATIO_SPAN, TERMS, PadTable, log_ratios
+from handtouch.field._bank_table import COLUMNS, GRIDS, RATIO_CELLS, RATIO_SPAN, TERMS, PadTable, log_ratios
 from handtouch.field.estimate import CORNER, LOST, PointEstimate, best_direction
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
@@ -47,8 +47,7 @@ class LocatorBank:
         self._model = np.array([order[id(model)] for model in models], dtype=np.intp)
         self._grid = grid
         self._top = np.nextafter(float(grid.cells), 0)
-        self._fractions = np.ascontiguousarray(np.concatenate([table.fractions for table in tables]))
-        self._log_radius = np.ascontiguousarray(np.concatenate([table.log_radius for table in tables]))
+        self._table = np.ascontiguousarray(np.concatenate([table.columns for table in tables]))
         self._starts = np.stack([table.starts for table in tables]).reshape(-1)
         self._sides = np.array([(model.a, model.b) for model in distinct])[self._model]
         self._shortest = self._sides.min(axis=1) ** 2
@@ -60,7 +59,7 @@ class LocatorBank:
         index = np.asarray(index, dtype=np.intp)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
-            return np.ascontiguousarray(self._read(self._first_row(index), s)[:, 0].T)
+            return np.ascontiguousarray(self._read(self._first_row(index), s)[:, 0, :4].T)
 
     def conformal_radius(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the radius R (n,) that gives a contact of radius A the resistance sheet / 2 pi ln(R / A).
@@ -71,11 +70,20 @@ class LocatorBank:
         index = np.asarray(index, dtype=np.intp)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
-            basis, row = self._basis(self._first_row(index), s)
-            table = self._log_radius.take(row, axis=0, mode="clip")
-            powers = basis[:, :, 0]
-            along_x = np.matmul(powers[:, 1, None], table)[:, 0]
-            return np.asarray(np.exp((along_x * powers[:, 0]).sum(axis=1)))
+            return np.exp(self._read(self._first_row(index), s)[:, 0, 4])
+
+    def tangent(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> Tangent:
+        """Return value and slopes of all that is tabulated, at points (n,) of the pads `index` (n,)."""
+        index = np.asarray(index, dtype=np.intp)
+        with np.errstate(all="ignore"):
+            s = self._coordinates(index, np.stack([x, y], axis=-1))
+            rows = self._read(self._first_row(index), s)
+            side = self._grid.place(s)
+            point = self._sides.take(index, axis=0) * side
+            slopes = rows[:, 1:3] / self._grid.width
+            return Tangent(
+                point, point * (1 - side), rows[:, 0, :4], slopes[:, :, :4], rows[:, 0, 4], slopes[:, :, 4]
+            )
 
     def estimate(
         self, index: ArrayLike, currents: ArrayLike, noise: ArrayLike, start: ArrayLike | None = None
@@ -143,16 +151,16 @@ class LocatorBank:
         return basis, first_row + cell[:, 1] * self._grid.cells + cell[:, 0]
 
     def _read(self, first_row: IndexArray, s: FloatArray) -> FloatArray:
-        """Fractions, their slopes along x, along y and their cross slope by cell: (n, 4, channels)."""
+        """Columns, their slopes along x, along y and their cross slope by cell: (n, 4, COLUMNS)."""
         basis, row = self._basis(first_row, s)
-        table = self._fractions.take(row, axis=0, mode="clip")
-        by_y = np.matmul(basis[:, 1], table).reshape(-1, 2, TERMS, 4)
-        rows: FloatArray = np.matmul(basis[:, 0, None], by_y).reshape(-1, 4, 4)
+        table = self._table.take(row, axis=0, mode="clip")
+        by_y = np.matmul(basis[:, 1], table).reshape(-1, 2, TERMS, COLUMNS)
+        rows: FloatArray = np.matmul(basis[:, 0, None], by_y).reshape(-1, 4, COLUMNS)
         return rows
 
     def _linearise(self, of: _Readings, s: FloatArray) -> _Normal:
         """Whitened normal equations at s cells."""
-        rows = self._read(of.first_row, s)
+        rows = self._read(of.first_row, s)[:, :, :4]
         rows[:, 3] = of.data
         rows *= of.weight[:, None]
         gram = np.matmul(rows, rows.swapaxes(1, 2))
@@ -238,6 +246,23 @@ class LocatorBank:
         s = self._coordinates(of.pad, point)
         fraction = self._grid.place(s)
         return self._linearise(of, s), of.sides * fraction * (1 - fraction) * self._grid.width
+
+
+class Tangent(NamedTuple):
+    """The tables of n pads at a point of each, with slopes along x and y per `reach`.
+
+    point (n, 2): x and y, kept inside the tables. reach (n, 2): the length over which all varies, a quarter
+    of a side in the middle, the distance near an edge. fractions (n, 4), slopes (n, 2, 4). log_radius (n,),
+    radius_slopes (n, 2): of `conformal_radius`.
+    """
+
+    point: FloatArray
+    reach: FloatArray
+
+    fractions: FloatArray
+    slopes: FloatArray
+    log_radius: FloatArray
+    radius_slopes: FloatArray
 
 
 class _Readings(NamedTuple):

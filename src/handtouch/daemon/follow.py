@@ -1,0 +1,206 @@
+"""Follows contacts: what a contact's four currents say of it, straightened at its last solution.
+
+A solution is costly, and from one tick to the next a contact moves little. So every solution leaves behind
+a map, affine in the currents, to all that is told of a contact: a Gauss-Newton step from where the contact
+was, with placement and strength differentiated. While currents stay within the map's trust, a tick costs one
+small matrix product a contact, and is as accurate as a solution: nothing lags, as a place that is kept would.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.daemon.model import PadModel
+from handtouch.field.bank import Tangent
+from handtouch.field.estimate import covariance_of
+from handtouch.field.strength import Status
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+
+VALUES = 12
+"""xy (2), position (3), normal (3), arc lengths (2), residual and force of a contact, in this order."""
+XY, POSITION, NORMAL, PAD = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, 10)
+RESIDUAL, FORCE = 10, 11
+
+_TRUST = 3  # rows of a map before the values: how far off x, y and the total are, 1 at the end of trust
+_TERMS = 7  # four currents over the relative total v, 1, v and v^2
+_BEND = 0.3  # standard deviations that the bend of the model may add to a place where trust ends, at most
+_NOISE = 4.0  # standard deviations of a place that trust spans at least
+_VAGUE = 0.1  # of `reach`: a place less certain than this has no tangent worth the name
+_TOTAL = 0.05  # relative change of the total that a parabola of the force spans
+NEAR = 8.0  # ends of trust from which one Gauss-Newton step leads back into it
+_FORCE_BEND = 0.01  # of the force: where the parabola bends more, trust spans less
+_LEAST_INFORMATION = 1e-6  # of a place, per squared `reach`
+_VALID, _SATURATED = int(Status.VALID), int(Status.SATURATED)
+
+
+class Solved(NamedTuple):
+    """What a solution tells beside the values, and what holds as long as its map is trusted; k rows."""
+
+    covariance_m2: FloatArray
+    force_std_n: FloatArray
+    saturated: BoolArray
+    residual_std: FloatArray
+
+
+class Follower:
+    """Maps of the contacts of a hand, one for each pad of `model`."""
+
+    def __init__(self, model: PadModel) -> None:
+        self._model = model
+        self._maps = np.full((model.size, _TRUST + VALUES, _TERMS), np.nan)
+        self._per_total = np.full((model.size, 4), np.nan)
+
+    def forget(self, pads: IntArray) -> None:
+        """The contacts on these pads are new."""
+        self._maps[pads] = np.nan
+
+    def read(self, pads: IntArray, currents: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Values (k, VALUES) for currents (k, 4) of the pads (k,), and how far from trusted (k, 3): up to 1.
+
+        NaN where there is no map.
+        """
+        terms = np.empty((len(pads), _TERMS, 1))
+        total = np.matmul(self._per_total.take(pads, axis=0)[:, None], currents[:, :, None])[:, 0]
+        np.divide(currents, total, out=terms[:, :4, 0])
+        terms[:, 4] = 1.0
+        terms[:, 5] = total
+        np.multiply(total, total, out=terms[:, 6])
+        found = np.matmul(self._maps.take(pads, axis=0), terms)[:, :, 0]
+        return found[:, _TRUST:], np.abs(found[:, :_TRUST])
+
+    def solve(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> Solved:
+        """Find the contacts (k,) anew, beginning at xy (k, 2), NaN for new ones, and draw their maps."""
+        noise = self._model.noise_a[pads].T
+        found = self._model.locator.estimate(pads, currents.T, noise, xy.T)
+        return self.draw(pads, currents, np.stack([found.x, found.y], axis=1), solved=True)
+
+    @np.errstate(all="ignore")
+    def draw(self, pads: IntArray, currents: FloatArray, xy: FloatArray, solved: bool = False) -> Solved:
+        """Draw the maps (k,) at the places xy (k, 2): near the most likely ones, or there when `solved`."""
+        at = _Linear.of(self._model.locator.tangent(pads, *xy.T), currents, self._model.noise_a[pads])
+        spread = np.sqrt(np.diagonal(at.covariance, axis1=1, axis2=2)[:, :2])
+        vague = spread.max(axis=1)
+        trust = np.maximum(np.sqrt(_BEND * spread.min(axis=1)), _NOISE * vague)
+        firm = vague <= _VAGUE
+        if solved:  # where an edge or a corner holds the most likely place, it has no tangent
+            step = np.matmul(at.by_current, currents[:, :, None])[:, :, 0]
+            firm &= np.abs(step).max(axis=1) <= trust
+        at.by_current[~firm] = 0.0
+        width = np.where(firm, trust, _VAGUE)
+        maps = np.zeros((len(pads), _TRUST + VALUES, _TERMS))
+        values = maps[:, _TRUST:]
+        by_place, covariance_m2, scales = self._place(pads, at, width, values)
+        strength = self._weigh(pads, currents, at, width, scales, by_place, maps)
+        np.matmul(by_place, at.by_current, out=values[:, :, :4])
+        values[:, RESIDUAL, :2] += 1 / at.total[:, None]
+        maps[:, :2, :4] = at.by_current / np.where(firm, trust, np.nan)[:, None, None]
+        self._maps[pads] = maps
+        self._per_total[pads] = at.per_total
+        pair = currents[:, 0] + currents[:, 1]
+        by_current = values[:, RESIDUAL, :4] - (pair / at.total)[:, None] * at.per_total
+        residual_std = np.sqrt(((by_current * self._model.noise_a[pads]) ** 2).sum(axis=1))
+        return Solved(covariance_m2, *strength, residual_std)
+
+    # Details: each fills its rows of `values` and of `by_place`, their change per reach along x and y -------
+
+    def _place(
+        self, pads: IntArray, at: _Linear, width: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """`by_place` (k, VALUES, 2), the covariance (k, 3, 3), and scales (3, k) of the stencil."""
+        k, tangent = len(pads), at.tangent
+        points = np.repeat(tangent.point[None], 3, axis=0)  # the place, and a width along x and along y
+        points[1, :, 0] += width * tangent.reach[:, 0]
+        points[2, :, 1] += width * tangent.reach[:, 1]
+        covariance = at.covariance[:, :2, :2] * (tangent.reach[:, :, None] * tangent.reach[:, None])
+        placed = self._model.placement.place(
+            np.tile(pads, 3),
+            points[:, :, 0].ravel(),
+            points[:, :, 1].ravel(),
+            np.tile(covariance, (3, 1, 1)),
+        )
+        told = np.concatenate(
+            [points.reshape(-1, 2), placed.position_m, placed.normal, placed.pad_m], axis=1
+        ).reshape(3, k, -1)
+        by_place = np.zeros((k, VALUES, 2))
+        by_place[:, :RESIDUAL] = np.moveaxis(told[1:] - told[0], 0, 2) / width[:, None, None]
+        by_place[:, RESIDUAL] = -tangent.slopes[:, :, 0] - tangent.slopes[:, :, 1]
+        values[:, :RESIDUAL, 4] = told[0]
+        values[:, RESIDUAL, 4] = -tangent.fractions[:, 0] - tangent.fractions[:, 1]
+        return by_place, placed.covariance_m2[:k], placed.scale.reshape(3, k)
+
+    def _weigh(
+        self,
+        pads: IntArray,
+        currents: FloatArray,
+        at: _Linear,
+        width: FloatArray,
+        scales: FloatArray,
+        by_place: FloatArray,
+        maps: FloatArray,
+    ) -> tuple[FloatArray, BoolArray]:
+        """The force as a parabola of the total; its standard deviation, and whether it is saturated."""
+        tangent = at.tangent
+        log_radius = tangent.log_radius + np.log(scales)
+        log_radius[1:] += (width[:, None] * tangent.radius_slopes).T
+        fractions = np.repeat((currents / at.total[:, None])[None], 5, axis=0)
+        fractions[1:3] += np.moveaxis(width[:, None, None] * tangent.slopes, 1, 0)
+        strength = self._model.force(
+            np.tile(pads, 5),
+            fractions.reshape(-1, 4).T,
+            (np.array([1, 1, 1, 1 - _TOTAL, 1 + _TOTAL])[:, None] * at.total).ravel(),
+            np.tile(np.sqrt(at.covariance[:, 2, 2]), 5),
+            np.exp(log_radius[[0, 1, 2, 0, 0]]).ravel(),
+        )
+        force, status = strength.force_n.reshape(5, -1), strength.status.reshape(5, -1)
+        middle, along_x, along_y, less, more = np.where(
+            (status[0] == _VALID) | (status[0] == _SATURATED), force, np.nan
+        )
+        by_place[:, FORCE, 0], by_place[:, FORCE, 1] = (along_x - middle) / width, (along_y - middle) / width
+        linear, square = (more - less) / (2 * _TOTAL), ((more + less) / 2 - middle) / _TOTAL**2
+        value = maps[:, _TRUST + FORCE]
+        value[:, 4], value[:, 5], value[:, 6] = middle - linear + square, linear - 2 * square, square
+        alike = (status[3] == status[0]) & (status[4] == status[0])
+        bend = np.abs(square) * (_TOTAL**2 / _FORCE_BEND) / middle
+        maps[:, 2, 5] = np.where(alike, np.fmax(bend, 1.0) / _TOTAL, np.nan)
+        maps[:, 2, 4] = -maps[:, 2, 5]
+        return strength.std_n.reshape(5, -1)[0], status[0] == _SATURATED
+
+
+class _Linear(NamedTuple):
+    """Least squares about a place of each of k contacts; places are in `reach` from there.
+
+    covariance (k, 3, 3) of (x, y, total). by_current (k, 2, 4): of the place, at the present total.
+    total (k,): most likely; per_total (k, 4): what it changes by with each current, relative to itself.
+    """
+
+    tangent: Tangent
+    covariance: FloatArray
+    by_current: FloatArray
+    total: FloatArray
+    per_total: FloatArray
+
+    @classmethod
+    def of(cls, tangent: Tangent, currents: FloatArray, noise: FloatArray) -> _Linear:
+        weight = 1 / noise
+        fractions, data = tangent.fractions * weight, currents * weight
+        norm = (fractions * fractions).sum(axis=1)
+        total = (fractions * data).sum(axis=1) / norm
+        slopes = tangent.slopes * (weight * total[:, None])[:, None]
+        mixing = np.matmul(slopes, (fractions / norm[:, None])[:, :, None])
+        slopes -= mixing * fractions[:, None]
+        covariance = covariance_of(
+            np.moveaxis(slopes, 0, -1),
+            mixing[:, :, 0].T,
+            fractions.T,
+            np.full(len(total), _LEAST_INFORMATION),
+        )
+        by_current = np.matmul(covariance[:, :2, :2], slopes) * weight[:, None]
+        by_total = fractions * weight / norm[:, None] - (mixing * by_current).sum(axis=1)
+        total = (by_total * currents).sum(axis=1)
+        return cls(tangent, covariance, by_current, total, by_total / total[:, None])
