@@ -112,6 +112,12 @@ def bench() -> Bench:
     return Bench()
 
 
+@pytest.fixture(scope="session")
+def make_bench() -> type[Bench]:
+    """For tests that need several."""
+    return Bench
+
+
 def eds_text(
     channels: Sequence[tuple[int, int, int, bool]],
     pdos: Sequence[Sequence[tuple[int, int, int]]],
