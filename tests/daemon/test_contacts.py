@@ -13,16 +13,14 @@ ON, OFF = 2.0, 1.0
 
 
 def _contacts(pads: int = 1, begin: int = 2, end: int = 3) -> Contacts:
-    return Contacts(np.full(pads, begin), np.full(pads, end))
+    return Contacts(np.full(pads, ON), np.full(pads, OFF), np.full(pads, begin), np.full(pads, end))
 
 
 def _step(
     contacts: Contacts, level: float, t_ns: int = 0, sampled: bool = True, trusted: bool = True
 ) -> Changes:
     one = np.ones(1, dtype=np.bool_)
-    return contacts.step(
-        one & sampled, one & (level > ON), one & (level < OFF), one & trusted, np.array([t_ns])
-    )
+    return contacts.step(one * level, one & sampled, one & trusted, np.array([t_ns]))
 
 
 def test_a_contact_begins_after_the_debounce_and_is_dated_to_its_first_sample() -> None:

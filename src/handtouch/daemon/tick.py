@@ -106,7 +106,7 @@ class Tick:
     def __init__(self, model: PadModel, period_ns: int) -> None:
         self.model = model
         self.columns = Columns.of(model.size)
-        self.contacts = Contacts(model.begin_samples, model.end_samples)
+        self.contacts = Contacts(model.on_a, model.off_a, model.begin_samples, model.end_samples)
         self.counts: NDArray[np.int64] = np.zeros((model.size, 4), dtype=np.int64)
         """of the last tick"""
         self.samples = np.zeros(model.size, dtype=np.int64)
@@ -144,27 +144,22 @@ class Tick:
         `node_state` (n,): PadState.CLEAR where the node is up, else what its pad is instead.
         """
         model, columns, contacts = self.model, self.columns, self.contacts
-        operational: BoolArray = np.equal(node_state, _CLEAR)
+        operational = np.logical_not(node_state)  # CLEAR is 0
         sampled = self._take_in(slab, operational, cycle, until_ns)
         self.counts = counts = slab.read()
-        absurd, stale = self._absurd(counts, slab), self._stale(now_ns)
+        absurd, stale = self._absurd(counts, slab), self._stale(now_ns, sampled)
         trusted = operational & ~(absurd | stale)
         np.multiply(counts, model.ampere_per_count, out=self._currents)
         np.copyto(columns.current_a, self._currents @ _ALL_CHANNELS, where=sampled)
-        below_off = columns.current_a < model.off_a
-        changes = contacts.step(
-            sampled, columns.current_a > model.on_a, below_off, trusted, columns.sample_ns
-        )
+        began, ended, telling = contacts.step(columns.current_a, sampled, trusted, columns.sample_ns)
         self._resolve_states(node_state, operational, absurd, stale)
-        if len(changes.began):
-            columns.values[changes.began] = np.nan  # no use to start from where the last contact was
-            self.follower.forget(changes.began)
-        # a sample below the threshold tells no place: until it is known whether more follow, the last holds
-        solved = np.flatnonzero(contacts.touching & sampled & ~below_off)
-        if len(solved):
-            self._solve(solved)
-        updated = np.setdiff1d(solved, changes.began) if len(changes.began) else solved
-        return Ticked(cycle.t_ns, changes.began, updated, changes.ended)
+        if len(began):
+            columns.values[began] = np.nan  # no use to start from where the last contact was
+            self.follower.forget(began)
+        if len(telling):
+            self._solve(telling)
+        updated = np.setdiff1d(telling, began) if len(began) else telling
+        return Ticked(cycle.t_ns, began, updated, ended)
 
     # Details, for every tick: ufuncs of few elements cost what their calls cost, so what is rare is asked
     # about first, by `count_nonzero`, the quickest of numpy's calls ----------------------------------------
@@ -198,10 +193,12 @@ class Tick:
         source = _SOURCE_PART * np.abs(counts).sum(axis=1) - least[:, 0]
         return np.asarray(railed.any(axis=1) | (counts.min(axis=1) < -source))
 
-    def _stale(self, now_ns: int) -> BoolArray:
+    def _stale(self, now_ns: int, sampled: BoolArray) -> BoolArray:
         """Pads (n,) that have been quiet for too long."""
+        if np.count_nonzero(sampled) == self.model.size:
+            return self._none
         since_ns = np.maximum(self.columns.sample_ns, self.paced_ns)
-        return np.asarray(now_ns - since_ns > _STALE_PERIODS * self.period_ns)
+        return np.asarray((now_ns - since_ns > _STALE_PERIODS * self.period_ns) & ~sampled)
 
     def _resolve_states(
         self,
@@ -213,14 +210,15 @@ class Tick:
         state = self.columns.state
         np.copyto(state, node_state)
         np.copyto(state, _TOUCHED, where=operational & self.contacts.touching)
-        np.copyto(state, _FAULTED, where=operational & absurd)
-        np.copyto(state, _STALE, where=operational & stale)
+        if np.count_nonzero(absurd) or np.count_nonzero(stale):
+            np.copyto(state, _FAULTED, where=operational & absurd)
+            np.copyto(state, _STALE, where=operational & stale)
 
     def _solve(self, touched: IntArray) -> None:
         """Locate, place and weigh the contacts on the pads `touched`."""
         currents = self._currents.take(touched, axis=0)
         values, off = self.follower.read(touched, currents)
-        if not np.maximum.reduce(off, axis=None) <= 1:  # or NaN
+        if np.count_nonzero(off <= 1) < off.size:  # or NaN
             self._solve_anew(touched, currents, values, off)
         self._read = touched, currents, values, off
         self.columns.values[touched] = values
