@@ -107,12 +107,11 @@ class LssMaster:
         known = [list(dict.fromkeys(values)) for values in (vendor_ids, product_codes, revisions, ())]
         heard: set[LssAddress] = set()
         sure: set[LssAddress] = set()
-        self.problem = ""
         self._release()
         try:
             for _ in range(_ATTEMPTS):
                 heard |= self._sweep(known)
-                if heard <= sure:
+                if heard <= sure and not self.problem:
                     break
                 # Those that answer to their name are there, and out of the way of any that was missed.
                 self._release()
@@ -156,6 +155,7 @@ class LssMaster:
     def _sweep(self, known: list[list[int]]) -> set[LssAddress]:
         """One node after the other, until none is left that has no id and hasn't been found."""
         found: set[LssAddress] = set()
+        self.problem = ""
         while self._open():
             address = self._search(known)
             if address is None or address in found:
