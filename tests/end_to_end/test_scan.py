@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,47 @@ def test_a_scan_beside_the_daemon_disturbs_nothing(rig: Any) -> None:
     for old, new in zip(before["pads"], after["pads"], strict=True):
         assert new["node"] == "operational"
         assert new["reboots"] == old["reboots"]
+
+
+UNNAMED = """
+import sys, threading
+import numpy as np
+from handtouch.canbus.device import DeviceBus
+from handtouch.canbus.port import open_bus
+from handtouch.config import Bus
+bus = Bus(name="can0", interface="udp_multicast", channel="239.74.163.2", options={"port": int(sys.argv[1])})
+nodes = DeviceBus(open_bus(bus), lambda t_ns: np.zeros((8, 4), np.int16))
+for number in range(8):
+    nodes.add_unconfigured(serial=0x9E3779B1 * (number + 1) % 2**32)
+nodes.start()
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_eight_nodes_without_an_id_get_one_each(network: list[str], free_port: int) -> None:
+    python = [*network, sys.executable]
+    with subprocess.Popen(
+        [*python, "-c", UNNAMED, str(free_port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as host:
+        assert host.stdin is not None
+        assert host.stdout is not None
+        try:
+            assert host.stdout.readline() == "ready\n"
+            bus = f"can0=udp_multicast:239.74.163.2,port={free_port}"
+            scan = [*python, "-m", "handtouch", "scan", "--bus", bus, "--seconds", "0.1", "--json"]
+            done = subprocess.run(
+                [*scan, "--assign", "0x11"], capture_output=True, text=True, timeout=LONGEST_S, check=False
+            )
+            assert done.returncode == 0, done.stdout + done.stderr
+            report = json.loads(done.stdout)["buses"][0]
+        finally:
+            host.stdin.close()
+    serials = sorted(0x9E3779B1 * (number + 1) % 2**32 for number in range(8))
+    assert [(node["node_id"], node["serial"]) for node in report["nodes"]] == list(
+        zip(range(0x11, 0x19), serials, strict=True)
+    )
+    assert [node["assigned"] for node in report["unconfigured"]] == list(range(0x11, 0x19))
 
 
 @pytest.mark.socketcan
