@@ -31,7 +31,7 @@ class Control:
         self.commands: dict[str, Command] = {}
         self.refused = 0
         """requests that were malformed or unknown"""
-        self._socket: zmq.Socket[bytes] = context.socket(zmq.REP)
+        self._socket: zmq.Socket[bytes] = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
         try:
             gate = gate or Gate(context)
@@ -44,13 +44,17 @@ class Control:
         """Answer what waits."""
         for _ in range(_REQUESTS_PER_POLL):
             try:
-                request = self._socket.recv(zmq.NOBLOCK)
+                client, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            if self._socket.getsockopt(zmq.RCVMORE):
-                self._socket.recv_multipart(zmq.NOBLOCK)
-                request = b""  # answered as malformed
-            self._socket.send(msgpack.packb(self.answer(request)), zmq.NOBLOCK)
+            # a REP socket would do this by itself, but malformed parts make it send answers astray for ever
+            if parts[:1] != [b""]:
+                self.refused += 1  # not from a REQ socket: no answer would be understood
+                continue
+            request = parts[1] if len(parts) == 2 else b""  # else answered as malformed
+            self._socket.send_multipart(
+                [client, b"", msgpack.packb(self.answer(request))], zmq.NOBLOCK
+            )
 
     def answer(self, request: bytes) -> dict[str, Any]:
         """The answer to one request, whatever its bytes."""
