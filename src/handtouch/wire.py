@@ -12,6 +12,7 @@ import typing
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from operator import attrgetter
 from typing import Any, Union
 
 import msgpack
@@ -136,6 +137,8 @@ class Health:
     """absent, booting, identified, configuring, settling, operational, stale, faulted or stopped"""
     since_ns: int
     """when the node entered its state"""
+    pace: str
+    """sync: it samples with SYNC; event: when something moves; off: switched off"""
     reason: str
     """cause and remedy in plain words, empty when all is well"""
     serial: int | None
@@ -222,7 +225,11 @@ TOPICS = (
     Topic("service", 0, Service, "twice a second"),
 )
 _BY_PREFIX = {topic.prefix: topic for topic in TOPICS}
-_FIELDS = {topic.payload: tuple(field.name for field in fields(topic.payload)) for topic in TOPICS}
+_FIELDS = {
+    topic.payload: (names := [field.name for field in fields(topic.payload)], attrgetter(*names))
+    for topic in TOPICS
+}
+_PACKER = msgpack.Packer()
 
 
 def topic_of(message: Message) -> str:
@@ -238,8 +245,8 @@ def topic_of(message: Message) -> str:
 
 def encode(message: Message) -> list[bytes]:
     """The two parts of a message, ready for a ZeroMQ multipart send."""
-    payload = {name: getattr(message, name) for name in _FIELDS[type(message)]}
-    return [topic_of(message).encode(), msgpack.packb(payload)]
+    names, values = _FIELDS[type(message)]
+    return [topic_of(message).encode(), _PACKER.pack(dict(zip(names, values(message), strict=True)))]
 
 
 def decode(parts: typing.Sequence[bytes]) -> Message:

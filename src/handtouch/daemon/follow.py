@@ -23,10 +23,10 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 VALUES = 12
-"""xy (2), position (3), normal (3), arc lengths (2), residual and force of a contact, in this order."""
-XY, POSITION, NORMAL, PAD = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, 10)
-RESIDUAL, FORCE = 10, 11
+"""xy (2), arc lengths (2), residual, position (3), normal (3) and force of a contact, in this order."""
+XY, PAD, RESIDUAL, POSITION, NORMAL, FORCE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11
 
+_PLACED = np.delete(np.arange(FORCE), RESIDUAL)
 _TRUST = 3  # rows of a map before the values: how far off x, y and the total are, 1 at the end of trust
 _TERMS = 7  # four currents over the relative total v, 1, v and v^2
 _BEND = 0.3  # standard deviations that the bend of the model may add to a place where trust ends, at most
@@ -125,12 +125,12 @@ class Follower:
             np.tile(covariance, (3, 1, 1)),
         )
         told = np.concatenate(
-            [points.reshape(-1, 2), placed.position_m, placed.normal, placed.pad_m], axis=1
+            [points.reshape(-1, 2), placed.pad_m, placed.position_m, placed.normal], axis=1
         ).reshape(3, k, -1)
         by_place = np.zeros((k, VALUES, 2))
-        by_place[:, :RESIDUAL] = np.moveaxis(told[1:] - told[0], 0, 2) / width[:, None, None]
+        by_place[:, _PLACED] = np.moveaxis(told[1:] - told[0], 0, 2) / width[:, None, None]
         by_place[:, RESIDUAL] = -tangent.slopes[:, :, 0] - tangent.slopes[:, :, 1]
-        values[:, :RESIDUAL, 4] = told[0]
+        values[:, _PLACED, 4] = told[0]
         values[:, RESIDUAL, 4] = -tangent.fractions[:, 0] - tangent.fractions[:, 1]
         return by_place, placed.covariance_m2[:k], placed.scale.reshape(3, k)
 

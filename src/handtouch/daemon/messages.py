@@ -6,7 +6,6 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.canbus.slab import Slab
@@ -50,9 +49,9 @@ class Messages:
     def send_contacts(self, ticked: Ticked, now_ns: int, outlet: Outlet) -> None:
         """Send begin, update and end of the contacts that a tick touched, and forget those that ended."""
         for event, rows in (("begin", ticked.began), ("update", ticked.updated), ("end", ticked.ended)):
-            for pad in rows:
+            for pad in rows.tolist():
                 if outlet.wants(self._topics[pad]):
-                    outlet.send(self._contact(int(pad), event, ticked.t_ns, now_ns, outlet))
+                    outlet.send(self._contact(pad, event, ticked.t_ns, now_ns, outlet))
         self._tick.contacts.forget(ticked.ended)
 
     def end_all(self, t_ns: int, outlet: Outlet) -> None:
@@ -62,6 +61,7 @@ class Messages:
         none = np.zeros(0, dtype=np.intp)
         self.send_contacts(Ticked(t_ns, none, none, touching), t_ns, outlet)
         self._tick.contacts.touching[:] = False
+        self._tick.columns.located.view("<f4")[:] = np.nan
         self._tick.columns.state[:] = PadState.STARTING
 
     def send_frames(self, slab: Slab, tick_number: int, t_ns: int, outlet: Outlet) -> None:
@@ -70,7 +70,7 @@ class Messages:
         for hand, rows in self._model.rows_of_hand.items():
             links = tuple(self._model.links[rows])
             if outlet.wants(topic := f"hand/{hand}"):
-                touching = self._tick.contacts.touching[rows]
+                located = columns.located[rows]
                 outlet.send(
                     wire.HandFrame(
                         v=wire.SCHEMA_VERSION,
@@ -82,11 +82,11 @@ class Messages:
                         state=columns.state[rows].tobytes(),
                         contact=ids[rows].astype("<u4").tobytes(),
                         sample_ns=columns.sample_ns[rows].astype("<i8").tobytes(),
-                        current_a=_float32(columns.current_a[rows]),
-                        position_m=_float32(columns.position_m[rows], touching),
-                        normal=_float32(columns.normal[rows], touching),
-                        force_n=_float32(columns.force_n[rows], touching),
-                        force_std_n=_float32(columns.force_std_n[rows], touching),
+                        current_a=columns.current_a[rows].astype("<f4").tobytes(),
+                        position_m=located["position_m"].tobytes(),
+                        normal=located["normal"].tobytes(),
+                        force_n=located["force_n"].tobytes(),
+                        force_std_n=located["force_std_n"].tobytes(),
                         repeat=False,
                     )
                 )
@@ -149,11 +149,3 @@ class Messages:
 
 def _finite(value: np.float64) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def _float32(column: NDArray[np.float64], valid: NDArray[np.bool_] | None = None) -> bytes:
-    """Little-endian float32, NaN in rows that aren't valid."""
-    narrow = column.astype("<f4")
-    if valid is not None:
-        narrow[~valid] = np.nan
-    return narrow.tobytes()

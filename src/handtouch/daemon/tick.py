@@ -28,6 +28,9 @@ _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
     int, (PadState.CLEAR, PadState.TOUCHED, PadState.STALE, PadState.FAULTED)
 )
 _FOREVER_NS = np.iinfo(np.int64).max
+LOCATED = np.dtype(
+    [("position_m", "<f4", 3), ("normal", "<f4", 3), ("force_n", "<f4"), ("force_std_n", "<f4")]
+)
 _ALL_CHANNELS = np.ones(4)
 _LEAVING = 0.5
 """Of a map's trust: beyond it, it is drawn anew before the contact leaves it."""
@@ -63,6 +66,8 @@ class Columns:
     saturated: NDArray[np.bool_]
     residual_std: FloatArray
     """of a point contact, from the noise of the channels"""
+    located: NDArray[np.void]
+    """position_m, normal, force_n and force_std_n as LOCATED; all NaN without contact"""
 
     @classmethod
     def of(cls, n: int) -> Columns:
@@ -87,6 +92,7 @@ class Columns:
             force_std_n=unknown(),
             saturated=np.zeros(n, dtype=np.bool_),
             residual_std=unknown(),
+            located=np.full((n, 8), np.nan, dtype="<f4").view(LOCATED)[:, 0],
         )
 
 
@@ -121,6 +127,7 @@ class Tick:
         """pads that sample with SYNC; the others when something moves, and are not waited for"""
         self.follower = Follower(model)
         self._read = _NOTHING_READ  # contacts of the last step: pads, currents, values, how far from trusted
+        self._located = self.columns.located.view("<f4").reshape(-1, 8)
         self._none = np.zeros(model.size, dtype=np.bool_)
         self._least_counts = -_SOURCE_STD * model.noise_counts[:, None]
         self._currents = np.zeros((model.size, 4))
@@ -158,6 +165,8 @@ class Tick:
             self.follower.forget(began)
         if len(telling):
             self._solve(telling)
+        if len(ended):
+            self._located[ended] = np.nan
         updated = np.setdiff1d(telling, began) if len(began) else telling
         return Ticked(cycle.t_ns, began, updated, ended)
 
@@ -222,6 +231,7 @@ class Tick:
             self._solve_anew(touched, currents, values, off)
         self._read = touched, currents, values, off
         self.columns.values[touched] = values
+        self._located[touched, :7] = values[:, 5:]
         peak = self.contacts.peak_n
         peak[touched] = np.fmax(peak.take(touched), values[:, FORCE])
 
@@ -255,6 +265,6 @@ class Tick:
     def _keep(self, pads: IntArray, solved: Solved) -> None:
         columns = self.columns
         columns.covariance_m2[pads] = solved.covariance_m2
-        columns.force_std_n[pads] = solved.force_std_n
+        columns.force_std_n[pads] = self._located[pads, 7] = solved.force_std_n
         columns.saturated[pads] = solved.saturated
         columns.residual_std[pads] = solved.residual_std
