@@ -22,13 +22,22 @@ Frame = tuple[int, bytes]
 
 
 class Wire:
-    """A bus that remembers what was sent on it, and when."""
+    """A bus that remembers what was sent on it, and when, and gives what is put in `incoming`."""
 
     def __init__(self, bench: Bench) -> None:
         self.sent: list[tuple[int, Frame]] = []
+        self.incoming: list[can.Message] = []
+        self.broken = False
         self._bench = bench
 
+    def recv(self, timeout: float | None = None) -> can.Message | None:  # noqa: ARG002
+        if self.broken:
+            raise can.CanOperationError("network is down")
+        return self.incoming.pop(0) if self.incoming else None
+
     def send(self, message: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
+        if self.broken:
+            raise can.CanOperationError("no buffer space")
         assert message.dlc == len(message.data)
         self.sent.append((self._bench.t_ns, (message.arbitration_id, bytes(message.data))))
 
