@@ -308,6 +308,33 @@ def test_reboots_and_emergencies_are_told(wire: Wire) -> None:
     assert re.search(r"booted \d+ times; EMCY 0x3100 mains voltage", verdict.remark)
 
 
+@pytest.mark.parametrize(
+    ("file", "objects", "names"),
+    [
+        ("feldmann-ai4w.eds", [(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
+        ("noname-4ch.eds", [(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
+        ("norsens-quad404.eds", [(0x9130, sub) for sub in (1, 2, 3, 4)], ("0x9130:1", "0x9130:4")),
+        (
+            "tactor-q16.eds",
+            [(i, 0) for i in (0x2110, 0x2120, 0x2130, 0x2140)],
+            ("0x2110:0:i16", "0x2140:0:i16"),
+        ),
+    ],
+)
+def test_the_channels_of_other_makers_nodes_are_found(
+    wire: Wire, file: str, objects: list[tuple[int, int]], names: tuple[str, str]
+) -> None:
+    nodes = wire.nodes()
+    nodes.add(9, eds=Path(__file__).parent / "data/eds" / file, channels=tuple(objects))
+    nodes.start()
+    (report,) = look_at([wire.bus], QUICK)
+    (node,) = report.nodes
+    found = channel_names(node)
+    assert (found[0], found[-1]) == names
+    (kind,) = config.parse(completed(fragment([(report.bus, report.nodes)]))).nodes.values()
+    assert kind.channels == found
+
+
 # Nodes that misbehave
 
 

@@ -102,7 +102,7 @@ class _Kinds:
 
     def _new_name(self, told: str) -> str:
         slug = re.sub(r"[^a-z0-9]+", "_", told.lower()).strip("_")[:40]
-        stem = slug if slug[:1].isalpha() else "node"
+        stem = slug if slug[:1].isalpha() else f"node_{slug}".strip("_")
         taken = {*self._known, *self._made.values()}
         return next(n for n in (stem, *(f"{stem}_{i}" for i in range(2, 999))) if n not in taken)
 
@@ -126,7 +126,7 @@ def _kind(node: NodeFacts, channels: tuple[str, ...]) -> Iterator[str]:
         yield f"product_code = 0x{node.product_code:X}"
     if channels != _STANDARD:
         guessed = any(name.count(":") > 1 for name in channels)
-        remark = "  # i: signed, u: unsigned; the node doesn't tell, its manual does" if guessed else ""
+        remark = "  # i: signed, u: unsigned; its manual or EDS tells" if guessed else ""
         yield f"channels = [{', '.join(map(json.dumps, channels))}]{remark}"
     yield from _to_fill_in(_KIND)
 
