@@ -51,6 +51,7 @@ class Wire:
         self.trouble: Trouble | None = None
         self.to_master: deque[can.Message] = deque()
         self.sent: list[tuple[int, bytes]] = []  # by the master
+        self.asked: list[int] = []  # identifiers of its remote frames
         self.down = False
         self.cut: set[int] = set()  # node ids whose cable is out
         self._rig = rig
@@ -64,7 +65,7 @@ class Wire:
             if frame[0].arbitration_id & 0x7F not in self.cut:
                 self.to_master.append(_copy(frame[0]))
         else:
-            self._from_master(*frame[:2])
+            self._from_master(*frame)
 
     # the port's side
     def fileno(self) -> int:
@@ -84,21 +85,26 @@ class Wire:
                 others.append(frame)
         return others
 
-    def _from_master(self, can_id: int, data: bytes) -> None:
+    def _from_master(self, can_id: int, data: bytes, remote: bool) -> None:
         if self.down:
             raise OSError("network is down")
-        self.sent.append((can_id, data))
+        if remote:
+            self.asked.append(can_id)
+        else:
+            self.sent.append((can_id, data))
         if (data[1] if can_id == 0 else can_id & 0x7F) in self.cut:
             return
-        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        message = can.Message(
+            arbitration_id=can_id, data=b"" if remote else data, is_remote_frame=remote, is_extended_id=False
+        )
         self._rig.devices.handle(message, self._rig.t_ns)
-        if can_id > 0x600:
+        if 0x600 < can_id < 0x680:
             self._answer(can_id - 0x80)
 
     def _answer(self, can_id: int) -> None:
         """Bring the answers to an SDO request to the job that waits for them; those to a probe stay."""
-        sdo = self._rig.master._nodes[can_id - 0x581].sdo
-        if not sdo.waiting:
+        sdo = self._rig.sdo_of(can_id - 0x580)
+        if sdo is None or not sdo.waiting:
             return
         for message in [m for m in self.to_master if m.arbitration_id == can_id]:
             self.to_master.remove(message)
@@ -106,25 +112,39 @@ class Wire:
 
 
 class Rig:
-    """Nodes 1 to n in slots 0 to n - 1, the master, and time that passes when it is told to."""
+    """Nodes 1 to n in slots 0 to n - 1, the master, and time that passes when it is told to.
 
-    def __init__(self, size: int = 3, **spec: Any) -> None:
+    `device` are options of `DeviceBus.add`, `role` our part on the bus, `spec` changes of every NodeSpec.
+    """
+
+    def __init__(
+        self, size: int = 3, role: str = "master", device: dict[str, Any] | None = None, **spec: Any
+    ) -> None:
         self.t_ns = 1_000_000 * MS
         self.size = size
-        self.counts = np.tile(np.array([10, 20, 30, 40], dtype=np.int16), (size, 1))
+        self.counts = np.tile(np.array([10, 20, 30, 40], dtype=np.int64), (size, 1))
         self.wire = Wire(self)
         self.devices = DeviceBus(self.wire, self._sample, clock=lambda: self.t_ns)  # type: ignore[arg-type]
         for number in range(1, size + 1):
-            self.devices.add(number, serial=100 + number)
+            self.devices.add(number, serial=100 + number, **(device or {}))
         self.slab = Slab(size)
-        self.port = Port(Bus(name="can", interface="virtual", channel="rig"), self.wire, self.slab)
+        bus = Bus(name="can", interface="virtual", channel="rig", role=role)  # type: ignore[arg-type]
+        self.port = Port(bus, self.wire, self.slab)
         self.specs = [self.spec(number, **spec) for number in range(1, size + 1)]
         self.syncs = True
+        self.foreign_sync = role == "listener"
         self.restart()
 
     def restart(self) -> None:
         """A new master, as after a restart of the daemon."""
         self.master = Master({"can": self.port}, self.specs, SYNC_PERIOD_MS * MS)
+
+    def sdo_of(self, node_id: int) -> Any:
+        """SDO client that the master has for a node, None without one."""
+        for node in self.master._nodes:
+            if node.port is self.port and node.spec.node_id == node_id:
+                return node.sdo
+        return None
 
     def spec(self, number: int, **changes: Any) -> NodeSpec:
         spec = NodeSpec(slot=number - 1, bus="can", node_id=number, name=f"pad{number}")
@@ -155,18 +175,36 @@ class Rig:
         self.master.take_events()
         self.wire.sent.clear()
 
+    def nmt(self, command: int, node_id: int) -> None:
+        """Another NMT master's command."""
+        message = can.Message(arbitration_id=0, data=bytes((command, node_id)), is_extended_id=False)
+        self.devices.handle(message, self.t_ns)
+        self.inject(0, bytes(message.data))
+
     def run(self, ms: int) -> list[NodeEvent | SerialChanged]:
         """Let time pass, in steps of a millisecond; what happened in the nodes' lives."""
         for _ in range(ms):
             self.t_ns += MS
-            if self.syncs and self.t_ns // MS % SYNC_PERIOD_MS == 0:
-                self.port.send(0x80, b"")
-            self.devices.advance(self.t_ns)
-            self.pump()
-            self.master.poll(self.t_ns)
-            if isinstance(self.master._workers, Jobs):
-                self.master._workers.work()
+            self.step()
         return self.master.take_events()
+
+    def step(self) -> None:
+        """Do what is due now."""
+        if self.syncs and self.t_ns // MS % SYNC_PERIOD_MS == 0:
+            self.sync()
+        self.devices.advance(self.t_ns)
+        self.pump()
+        self.master.poll(self.t_ns)
+        if isinstance(self.master._workers, Jobs):
+            self.master._workers.work()
+
+    def sync(self) -> None:
+        """A SYNC, ours or that of another producer."""
+        self.slab.begin_cycle(self.t_ns)
+        if self.foreign_sync:
+            self.devices.handle(can.Message(arbitration_id=0x80, is_extended_id=False), self.t_ns)
+        else:
+            self.port.send(0x80, b"")
 
     def pump(self) -> None:
         for frame in self.port.drain():
@@ -177,7 +215,7 @@ class Rig:
         self.wire.to_master.append(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         self.pump()
 
-    def _sample(self, t_ns: int) -> NDArray[np.int16]:  # noqa: ARG002
+    def _sample(self, t_ns: int) -> NDArray[np.int64]:  # noqa: ARG002
         return self.counts
 
 
@@ -189,13 +227,13 @@ def _copy(message: can.Message) -> can.Message:
 
 @pytest.fixture
 def make_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
-    """Rigs by size and spec; silence of a node costs 5 ms of real time."""
+    """Rigs; silence of a node costs 5 ms of real time."""
     monkeypatch.setattr(master, "ThreadPoolExecutor", Jobs)
     monkeypatch.setattr(sdo, "SDO_TIMEOUT_S", 0.005)
     rigs: list[Rig] = []
 
-    def make(size: int = 3, **spec: Any) -> Rig:
-        rigs.append(Rig(size, **spec))
+    def make(size: int = 3, *more: Any, **options: Any) -> Rig:
+        rigs.append(Rig(size, *more, **options))
         return rigs[-1]
 
     yield make

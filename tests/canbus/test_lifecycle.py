@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handtouch.canbus.lifecycle import (
@@ -14,6 +15,7 @@ from handtouch.canbus.lifecycle import (
     NMT_STOPPED,
     Action,
     Answer,
+    Beats,
     BootUp,
     Done,
     Event,
@@ -21,6 +23,8 @@ from handtouch.canbus.lifecycle import (
     Heartbeat,
     Life,
     NodeState,
+    Rest,
+    Role,
     Sample,
     Silence,
     Stop,
@@ -89,14 +93,18 @@ TRANSITIONS: list[tuple[str, Life, Event, NodeState, tuple[Action, ...]]] = [
     ("mapping unusable", life(I), failed(MAPPING), F, ()),
     ("boot-up while identified", life(I), BootUp(), B, (IDENTIFY,)),
     ("configured", life(C), Done(CONFIGURE, 1), S, (Action.START,)),
-    ("configured, runs already", life(C, nmt=NMT_OPERATIONAL), Done(CONFIGURE, 1), S, ()),
+    ("configured, runs already", life(C, nmt=NMT_OPERATIONAL), Done(CONFIGURE, 1), S, (Action.START,)),
     ("configuration refused", life(C), failed(CONFIGURE), F, ()),
     ("boot-up while configuring", life(C), BootUp(), B, (IDENTIFY,)),
     ("step out of order", life(C), Done(IDENTIFY, 1), C, ()),
     # settling
     ("first sample", life(S), Sample(), S, ()),
-    ("last sample to discard", life(S, discard=1), Sample(), O, ()),
-    ("lost before, no heartbeat yet", life(S, discard=1, must_beat=True), Sample(), S, ()),
+    ("last sample to discard", life(S, discard=1), Sample(), S, ()),
+    ("first sample to trust", life(S, discard=0), Sample(), O, ()),
+    ("lost before, no heartbeat yet", life(S, discard=0, must_beat=True), Sample(), S, ()),
+    ("configured, yet no heartbeat", life(S, must_beat=True, heartbeat_ns=QUIET), Tick(), F, ()),
+    ("not synchronous again, no answer", life(O), failed(Action.PACE, silent=True), B, (IDENTIFY,)),
+    ("refuses to be event-driven", life(O), failed(Action.PACE), O, ()),
     ("no sample", life(S, due_ns=NOW), Tick(), T, ()),
     ("old heartbeat", life(S, started_ns=NOW - MS), Heartbeat(NMT_PREOPERATIONAL), S, ()),
     ("start was not heard", life(S), Heartbeat(NMT_PREOPERATIONAL), B, (IDENTIFY,)),
@@ -127,6 +135,32 @@ TRANSITIONS: list[tuple[str, Life, Event, NodeState, tuple[Action, ...]]] = [
     ("faulted and lost", life(F, heartbeat_ns=NOW - 351 * MS), Tick(), A, ()),
     ("faulted and rebooted", life(F), BootUp(), B, (IDENTIFY,)),
     ("heartbeat of a faulted node", life(F), Heartbeat(NMT_OPERATIONAL), F, ()),
+    ("awake at last", life(F, nmt=NMT_STOPPED), Heartbeat(NMT_PREOPERATIONAL), F, ()),
+    # two nodes with its id
+    ("twice as many heartbeats", life(O), Beats(True), F, ()),
+    ("twins at rest", life(X, resting=True), Beats(True), F, ()),
+    ("twins of an absent node", life(A), Beats(True), A, ()),
+    ("as many heartbeats as should be", life(O), Beats(False), O, ()),
+    ("twins are not tried again", life(F, twins=True, due_ns=NOW), Tick(), F, ()),
+    ("a twin reboots", life(F, twins=True), BootUp(), B, (IDENTIFY,)),
+    # outside the scene
+    *(
+        (f"not needed while {state.name}", life(state), Rest(True), X, (Action.POWER_DOWN,))
+        for state in (S, O, T)
+    ),
+    *((f"not needed while {state.name}", life(state), Rest(True), state, ()) for state in (A, B, I, C, F)),
+    ("configured, not needed", life(C, resting=True), Done(CONFIGURE, 1), X, (Action.POWER_DOWN,)),
+    ("needed again", life(X, resting=True, nmt=NMT_STOPPED), Rest(False), B, (WAKE, IDENTIFY)),
+    ("not needed still", life(X, resting=True), Rest(True), X, ()),
+    ("rebooted at rest", life(X, resting=True), BootUp(), B, (IDENTIFY,)),
+    ("lost at rest", life(X, resting=True, heartbeat_ns=QUIET), Tick(), A, ()),
+    ("at rest", life(X, resting=True), Heartbeat(NMT_STOPPED), X, ()),
+    ("should rest, but runs", life(X, resting=True), Heartbeat(NMT_OPERATIONAL), X, (Action.POWER_DOWN,)),
+    ("runs, was just told to rest", life(X, resting=True, started_ns=NOW), Heartbeat(5), X, ()),
+    ("switched off", life(X, resting=True), Done(Action.POWER_DOWN, 1), X, ()),
+    ("can't be switched off", life(X, resting=True), failed(Action.POWER_DOWN), X, ()),
+    ("stop at rest", life(X, resting=True), Stop(), X, (Action.STOP,)),
+    ("needed, as it was", life(O), Rest(False), O, ()),
     # stopped
     *(
         (f"stop from {state.name}", life(state), Stop(), X, (Action.STOP,))
@@ -145,6 +179,8 @@ TRANSITIONS: list[tuple[str, Life, Event, NodeState, tuple[Action, ...]]] = [
             Silence(1),
             Tick(),
             Stop(),
+            Beats(True),
+            Rest(False),
         )
     ),
 ]
@@ -162,7 +198,7 @@ def test_transition(before: Life, event: Event, state: NodeState, actions: tuple
 def test_every_state_is_left_and_reached() -> None:
     changes = [(before.state, state) for _, before, _, state, _ in TRANSITIONS if before.state is not state]
     assert {state for _, state in changes} == set(NodeState)
-    assert {before for before, _ in changes} == set(NodeState) - {X}
+    assert {before for before, _ in changes} == set(NodeState)  # stopped: at rest only
 
 
 def test_time_out_tells_how_long_nothing_was_heard_and_where_to_look() -> None:
@@ -184,7 +220,7 @@ def test_retries_pause_ever_longer_up_to_a_limit_and_forget_after_success() -> N
         assert actions == (IDENTIFY,)
     assert pauses[:4] == [100, 200, 400, 800]
     assert pauses[-1] == 5000
-    assert advance(life(S, discard=1, failures=9), Sample(), NOW, TIMING)[0].failures == 0
+    assert advance(life(S, discard=0, failures=9), Sample(), NOW, TIMING)[0].failures == 0
 
 
 @pytest.mark.parametrize("heard", [BootUp(), Heartbeat(NMT_PREOPERATIONAL), Answer()])
@@ -213,15 +249,49 @@ def test_reason_of_a_fault_stays_while_it_is_tried_again() -> None:
     assert (again.state, again.reason) == (F, "why")
 
 
+@pytest.mark.parametrize("seen", [Heartbeat(NMT_PREOPERATIONAL), Heartbeat(NMT_OPERATIONAL)])
+def test_node_that_could_not_answer_while_stopped_is_tried_as_soon_as_it_can(seen: Event) -> None:
+    faulted, _ = advance(life(F, nmt=NMT_STOPPED), seen, NOW, TIMING)
+    assert advance(faulted, Tick(), NOW, TIMING)[1] == (IDENTIFY,)
+
+
+def test_node_whose_twin_is_gone_is_tried_at_once() -> None:
+    single, _ = advance(life(F, twins=True), Beats(False), NOW, TIMING)
+    assert advance(single, Tick(), NOW, TIMING)[1] == (IDENTIFY,)
+
+
+def test_node_that_answers_a_probe_and_then_nothing_is_tried_less_and_less_often() -> None:
+    now, absent, pauses = NOW, life(A, due_ns=NOW), []
+    for _ in range(8):
+        absent, actions = advance(absent, Tick(), now, TIMING)
+        assert actions == (Action.PROBE,)
+        booting, _ = advance(absent, Answer(), now, TIMING)
+        now += 400 * MS
+        lost = failed(IDENTIFY, attempt=booting.attempt, silent=True)
+        absent, _ = advance(booting, lost, now, TIMING)
+        assert absent.state is A
+        pauses.append((absent.due_ns - now) // MS)
+        now = absent.due_ns
+    assert pauses == [100, 200, 400, 800, 1600, 3200, 5000, 5000]
+
+
+def test_what_went_wrong_when_it_was_switched_off_is_told() -> None:
+    refused, _ = advance(life(X, resting=True), failed(Action.POWER_DOWN), NOW, TIMING)
+    assert refused.reason == "outside the scene: switched off until it is needed, but why"
+    again, _ = advance(refused, Done(Action.POWER_DOWN, 1), NOW, TIMING)
+    assert again.reason == "outside the scene: switched off until it is needed"
+
+
 # Attempts are counted back from the present one.
+STEPS = [IDENTIFY, MAPPING, CONFIGURE, Action.POWER_DOWN, Action.PACE]
 EVENTS = st.one_of(
     st.just(BootUp()),
     st.builds(Heartbeat, st.sampled_from([4, 5, 127, 99])),
     st.just(Answer()),
-    st.builds(Done, st.sampled_from([IDENTIFY, MAPPING, CONFIGURE]), st.sampled_from([0, 0, 0, 1])),
+    st.builds(Done, st.sampled_from(STEPS), st.sampled_from([0, 0, 0, 1])),
     st.builds(
         Failed,
-        st.sampled_from([IDENTIFY, MAPPING, CONFIGURE]),
+        st.sampled_from(STEPS),
         st.sampled_from([0, 0, 0, 1]),
         st.just("why"),
         st.booleans(),
@@ -229,34 +299,111 @@ EVENTS = st.one_of(
     ),
     st.just(Sample()),
     st.builds(Silence, st.integers(0, 10**9)),
+    st.builds(Beats, st.booleans()),
+    st.builds(Rest, st.booleans()),
     st.just(Tick()),
 )
+HISTORIES = st.lists(st.tuples(EVENTS, st.integers(0, 500)), max_size=60)
+COMMANDS = {Action.ENTER_PREOPERATIONAL, Action.START, Action.STOP, Action.POWER_DOWN}
+ALLOWED = {  # by what a state can be preceded
+    O: {S, T},
+    C: {I},
+    I: {B, F},
+    T: {O, S},
+}
 
 
-@given(st.lists(st.tuples(EVENTS, st.integers(0, 500)), max_size=60))
-def test_in_any_order_of_events(history: list[tuple[Event, int]]) -> None:
-    """Trust is earned step by step, attempts are counted up, and nothing is ever due in the past for good."""
-    now, current = 0, Life()
-    allowed = {
-        O: {S, T},
-        S: {C, T},
-        C: {I},
-        I: {B, F},
-        T: {O, S},
-    }
+def lived(
+    history: list[tuple[Event, int]], role: Role
+) -> Iterator[tuple[Life, Event, Life, tuple[Action, ...], int]]:
+    """Each step of a history: life before, event, life after, actions and time."""
+    now, current, timing = 0, Life(), replace(TIMING, role=role)
     for drawn, pause_ms in history:
         event = drawn
         now += pause_ms * MS
         if isinstance(event, Done | Failed):
             event = replace(event, attempt=current.attempt - event.attempt)
         before = current
-        current, _ = advance(before, event, now, TIMING)
-        assert current.attempt >= before.attempt
-        if current.state is not before.state and current.state in allowed:
-            assert before.state in allowed[current.state]
-        if current.state is O:
-            assert not current.must_beat
-            assert current.heartbeat_ns is not None
+        current, actions = advance(before, event, now, timing)
+        yield before, event, current, actions, now
+
+
+@given(HISTORIES, st.sampled_from(Role))
+def test_in_any_order_of_events(history: list[tuple[Event, int]], role: Role) -> None:
+    """Trust is earned step by step, attempts are counted up, and nothing is ever due in the past for good."""
+    for before, event, after, actions, now in lived(history, role):
+        assert after.attempt >= before.attempt
+        assert before.since_ns <= after.since_ns <= now
+        assert after.reason or after.state is O
+        if after.state is not before.state and after.state in ALLOWED:
+            assert before.state in ALLOWED[after.state]
+        if after.state is O:
+            assert not after.must_beat
+            assert after.heartbeat_ns is not None or role is Role.LISTENER
+        if after.stranger:
+            assert not COMMANDS & set(actions)
+        if after.resting:
+            assert Action.START not in actions
         if isinstance(event, Tick):
-            due = due_ns(current, TIMING)
+            due = due_ns(after, replace(TIMING, role=role))
             assert due is None or due > now - 1
+        if role is not Role.MASTER:
+            assert not COMMANDS & set(actions)
+            assert not after.resting
+        if role is Role.LISTENER:
+            assert actions == ()
+
+
+class Answering:
+    """A node that is there and right, and does what it is told; time passes 5 ms at a time."""
+
+    def __init__(self, life: Life, now: int, nmt: int, beats: bool) -> None:
+        self.life, self.now, self.nmt, self.beats = life, now, nmt, beats
+        pending = {B: IDENTIFY, I: MAPPING, C: CONFIGURE}.get(life.state)  # a worker is at it, or was
+        self.jobs = [(now, pending, life.attempt)] if pending else []
+
+    def pass_time(self, ms: int) -> None:
+        for _ in range(ms // 5):
+            self.now += 5 * MS
+            if self.nmt == NMT_OPERATIONAL:
+                self.tell(Sample())
+            if self.beats and self.now % (100 * MS) == 0:
+                self.tell(Heartbeat(self.nmt))
+            due = due_ns(self.life, TIMING)
+            if due is not None and due <= self.now:
+                self.tell(Tick())
+            ended = [job for job in self.jobs if job[0] <= self.now]
+            self.jobs = [job for job in self.jobs if job[0] > self.now]
+            for _, step, attempt in ended:
+                silent = self.nmt == NMT_STOPPED
+                self.beats |= step is CONFIGURE and not silent
+                self.tell(Failed(step, attempt, "no answer", True) if silent else Done(step, attempt))
+
+    def tell(self, event: Event) -> None:
+        self.life, actions = advance(self.life, event, self.now, TIMING)
+        for action in actions:
+            if action is Action.PROBE:
+                self.tell(Heartbeat(self.nmt) if self.nmt == NMT_STOPPED else Answer())
+            elif action in COMMANDS:
+                self.nmt = {WAKE: NMT_PREOPERATIONAL, Action.START: NMT_OPERATIONAL}.get(action, NMT_STOPPED)
+            else:
+                patience = 400 if self.nmt == NMT_STOPPED else 5
+                self.jobs.append((self.now + patience * MS, action, self.life.attempt))
+
+
+@settings(max_examples=200)
+@given(HISTORIES, st.sampled_from([4, 5, 127]), st.booleans())
+def test_node_that_is_there_and_right_is_operational_soon_whatever_was_before(
+    history: list[tuple[Event, int]], nmt: int, beats: bool
+) -> None:
+    """Within the longest pause and the time to boot; one that isn't needed is stopped by then."""
+    steps = list(lived(history, Role.MASTER))
+    current, now = (steps[-1][2], steps[-1][4]) if steps else (Life(), 0)
+    if current.twins:
+        current, _ = advance(current, Beats(False), now, TIMING)
+    node = Answering(current, now // (5 * MS) * 5 * MS, nmt, beats)
+    node.pass_time(7000)
+    wanted = (X, NMT_STOPPED) if node.life.resting else (O, NMT_OPERATIONAL)
+    assert (node.life.state, node.nmt) == wanted, node.life
+    node.pass_time(2000)
+    assert (node.life.state, node.nmt) == wanted, node.life

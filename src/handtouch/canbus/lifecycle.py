@@ -1,7 +1,8 @@
 """The life of one CANopen node as a pure state machine: a life and an event in, a life and actions out.
 
-Public names: `NodeState`, `Action`, `Timing`, `Life`, `advance`, `due_ns` and the events. No clock, no bus:
-time is an argument in ns, and whoever calls carries out the actions and reports their results as events.
+Public names: `NodeState`, `Action`, `Role`, `Timing`, `Life`, `advance`, `due_ns`, `is_supervised` and the
+events. No clock, no bus: time is an argument in ns, and whoever calls carries out the actions and reports
+their results as events.
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ _TWINS = (
     "two nodes have its id, for heartbeats come twice as often as they should: unplug one and give it "
     "another id (`handtouch scan` tells the serial numbers)"
 )
+_RESTING = "outside the scene: switched off until it is needed"
 _LOOK_AT = "check its power, cable, node id and the bit rate and termination of the bus"
 
 
@@ -178,6 +180,7 @@ class Stop:
 Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Beats | Rest | Tick | Stop
 Next = tuple[Life, tuple[Action, ...]]
 
+_BOOT_STEPS = frozenset({Action.IDENTIFY, Action.READ_MAPPING, Action.CONFIGURE})
 _IN_BOOT = frozenset({NodeState.BOOTING, NodeState.IDENTIFIED, NodeState.CONFIGURING})
 _STARTED = frozenset({NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE})
 
@@ -221,10 +224,15 @@ def due_ns(life: Life, timing: Timing) -> int | None:
     dues = []
     if life.state in (NodeState.ABSENT, NodeState.FAULTED, NodeState.SETTLING):
         dues.append(life.due_ns)
-    ended = life.state is NodeState.STOPPED and not life.resting
-    if life.heartbeat_ns is not None and life.state is not NodeState.ABSENT and not ended:
+    if life.heartbeat_ns is not None and is_supervised(life):
         dues.append(life.heartbeat_ns + timing.heartbeat_timeout_ns)
     return min(dues, default=None)
+
+
+def is_supervised(life: Life) -> bool:
+    """Whether it is lost when its heartbeats end."""
+    ended = life.state is NodeState.STOPPED and not life.resting
+    return life.heartbeat_ns is not None and life.state is not NodeState.ABSENT and not ended
 
 
 def _enter(life: Life, state: NodeState, t_ns: int, reason: str) -> Life:
@@ -238,7 +246,7 @@ def _boot(life: Life, t_ns: int, reason: str, timing: Timing) -> Next:
         life = _enter(life, NodeState.SETTLING, t_ns, f"{reason}; we only listen, its identity isn't checked")
         return replace(life, started_ns=t_ns, discard=timing.settle_samples, due_ns=_NEVER_NS), ()
     life = _enter(life, NodeState.BOOTING, t_ns, reason)
-    return replace(life, attempt=life.attempt + 1, probes=0), _identify(life, timing)
+    return replace(life, attempt=life.attempt + 1, probes=0, twins=False), _identify(life, timing)
 
 
 def _identify(life: Life, timing: Timing) -> tuple[Action, ...]:
@@ -252,18 +260,33 @@ def _heartbeat(life: Life, nmt: int, t_ns: int, timing: Timing) -> Next:
     if life.heartbeat_ns is not None or timing.role is Role.LISTENER:
         life = replace(life, heartbeat_ns=t_ns)
     just_stopped = nmt == NMT_STOPPED != life.nmt
+    woken = life.nmt == NMT_STOPPED != nmt
     life = replace(life, nmt=nmt, heard_ns=t_ns, must_beat=False)
     told = f"heartbeat: node is {NMT_NAMES.get(nmt, f'in NMT state {nmt}')}"
     if life.state is NodeState.ABSENT or (life.state in _IN_BOOT and just_stopped):
         return _boot(life, t_ns, told, timing)
-    # A heartbeat sent before our start command may still arrive after it.
+    if life.state is NodeState.FAULTED and woken and not life.twins:
+        life = replace(life, due_ns=t_ns)  # while stopped it couldn't answer
+    # A heartbeat sent before our command may still arrive after it.
     settled = t_ns - life.started_ns > 2 * timing.heartbeat_ns
+    if life.state is NodeState.STOPPED and nmt != NMT_STOPPED and settled:
+        return replace(life, started_ns=t_ns), (Action.POWER_DOWN,)
+    if life.state in _STARTED and timing.role is not Role.MASTER:
+        return _follow(life, told, t_ns, timing, settled), ()
     if life.state in _STARTED and nmt != NMT_OPERATIONAL and settled:
-        if timing.role is Role.MASTER:
-            return _boot(life, t_ns, f"{told}, though it was started", timing)
-        life = _enter(life, NodeState.SETTLING, t_ns, f"{told}; another master has to start it")
-        return replace(life, discard=timing.settle_samples, due_ns=_NEVER_NS), ()
+        return _boot(life, t_ns, f"{told}, though it was started", timing)
     return life, ()
+
+
+def _follow(life: Life, told: str, t_ns: int, timing: Timing, settled: bool) -> Life:
+    """Another master starts and stops it."""
+    if life.nmt != NMT_OPERATIONAL and settled:
+        life = _enter(life, NodeState.SETTLING, t_ns, f"{told}; another master has to start it")
+        return replace(life, discard=timing.settle_samples, due_ns=_NEVER_NS)
+    if life.nmt == NMT_OPERATIONAL and life.state is NodeState.SETTLING and life.due_ns == _NEVER_NS:
+        life = _enter(life, NodeState.SETTLING, t_ns, "started by another master")
+        return replace(life, due_ns=t_ns + timing.settle_timeout_ns)
+    return life
 
 
 def _boot_up(life: Life, t_ns: int, timing: Timing) -> Next:
@@ -300,11 +323,16 @@ def _done(life: Life, event: Done, t_ns: int, timing: Timing) -> Next:
             return life, (Action.CONFIGURE,)
         case Action.CONFIGURE if life.state is NodeState.CONFIGURING:
             return _start(life, t_ns, timing)
+        case Action.POWER_DOWN if life.state is NodeState.STOPPED:
+            return _enter(life, NodeState.STOPPED, t_ns, _RESTING), ()
     return life, ()
 
 
 def _start(life: Life, t_ns: int, timing: Timing) -> Next:
-    """Trust begins after some samples; a node found running is left running, one not needed is stopped."""
+    """Trust begins after some samples; one not needed is stopped.
+
+    A node found running is started as well: it may have been halted to be configured.
+    """
     if life.resting:
         life = replace(life, heartbeat_ns=t_ns, started_ns=t_ns)
         return _rest(_enter(life, NodeState.SETTLING, t_ns, ""), True, t_ns, timing)
@@ -319,16 +347,22 @@ def _start(life: Life, t_ns: int, timing: Timing) -> Next:
         discard=timing.settle_samples,
         due_ns=t_ns + timing.settle_timeout_ns if running or ours else _NEVER_NS,
     )
-    return life, () if running or not ours else (Action.START,)
+    return life, (Action.START,) if ours else ()
 
 
 def _failed(life: Life, event: Failed, t_ns: int, timing: Timing) -> Next:
-    if event.attempt != life.attempt or life.state not in _IN_BOOT | {NodeState.FAULTED}:
+    if event.attempt != life.attempt:
+        return life, ()
+    if event.step is Action.PACE and event.silent and life.state in _STARTED:  # its TPDO may be off now
+        return _boot(life, t_ns, event.reason, timing)
+    if event.step is Action.POWER_DOWN and life.state is NodeState.STOPPED:
+        return _enter(life, NodeState.STOPPED, t_ns, f"{_RESTING}, but {event.reason}"), ()
+    if event.step not in _BOOT_STEPS or life.state not in _IN_BOOT | {NodeState.FAULTED}:
         return life, ()
     quiet_ns = t_ns - life.heard_ns if life.heard_ns is not None else t_ns
     gone = event.silent and quiet_ns > timing.heartbeat_timeout_ns
     life = _enter(life, NodeState.ABSENT if gone else NodeState.FAULTED, t_ns, event.reason)
-    failures = 0 if gone else life.failures + 1
+    failures = life.failures + 1
     stranger = life.stranger or event.stranger
     due = t_ns + timing.pause_ns(failures)
     heartbeat_ns = None if gone else life.heartbeat_ns
@@ -336,24 +370,23 @@ def _failed(life: Life, event: Failed, t_ns: int, timing: Timing) -> Next:
 
 
 def _sample(life: Life, t_ns: int, timing: Timing) -> Next:
-    if life.state is NodeState.ABSENT and timing.role is Role.LISTENER:
+    if life.state is NodeState.ABSENT and timing.role is Role.LISTENER and not life.must_beat:
         return _boot(life, t_ns, "samples came", timing)
     if life.state not in (NodeState.SETTLING, NodeState.STALE):
         return life, ()
-    discard = max(life.discard - 1, 0) if life.state is NodeState.SETTLING else life.discard
-    if discard == 0 and not life.must_beat:
-        return replace(_enter(life, NodeState.OPERATIONAL, t_ns, ""), discard=0, failures=0), ()
+    if life.discard == 0 and not life.must_beat:
+        return replace(_enter(life, NodeState.OPERATIONAL, t_ns, ""), failures=0), ()
     if life.state is NodeState.STALE:
         life = _enter(life, NodeState.SETTLING, t_ns, "samples came")
-        discard = max(discard - 1, 0)
-    return replace(life, discard=discard, due_ns=t_ns + timing.settle_timeout_ns), ()
+    return replace(life, discard=max(life.discard - 1, 0), due_ns=t_ns + timing.settle_timeout_ns), ()
 
 
 def _silence(life: Life, age_ns: int, t_ns: int) -> Next:
     if life.state is not NodeState.OPERATIONAL:
         return life, ()
-    told = f"no sample for {age_ns / 1e6:.0f} ms, heartbeat is there"
-    return _enter(life, NodeState.STALE, t_ns, f"{told}; is there a SYNC?"), ()
+    beats = "its heartbeat is there" if life.heartbeat_ns is not None else "it sends no heartbeat either"
+    told = f"no sample for {age_ns / 1e6:.0f} ms, {beats}; is there a SYNC?"
+    return _enter(life, NodeState.STALE, t_ns, told), ()
 
 
 def _rest(life: Life, resting: bool, t_ns: int, timing: Timing) -> Next:
@@ -361,7 +394,7 @@ def _rest(life: Life, resting: bool, t_ns: int, timing: Timing) -> Next:
         return life, ()
     life = replace(life, resting=resting)
     if resting and life.state in _STARTED:
-        life = _enter(life, NodeState.STOPPED, t_ns, "outside the scene: switched off until it is needed")
+        life = _enter(life, NodeState.STOPPED, t_ns, _RESTING)
         return replace(life, nmt=NMT_STOPPED, started_ns=t_ns), (Action.POWER_DOWN,)
     if not resting and life.state is NodeState.STOPPED:
         return _boot(life, t_ns, "needed again", timing)
@@ -370,31 +403,18 @@ def _rest(life: Life, resting: bool, t_ns: int, timing: Timing) -> Next:
 
 def _beats(life: Life, twice: bool, t_ns: int, timing: Timing) -> Next:
     if not twice:
-        return replace(life, twins=False), ()
-    if life.state is NodeState.ABSENT:
+        return replace(life, twins=False, due_ns=t_ns if life.twins else life.due_ns), ()
+    if life.state is NodeState.ABSENT or timing.role is not Role.MASTER:  # others may set its heartbeat, too
         return life, ()
     life = _enter(life, NodeState.FAULTED, t_ns, _TWINS)
     return replace(life, twins=True, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns), ()
 
 
 def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
-    supervised = life.heartbeat_ns is not None and life.state is not NodeState.ABSENT
-    if supervised and life.heartbeat_ns is not None:
+    if life.heartbeat_ns is not None and is_supervised(life):
         quiet_ns = t_ns - life.heartbeat_ns
         if quiet_ns > timing.heartbeat_timeout_ns:
-            if life.must_beat and timing.role is not Role.LISTENER:
-                # alive, for it was just configured: tried again less and less often
-                failures = life.failures + 1
-                life = _enter(life, NodeState.FAULTED, t_ns, _NO_HEARTBEAT)
-                due = t_ns + timing.pause_ns(failures)
-                return replace(life, heartbeat_ns=None, failures=failures, due_ns=due), ()
-            failures = 0
-            told = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms; {_LOOK_AT}"
-            life = _enter(life, NodeState.ABSENT, t_ns, told)
-            due = t_ns + timing.pause_ns(failures)
-            return replace(
-                life, heartbeat_ns=None, nmt=None, must_beat=True, failures=failures, due_ns=due
-            ), ()
+            return _lost(life, quiet_ns, t_ns, timing), ()
     if t_ns < life.due_ns:
         return life, ()
     if life.state is NodeState.ABSENT and timing.role is Role.LISTENER:
@@ -409,3 +429,15 @@ def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
     if life.state is NodeState.SETTLING:
         return _enter(life, NodeState.STALE, t_ns, "started, but no sample came: is there a SYNC?"), ()
     return life, ()
+
+
+def _lost(life: Life, quiet_ns: int, t_ns: int, timing: Timing) -> Life:
+    """No heartbeat for too long."""
+    if life.must_beat and timing.role is not Role.LISTENER:
+        # alive, for it was just configured: tried again less and less often
+        failures = life.failures + 1
+        life = _enter(life, NodeState.FAULTED, t_ns, _NO_HEARTBEAT)
+        return replace(life, heartbeat_ns=None, failures=failures, due_ns=t_ns + timing.pause_ns(failures))
+    told = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms; {_LOOK_AT}"
+    life = replace(_enter(life, NodeState.ABSENT, t_ns, told), heartbeat_ns=None, nmt=None)
+    return replace(life, must_beat=True, failures=0, due_ns=t_ns + timing.pause_ns(0))

@@ -6,7 +6,7 @@ Public names: `Tpdo`, `Mapping`, `arrange`, `from_eds`, `read_mapping`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from . import eds
@@ -19,20 +19,35 @@ DEFAULT_TPDOS = (2, 1, 3, 4)
 NOT_VALID = 1 << 31
 """Bit of a PDO's identifier in 0x1800 + n sub 1 that switches it off."""
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
-_EXTENDED, _IDENTIFIER = 1 << 29, 0x7FF
+_NO_REMOTE, _EXTENDED, _IDENTIFIER = 1 << 30, 1 << 29, 0x7FF
+_FOR_PDOS = frozenset({*range(0x181, 0x581), 0x600, *range(0x680, 0x6E0)})  # others have a use in CANopen
 _PREDEFINED = 4
 _PDO_BITS = 8 * PDO_BYTES
 
 
 @dataclass(frozen=True, slots=True)
 class Tpdo:
-    """A TPDO as the node has it; `entries` are the mapped objects, as 0x1A00 + n holds them."""
+    """A TPDO as the node has it; `entries` are the mapped objects, as 0x1A00 + n holds them.
+
+    `no_remote`: bit 30 of its identifier, which many nodes don't let anybody change.
+    """
 
     number: int
     cob_id: int
     enabled: bool
     transmission: int
     entries: tuple[int, ...]
+    no_remote: int = 0
+
+    @property
+    def on(self) -> int:
+        """0x1800 + n sub 1 while it is sent."""
+        return self.cob_id | self.no_remote
+
+    @property
+    def off(self) -> int:
+        """0x1800 + n sub 1 while it isn't."""
+        return self.on | NOT_VALID
 
     @property
     def size(self) -> int:
@@ -167,11 +182,23 @@ def _entries(sdo: Sdo, number: int) -> tuple[int, ...] | None:
 def _communication(sdo: Sdo, tpdo: Tpdo) -> Tpdo:
     index = COMMUNICATION + tpdo.number - 1
     cob_id = sdo.read(index, 1, f"identifier of TPDO{tpdo.number}")
-    if cob_id & _EXTENDED or not cob_id & _IDENTIFIER:
-        raise StepError(f"TPDO{tpdo.number} has no 11-bit identifier (0x{index:04X}:01 is 0x{cob_id:08X})")
+    identifier = _checked(tpdo.number, cob_id, cob_id & _IDENTIFIER)
     transmission = sdo.read(index, 2, f"transmission type of TPDO{tpdo.number}")
     enabled = not cob_id & NOT_VALID
-    return Tpdo(tpdo.number, cob_id & _IDENTIFIER, enabled, transmission, tpdo.entries)
+    return Tpdo(tpdo.number, identifier, enabled, transmission, tpdo.entries, cob_id & _NO_REMOTE)
+
+
+def _checked(number: int, cob_id: int, identifier: int) -> int:
+    """The identifier of a TPDO, if it can have that one."""
+    told = f"(0x{COMMUNICATION + number - 1:04X}:01 is 0x{cob_id:08X})"
+    if cob_id & _EXTENDED or not identifier:
+        raise StepError(f"TPDO{number} has no 11-bit identifier {told}")
+    if identifier not in _FOR_PDOS:
+        raise StepError(
+            f"TPDO{number} has identifier 0x{identifier:X}, which CANopen uses otherwise {told}; "
+            "give it another, and store it"
+        )
+    return identifier
 
 
 def _remap(
@@ -205,15 +232,15 @@ def _map(sdo: Sdo, node_id: int, number: int, entries: tuple[int, ...]) -> Tpdo:
     identifier = cob_id & _IDENTIFIER
     if not identifier and number <= _PREDEFINED:
         identifier = 0x80 + 0x100 * number + node_id
-    if cob_id & _EXTENDED or not identifier:
-        raise StepError(f"TPDO{number} has no 11-bit identifier (0x{communication:04X}:01 is 0x{cob_id:08X})")
-    sdo.set(communication, 1, NOT_VALID | identifier, 4, name)
+    no_remote = cob_id & _NO_REMOTE
+    made = Tpdo(number, _checked(number, cob_id, identifier), False, 0, entries, no_remote)
+    sdo.set(communication, 1, made.off, 4, name)
     sdo.set(mapping, 0, 0, 1, what)
     for sub, entry in enumerate(entries, 1):
         sdo.write(mapping, sub, entry, 4, what)
     sdo.write(mapping, 0, len(entries), 1, what)
     transmission = sdo.read(communication, 2, f"transmission type of TPDO{number}")
-    return Tpdo(number, identifier, False, transmission, entries)
+    return replace(made, transmission=transmission)
 
 
 def _groups(channels: Channels) -> list[list[Channel]]:

@@ -40,6 +40,7 @@ from .lifecycle import (
     Timing,
     advance,
     due_ns,
+    is_supervised,
 )
 from .mapping import Mapping as PdoMapping
 from .mapping import from_eds, read_mapping, tpdo_numbers
@@ -55,6 +56,8 @@ STALE_PERIODS = 3
 EMERGENCIES_KEPT = 16
 BEATS_WATCHED = 10
 """Heartbeat periods over which it is judged whether they come twice as often as they should."""
+CROWDED = 2
+"""Times in a row that they do before two nodes are said to have its id: late ones come in a burst once."""
 _TWICE = 1.6  # times as many
 _WORKERS = 32
 _EVENTS_KEPT = 1024
@@ -72,7 +75,7 @@ _PROBE = bytes(
 _NMT_COMMANDS = {Action.START: 1, Action.STOP: 2, Action.ENTER_PREOPERATIONAL: 128}
 
 _FOREIGN, _IGNORED = -1, -2
-_GUARDED = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
+_STARTED = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
 _NOBODY_WAITS = (NodeState.ABSENT, NodeState.STOPPED)
 Outcome = Done | Failed
 Result = boot.Identity | PdoMapping | boot.Configured | boot.Paced
@@ -101,7 +104,8 @@ class _Node:
     asked_ns: int = 0  # when the receiving thread itself asked for it, 0 if it hasn't
     request: bytes = b""  # and how
     paced_ns: int = 0  # since when it is so
-    watched: tuple[int, int] = (0, 0)  # since when, and how many heartbeats had come then
+    watched: tuple[int, int] | None = None  # since when its heartbeats are counted, and how many had come
+    crowded: int = 0  # times in a row that there were twice as many as there should be
     emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
 
     def status(self) -> NodeStatus:
@@ -202,13 +206,14 @@ class Master:
             self._advance(node, Rest(resting), t_ns)
 
     def pace(self, slot: int, idle: bool, t_ns: int) -> None:
-        """Make an operational node event-driven (`idle`), where it can be, or synchronous again.
+        """Make an operational node event-driven (`idle`), where it can be, or a started one synchronous.
 
         Back to synchronous is asked for at once, before the next SYNC; ask again until `idle` tells that it
         is so. Whatever else has to be said to the node is said by a worker.
         """
         node = self._by_slot[slot]
-        if self._workers is None or node.idle == idle or not self.can_idle(slot):
+        may = self.can_idle(slot) if idle else node.life.state in _STARTED
+        if self._workers is None or node.idle == idle or not may:
             return
         unanswered = node.asked_ns and t_ns - node.asked_ns > _HASTE_NS
         if node.pacing and not unanswered:
@@ -262,6 +267,7 @@ class Master:
 
     def _heartbeat(self, node: _Node, nmt: int, t_ns: int) -> None:
         if nmt == NMT_BOOT_UP:
+            node.watched = None  # its heartbeat time is its own until it is configured
             self._advance(node, BootUp(), t_ns)
             return
         node.heartbeats += 1
@@ -272,16 +278,17 @@ class Master:
 
     def _watch_rate(self, node: _Node, t_ns: int) -> None:
         """Two nodes of one id give themselves away by their heartbeats, which come twice as often."""
-        if node.guarded:
+        if node.watched is None:
             return
         since_ns, before = node.watched
         periods = (t_ns - since_ns) / node.timing.heartbeat_ns
         if periods < BEATS_WATCHED:
             return
         node.watched = (t_ns, node.heartbeats)
-        set_by_us = node.life.started_ns and node.life.started_ns <= since_ns
-        if set_by_us and periods < 2 * BEATS_WATCHED:
-            self._advance(node, Beats(node.heartbeats - before > _TWICE * periods), t_ns)
+        twice = node.heartbeats - before > _TWICE * periods
+        node.crowded = node.crowded + 1 if twice else 0
+        if not twice or node.crowded >= CROWDED:
+            self._advance(node, Beats(twice), t_ns)
 
     def _watch_samples(self, t_ns: int) -> None:
         stamps = self._slab.t_ns
@@ -303,7 +310,7 @@ class Master:
             if due is not None and due <= t_ns:
                 self._advance(node, Tick(), t_ns)
                 due = due_ns(node.life, node.timing)
-            if node.guarded and node.life.state in _GUARDED:
+            if node.guarded and is_supervised(node.life):
                 self._guard(node, t_ns)
                 due = min(node.guard_ns, due) if due is not None else node.guard_ns
             if due is not None:
@@ -346,6 +353,8 @@ class Master:
             _command(node, action)
         elif action is Action.PROBE:
             node.port.send(_SDO_REQUEST + node.spec.node_id, _PROBE)
+            # stopped, it serves no SDO; without heartbeat it tells its state only when it is asked
+            node.port.send(_HEARTBEAT + node.spec.node_id, b"", remote=True)
         elif self._workers is not None:
             self._workers.submit(self._work, node, action, node.life.attempt)
 
@@ -389,6 +398,10 @@ class Master:
                 node.may_idle = result.may_idle
                 self._set_pace(node, False, t_ns)
                 self._next_due_ns = t_ns
+                if node.watched is None:
+                    node.watched, node.crowded = (t_ns, node.heartbeats), 0
+                if result.refusal:
+                    self._tell(node, node.life.state, f"stays synchronous while idle: {result.refusal}", t_ns)
             elif isinstance(result, PdoMapping) and (clash := self._route(node, result)):
                 outcome = Failed(outcome.step, outcome.attempt, clash)
             self._advance(node, outcome, t_ns)
@@ -399,7 +412,10 @@ class Master:
             self._set_pace(node, result.idle, t_ns)
         elif isinstance(outcome, Failed):
             # one that refuses to be event-driven isn't asked again until it boots
-            node.may_idle = node.idle or outcome.silent
+            node.may_idle = node.idle
+            if outcome.silent:
+                self._advance(node, outcome, t_ns)
+                return
             kind = "event-driven" if node.idle else "synchronous"
             self._tell(node, node.life.state, f"stays {kind}: {outcome.reason}", t_ns)
 
@@ -452,8 +468,11 @@ def _carry_out(node: _Node, step: Action, idle: bool) -> Result | None:
         may = halt if spec.remap else None
         return read_mapping(node.sdo, spec.node_id, node.tpdos, spec.channels, may)
     if step is Action.POWER_DOWN:
-        boot.excite(node.sdo, spec.excitation, False)
-        _command(node, Action.STOP)
+        try:
+            boot.excite(node.sdo, spec.excitation, False)
+        finally:
+            if not node.sdo.outdated():
+                _command(node, Action.STOP)
         return None
     if node.mapping is None:
         raise StepError("no PDO mapping to configure")

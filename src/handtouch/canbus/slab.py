@@ -98,7 +98,7 @@ class Slab:
         self._whole[slot] = whole
         self._parts.pop(slot, None)
         if whole != 1:
-            self._parts[slot] = _Parts()
+            self._parts[slot] = _Parts(frozenset(field.pdo for field in layout))
         self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = bytes(_SAMPLE_BYTES)
         unsigned = self._bottom == -1
         self._unsigned = np.where(unsigned, self._top, -1) if unsigned.any() else None
@@ -106,12 +106,15 @@ class Slab:
     def write(self, slot: int, data: bytes | bytearray, t_ns: int, pdo: int = 0) -> None:
         """Store a PDO of a slot, at most 8 bytes; `pdo` as the slot's layout counts them.
 
-        A sample counts when all its PDOs have come; a second one within a cycle replaces the first.
+        A sample counts when all its PDOs have come; a second one within a cycle replaces the first. One of
+        several PDOs doesn't count if the SYNC before brought less than all: what was missing may come now.
         """
         if self._whole[slot] == 1:
             start = slot * _SAMPLE_BYTES
             self._bytes[start : start + len(data)] = data
-        elif not self._complete(slot, pdo, data, t_ns):
+        elif self._parts[slot].add(pdo, data, t_ns):
+            self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = self._parts[slot].data
+        else:
             return
         self._t_ns[slot] = t_ns
         if self._fresh[slot]:
@@ -139,28 +142,35 @@ class Slab:
         np.greater_equal(self.t_ns, t_ns, out=self.fresh, casting="unsafe")
         self.fresh_count = int(np.count_nonzero(self.fresh))
         for parts in self._parts.values():
-            parts.forget_before(t_ns)
-
-    def _complete(self, slot: int, pdo: int, data: bytes | bytearray, t_ns: int) -> bool:
-        """Keep a part of a sample; True when the sample is whole, and in its place."""
-        parts = self._parts[slot]
-        start = pdo * PDO_BYTES
-        parts.data[start : start + len(data)] = data
-        parts.t_ns[pdo] = t_ns
-        if sum(1 << number for number in parts.t_ns) != self._whole[slot]:
-            return False
-        parts.t_ns.clear()
-        self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = parts.data
-        return True
+            parts.begin_cycle(t_ns)
 
 
 class _Parts:
-    """A sample of several PDOs while it is incomplete."""
+    """A sample of several PDOs, `wanted`, while it is incomplete."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: frozenset[int]) -> None:
         self.data = bytearray(_SAMPLE_BYTES)
-        self.t_ns: dict[int, int] = {}  # PDO -> arrival
+        self._wanted = wanted
+        self._missing = set(wanted)
+        self._first_ns: dict[int, int] = {}  # PDO -> its first arrival in this cycle
+        self._last_ns: dict[int, int] = {}
+        self._doubtful = False
 
-    def forget_before(self, t_ns: int) -> None:
-        """Parts that came before a SYNC don't belong with those after it."""
-        self.t_ns = {pdo: at for pdo, at in self.t_ns.items() if at >= t_ns}
+    def add(self, pdo: int, data: bytes | bytearray, t_ns: int) -> bool:
+        """Keep a part; True when the sample is whole and of one SYNC."""
+        start = pdo * PDO_BYTES
+        self.data[start : start + len(data)] = data
+        self._first_ns.setdefault(pdo, t_ns)
+        self._last_ns[pdo] = t_ns
+        self._missing.discard(pdo)
+        if self._missing:
+            return False
+        self._missing |= self._wanted
+        return not self._doubtful
+
+    def begin_cycle(self, t_ns: int) -> None:
+        """Parts that came before a SYNC don't belong with those after it; late ones look as if they did."""
+        self._doubtful = any(self._first_ns.get(pdo, t_ns) >= t_ns for pdo in self._wanted)
+        self._last_ns = {pdo: at for pdo, at in self._last_ns.items() if at >= t_ns}
+        self._first_ns = dict(self._last_ns)
+        self._missing = set(self._wanted - self._last_ns.keys()) or set(self._wanted)
