@@ -1,4 +1,4 @@
-"""What a scene doesn't need and what that saves: bus load, ticks and processor share; how soon a pad is awake.
+"""What a scene doesn't need and what that saves: bus load, ticks, processor; how soon a pad is awake.
 
 The real daemon serves simulated nodes over udp_multicast, as in bench_latency. Each case is the hand in one
 scene, touched so much; then, again and again, one pad of an idle hand is touched, and its samples are timed
@@ -142,7 +142,7 @@ def loads(folder: Path, seconds: float) -> list[dict[str, Any]]:
 
 
 def wakes(folder: Path, trials: int) -> dict[str, Any]:
-    """From the first event frame of a pad touched in an idle hand to its sampling at full rate, in periods."""
+    """Periods from the first event frame of a pad touched in an idle hand to sampling at full rate."""
     daemon = Daemon(folder, links='["*"]', idle=True)
     nodes = Nodes(daemon.deployment)
     nodes.start()
@@ -210,8 +210,9 @@ second in any case; when all do so, SYNC slows down to `idle_sync_period_ms`.
 
 **Awake again**: from the first event frame of a touched pad to its next sample, which follows SYNC at full
 rate: median {wake["median_periods"]:.2f} periods, 95 % {wake["p95_periods"]:.2f}, worst
-{wake["worst_periods"]:.2f} ({wake["trials"]} touches at random times; {100 * wake["within_two_periods"]:.1f} %
-within two). From there on {100 * wake["rate_after"]:.0f} % of the full rate.
+{wake["worst_periods"]:.2f} ({wake["trials"]} touches at random times;
+{100 * wake["within_two_periods"]:.1f} % within two). From there on {100 * wake["rate_after"]:.0f} % of the
+full rate.
 
 Made by `make bench ONLY=idle`.
 """

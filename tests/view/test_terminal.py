@@ -21,7 +21,7 @@ CONTACT = wire.Contact(
 )  # fmt: skip
 HEALTH = wire.Health(
     v=1, seq=1, t_ns=12_000_000_000, hand="right", link="thumb_tip", bus="can0", node_id=19, state="clear",
-    node="operational", since_ns=0, reason="", serial=1003, rate_hz=200.0, samples=10, missed=0, age_s=0.001,
+    node="operational", since_ns=0, pace="sync", reason="", serial=1003, rate_hz=200.0, samples=10, missed=0, age_s=0.001,
     reboots=0, heartbeats_missed=0, emergencies=(), repeat=False,
 )  # fmt: skip
 SERVICE = wire.Service(

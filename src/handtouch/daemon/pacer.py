@@ -80,6 +80,8 @@ class Pacer:
             self._wake(now_ns)
         if self._master.paces != self._paces:
             self._follow(now_ns)
+        if self.slow and self._with_sync().any():  # a node that came back is settling
+            self._set_slow(False, now_ns)
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + _LOOK_NS
             self._settle(now_ns)
@@ -109,8 +111,14 @@ class Pacer:
             master.pace(slot, True, now_ns)
         for slot in np.flatnonzero(self.needed & ~untouched & ~tick.synchronous).tolist():
             master.pace(slot, False, now_ns)
-        up = self.needed & (master.states == NodeState.OPERATIONAL)
-        self._set_slow(bool(up.any()) and not (tick.synchronous & up).any(), now_ns)
+        waiting = self.needed & ~tick.synchronous & (master.states == NodeState.OPERATIONAL)
+        self._set_slow(bool(waiting.any()) and not self._with_sync().any(), now_ns)
+
+    def _with_sync(self) -> NDArray[np.bool_]:
+        """Pads whose node is up and samples with SYNC."""
+        states = self._master.states
+        up = (states >= NodeState.SETTLING) & (states <= NodeState.STALE)
+        return np.asarray(self.needed & up & self._pipeline.tick.synchronous)
 
     def _follow(self, now_ns: int) -> None:
         """Take over what the nodes are made to do; one that is new at full rate gets time to be touched."""

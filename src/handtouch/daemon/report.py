@@ -137,6 +137,7 @@ class Report:
             state=state.name.lower(),
             node=status.state.name.lower(),
             since_ns=status.since_ns,
+            pace="off" if state == PadState.OFF else "event" if status.idle else "sync",
             reason=explain(state, status.state, status.reason, counts, railed),
             serial=status.serial,
             rate_hz=float(self._rate_hz[pad]) if state <= PadState.TOUCHED else 0.0,

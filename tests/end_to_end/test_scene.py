@@ -1,0 +1,69 @@
+"""What a scene doesn't need isn't done: the real daemon and nodes, on a real bus."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from handtouch import wire
+
+IDLE = 'excitation = "0x2100:0:u8"\nidle = { delta_counts = 12 }\n'
+
+
+def deploy(rig: Any, scene: str, node: str = "") -> None:
+    """Write a scene and what nodes can do into the deployment."""
+    text = rig.config.read_text()
+    text, changed = re.subn(r"heartbeat_ms = 100\n", f"heartbeat_ms = 100\n{node}", text)
+    assert changed == 1
+    rig.config.write_text(text.replace("[touch]", f"[scene]\n{scene}\n\n[touch]", 1))
+
+
+def paces(status: dict[str, Any]) -> dict[str, str]:
+    return {pad["link"]: pad["pace"] for pad in status["pads"]}
+
+
+@pytest.mark.parametrize("node", ["", IDLE], ids=["stopped", "excitation off"])
+def test_pads_outside_the_scene_are_off_and_their_touches_cost_nothing(rig: Any, node: str) -> None:
+    deploy(rig, 'links = ["index_*"]', node)
+    rig.simulate()
+    rig.start("run")
+    off = rig.wait("12 pads off", lambda s: [p["state"] for p in s["pads"]].count("off") == 12)
+    assert {link for link, pace in paces(off).items() if pace == "off"} == {
+        pad["link"] for pad in off["pads"] if not pad["link"].startswith("index_")
+    }
+    assert all(
+        pad["node"] == "stopped" and "scene" in pad["reason"] for pad in off["pads"] if pad["pace"] == "off"
+    )
+    with rig.subscribe("contact/*/*") as contacts:
+        links = {contacts.recv(30).link for _ in range(40)}
+    assert links == {"index_distal"}  # the scenario presses palm_heel too
+    heartbeats = rig.wait("still watched", lambda s: all(p["heartbeats_missed"] < 5 for p in s["pads"]))
+    assert heartbeats["service"]["buses"]["can0"]["short"] == 0
+
+
+def test_untouched_pads_send_when_something_moves_and_touched_ones_with_sync(rig: Any) -> None:
+    deploy(rig, "idle_after_s = 0.3", IDLE)
+    rig.simulate()
+    rig.start("run")
+    seen = rig.wait(
+        "13 pads event-driven, which the scenario never touches",
+        lambda s: all(
+            pace == "event" for link, pace in paces(s).items() if link not in ("index_distal", "palm_heel")
+        ),
+    )
+    up = {pad["link"]: (pad["node"], pad["reason"]) for pad in seen["pads"] if pad["node"] != "operational"}
+    assert not up, rig.all_printed()
+    with rig.subscribe("contact/*/index_distal", "health/*/index_distal") as messages:
+        begun, at_full_rate = 0, 0
+        while not (begun >= 3 and at_full_rate):
+            message = messages.recv(60)
+            assert message is not None, rig.all_printed()
+            if isinstance(message, wire.Contact):
+                begun += message.event == "begin"
+                assert message.reason in ("", "released")
+            elif message.state == "touched":
+                at_full_rate += message.pace == "sync"
+    idle = [pad for pad in rig.status()["pads"] if pad["pace"] == "event"]
+    assert all(pad["state"] in ("clear", "touched") for pad in idle)  # rare samples are no stale ones
