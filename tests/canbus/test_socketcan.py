@@ -145,7 +145,7 @@ def test_remote_frame_is_sent_as_one(port: Port) -> None:
         assert port.send(0x701, bytes(1), remote=True)
         got = stranger.recv(2.0)
     assert got is not None
-    assert (got.arbitration_id, got.is_remote_frame, got.dlc, got.data) == (0x701, True, 1, b"")
+    assert (got.arbitration_id, got.is_remote_frame, got.dlc, got.data) == (0x701, True, 1, bytearray())
 
 
 def produce(sync: Sync, port: Port, seconds: float) -> int:

@@ -56,7 +56,7 @@ class Port:
             return open_bus(bus)
 
         try:
-            receiver = _receiver(bus.interface, opener)
+            receiver = _receiver(bus, opener)
         except BusError:
             raise
         except Exception as error:  # as in `open_bus`: it is there, but can't be received from
@@ -183,12 +183,12 @@ def restart_ms(channel: str) -> int | None:
         return None
 
 
-def _receiver(interface: str, opener: Callable[[], can.BusABC]) -> Receiver:
-    if interface == "socketcan":
-        return SocketcanReceiver(opener)
-    if interface == "udp_multicast":
+def _receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
+    if bus.interface == "socketcan":
+        return SocketcanReceiver(opener, str(bus.channel))
+    if bus.interface == "udp_multicast":
         return PolledReceiver(opener)
-    return ThreadReceiver(opener, interface)
+    return ThreadReceiver(opener, bus.interface)
 
 
 def _unopened(bus: Bus, error: Exception) -> BusError:

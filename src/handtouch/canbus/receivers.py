@@ -10,7 +10,6 @@ Public names: `Receiver`, `CyclicSender`, `ThreadReceiver`, `Retry`, `RECEIVE_BU
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import socket
@@ -18,6 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from time import monotonic_ns
 from typing import Protocol
 
 import can
@@ -34,7 +34,6 @@ DRAIN_LIMIT = 4096
 QUEUE_FRAMES = 16384
 """Frames that a reader thread holds at most, 1.9 s of a full bus; older ones are dropped and counted."""
 
-_WALL_STAMPED = frozenset({"socketcan", "udp_multicast", "virtual"})
 _TELLS_STATE = frozenset({"ixxat", "etas"})  # elsewhere python-can's `state` is what was asked for
 _SEND_TIMEOUT_S = 0.01  # an adapter that hangs must not hold up the other buses for longer
 _RETRY_FIRST_S, _RETRY_LAST_S = 0.1, 2.0
@@ -120,9 +119,8 @@ class ThreadReceiver:
 
     def __init__(self, opener: Opener, interface: str) -> None:
         self._opener = opener
-        self._stamped = interface in _WALL_STAMPED
         self._tells_state = interface in _TELLS_STATE
-        self._queue: deque[can.Message] = deque(maxlen=QUEUE_FRAMES)
+        self._queue: deque[tuple[can.Message, int]] = deque(maxlen=QUEUE_FRAMES)  # with their arrival
         self._lost = 0
         self._errors = 0
         self._counted = (0, 0)
@@ -130,7 +128,9 @@ class ThreadReceiver:
         self._bus: can.BusABC | None = opener()
         self._eventfd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._signalled = False
+        self._owed = False  # a signal whose flag has been lowered already
         self._closing = threading.Event()
+        self._open = True  # the same, cheaper to look at
         self._thread = threading.Thread(target=self._run, name=f"can-{interface}", daemon=True)
         self._thread.start()
 
@@ -138,6 +138,7 @@ class ThreadReceiver:
         return self._eventfd
 
     def close(self) -> None:
+        self._open = False
         self._closing.set()
         self._thread.join(timeout=5)
         if self._bus is not None:
@@ -158,11 +159,8 @@ class ThreadReceiver:
         self._lower_signal()
         popleft, accept = self._queue.popleft, router.accept_message
         count = min(len(self._queue), DRAIN_LIMIT)
-        now_ns = time.monotonic_ns()
-        offset_ns = now_ns - time.time_ns()
         for _ in range(count):
-            message = popleft()
-            frame = accept(message, monotonic_from_wall(message.timestamp, now_ns, offset_ns))
+            frame = accept(*popleft())
             if frame is not None:
                 others.append(frame)
         if count == DRAIN_LIMIT:
@@ -174,11 +172,14 @@ class ThreadReceiver:
         return others
 
     def _lower_signal(self) -> None:
-        # In this order, and before the queue is read: a frame that comes meanwhile is either read below or
-        # raises the signal again. The other way round its signal could be taken and never raised any more.
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self._eventfd)
-        self._signalled = False
+        # Before the queue is read: what comes meanwhile is either read there or raises the signal again.
+        if self._signalled or self._owed:
+            try:
+                os.eventfd_read(self._eventfd)
+                self._owed = False
+            except BlockingIOError:  # the reader is just about to raise it
+                self._owed = True
+            self._signalled = False
 
     def _raise_signal(self) -> None:
         if not self._signalled:
@@ -198,9 +199,7 @@ class ThreadReceiver:
                 self._drop(bus)
                 continue
             try:
-                message = bus.recv(0.1)
-                if message is None and self._tells_state and bus.state is can.BusState.ERROR:
-                    raise can.CanOperationError("bus-off")
+                came = self._read(bus)
             except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; here it is counted
                 in_a_row += 1
                 self._failed(trouble_of(error))
@@ -209,20 +208,31 @@ class ThreadReceiver:
                     self._drop(bus)
                     self.trouble = given_up(error)
                 continue
-            if message is None:
-                continue
-            self._put(message)
-            if in_a_row or self.trouble is not None:
+            if came:
                 in_a_row = 0
                 retry.reset()
                 self.trouble = None
 
+    def _read(self, bus: can.BusABC) -> bool:
+        """Take frames until none come for a while, or one has although there is trouble. Whether one came."""
+        recv, put, came = bus.recv, self._put, False
+        while self._open:
+            message = recv(0.1)
+            if message is None:
+                if self._tells_state and bus.state is can.BusState.ERROR:
+                    raise can.CanOperationError("bus-off")
+                break
+            put(message)
+            came = True
+            if self.trouble is not None:
+                break
+        return came
+
     def _put(self, message: can.Message) -> None:
-        if not self._stamped:  # its stamps may be of the adapter's own clock
-            message.timestamp = time.time()
-        if len(self._queue) == QUEUE_FRAMES:
+        queue = self._queue
+        if len(queue) == QUEUE_FRAMES:
             self._lost += 1
-        self._queue.append(message)
+        queue.append((message, monotonic_ns()))  # its own stamp may be of the adapter's clock
         if not self._signalled:
             self._raise_signal()
 

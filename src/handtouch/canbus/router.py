@@ -48,9 +48,7 @@ class Router:
         self.slab = slab
         self.counters = Counters()
         self.state = BusState()
-        self._slots = [NOBODY] * IDENTIFIERS
-        self._pdos = bytearray(IDENTIFIERS)
-        self._sizes = bytearray(IDENTIFIERS)
+        self._routes: list[tuple[int, int, int] | None] = [None] * IDENTIFIERS  # slot, PDO, size
         self._write = slab.write
 
     def route(self, can_id: int, slot: int, pdo: int = 0, size: int = PDO_BYTES) -> None:
@@ -67,11 +65,12 @@ class Router:
             raise ValueError(
                 f"PDO {pdo} of {size} bytes is outside 0 to {PDOS - 1} of 1 to {PDO_BYTES} bytes"
             )
-        self._slots[can_id], self._pdos[can_id], self._sizes[can_id] = slot, pdo, size
+        self._routes[can_id] = None if slot == NOBODY else (slot, pdo, size)
 
     def slot(self, can_id: int) -> int:
         """Slot that frames with this identifier are written to, NOBODY without a route."""
-        return self._slots[can_id]
+        route = self._routes[can_id]
+        return NOBODY if route is None else route[0]
 
     def accept(self, can_id: int, data: bytes | bytearray, t_ns: int) -> bool:
         """Take a data frame with an 11-bit identifier and at most 8 bytes; False if it isn't a sample.
@@ -82,11 +81,12 @@ class Router:
         size = len(data)
         counters.frames += 1
         counters.bits += _FRAME_BITS[size]
-        slot = self._slots[can_id]
-        if slot < 0:
+        route = self._routes[can_id]
+        if route is None:
             return False
-        if size == self._sizes[can_id]:
-            self._write(slot, data, t_ns, self._pdos[can_id])
+        slot, pdo, expected = route
+        if size == expected:
+            self._write(slot, data, t_ns, pdo)
             counters.samples += 1
         else:
             counters.short += 1
@@ -103,7 +103,13 @@ class Router:
         can_id = message.arbitration_id
         if message.is_error_frame:
             self.error(can_id, message.data, t_ns)
-        elif message.is_extended_id or message.is_remote_frame or message.is_fd or len(message.data) > 8 or not 0 <= can_id < IDENTIFIERS:
+        elif (
+            message.is_extended_id
+            or message.is_remote_frame
+            or message.is_fd
+            or len(message.data) > 8
+            or not 0 <= can_id < IDENTIFIERS
+        ):
             self.counters.foreign += 1
         elif not self.accept(can_id, message.data, t_ns):
             return can_id, bytes(message.data), t_ns

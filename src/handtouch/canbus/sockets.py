@@ -146,6 +146,17 @@ class _SocketReceiver:
 class SocketcanReceiver(_SocketReceiver):
     """SocketCAN by its socket: kernel stamps, and a third of the cost of python-can's `recv`."""
 
+    def __init__(self, opener: Opener, channel: str) -> None:
+        self._channel = channel
+        super().__init__(opener)
+
+    def _reopen(self, router: Router) -> can.BusABC | None:
+        try:
+            socket.if_nametoindex(self._channel)
+        except OSError:
+            return None  # python-can's attempt would cost the other buses milliseconds
+        return super()._reopen(router)
+
     def _read(self, bus: can.BusABC, router: Router, others: list[Frame]) -> None:  # noqa: ARG002
         recvmsg, unpack, accept = self._socket.recvmsg, _FRAME.unpack_from, router.accept
         stamp = _TIMESPEC.unpack_from

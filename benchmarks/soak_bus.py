@@ -1,0 +1,280 @@
+"""The receive path at the rate of full buses for a long time: losses, queue, and the share of a core.
+
+Without SocketCAN: one and seven in-process buses that carry 8,500 frames/s each, what a 1 Mbit/s bus can, in
+batches a millisecond apart, as an adapter on USB delivers them. All write one slab. The processor time is of
+the receiving threads, the readers of the buses and the one that drains them; --seconds says how long each
+takes. Under `tests/socketcan/vcan-run`: the highest rate of cangen that `Port.drain` and a bare receive loop
+each take without a loss, in turns. Writes docs/benchmarks/soak_bus.{md,json}; exit status 1 if a frame was
+lost in-process, or if the port falls behind the bare loop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import select
+import socket
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+from bench_receive_path import FRAME, VCAN, store
+
+from handtouch.canbus.port import Port
+from handtouch.canbus.receivers import QUEUE_FRAMES, grow_receive_buffer
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
+
+OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
+PADS, ID0 = 15, 0x281
+FULL_BUS = 8500
+AIM = {1: 0.10, 7: 0.50}
+BATCH_S = 0.001
+RUN_S, TURNS = 2.0, 3
+RATES = (2000, 3000, 4000, 6000, 8000, 12000, 16000, 24000, 32000, 48000, 64000)
+
+
+class Feeder:
+    """Fills the queues of in-process buses at a steady rate, in a thread of its own."""
+
+    def __init__(self, buses: list[Any], rate: float) -> None:
+        self.sent = 0
+        self._buses = buses
+        self._rate = rate
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Feeder:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        messages = [
+            can.Message(arbitration_id=ID0 + n, data=bytes(8), is_extended_id=False) for n in range(PADS)
+        ]
+        start, count = time.monotonic(), 0  # frames on each bus
+        while not self._over.wait(BATCH_S):
+            due = int((time.monotonic() - start) * self._rate)
+            for bus in self._buses:
+                queue = bus.queue  # its `send` copies deeply, at three times the cost of receiving
+                with queue.mutex:
+                    queue.queue.extend(messages[number % PADS] for number in range(count, due))
+                    queue.not_empty.notify()
+            self.sent += (due - count) * len(self._buses)
+            count = due
+
+
+def in_process(buses: int, seconds: float) -> dict[str, Any]:
+    """`buses` full buses into one slab for so long."""
+    slab = Slab(buses * PADS)
+    ports = [
+        Port.open(Bus(name=f"can{n}", interface="virtual", channel=f"soak{n}"), slab) for n in range(buses)
+    ]
+    for number, port in enumerate(ports):
+        for pad in range(PADS):
+            port.route(ID0 + pad, number * PADS + pad)
+    receivers: list[Any] = [port._receiver for port in ports]
+    clocks = [time.pthread_getcpuclockid(receiver._thread.ident) for receiver in receivers]
+    clocks.append(time.CLOCK_THREAD_CPUTIME_ID)
+    busy: list[float] = []
+    longest, memory = 0, resident_mb()
+    with Feeder([receiver._bus for receiver in receivers], FULL_BUS) as feeder:
+        start = time.monotonic()
+        before = [time.clock_gettime(clock) for clock in clocks]
+        while time.monotonic() - start < seconds:
+            select.select(ports, (), (), 0.1)
+            for port, receiver in zip(ports, receivers, strict=True):
+                longest = max(longest, len(receiver._queue))
+                port.drain()
+        busy = [time.clock_gettime(clock) - then for clock, then in zip(clocks, before, strict=True)]
+        took = time.monotonic() - start
+    deadline = time.monotonic() + 5
+    while sum(port.counters.frames for port in ports) < feeder.sent and time.monotonic() < deadline:
+        for port in ports:
+            port.drain()
+    grown = resident_mb() - memory
+    lost = feeder.sent - sum(port.counters.samples for port in ports)
+    overflow = sum(port.counters.overflow for port in ports)
+    for port in ports:
+        port.close()
+    return {
+        "buses": buses,
+        "seconds": round(took, 1),
+        "frames": feeder.sent,
+        "frames_per_s": round(feeder.sent / took),
+        "lost": lost,
+        "overflow": overflow,
+        "longest_queue": longest,
+        "queue_limit": QUEUE_FRAMES,
+        "readers_core": round(sum(busy[:-1]) / took, 4),
+        "drain_core": round(busy[-1] / took, 4),
+        "core": round(sum(busy) / took, 4),
+        "aim": AIM[buses],
+        "memory_growth_mb": round(grown, 2),
+        "machine": machine(),
+    }
+
+
+def resident_mb() -> float:
+    """Memory of this process that is in RAM."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def port_loop() -> tuple[Callable[[], int], Callable[[], None]]:
+    """A port on vcan0: frames read by a call, and how to close it."""
+    port = Port.open(Bus(name="port", interface="socketcan", channel="vcan0"), Slab(PADS))
+    for pad in range(PADS):
+        port.route(ID0 + pad, pad)
+
+    def read() -> int:
+        before = port.counters.frames
+        select.select([port], (), (), 0.1)
+        port.drain()
+        return port.counters.frames - before
+
+    return read, port.close
+
+
+def bare_loop() -> tuple[Callable[[], int], Callable[[], None]]:
+    """The same with a socket, without stamps, counts and checks."""
+    bus = can.Bus(interface="socketcan", channel="vcan0")
+    sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketcanBus has it
+    grow_receive_buffer(sock)
+    keep, recv, unpack = store(Slab(PADS)), sock.recv, FRAME.unpack
+
+    def read() -> int:
+        count = 0
+        select.select([sock], (), (), 0.1)
+        while True:
+            try:
+                can_id, _, data = unpack(recv(16, socket.MSG_DONTWAIT))
+            except BlockingIOError:
+                return count
+            keep(can_id, data)
+            count += 1
+
+    return read, bus.shutdown
+
+
+def keeps_up(loop: Callable[[], tuple[Callable[[], int], Callable[[], None]]], rate: int) -> float:
+    """Frames/s that came while cangen sent `rate` a second for RUN_S, 0 if one was lost."""
+    read, close = loop()
+    batch = max(1, rate // 100)
+    count = int(rate * RUN_S)
+    start, got, last = time.monotonic(), 0, time.monotonic()
+    cangen = subprocess.Popen(
+        [
+            "cangen",
+            "vcan0",
+            "-g",
+            "10",
+            "-c",
+            str(batch),
+            "-n",
+            str(count),
+            "-I",
+            f"{ID0:X}",
+            "-L",
+            "8",
+            "-p",
+            "100",
+        ]
+    )
+    while got < count and time.monotonic() - last < 1.0:
+        if new := read():
+            got, last = got + new, time.monotonic()
+    cangen.wait()
+    close()
+    return count / (last - start) if got == count else 0.0
+
+
+def without_loss() -> dict[str, Any]:
+    """The highest rate of RATES that each loop keeps up with, and what it made of it."""
+    best = {"bare": [0.0] * TURNS, "port": [0.0] * TURNS}
+    for turn in range(TURNS):
+        for name, loop in (("bare", bare_loop), ("port", port_loop)):
+            for rate in RATES:
+                reached = keeps_up(loop, rate)
+                best[name][turn] = max(best[name][turn], reached)
+                print(f"{name} {rate:6} asked: {reached:8.0f} frames/s")
+                if reached < 0.7 * rate:  # lost, or no faster than that
+                    break
+    bare, port = (statistics.median(best[name]) for name in ("bare", "port"))
+    return {
+        "bare_per_s": round(bare),
+        "port_per_s": round(port),
+        "ratio": round(port / bare, 3),
+        "machine": machine(),
+    }
+
+
+def machine() -> str:
+    """Where this was measured."""
+    where = os.environ.get("VCAN_RUN", "host")
+    return f"{where}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def report(new: dict[str, Any]) -> None:
+    """Add to what earlier runs, in the other place, have left."""
+    path = OUT / "soak_bus.json"
+    figures: dict[str, Any] = (json.loads(path.read_text()) if path.exists() else {}) | new
+    path.write_text(json.dumps(figures, indent=1) + "\n")
+    lines = [
+        "# Full buses for a long time",
+        "",
+        f"In-process buses with {FULL_BUS} frames/s each, all into one slab. The share of a core is that of",
+        "the receiving threads: one that reads each bus, one that drains all. By `benchmarks/soak_bus.py`.",
+        "",
+        "| buses | seconds | frames/s | lost | longest queue | of | readers | drain | core | aim | on |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        "| {buses} | {seconds} | {frames_per_s} | {lost} | {longest_queue} | {queue_limit} "
+        "| {readers_core:.1%} | {drain_core:.1%} | {core:.1%} | {aim:.0%} | {machine} |".format(**row)
+        for row in figures.get("in_process", [])
+    ]
+    if "socketcan" in figures:
+        lines += [
+            "",
+            "Highest rate of cangen without a loss on SocketCAN, medians of "
+            f"{TURNS} turns; a bare loop reads, looks up and stores:",
+            "",
+            "| bare loop, frames/s | port, frames/s | ratio | on |",
+            "|---|---|---|---|",
+            "| {bare_per_s} | {port_per_s} | {ratio} | {machine} |".format(**figures["socketcan"]),
+        ]
+    (OUT / "soak_bus.md").write_text("\n".join(lines) + "\n")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=600.0, help="of each in-process run (600)")
+    asked = parser.parse_args()
+    OUT.mkdir(parents=True, exist_ok=True)
+    if VCAN.exists():
+        figures = without_loss()
+        report({"socketcan": figures})
+        print(figures)
+        return int(figures["ratio"] < 1 / 1.5)
+    rows = []
+    for buses in AIM:
+        rows.append(in_process(buses, asked.seconds))
+        print(rows[-1], flush=True)
+    report({"in_process": rows})
+    return int(any(row["lost"] or row["overflow"] for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
