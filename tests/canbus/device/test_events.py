@@ -71,6 +71,8 @@ def test_a_node_tells_where_it_is_when_it_is_started(bench: Any) -> None:
     assert bench.data(50) == []
     bench.nmt(1, 1)
     assert [frame for _, frame in bench.data(50)] == [(0x281, struct.pack("<4h", 10, 20, 30, 40))]
+    bench.nmt(1, 1)  # it runs already
+    assert bench.data(50) == []
 
 
 def test_an_event_driven_node_answers_no_sync_and_reads_on_its_own_clock(bench: Any) -> None:

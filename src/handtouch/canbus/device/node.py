@@ -219,7 +219,9 @@ class Device(Switches):
         if command in RESETS:
             self._boot(power=command == _RESET_NODE)
             return
-        self._enter(COMMAND_TO_STATE[command])
+        state = COMMAND_TO_STATE[command]
+        if state != self._state:
+            self._enter(state)
 
     def on_sdo(self, data: bytes) -> None:
         if self._talks:
