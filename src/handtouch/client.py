@@ -257,8 +257,8 @@ class _Door:
                 f"{self._endpoint} doesn't let {self._key.name} in: its key is not known there, or has no "
                 "right to this endpoint; `handtouch keys list FOLDER` on the daemon's machine tells"
             )
-        if self._failures < _FAILURES:
-            return  # a daemon that goes down while we connect looks the same once
+        if self._failures < _FAILURES and event != zmq.Event.HANDSHAKE_FAILED_PROTOCOL:
+            return  # a daemon that goes down while we connect looks the same once; ZeroMQ tries again
         if self._key is None:
             raise PermissionError(
                 f"{self._endpoint} lets nobody in without a key: `handtouch keys client FOLDER NAME` on the "
