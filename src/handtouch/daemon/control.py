@@ -52,9 +52,7 @@ class Control:
                 self.refused += 1  # not from a REQ socket: no answer would be understood
                 continue
             request = parts[1] if len(parts) == 2 else b""  # else answered as malformed
-            self._socket.send_multipart(
-                [client, b"", msgpack.packb(self.answer(request))], zmq.NOBLOCK
-            )
+            self._socket.send_multipart([client, b"", msgpack.packb(self.answer(request))], zmq.NOBLOCK)
 
     def answer(self, request: bytes) -> dict[str, Any]:
         """The answer to one request, whatever its bytes."""
