@@ -28,6 +28,7 @@ def _parts(seq: int, link: str = "thumb", repeat: bool = False) -> list[bytes]:
             "clear",
             "operational",
             0,
+            "sync",
             "",
             None,
             0.0,

@@ -25,7 +25,7 @@ def _health(publisher: Publisher, link: str, text: str = "") -> wire.Health:
     topic = f"health/h/{link}"
     return wire.Health(
         wire.SCHEMA_VERSION, publisher.next_seq(topic), 1, "h", link, "can0", 1, "clear", "operational",
-        0, text, None, 0.0, 0, 0, None, 0, 0, (), False,
+        0, "sync", text, None, 0.0, 0, 0, None, 0, 0, (), False,
     )  # fmt: skip
 
 

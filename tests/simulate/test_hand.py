@@ -51,7 +51,7 @@ def test_counts_are_the_currents_of_the_truth_with_the_noise_of_the_node(
     hand = VirtualHand(deployment, press("round"), IDEAL)
     (true,) = hand.truth(10.0)
     counts = np.array([hand.sample(10 + k * 0.005) for k in range(4000)])
-    assert counts.dtype == np.int16
+    assert counts.dtype == np.int64
     assert counts.shape[1:] == (4, 4)
     expected = np.zeros((4, 4))
     expected[1] = np.array(true.currents_a) / 10e-3 * 32767

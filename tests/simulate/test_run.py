@@ -165,7 +165,7 @@ def test_what_cannot_be_simulated_is_told_before_any_node_speaks(
     eds = tmp_path / "other.eds"
     eds.write_text("[FileInfo]\nFileName=other.eds\n[DeviceInfo]\nVendorName=x\n")
     node = deployment.nodes["plain"].model_copy(update={"eds": str(eds)})
-    with pytest.raises(ValueError, match="0x6401"):
+    with pytest.raises(ValueError, match="has no objects"):
         SimulatedHand.open(
             deployment.model_copy(update={"nodes": {"plain": node}}), Scenario.tour(deployment), IDEAL
         )

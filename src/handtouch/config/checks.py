@@ -67,10 +67,6 @@ def _check_scene(deployment: Deployment) -> Iterator[Problem]:
         full = pattern if "/" in pattern else f"*/{pattern}"
         if not any(fnmatchcase(name, full) for name in names):
             yield Problem("[scene]: links", _is(pattern), f"matches no pad; there are {', '.join(names)}")
-    period_ms, idle_ms = deployment.daemon.sync_period_ms, deployment.scene.idle_sync_period_ms
-    if idle_ms < period_ms:
-        told = f"must not be shorter than sync_period_ms = {period_ms}"
-        yield Problem("[scene]: idle_sync_period_ms", _is(idle_ms), told)
 
 
 def rectangle_mm(surface: Surface) -> tuple[float, float]:

@@ -240,7 +240,10 @@ class Scene(Table):
         2.0, description="a pad untouched for so long becomes event-driven, where its node can"
     )
     idle_sync_period_ms: float = Field(
-        50.0, ge=1, le=1000, description="period of SYNC while every pad in the scene is event-driven"
+        50.0,
+        ge=1,
+        le=1000,
+        description="period of SYNC while every pad in the scene is event-driven, if that is longer",
     )
 
 
