@@ -24,7 +24,7 @@ CAUSES = {
     "wrong_server_key": "a client with the key of another daemon",
     "unknown_key": "a client whose key is not known here",
     "no_right": "a client that may read, but not control",
-    "garbage": "something that doesn't speak as a client does",
+    "garbage": "something that doesn't speak as a client does, or hung up too early to tell",
 }
 """Why a connection was refused: name of the counter -> words."""
 

@@ -1,0 +1,176 @@
+"""A daemon that other machines reach: `handtouch run` with keys, and clients with and without."""
+
+from __future__ import annotations
+
+import os
+import random
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from handtouch import keys
+from handtouch.client import connect, request
+
+from .conftest import START_S, Rig
+
+_ZMTP = b"\xff" + bytes(8) + b"\x7f\x03\x00"
+THROWN = [
+    b"GET / HTTP/1.1\r\n\r\n" * 100,
+    b"",
+    _ZMTP,
+    _ZMTP + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31) + b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x03SUB",
+    _ZMTP + b"CURVE".ljust(20, b"\0") + b"\0" + bytes(31) + b"\x06\x7f" + b"\xff" * 7 + bytes(5000),
+    *(random.Random(seed).randbytes(10_000) for seed in range(20)),
+]
+
+
+def _free_ports(count: int) -> list[int]:
+    with ExitStack() as open_still:
+        probes = [open_still.enter_context(socket.socket()) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [int(probe.getsockname()[1]) for probe in probes]
+
+
+class Reachable(Rig):
+    """A daemon on all interfaces, without nodes: it ticks all the same."""
+
+    def __init__(self, folder: Path, with_keys: bool) -> None:
+        streams = ("live", "complete", "control", "inputs")
+        self.ports = dict(zip(streams, _free_ports(len(streams)), strict=True))
+        settings = {stream: f"tcp://0.0.0.0:{port}" for stream, port in self.ports.items()}
+        super().__init__(
+            folder, settings | ({"keys": "keys"} if with_keys else {}), [], ["can0=virtual:nobody"]
+        )
+        self.keys = folder / "keys"
+
+    def at(self, stream: str) -> str:
+        return f"tcp://127.0.0.1:{self.ports[stream]}"
+
+    def key(self, name: str) -> Path:
+        return self.folder / f"{name}.key"
+
+    def run_command(self, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            self.command(*arguments),
+            capture_output=True,
+            text=True,
+            timeout=START_S,
+            check=False,
+            env={**os.environ, **environment},
+        )
+
+    def ask(self, name: str) -> dict[str, Any]:
+        return request("status", endpoint=self.at("control"), key=self.key(name), timeout_s=START_S)
+
+
+@pytest.fixture
+def reachable(tmp_path: Path) -> Iterator[Reachable]:
+    made = Reachable(tmp_path, with_keys=True)
+    assert made.run_command("keys", "make", str(made.keys), "--name", "robot1").returncode == 0
+    for name, rights in (("reader", "read"), ("pilot", "control")):
+        done = made.run_command(
+            *("keys", "client", str(made.keys), name, "--rights", rights, "--out", str(made.key(name)))
+        )
+        assert done.returncode == 0, done.stderr
+    yield made
+    made.end_all()
+
+
+def test_without_keys_no_daemon_starts_that_other_machines_reach(tmp_path: Path) -> None:
+    rig = Reachable(tmp_path, with_keys=False)
+    done = rig.run_command("run", str(rig.config))
+    assert done.returncode == 2
+    assert "reaches beyond this machine" in done.stderr
+    assert "handtouch keys make" in done.stderr
+
+
+def test_with_a_folder_that_is_not_there_neither(tmp_path: Path) -> None:
+    rig = Reachable(tmp_path, with_keys=True)
+    done = rig.run_command("run", str(rig.config))
+    assert done.returncode == 2
+    assert f"handtouch keys make {rig.keys}" in done.stderr
+
+
+def test_nor_with_a_secret_that_others_may_read(reachable: Reachable) -> None:
+    (reachable.keys / "server.key").chmod(0o644)
+    done = reachable.run_command("run", str(reachable.config), "--bus", reachable.bus[0])
+    assert done.returncode == 2
+    assert f"chmod 600 {reachable.keys / 'server.key'}" in done.stderr
+    found = reachable.run_command("doctor", str(reachable.config))
+    assert f"chmod 600 {reachable.keys / 'server.key'}" in found.stdout
+
+
+def test_each_key_opens_what_it_has_the_right_to(reachable: Reachable, tmp_path: Path) -> None:
+    keys.make(tmp_path / "other", "robot2")
+    keys.add_client(tmp_path / "other", "stranger", "control", reachable.key("stranger"))
+    reachable.start("run")
+    assert reachable.ask("pilot")["ok"]
+    with connect("service", endpoint=reachable.at("live"), key=reachable.key("reader")) as messages:
+        assert messages.recv(START_S) is not None
+    for name, why in (
+        ("reader", "no right to this endpoint"),
+        ("stranger", "another daemon"),
+    ):
+        with pytest.raises(PermissionError, match=why):
+            reachable.ask(name)
+    with pytest.raises(PermissionError, match="nobody in without a key"):
+        request("status", endpoint=reachable.at("control"), key="", timeout_s=START_S)
+
+    keys.add_client(reachable.keys, "late", "control", reachable.key("late"))
+    assert reachable.ask("late")["ok"]
+    keys.revoke(reachable.keys, "late")
+    with pytest.raises(PermissionError, match="not known there"):
+        reachable.ask("late")
+    assert reachable.end("run") == 0
+    told = reachable.printed("run")
+    assert "refused a client that may read, but not control: reader from 127.0.0.1" in told
+    assert "refused a client with the key of another daemon" in told
+    assert "refused a client whose key is not known here" in told
+
+
+def test_the_commands_take_a_key_by_option_and_by_environment(reachable: Reachable) -> None:
+    reachable.start("run")
+    reachable.ask("pilot")
+    control, live = ("--endpoint", reachable.at("control")), ("--endpoint", reachable.at("live"))
+    pilot, reader = str(reachable.key("pilot")), str(reachable.key("reader"))
+    done = reachable.run_command("status", *control, "--key", pilot, "--json")
+    assert '"pads"' in done.stdout, done.stderr
+    done = reachable.run_command("status", *control, "--json", HANDTOUCH_KEY=pilot)
+    assert '"pads"' in done.stdout, done.stderr
+    done = reachable.run_command("status", *control, HANDTOUCH_KEY=reader)
+    assert done.returncode == 1
+    assert "doesn't let reader in" in done.stderr
+    done = reachable.run_command("watch", "service", *live, "--key", reader, "--seconds", "3")
+    assert done.returncode == 0, done.stderr
+    done = reachable.run_command("watch", "service", *live, "--seconds", "60")
+    assert done.returncode == 1
+    assert "--key" in done.stderr
+
+
+def test_garbage_on_the_raw_sockets_stops_no_tick(reachable: Reachable) -> None:
+    reachable.start("run")
+    before = reachable.ask("pilot")["service"]["ticks"]
+    with (
+        connect("hand/*", endpoint=reachable.at("live"), key=reachable.key("reader"), queue=100_000) as hands,
+        ExitStack() as open_still,
+    ):
+        first = hands.recv(START_S)
+        for data in THROWN:
+            for stream in ("live", "complete", "control"):
+                thrown = open_still.enter_context(
+                    socket.create_connection(("127.0.0.1", reachable.ports[stream]), timeout=START_S)
+                )
+                with suppress(OSError):  # it may hang up on us
+                    thrown.sendall(data)
+        assert reachable.ask("pilot")["service"]["ticks"] > before
+        seen = [first.tick, *(hands.recv(START_S).tick for _ in range(100))]
+        assert seen == list(range(first.tick, first.tick + 101))
+        assert hands.gaps == 0
+    assert reachable.end("run") == 0
+    assert "Traceback" not in reachable.printed("run")
