@@ -92,11 +92,11 @@ def parse(text: str) -> tuple[int, int, tuple[int, bool] | None]:
 def channels_of(objects: Sequence[str], path: Path | str | None) -> Channels:
     """The four channels of a kind of node; types come from the object's text, its EDS or CiA's profiles.
 
-    Raises EdsError for a form that `parse` doesn't know, an EDS that can't be read, and a type that isn't
-    known, isn't an integer, is wider than 32 bits or contradicts the EDS.
+    Raises EdsError for a form that `parse` does not know, an object given twice, an unreadable EDS, and
+    a type that isn't known, isn't an integer, is wider than 32 bits or contradicts the EDS.
     """
     dictionary = eds.load(path, 1) if path else None
-    made = []
+    made: list[Channel] = []
     for text in objects:
         index, sub, told = parse(text)
         listed = eds.integer_type(dictionary, index, sub) if dictionary is not None else None
@@ -111,6 +111,8 @@ def channels_of(objects: Sequence[str], path: Path | str | None) -> Channels:
             raise eds.EdsError(f'"{text}": its type is not known; give the EDS, or write it: "{text}:i16"')
         if kind[0] > WIDEST_BITS:
             raise eds.EdsError(f'"{text}" has {kind[0]} bits; channels of at most {WIDEST_BITS} are known')
+        if any((channel.index, channel.sub) == (index, sub) for channel in made):
+            raise eds.EdsError(f'"{text}" is given twice; each channel has an object of its own')
         made.append(Channel(index, sub, *kind))
     first, second, third, fourth = made
     return first, second, third, fourth

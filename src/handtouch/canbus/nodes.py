@@ -11,6 +11,7 @@ from handtouch.config import Deployment, Node
 
 from .boot import Identity, Idle
 from .channels import STANDARD_CHANNELS, Channels, Object, channels_of, in_order, written
+from .eds import EdsError
 from .emergency import Emergency
 from .lifecycle import NodeState
 
@@ -71,12 +72,17 @@ def _idle(kind: Node, sync_period_ms: float) -> Idle | None:
     """Events come no faster than samples would."""
     if kind.idle is None:
         return None
-    enable = kind.idle.enable_object
+    enable, deltas = kind.idle.enable_object, tuple(map(written, kind.idle.delta_objects))
+    for text, delta in zip(kind.idle.delta_objects, deltas, strict=True):
+        if kind.idle.delta_counts >= 1 << 8 * delta.size:
+            raise EdsError(
+                f'"{text}": delta_counts = {kind.idle.delta_counts} is beyond its type; choose a smaller one'
+            )
     return Idle(
         kind.idle.delta_counts,
         kind.idle.period_ms,
         round(sync_period_ms * 10),
-        tuple(map(written, kind.idle.delta_objects)),
+        deltas,
         written(enable) if enable else None,
     )
 
