@@ -297,7 +297,7 @@ def _multicast_finding(subject: str, bus: config.Bus) -> Finding:
 def _device_findings(subject: str, bus: config.Bus) -> Iterator[Finding]:
     device = str(bus.channel).split("@")[0]
     if importlib.util.find_spec("serial") is None:
-        yield Finding(subject, "fail", f"{bus.interface} needs pyserial", "pip install pyserial")
+        yield Finding(subject, "fail", f"{bus.interface} needs pyserial", "pip install 'handtouch[slcan]'")
     if not Path(device).exists():
         yield Finding(subject, "fail", f"there is no {device}", "plug the adapter in")
     elif not os.access(device, os.R_OK | os.W_OK):

@@ -142,7 +142,7 @@ class ThreadReceiver:
         self._closing.set()
         self._thread.join(timeout=5)
         if self._bus is not None:
-            self._bus.shutdown()
+            self._drop(self._bus)
         os.close(self._eventfd)
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
