@@ -158,6 +158,7 @@ def _add_checking(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     doctor.add_argument("--json", action="store_true", help="as JSON")
 
     _add_scan(commands)
+    _add_commission(commands)
 
     figures = _command(commands, "figures", _figures, "redraw the paper's theoretical figures")
     figures.add_argument("--out", type=Path, default=Path("figures"), help="folder (default: figures)")
@@ -193,6 +194,30 @@ def _add_scan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         type=_positive,
         default=5.0,
         help="wait at least so long for LSS answers (default: 5)",
+    )
+
+
+def _add_commission(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    commission = _command(
+        commands,
+        "commission",
+        _commission,
+        "press one pad after another: finds swapped nodes, the order of electrodes and dead channels, and "
+        "writes them to the deployment file",
+    )
+    _add_config(commission)
+    _add_bus(commission)
+    commission.add_argument(
+        "--link",
+        action="append",
+        default=[],
+        metavar="PATTERN",
+        help='pads to do, such as "thumb_*" or "left/index_distal" (default: all that are not done yet)',
+    )
+    commission.add_argument("--dry-run", action="store_true", help="show what would change, write nothing")
+    commission.add_argument("--yes", action="store_true", help="take swapped nodes over without asking")
+    commission.add_argument(
+        "--seconds", type=_positive, default=60.0, help="wait so long for a press or a key (default: 60)"
     )
 
 
@@ -327,6 +352,19 @@ def _scan(asked: argparse.Namespace) -> int:
         lss_wait_s=asked.lss_wait_ms * 1e-3,
     )
     return scan.run(asked.config, asked.bus, request, as_json=asked.json)
+
+
+def _commission(asked: argparse.Namespace) -> int:
+    from handtouch import commission
+
+    return commission.run(
+        asked.config,
+        asked.bus,
+        links=asked.link,
+        dry_run=asked.dry_run,
+        yes=asked.yes,
+        patience_s=asked.seconds,
+    )
 
 
 def _figures(asked: argparse.Namespace) -> int:
