@@ -54,6 +54,7 @@ class Wire:
         self.asked: list[int] = []  # identifiers of its remote frames
         self.down = False
         self.cut: set[int] = set()  # node ids whose cable is out
+        self.lose: set[int] = set()  # identifiers of frames that don't arrive
         self._rig = rig
 
     # the devices' side
@@ -62,7 +63,8 @@ class Wire:
 
     def send(self, *frame: Any) -> None:
         if len(frame) == 1:
-            if frame[0].arbitration_id & 0x7F not in self.cut:
+            identifier = frame[0].arbitration_id
+            if identifier & 0x7F not in self.cut and identifier not in self.lose:
                 self.to_master.append(_copy(frame[0]))
         else:
             self._from_master(*frame)
