@@ -2,8 +2,8 @@
 
 Public names: `Gate`, `CAUSES`.
 
-The hot thread answers the handshakes itself, a few per tick. They are rare, each costs microseconds, and a
-flood of them is slowed down to the tick's pace; a thread for them would fight the tick for the interpreter.
+The hot thread answers the handshakes itself, a few at a time. They are rare, and a flood of them waits in
+line; a thread for them would fight the tick for the interpreter, and under a flood win too often.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ CAUSES = {
 """Why a connection was refused: name of the counter -> words."""
 
 _ZAP = "inproc://zeromq.zap.01"
+_POLL_NS = 10_000_000
 _HANDSHAKES_PER_POLL = 2
 _EVENTS_PER_POLL = 100
 _HANDSHAKE_MS = 5000
@@ -57,6 +58,7 @@ class Gate:
         self._context = context
         self._folder = folder
         self._monitors: list[zmq.Socket[bytes]] = []
+        self._polled_ns = 0
         self._told: dict[str, tuple[int, int]] = {}
         self._clients: dict[str, keys.Client] = {}
         self._seen: object = None
@@ -88,9 +90,10 @@ class Gate:
         self._monitors.append(monitor)
 
     def poll(self, now_ns: int) -> None:
-        """Answer handshakes and count refusals."""
-        if self._folder is None:
+        """Answer handshakes and count refusals, every 10 ms: to look for them costs microseconds."""
+        if self._folder is None or now_ns - self._polled_ns < _POLL_NS:
             return
+        self._polled_ns = now_ns
         for _ in range(_HANDSHAKES_PER_POLL):
             if not _ready(self._zap):
                 break
