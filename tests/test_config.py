@@ -247,6 +247,18 @@ MISTAKES = {
         ("[[bus]]", '[daemon]\nlive = "tcp://0.0.0.0:5580"\n[[bus]]'),
         '[daemon]: live = "tcp://0.0.0.0:5580": reaches beyond this machine; only loopback',
     ),
+    "endpoint open to the world, and how to open it": (
+        ("[[bus]]", '[daemon]\nlive = "tcp://*:5580"\n[[bus]]'),
+        'make some with `handtouch keys make FOLDER` beside this file, and give keys = "FOLDER" in [daemon]',
+    ),
+    "keys that are not there": (
+        ("[[bus]]", '[daemon]\nkeys = "absent"\n[[bus]]'),
+        '[daemon]: keys = "absent": no such folder; `handtouch keys make absent` makes it',
+    ),
+    "keys that are nowhere": (
+        ("[[bus]]", '[daemon]\nkeys = ""\nlive = "tcp://*:5580"\n[[bus]]'),
+        '[daemon]: keys = ""',
+    ),
     "endpoint used twice": (
         ("[[bus]]", '[daemon]\nlive = "tcp://127.0.0.1:5582"\n[[bus]]'),
         '[daemon]: complete = "tcp://127.0.0.1:5582": is the endpoint of live too',
@@ -290,6 +302,22 @@ def test_a_mistake_is_named(change: tuple[str, str], expected: str) -> None:
 def test_endpoints_on_this_machine_are_taken(endpoint: str) -> None:
     text = SMALL.replace("[[bus]]", f'[daemon]\nlive = "{endpoint}"\n[[bus]]', 1)
     assert config.parse(text).daemon.live == endpoint
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "*", "192.168.1.20", "eth0", "127.0.0.1"])
+def test_with_keys_an_endpoint_may_reach_beyond_this_machine(tmp_path: Path, host: str) -> None:
+    (tmp_path / "keys").mkdir()
+    table = f'[daemon]\nkeys = "keys"\nlive = "tcp://{host}:7001"\n[[bus]]'
+    daemon = config.parse(SMALL.replace("[[bus]]", table, 1), folder=tmp_path).daemon
+    assert daemon.live == f"tcp://{host}:7001"
+    assert daemon.keys == str(tmp_path / "keys")
+
+
+def test_an_endpoint_on_all_interfaces_takes_its_port_on_each(tmp_path: Path) -> None:
+    (tmp_path / "keys").mkdir()
+    table = '[daemon]\nkeys = "keys"\nlive = "tcp://*:5582"\n[[bus]]'
+    with pytest.raises(ConfigError, match="is the endpoint of live too"):
+        config.parse(SMALL.replace("[[bus]]", table, 1), folder=tmp_path)
 
 
 @given(st.from_regex(r"tcp://[\[\]0-9a-z.:*]{0,20}", fullmatch=True))
