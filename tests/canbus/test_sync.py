@@ -92,8 +92,7 @@ class Rig:
         while self.now_ns < end_ns:
             for kernel in self.kernels:
                 kernel.now_ns = self.now_ns
-            if self.now_ns >= self.sync.wake_ns:
-                self._took(self.sync.poll(self.now_ns))
+            self._took(self.sync.poll(self.now_ns))
             for port, kernel in zip(self.ports, self.kernels, strict=True):
                 while kernel.period_ns is not None and kernel.next_ns <= self.now_ns - self.delay_ns:
                     t_ns, kernel.next_ns = kernel.next_ns, kernel.next_ns + kernel.period_ns
@@ -102,7 +101,8 @@ class Rig:
             if foreign_ns and self.now_ns >= next_foreign_ns:
                 next_foreign_ns += foreign_ns
                 self._took(self.sync.seen("can0", self.now_ns, self.now_ns))
-            self.now_ns += step_ns
+            if self.now_ns < self.sync.wake_ns:
+                self.now_ns += step_ns
 
     def figures(self, bus: str = "can0") -> dict[str, Any]:
         return self.sync.figures(bus, self.now_ns)
@@ -184,6 +184,17 @@ def test_loop_takes_over_from_a_kernel_that_stops_sending_and_gives_back(
     assert rig.figures()["problem"] == ""
     assert rig.figures()["others"] == 0
     assert max(intervals(rig.cycles)) <= 2 * P
+
+
+def test_pause_of_the_loop_is_not_taken_for_the_kernels() -> None:
+    """What the kernel sent meanwhile waits to be received."""
+    rig = Rig(Kernel())
+    rig.run(0.5)
+    rig.now_ns += 100 * MS
+    rig.run(1.5)
+    assert rig.figures()["by"] == "kernel"
+    assert rig.kernels[0].started == 1
+    assert rig.figures()["problem"] == ""
 
 
 def test_kernel_that_is_away_on_one_bus_leaves_the_others_alone() -> None:

@@ -75,6 +75,7 @@ class Sync:
         self._produced = [bus for bus in self._buses.values() if bus.ours]
         self._clock: _SyncBus | None = None  # whose SYNC begins the cycle; None: the loop's timer
         self._due_ns = self._begun_ns = 0
+        self._has_looked = False  # for a late SYNC among what has been received
 
     def start(self, now_ns: int) -> None:
         """The first SYNC is due now, at the next `poll`."""
@@ -109,6 +110,10 @@ class Sync:
     def poll(self, now_ns: int) -> int | None:
         """Send what is due; the time of a cycle that begins now, be its SYNC ours or one that is late."""
         if now_ns < self._due_ns:
+            return None
+        if self._clock is not None and not self._has_looked:
+            self._has_looked = True  # after a pause of the loop the SYNC may be waiting to be received
+            self._due_ns = now_ns
             return None
         for bus in self._produced:
             if bus.sender is not None and now_ns - bus.last_ns > _AWAY * self.period_ns:
@@ -151,6 +156,7 @@ class Sync:
         for bus in self._produced:
             bus.judge(now_ns, self.period_ns)
         self._choose_clock()
+        self._has_looked = False
         self._begun_ns = t_ns
         self._due_ns = self._next_due_ns(t_ns)
 

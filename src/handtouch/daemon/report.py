@@ -95,7 +95,7 @@ class Report:
                 self._publisher.send(self._health(pad, now_ns, statuses[pad]), lasting=True)
         if now_ns - self._half_second.since_ns >= _SERVICE_NS:
             rates = self._half_second.per_second(now_ns, self._totals())
-            self._speeds = dict(zip(["ticks", *self._ports], rates.tolist(), strict=True))
+            self._speeds = dict(zip(["ticks", *_of_buses(self._ports)], rates.tolist(), strict=True))
             self._tick_us = _summary(self._durations_ns)
             self._durations_ns.clear()
             self._publisher.send(self._service(now_ns, self._publisher.next_seq("service")), lasting=True)
@@ -168,7 +168,8 @@ class Report:
             tick_us=self._tick_us,
             buses={
                 name: {
-                    "load": self._speeds.get(name, 0.0) / bit_rates[name],
+                    "load": self._speeds.get(f"{name} bits", 0.0) / bit_rates[name],
+                    "lost_hz": self._speeds.get(f"{name} lost", 0.0),
                     **port.state.figures(),
                     "sync": self._sync.figures(name, now_ns),
                     **asdict(port.counters),
@@ -183,7 +184,14 @@ class Report:
         )
 
     def _totals(self) -> NDArray[np.int64]:
-        return np.array([self._pipeline.ticks, *(port.counters.bits for port in self._ports.values())])
+        counters = [port.counters for port in self._ports.values()]
+        return np.array(
+            [self._pipeline.ticks, *(n for bus in counters for n in (bus.bits, bus.overflow))], dtype=np.int64
+        )
+
+
+def _of_buses(names: Iterable[str]) -> list[str]:
+    return [f"{name} {what}" for name in names for what in ("bits", "lost")]
 
 
 class _Window:
