@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 
-from handtouch import config, doctor, shipped
+from handtouch import config, doctor, keys, shipped
 from handtouch.doctor import Finding, Machine
 
 TROUBLE_OPENING_RAW = doctor._trouble_opening_raw
@@ -111,6 +112,35 @@ def test_a_taken_port_is_found() -> None:
     assert findings[0].state == "fail"
     assert "address already in use" in findings[0].detail
     assert "handtouch status" in findings[0].remedy
+
+
+@pytest.mark.parametrize(("host", "state"), [("*", "ok"), ("lo", "ok"), ("no-such0", "fail")])
+def test_an_endpoint_on_an_interface_needs_that_interface(free_port: int, host: str, state: str) -> None:
+    found = next(doctor.endpoint_findings(config.Daemon(live=f"tcp://{host}:{free_port}")))
+    assert found.state == state
+
+
+def test_keys_that_cannot_be_used_are_found_and_named(tmp_path: Path) -> None:
+    keys.make(tmp_path / "keys", "robot1")
+    keys.add_client(tmp_path / "keys", "viewer", "read", tmp_path / "viewer.key")
+    daemon = config.Daemon(keys=str(tmp_path / "keys"))
+    (well,) = doctor.key_findings(daemon)
+    assert (well.state, "lets 1 clients in" in well.detail) == ("ok", True)
+    (tmp_path / "keys/server.key").chmod(0o640)
+    (tmp_path / "keys/clients/viewer.pub").write_text("")
+    found = list(doctor.key_findings(daemon))
+    assert {finding.state for finding in found} == {"fail"}
+    assert any("chmod 600" in finding.remedy for finding in found)
+    assert any("viewer.pub" in finding.detail for finding in found)
+
+
+@pytest.mark.parametrize(("daemon", "state"), [(config.Daemon(), "warn"), (config.Daemon(keys="k"), "fail")])
+def test_a_pyzmq_without_cryptography_is_found(
+    monkeypatch: pytest.MonkeyPatch, daemon: config.Daemon, state: str
+) -> None:
+    monkeypatch.setattr(zmq, "has", lambda _: False)
+    (found,) = doctor.key_findings(daemon)
+    assert (found.state, "pyzmq" in found.remedy) == (state, True)
 
 
 def test_an_ipc_endpoint_is_free_only_while_nobody_answers_there(tmp_path: Path) -> None:

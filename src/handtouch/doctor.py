@@ -333,16 +333,11 @@ def _ipc_finding(subject: str, path: Path) -> Finding:
 
 
 def _trouble_binding(endpoint: str) -> str | None:
-    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    if port == "*":
-        return None
-    family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
-    try:
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host.strip("[]"), int(port)))
-    except (OSError, OverflowError, ValueError) as error:
-        return str(getattr(error, "strerror", None) or error).lower()
+    with zmq.Context() as context, context.socket(zmq.PUB) as probe:
+        try:
+            probe.bind(endpoint)  # knows names of interfaces too
+        except zmq.ZMQError as error:
+            return str(error.strerror).lower()
     return None
 
 
