@@ -112,11 +112,15 @@ def identify(sdo: Sdo, expected: Expected) -> Identity:
     return identity
 
 
-def configure(sdo: Sdo, mapping: Mapping, wanted: Settings, halt: Callable[[], None]) -> Configured:
+def configure(
+    sdo: Sdo, mapping: Mapping, wanted: Settings, halt: Callable[[], None], booted: bool = False
+) -> Configured:
     """Set what differs: PDOs enabled and synchronous, heartbeat time; each is read back.
 
-    A node without heartbeat gets it as guard time. `halt` makes the node pre-operational; called only if a
-    PDO must be changed, which many nodes refuse while they run.
+    A node without heartbeat gets it as guard time. One that has just `booted` is told its heartbeat time
+    anyhow: another with its id may have answered in its place, and is known by its heartbeats alone. `halt`
+    makes the node pre-operational; called only if a PDO must be changed, which many nodes refuse while they
+    run.
     """
     if any(not tpdo.enabled or tpdo.transmission != SYNCHRONOUS for tpdo in mapping.tpdos):
         halt()
@@ -135,7 +139,7 @@ def configure(sdo: Sdo, mapping: Mapping, wanted: Settings, halt: Callable[[], N
                 raise
             may_idle, refusal = False, str(error)
     excite(sdo, wanted.excitation, True)
-    return Configured(_supervise(sdo, wanted.heartbeat_ms), may_idle, refusal)
+    return Configured(_supervise(sdo, wanted.heartbeat_ms, booted), may_idle, refusal)
 
 
 def prepare_idle(sdo: Sdo, tpdo: Tpdo, idle: Idle, halt: Callable[[], None]) -> None:
@@ -205,11 +209,11 @@ def _identifier(tpdo: Tpdo) -> str:
     return f"identifier of TPDO{tpdo.number}"
 
 
-def _supervise(sdo: Sdo, period_ms: int) -> bool:
+def _supervise(sdo: Sdo, period_ms: int, booted: bool) -> bool:
     """Set the heartbeat; where there is none, guarding. Returns whether it is guarding."""
     heartbeat = sdo.read_optional(_HEARTBEAT, 0, "heartbeat time")
     if heartbeat is not None:
-        if heartbeat != period_ms:
+        if booted or heartbeat != period_ms:
             sdo.write(_HEARTBEAT, 0, period_ms, 2, "heartbeat time")
         return False
     if sdo.read_optional(_GUARD_TIME, 0, "guard time") is not None:

@@ -94,6 +94,7 @@ class _Node:
     identity: boot.Identity | None = None
     mapping: PdoMapping | None = None
     working: threading.Lock = field(default_factory=threading.Lock)  # one transfer at a time
+    booted: bool = False  # and not configured since
     guarded: bool = False
     guard_ns: int = 0  # when to ask a guarded node next
     heartbeats: int = 0
@@ -267,7 +268,7 @@ class Master:
 
     def _heartbeat(self, node: _Node, nmt: int, t_ns: int) -> None:
         if nmt == NMT_BOOT_UP:
-            node.watched = None  # its heartbeat time is its own until it is configured
+            node.booted, node.watched = True, None  # its heartbeat time is its own until it is configured
             self._advance(node, BootUp(), t_ns)
             return
         node.heartbeats += 1
@@ -395,7 +396,7 @@ class Master:
                 self._take_identity(node, result, t_ns)
             elif isinstance(result, boot.Configured):
                 node.guarded = result.guarded
-                node.may_idle = result.may_idle
+                node.booted, node.may_idle = False, result.may_idle
                 self._set_pace(node, False, t_ns)
                 self._next_due_ns = t_ns
                 if node.watched is None:
@@ -479,7 +480,7 @@ def _carry_out(node: _Node, step: Action, idle: bool) -> Result | None:
     if step is Action.PACE:
         boot.set_pace(node.sdo, node.mapping.tpdos[0], idle)
         return boot.Paced(idle)
-    return boot.configure(node.sdo, node.mapping, spec, halt)
+    return boot.configure(node.sdo, node.mapping, spec, halt, node.booted)
 
 
 def _command(node: _Node, action: Action) -> None:

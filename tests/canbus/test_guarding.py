@@ -1,0 +1,138 @@
+"""A node without a heartbeat is asked for its state, and supervised all the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from handtouch.canbus.channels import channels_of
+from handtouch.canbus.lifecycle import NodeState
+
+Make = Callable[..., Any]
+EDS = str(Path(__file__).parent.parent / "data" / "eds" / "tactor-q16.eds")
+OPERATIONAL, ABSENT, STOPPED = NodeState.OPERATIONAL, NodeState.ABSENT, NodeState.STOPPED
+
+
+@pytest.fixture
+def make_guarded(make_rig: Make) -> Make:
+    """Rigs of nodes with guarding instead of a heartbeat."""
+    channels = channels_of([f"0x21{n}0:0" for n in (1, 2, 3, 4)], EDS)
+    device = {"eds": EDS, "channels": tuple((c.index, c.sub) for c in channels)}
+
+    def make(size: int = 2, **more: Any) -> Any:
+        return make_rig(size, device=device, eds=EDS, channels=channels, **more)
+
+    return make
+
+
+@pytest.fixture
+def rig(make_guarded: Make) -> Any:
+    """Two of them, operational."""
+    rig = make_guarded()
+    rig.boot()
+    rig.wire.asked.clear()
+    return rig
+
+
+def test_guarded_node_is_asked_once_a_period(rig: Any) -> None:
+    assert rig.status(1).guarded
+    assert rig.node(1).read(0x100C, 0) == 100
+    assert rig.node(1).read(0x100D, 0) == 3
+    before = rig.status(1).heartbeats
+    rig.run(1000)
+    assert rig.wire.asked.count(0x701) == rig.wire.asked.count(0x702) == 10
+    assert rig.status(1).heartbeats - before == 10
+    assert rig.status(1).heartbeats_missed == 0
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_guarded_node_that_vanishes_is_lost_in_time_and_comes_back(rig: Any) -> None:
+    rig.node(1).unplug()
+    events = [e for e in rig.run(600) if e.new is ABSENT]
+    assert [e.slot for e in events] == [0]
+    assert "no heartbeat for 35" in events[0].reason
+    rig.run(3000)
+    rig.node(1).plug()
+    rig.run(300)
+    assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
+    rig.run(3000)
+    assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
+
+
+def test_guarded_node_that_does_not_answer_any_more_is_not_trusted_for_its_data(rig: Any) -> None:
+    rig.node(1).send_heartbeat = False
+    events = rig.run(10_000)
+    assert events[-1].new is NodeState.FAULTED
+    assert OPERATIONAL not in [e.new for e in events]
+    rig.node(1).send_heartbeat = True
+    rig.run(5500)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_wrong_toggle_bit_is_no_fault(rig: Any) -> None:
+    """It tells that an answer was lost; what that means is told by time."""
+    for _ in range(5):
+        rig.run(100)
+        rig.inject(0x701, b"\x05")
+        rig.inject(0x701, b"\x05")
+        rig.run(400)
+    rig.wire.lose = {0x701}
+    rig.run(150)
+    rig.wire.lose = set()
+    rig.run(500)
+    assert rig.state(1) is OPERATIONAL
+    assert 1 <= rig.status(1).heartbeats_missed <= 2
+    assert rig.run(1000) == []
+
+
+def test_guarded_node_that_stopped_is_started_again(rig: Any) -> None:
+    rig.run(300)
+    rig.node(1).on_nmt(2)
+    rig.run(500)
+    assert rig.state(1) is OPERATIONAL
+    assert rig.node(1).state == "OPERATIONAL"
+
+
+def test_stopped_guarded_node_is_found_after_a_restart(rig: Any) -> None:
+    """It serves no SDO and sends nothing by itself: only its guarding answers."""
+    rig.master.stop(rig.t_ns)
+    assert rig.node(1).state == "STOPPED"
+    rig.restart()
+    rig.start()
+    rig.run(500)
+    assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
+
+
+def test_guarded_node_at_rest_is_watched_and_woken(rig: Any) -> None:
+    rig.master.rest(0, True, rig.t_ns)
+    rig.run(2000)
+    assert rig.state(1) is STOPPED
+    assert rig.node(1).state == "STOPPED"
+    assert rig.node(1).read(0x100C, 0) == 100  # nor has it been forgotten
+    assert rig.status(1).emergencies == ()
+    rig.node(1).unplug()
+    rig.run(600)
+    assert rig.state(1) is ABSENT
+    rig.node(1).plug()
+    rig.run(300)
+    assert rig.state(1) is STOPPED
+    rig.master.rest(0, False, rig.t_ns)
+    rig.run(200)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_life_guarding_of_the_node_never_fires_while_we_run(rig: Any) -> None:
+    rig.run(5000)
+    assert [rig.status(n).emergencies for n in (1, 2)] == [(), ()]
+    assert rig.status(1).reboots == 0
+
+
+def test_two_guarded_nodes_with_one_id_are_told(rig: Any) -> None:
+    twin = rig.devices.add_twin(1, serial=999)
+    twin.plug()
+    rig.run(4000)
+    assert rig.state(1) is NodeState.FAULTED
+    assert "two nodes have its id" in rig.status(1).reason
