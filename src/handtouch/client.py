@@ -121,7 +121,8 @@ class Subscriber:
             while True:
                 coming = asyncio.ensure_future(socket.recv_multipart())
                 try:
-                    await asyncio.wait((coming, refused), return_when=asyncio.FIRST_COMPLETED)
+                    if not coming.done():
+                        await asyncio.wait((coming, refused), return_when=asyncio.FIRST_COMPLETED)
                     if not coming.done():
                         refused.result()
                 finally:
