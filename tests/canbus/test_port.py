@@ -12,11 +12,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import can
 import pytest
 
 from handtouch.canbus import receivers
+from handtouch.canbus.bus_state import Condition
 from handtouch.canbus.port import BusError, Port
 from handtouch.canbus.receivers import Retry, ThreadReceiver, monotonic_from_wall
 from handtouch.canbus.router import Router
@@ -189,6 +191,7 @@ class FakeBus(can.BusABC):
         self.ends = socket.socketpair()
         self.ends[1].send(b"x")
         self.closed = False
+        self.send_error: Exception = can.CanOperationError("Transmit buffer full")
         super().__init__("fake")
 
     def fileno(self) -> int:
@@ -204,7 +207,7 @@ class FakeBus(can.BusABC):
         return item, False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
-        raise can.CanOperationError("Transmit buffer full")
+        raise self.send_error
 
     def shutdown(self) -> None:
         self.closed = True
@@ -307,6 +310,77 @@ def test_full_transmit_queue_is_counted_never_raised(start: Any) -> None:
     assert (port.counters.sent, port.counters.queue_full, port.counters.bits) == (0, 1, 0)
 
 
+def test_other_failures_to_send_are_told_from_a_full_queue(start: Any) -> None:
+    opener = Opener()
+    port = Port(Bus(name="palm", interface="fake", channel="1"), start(opener), Slab(1))
+    assert not port.send(0x80, b"")
+    assert "transmit queue full, 1 frames not sent" in port.look(time.monotonic_ns()).problem
+    opener.opened[0].send_error = ValueError("whatever drivers raise")
+    assert not port.send(0x80, b"")
+    assert (port.counters.queue_full, port.counters.send_failures) == (1, 1)
+    assert port.state.condition is Condition.ACTIVE
+    assert port.send_cyclically(0x80, b"", 0.01) is None  # no kernel here
+
+
+@pytest.mark.parametrize("told_by", ["recv", "send"])
+def test_bus_off_adapter_is_closed_and_opened_again(told_by: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(receivers, "_RETRY_FIRST_S", 0.002)
+    off = can.CanOperationError("The controller is bus-off")
+    opener = Opener([off] if told_by == "recv" else [], OSError("still busy"), [SAMPLE])
+    receiver = ThreadReceiver(opener, "fake")
+    port = Port(Bus(name="palm", interface="fake", channel="1"), receiver, Slab(1))
+    opener.opened[0].send_error = off
+    if told_by == "send":
+        assert not port.send(0x80, b"")
+        assert port.look(time.monotonic_ns()).condition is Condition.BUS_OFF
+        assert "closed and opened again" in port.problem
+    assert eventually(lambda: port.drain() == [(0x281, bytes(8), mock.ANY)])
+    assert opener.opened[0].closed
+    assert len(opener.opened) == 2
+    assert port.look(time.monotonic_ns()).condition is Condition.ACTIVE
+    port.close()
+
+
+def test_error_frame_of_an_adapter_that_speaks_the_kernels_language_sets_the_state() -> None:
+    bus_off = can.Message(arbitration_id=0x40, data=bytes(8), is_error_frame=True)
+    receiver = ThreadReceiver(Opener([bus_off]), "gs_usb")
+    port = Port(Bus(name="palm", interface="gs_usb", channel="1"), receiver, Slab(1))
+    assert eventually(lambda: port.drain() == [] and port.counters.errors == 1)
+    assert port.look(time.monotonic_ns()).condition is Condition.BUS_OFF
+    assert port.state.causes == {"bus-off": 1}
+    port.close()
+
+
+@pytest.mark.parametrize("can_id", [0x800, 0xFFF, -1])
+def test_identifier_that_cannot_be_is_dropped(start: Any, router: Router, can_id: int) -> None:
+    """As a garbled line of slcan has it; in the router it was an index."""
+    odd = frame(0, b"")
+    odd.arbitration_id = can_id
+    receiver = start(Opener([odd, SAMPLE]))
+    assert drain_until(receiver, router, lambda: router.counters.samples == 1)
+    assert router.counters.foreign == 1
+
+
+def test_remote_frame_is_sent_as_one(port: Port, other: can.BusABC) -> None:
+    assert port.send(0x701, bytes(1), remote=True)
+    got = other.recv(1.0)
+    assert got is not None
+    assert (got.arbitration_id, got.is_remote_frame, got.dlc) == (0x701, True, 1)
+    assert port.counters.bits == 55
+    other.send(got)
+    assert eventually(lambda: port.drain() == [] and port.counters.foreign == 1)
+
+
+def test_adapter_that_cannot_even_be_closed_is_given_back() -> None:
+    class Stuck(FakeBus):
+        def shutdown(self) -> None:
+            super().shutdown()
+            raise can.CanOperationError("Could not write to serial device")
+
+    ThreadReceiver(lambda: Stuck([]), "fake").close()
+    PolledReceiver(lambda: Stuck([])).close()
+
+
 def test_closing_gives_everything_back() -> None:
     """Descriptors are counted, as a leak of one per reconnection would end a long run."""
     before = len(os.listdir("/proc/self/fd"))
@@ -335,6 +409,31 @@ def test_pauses_between_attempts_grow_to_a_limit() -> None:
 def test_stamps_that_cannot_be_are_replaced_by_now(stamp_s: float, t_ns: int) -> None:
     now_ns, offset_ns = 50 * 10**9, -50 * 10**9  # the wall clock shows 100 s
     assert monotonic_from_wall(stamp_s, now_ns, offset_ns) == t_ns
+
+
+OVERFLOW = """
+import can
+from handtouch.canbus import receivers
+from handtouch.canbus.port import Port
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
+receivers.RECEIVE_BUFFER_BYTES = 1  # the kernel's least: a few frames
+port = Port.open(Bus(name="palm", interface="udp_multicast", channel="239.74.163.3"), Slab(1))
+stranger = can.Bus(interface="udp_multicast", channel="239.74.163.3")
+for number in range(200):
+    stranger.send(can.Message(arbitration_id=0x701, data=bytes(8), is_extended_id=False))
+port.drain()
+c = port.counters
+assert 0 < c.frames < 200 and c.overflow == 200 - c.frames, c
+port.close(); stranger.shutdown()
+"""
+
+
+def test_what_udp_multicast_drops_is_counted(network: list[str]) -> None:
+    done = subprocess.run(
+        [*network, sys.executable, "-c", OVERFLOW], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
 
 
 UDP = """
