@@ -26,11 +26,29 @@ def table(session: Session) -> str:
 
 
 def difference(before: str, after: str, name: str) -> str:
-    """Unified diff; empty when nothing changed."""
-    lines = difflib.unified_diff(
-        before.splitlines(keepends=True), after.splitlines(keepends=True), name, f"{name} (found)", n=1
-    )
-    return "".join(lines)
+    """The lines that changed, table by table, as a diff shows them; empty when nothing changed.
+
+    Tables are compared one by one: a diff of the whole would show swapped nodes as pads that moved.
+    """
+    shown, line = [], 1
+    for old, new in zip(_tables(before), _tables(after), strict=True):
+        if old != new:
+            link = next((text.partition("=")[2].strip() for text in old if text.startswith("link")), "")
+            shown.append(f"@@ line {line} @@ {old[0].strip()} {link}".rstrip())
+            body = list(difflib.unified_diff(old, new, n=1, lineterm=""))[2:]
+            shown += [text for text in body if not text.startswith("@@")]
+        line += len(old)
+    return "\n".join([f"--- {name}", f"+++ {name}, as found", *shown]) + "\n" if shown else ""
+
+
+def _tables(text: str) -> list[list[str]]:
+    """Lines of the text, a new list at every table header."""
+    tables: list[list[str]] = [[]]
+    for line in text.splitlines():
+        if line.startswith("["):
+            tables.append([])
+        tables[-1].append(line)
+    return tables
 
 
 def _cells(session: Session, row: int, outcome: Outcome) -> tuple[str, ...]:

@@ -116,8 +116,12 @@ class _Said(Exception):  # noqa: N818 - no error: a key that ends what is being 
         self.key = key
 
 
-class _NoAnswer(Exception):  # noqa: N818
-    """Nobody pressed in time."""
+class _NoPress(Exception):  # noqa: N818
+    """There was no press in time, or none that could be used; `str` says why."""
+
+    def __init__(self, result: Result, why: str) -> None:
+        super().__init__(why)
+        self.result = result
 
 
 class Session:
@@ -241,10 +245,9 @@ class Session:
             try:
                 slot = self._find_node(row, title)
                 presses, verdict = self._find_order(row, slot, title)
-            except _NoAnswer:
-                outcome.result = Result.NO_ANSWER
-                outcome.problems = [_NO_ANSWER]
-                self._say(f"  {_NO_ANSWER}.", "bad")
+            except _NoPress as failed:
+                outcome.result, outcome.problems = failed.result, [str(failed)]
+                self._say(f"  {failed}.", "bad")
                 key = self._ask("Enter or a: again, s: skip, q: quit")
             except _Said as said:
                 key = said.key
@@ -260,14 +263,14 @@ class Session:
             outcome.result, outcome.problems = Result.LEFT, []
 
     def _find_node(self, row: int, title: str) -> int:
-        """Which node answers. Raises _NoAnswer and _Said."""
+        """Which node answers. Raises _NoPress and _Said."""
         while True:
             press = self._press(row, f"{title}: press it anywhere")
             holder = self._held_by(press.slot, row)
             if holder is not None:
                 self._say(
-                    f"  the node of {holder} answered, which was found before: is the right pad pressed? "
-                    f"If so, do {holder} again.",
+                    f"  the node of {holder} answered, which was found before: was the right pad pressed? "
+                    f"If so, do {holder} again later, by --link.",
                     "bad",
                 )
                 self._go_on("Enter: press again, s: skip, q: quit")
@@ -285,7 +288,7 @@ class Session:
             return press.slot
 
     def _find_order(self, row: int, slot: int, title: str) -> tuple[list[tuple[Near, Press]], Verdict | None]:
-        """Presses near electrodes until the order is clear, with the verdict. Raises _NoAnswer and _Said."""
+        """Presses near electrodes until the order is clear, with the verdict. Raises _NoPress and _Said."""
         presses: list[tuple[Near, Press]] = []
         verdict: Verdict | None = None
         asked = list(_FIRST)
@@ -353,8 +356,9 @@ class Session:
     # Presses ----------------------------------------------------------------------------------------------
 
     def _press(self, row: int, prompt: str, expected: int | None = None) -> Press:
-        """Ask for a press until there is a good one. Raises _NoAnswer, _Said."""
+        """Ask for a press until there is a good one. Raises _NoPress, _Said."""
         self._let_go()
+        complaint: str | None = None
         for _ in range(_TRIES):
             self._say(prompt, "ask")
             press = self._await_press(self._owner[row] if expected is None else expected)
@@ -364,7 +368,7 @@ class Session:
                 return press
             self._say(f"  {complaint}; let go, and press again.", "bad")
             self._let_go()
-        raise _NoAnswer
+        raise _NoPress(Result.UNCLEAR, complaint or "")
 
     def _complaint(self, press: Press, expected: int | None) -> str | None:
         if press.others:
@@ -393,7 +397,7 @@ class Session:
                 return press
             if sample.t_ns - begun_ns > self._patience_ns:
                 break
-        raise _NoAnswer
+        raise _NoPress(Result.NO_ANSWER, _NO_ANSWER)
 
     def _let_go(self) -> None:
         """Wait until nothing is pressed; what stays pressed is taken for rest in the end."""

@@ -1,0 +1,221 @@
+"""`handtouch commission` as a process, on a bus with a hand that is wired quite otherwise than its file says.
+
+Run as a program, this file is that hand's nodes: it presses what it is told to on standard input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import pty
+import random
+import re
+import select
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.device import DeviceBus
+from handtouch.canbus.port import open_bus
+from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.world import World
+
+ASKED = {"anywhere": (0.5, 0.5), "x0": (0.15, 0.5), "xa": (0.85, 0.5), "y0": (0.5, 0.15), "yb": (0.5, 0.85)}
+HOW_HARD = {"hard": (0.8, 4.0), "gently": (0.3, 0.5)}  # N; the hard ones are too hard for some pads
+OFF = 0.15  # of a side: how far from the place asked for this person presses
+PROMPT = re.compile(r"\[\d+/\d+\] right/(\w+): press (?:it (anywhere)|near electrode (\w+))")
+
+pytestmark = pytest.mark.timeout(400)
+
+
+class PressableHand:
+    """The nodes of a deployment; `press` and `release` say what the next samples show."""
+
+    def __init__(self, deployment: config.Deployment, seed: int) -> None:
+        chance = random.Random(seed)
+        pads = deployment.hands[0].pads
+        touches: list[dict[str, Any]] = []
+        self._times: dict[tuple[str, str, str], float] = {}
+        for pad in pads:
+            for near, hard in itertools.product(ASKED, HOW_HARD):
+                place = [min(max(c + chance.uniform(-OFF, OFF), 0.03), 0.97) for c in ASKED[near]]
+                self._times[pad.link, near, hard] = len(touches) + 0.5
+                touches.append(
+                    {
+                        "link": pad.link,
+                        "from_s": float(len(touches)),
+                        "duration_s": 0.95,
+                        "path": [place],
+                        "force_n": [chance.uniform(*HOW_HARD[hard])],
+                    }
+                )
+        straight = deployment.model_copy(
+            update={
+                "hands": tuple(
+                    hand.model_copy(
+                        update={
+                            "pads": tuple(p.model_copy(update={"electrodes": ELECTRODES}) for p in hand.pads)
+                        }
+                    )
+                    for hand in deployment.hands
+                )
+            }
+        )
+        scenario = Scenario.model_validate({"touch": touches})
+        self._hand = VirtualHand(straight, scenario, World(seed=seed))
+        self._idle_s = self._now_s = len(touches) + 10.0
+        self._bus = open_bus(deployment.buses[0])
+        self.nodes = DeviceBus(self._bus, self._sample)
+        for pad in pads:
+            device = self.nodes.add(pad.node_id, serial=pad.serial)
+            device.wired = tuple(map(ELECTRODES.index, pad.electrodes))
+        self.nodes.start()
+
+    def press(self, link: str, near: str, hard: str) -> None:
+        self._now_s = self._times[link, near, hard]
+
+    def release(self) -> None:
+        self._now_s = self._idle_s
+
+    def _sample(self, t_ns: int) -> NDArray[np.int64]:
+        return self._hand.sample(self._now_s + t_ns % 100_000_000 * 1e-9)  # noise is another at every time
+
+
+def serve(path: str, bus: str, seed: str) -> None:
+    """Press what standard input says, "LINK NEAR HOW" or "release", until it ends."""
+    hand = PressableHand(config.with_bus(config.load(path), bus), int(seed))
+    print("ready", flush=True)
+    for line in sys.stdin:
+        words = line.split()
+        if words == ["release"]:
+            hand.release()
+        else:
+            hand.press(*words)
+
+
+def scramble(text: str, seed: int) -> tuple[str, str]:
+    """A deployment file that is wrong in many places, and the right one: the same text otherwise."""
+    chance = random.Random(seed)
+    blocks = re.split(r"(?m)^(?=\[\[hand\.pad\]\])", text)
+    wrong, right = [blocks[0]], [blocks[0]]
+    numbers = list(range(len(blocks) - 1))
+    chance.shuffle(numbers)
+    ids = [re.search(r"node_id = (\w+)", block)[1] for block in blocks[1:]]  # type: ignore[index]
+    serials = [re.search(r"serial = (\d+)", block)[1] for block in blocks[1:]]  # type: ignore[index]
+    shuffled = serials.copy()
+    chance.shuffle(shuffled)
+    for number, block in enumerate(blocks[1:]):
+        order = chance.sample(ELECTRODES, 4)
+        commented = block.replace('node = "four_channel"\n', 'node = "four_channel" # the kind\n')
+        wired = f"electrodes = {str(order).replace(chr(39), chr(34))}"
+        with_id = commented.replace(
+            f"node_id = {ids[number]}\n", f"node_id = {ids[number]} # printed on it\n"
+        )
+        after = '"four_channel" # the kind\n'
+        right.append(with_id.replace(after, f"{after}{wired}\n"))
+        block = with_id.replace(f"node_id = {ids[number]}", f"node_id = {ids[numbers[number]]}")
+        block = block.replace(f"serial = {serials[number]}", f"serial = {shuffled[number]}")
+        if number % 5 == 1:  # a serial number that nobody wrote down
+            block = re.sub(r"serial = \d+\n", "", block)
+        if number % 3 == 0:  # an order that somebody guessed
+            other = chance.sample(ELECTRODES, 4)
+            block = block.replace(
+                after, f'{after}electrodes = ["{other[0]}", "{other[1]}", "{other[2]}", "{other[3]}"]\n'
+            )
+        wrong.append(block)
+    return "".join(wrong), "".join(right)
+
+
+class Presser:
+    """The nodes in a process of their own, and somebody who reads what commissioning prints and presses."""
+
+    def __init__(self, rig: Any, truth: Path, seed: int) -> None:
+        self._how = "hard"
+        command = [*rig.command()[:-2], __file__, str(truth), *rig.bus, str(seed)]
+        self._nodes = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self._nodes.stdout is not None
+        assert self._nodes.stdout.readline() == "ready\n"
+
+    def follow(self, line: str) -> None:
+        """Do what a printed line asks for."""
+        if prompt := PROMPT.search(line):
+            self.do(f"{prompt[1]} {prompt[2] or prompt[3]} {self._how}")
+        elif "let go" in line:
+            self._how = "gently" if "more gently" in line else "hard"
+            self.do("release")
+
+    def do(self, command: str) -> None:
+        assert self._nodes.stdin is not None
+        print(command, file=self._nodes.stdin, flush=True)
+
+    def close(self) -> None:
+        assert self._nodes.stdin is not None
+        assert self._nodes.stdout is not None
+        self._nodes.stdin.close()
+        self._nodes.wait(30)
+        self._nodes.stdout.close()
+
+
+@contextlib.contextmanager
+def pressed(rig: Any, truth: str, seed: int = 5) -> Iterator[Presser]:
+    path = rig.folder / "truth.toml"
+    path.write_text(truth)
+    presser = Presser(rig, path, seed)
+    try:
+        yield presser
+    finally:
+        presser.close()
+
+
+def commission(rig: Any, presser: Presser, *arguments: str, keys: str = "") -> tuple[int, str]:
+    """Exit status and what was printed; `keys` are there from the start."""
+    command = rig.command("commission", str(rig.config), "--bus", rig.bus[0], *arguments)
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    printed = []
+    with process:
+        process.stdin.write(keys)
+        process.stdin.close()
+        for line in process.stdout:
+            printed.append(line)
+            presser.follow(line)
+    return process.wait(), "".join(printed)
+
+
+def test_a_hand_wired_at_random_is_found_out_pad_by_pad_and_only_its_lines_change(rig: Any) -> None:
+    wrong, right = scramble(rig.config.read_text(), seed=1)
+    rig.config.write_text(wrong)
+    truth, folder = config.parse(right), rig.folder
+    with pressed(rig, right) as presser:
+        status, printed = commission(rig, presser, "--yes")
+    assert status == 0, printed
+    found = config.load(rig.config)
+    assert [pad.link for pad in found.hands[0].pads] == [pad.link for pad in truth.hands[0].pads]
+    for pad, true in zip(found.hands[0].pads, truth.hands[0].pads, strict=True):
+        assert (pad.node_id, pad.serial, pad.electrodes) == (true.node_id, true.serial, true.electrodes)
+    assert found == truth
+    shown = [line for line in printed.splitlines() if re.match(r"[-+](?!--|\+\+)", line)]
+    assert shown
+    assert all(re.match(r"[-+](node_id|serial|electrodes) = ", line) for line in shown), printed
+    assert rig.config.read_text() == right  # to the letter: comments, order, hexadecimal numbers
+    assert (folder / "hand.toml.bak").read_text() == wrong
+    assert not (folder / "hand.toml.commissioned").exists()
+
+
+if __name__ == "__main__":
+    serve(*sys.argv[1:])
