@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -174,3 +175,15 @@ def test_garbage_on_the_raw_sockets_stops_no_tick(reachable: Reachable) -> None:
         assert hands.gaps == 0
     assert reachable.end("run") == 0
     assert "Traceback" not in reachable.printed("run")
+
+
+def test_a_client_with_a_key_comes_back_by_itself_when_the_daemon_restarts(reachable: Reachable) -> None:
+    with connect("service", endpoint=reachable.at("live"), key=reachable.key("reader")) as messages:
+        reachable.start("run")
+        before = messages.recv(START_S)
+        assert reachable.end("run", signal.SIGKILL) != 0
+        reachable.start("run")
+        after = messages.recv(START_S)
+        while after is not None and after.pid == before.pid:
+            after = messages.recv(START_S)
+        assert after is not None
