@@ -64,7 +64,7 @@ _EVENTS_KEPT = 1024
 _NEVER_NS = 1 << 62
 _HASTE_NS = 30_000_000
 """How long an answer to a request of the receiving thread's own is waited for."""
-_SDO_WRITTEN = 0x60
+_SDO_WRITTEN, _SDO_REFUSED = 0x60, 0x80
 
 _NMT, _SYNC, _TIME, _LSS_ANSWER, _LSS_REQUEST = 0x000, 0x080, 0x100, 0x7E4, 0x7E5
 _EMCY, _SDO_ANSWER, _SDO_REQUEST, _HEARTBEAT = 0x080, 0x580, 0x600, 0x700
@@ -262,8 +262,8 @@ class Master:
         elif node.sdo.waiting:
             node.sdo.deliver(data)
         else:
-            if node.asked_ns and data[0] == _SDO_WRITTEN and data[1:4] == node.request[1:4]:
-                self._set_pace(node, False, t_ns)
+            if node.asked_ns and data[1:4] == node.request[1:4]:
+                self._pace_answered(node, data[0], t_ns)
             self._advance(node, Answer(), t_ns)
 
     def _heartbeat(self, node: _Node, nmt: int, t_ns: int) -> None:
@@ -419,6 +419,14 @@ class Master:
                 return
             kind = "event-driven" if node.idle else "synchronous"
             self._tell(node, node.life.state, f"stays {kind}: {outcome.reason}", t_ns)
+
+    def _pace_answered(self, node: _Node, command: int, t_ns: int) -> None:
+        """A node that doesn't let a PDO be changed while it is on needs more than one request."""
+        if command == _SDO_WRITTEN:
+            self._set_pace(node, False, t_ns)
+        elif command == _SDO_REFUSED and self._workers is not None:
+            node.asked_ns = 0
+            self._workers.submit(self._work, node, Action.PACE, node.life.attempt, False)
 
     def _set_pace(self, node: _Node, idle: bool, t_ns: int) -> None:
         slot, spec = node.spec.slot, node.spec
