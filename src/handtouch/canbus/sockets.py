@@ -189,7 +189,7 @@ class SocketcanReceiver(_SocketReceiver):
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
         if self._bus is None:
             raise OSError(errno.ENODEV, self.trouble.text if self.trouble else "closed")
-        # Not stored: python-can's shutdown would fail with the task of a device that is gone, and close nothing.
+        # Not stored: python-can's shutdown would fail with the task of a gone device, and close nothing.
         return _KernelSender(self._bus.send_periodic(message(can_id, data), period_s, store_task=False))
 
 
