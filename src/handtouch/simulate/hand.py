@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import i0e, i1e
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES, Channels, channels_of
+from handtouch.canbus.channels import ELECTRODES, Channels, channels_of, in_order
 from handtouch.hand import mount_of
 from handtouch.simulate.scenario import Pressing, Scenario
 from handtouch.simulate.shape import Shape, shape_of
@@ -51,7 +51,6 @@ class VirtualHand:
         self._bank = SheetBank([row.maps for row in self._rows])
         self._electric = _Electric(self._rows)
         self._noise = np.array([row.noise_counts for row in self._rows])
-        self._wiring = np.array([[ELECTRODES.index(e) for e in row.pad.electrodes] for row in self._rows])
         limits = np.array([[channel.limits for channel in row.channels] for row in self._rows])
         self._low, self._high = limits[:, :, 0], limits[:, :, 1]
         self._contacts = [
@@ -64,7 +63,7 @@ class VirtualHand:
         ]
 
     def sample(self, t_s: float) -> NDArray[np.int64]:
-        """Counts (pads, 4) of each node's channels, in its order, `t_s` after the start of the scenario."""
+        """Counts (pads, 4) of the electrodes x0, xa, y0, yb, `t_s` after the start of the scenario."""
         moment = max(round(t_s * 1e9), 0)
         counts = np.random.default_rng((*self._seed, moment)).standard_normal((len(self._rows), 4))
         counts *= self._noise[:, None]
@@ -72,8 +71,7 @@ class VirtualHand:
             currents, _ = self._currents(contacts)
             rows = [contact.row for contact in contacts]
             counts[rows] += currents * self._electric.counts_per_ampere[rows]
-        wired = np.take_along_axis(np.rint(counts), self._wiring, axis=1)
-        return np.asarray(np.clip(wired, self._low, self._high), dtype=np.int64)
+        return np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
 
     def truth(self, t_s: float, t_ns: int = 0) -> list[Truth]:
         """The contacts of the sample at `t_s`; `t_ns` is the host's time of it."""
@@ -158,16 +156,16 @@ class _Row:
         node, shape, parts = deployment.nodes[pad.node], shape_of(pad.surface), world.parts(hand, pad)
         maps, sheet = solve(shape, _gaps(shape, parts)), deployment.sheets[pad.sheet]
         noise = node.noise_counts if world.noise_counts is None else world.noise_counts
-        channels = channels_of(node.channels, node.eds)
+        channels = in_order(channels_of(node.channels, node.eds), pad.electrodes)
         return cls(hand, pad, node, channels, sheet, parts, shape, maps, *mount_of(pad), noise)
 
     @property
     def counts_per_ampere(self) -> FloatArray:
         """(4,) of the electrodes x0, xa, y0, yb."""
         full = [self.node.full_scale_counts or channel.limits[1] for channel in self.channels]
-        of_channel = np.array(full) / (self.node.full_scale_ma * 1e-3) / np.array(self.node.channel_scale)
-        order = [self.pad.electrodes.index(name) for name in ELECTRODES]
-        return np.asarray(of_channel[order] * np.array(self.parts.gain))
+        scale = [self.node.channel_scale[self.pad.electrodes.index(name)] for name in ELECTRODES]
+        of_channel = np.array(full) / (self.node.full_scale_ma * 1e-3 * np.array(scale))
+        return np.asarray(of_channel * np.array(self.parts.gain))
 
 
 class _Electric:

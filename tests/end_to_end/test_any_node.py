@@ -1,0 +1,61 @@
+"""Nodes that nobody here built, by their EDS: wide channels, several PDOs, odd wiring; places are right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from handtouch.simulate.truth import read
+
+EDS = Path(__file__).parents[1] / "data" / "eds"
+NODES = {
+    "CiA 404, int32 in two PDOs": (
+        "norsens-quad404.eds",
+        'channels = ["0x9130:1", "0x9130:2", "0x9130:3", "0x9130:4"]\nfull_scale_counts = 8_000_000\n',
+    ),
+    "24 bits in two PDOs": (
+        "hapt24.dcf",
+        'channels = ["0x8130:1", "0x8130:2", "0x8130:3", "0x8130:4"]\nchannel_scale = [1.0, 1.1, 0.9, 1.0]\n',
+    ),
+    "unsigned between other objects, mapping fixed, guarded": (
+        "tactor-q16.eds",
+        'channels = ["0x2110:0", "0x2120:0", "0x2130:0", "0x2140:0"]\n',
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_a_touch_is_found_whatever_the_node(rig: Any, name: str) -> None:
+    eds, keys = NODES[name]
+    text = rig.config.read_text()
+    text = text.replace("drive_v = 5.0", f'eds = "{EDS / eds}"\n{keys}drive_v = 5.0', 1)
+    text = text.replace(
+        'node = "four_channel"', 'node = "four_channel"\nelectrodes = ["yb", "x0", "xa", "y0"]'
+    )
+    rig.config.write_text(text)
+    truth = rig.folder / "truth.jsonl"
+    rig.simulate("--truth", str(truth))
+    rig.start("run")
+    rig.wait_operational()
+    with rig.subscribe("contact/*/*") as messages:
+        found = [messages.recv(30) for _ in range(60)]
+    rig.end("simulate")
+    places = {(true.link, true.t_ns): true.position_m for true in read(truth)}
+    errors = [
+        np.linalg.norm(np.subtract(contact.position_m, places[contact.link, stamp]))
+        for contact in found
+        if contact.event == "update" and contact.location == "valid"
+        for stamp in [_nearest(places, contact)]
+        if stamp is not None
+    ]
+    assert len(errors) > 20
+    assert np.median(errors) < 0.3e-3
+
+
+def _nearest(places: dict[tuple[str, int], Any], contact: Any) -> int | None:
+    """Time of the true contact that a message is of: within a period."""
+    times = [t_ns for link, t_ns in places if link == contact.link and abs(t_ns - contact.t_ns) < 20_000_000]
+    return min(times, key=lambda t_ns: abs(t_ns - contact.t_ns), default=None)
