@@ -6,16 +6,17 @@ Run as a program, this file is that hand's nodes: it presses what it is told to 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import itertools
 import os
 import pty
 import random
 import re
-import select
+import signal
+import struct
 import subprocess
 import sys
-import threading
-import time
+import termios
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -108,34 +109,34 @@ def serve(path: str, bus: str, seed: str) -> None:
 def scramble(text: str, seed: int) -> tuple[str, str]:
     """A deployment file that is wrong in many places, and the right one: the same text otherwise."""
     chance = random.Random(seed)
-    blocks = re.split(r"(?m)^(?=\[\[hand\.pad\]\])", text)
-    wrong, right = [blocks[0]], [blocks[0]]
-    numbers = list(range(len(blocks) - 1))
-    chance.shuffle(numbers)
-    ids = [re.search(r"node_id = (\w+)", block)[1] for block in blocks[1:]]  # type: ignore[index]
-    serials = [re.search(r"serial = (\d+)", block)[1] for block in blocks[1:]]  # type: ignore[index]
-    shuffled = serials.copy()
-    chance.shuffle(shuffled)
-    for number, block in enumerate(blocks[1:]):
-        order = chance.sample(ELECTRODES, 4)
-        commented = block.replace('node = "four_channel"\n', 'node = "four_channel" # the kind\n')
-        wired = f"electrodes = {str(order).replace(chr(39), chr(34))}"
-        with_id = commented.replace(
-            f"node_id = {ids[number]}\n", f"node_id = {ids[number]} # printed on it\n"
-        )
-        after = '"four_channel" # the kind\n'
-        right.append(with_id.replace(after, f"{after}{wired}\n"))
-        block = with_id.replace(f"node_id = {ids[number]}", f"node_id = {ids[numbers[number]]}")
-        block = block.replace(f"serial = {serials[number]}", f"serial = {shuffled[number]}")
-        if number % 5 == 1:  # a serial number that nobody wrote down
+    head, *blocks = re.split(r"(?m)^(?=\[\[hand\.pad\]\])", text)
+    kind = 'node = "four_channel" # the kind\n'
+    ids = [found[1] for block in blocks if (found := re.search(r"node_id = (\w+)", block))]
+    serials = [found[1] for block in blocks if (found := re.search(r"serial = (\d+)", block))]
+    other_ids, other_serials = chance.sample(ids, len(ids)), chance.sample(serials, len(serials))
+    wrong, right = [head], [head]
+    for number, block in enumerate(blocks):
+        block = block.replace('node = "four_channel"\n', kind)
+        block = block.replace(f"= {ids[number]}\n", f"= {ids[number]} # as printed on it\n")
+        guessed = number % 3 == 0  # somebody wrote an order down
+        order, guess = chance.sample(ELECTRODES, 4), chance.sample(ELECTRODES, 4)
+        told = guessed or order != list(ELECTRODES)
+        right.append(block.replace(kind, kind + _key(order)) if told else block)
+        block = block.replace(f"= {ids[number]} ", f"= {other_ids[number]} ")
+        block = block.replace(f"serial = {serials[number]}", f"serial = {other_serials[number]}")
+        if number % 5 == 1:  # nobody wrote the serial number down
             block = re.sub(r"serial = \d+\n", "", block)
-        if number % 3 == 0:  # an order that somebody guessed
-            other = chance.sample(ELECTRODES, 4)
-            block = block.replace(
-                after, f'{after}electrodes = ["{other[0]}", "{other[1]}", "{other[2]}", "{other[3]}"]\n'
-            )
-        wrong.append(block)
+        wrong.append(block.replace(kind, kind + _key(guess)) if guessed else block)
     return "".join(wrong), "".join(right)
+
+
+def _key(order: list[str]) -> str:
+    return f"electrodes = [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in order)}]\n"
+
+
+def first_pads(text: str, count: int) -> str:
+    """The deployment without its other pads."""
+    return "".join(re.split(r"(?m)^(?=\[\[hand\.pad\]\])", text)[: count + 1])
 
 
 class Presser:
@@ -179,8 +180,8 @@ def pressed(rig: Any, truth: str, seed: int = 5) -> Iterator[Presser]:
         presser.close()
 
 
-def commission(rig: Any, presser: Presser, *arguments: str, keys: str = "") -> tuple[int, str]:
-    """Exit status and what was printed; `keys` are there from the start."""
+def commission(rig: Any, presser: Presser, *arguments: str, stop_at: str = "") -> tuple[int, str]:
+    """Exit status and what was printed; it is interrupted at a line with `stop_at`."""
     command = rig.command("commission", str(rig.config), "--bus", rig.bus[0], *arguments)
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -189,12 +190,33 @@ def commission(rig: Any, presser: Presser, *arguments: str, keys: str = "") -> t
     assert process.stdout is not None
     printed = []
     with process:
-        process.stdin.write(keys)
-        process.stdin.close()
         for line in process.stdout:
             printed.append(line)
-            presser.follow(line)
+            if stop_at and stop_at in line:
+                process.send_signal(signal.SIGINT)
+            else:
+                presser.follow(line)
     return process.wait(), "".join(printed)
+
+
+def commission_in_terminal(rig: Any, presser: Presser, *arguments: str) -> tuple[int, str]:
+    """The same under a pseudo-terminal; Enter is the answer to every question."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 400, 0, 0))  # so that no line is broken
+    command = rig.command("commission", str(rig.config), "--bus", rig.bus[0], *arguments)
+    process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    printed = rest = ""
+    with contextlib.suppress(OSError):  # how a pseudo-terminal ends
+        while data := os.read(ours, 4096):
+            printed += data.decode(errors="replace")
+            *lines, rest = (rest + data.decode(errors="replace")).split("\n")
+            for line in lines:
+                presser.follow(line)
+                if "Enter: they are swapped" in line:
+                    os.write(ours, b"\n")
+    os.close(ours)
+    return process.wait(), printed
 
 
 def test_a_hand_wired_at_random_is_found_out_pad_by_pad_and_only_its_lines_change(rig: Any) -> None:
@@ -215,6 +237,50 @@ def test_a_hand_wired_at_random_is_found_out_pad_by_pad_and_only_its_lines_chang
     assert rig.config.read_text() == right  # to the letter: comments, order, hexadecimal numbers
     assert (folder / "hand.toml.bak").read_text() == wrong
     assert not (folder / "hand.toml.commissioned").exists()
+
+
+def test_what_is_done_is_kept_when_it_is_interrupted_and_the_rest_is_done_later(rig: Any) -> None:
+    wrong, right = scramble(first_pads(rig.config.read_text(), 3), seed=2)
+    rig.config.write_text(wrong)
+    with pressed(rig, right) as presser:
+        status, printed = commission(rig, presser, "--yes", stop_at="[2/3]")
+        assert status == 1
+        assert "Interrupted" in printed
+        half = config.load(rig.config)
+        assert half.hands[0].pads[0] == config.parse(right).hands[0].pads[0]
+        assert (rig.folder / "hand.toml.commissioned").read_text() == "right/thumb_proximal\n"
+        status, printed = commission(rig, presser, "--yes")
+    assert status == 0, printed
+    assert "1 pads were done before" in printed
+    assert "[1/2] right/thumb_middle" in printed
+    assert rig.config.read_text() == right
+    assert (rig.folder / "hand.toml.bak").read_text() == wrong
+    assert not (rig.folder / "hand.toml.commissioned").exists()
+
+
+def test_a_swap_is_asked_about_in_a_terminal_and_a_dry_run_writes_nothing(rig: Any) -> None:
+    wrong, right = scramble(first_pads(rig.config.read_text(), 3), seed=6)
+    assert config.parse(wrong).hands[0].pads[0].node_id != config.parse(right).hands[0].pads[0].node_id
+    rig.config.write_text(wrong)
+    with pressed(rig, right) as presser:
+        status, printed = commission_in_terminal(rig, presser, "--dry-run", "--link", "thumb_proximal")
+    assert status == 0, printed
+    assert "they are swapped" in printed
+    assert "█" in printed  # live feedback
+    assert "+node_id = 0x11 # as printed on it" in printed
+    assert "Nothing was written" in printed
+    assert rig.config.read_text() == wrong
+    assert {path.name for path in rig.folder.glob("hand.toml*")} == {"hand.toml"}
+
+
+def test_it_leaves_the_buses_to_a_daemon_that_runs(rig: Any) -> None:
+    rig.config.write_text(first_pads(rig.config.read_text(), 1))
+    rig.start("run")
+    rig.status()
+    command = rig.command("commission", str(rig.config), "--bus", rig.bus[0])
+    done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+    assert done.returncode == 1
+    assert "a daemon answers at" in done.stderr
 
 
 if __name__ == "__main__":
