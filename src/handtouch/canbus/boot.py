@@ -128,7 +128,7 @@ def configure(
         if tpdo.transmission != SYNCHRONOUS:
             _set_transmission(sdo, tpdo, SYNCHRONOUS)
         if not tpdo.enabled:
-            sdo.set(COMMUNICATION + tpdo.number - 1, 1, tpdo.on, 4, _identifier(tpdo))
+            _switch_on(sdo, tpdo)
     may_idle = wanted.idle is not None and len(mapping.tpdos) == 1  # several would come one by one
     refusal = ""
     if wanted.idle is not None and may_idle:
@@ -138,6 +138,7 @@ def configure(
             if error.silent:
                 raise
             may_idle, refusal = False, str(error)
+            _switch_on(sdo, mapping.tpdos[0])
     excite(sdo, wanted.excitation, True)
     return Configured(_supervise(sdo, wanted.heartbeat_ms, booted), may_idle, refusal)
 
@@ -194,15 +195,18 @@ def _set_transmission(sdo: Sdo, tpdo: Tpdo, kind: int) -> None:
 @contextmanager
 def _switched_off(sdo: Sdo, tpdo: Tpdo) -> Iterator[None]:
     """A TPDO isn't sent meanwhile; it is again afterwards, also if what was tried is refused."""
-    index = COMMUNICATION + tpdo.number - 1
-    sdo.write(index, 1, tpdo.off, 4, _identifier(tpdo))
     try:
+        sdo.write(COMMUNICATION + tpdo.number - 1, 1, tpdo.off, 4, _identifier(tpdo))
         yield
+        _switch_on(sdo, tpdo)
     except StepError as error:
         if not error.silent:
-            sdo.write(index, 1, tpdo.on, 4, _identifier(tpdo))
+            _switch_on(sdo, tpdo)
         raise
-    sdo.write(index, 1, tpdo.on, 4, _identifier(tpdo))
+
+
+def _switch_on(sdo: Sdo, tpdo: Tpdo) -> None:
+    sdo.set(COMMUNICATION + tpdo.number - 1, 1, tpdo.on, 4, _identifier(tpdo))
 
 
 def _identifier(tpdo: Tpdo) -> str:
