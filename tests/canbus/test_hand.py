@@ -10,6 +10,7 @@ import can
 import numpy as np
 import pytest
 
+from handtouch.canbus import sdo
 from handtouch.canbus.device import DeviceBus
 from handtouch.canbus.lifecycle import NodeState
 from handtouch.canbus.master import Master, NodeSpec
@@ -72,3 +73,30 @@ def _cycle(port: Port, master: Master, what: Callable[[], bool], seconds: float)
         if what():
             return True
     return False
+
+
+def test_dead_nodes_keep_no_other_node_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five of fifteen answer nothing: while the first transfer to them still waits, all others are up."""
+    monkeypatch.setattr(sdo, "SDO_TIMEOUT_S", 1.5)
+    slab = Slab(NODES)
+    port = Port.open(Bus(name="palm", interface="virtual", channel="dead"), slab)
+    dead = {1, 4, 7, 10, 15}
+    with can.Bus(interface="virtual", channel="dead") as bus:
+        devices = DeviceBus(bus, lambda _: np.zeros((NODES, 4), dtype=np.int16))
+        for number in range(1, NODES + 1):
+            devices.add(number).sdo.frozen = number in dead
+        devices.start()
+        specs = [NodeSpec(slot, "palm", slot + 1, f"pad{slot}") for slot in range(NODES)]
+        master = Master({"palm": port}, specs, 20_000_000)
+        master.start(time.monotonic_ns())
+        living = [number - 1 for number in range(1, NODES + 1) if number not in dead]
+        assert _cycle(port, master, lambda: bool((master.states[living] == NodeState.OPERATIONAL).all()), 10)
+        waiting = [NodeState(int(master.states[number - 1])) for number in dead]
+        assert waiting == [NodeState.BOOTING] * len(dead)
+        assert not [e for e in master.take_events() if "no answer" in str(e)]
+        for number in dead:
+            devices.devices[number].sdo.frozen = False
+        assert _cycle(port, master, lambda: bool((master.states == NodeState.OPERATIONAL).all()), 20)
+        master.stop(time.monotonic_ns())
+        devices.stop()
+    port.close()
