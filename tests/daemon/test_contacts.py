@@ -20,7 +20,7 @@ def _step(
     contacts: Contacts, level: float, t_ns: int = 0, sampled: bool = True, trusted: bool = True
 ) -> Changes:
     one = np.ones(1, dtype=np.bool_)
-    return contacts.step(one * level, one & sampled, one & trusted, np.array([t_ns]))
+    return contacts.step(np.array([level]), one & sampled, one & trusted, np.array([t_ns]))
 
 
 def test_a_contact_begins_after_the_debounce_and_is_dated_to_its_first_sample() -> None:

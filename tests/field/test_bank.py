@@ -87,6 +87,34 @@ def test_error_is_the_least_possible(noise: float, limit: float) -> None:
     assert np.sqrt((squared / expected).mean()) < limit
 
 
+@pytest.mark.parametrize("strength", [0.0, 1.0, 3.0])
+def test_it_agrees_with_each_pads_own_estimate_on_hardly_more_than_noise(strength: float) -> None:
+    generator = np.random.default_rng(10)
+    for model in MODELS:
+        place = generator.uniform(0.05, 0.95, (2, 500)) * [[model.a], [model.b]]
+        currents = strength * model.fractions(*place) + generator.normal(size=(4, 500))
+        pad = np.full(500, next(i for i, other in enumerate(PADS) if other is model))
+        found, own = BANK.estimate(pad, currents, 1.0), model.estimate(currents, 1.0)
+        assert ((found.total > 0) == (own.total > 0)).mean() > 0.99
+        both = (found.total > 0) & (own.total > 0)
+        assert (np.abs(found.chi_squared - own.chi_squared)[both] < 0.1).mean() > 0.98
+        assert found.converged.mean() > own.converged.mean() - 0.02
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 3.0, 100.0]), st.floats(0.01, 100.0))
+def test_a_covariance_is_positive_semidefinite_whatever_the_noise_of_each_channel(
+    seed: int, strength: float, uneven: float
+) -> None:
+    generator = np.random.default_rng(seed)
+    index, _, _, fractions = contacts(50, seed, 1e-3)
+    noise = np.exp(np.log(uneven) * generator.uniform(-1, 1, (4, 50)))
+    found = BANK.estimate(index, strength * fractions + noise * generator.normal(size=(4, 50)), noise)
+    known = np.isfinite(found.covariance).all(axis=(1, 2))
+    scale = np.sqrt(np.diagonal(found.covariance[known], axis1=1, axis2=2))
+    correlation = found.covariance[known] / (scale[:, :, None] * scale[:, None])
+    assert np.linalg.eigvalsh(correlation).min(initial=0.0) > -1e-12
+
+
 def test_a_start_changes_nothing_and_an_unknown_one_is_found() -> None:
     index, x, y, fractions = contacts(200, 7, 0.1)
     currents = fractions + 1e-4 * np.random.default_rng(8).normal(size=fractions.shape)

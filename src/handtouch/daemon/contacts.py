@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Changes(NamedTuple):
-    """What one step changed: pads whose contact began, ended, and those of contacts with a sample to solve."""
+    """What one step changed: pads whose contact began, or ended, and those with a sample of a contact."""
 
     began: IntArray
     ended: IntArray

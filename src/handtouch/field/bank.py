@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch.field._bank_table import COLUMNS, GRIDS, RATIO_CELLS, RATIO_SPAN, TERMS, PadTable, log_ratios
-from handtouch.field.estimate import CORNER, LOST, PointEstimate, best_direction
+from handtouch.field.estimate import CORNER, LOST, PointEstimate, best_direction, covariance_of
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
 IndexArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 _STEPS = 10
+_SEARCH_STEPS = 20
+_GUESSES = np.stack(np.meshgrid(*[(np.arange(9) + 0.5) / 9] * 2), axis=-1).reshape(-1, 2)  # sides
 _SETTLED = 1e-2  # squared Newton decrement, in variances: the step then taken leaves far less
 _LONGEST_STEP = 1.0  # in w, where places are 1 / (1 + exp(-w)) of a side
 _WITH_SLOPES = np.hstack([np.eye(TERMS), np.diag(np.arange(1.0, TERMS), 1)])  # powers and their derivatives
@@ -49,6 +51,7 @@ class LocatorBank:
         self._top = np.nextafter(float(grid.cells), 0)
         self._table = np.ascontiguousarray(np.concatenate([table.columns for table in tables]))
         self._starts = np.stack([table.starts for table in tables]).reshape(-1)
+        self._guesses = np.stack([m.fractions(*(_GUESSES * (m.a, m.b)).T).T for m in distinct])
         self._sides = np.array([(model.a, model.b) for model in distinct])[self._model]
         self._shortest = self._sides.min(axis=1) ** 2
         self.table_error = np.array([table.error for table in tables])[self._model]
@@ -106,7 +109,13 @@ class LocatorBank:
                 data = np.where(weight == 0, 0.0, data)  # whatever a channel that is left out reads
             s = self._start(index, data, weight, start)
             sides = self._sides.take(index, axis=0)
-            return self._iterate(_Readings(index, self._first_row(index), sides, data.T, weight.T), s)
+            of = _Readings(index, self._first_row(index), sides, data.T, weight.T)
+            found = self._iterate(of, s)
+            if not np.logical_and.reduce(found.converged):
+                left = np.flatnonzero(~found.converged & np.isfinite(of.data * of.weight).all(axis=1))
+                if left.size:
+                    found.put(left, self._search(of.some(left)))
+            return found
 
     # Details ----------------------------------------------------------------------------------------------
 
@@ -182,6 +191,35 @@ class LocatorBank:
                 break
         return self._result(of, s, step, at, decrement, ~unsettled)
 
+    def _search(self, of: _Readings) -> PointEstimate:
+        """From the most likely of a grid of points, in steps halved until the likelihood rises.
+
+        For contacts hardly above their noise: Gauss-Newton alone leads some of them off the pad.
+        """
+        weighted, squared = of.data * of.weight * of.weight, of.weight * of.weight
+        fractions = self._guesses.take(self._model.take(of.pad), axis=0)
+        along = np.matmul(fractions, weighted[:, :, None])[:, :, 0]
+        norm = np.matmul(fractions * fractions, squared[:, :, None])[:, :, 0]
+        best = np.argmax(np.square(np.maximum(along, 0.0)) / norm, axis=1)
+        s = self._grid.coordinate(_GUESSES[best])
+        at = self._linearise(of, s)
+        damping, settled = np.ones(len(s)), np.zeros(len(s), dtype=np.bool_)
+        longest = _LONGEST_STEP / self._grid.width
+        for _ in range(_SEARCH_STEPS):
+            step, decrement = at.step(s, self._top)
+            step = np.minimum(np.maximum(step, -longest), longest) * damping[:, None]
+            trial = np.minimum(np.maximum(s + step, 0.0), self._top)
+            new = self._linearise(of, trial)
+            better = (new.cost() <= at.cost()) & (new.total() > 0) | ~(at.total() > 0)
+            still = settled | ~better
+            settled |= better & (decrement <= _SETTLED)
+            s = np.where(still[:, None], s, trial)
+            at = at.where(still, new)
+            damping = np.where(better, np.minimum(1.0, 4 * damping), damping / 4)
+            if settled.all():
+                break
+        return self._result(of, s, np.zeros_like(s), at, np.zeros(len(s)), settled)
+
     def _result(
         self,
         of: _Readings,
@@ -206,23 +244,22 @@ class LocatorBank:
         found = total > 0
         if not np.logical_and.reduce(found):
             point[~found] = covariance[~found] = np.nan
-        self._leave_corner(of, point, total, covariance)
-        _forget_lost(point, of.sides, covariance)
-        return PointEstimate(
+        estimate = PointEstimate(
             point[:, 0], point[:, 1], total, residual, chi_squared, covariance, settled & found
         )
+        self._leave_corner(of, point, estimate)
+        _forget_lost(point, of.sides, covariance)
+        return estimate
 
-    def _leave_corner(
-        self, of: _Readings, point: FloatArray, total: FloatArray, covariance: FloatArray
-    ) -> None:
-        """As in `estimate`: out to where currents tell, in place, with the covariance of there."""
+    def _leave_corner(self, of: _Readings, point: FloatArray, found: PointEstimate) -> None:
+        """As in `estimate`: out to where currents tell, in place, with all that is found there."""
         nearest = np.minimum(point, of.sides - point)
         distance = nearest[:, 0] ** 2 + nearest[:, 1] ** 2
         shortest = self._shortest.take(of.pad)
         if not np.logical_or.reduce(distance < 0.0625 * shortest):
             return
         noise = 2 / np.sqrt((of.weight * of.weight).sum(axis=1))
-        radius = shortest * np.minimum(CORNER * CORNER * noise / total, 0.0625)
+        radius = shortest * np.minimum(CORNER * CORNER * noise / found.total, 0.0625)
         which = np.flatnonzero(distance < radius)
         if not which.size:
             return
@@ -232,14 +269,17 @@ class LocatorBank:
 
         def linearised(place: FloatArray) -> tuple[FloatArray, FloatArray]:
             at, scale = self._linearise_at(of, place.T)
-            best = at.total()[:, None]
-            slopes = (at.rows[:, 1:3] - at.mixing * at.rows[:, :1]) * (best / scale)[:, :, None]
-            return (at.rows[:, 3] - best * at.rows[:, 0]).T, np.moveaxis(slopes, 0, -1)
+            slopes = at.slopes() * (at.total()[:, None] / scale)[:, :, None]
+            return at.misfit().T, np.moveaxis(slopes, 0, -1)
 
         angle = best_direction(linearised, corner, inward, np.arctan2(nearest[which, 1], nearest[which, 0]))
         point[which] = (corner + inward * np.stack([np.cos(angle), np.sin(angle)])).T
         at, scale = self._linearise_at(of, point[which])
-        covariance[which] = at.covariance(at.total(), scale)
+        total = at.total()
+        found.total[which], found.chi_squared[which] = total, at.cost()
+        found.residual[which] = (at.misfit()[:, :2] / of.weight[:, :2]).sum(axis=1) / total
+        found.covariance[which] = at.covariance(total, scale)
+        found.converged[which] = total > 0
 
     def _linearise_at(self, of: _Readings, point: FloatArray) -> tuple[_Normal, FloatArray]:
         """Normal equations at points (n, 2), and lengths of a cell there, (n, 2)."""
@@ -294,6 +334,24 @@ class _Normal(NamedTuple):
     mixing: FloatArray
     reduced: FloatArray
 
+    def where(self, keep: BoolArray, other: _Normal) -> _Normal:
+        """These where `keep` (n,), else the others."""
+        return _Normal(
+            *(np.where(keep[:, None, None], mine, its) for mine, its in zip(self, other, strict=True))
+        )
+
+    def slopes(self) -> FloatArray:
+        """Slopes of the fractions by cell, less what the total absorbs, (n, 2, 4)."""
+        return self.rows[:, 1:3] - self.mixing * self.rows[:, :1]
+
+    def misfit(self) -> FloatArray:
+        """What the best total leaves of the data, (n, 4)."""
+        return self.rows[:, 3] - self.total()[:, None] * self.rows[:, 0]
+
+    def cost(self) -> FloatArray:
+        """Squared misfits at this point with the best total, (n,)."""
+        return np.asarray(self.gram[:, 3, 3] - self.total() * self.gram[:, 0, 3])
+
     def total(self) -> FloatArray:
         """The best total at this point, (n,)."""
         return np.asarray(self.gram[:, 0, 3] / self.gram[:, 0, 0])
@@ -316,18 +374,14 @@ class _Normal(NamedTuple):
 
     def covariance(self, total: FloatArray, scale: FloatArray) -> FloatArray:
         """Inverse Fisher information of (x, y, total), (n, 3, 3); scale: lengths of a cell, (n, 2)."""
-        xx, xy, yy = self.reduced[:, 0, 1], self.reduced[:, 0, 2], self.reduced[:, 1, 2]
-        inverse = np.empty((len(xx), 2, 2))
-        inverse[:, 0, 0] = yy
-        inverse[:, 1, 1] = xx
-        inverse[:, 0, 1] = inverse[:, 1, 0] = -xy
-        inverse /= (xx * yy - xy * xy)[:, None, None]
-        carry = np.zeros((len(xx), 3, 2))
-        np.divide(scale, total[:, None], out=carry.reshape(-1, 6)[:, :4:3])
-        np.negative(self.mixing[:, :, 0], out=carry[:, 2])
-        covariance: FloatArray = np.matmul(np.matmul(carry, inverse), carry.swapaxes(1, 2))
-        covariance[:, 2, 2] += 1 / self.gram[:, 0, 0]
-        return covariance
+        by_cell = covariance_of(
+            np.moveaxis(self.slopes() * total[:, None, None], 0, -1),
+            self.mixing[:, :, 0].T * total,
+            self.rows[:, 0].T,
+            np.zeros(len(total)),
+        )
+        units = np.concatenate([scale, np.ones((len(scale), 1))], axis=1)
+        return np.where(by_cell == 0, 0.0, by_cell * units[:, :, None] * units[:, None])
 
 
 def _held_back(reduced: FloatArray, s: FloatArray, top: float) -> FloatArray:
