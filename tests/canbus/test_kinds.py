@@ -181,6 +181,24 @@ def test_listener_takes_the_mapping_from_the_eds_or_says_why_not(make_rig: Make)
         make_rig(1, role="listener", channels=channels_of([f"0x9130:{n}" for n in (1, 2, 3, 4)], None))
 
 
+@pytest.mark.parametrize(
+    ("identifier", "error", "told"),
+    [
+        ("0x1C5", ValueError, 'nodes "pad1" and "pad2" both send 0x1C5 by their EDS'),
+        ("0x701", EdsError, "TPDO1 has identifier 0x701, which CANopen uses otherwise"),
+    ],
+)
+def test_listener_refuses_identifiers_that_cannot_be(
+    make_rig: Make, tmp_path: Path, identifier: str, error: type[Exception], told: str
+) -> None:
+    text = (FOLDER / "noname-4ch.eds").read_text(encoding="latin-1")
+    assert "180h+$NODEID" in text
+    path = tmp_path / "fixed.eds"
+    path.write_text(text.replace("180h+$NODEID", identifier), encoding="latin-1")
+    with pytest.raises(error, match=told):
+        make_rig(2, role="listener", eds=str(path))
+
+
 def test_bit_that_forbids_remote_frames_is_kept(make_rig: Make) -> None:
     """Many nodes refuse to change bit 30 of an identifier."""
     rig = make_kind(make_rig, "feldmann-ai4w.eds", 1, device={"strict_pdo": True})

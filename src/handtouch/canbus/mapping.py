@@ -107,6 +107,8 @@ def from_eds(path: Path | str | None, node_id: int, channels: Channels) -> Mappi
     ]
     try:
         found = arrange(listed, channels)
+        for tpdo in found.tpdos if found else ():
+            _checked(tpdo.number, tpdo.cob_id, tpdo.cob_id)
     except StepError as error:
         raise eds.EdsError(f"{path}: {error}") from error
     if found is None:

@@ -8,11 +8,9 @@ broadcast.
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +18,13 @@ from numpy.typing import NDArray
 from . import boot, emergency
 from .lifecycle import (
     NMT_BOOT_UP,
-    NMT_PREOPERATIONAL,
     Action,
     Answer,
     Beats,
     BootUp,
-    Done,
     Event,
     Failed,
     Heartbeat,
-    Life,
     NodeState,
     Rest,
     Role,
@@ -37,23 +32,20 @@ from .lifecycle import (
     Silence,
     Stop,
     Tick,
-    Timing,
     advance,
     due_ns,
     is_supervised,
 )
 from .mapping import Mapping as PdoMapping
-from .mapping import from_eds, read_mapping, tpdo_numbers
+from .member import NMT_COMMANDS, Member, Outcome, Result, command, member, outcome
 from .nodes import NodeEvent, NodeSpec, NodeStatus, SerialChanged
 from .port import Port
 from .router import IDENTIFIERS, NOBODY
-from .sdo import Outdated, Sdo, StepError
 
 __all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus", "SerialChanged"]
 
 STALE_PERIODS = 3
 """Periods without a sample after which an operational node is stale."""
-EMERGENCIES_KEPT = 16
 BEATS_WATCHED = 10
 """Heartbeat periods over which it is judged whether they come twice as often as they should."""
 CROWDED = 2
@@ -72,61 +64,9 @@ _PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
 _PROBE = bytes(
     (0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0)
 )  # SDO: read 0x1000, the device type, which all nodes have
-_NMT_COMMANDS = {Action.START: 1, Action.STOP: 2, Action.ENTER_PREOPERATIONAL: 128}
 
 _FOREIGN, _IGNORED = -1, -2
 _STARTED = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
-_NOBODY_WAITS = (NodeState.ABSENT, NodeState.STOPPED)
-Outcome = Done | Failed
-Result = boot.Identity | PdoMapping | boot.Configured | boot.Paced
-
-
-@dataclass(slots=True, eq=False)
-class _Node:
-    """All that is known of a node. Only the receiving thread changes it."""
-
-    spec: NodeSpec
-    port: Port
-    timing: Timing
-    tpdos: tuple[int, ...]
-    sdo: Sdo
-    life: Life = field(default_factory=Life)
-    identity: boot.Identity | None = None
-    mapping: PdoMapping | None = None
-    working: threading.Lock = field(default_factory=threading.Lock)  # one transfer at a time
-    booted: bool = False  # and not configured since
-    guarded: bool = False
-    guard_ns: int = 0  # when to ask a guarded node next
-    heartbeats: int = 0
-    missed: int = 0
-    may_idle: bool = False  # it could be made event-driven
-    idle: bool = False  # it is
-    pacing: bool = False  # a change of that is under way
-    asked_ns: int = 0  # when the receiving thread itself asked for it, 0 if it hasn't
-    request: bytes = b""  # and how
-    paced_ns: int = 0  # since when it is so
-    watched: tuple[int, int] | None = None  # since when its heartbeats are counted, and how many had come
-    crowded: int = 0  # times in a row that there were twice as many as there should be
-    emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
-
-    def status(self) -> NodeStatus:
-        return NodeStatus(
-            self.spec.slot,
-            self.spec.name,
-            self.spec.bus,
-            self.spec.node_id,
-            self.life.state,
-            self.life.since_ns,
-            self.life.reason,
-            self.identity,
-            tuple(tpdo.cob_id for tpdo in self.mapping.tpdos) if self.mapping else (),
-            self.guarded,
-            self.idle,
-            self.heartbeats,
-            self.missed,
-            self.life.reboots,
-            tuple(self.emergencies),
-        )
 
 
 class Master:
@@ -156,13 +96,13 @@ class Master:
         self.paced_ns: NDArray[np.int64] = np.zeros(self._slab.size, dtype=np.int64)
         self.idle: NDArray[np.bool_] = np.zeros(self._slab.size, dtype=np.bool_)
         self.paces = 0
-        self._nodes = [_node(spec, ports, sync_period_ns or 0) for spec in nodes]
+        self._nodes = [member(spec, ports, sync_period_ns or 0) for spec in nodes]
         self._by_slot = {node.spec.slot: node for node in self._nodes}
         self._owners = _owners(ports, self._nodes)
         self._waiting: dict[int, int] = {}  # slots whose next sample matters -> stamp of the last one
         self._next_due_ns = 0
         self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_EVENTS_KEPT)
-        self._results: deque[tuple[_Node, Outcome | None, Result | None]] = deque()  # from the workers
+        self._results: deque[tuple[Member, Outcome | None, Result | None]] = deque()  # from the workers
         self._workers: ThreadPoolExecutor | None = None
 
     def start(self, t_ns: int) -> None:
@@ -250,7 +190,7 @@ class Master:
             self._workers = None
         self._results.clear()
 
-    def _from_node(self, node: _Node, service: int, data: bytes, t_ns: int) -> None:
+    def _from_node(self, node: Member, service: int, data: bytes, t_ns: int) -> None:
         size = {_HEARTBEAT: 1}.get(service, 8)
         if len(data) != size:
             node.port.counters.short += 1
@@ -266,7 +206,7 @@ class Master:
                 self._pace_answered(node, data[0], t_ns)
             self._advance(node, Answer(), t_ns)
 
-    def _heartbeat(self, node: _Node, nmt: int, t_ns: int) -> None:
+    def _heartbeat(self, node: Member, nmt: int, t_ns: int) -> None:
         if nmt == NMT_BOOT_UP:
             node.booted, node.watched = True, None  # its heartbeat time is its own until it is configured
             self._advance(node, BootUp(), t_ns)
@@ -277,7 +217,7 @@ class Master:
             node.missed += max(round((t_ns - node.life.heartbeat_ns) / node.timing.heartbeat_ns) - 1, 0)
         self._advance(node, Heartbeat(nmt), t_ns)
 
-    def _watch_rate(self, node: _Node, t_ns: int) -> None:
+    def _watch_rate(self, node: Member, t_ns: int) -> None:
         """Two nodes of one id give themselves away by their heartbeats, which come twice as often."""
         if node.watched is None:
             return
@@ -317,13 +257,13 @@ class Master:
             if due is not None:
                 self._next_due_ns = min(self._next_due_ns, due)
 
-    def _guard(self, node: _Node, t_ns: int) -> None:
+    def _guard(self, node: Member, t_ns: int) -> None:
         """Ask a node that has no heartbeat for its state, once a period."""
         if t_ns >= node.guard_ns:
             node.port.send(_HEARTBEAT + node.spec.node_id, b"", remote=True)
             node.guard_ns = t_ns + node.timing.heartbeat_ns
 
-    def _advance(self, node: _Node, event: Event, t_ns: int) -> None:
+    def _advance(self, node: Member, event: Event, t_ns: int) -> None:
         before = node.life
         node.life, actions = advance(before, event, t_ns, node.timing)
         after = node.life
@@ -336,7 +276,7 @@ class Master:
         for action in actions:
             self._act(node, action)
 
-    def _changed(self, node: _Node) -> None:
+    def _changed(self, node: Member) -> None:
         """Keep what is derived from a node's state."""
         slot, state = node.spec.slot, node.life.state
         self.states[slot] = state
@@ -346,12 +286,12 @@ class Master:
         else:
             self._waiting.pop(slot, None)
 
-    def _tell(self, node: _Node, old: NodeState, reason: str, t_ns: int) -> None:
+    def _tell(self, node: Member, old: NodeState, reason: str, t_ns: int) -> None:
         self._events.append(NodeEvent(node.spec.slot, t_ns, old, node.life.state, reason))
 
-    def _act(self, node: _Node, action: Action) -> None:
-        if action in _NMT_COMMANDS:
-            _command(node, action)
+    def _act(self, node: Member, action: Action) -> None:
+        if action in NMT_COMMANDS:
+            command(node, action)
         elif action is Action.PROBE:
             node.port.send(_SDO_REQUEST + node.spec.node_id, _PROBE)
             # stopped, it serves no SDO; without heartbeat it tells its state only when it is asked
@@ -359,30 +299,10 @@ class Master:
         elif self._workers is not None:
             self._workers.submit(self._work, node, action, node.life.attempt)
 
-    def _work(self, node: _Node, step: Action, attempt: int, idle: bool = False) -> None:
+    def _work(self, node: Member, step: Action, attempt: int, idle: bool = False) -> None:
         """In a worker: carry out a step; its outcome goes to the receiving thread."""
         with node.working:
-            self._results.append((node, *self._outcome(node, step, attempt, idle)))
-
-    def _outcome(
-        self, node: _Node, step: Action, attempt: int, idle: bool
-    ) -> tuple[Outcome | None, Result | None]:
-        def outdated() -> bool:
-            gone = not node.life.resting if step is Action.POWER_DOWN else node.life.state in _NOBODY_WAITS
-            return gone or node.life.attempt != attempt
-
-        node.sdo.outdated = outdated
-        result: Result | None = None
-        outcome: Outcome = Done(step, attempt)
-        try:
-            result = _carry_out(node, step, idle)
-        except Outdated:
-            return None, None
-        except StepError as error:
-            outcome = Failed(step, attempt, str(error), error.silent, error.stranger)
-        except Exception as error:  # noqa: BLE001 - a future would swallow it; here it becomes the node's reason
-            outcome = Failed(step, attempt, f"unexpected {type(error).__name__}: {error}")
-        return outcome, result
+            self._results.append((node, *outcome(node, step, attempt, idle)))
 
     def _collect(self, t_ns: int) -> None:
         while self._results:
@@ -407,7 +327,7 @@ class Master:
                 outcome = Failed(outcome.step, outcome.attempt, clash)
             self._advance(node, outcome, t_ns)
 
-    def _paced(self, node: _Node, outcome: Outcome, result: Result | None, t_ns: int) -> None:
+    def _paced(self, node: Member, outcome: Outcome, result: Result | None, t_ns: int) -> None:
         node.pacing = False
         if isinstance(result, boot.Paced):
             self._set_pace(node, result.idle, t_ns)
@@ -420,7 +340,7 @@ class Master:
             kind = "event-driven" if node.idle else "synchronous"
             self._tell(node, node.life.state, f"stays {kind}: {outcome.reason}", t_ns)
 
-    def _pace_answered(self, node: _Node, command: int, t_ns: int) -> None:
+    def _pace_answered(self, node: Member, command: int, t_ns: int) -> None:
         """A node that doesn't let a PDO be changed while it is on needs more than one request."""
         if command == _SDO_WRITTEN:
             self._set_pace(node, False, t_ns)
@@ -428,7 +348,7 @@ class Master:
             node.asked_ns = 0
             self._workers.submit(self._work, node, Action.PACE, node.life.attempt, False)
 
-    def _set_pace(self, node: _Node, idle: bool, t_ns: int) -> None:
+    def _set_pace(self, node: Member, idle: bool, t_ns: int) -> None:
         slot, spec = node.spec.slot, node.spec
         node.idle, node.pacing, node.asked_ns = idle, False, 0
         period_ns = spec.idle.period_ms * 1_000_000 if idle and spec.idle else 0
@@ -437,13 +357,13 @@ class Master:
         self.idle[slot] = idle
         self.paces += 1
 
-    def _take_identity(self, node: _Node, identity: boot.Identity, t_ns: int) -> None:
+    def _take_identity(self, node: Member, identity: boot.Identity, t_ns: int) -> None:
         before = node.identity
         node.identity = identity
         if before is not None and before.serial != identity.serial:
             self._events.append(SerialChanged(node.spec.slot, t_ns, before.serial, identity.serial))
 
-    def _route(self, node: _Node, mapping: PdoMapping) -> str:
+    def _route(self, node: Member, mapping: PdoMapping) -> str:
         """Route the node's samples; the reason where an identifier of theirs is another node's already."""
         router, slot = node.port.router, node.spec.slot
         for tpdo in mapping.tpdos:
@@ -463,71 +383,26 @@ class Master:
         return ""
 
 
-def _carry_out(node: _Node, step: Action, idle: bool) -> Result | None:
-    spec = node.spec
-    if step is Action.IDENTIFY:
-        expected = boot.Expected(spec.vendor_id, spec.product_code, spec.revision, spec.serial)
-        return boot.identify(node.sdo, expected)
-
-    def halt() -> None:
-        if node.life.nmt != NMT_PREOPERATIONAL and node.timing.role is Role.MASTER:
-            _command(node, Action.ENTER_PREOPERATIONAL)
-
-    if step is Action.READ_MAPPING:
-        may = halt if spec.remap else None
-        return read_mapping(node.sdo, spec.node_id, node.tpdos, spec.channels, may)
-    if step is Action.POWER_DOWN:
-        try:
-            boot.excite(node.sdo, spec.excitation, False)
-        finally:
-            if not node.sdo.outdated():
-                _command(node, Action.STOP)
-        return None
-    if node.mapping is None:
-        raise StepError("no PDO mapping to configure")
-    if step is Action.PACE:
-        boot.set_pace(node.sdo, node.mapping.tpdos[0], idle)
-        return boot.Paced(idle)
-    return boot.configure(node.sdo, node.mapping, spec, halt, node.booted)
-
-
-def _command(node: _Node, action: Action) -> None:
-    """NMT, to one node: the second byte is never 0, which would mean all."""
-    node.port.send(_NMT, bytes((_NMT_COMMANDS[action], node.spec.node_id)))
-
-
-def _node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns: int) -> _Node:
-    if spec.bus not in ports:
-        raise ValueError(f'node "{spec.name}" is on bus "{spec.bus}", which is not open')
-    if not 1 <= spec.node_id <= 127:
-        raise ValueError(f'node "{spec.name}": node id {spec.node_id} is outside 1 to 127')
-    port = ports[spec.bus]
-    if not 0 <= spec.slot < port.slab.size:
-        raise ValueError(f'node "{spec.name}": slot {spec.slot} is outside the slab of {port.slab.size}')
-    timing = Timing(
-        heartbeat_ns=spec.heartbeat_ms * 1_000_000,
-        heartbeat_timeout_ns=spec.heartbeat_timeout_ms * 1_000_000,
-        settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
-        role=Role(port.bus.role),
-    )
-    node = _Node(spec, port, timing, tpdo_numbers(spec.eds, spec.channels), Sdo(spec.node_id, port.send))
-    if timing.role is Role.LISTENER:  # nothing can be asked
-        node.mapping = from_eds(spec.eds, spec.node_id, spec.channels)
-    return node
-
-
-def _owners(ports: Mapping[str, Port], nodes: Sequence[_Node]) -> dict[str, list[int]]:
+def _owners(ports: Mapping[str, Port], nodes: Sequence[Member]) -> dict[str, list[int]]:
     """For each bus and identifier: which of `nodes` handles it, _IGNORED or _FOREIGN."""
     owners = {name: [_FOREIGN] * IDENTIFIERS for name in ports}
     for table in owners.values():
         for can_id in (_NMT, _SYNC, _TIME, _LSS_ANSWER, _LSS_REQUEST):
             table[can_id] = _IGNORED
     slots: set[int] = set()
+    heard: dict[tuple[str, int], str] = {}  # a listener's nodes by the identifiers of their samples
     for number, node in enumerate(nodes):
         spec, table = node.spec, owners[node.spec.bus]
         if table[_HEARTBEAT + spec.node_id] != _FOREIGN or spec.slot in slots:
             raise ValueError(f'node "{spec.name}": node id {spec.node_id} or slot {spec.slot} is given twice')
         slots.add(spec.slot)
+        for tpdo in node.mapping.tpdos if node.mapping else ():
+            other = heard.setdefault((spec.bus, tpdo.cob_id), spec.name)
+            if other != spec.name:
+                raise ValueError(
+                    f'nodes "{other}" and "{spec.name}" both send 0x{tpdo.cob_id:X} by their EDS; '
+                    "give each an EDS, or DCF, with the identifiers that it has"
+                )
         for service in (_EMCY, _SDO_ANSWER, _HEARTBEAT):
             table[service + spec.node_id] = number
         for service in (_SDO_REQUEST, *_PDOS):  # our own requests, echoed; PDOs before they are routed
