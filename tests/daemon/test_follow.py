@@ -1,0 +1,179 @@
+"""Maps drawn at a contact's last solution say what solving at every tick would say."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from handtouch.daemon.follow import Follower
+from handtouch.daemon.model import PadModel
+from handtouch.daemon.tick import Tick
+from handtouch.field.strength import Status
+
+FloatArray = NDArray[np.float64]
+PADS = np.arange(3)
+
+
+class Reference(NamedTuple):
+    """Contacts on all pads, each solved on its own."""
+
+    xy: FloatArray
+    xy_std: FloatArray
+    position_m: FloatArray
+    normal: FloatArray
+    pad_m: FloatArray
+    covariance_m2: FloatArray
+    force_n: FloatArray
+    force_std_n: FloatArray
+    residual: FloatArray
+    residual_std: FloatArray
+
+    @classmethod
+    def of(cls, model: PadModel, currents: FloatArray) -> Reference:
+        found = model.locator.estimate(PADS, currents.T, model.noise_a.T)
+        placed = model.placement.place(PADS, found.x, found.y, found.covariance[:, :2, :2])
+        radius_m = model.locator.conformal_radius(PADS, found.x, found.y) * placed.scale
+        std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        strength = model.force(PADS, currents.T, found.total, std[:, 2], radius_m)
+        assert (strength.status == Status.VALID).all()
+        return cls(
+            np.stack([found.x, found.y], axis=1),
+            std[:, :2],
+            placed.position_m,
+            placed.normal,
+            placed.pad_m,
+            placed.covariance_m2,
+            strength.force_n,
+            strength.std_n,
+            found.residual,
+            np.abs(found.residual) / np.sqrt(np.maximum(found.chi_squared, 1e-300)),
+        )
+
+
+def reading(model: PadModel, xy: FloatArray, total_a: float, rng: np.random.Generator | None) -> FloatArray:
+    """Currents (3, 4) of contacts at xy (3, 2), parts of the sides."""
+    fractions = model.locator.fractions(PADS, *(xy * model.locator._sides).T).T
+    noise = model.noise_a * rng.normal(size=(3, 4)) if rng else 0.0
+    return np.asarray(total_a * fractions + noise)
+
+
+def step(tick: Tick, currents: FloatArray) -> None:
+    """What a tick does with the currents of contacts."""
+    tick._currents[:] = currents
+    tick._solve(PADS)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(3e-4, 3e-3))
+def test_a_contact_is_told_as_if_it_was_solved(bench: Any, seed: int, total_a: float) -> None:
+    rng = np.random.default_rng(seed)
+    tick = Tick(bench.model, 5_000_000)
+    currents = reading(bench.model, rng.uniform(0.15, 0.85, (3, 2)), total_a, rng)
+    step(tick, currents)
+    columns, expected = tick.columns, Reference.of(bench.model, currents)
+    assert (np.abs(columns.xy - expected.xy) < 0.02 * expected.xy_std).all()
+    np.testing.assert_allclose(columns.position_m, expected.position_m, atol=1e-7)
+    np.testing.assert_allclose(columns.normal, expected.normal, atol=2e-5)
+    np.testing.assert_allclose(columns.pad_m, expected.pad_m, atol=1e-7)
+    np.testing.assert_allclose(columns.force_n, expected.force_n, rtol=1e-4)
+    np.testing.assert_allclose(columns.force_std_n, expected.force_std_n, rtol=1e-3)
+    np.testing.assert_allclose(columns.residual, expected.residual, atol=1e-5)
+    np.testing.assert_allclose(columns.residual_std, expected.residual_std, rtol=0.02)
+    scale = np.abs(expected.covariance_m2).max(axis=(1, 2))[:, None, None]
+    np.testing.assert_allclose(columns.covariance_m2 / scale, expected.covariance_m2 / scale, atol=0.03)
+
+
+@pytest.mark.parametrize("settled", [True, False])
+@pytest.mark.parametrize("per_tick", [0.0, 1e-4, 1e-3, 1e-2], ids="{} of a side".format)
+@pytest.mark.parametrize("total_a", [1e-4, 3e-4, 3e-3])
+def test_a_followed_contact_is_as_accurate_as_one_solved_at_every_tick(
+    bench: Any, total_a: float, per_tick: float, settled: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    tick = Tick(bench.model, 5_000_000)
+    angle = rng.uniform(0, 2 * np.pi, 3)
+    way = per_tick * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    at = rng.uniform(0.3, 0.7, (3, 2))
+    followed, solved = [], []
+    for _ in range(150):
+        at = at + way
+        way = np.where((at < 0.15) | (at > 0.85), -way, way)
+        currents = reading(bench.model, at, total_a, rng)
+        step(tick, currents)
+        if settled:
+            tick.settle()
+        own = bench.model.locator.estimate(PADS, currents.T, bench.model.noise_a.T)
+        place = at * bench.model.locator._sides
+        std = np.sqrt(np.diagonal(own.covariance, axis1=1, axis2=2))[:, :2]
+        followed.append((tick.columns.xy - place) / std)
+        solved.append((np.stack([own.x, own.y], axis=1) - place) / std)
+    assert np.std(followed) < 1.02 * np.std(solved)
+    assert np.std(np.subtract(followed, solved)) < 0.15
+
+
+def test_a_force_that_changes_is_that_of_its_own_current(bench: Any) -> None:
+    tick = Tick(bench.model, 5_000_000)
+    for total_a in 1e-3 * (1 + 0.5 * np.sin(np.arange(60) * 0.15)):
+        currents = reading(bench.model, np.full((3, 2), 0.4), total_a, None)
+        step(tick, currents)
+        tick.settle()
+        np.testing.assert_allclose(
+            tick.columns.force_n, Reference.of(bench.model, currents).force_n, rtol=1e-4
+        )
+
+
+def test_a_resting_contact_is_never_solved_again(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, drawn, draw = np.random.default_rng(4), [], Follower.draw
+
+    def counted(*args: Any, **more: Any) -> Any:
+        drawn.append(args)
+        return draw(*args, **more)
+
+    monkeypatch.setattr(Follower, "draw", counted)
+    tick = Tick(bench.model, 5_000_000)
+    for _ in range(200):
+        step(tick, reading(bench.model, np.full((3, 2), 0.4), 3e-3, rng))
+        tick.settle()
+    assert len(drawn) == 1
+
+
+def test_settling_changes_no_contact(bench: Any) -> None:
+    tick = Tick(bench.model, 5_000_000)
+    step(tick, reading(bench.model, np.full((3, 2), 0.4), 1e-3, None))
+    step(tick, reading(bench.model, np.full((3, 2), 0.403), 1e-3, None))
+    before = tick.columns.values.copy()
+    tick.settle()
+    np.testing.assert_array_equal(tick.columns.values, before)
+    tick.settle()  # nothing is left to do
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.5), (0.5, 1.0), (0.0, 0.0), (1.0, 1.0)])
+def test_a_contact_on_an_edge_or_in_a_corner_stays_where_the_locator_puts_it(
+    bench: Any, place: tuple[float, float]
+) -> None:
+    rng = np.random.default_rng(5)
+    tick = Tick(bench.model, 5_000_000)
+    at = np.clip(np.full((3, 2), place), 1e-3, 1 - 1e-3)
+    for _ in range(20):
+        currents = reading(bench.model, at, 3e-4, rng)
+        step(tick, currents)
+        tick.settle()
+        own = bench.model.locator.estimate(PADS, currents.T, bench.model.noise_a.T)
+        std = np.sqrt(np.diagonal(own.covariance, axis1=1, axis2=2))[:, :2]
+        assert (np.abs(tick.columns.xy - np.stack([own.x, own.y], axis=1)) < 0.5 * std).all()
+        assert ((tick.columns.xy >= 0) & (tick.columns.xy <= bench.model.locator._sides)).all()
+
+
+def test_a_new_contact_owes_nothing_to_the_one_before(bench: Any) -> None:
+    tick = Tick(bench.model, 5_000_000)
+    there = reading(bench.model, np.full((3, 2), 0.8), 3e-3, None)
+    step(tick, reading(bench.model, np.full((3, 2), 0.2), 1e-3, None))
+    step(tick, there)
+    expected = Reference.of(bench.model, there)
+    np.testing.assert_allclose(tick.columns.position_m, expected.position_m, atol=1e-7)
+    np.testing.assert_allclose(tick.columns.force_n, expected.force_n, rtol=1e-4)
