@@ -1,7 +1,7 @@
 """The objects that carry a node's four channels, with their integer types, from configuration and EDS.
 
 Public names: `Channel`, `Channels`, `STANDARD_CHANNELS`, `ELECTRODES`, `channels_of`, `in_order`, `parse`,
-`full_scale_counts`.
+`full_scale_counts`, `PROFILE_TYPES`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .slab import limits
 ELECTRODES = ("x0", "xa", "y0", "yb")
 WIDEST_BITS = 32
 _FORM = re.compile(r"0x([0-9A-Fa-f]{4}):(0x[0-9A-Fa-f]{1,2}|\d{1,3})(?::([iu])(8|16|24|32))?")
-_KNOWN = {  # CiA 401 and CiA 404: read analogue input, process and field values
+PROFILE_TYPES = {  # (bits, signed); CiA 401 and CiA 404: read analogue input, process and field values
     0x6400: (8, True),
     0x6401: (16, True),
     0x6402: (32, True),
@@ -106,7 +106,7 @@ def channels_of(objects: Sequence[str], path: Path | str | None) -> Channels:
             raise eds.EdsError(
                 f'"{text}": {path} says {_type(*listed)}; leave the type out, or correct the EDS'
             )
-        kind = told or listed or _KNOWN.get(index)
+        kind = told or listed or PROFILE_TYPES.get(index)
         if kind is None:
             raise eds.EdsError(f'"{text}": its type is not known; give the EDS, or write it: "{text}:i16"')
         if kind[0] > WIDEST_BITS:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from handtouch import config
-from handtouch.canbus.channels import channels_of
+from handtouch.canbus.channels import PROFILE_TYPES
 from handtouch.canbus.survey import NodeFacts, four_channels
 
 FILL_IN = "FILL IN"
@@ -72,10 +72,7 @@ def channel_names(node: NodeFacts) -> tuple[str, ...]:
 
 def _object_name(entry: int) -> str:
     name = f"0x{entry >> 16:04X}:{entry >> 8 & 0xFF}"
-    try:
-        bits = channels_of([name] * 4, None)[0].bits
-    except ValueError:  # no object of a device profile
-        bits = 0
+    bits, _ = PROFILE_TYPES.get(entry >> 16, (0, True))
     return name if bits == entry & 0xFF else f"{name}:i{entry & 0xFF}"
 
 
