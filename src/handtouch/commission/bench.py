@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.canbus.channels import ELECTRODES
 from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master
+from handtouch.canbus.master import STALE_PERIODS, Master
 from handtouch.canbus.nodes import NodeStatus, node_specs
 from handtouch.canbus.port import Port
 from handtouch.canbus.router import SYNC_ID
@@ -25,6 +25,8 @@ from handtouch.canbus.slab import Slab
 from handtouch.canbus.sync import Sync
 
 from .edit import Edit, applied
+
+_HELD_NS = 100_000_000  # a sample that is late or lost doesn't end a press
 
 
 def as_wired(deployment: config.Deployment) -> config.Deployment:
@@ -39,7 +41,7 @@ def as_wired(deployment: config.Deployment) -> config.Deployment:
 
 @dataclass(frozen=True)
 class Sample:
-    """One SYNC's counts (n, 4), in the order of each node's channels; `alive` (n,): which nodes sent them."""
+    """The latest counts (n, 4) at a SYNC, in the order of each node's channels; `alive` (n,): not too old."""
 
     t_ns: int
     counts: NDArray[np.int64]
@@ -64,6 +66,7 @@ class Bench:
                 opened.callback(port.close)
             self._master = Master(self._ports, specs, period_ns)
             self._opened = opened.pop_all()
+        self._held_ns = max(_HELD_NS, STALE_PERIODS * period_ns)
         self._sync = Sync(list(self._ports.values()), period_ns)
 
     def __enter__(self) -> Bench:
@@ -109,7 +112,8 @@ class Bench:
 
     def _cycle(self, t_ns: int) -> Sample:
         """What the period that ends now has brought."""
-        alive = (self._slab.fresh > 0) & (self._master.states == NodeState.OPERATIONAL)
+        started = np.isin(self._master.states, (NodeState.OPERATIONAL, NodeState.STALE))
+        alive = started & (t_ns - self._slab.t_ns < self._held_ns)
         sample = Sample(t_ns, self._slab.read().copy(), alive)
         self._slab.begin_cycle(t_ns)
         return sample

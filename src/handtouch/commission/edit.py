@@ -141,7 +141,8 @@ def _like(old: Item, value: Any) -> Item:
 
 def _digits(old: str, value: int) -> str:
     """A number in the base of another one."""
-    prefix = old[:2].lower()
+    old = old.replace("_", "")
+    prefix = old[:2]
     if prefix not in ("0x", "0o", "0b"):
         return str(value)
     digits = format(value, prefix[1]).rjust(len(old) - 2, "0")
