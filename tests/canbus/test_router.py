@@ -93,6 +93,13 @@ def test_kinds_of_frame_that_canopen_does_not_use_never_reach_the_slab(
     assert router.slab.t_ns[0] == 0
 
 
+def test_request_of_node_guarding_is_neither_foreign_nor_a_boot_up_message() -> None:
+    router = Router(Slab(1))
+    guard = can.Message(arbitration_id=0x701, is_remote_frame=True, dlc=0, is_extended_id=False)
+    assert router.accept_message(guard, 1) is None
+    assert (router.counters.frames, router.counters.foreign) == (1, 0)
+
+
 def test_a_log_feeds_the_same_routes() -> None:
     router = Router(Slab(1))
     router.route(0x281, 0)

@@ -17,6 +17,7 @@ IDENTIFIERS = 2048
 """CANopen uses 11-bit identifiers."""
 SYNC_ID = 0x80
 NOBODY = -1
+_GUARDING = range(0x701, 0x780)
 
 Frame = tuple[int, bytes, int]
 """Identifier, data, arrival in ns of the host's monotonic clock."""
@@ -103,6 +104,9 @@ class Router:
         can_id = message.arbitration_id
         if message.is_error_frame:
             self.error(can_id, message.data, t_ns)
+        elif message.is_remote_frame and not message.is_extended_id and can_id in _GUARDING:
+            self.counters.frames += 1  # somebody guards a node; ours come back where a bus echoes
+            self.counters.bits += _FRAME_BITS[0]
         elif (
             message.is_extended_id
             or message.is_remote_frame
