@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -36,13 +37,12 @@ class Pads:
 
     def __init__(self, links: list[str], **changes: Any) -> None:
         channel = f"commission{next(_numbers)}"
+        self.option = f"can0=virtual:{channel}"
         whole = config.parse(shipped.path("utah_mit.toml").read_text())
         pads = tuple(pad for pad in whole.hands[0].pads if pad.link in links)
         hand = whole.hands[0].model_copy(update={"pads": pads})
         nodes = {"four_channel": whole.nodes["four_channel"].model_copy(update=changes)}
-        self.truth = config.with_bus(
-            whole.model_copy(update={"hands": (hand,), "nodes": nodes}), f"can0=virtual:{channel}"
-        )
+        self.truth = config.with_bus(whole.model_copy(update={"hands": (hand,), "nodes": nodes}), self.option)
         self._pads = pads
         self._networks = [network_of(pad, whole.sheets[pad.sheet]) for pad in pads]
         self._rng = np.random.default_rng(1)
@@ -342,6 +342,86 @@ def test_serial_numbers_that_nodes_share_are_not_written(made: Callable[..., Pad
         device.write(0x1018, 4, 77, keep=True)
     _, session = told(pads, Person(pads))
     assert {edit.serial for edit in session.edits().values()} == {None}
+
+
+@dataclass
+class Written:
+    """A hand, its file, where the first two channels are told in the wrong order, and somebody at it."""
+
+    pads: Pads
+    path: Path
+    person: Person
+
+    def run(self, **options: Any) -> int:
+        self.pads.nodes.start()
+        return commission.run(self.path, [self.pads.option], **options)
+
+
+@pytest.fixture
+def written(
+    made: Callable[..., Pads],
+    tmp_path: Path,
+    endpoints: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Written:
+    pads = made("thumb_proximal", "thumb_middle")
+    person = Person(pads)
+    monkeypatch.setattr(commission, "open_dialogue", lambda: contextlib.nullcontext(person))
+    text = "".join(re.split(r"(?m)^(?=\[\[hand\.pad\]\])", shipped.path("utah_mit.toml").read_text())[:3])
+    text = text.replace("[daemon]\n", f'[daemon]\ncontrol = "{endpoints["control"]}"\n')
+    pads.devices["thumb_middle"].wired = (1, 0, 2, 3)
+    path = tmp_path / "hand.toml"
+    path.write_text(text)
+    return Written(pads, path, person)
+
+
+def test_line_ends_stay_as_they_are(written: Written) -> None:
+    before = written.path.read_text().replace("\n", "\r\n")
+    written.path.write_bytes(before.encode())
+    assert written.run() == 0
+    after = written.path.read_bytes().decode()
+    (new,) = set(after.split("\r\n")) - set(before.split("\r\n"))
+    assert new == 'electrodes = ["xa", "x0", "y0", "yb"]'
+
+
+def test_what_somebody_writes_meanwhile_stays(written: Written) -> None:
+    def press_and_write(near: Near | None) -> None:
+        if near is None:
+            written.path.write_text(written.path.read_text() + "# Mind the third finger.\n")
+        written.pads.press("thumb_middle", near)
+
+    written.person.instead = {"thumb_middle": press_and_write}
+    assert written.run() == 0
+    after = written.path.read_text()
+    assert after.endswith("# Mind the third finger.\n")
+    assert config.load(written.path).hands[0].pads[1].electrodes == ("xa", "x0", "y0", "yb")
+
+
+def test_a_file_that_cannot_say_what_was_found_is_left_alone(
+    written: Written, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = "a pad too few"
+
+    def press_and_break(near: Near | None) -> None:
+        written.path.write_text(broken)
+        written.pads.press("thumb_middle", near)
+
+    written.person.instead = {"thumb_middle": press_and_break}
+    assert written.run() == 1
+    assert "can't be written" in written.person.text
+    assert written.path.read_text() == broken
+    assert "xa x0 y0 yb" in capsys.readouterr().out  # what was found isn't lost
+
+
+def test_one_pad_can_be_done_again_when_all_others_are_left(written: Written) -> None:
+    assert written.run(links=["thumb_proximal"]) == 0
+    assert (written.path.parent / "hand.toml.commissioned").read_text() == "right/thumb_proximal\n"
+    written.pads.nodes.stop()
+    assert written.run(links=["right/thumb_proximal"]) == 0
+    assert sum("press it anywhere" in line for line in written.person.said) == 2
+    written.pads.nodes.stop()
+    assert written.run() == 0
+    assert not (written.path.parent / "hand.toml.commissioned").exists()
 
 
 def test_usage_is_checked_before_a_bus_is_touched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -113,6 +113,12 @@ def test_pads_written_in_one_line_are_found_too() -> None:
     assert 'electrodes = ["xa", "x0", "y0", "yb"]' in new
 
 
+def test_a_key_below_the_last_line_gets_a_line_of_its_own() -> None:
+    text = '[[hand]]\nname = "right"\n[[hand.pad]]\nlink = "a"\nbus = "can0"\nnode_id = 1\nnode = "n"'
+    new = edited(text, {("right", "a"): Edit("can0", 1, "n", 5, ("xa", "x0", "y0", "yb"))})
+    assert new.splitlines()[-3:] == ["serial = 5", 'node = "n"', 'electrodes = ["xa", "x0", "y0", "yb"]']
+
+
 def test_a_pad_that_is_gone_from_the_file_is_told() -> None:
     with pytest.raises(KeyError):
         edited(HAND, {("right", "c"): SWAPPED["right", "a"]})

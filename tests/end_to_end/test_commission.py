@@ -62,20 +62,8 @@ class PressableHand:
                         "force_n": [chance.uniform(*HOW_HARD[hard])],
                     }
                 )
-        straight = deployment.model_copy(
-            update={
-                "hands": tuple(
-                    hand.model_copy(
-                        update={
-                            "pads": tuple(p.model_copy(update={"electrodes": ELECTRODES}) for p in hand.pads)
-                        }
-                    )
-                    for hand in deployment.hands
-                )
-            }
-        )
         scenario = Scenario.model_validate({"touch": touches})
-        self._hand = VirtualHand(straight, scenario, World(seed=seed))
+        self._hand = VirtualHand(deployment, scenario, World(seed=seed))
         self._idle_s = self._now_s = len(touches) + 10.0
         self._bus = open_bus(deployment.buses[0])
         self.nodes = DeviceBus(self._bus, self._sample)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import signal
 import sys
 from collections.abc import Collection, Sequence
 from fnmatch import fnmatchcase
@@ -41,6 +42,7 @@ def run(
 
     Exit status: 0 all is well, 1 something is wrong, was skipped or left, 2 usage.
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # nodes are stopped, the terminal is given back
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
     try:
         wired = config.load(path)
@@ -62,17 +64,18 @@ def run(
         session = Session(wired, bench, dialogue, record.save, chosen, yes=yes, patience_s=patience_s)
         if before := record.recall(session, chosen if links else ()):
             dialogue.say(f"{before} pads were done before; --link NAME does them again.")
+        saved = True
         try:
             session.run()
         except KeyboardInterrupt:
             dialogue.say("Interrupted; what was found is kept.")
-        except OSError as error:
-            dialogue.say(f"{path} can't be written: {error.strerror or error}", "bad")
-            return 1
+        except (OSError, ValueError, KeyError) as error:  # full disk; a file that was edited meanwhile
+            dialogue.say(f"{path} can't be written: {error}", "bad")
+            saved = False
         table = report.table(session)
     print(table, end="")
     print(record.told(), end="")
-    return 0 if all(session.outcomes[row].well for row in chosen) else 1
+    return 0 if saved and all(session.outcomes[row].well for row in chosen) else 1
 
 
 class _Record:
@@ -81,7 +84,7 @@ class _Record:
     def __init__(self, path: Path, dry_run: bool) -> None:
         self._path, self._dry_run = path, dry_run
         self._folder = path.parent
-        self._original = path.read_text(encoding="utf-8")
+        self._original = _text(path)
         self._text = self._original
         self._done_file = path.with_name(f"{path.name}.commissioned")
         self._backup = path.with_name(f"{path.name}.bak")
@@ -98,8 +101,8 @@ class _Record:
         return sum(outcome.result is Result.BEFORE for outcome in session.outcomes)
 
     def save(self, session: Session) -> None:
-        """Write what was found so far. Raises OSError, and ValueError if it would not be what was found."""
-        text = self._path.read_text(encoding="utf-8")  # as it is now: somebody may have edited it
+        """Write what was found so far. Raises OSError; ValueError, KeyError for a file that can't say it."""
+        text = _text(self._path)  # as it is now: somebody may have edited it
         edits = session.edits()
         new = edited(text, edits)
         before = config.parse(text, str(self._path), self._folder)
@@ -126,6 +129,11 @@ class _Record:
         if self._dry_run:
             return f"{difference}Nothing was written (--dry-run).\n"
         return f"{difference}{self._path}: written; as it was before: {self._backup}\n"
+
+
+def _text(path: Path) -> str:
+    """With its line ends as they are."""
+    return path.read_bytes().decode("utf-8")
 
 
 def _chosen(deployment: config.Deployment, links: Sequence[str]) -> list[int]:

@@ -105,8 +105,10 @@ def _set(pad: Any, key: str, value: Any) -> None:
     if key not in pad:
         if value is None or (key == "electrodes" and value == ("x0", "xa", "y0", "yb")):
             return
+        item = tomlkit.item(list(value) if key == "electrodes" else value)
+        item.trivia.trail = pad[_AFTER[key]].trivia.trail  # its line's end
         # tomlkit's `append` would put it below the comments before the next table
-        pad.value._insert_after(_AFTER[key], key, tomlkit.item(list(value) if key == "electrodes" else value))
+        pad.value._insert_after(_AFTER[key], key, item)
     elif value is None:
         del pad[key]
     elif _plain(pad[key]) != _plain(value):
