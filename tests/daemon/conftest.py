@@ -81,7 +81,7 @@ class Bench:
 
     def counts(self, pad: int, x: float, y: float, current_a: float) -> NDArray[np.int16]:
         """Reading of a pad into which a contact at (x, y) parts of its rectangle injects a current."""
-        side_a, side_b = self.model.locator._sides[pad]
+        side_a, side_b = self.model.locator.sides[pad]
         at = np.array([pad]), np.array([x * side_a]), np.array([y * side_b])
         fractions = self.model.locator.fractions(*at)[:, 0]
         counts: NDArray[np.int16] = np.rint(

@@ -57,7 +57,7 @@ class Reference(NamedTuple):
 
 def reading(model: PadModel, xy: FloatArray, total_a: float, rng: np.random.Generator | None) -> FloatArray:
     """Currents (3, 4) of contacts at xy (3, 2), parts of the sides."""
-    fractions = model.locator.fractions(PADS, *(xy * model.locator._sides).T).T
+    fractions = model.locator.fractions(PADS, *(xy * model.locator.sides).T).T
     noise = model.noise_a * rng.normal(size=(3, 4)) if rng else 0.0
     return np.asarray(total_a * fractions + noise)
 
@@ -108,7 +108,7 @@ def test_a_followed_contact_is_as_accurate_as_one_solved_at_every_tick(
         if settled:
             tick.settle()
         own = bench.model.locator.estimate(PADS, currents.T, bench.model.noise_a.T)
-        place = at * bench.model.locator._sides
+        place = at * bench.model.locator.sides
         std = np.sqrt(np.diagonal(own.covariance, axis1=1, axis2=2))[:, :2]
         followed.append((tick.columns.xy - place) / std)
         solved.append((np.stack([own.x, own.y], axis=1) - place) / std)
@@ -166,7 +166,7 @@ def test_a_contact_on_an_edge_or_in_a_corner_stays_where_the_locator_puts_it(
         own = bench.model.locator.estimate(PADS, currents.T, bench.model.noise_a.T)
         std = np.sqrt(np.diagonal(own.covariance, axis1=1, axis2=2))[:, :2]
         assert (np.abs(tick.columns.xy - np.stack([own.x, own.y], axis=1)) < 0.5 * std).all()
-        assert ((tick.columns.xy >= 0) & (tick.columns.xy <= bench.model.locator._sides)).all()
+        assert ((tick.columns.xy >= 0) & (tick.columns.xy <= bench.model.locator.sides)).all()
 
 
 def test_a_new_contact_owes_nothing_to_the_one_before(bench: Any) -> None:

@@ -29,12 +29,23 @@ _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
 )
 _FOREVER_NS = np.iinfo(np.int64).max
 LOCATED = np.dtype(
-    [("position_m", "<f4", 3), ("normal", "<f4", 3), ("force_n", "<f4"), ("force_std_n", "<f4")]
+    [
+        ("pad_m", "<f4", 2),
+        ("residual", "<f4"),
+        ("position_m", "<f4", 3),
+        ("normal", "<f4", 3),
+        ("force_n", "<f4"),
+        ("force_std_n", "<f4"),
+        ("residual_std", "<f4"),
+        ("covariance_m2", "<f4", 9),
+    ]
 )
 _ALL_CHANNELS = np.ones(4)
-_LEAVING = 0.5
+_LEAVING = 0.7
 """Of a map's trust: beyond it, it is drawn anew before the contact leaves it."""
-_NOTHING_READ = np.zeros(0, dtype=np.intp), np.zeros((0, 4)), np.zeros((0, VALUES)), np.zeros((0, 3))
+_TREND = 4
+"""Ticks of exponential smoothing, which lags behind a steady change by one less."""
+_NOTHING_READ = np.zeros(0, dtype=np.intp), np.zeros((0, 4))
 
 
 @dataclass(frozen=True)
@@ -67,7 +78,7 @@ class Columns:
     residual_std: FloatArray
     """of a point contact, from the noise of the channels"""
     located: NDArray[np.void]
-    """position_m, normal, force_n and force_std_n as LOCATED; all NaN without contact"""
+    """what is told of contacts, as LOCATED; all NaN without contact"""
 
     @classmethod
     def of(cls, n: int) -> Columns:
@@ -92,7 +103,7 @@ class Columns:
             force_std_n=unknown(),
             saturated=np.zeros(n, dtype=np.bool_),
             residual_std=unknown(),
-            located=np.full((n, 8), np.nan, dtype="<f4").view(LOCATED)[:, 0],
+            located=np.full((n, 20), np.nan, dtype="<f4").view(LOCATED)[:, 0],
         )
 
 
@@ -126,8 +137,9 @@ class Tick:
         self.synchronous = np.ones(model.size, dtype=np.bool_)
         """pads that sample with SYNC; the others when something moves, and are not waited for"""
         self.follower = Follower(model)
-        self._read = _NOTHING_READ  # contacts of the last step: pads, currents, values, how far from trusted
-        self._located = self.columns.located.view("<f4").reshape(-1, 8)
+        self._read = _NOTHING_READ  # contacts of the last step: pads and currents
+        self._behind = np.full((model.size, 4), np.nan)  # their currents, smoothed: as they were a while ago
+        self._located = self.columns.located.view("<f4").reshape(-1, 20)
         self._none = np.zeros(model.size, dtype=np.bool_)
         self._least_counts = -_SOURCE_STD * model.noise_counts[:, None]
         self._currents = np.zeros((model.size, 4))
@@ -163,6 +175,7 @@ class Tick:
         if len(began):
             columns.values[began] = np.nan  # no use to start from where the last contact was
             self.follower.forget(began)
+            self._behind[began] = np.nan
         if len(telling):
             self._solve(telling)
         if len(ended):
@@ -229,9 +242,9 @@ class Tick:
         values, off = self.follower.read(touched, currents)
         if np.count_nonzero(off <= 1) < off.size:  # or NaN
             self._solve_anew(touched, currents, values, off)
-        self._read = touched, currents, values, off
+        self._read = touched, currents
         self.columns.values[touched] = values
-        self._located[touched, :7] = values[:, 5:]
+        self._located[touched, :10] = values[:, PAD.start :]
         peak = self.contacts.peak_n
         peak[touched] = np.fmax(peak.take(touched), values[:, FORCE])
 
@@ -249,15 +262,22 @@ class Tick:
             values[lost], off[lost] = self.follower.read(some, currents[lost])
 
     def settle(self) -> None:
-        """Draw anew, where contacts are now, the maps that they are about to leave.
+        """Draw anew the maps that contacts are about to leave, where their currents are heading.
 
         Call it between two steps, when nobody waits: it makes the next step cheap, and changes no contact.
         """
-        pads, currents, values, off = self._read
+        pads, currents = self._read
         self._read = _NOTHING_READ
+        if not len(pads):
+            return
+        behind = self._behind.take(pads, axis=0)
+        behind = np.where(np.isnan(behind), currents, behind + (currents - behind) / _TREND)
+        self._behind[pads] = behind
+        ahead = currents + (currents - behind) / (_TREND - 1)
+        values, off = self.follower.read(pads, ahead)
         leaving = np.flatnonzero(off.max(axis=1) > _LEAVING)
         if len(leaving):
-            self._draw(pads[leaving], currents[leaving], values[leaving, XY])
+            self._draw(pads[leaving], ahead[leaving], values[leaving, XY])
 
     def _draw(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> None:
         self._keep(pads, self.follower.draw(pads, currents, xy))
@@ -265,6 +285,9 @@ class Tick:
     def _keep(self, pads: IntArray, solved: Solved) -> None:
         columns = self.columns
         columns.covariance_m2[pads] = solved.covariance_m2
-        columns.force_std_n[pads] = self._located[pads, 7] = solved.force_std_n
+        columns.force_std_n[pads] = solved.force_std_n
         columns.saturated[pads] = solved.saturated
         columns.residual_std[pads] = solved.residual_std
+        self._located[pads, 10] = np.where(solved.saturated, np.nan, solved.force_std_n)
+        self._located[pads, 11] = solved.residual_std
+        self._located[pads, 12:] = solved.covariance_m2.reshape(-1, 9)

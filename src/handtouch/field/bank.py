@@ -28,6 +28,7 @@ class LocatorBank:
 
     models: one for each pad, with channels x0, xa, y0, yb; pads that share a model object share its table.
     tolerance: of a tabulated fraction; finer tables, of 6 to 24 MB a model, are tried until all meet it.
+    sides: (pads, 2), a and b of each.
     table_error: (pads,), the largest error of a tabulated fraction, as measured between the nodes, at 3 % of
         a side and farther from the edges. edge_error: the same up to the edges.
 
@@ -52,8 +53,8 @@ class LocatorBank:
         self._table = np.ascontiguousarray(np.concatenate([table.columns for table in tables]))
         self._starts = np.stack([table.starts for table in tables]).reshape(-1)
         self._guesses = np.stack([m.fractions(*(_GUESSES * (m.a, m.b)).T).T for m in distinct])
-        self._sides = np.array([(model.a, model.b) for model in distinct])[self._model]
-        self._shortest = self._sides.min(axis=1) ** 2
+        self.sides = np.array([(model.a, model.b) for model in distinct])[self._model]
+        self._shortest = self.sides.min(axis=1) ** 2
         self.table_error = np.array([table.error for table in tables])[self._model]
         self.edge_error = np.array([table.edge_error for table in tables])[self._model]
 
@@ -82,7 +83,7 @@ class LocatorBank:
             s = self._coordinates(index, np.stack([x, y], axis=-1))
             rows = self._read(self._first_row(index), s)
             side = self._grid.place(s)
-            point = self._sides.take(index, axis=0) * side
+            point = self.sides.take(index, axis=0) * side
             slopes = rows[:, 1:3] / self._grid.width
             return Tangent(
                 point, point * (1 - side), rows[:, 0, :4], slopes[:, :, :4], rows[:, 0, 4], slopes[:, :, 4]
@@ -108,7 +109,7 @@ class LocatorBank:
             if not weight.all():
                 data = np.where(weight == 0, 0.0, data)  # whatever a channel that is left out reads
             s = self._start(index, data, weight, start)
-            sides = self._sides.take(index, axis=0)
+            sides = self.sides.take(index, axis=0)
             of = _Readings(index, self._first_row(index), sides, data.T, weight.T)
             found = self._iterate(of, s)
             if not np.logical_and.reduce(found.converged):
@@ -124,7 +125,7 @@ class LocatorBank:
 
     def _coordinates(self, index: IndexArray, point: FloatArray) -> FloatArray:
         """Cells (n, 2) of points (n, 2), clamped to the tables."""
-        s = self._grid.coordinate(point / self._sides.take(index, axis=0))
+        s = self._grid.coordinate(point / self.sides.take(index, axis=0))
         return np.asarray(np.minimum(np.maximum(s, 0.0), self._top))
 
     def _start(

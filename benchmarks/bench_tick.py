@@ -1,0 +1,184 @@
+"""Cost of a tick: 15 to 960 pads, none, a tenth or all of them touched, contacts at rest and sliding.
+
+A tick is timed in two parts: the step, from the last sample to columns that are ready to be sent, and what is
+left for after the sending (`settle`). Each is timed hot, tick after tick, and cold, after a sleep as between
+two SYNCs, in which caches are lost. The floor, in the same run, is what nobody can do without: counts to
+currents, their sums, and one comparison. Writes docs/benchmarks/tick.{md,json}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import shipped
+from handtouch.canbus.slab import Slab
+from handtouch.config import Deployment, load
+from handtouch.daemon.cycle import Cycle
+from handtouch.daemon.model import PadModel
+from handtouch.daemon.tick import Tick
+
+OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
+PADS = (15, 60, 240, 960)
+PARTS = (0.1, 1.0)
+PERIOD_NS = 5_000_000
+SLIDING_M = 1e-4  # a tick: 20 mm/s at 200 Hz
+SPEEDS = {"resting": 0.0, "sliding": SLIDING_M}
+STRENGTH = 20.0  # of the threshold's current
+PAUSE_S = 0.003
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, Any]
+
+
+def hands(pads: int) -> PadModel:
+    """The shipped hand, as often as it takes."""
+    deployment: Deployment = load(shipped.path("utah_mit.toml"))
+    (hand,) = deployment.hands
+    many = [hand.model_copy(update={"name": f"hand{k}"}) for k in range(pads // len(hand.pads))]
+    return PadModel(deployment.model_copy(update={"hands": tuple(many)}))
+
+
+class Driver:
+    """Ticks a daemon's worth of pads with contacts on some."""
+
+    def __init__(self, model: PadModel, touched: int, sliding_m: float) -> None:
+        self.model, self.touched = model, touched
+        self.tick, self.slab = Tick(model, PERIOD_NS), Slab(model.size)
+        self.cycle = Cycle(PERIOD_NS, 0.6)
+        self._up = np.zeros(model.size, dtype=np.uint8)
+        self._random = np.random.default_rng(model.size + touched)
+        self._sides = model.locator.sides
+        self._place = self._random.uniform(0.3, 0.7, (model.size, 2))
+        angle = self._random.uniform(0, 2 * np.pi, model.size)
+        self._way = sliding_m * np.stack([np.cos(angle), np.sin(angle)], axis=1) / self._sides
+        self._t_ns = 10**9
+
+    def sample(self) -> None:
+        """The next period's samples, with a count of noise."""
+        self._t_ns += PERIOD_NS
+        self._place += self._way
+        self._way[(self._place < 0.2) | (self._place > 0.8)] *= -1
+        pads = np.arange(self.touched)
+        at = self._place[pads] * self._sides[pads]
+        counts = self._random.normal(size=(self.model.size, 4))
+        current = self.model.locator.fractions(pads, *at.T).T * (STRENGTH * self.model.on_a[pads, None])
+        counts[pads] += current / self.model.ampere_per_count[pads]
+        self.slab.begin_cycle(self._t_ns)
+        self.cycle.begin(self._t_ns)
+        for slot, data in enumerate(np.rint(counts).astype("<i2")):
+            self.slab.write(slot, data.tobytes(), self._t_ns + 1000)
+
+    def step(self) -> None:
+        self.tick.step(self.slab, self._up, self.cycle, self._t_ns + 2000)
+
+    def floor(self) -> None:
+        """Counts to currents, and which pads are touched."""
+        currents = self.slab.read() * self.model.ampere_per_count
+        np.count_nonzero(currents @ np.ones(4) > self.model.on_a)
+
+    def measure(self, ticks: int, pause_s: float) -> dict[str, float]:
+        """Median microseconds of each part."""
+        spent: dict[str, list[int]] = {"floor": [], "step": [], "settle": []}
+        parts: list[tuple[str, Callable[[], None]]] = [("step", self.step), ("settle", self.tick.settle)]
+        for number in range(ticks + 10):
+            self.sample()
+            for name, part in [("floor", self.floor)] * (number % 4 == 0) + parts:
+                if name != "settle" and pause_s:
+                    time.sleep(pause_s)
+                begin_ns = time.perf_counter_ns()
+                part()
+                if number >= 10:
+                    spent[name].append(time.perf_counter_ns() - begin_ns)
+        assert np.count_nonzero(self.tick.contacts.touching) == self.touched
+        return {name: float(np.median(times)) * 1e-3 for name, times in spent.items()}
+
+
+def measure(ticks: int) -> list[Row]:
+    rows = []
+    for pads in PADS:
+        model = hands(pads)
+        scenes = [(round(part * pads), kind) for part in PARTS for kind in SPEEDS]
+        for touched, kind in [(0, "none"), *scenes]:
+            for state, pause_s in (("hot", 0.0), ("cold", PAUSE_S)):
+                spent = Driver(model, touched, SPEEDS.get(kind, 0.0)).measure(ticks, pause_s)
+                rows.append({"pads": pads, "touched": touched, "contacts": kind, "state": state, **spent})
+    return rows
+
+
+def pick(rows: list[Row], state: str, pads: int, touched: int, contacts: str) -> Row:
+    wanted = (state, pads, touched, contacts)
+    return next(r for r in rows if (r["state"], r["pads"], r["touched"], r["contacts"]) == wanted)
+
+
+def line(rows: list[Row], row: Row) -> str:
+    """A row of the table, from a hot one and its cold sister."""
+    cold = pick(rows, "cold", row["pads"], row["touched"], row["contacts"])
+    each = f"{whole(row) / row['touched']:.1f}" if row["touched"] else ""
+    columns = [row["pads"], row["touched"], row["contacts"]]
+    columns += [f"{row[part]:.0f}" for part in ("floor", "step", "settle")] + [each]
+    columns += [f"{cold[part]:.0f}" for part in ("floor", "step", "settle")]
+    return "| " + " | ".join(map(str, columns)) + " |"
+
+
+def whole(row: Row) -> float:
+    """Step and settling."""
+    return float(row["step"] + row["settle"])
+
+
+def write(rows: list[Row], machine: str) -> str:
+    table = "\n".join(line(rows, row) for row in rows if row["state"] == "hot")
+    idle = "\n".join(
+        f"* {pads} pads: {whole(none) / whole(pick(rows, 'hot', pads, pads, 'resting')):.0%} of all at rest, "
+        f"{whole(none) / whole(pick(rows, 'hot', pads, pads, 'sliding')):.0%} of all sliding"
+        for pads in PADS
+        for none in [pick(rows, "hot", pads, 0, "none")]
+    )
+    few, many = PADS[0], PADS[-1]
+    growth = {kind: whole(pick(rows, "hot", many, many, kind)) for kind in SPEEDS}
+    growth = {kind: growth[kind] / whole(pick(rows, "hot", few, few, kind)) for kind in SPEEDS}
+    text = f"""# Cost of a tick
+
+Microseconds, medians; {machine}.
+Contacts at {STRENGTH:.0f} times the threshold, noise of one count a channel; sliding ones move
+{SLIDING_M * 1e3:.1f} mm a tick and turn back near edges. Hot: tick after tick. Cold: {PAUSE_S * 1e3:.0f} ms
+of sleep before each step. The step is what a message waits for; settling comes after it was sent. The floor is
+counts to currents and a comparison.
+
+| pads | touched | contacts | floor | step | settle | both, a contact | floor cold | step | settle |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
+{table}
+
+Cost of idle pads as part of that of touched ones:
+
+{idle}
+
+Growth from {few} to {many} pads, {many // few} times as many, all touched: {growth["resting"]:.1f}
+times at rest, {growth["sliding"]:.1f} times sliding.
+
+Made by `make bench ONLY=tick`.
+"""
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / "tick.md").write_text(text)
+    (OUT / "tick.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--ticks", type=int, default=200)
+    machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+    print(write(measure(parser.parse_args().ticks), machine))
+
+
+if __name__ == "__main__":
+    main()
