@@ -151,8 +151,8 @@ def write(rows: list[Row], machine: str) -> str:
 Microseconds, medians; {machine}.
 Contacts at {STRENGTH:.0f} times the threshold, noise of one count a channel; sliding ones move
 {SLIDING_M * 1e3:.1f} mm a tick and turn back near edges. Hot: tick after tick. Cold: {PAUSE_S * 1e3:.0f} ms
-of sleep before each step. The step is what a message waits for; settling comes after it was sent. The floor is
-counts to currents and a comparison.
+of sleep before each step. The step is what a message waits for; settling comes after it was sent. The floor
+is counts to currents and a comparison.
 
 | pads | touched | contacts | floor | step | settle | both, a contact | floor cold | step | settle |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
