@@ -11,7 +11,7 @@ import pytest
 from handtouch.cli import build_parser, main
 
 COMMANDS = [
-    *("demo", "run", "simulate", "replay", "watch", "status", "keys"),
+    *("demo", "run", "simulate", "replay", "watch", "status", "keys", "scan", "commission"),
     *("check", "doctor", "figures", "design"),
 ]
 

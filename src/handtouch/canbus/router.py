@@ -99,20 +99,24 @@ class Router:
         counters.errors += 1
         self.state.error_frame(can_id, data, t_ns, counters.frames, counters.sent)
 
+    def remote(self, can_id: int) -> None:
+        """Take a remote frame: somebody guards a node (ours come back where a bus echoes), or it is foreign."""
+        counters = self.counters
+        if can_id in _GUARDING:
+            counters.frames += 1
+            counters.bits += _FRAME_BITS[0]
+        else:
+            counters.foreign += 1
+
     def accept_message(self, message: can.Message, t_ns: int) -> Frame | None:
         """Take any frame as python-can gives it; what isn't ours to store or to drop is returned."""
         can_id = message.arbitration_id
         if message.is_error_frame:
             self.error(can_id, message.data, t_ns)
-        elif message.is_remote_frame and not message.is_extended_id and can_id in _GUARDING:
-            self.counters.frames += 1  # somebody guards a node; ours come back where a bus echoes
-            self.counters.bits += _FRAME_BITS[0]
+        elif message.is_remote_frame and not message.is_extended_id:
+            self.remote(can_id)
         elif (
-            message.is_extended_id
-            or message.is_remote_frame
-            or message.is_fd
-            or len(message.data) > 8
-            or not 0 <= can_id < IDENTIFIERS
+            message.is_extended_id or message.is_fd or len(message.data) > 8 or not 0 <= can_id < IDENTIFIERS
         ):
             self.counters.foreign += 1
         elif not self.accept(can_id, message.data, t_ns):

@@ -174,8 +174,10 @@ class SocketcanReceiver(_SocketReceiver):
             if can_id >= 0x800:
                 if can_id & _ERROR_FRAME:
                     router.error(can_id & _IDENTIFIER, data, t_ns)
+                elif can_id & ~_REMOTE < 0x800:
+                    router.remote(can_id & ~_REMOTE)
                 else:
-                    router.counters.foreign += 1  # extended or remote
+                    router.counters.foreign += 1  # extended
                 continue
             if size != 8:
                 data = data[:size]
