@@ -100,7 +100,7 @@ class Router:
         self.state.error_frame(can_id, data, t_ns, counters.frames, counters.sent)
 
     def remote(self, can_id: int) -> None:
-        """Take a remote frame: somebody guards a node (ours come back where a bus echoes), or it is foreign."""
+        """Take a remote frame: somebody guards a node (ours come back on some buses), or it is foreign."""
         counters = self.counters
         if can_id in _GUARDING:
             counters.frames += 1
