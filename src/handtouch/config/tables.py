@@ -15,6 +15,7 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
 Electrode = Literal["x0", "xa", "y0", "yb"]
+Output = Literal["location", "strength", "raw"]
 Four = Annotated[tuple[Positive, Positive, Positive, Positive], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -66,7 +67,7 @@ class Bus(Table):
 
 
 class Idle(Table):
-    """`[node.NAME.idle]`: a pad in the scene that nothing touches sends when a channel moves, not with SYNC."""
+    """`[node.NAME.idle]`: an untouched pad in the scene sends when a channel moves, not with SYNC."""
 
     delta_counts: Annotated[int, Field(ge=1)] = Field(
         description="change of a channel after which the node sends at once; some five times noise_counts"
@@ -230,12 +231,27 @@ class Hand(Table):
     pads: Annotated[tuple[Pad, ...], Field(strict=False, min_length=1)] = Field(alias="pad")
 
 
-class Scene(Table):
-    """`[scene]`: what the task at hand needs; pads outside it are switched off."""
+class Wants(Table):
+    """What somebody uses of the hand: which links, what of them, how finely and how often."""
 
     links: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         ("*",), description='links in use, as patterns: "thumb_*", "left/index_distal"'
     )
+    outputs: Annotated[tuple[Output, ...], Field(strict=False)] = Field(
+        ("location", "strength"),
+        description="what is used of a contact; raw: its pads are sampled with every SYNC, touched or not",
+    )
+    tolerance_mm: NonNegative = Field(
+        0.0, le=10, description="error of a location that does no harm; 0: as good as the currents tell it"
+    )
+    rate_hz: Positive | None = Field(
+        None, description="updates a second that are enough; left out: one a SYNC. Begin and end come at once"
+    )
+
+
+class Scene(Wants):
+    """`[scene]`: what the task at hand needs; pads outside it are switched off."""
+
     idle_after_s: Positive = Field(
         2.0, description="a pad untouched for so long becomes event-driven, where its node can"
     )

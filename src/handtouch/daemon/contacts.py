@@ -68,6 +68,18 @@ class Contacts:
         # a sample below the threshold tells no place: until it is known whether more follow, the last holds
         return Changes(began, ended, (touching & sampled & above).nonzero()[0])
 
+    def adopt(
+        self,
+        on: FloatArray,
+        off: FloatArray,
+        begin_samples: NDArray[np.int64],
+        end_samples: NDArray[np.int64],
+    ) -> None:
+        """Other thresholds and debounces from the next step on; what is touched now goes on by them."""
+        self._on, self._least = on, np.nextafter(off, -np.inf)
+        self._threshold = np.where(self.touching, self._least, on)
+        self._need = np.stack([begin_samples, end_samples])
+
     def forget(self, ended: IntArray) -> None:
         """Clear the ids of ended contacts, once their last message is made."""
         self.id[ended] = 0

@@ -35,6 +35,7 @@ _VAGUE = 0.1  # of `reach`: a place less certain than this has no tangent worth 
 _TOTAL = 0.05  # relative change of the total that a parabola of the force spans
 NEAR = 8.0  # ends of trust from which one Gauss-Newton step leads back into it
 _FORCE_BEND = 0.01  # of the force: where the parabola bends more, trust spans less
+_WIDEST = 0.5  # of `reach`: what a tolerance lets a map span at most
 _LEAST_INFORMATION = 1e-6  # of a place, per squared `reach`
 _VALID, _SATURATED = int(Status.VALID), int(Status.SATURATED)
 
@@ -55,6 +56,15 @@ class Follower:
         self._model = model
         self._maps = np.full((model.size, _TRUST + VALUES, _TERMS), np.nan)
         self._per_total = np.full((model.size, 4), np.nan)
+        self.weighed = np.ones(model.size, dtype=np.bool_)
+        """pads whose force is wanted"""
+        self.tolerance_m = np.zeros(model.size)
+        """error of a place that the bend of a map may add, where that is more than the noise allows"""
+
+    def take_over(self, other: Follower) -> None:
+        """Go on from what another one has of the same pads."""
+        self._maps, self._per_total = other._maps, other._per_total
+        self.weighed, self.tolerance_m = other.weighed, other.tolerance_m
 
     def forget(self, pads: IntArray) -> None:
         """The contacts on these pads are new."""
@@ -88,6 +98,10 @@ class Follower:
         vague = spread.max(axis=1)
         trust = np.maximum(np.sqrt(_BEND * spread.min(axis=1)), _NOISE * vague)
         firm = vague <= _VAGUE
+        tolerated = self.tolerance_m.take(pads)
+        if np.count_nonzero(tolerated):
+            widest = np.minimum(np.sqrt(tolerated / at.tangent.reach.max(axis=1)), _WIDEST)
+            trust = np.maximum(trust, widest)
         if solved:  # where an edge or a corner holds the most likely place, it has no tangent
             step = np.matmul(at.by_current, currents[:, :, None])[:, :, 0]
             firm &= np.abs(step).max(axis=1) <= trust
@@ -96,7 +110,15 @@ class Follower:
         maps = np.zeros((len(pads), _TRUST + VALUES, _TERMS))
         values = maps[:, _TRUST:]
         by_place, covariance_m2, scales = self._place(pads, at, width, values)
-        strength = self._weigh(pads, currents, at, width, scales, by_place, maps)
+        weighed = self.weighed.take(pads)
+        if np.count_nonzero(weighed):
+            strength = self._weigh(pads, currents, at, width, scales, by_place, maps)
+        else:
+            strength = np.full(len(pads), np.nan), weighed
+        if np.count_nonzero(weighed) < weighed.size:
+            maps[~weighed, _TRUST + FORCE] = np.nan
+            maps[~weighed, 2] = 0.0  # any total will do
+            strength[0][~weighed] = np.nan
         np.matmul(by_place, at.by_current, out=values[:, :, :4])
         values[:, RESIDUAL, :2] += 1 / at.total[:, None]
         maps[:, :2, :4] = at.by_current / np.where(firm, trust, np.nan)[:, None, None]

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
 from handtouch.canbus.channels import ELECTRODES, Channels, channels_of, in_order
@@ -24,7 +24,8 @@ class PadModel:
     """Columns of the n pads of a deployment, in its order; the same order as the slab's.
 
     `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` (n, 4) of the electrodes
-    x0, xa, y0, yb, their noise as `noise_counts` (n,) and `noise_a` (n, 4);
+    x0, xa, y0, yb, their noise as `noise_counts` (n,) and `noise_a` (n, 4), what they read untouched as
+    `offset_counts` and `offset_a` (n, 4), zero unless `tared`; `gains` (n, 4) are in `ampere_per_count`;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
     middle of the pad; `begin_samples`, `end_samples`. `locator` finds contacts, `placement` puts them on
     their links, `force` weighs them.
@@ -40,7 +41,8 @@ class PadModel:
         self.hands = [hand for hand, _ in entries]
         self.links = [pad.link for pad in pads]
         self.rows_of_hand = _rows(self.hands)
-        self.calibration = [_nominal(pad, deployment) for pad in pads]
+        self.nominal = [_nominal(pad, deployment) for pad in pads]
+        self.calibration = list(self.nominal)
         kinds = {name: channels_of(node.channels, node.eds) for name, node in deployment.nodes.items()}
         self.ampere_per_count = np.array(
             [_ampere_per_count(pad, deployment, kinds[pad.node]) for pad in pads]
@@ -48,6 +50,11 @@ class PadModel:
         counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
         self.noise_counts = np.array(counts)
         self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
+        self._nominal_a = self.ampere_per_count.copy()
+        self.gains = np.ones((self.size, 4))
+        self.offset_counts = np.zeros((self.size, 4))
+        self.offset_a = np.zeros((self.size, 4))
+        self.tared = False
         self.on_n = np.array([touch.on_n for touch in touches])
         self.off_n = np.array([touch.off_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
@@ -69,6 +76,27 @@ class PadModel:
             np.array([sheet.reference_kpa * 1e3 for sheet in sheets]),
         )
         self.on_a, self.off_a = (self._threshold(force, networks) for force in (self.on_n, self.off_n))
+
+    def calibrate(self, pad: int, gains: ArrayLike, offset_counts: ArrayLike, name: str) -> None:
+        """Correct the channels x0, xa, y0, yb of a pad: offsets off, then times gains; tell it by `name`."""
+        self.gains[pad] = gains
+        self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
+        self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
+        self.calibration[pad] = name
+        self.tare(pad, offset_counts)
+
+    def tare(self, pad: int, offset_counts: ArrayLike) -> None:
+        """What the channels (4,) of a pad read that nothing touches."""
+        self.offset_counts[pad] = offset_counts
+        self.offset_a[pad] = self.offset_counts[pad] * self.ampere_per_count[pad]
+        self.tared = bool(self.offset_counts.any())
+
+    def take_over(self, other: PadModel) -> None:
+        """Correct all pads as the model did that this one replaces."""
+        for pad in range(self.size):
+            corrected = bool((other.gains[pad] != 1).any()) or other.calibration[pad] != other.nominal[pad]
+            name = other.calibration[pad] if corrected else self.calibration[pad]
+            self.calibrate(pad, other.gains[pad], other.offset_counts[pad], name)
 
     def force(
         self,

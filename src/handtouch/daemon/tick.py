@@ -103,7 +103,7 @@ class Columns:
             force_std_n=unknown(),
             saturated=np.zeros(n, dtype=np.bool_),
             residual_std=unknown(),
-            located=np.full((n, 20), np.nan, dtype="<f4").view(LOCATED)[:, 0],
+            located=np.full((n, LOCATED.itemsize // 4), np.nan, dtype="<f4").view(LOCATED)[:, 0],
         )
 
 
@@ -139,8 +139,12 @@ class Tick:
         self.follower = Follower(model)
         self._read = _NOTHING_READ  # contacts of the last step: pads and currents
         self._behind = np.full((model.size, 4), np.nan)  # their currents, smoothed: as they were a while ago
-        self._located = self.columns.located.view("<f4").reshape(-1, 20)
+        self._located = self.columns.located.view("<f4").reshape(model.size, -1)
         self._none = np.zeros(model.size, dtype=np.bool_)
+        self._steps = 0
+        self._wanted = np.ones(model.size, dtype=np.bool_)  # pads to locate
+        self._every = np.ones(model.size, dtype=np.int64)  # steps from one update to the next
+        self._sparse = False  # whether anything is not wanted at every step
         self._least_counts = -_SOURCE_STD * model.noise_counts[:, None]
         self._currents = np.zeros((model.size, 4))
         self._taken_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the samples that were used
@@ -148,6 +152,43 @@ class Tick:
     def expected(self) -> NDArray[np.bool_]:
         """Pads whose sample a tick should wait for: those that are alive."""
         return np.asarray((self.columns.state <= _TOUCHED) & self.synchronous)
+
+    def want(
+        self,
+        located: BoolArray,
+        weighed: BoolArray,
+        tolerance_m: FloatArray,
+        every: NDArray[np.int64],
+    ) -> None:
+        """Locate, weigh, and update every so many steps only what somebody wants; all (n,), copied."""
+        changed = np.flatnonzero((located != self._wanted) | (weighed != self.follower.weighed))
+        self.forget(changed)
+        self.follower.weighed[:], self.follower.tolerance_m[:] = weighed, tolerance_m
+        self._wanted[:], self._every[:] = located, every
+        self._sparse = not (located.all() and (every == 1).all())
+
+    def solve_all(self) -> None:
+        """Locate and weigh what is touched, wanted or not, as it is now; the next `want` forgets it."""
+        everything = ~self._none
+        self.want(everything, everything, self.follower.tolerance_m, self._every)
+        touching = np.flatnonzero(self.contacts.touching)
+        if len(touching):
+            self._solve(touching)
+
+    def adopt(self, model: PadModel, changed: IntArray) -> None:
+        """Go on with another model of the same pads, of which some have changed; contacts go on."""
+        before, self.model = self.follower, model
+        self.follower = Follower(model)
+        self.follower.take_over(before)
+        self._least_counts = -_SOURCE_STD * model.noise_counts[:, None]
+        self.forget(changed)
+        self.contacts.adopt(model.on_a, model.off_a, model.begin_samples, model.end_samples)
+
+    def forget(self, pads: IntArray) -> None:
+        """What was found on these pads holds no more."""
+        columns = self.columns
+        self.follower.forget(pads)
+        columns.values[pads] = columns.force_std_n[pads] = self._located[pads] = np.nan
 
     def step(
         self,
@@ -169,6 +210,8 @@ class Tick:
         absurd, stale = self._absurd(counts, slab), self._stale(now_ns, sampled)
         trusted = operational & ~(absurd | stale)
         np.multiply(counts, model.ampere_per_count, out=self._currents)
+        if model.tared:
+            self._currents -= model.offset_a
         np.copyto(columns.current_a, self._currents @ _ALL_CHANNELS, where=sampled)
         began, ended, telling = contacts.step(columns.current_a, sampled, trusted, columns.sample_ns)
         self._resolve_states(node_state, operational, absurd, stale)
@@ -176,8 +219,14 @@ class Tick:
             columns.values[began] = np.nan  # no use to start from where the last contact was
             self.follower.forget(began)
             self._behind[began] = np.nan
-        if len(telling):
-            self._solve(telling)
+        self._steps += 1
+        solved = telling
+        if self._sparse:
+            due = self._steps % self._every[telling] == 0
+            telling = telling[due | np.isin(telling, began)]
+            solved = telling[self._wanted[telling]]
+        if len(solved):
+            self._solve(solved)
         if len(ended):
             self._located[ended] = np.nan
         updated = np.setdiff1d(telling, began) if len(began) else telling
@@ -210,10 +259,11 @@ class Tick:
     def _absurd(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
         """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take."""
         railed, least = slab.railed(counts), self._least_counts
-        if not np.count_nonzero(railed) and not np.count_nonzero(counts < least):
+        read = counts - self.model.offset_counts if self.model.tared else counts
+        if not np.count_nonzero(railed) and not np.count_nonzero(read < least):
             return self._none
-        source = _SOURCE_PART * np.abs(counts).sum(axis=1) - least[:, 0]
-        return np.asarray(railed.any(axis=1) | (counts.min(axis=1) < -source))
+        source = _SOURCE_PART * np.abs(read).sum(axis=1) - least[:, 0]
+        return np.asarray(railed.any(axis=1) | (read.min(axis=1) < -source))
 
     def _stale(self, now_ns: int, sampled: BoolArray) -> BoolArray:
         """Pads (n,) that have been quiet for too long."""
