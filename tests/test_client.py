@@ -15,32 +15,13 @@ from handtouch import wire
 from handtouch.client import Subscriber
 
 
-def _parts(seq: int, link: str = "thumb", repeat: bool = False) -> list[bytes]:
+def _parts(seq: int, link: str = "thumb", repeat: bool = False, run: int = 1) -> list[bytes]:
     return wire.encode(
         wire.Health(
-            1,
-            seq,
-            1,
-            "h",
-            link,
-            "can0",
-            1,
-            "clear",
-            "operational",
-            0,
-            "sync",
-            "",
-            None,
-            0.0,
-            0,
-            0,
-            None,
-            0,
-            0,
-            (),
-            repeat,
+            1, run, seq, 1, "h", link, "can0", 1, "clear", "operational",
+            0, "sync", "", None, 0.0, 0, 0, None, 0, 0, (), repeat,
         )
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
 
 Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Service`; `encode`, `decode`, `topic_of`,
-`WireError`, `PadState`. `docs/wire.md` describes every field for readers in other languages.
+`WireError`, `PadState`, `COLUMNS`. `docs/wire.md` describes every field for readers in other languages.
 SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil, never NaN.
 """
 
@@ -18,7 +18,7 @@ from typing import Any, Union
 import msgpack
 
 SCHEMA_VERSION = 1
-"""Goes up when a field changes its meaning or goes; new fields don't count: readers ignore unknown keys."""
+"""When it goes up: docs/wire.md, "Versions"."""
 
 Vector3 = tuple[float, float, float]
 Floats9 = tuple[float, float, float, float, float, float, float, float, float]
@@ -51,7 +51,10 @@ class Contact:
     """`contact/<hand>/<link>`: one touch at one instant of its life."""
 
     v: int
+    run: int
+    """which run of the daemon: another number, another life, and `seq` and `id` begin anew"""
     seq: int
+    """counts the instants of the topic, sent or not: a gap tells how many a subscriber missed"""
     t_ns: int
     event: str
     """begin, update or end"""
@@ -86,9 +89,9 @@ class Contact:
     off_n: float
     calibration: str
     reason: str
-    """why a contact ended: released, stale, lost, faulted, restarted or stopped; else empty"""
+    """why a contact ended: released, stale, lost, faulted, off, restarted or stopped; else empty"""
     repeat: bool
-    """sent again for a late joiner, under the seq of the original"""
+    """the present state for a late joiner, under the seq that the topic has reached"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +99,7 @@ class HandFrame:
     """`hand/<hand>`: the whole hand as columns, one per tick; each column little-endian, one row per link."""
 
     v: int
+    run: int
     seq: int
     t_ns: int
     tick: int
@@ -110,12 +114,22 @@ class HandFrame:
     current_a: bytes
     """float32, total current"""
     position_m: bytes
-    """float32 x 3 in the link frame, NaN without a valid location"""
+    """float32 x 3 in the link frame; this and the following are NaN without contact or when not known"""
     normal: bytes
     """float32 x 3"""
+    covariance_m2: bytes
+    """float32 x 9, of position_m, row by row"""
+    pad_m: bytes
+    """float32 x 2, arc lengths on the pad"""
     force_n: bytes
-    """float32, NaN without a valid strength"""
+    """float32"""
     force_std_n: bytes
+    """float32; NaN unless force_n is a value"""
+    saturated: bytes
+    """uint8, 1 where force_n is a lower bound"""
+    residual: bytes
+    """float32"""
+    residual_std: bytes
     """float32"""
     repeat: bool
 
@@ -125,6 +139,7 @@ class Health:
     """`health/<hand>/<link>`: a pad and its node; sent at every change and once a second."""
 
     v: int
+    run: int
     seq: int
     t_ns: int
     hand: str
@@ -161,6 +176,7 @@ class Raw:
     """`raw/<hand>`: the counts as they came, one per tick."""
 
     v: int
+    run: int
     seq: int
     t_ns: int
     tick: int
@@ -180,6 +196,7 @@ class Service:
     """`service`: the daemon's own heartbeat, twice a second; three missed ones mean that it is gone."""
 
     v: int
+    run: int
     seq: int
     t_ns: int
     wall_offset_ns: int
@@ -192,10 +209,18 @@ class Service:
     """hand -> list of its links"""
     ticks: int
     overruns: int
-    """periods that passed without a tick because the daemon was late"""
+    """late ticks: messages out more than a period after their SYNC, or periods without any"""
     rate_hz: float
     tick_us: dict[str, Any]
     """median, p99 and max of the last half second's ticks, from the last sample to the last message"""
+    loop: dict[str, Any]
+    """where its time goes: histograms, and which part made ticks late"""
+    contacts: int
+    """begun since it started"""
+    refused: dict[str, Any]
+    """cause -> connections and requests that were refused"""
+    process: dict[str, Any]
+    """memory, processor time, garbage collections, log messages not said"""
     buses: dict[str, Any]
     """bus -> load (part of the bit rate) and counters by cause"""
     drops: dict[str, Any]
@@ -205,6 +230,27 @@ class Service:
 
 
 Message = Contact | HandFrame | Health | Raw | Service
+
+_F4 = ("<f4", 1)
+COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
+    HandFrame: {
+        "state": ("<u1", 1),
+        "contact": ("<u4", 1),
+        "sample_ns": ("<i8", 1),
+        "current_a": _F4,
+        "position_m": ("<f4", 3),
+        "normal": ("<f4", 3),
+        "covariance_m2": ("<f4", 9),
+        "pad_m": ("<f4", 2),
+        "force_n": _F4,
+        "force_std_n": _F4,
+        "saturated": ("<u1", 1),
+        "residual": _F4,
+        "residual_std": _F4,
+    },
+    Raw: {"counts": ("<i8", 4), "sample_ns": ("<i8", 1), "fresh": ("<u1", 1)},
+}
+"""Payload -> column -> (type of its elements: order, kind, bytes; elements per row)."""
 
 
 @dataclass(frozen=True)
@@ -270,6 +316,9 @@ def decode(parts: typing.Sequence[bytes]) -> Message:
     if payload.get("v") != SCHEMA_VERSION:
         raise WireError(f"{name}: schema version {payload.get('v')!r}, this reader knows {SCHEMA_VERSION}")
     message = row.payload(**_checked(name, payload, row.payload))
+    for column, (kind, elements) in COLUMNS.get(row.payload, {}).items():
+        if len(getattr(message, column)) != len(message.links) * elements * int(kind[-1]):
+            raise WireError(f"{name}: {column} doesn't have one row of {elements} {kind} per link")
     if topic_of(message) != name:
         raise WireError(f"{name}: payload belongs to {topic_of(message)}")
     return typing.cast(Message, message)

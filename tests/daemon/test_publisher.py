@@ -24,14 +24,14 @@ def publisher() -> Iterator[Publisher]:
 def _health(publisher: Publisher, link: str, text: str = "") -> wire.Health:
     topic = f"health/h/{link}"
     return wire.Health(
-        wire.SCHEMA_VERSION, publisher.next_seq(topic), 1, "h", link, "can0", 1, "clear", "operational",
+        wire.SCHEMA_VERSION, publisher.run, publisher.next_seq(topic), 1, "h", link, "can0", 1, "clear", "operational",
         0, "sync", text, None, 0.0, 0, 0, None, 0, 0, (), False,
     )  # fmt: skip
 
 
 def _until(publisher: Publisher, topic: str, wanted: bool = True) -> None:
     for _ in range(2000):
-        publisher.take_subscriptions()
+        publisher.take_subscriptions(0)
         if publisher.wants(topic) == wanted:
             return
         for socket in publisher._sockets.values():
@@ -68,7 +68,7 @@ def test_a_late_joiner_gets_the_lasting_state_as_a_repeat_and_others_do_not_see_
         assert (first.reason, first.repeat) == ("first", False)
         with connect("health/h/*", endpoint=publisher.endpoints["live"]) as late:
             for _ in range(1000):
-                publisher.take_subscriptions()
+                publisher.take_subscriptions(0)
                 repeat = late.recv(0.01)
                 if repeat is not None:
                     break
@@ -86,7 +86,7 @@ def test_a_subscriber_that_stalls_loses_messages_and_nobody_else_does(publisher:
     with connect("health/*/*", endpoint=endpoint, queue=1), connect("health/*/*", endpoint=endpoint) as awake:
         _until(publisher, "health/h/thumb")
         for _ in range(200):  # both have joined when the second subscription has been taken, too
-            publisher.take_subscriptions()
+            publisher.take_subscriptions(0)
             publisher._sockets["live"].poll(1)
         got = []
         for _ in range(count):

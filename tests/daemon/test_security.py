@@ -75,7 +75,7 @@ class Served:
             time_ns += 10_000_000
             self.now_ns = time_ns + self.skipped_ns
             self.gate.poll(self.now_ns)
-            self.publisher.take_subscriptions()
+            self.publisher.take_subscriptions(self.now_ns)
             self.control.poll()
             self.publisher.send(_health(self.publisher.next_seq("health/h/thumb")))
 

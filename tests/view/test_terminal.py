@@ -13,22 +13,25 @@ from handtouch.view.terminal import HandView
 from handtouch.view.watch import LineDisplay
 
 CONTACT = wire.Contact(
-    v=1, seq=1, t_ns=12_000_000_000, event="begin", id=7, hand="right", link="thumb_tip", frame="thumb_tip",
+    v=1, run=1, seq=1, repeat=False, t_ns=12_000_000_000, event="begin", id=7, hand="right",
+    link="thumb_tip", frame="thumb_tip",
     begin_ns=11_500_000_000, duration_s=0.5, age_s=0.001, position_m=(0.0123, -0.004, 0.0056),
     normal=(0.0, 0.0, 1.0), covariance_m2=(4e-10, 0, 0, 0, 3e-10, 0, 0, 0, 2e-10), pad_m=(0.01, 0.02),
     location="valid", force_n=1.234, force_std_n=0.056, peak_force_n=2.5, strength="valid", current_a=1e-3,
-    residual=0.0, residual_std=1e-4, on_n=0.06, off_n=0.03, calibration="nominal", reason="", repeat=False,
+    residual=0.0, residual_std=1e-4, on_n=0.06, off_n=0.03, calibration="nominal", reason="",
 )  # fmt: skip
 HEALTH = wire.Health(
-    v=1, seq=1, t_ns=12_000_000_000, hand="right", link="thumb_tip", bus="can0", node_id=19, state="clear",
-    node="operational", since_ns=0, pace="sync", reason="", serial=1003, rate_hz=200.0, samples=10, missed=0, age_s=0.001,
-    reboots=0, heartbeats_missed=0, emergencies=(), repeat=False,
+    v=1, run=1, seq=1, repeat=False, t_ns=12_000_000_000, hand="right", link="thumb_tip", bus="can0",
+    node_id=19, state="clear", node="operational", since_ns=0, pace="sync", reason="", serial=1003,
+    rate_hz=200.0, samples=10, missed=0, age_s=0.001,
+    reboots=0, heartbeats_missed=0, emergencies=(),
 )  # fmt: skip
 SERVICE = wire.Service(
-    v=1, seq=1, t_ns=12_000_000_000, wall_offset_ns=0, version="0", pid=1, uptime_s=3.0, period_s=0.005,
+    v=1, run=1, seq=1, repeat=False, t_ns=12_000_000_000, wall_offset_ns=0, version="0", pid=1,
+    uptime_s=3.0, period_s=0.005,
     hands={"right": ["thumb_tip"]}, ticks=600, overruns=0, rate_hz=200.0,
     tick_us={"p50": 250.0, "p99": 400.0, "max": 500.0}, buses={"can0": {"load": 0.43}}, drops={},
-    subscriptions=(), repeat=False,
+    subscriptions=(),
 )  # fmt: skip
 
 
@@ -92,8 +95,11 @@ def test_a_line_says_what_is_known_and_what_is_not(contact: wire.Contact, text: 
 
 
 def test_every_kind_of_message_has_a_line() -> None:
-    frame = wire.HandFrame(1, 1, 1, 5, "right", ("a", "b"), b"\1\0", b"", b"", b"", b"", b"", b"", b"", False)
-    raw = wire.Raw(1, 1, 1, 5, "right", ("a", "b"), b"", b"", b"\1\1", False)
+    frame = wire.HandFrame(
+        **{**dict.fromkeys(wire.COLUMNS[wire.HandFrame], b""), "state": b"\1\0"},
+        v=1, run=1, seq=1, t_ns=1, tick=5, hand="right", links=("a", "b"), repeat=False,
+    )  # fmt: skip
+    raw = wire.Raw(1, 1, 1, 1, 5, "right", ("a", "b"), b"", b"", b"\1\1", False)
     assert "1 of 2 touched" in line(frame)
     assert "2 fresh" in line(raw)
     assert "600" not in line(HEALTH)

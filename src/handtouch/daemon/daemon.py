@@ -27,9 +27,10 @@ from handtouch.canbus.port import BusError, Port
 from handtouch.canbus.router import SYNC_ID
 from handtouch.canbus.sync import Sync
 from handtouch.config import ConfigError, Deployment, load, with_bus
+from handtouch.daemon import histogram, logs
 from handtouch.daemon.control import Control
 from handtouch.daemon.model import PadModel
-from handtouch.daemon.notify import Notifier
+from handtouch.daemon.notify import Notifier, Pulse
 from handtouch.daemon.pacer import Pacer
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
@@ -60,8 +61,13 @@ class Daemon:
             self.control = Control(context, settings.control, self.gate)
             opened.callback(self.control.close)
             self.pipeline = Pipeline(
-                model or PadModel(deployment), period_ns, settings.window, self.publisher
+                model or PadModel(deployment),
+                period_ns,
+                settings.window,
+                self.publisher,
+                self.publisher.run,
             )
+            self.publisher.present.update(self.pipeline.messages.present())
             self.ports: dict[str, Port] = {}
             for bus in deployment.buses:
                 self.ports[bus.name] = port = Port.open(bus, self.pipeline.slab)
@@ -69,7 +75,16 @@ class Daemon:
             self._opened = opened.pop_all()
         self.master = Master(self.ports, node_specs(deployment), period_ns)
         self.sync = Sync(list(self.ports.values()), period_ns)
-        self.report = Report(deployment, self.pipeline, self.master, self.ports, self.sync, self.publisher)
+        self.report = Report(
+            deployment,
+            self.pipeline,
+            self.master,
+            self.ports,
+            self.sync,
+            self.publisher,
+            self.gate,
+            self.control,
+        )
         self.pacer = Pacer(deployment, self.pipeline, self.master, self.sync)
         self.control.commands["status"] = self.report.status
 
@@ -83,8 +98,11 @@ class Daemon:
         """Give buses and endpoints back."""
         self._opened.close()
 
-    def run(self, stop: threading.Event, alive: Callable[[], None] = lambda: None) -> None:
-        """Serve until `stop` is set; `alive` is called after every tick. Contacts end, nodes are stopped."""
+    def run(self, stop: threading.Event, alive: Callable[[int], None] = lambda _: None) -> None:
+        """Serve until `stop` is set; `alive` is called after every tick, with the time in ns.
+
+        At the end contacts end and nodes are stopped.
+        """
         self.master.start(time.monotonic_ns())
         gc.collect()
         gc.freeze()
@@ -97,27 +115,38 @@ class Daemon:
             self.master.stop(now_ns)
             gc.unfreeze()
 
-    def _loop(self, stop: threading.Event, alive: Callable[[], None]) -> None:
+    def _loop(self, stop: threading.Event, alive: Callable[[int], None]) -> None:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
-        sync, pacer = self.sync, self.pacer
+        sync, pacer, stages = self.sync, self.pacer, self.report.stages
+        pipeline.stepped = lambda: stages.lap(histogram.TICK, time.monotonic_ns())
         sync.start(time.monotonic_ns())
         while not stop.is_set():
             now_ns = time.monotonic_ns()
             if (sync_ns := sync.poll(now_ns)) is not None:
-                pipeline.begin(sync_ns, now_ns)
+                self._begin(sync_ns, now_ns)
             wake_ns = sync.wake_ns
             if not cycle.ticked:
                 wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns)
             wait_s = max(0, wake_ns - now_ns) * 1e-9
             select.select(ports, (), (), wait_s)
+            stages.slept(wake_ns, time.monotonic_ns())
             self._receive(ports)
             now_ns = time.monotonic_ns()
+            stages.lap(histogram.RECEIVE, now_ns)
             ticked = pipeline.advance(now_ns)
             if ticked is None and pacer.slow and pipeline.slab.fresh_count:
                 ticked = pipeline.tick_now(now_ns)
             if ticked is not None:
-                self.report.ticked(now_ns, time.monotonic_ns())
+                sent_ns = time.monotonic_ns()
+                stages.lap(histogram.SEND, sent_ns)
+                self.report.ticked(now_ns, sent_ns)
                 self._after_tick(alive)
+
+    def _begin(self, sync_ns: int, now_ns: int) -> None:
+        """A SYNC was sent or seen: a new period."""
+        self.report.stages.begin(self.sync.overruns, not self.pipeline.cycle.ticked)
+        self.pipeline.begin(sync_ns, now_ns)
+        self.report.stages.lap(histogram.SYNC, time.monotonic_ns())
 
     def _receive(self, ports: list[Port]) -> None:
         for port in ports:
@@ -125,23 +154,28 @@ class Daemon:
                 if can_id == SYNC_ID:
                     now_ns = time.monotonic_ns()
                     if (sync_ns := self.sync.seen(port.name, t_ns, now_ns)) is not None:
-                        self.pipeline.begin(sync_ns, now_ns)
+                        self._begin(sync_ns, now_ns)
                 else:
                     self.master.handle(port.name, can_id, data, t_ns)
 
-    def _after_tick(self, alive: Callable[[], None]) -> None:
+    def _after_tick(self, alive: Callable[[int], None]) -> None:
         """What may wait until the contacts are out."""
+        lap = self.report.stages.lap
         self.pipeline.settle()
         now_ns = time.monotonic_ns()
+        lap(histogram.SETTLE, now_ns)
         self.master.poll(now_ns)
         self.pacer.step(now_ns)
         for port in self.ports.values():
             port.look(now_ns)
-        self.gate.poll(now_ns)
-        self.publisher.take_subscriptions()
+        lap(histogram.NODES, time.monotonic_ns())
         self.report.poll(now_ns)
+        lap(histogram.REPORT, time.monotonic_ns())
+        self.gate.poll(now_ns)
+        self.publisher.take_subscriptions(now_ns)
         self.control.poll()
-        alive()
+        alive(now_ns)
+        lap(histogram.REQUESTS, time.monotonic_ns())
 
 
 def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.canbus.slab import Slab
@@ -30,28 +33,34 @@ class Outlet(Protocol):
     def wants(self, topic: str) -> bool:
         """Whether a message of this topic is of use to anybody."""
 
-    def next_seq(self, topic: str) -> int:
-        """Number of the topic's next message."""
-
     def send(self, message: wire.Message) -> None:
         """Take a message."""
 
 
 class Messages:
-    """Writes the messages of every tick for the pads of a model."""
+    """Writes the messages of every tick for the pads of a model; `run` is the daemon's.
 
-    def __init__(self, model: PadModel, tick: Tick) -> None:
+    `seq` counts what there was to tell, whether anybody wanted it or not: who was away sees a gap.
+    """
+
+    def __init__(self, model: PadModel, tick: Tick, run: int = 0) -> None:
         self._model = model
         self._tick = tick
+        self._run = run
+        self._seq: NDArray[np.int64] = np.zeros(model.size, dtype=np.int64)
+        self._frames = 0
+        self._frame_of = 0, 0  # number and time of the tick that the last frames were of
         self._reason = ""  # why all contacts end, once the daemon stops
         self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
 
     def send_contacts(self, ticked: Ticked, now_ns: int, outlet: Outlet) -> None:
         """Send begin, update and end of the contacts that a tick touched, and forget those that ended."""
         for event, rows in (("begin", ticked.began), ("update", ticked.updated), ("end", ticked.ended)):
+            if len(rows):
+                self._seq[rows] += 1
             for pad in rows.tolist():
                 if outlet.wants(self._topics[pad]):
-                    outlet.send(self._contact(pad, event, ticked.t_ns, now_ns, outlet))
+                    outlet.send(self._contact(pad, event, ticked.t_ns, now_ns))
         self._tick.contacts.forget(ticked.ended)
 
     def end_all(self, t_ns: int, outlet: Outlet) -> None:
@@ -66,47 +75,73 @@ class Messages:
 
     def send_frames(self, slab: Slab, tick_number: int, t_ns: int, outlet: Outlet) -> None:
         """Send the columns of every hand, and their raw counts, where somebody wants them."""
-        columns, ids = self._tick.columns, self._tick.contacts.id
-        for hand, rows in self._model.rows_of_hand.items():
-            links = tuple(self._model.links[rows])
-            if outlet.wants(topic := f"hand/{hand}"):
-                located = columns.located[rows]
-                outlet.send(
-                    wire.HandFrame(
-                        v=wire.SCHEMA_VERSION,
-                        seq=outlet.next_seq(topic),
-                        t_ns=t_ns,
-                        tick=tick_number,
-                        hand=hand,
-                        links=links,
-                        state=columns.state[rows].tobytes(),
-                        contact=ids[rows].astype("<u4").tobytes(),
-                        sample_ns=columns.sample_ns[rows].astype("<i8").tobytes(),
-                        current_a=columns.current_a[rows].astype("<f4").tobytes(),
-                        position_m=located["position_m"].tobytes(),
-                        normal=located["normal"].tobytes(),
-                        force_n=located["force_n"].tobytes(),
-                        force_std_n=located["force_std_n"].tobytes(),
-                        repeat=False,
-                    )
-                )
-            if outlet.wants(topic := f"raw/{hand}"):
-                outlet.send(
-                    wire.Raw(
-                        v=wire.SCHEMA_VERSION,
-                        seq=outlet.next_seq(topic),
-                        t_ns=t_ns,
-                        tick=tick_number,
-                        hand=hand,
-                        links=links,
-                        counts=self._tick.counts[rows].astype("<i8").tobytes(),
-                        sample_ns=columns.sample_ns[rows].astype("<i8").tobytes(),
-                        fresh=slab.fresh[rows].tobytes(),
-                        repeat=False,
-                    )
-                )
+        self._frames += 1
+        self._frame_of = tick_number, t_ns
+        for hand in self._model.rows_of_hand:
+            if outlet.wants(f"hand/{hand}"):
+                outlet.send(self._hand(hand))
+            if outlet.wants(f"raw/{hand}"):
+                outlet.send(self._raw(hand, slab))
 
-    def _contact(self, pad: int, event: str, t_ns: int, now_ns: int, outlet: Outlet) -> wire.Contact:
+    def present(self) -> dict[str, Callable[[int], wire.Message | None]]:
+        """Topic -> what there is to repeat of it, at a time [ns]: contacts under way, and hands."""
+        return {
+            **{topic: partial(self._under_way, pad) for pad, topic in enumerate(self._topics)},
+            **{f"hand/{hand}": partial(self._last_hand, hand) for hand in self._model.rows_of_hand},
+        }
+
+    def _under_way(self, pad: int, now_ns: int) -> wire.Contact | None:
+        if not self._tick.contacts.touching[pad]:
+            return None
+        return self._contact(pad, "update", 0, now_ns, repeat=True)
+
+    def _last_hand(self, hand: str, _: int) -> wire.HandFrame | None:
+        return self._hand(hand, repeat=True) if self._frames else None
+
+    def _hand(self, hand: str, repeat: bool = False) -> wire.HandFrame:
+        columns, rows = self._tick.columns, self._model.rows_of_hand[hand]
+        located = columns.located[rows]
+        return wire.HandFrame(
+            v=wire.SCHEMA_VERSION,
+            run=self._run,
+            seq=self._frames,
+            t_ns=self._frame_of[1],
+            tick=self._frame_of[0],
+            hand=hand,
+            links=tuple(self._model.links[rows]),
+            state=columns.state[rows].tobytes(),
+            contact=self._tick.contacts.id[rows].astype("<u4").tobytes(),
+            sample_ns=columns.sample_ns[rows].astype("<i8").tobytes(),
+            current_a=columns.current_a[rows].astype("<f4").tobytes(),
+            position_m=located["position_m"].tobytes(),
+            normal=located["normal"].tobytes(),
+            covariance_m2=located["covariance_m2"].tobytes(),
+            pad_m=located["pad_m"].tobytes(),
+            force_n=located["force_n"].tobytes(),
+            force_std_n=located["force_std_n"].tobytes(),
+            saturated=columns.saturated[rows].tobytes(),
+            residual=located["residual"].tobytes(),
+            residual_std=located["residual_std"].tobytes(),
+            repeat=repeat,
+        )
+
+    def _raw(self, hand: str, slab: Slab) -> wire.Raw:
+        rows = self._model.rows_of_hand[hand]
+        return wire.Raw(
+            v=wire.SCHEMA_VERSION,
+            run=self._run,
+            seq=self._frames,
+            t_ns=self._frame_of[1],
+            tick=self._frame_of[0],
+            hand=hand,
+            links=tuple(self._model.links[rows]),
+            counts=self._tick.counts[rows].astype("<i8").tobytes(),
+            sample_ns=self._tick.columns.sample_ns[rows].astype("<i8").tobytes(),
+            fresh=slab.fresh[rows].tobytes(),
+            repeat=False,
+        )
+
+    def _contact(self, pad: int, event: str, t_ns: int, now_ns: int, repeat: bool = False) -> wire.Contact:
         model, columns, contacts = self._model, self._tick.columns, self._tick.contacts
         sample_ns = int(columns.sample_ns[pad])
         begin_ns = int(contacts.begin_ns[pad])
@@ -117,7 +152,8 @@ class Messages:
         state = PadState(int(columns.state[pad]))
         return wire.Contact(
             v=wire.SCHEMA_VERSION,
-            seq=outlet.next_seq(self._topics[pad]),
+            run=self._run,
+            seq=int(self._seq[pad]),
             t_ns=sample_ns if event != "end" else t_ns,
             event=event,
             id=int(contacts.id[pad]),
@@ -143,7 +179,7 @@ class Messages:
             off_n=float(model.off_n[pad]),
             calibration=model.calibration[pad],
             reason=self._reason or REASONS.get(state, "released") if event == "end" else "",
-            repeat=False,
+            repeat=repeat,
         )
 
 

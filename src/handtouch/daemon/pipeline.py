@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,16 +22,19 @@ class Pipeline:
 
     Call `begin` at each SYNC, write samples into `slab`, and `advance` as time passes. `node_state` (n,)
     uint8 is for the owner to keep: PadState.CLEAR where a node is up, else what its pad is instead.
+    `run` is the daemon's, for its messages.
     """
 
-    def __init__(self, model: PadModel, period_ns: int, window: float, outlet: Outlet) -> None:
+    def __init__(self, model: PadModel, period_ns: int, window: float, outlet: Outlet, run: int = 0) -> None:
         self.model = model
         self.slab = Slab(model.size)
         self.cycle = Cycle(period_ns, window)
         self.tick = Tick(model, period_ns)
-        self.messages = Messages(model, self.tick)
+        self.messages = Messages(model, self.tick, run)
         self.node_state: NDArray[np.uint8] = np.full(model.size, PadState.STARTING, dtype=np.uint8)
         self.ticks = 0
+        self.stepped: Callable[[], None] = lambda: None
+        """called between the step of a tick and its messages, for who watches the time"""
         self._outlet = outlet
         self._expected = self.tick.expected()
         self._expected_count = 0
@@ -71,6 +76,7 @@ class Pipeline:
         self.cycle.ticked = True
         self.ticks += 1
         ticked = self.tick.step(self.slab, self.node_state, self.cycle, now_ns, until_ns)
+        self.stepped()
         self.messages.send_contacts(ticked, now_ns, self._outlet)
         self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
         return ticked

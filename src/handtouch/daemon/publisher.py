@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import socket as stdlib_socket
+import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,13 +19,17 @@ LIVE_QUEUE = 64
 COMPLETE_QUEUE = 20_000
 """Messages kept on the complete stream: seconds."""
 _SUBSCRIPTIONS_PER_POLL = 100
+_REPEATS_PER_POLL = 16
+"""Late joiners, however many, cost a tick no more than that."""
 
 
 class Publisher:
     """Two XPUB sockets with the same topics; never blocks, counts what a full queue drops.
 
     `endpoints` (stream -> endpoint as bound, with its real port), `drops` (stream -> messages that a full
-    queue of some subscriber couldn't take), `subscriptions` (prefixes that somebody asked for).
+    queue of some subscriber couldn't take), `subscriptions` (prefixes that somebody asked for), `run` (tells
+    this publisher's life from others: when it began, in seconds since 1970), `present` (topic -> a function
+    that makes, at a time in ns, what to repeat of it for those who subscribe late, if anything).
 
     Whoever connects passes the `gate`. Raises OSError naming the endpoint when it can't be bound.
     """
@@ -32,13 +38,15 @@ class Publisher:
         self, context: zmq.Context[zmq.Socket[bytes]], live: str, complete: str, gate: Gate | None = None
     ) -> None:
         gate = gate or Gate(context)
-        self.drops: Counter[str] = Counter()
+        self.run = int(time.time())
+        self.present: dict[str, Callable[[int], wire.Message | None]] = {}
+        self.drops: Counter[str] = Counter(live=0, complete=0)
         self.subscriptions: frozenset[bytes] = frozenset()
         self.endpoints: dict[str, str] = {}
         self._sockets: dict[str, zmq.Socket[bytes]] = {}
         self._asked: dict[str, set[bytes]] = {}
         self._seq: Counter[str] = Counter()
-        self._last: dict[str, wire.Message] = {}
+        self._repeats: dict[tuple[str, str], None] = {}  # (stream, topic) that somebody waits for, in order
         self._wanted: dict[str, bool] = {}
         for stream, endpoint, queue in (("live", live, LIVE_QUEUE), ("complete", complete, COMPLETE_QUEUE)):
             socket: zmq.Socket[bytes] = context.socket(zmq.XPUB)
@@ -47,6 +55,7 @@ class Publisher:
             socket.setsockopt(zmq.SNDHWM, queue)
             socket.setsockopt(zmq.LINGER, 200)  # so that the ends of contacts still leave at shutdown
             socket.setsockopt(zmq.XPUB_NODROP, 1)
+            socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # who asks for what others have wants the present, too
             socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
             socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
             try:
@@ -55,8 +64,8 @@ class Publisher:
                 self.close()
                 raise
 
-    def take_subscriptions(self) -> None:
-        """Read what subscribers asked for or gave up; repeat lasting messages for those who come late."""
+    def take_subscriptions(self, now_ns: int) -> None:
+        """Read what subscribers asked for or gave up; repeat the present for those who come late."""
         for stream, socket in self._sockets.items():
             for _ in range(_SUBSCRIPTIONS_PER_POLL):  # who asks without end must not stop the tick
                 try:
@@ -65,13 +74,21 @@ class Publisher:
                     break
                 if request[:1] == b"\x01":
                     self._asked[stream].add(request[1:])
-                    self._repeat(socket, request[1:])
+                    self._repeats.update(
+                        {
+                            (stream, topic): None
+                            for topic in self.present
+                            if topic.encode().startswith(request[1:])
+                        }
+                    )
                 elif request[:1] == b"\x00":
                     self._asked[stream].discard(request[1:])
                 else:
                     continue  # not a subscription: nobody has anything else to say here
                 self.subscriptions = frozenset().union(*self._asked.values())
                 self._wanted.clear()
+        if self._repeats:
+            self._repeat(now_ns)
 
     def wants(self, topic: str) -> bool:
         """Whether anybody subscribed to a prefix of the topic."""
@@ -90,7 +107,7 @@ class Publisher:
         """Send to those who subscribed; a `lasting` message is repeated for those who subscribe later."""
         topic = wire.topic_of(message)
         if lasting:
-            self._last[topic] = message
+            self.present[topic] = lambda _: replace(message, repeat=True)
         if not self.wants(topic):
             return
         parts = wire.encode(message)
@@ -103,11 +120,14 @@ class Publisher:
         for socket in self._sockets.values():
             socket.close()
 
-    def _repeat(self, socket: zmq.Socket[bytes], prefix: bytes) -> None:
-        for topic, message in self._last.items():
-            if topic.encode().startswith(prefix):
-                stream = next(name for name, known in self._sockets.items() if known is socket)
-                self._try_send(stream, socket, wire.encode(replace(message, repeat=True)))
+    def _repeat(self, now_ns: int) -> None:
+        sent = 0
+        while self._repeats and sent < _REPEATS_PER_POLL:
+            stream, topic = next(iter(self._repeats))
+            del self._repeats[stream, topic]
+            if (message := self.present[topic](now_ns)) is not None:
+                self._try_send(stream, self._sockets[stream], wire.encode(message))
+                sent += 1
 
     def _try_send(self, stream: str, socket: zmq.Socket[bytes], parts: list[bytes]) -> None:
         try:

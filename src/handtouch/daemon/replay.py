@@ -63,15 +63,10 @@ class _Outlet:
     def __init__(self, take: Callable[[wire.Contact], None], publisher: Publisher | None) -> None:
         self._take = take
         self._publisher = publisher
-        self._seq: dict[str, int] = {}
         self.contacts = 0
 
     def wants(self, topic: str) -> bool:
         return topic.startswith("contact/") or (self._publisher is not None and self._publisher.wants(topic))
-
-    def next_seq(self, topic: str) -> int:
-        self._seq[topic] = self._seq.get(topic, 0) + 1
-        return self._seq[topic]
 
     def send(self, message: wire.Message) -> None:
         if isinstance(message, wire.Contact):
@@ -153,6 +148,8 @@ def replay(
     period_ns, clock = _rhythm(log, round(deployment.daemon.sync_period_ms * 1e6))
     outlet = _Outlet(take, publisher)
     feeder = _Feeder(deployment, outlet, period_ns, clock)
+    if publisher:
+        publisher.present.update(feeder.pipeline.messages.present())
     first_ns = t_ns = 0
     for message in _messages(log):
         t_ns = round(message.timestamp * 1e9)
@@ -277,7 +274,7 @@ def run(
 def _serving(pace: Callable[[int], None], publisher: Publisher, gate: Gate) -> Callable[[int], None]:
     def serve(t_ns: int) -> None:
         gate.poll(time.monotonic_ns())
-        publisher.take_subscriptions()
+        publisher.take_subscriptions(t_ns)
         pace(t_ns)
 
     return serve

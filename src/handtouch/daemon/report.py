@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -18,14 +19,20 @@ from handtouch.canbus.master import Master, NodeStatus
 from handtouch.canbus.port import Port
 from handtouch.canbus.sync import Sync
 from handtouch.config import Deployment
+from handtouch.daemon.control import Control
+from handtouch.daemon.histogram import StageClock
+from handtouch.daemon.logs import Logs
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
+from handtouch.daemon.security import Gate
 from handtouch.supervise.health import explain
 from handtouch.wire import PadState
 
 _SECOND_NS = 1_000_000_000
 _SERVICE_NS = _SECOND_NS // 2
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _log = logging.getLogger("handtouch.health")
+_loop_log = logging.getLogger("handtouch.loop")
 
 _PAD_OF_NODE = {
     NodeState.OPERATIONAL: PadState.CLEAR,
@@ -49,6 +56,8 @@ class Report:
         ports: Mapping[str, Port],
         sync: Sync,
         publisher: Publisher,
+        gate: Gate,
+        control: Control,
     ) -> None:
         n = pipeline.model.size
         self._deployment = deployment
@@ -57,12 +66,16 @@ class Report:
         self._ports = ports
         self._sync = sync
         self._publisher = publisher
+        self._gate, self._control = gate, control
+        self.listener: Callable[[wire.Message], None] = lambda _: None
+        """is given every health and service message, subscribed or not"""
         self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
         self._names = [(hand, pad.link) for hand, pad in self._pads]
         self._events_before: set[int] = set()
         self._told = np.full(n, PadState.STARTING, dtype=np.uint8)
         self._was_up = np.zeros(n, dtype=np.bool_)
         self._started_ns = time.monotonic_ns()
+        self.stages = StageClock(self._started_ns)
         self._second = _Window(self._started_ns, np.zeros(n, dtype=np.int64))
         self._half_second = _Window(self._started_ns, self._totals())
         self._rate_hz = np.zeros(n)
@@ -73,14 +86,19 @@ class Report:
     def ticked(self, from_ns: int, to_ns: int) -> None:
         """A tick took from `from_ns`, its last sample read, to `to_ns`, its messages out."""
         self._durations_ns.append(to_ns - from_ns)
+        self.stages.ticked(self._pipeline.cycle.t_ns, self._sync.period_ns, from_ns, to_ns)
 
     def poll(self, now_ns: int) -> None:
         """Take over the master's view of the nodes; tell what changed, and everything from time to time."""
         events = self._master.take_events()
         if events:
             for event in events:
-                _log.info("%s: %s", "/".join(self._names[event.slot]), event)
+                hand, link = self._names[event.slot]
+                _log.info("%s/%s: %s", hand, link, event, extra={"fields": {"hand": hand, "link": link}})
             self._translate()
+        if self.stages.told is not None:
+            (part, told), self.stages.told = self.stages.told, None
+            _loop_log.warning("ticks %s", told, extra={"fields": {"part": part}})
         state = self._pipeline.tick.columns.state
         visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
         changed = self._events_before | set(np.flatnonzero(visible != self._told).tolist())
@@ -92,13 +110,17 @@ class Report:
         if changed:
             statuses = self._master.status()
             for pad in sorted(changed):
-                self._publisher.send(self._health(pad, now_ns, statuses[pad]), lasting=True)
+                self._tell(self._health(pad, now_ns, statuses[pad]))
         if now_ns - self._half_second.since_ns >= _SERVICE_NS:
             rates = self._half_second.per_second(now_ns, self._totals())
             self._speeds = dict(zip(["ticks", *_of_buses(self._ports)], rates.tolist(), strict=True))
             self._tick_us = _summary(self._durations_ns)
             self._durations_ns.clear()
-            self._publisher.send(self._service(now_ns, self._publisher.next_seq("service")), lasting=True)
+            self._tell(self._service(now_ns, self._publisher.next_seq("service")))
+
+    def _tell(self, message: wire.Health | wire.Service) -> None:
+        self._publisher.send(message, lasting=True)
+        self.listener(message)
 
     def status(self) -> dict[str, Any]:
         """Everything about the daemon and every pad, for the control endpoint."""
@@ -128,6 +150,7 @@ class Report:
         topic = f"health/{hand}/{settings.link}"
         return wire.Health(
             v=wire.SCHEMA_VERSION,
+            run=self._publisher.run,
             seq=self._publisher.next_seq(topic) if seq is None else seq,
             t_ns=now_ns,
             hand=hand,
@@ -154,6 +177,7 @@ class Report:
         bit_rates = {bus.name: bus.bitrate_bit_s for bus in self._deployment.buses}
         return wire.Service(
             v=wire.SCHEMA_VERSION,
+            run=self._publisher.run,
             seq=seq,
             t_ns=now_ns,
             wall_offset_ns=time.time_ns() - time.monotonic_ns(),
@@ -163,9 +187,13 @@ class Report:
             period_s=self._deployment.daemon.sync_period_ms * 1e-3,
             hands={hand.name: [pad.link for pad in hand.pads] for hand in self._deployment.hands},
             ticks=self._pipeline.ticks,
-            overruns=self._sync.overruns,
+            overruns=sum(self.stages.overruns.values()),
             rate_hz=self._speeds.get("ticks", 0.0),
             tick_us=self._tick_us,
+            loop=self.stages.figures(),
+            contacts=self._pipeline.tick.contacts.begun,
+            refused={**self._gate.refused, "request": self._control.refused},
+            process=_process(),
             buses={
                 name: {
                     "load": self._speeds.get(f"{name} bits", 0.0) / bit_rates[name],
@@ -205,6 +233,21 @@ class _Window:
         rates = (totals - self._totals).astype(np.float64) * (_SECOND_NS / max(1, now_ns - self.since_ns))
         self.since_ns, self._totals = now_ns, totals.copy()
         return rates
+
+
+def _process() -> dict[str, Any]:
+    """What this process takes of the machine. Called by the loop's own thread."""
+    with open("/proc/self/statm", "rb") as statm:
+        resident_pages = int(statm.read().split()[1])
+    logs = next((handler for handler in logging.getLogger().handlers if isinstance(handler, Logs)), None)
+    return {
+        "memory_bytes": resident_pages * _PAGE_BYTES,
+        "cpu_s": time.process_time(),
+        "loop_cpu_s": time.thread_time(),
+        "collections": [generation["collections"] for generation in gc.get_stats()],
+        "log_dropped": logs.dropped if logs else 0,
+        "log_silenced": logs.silenced if logs else 0,
+    }
 
 
 def _summary(durations_ns: Iterable[int]) -> dict[str, float]:
