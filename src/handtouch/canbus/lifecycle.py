@@ -78,6 +78,10 @@ _TWINS = (
     "two nodes have its id, for heartbeats come twice as often as they should: unplug one and give it "
     "another id (`handtouch scan` tells the serial numbers)"
 )
+_BABBLES = (
+    "its samples come {} times as often as SYNC asks for them: its firmware babbles, or another device sends "
+    "with its identifier; power-cycle it, or unplug it"
+)
 _RESTING = "outside the scene: switched off until it is needed"
 _LOOK_AT = "check its power, cable, node id and the bit rate and termination of the bus"
 
@@ -102,6 +106,8 @@ class Life:
     must_beat: bool = False  # lost for want of heartbeats: not trusted before it has sent one
     stranger: bool = False  # at its last identification it was not the configured node
     twins: bool = False  # two nodes have its id
+    babbles: bool = False  # it sends many samples for one SYNC
+    because: str = ""  # why the present boot began
     resting: bool = False  # not needed now: configured, but stopped instead of started
 
 
@@ -161,6 +167,13 @@ class Beats:
 
 
 @dataclass(frozen=True, slots=True)
+class Babble:
+    """How many samples came for each SYNC over a while; 0 where it is one, as it should be."""
+
+    times: int
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """Time has passed."""
 
@@ -177,7 +190,7 @@ class Stop:
     """The node is not wanted any more."""
 
 
-Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Beats | Rest | Tick | Stop
+Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Beats | Babble | Rest | Tick | Stop
 Next = tuple[Life, tuple[Action, ...]]
 
 _BOOT_STEPS = frozenset({Action.IDENTIFY, Action.READ_MAPPING, Action.CONFIGURE})
@@ -206,6 +219,8 @@ def advance(life: Life, event: Event, t_ns: int, timing: Timing) -> Next:
             return _silence(life, age_ns, t_ns)
         case Beats(twice):
             return _beats(life, twice, t_ns, timing)
+        case Babble(times):
+            return _babble(life, times, t_ns, timing)
         case Rest(resting):
             return _rest(life, resting, t_ns, timing)
         case Tick():
@@ -246,7 +261,8 @@ def _boot(life: Life, t_ns: int, reason: str, timing: Timing) -> Next:
         life = _enter(life, NodeState.SETTLING, t_ns, f"{reason}; we only listen, its identity isn't checked")
         return replace(life, started_ns=t_ns, discard=timing.settle_samples, due_ns=_NEVER_NS), ()
     life = _enter(life, NodeState.BOOTING, t_ns, reason)
-    return replace(life, attempt=life.attempt + 1, probes=0, twins=False), _identify(life, timing)
+    life = replace(life, attempt=life.attempt + 1, probes=0, twins=False, babbles=False, because=reason)
+    return life, _identify(life, timing)
 
 
 def _identify(life: Life, timing: Timing) -> tuple[Action, ...]:
@@ -265,7 +281,7 @@ def _heartbeat(life: Life, nmt: int, t_ns: int, timing: Timing) -> Next:
     told = f"heartbeat: node is {NMT_NAMES.get(nmt, f'in NMT state {nmt}')}"
     if life.state is NodeState.ABSENT or (life.state in _IN_BOOT and just_stopped):
         return _boot(life, t_ns, told, timing)
-    if life.state is NodeState.FAULTED and woken and not life.twins:
+    if life.state is NodeState.FAULTED and woken and not (life.twins or life.babbles):
         life = replace(life, due_ns=t_ns)  # while stopped it couldn't answer
     # A heartbeat sent before our command may still arrive after it.
     settled = t_ns - life.started_ns > 2 * timing.heartbeat_ns
@@ -410,6 +426,15 @@ def _beats(life: Life, twice: bool, t_ns: int, timing: Timing) -> Next:
     return replace(life, twins=True, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns), ()
 
 
+def _babble(life: Life, times: int, t_ns: int, timing: Timing) -> Next:
+    if not times:
+        return replace(life, babbles=False, due_ns=t_ns if life.babbles else life.due_ns), ()
+    if life.state not in _STARTED or timing.role is not Role.MASTER:  # others may make it send as they like
+        return life, ()
+    life = _enter(life, NodeState.FAULTED, t_ns, _BABBLES.format(times))
+    return replace(life, babbles=True, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns), ()
+
+
 def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
     if life.heartbeat_ns is not None and is_supervised(life):
         quiet_ns = t_ns - life.heartbeat_ns
@@ -425,7 +450,7 @@ def _tick(life: Life, t_ns: int, timing: Timing) -> Next:
     if life.state is NodeState.FAULTED:
         # It stays FAULTED, with its reason, until an attempt gets further.
         life = replace(life, attempt=life.attempt + 1, due_ns=t_ns + timing.retry_last_ns)
-        return life, () if life.twins else _identify(life, timing)
+        return life, () if life.twins or life.babbles else _identify(life, timing)
     if life.state is NodeState.SETTLING:
         return _enter(life, NodeState.STALE, t_ns, "started, but no sample came: is there a SYNC?"), ()
     return life, ()

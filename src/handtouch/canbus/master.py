@@ -20,6 +20,7 @@ from .lifecycle import (
     NMT_BOOT_UP,
     Action,
     Answer,
+    Babble,
     Beats,
     BootUp,
     Event,
@@ -51,6 +52,9 @@ BEATS_WATCHED = 10
 CROWDED = 2
 """Times in a row that they do before two nodes are said to have its id: late ones come in a burst once."""
 _TWICE = 1.6  # times as many
+BABBLE = 2
+"""Samples beyond one for each SYNC from which on a node is said to babble; duplicates are at most one."""
+_BABBLE_NS = 500_000_000  # over which they are counted
 _WORKERS = 32
 _EVENTS_KEPT = 1024
 _NEVER_NS = 1 << 62
@@ -101,6 +105,8 @@ class Master:
         self._owners = _owners(ports, self._nodes)
         self._waiting: dict[int, int] = {}  # slots whose next sample matters -> stamp of the last one
         self._next_due_ns = 0
+        self._repeats = (0, self._slab.repeats.copy())  # since when they are counted, and how many had come
+        self._babbling: set[int] = set()
         self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_EVENTS_KEPT)
         self._results: deque[tuple[Member, Outcome | None, Result | None]] = deque()  # from the workers
         self._workers: ThreadPoolExecutor | None = None
@@ -137,6 +143,8 @@ class Master:
         if self._results:
             self._collect(t_ns)
         self._watch_samples(t_ns)
+        if t_ns - self._repeats[0] >= _BABBLE_NS and self._sync_period_ns:
+            self._watch_repeats(t_ns)
         if t_ns >= self._next_due_ns:
             self._tick(t_ns)
 
@@ -243,6 +251,19 @@ class Master:
             if silent.any():
                 for slot in np.flatnonzero(silent).tolist():
                     self._advance(self._by_slot[slot], Silence(int(ages[slot])), t_ns)
+
+    def _watch_repeats(self, t_ns: int) -> None:
+        """Which nodes send far more samples than SYNC asks for; a SYNC too many shows in most of them."""
+        since_ns, before = self._repeats
+        self._repeats = (t_ns, self._slab.repeats.copy())
+        extra = self._slab.repeats - before
+        usual = np.sort(extra)[(len(extra) - 1) // 2] if len(extra) > 1 else 0
+        periods = max((t_ns - since_ns) / self._sync_period_ns, 1.0)
+        babbling = set(np.flatnonzero(extra - usual > BABBLE * periods).tolist())
+        for slot in babbling | self._babbling:
+            times = 1 + round(extra[slot] / periods) if slot in babbling else 0
+            self._advance(self._by_slot[slot], Babble(times), t_ns)
+        self._babbling = babbling
 
     def _tick(self, t_ns: int) -> None:
         self._next_due_ns = _NEVER_NS

@@ -24,6 +24,7 @@ Result = boot.Identity | PdoMapping | boot.Configured | boot.Paced
 
 _NMT = 0x000
 NMT_COMMANDS = {Action.START: 1, Action.STOP: 2, Action.ENTER_PREOPERATIONAL: 128}
+_BOOTED_FOR_A_REASON = (NodeState.IDENTIFIED, NodeState.CONFIGURING, NodeState.SETTLING)
 _NOBODY_WAITS = (NodeState.ABSENT, NodeState.STOPPED)
 
 
@@ -56,6 +57,9 @@ class Member:
     emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
 
     def status(self) -> NodeStatus:
+        told = self.life.reason
+        if self.life.because and self.life.state in _BOOTED_FOR_A_REASON:
+            told = f"{self.life.because}; {told}"
         return NodeStatus(
             self.spec.slot,
             self.spec.name,
@@ -63,7 +67,7 @@ class Member:
             self.spec.node_id,
             self.life.state,
             self.life.since_ns,
-            self.life.reason,
+            told,
             self.identity,
             tuple(tpdo.cob_id for tpdo in self.mapping.tpdos) if self.mapping else (),
             self.guarded,
