@@ -19,6 +19,7 @@ from handtouch import cli, commission, config, shipped
 from handtouch.canbus.channels import ELECTRODES
 from handtouch.canbus.device import Device, DeviceBus
 from handtouch.commission.bench import Bench
+from handtouch.commission.edit import applied
 from handtouch.commission.order import ASKED, Near
 from handtouch.commission.press import PressDetector
 from handtouch.commission.report import table
@@ -87,6 +88,7 @@ class Person:
     instead: Mapping[str, Callable[[Near | None], None]] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     pending: list[Key] = field(default_factory=list)
+    also: Pads | None = None
 
     @property
     def listens(self) -> bool:
@@ -102,6 +104,8 @@ class Person:
                 self.pads.press(prompt[1], near)
         elif "let go" in text:
             self.pads.release()
+            if self.also is not None:
+                self.also.release()
         elif "Enter" in text and self.keys:
             self.pads.release()
             self.pending.append(self.keys.pop(0))
@@ -192,6 +196,28 @@ def test_three_nodes_in_a_ring_go_each_to_its_pad(made: Callable[..., Pads]) -> 
     found = {link: (edit.node_id, edit.serial) for (_, link), edit in session.edits().items()}
     assert found == {pad.link: (pad.node_id, pad.serial) for pad in pads.truth.hands[0].pads}
     assert all(outcome.well for outcome in outcomes.values())
+
+
+def test_nodes_swapped_between_two_buses_and_of_two_kinds_go_to_their_pads(made: Callable[..., Pads]) -> None:
+    near_thumb, near_palm = made("thumb_middle"), made("palm_heel", noise_counts=3.0)
+    near_palm.nodes.start()
+    (thumb,), (palm,) = (pads.truth.hands[0].pads for pads in (near_thumb, near_palm))
+    palm = palm.model_copy(update={"bus": "can1", "node": "noisy"})
+    (can0,), (can1,) = (pads.truth.buses for pads in (near_thumb, near_palm))
+    truth = near_thumb.truth.model_copy(
+        update={
+            "buses": (can0, can1.model_copy(update={"name": "can1"})),
+            "nodes": {**near_thumb.truth.nodes, "noisy": near_palm.truth.nodes["four_channel"]},
+            "hands": (near_thumb.truth.hands[0].model_copy(update={"pads": (thumb, palm)}),),
+        }
+    )
+    keys = ("bus", "node_id", "node", "serial")
+    thumbs, palms = ({key: getattr(pad, key) for key in keys} for pad in (thumb, palm))
+    person = Person(near_thumb, also=near_palm)
+    person.instead = {"palm_heel": lambda near: near_palm.press("palm_heel", near)}
+    _, session = told(near_thumb, person, with_pads(truth, thumb_middle=palms, palm_heel=thumbs), yes=True)
+    assert applied(truth, session.edits()) == truth
+    assert {link for _, link in session.edits()} == {"thumb_middle", "palm_heel"}
 
 
 def test_a_swap_is_taken_over_only_when_somebody_says_so(made: Callable[..., Pads]) -> None:
