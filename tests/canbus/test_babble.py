@@ -46,16 +46,3 @@ def test_babble_that_goes_on_through_a_reboot_is_told_again(rig: Any) -> None:
 def test_node_that_another_master_configures_may_send_as_it_likes(role: Role) -> None:
     life = Life(state=OPERATIONAL)
     assert advance(life, Babble(11), 0, Timing(100 * MS, 350 * MS, role)) == (life, ())
-
-
-def test_status_tells_why_a_node_boots_until_it_is_up(rig: Any) -> None:
-    rig.boot()
-    rig.node(1).on_nmt(128)
-    told = set()
-    for _ in range(300):
-        rig.run(1)
-        told.add((rig.state(1), rig.status(1).reason))
-    reasons = [reason for state, reason in told if state not in (OPERATIONAL, NodeState.STALE)]
-    assert len(reasons) >= 2
-    assert all("node is pre-operational, though it was started" in reason for reason in reasons)
-    assert rig.status(1).reason == ""

@@ -323,7 +323,10 @@ def _answer(life: Life, t_ns: int, timing: Timing) -> Next:
     life = replace(life, heard_ns=t_ns)
     if life.state is not NodeState.ABSENT:
         return life, ()
-    return _boot(replace(life, nmt=None), t_ns, "answers over SDO", timing)
+    told = "answers over SDO"
+    if life.must_beat:  # it may answer before anybody has read that it was lost
+        told = f"{told}, but was {life.reason.partition(';')[0]}"
+    return _boot(replace(life, nmt=None), t_ns, told, timing)
 
 
 def _done(life: Life, event: Done, t_ns: int, timing: Timing) -> Next:

@@ -1,0 +1,34 @@
+"""The cause of what happened to a node is still told when the next thing happens at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from handtouch.canbus.lifecycle import NodeState
+
+
+def test_status_tells_why_a_node_boots_until_it_is_up(rig: Any) -> None:
+    rig.boot()
+    rig.node(1).on_nmt(128)
+    told = set()
+    for _ in range(300):
+        rig.run(1)
+        told.add((rig.state(1), rig.status(1).reason))
+    up = (NodeState.OPERATIONAL, NodeState.STALE)
+    reasons = [reason for state, reason in told if state not in up]
+    assert len(reasons) >= 2
+    assert all("node is pre-operational, though it was started" in reason for reason in reasons)
+    assert rig.status(1).reason == ""
+
+
+def test_node_that_answers_as_soon_as_it_is_lost_is_still_said_to_be_lost(rig: Any) -> None:
+    rig.boot()
+    rig.node(1).send_heartbeat = False
+    rig.run(1500)
+    rig.node(1).send_heartbeat = True
+    events = [event for event in rig.run(6000) if event.slot == 0]
+    assert rig.state(1) is NodeState.OPERATIONAL, events
+    rig.node(1).send_heartbeat = False
+    booting = [event for event in rig.run(600) if event.new is NodeState.BOOTING]
+    assert booting
+    assert "lost: no heartbeat for" in booting[0].reason
