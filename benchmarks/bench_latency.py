@@ -177,13 +177,13 @@ def measure_daemon(config: Path, seconds: float) -> dict[str, Any]:
     received: list[tuple[int, int]] = []
     cpu = ProcessorShare()
     with connect("hand/*", endpoint=deployment.daemon.live, queue=100_000) as messages:
-        while messages.recv(30).state.count(1) != TOUCHED:  # all up and touched
+        while messages.recv().state.count(1) != TOUCHED:  # all up and touched
             time.sleep(0)
         before = request("status", endpoint=deployment.daemon.control)
         cpu.start(daemon.pid)
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
-            message = messages.recv(1)
+            message = messages.recv()
             received.append((message.t_ns, time.monotonic_ns()))
         share = cpu.stop()
         gaps = messages.gaps

@@ -1,7 +1,7 @@
 """handtouch: middleware that gives a robot hand a sense of touch.
 
-`connect` subscribes to a running daemon, `request` asks it something; both load on first use, so that
-`import handtouch.field` stays light.
+`connect` subscribes to a running daemon, `columns` reads its hand frames as arrays, `request` asks it
+something; they load on first use, so that `import handtouch.field` stays light.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from handtouch.client import Subscriber, connect, request
+    from handtouch.client import Subscriber, columns, connect, request
 
 __version__ = "0.1.0"
-__all__ = ["Subscriber", "__version__", "connect", "request"]
+__all__ = ["Subscriber", "__version__", "columns", "connect", "request"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("connect", "request", "Subscriber"):
+    if name in ("Subscriber", "columns", "connect", "request"):
         from handtouch import client
 
         return getattr(client, name)

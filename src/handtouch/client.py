@@ -4,7 +4,7 @@
         for contact in messages:
             print(contact.link, contact.event, contact.force_n)
 
-Public names: `connect`, `Subscriber`, `request`.
+Public names: `connect`, `Subscriber`, `request`; `columns` reads a hand frame as arrays.
 """
 
 from __future__ import annotations
@@ -15,15 +15,17 @@ import time
 from collections.abc import AsyncIterator, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
 
 import msgpack
 import zmq
-import zmq.asyncio
 from zmq.utils.monitor import parse_monitor_message
 
 from handtouch import wire
 from handtouch.keys import ClientKey, load_client
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 LIVE = "tcp://127.0.0.1:5580"
 CONTROL = "tcp://127.0.0.1:5581"
@@ -31,13 +33,39 @@ SILENCE_S = 1.5
 """The daemon says `service` twice a second; three missed ones mean that it is gone."""
 
 
+M = TypeVar("M", bound=wire.Message, covariant=True)
+
+
+class _Options(TypedDict, total=False):
+    endpoint: str
+    key: Path | str | None
+    queue: int
+
+
+@overload
+def connect(**options: Unpack[_Options]) -> Subscriber[wire.Contact]: ...
+@overload
+def connect(pattern: Literal["contact/*/*"], /, **options: Unpack[_Options]) -> Subscriber[wire.Contact]: ...
+@overload
+def connect(pattern: Literal["hand/*"], /, **options: Unpack[_Options]) -> Subscriber[wire.HandFrame]: ...
+@overload
+def connect(pattern: Literal["health/*/*"], /, **options: Unpack[_Options]) -> Subscriber[wire.Health]: ...
+@overload
+def connect(pattern: Literal["raw/*"], /, **options: Unpack[_Options]) -> Subscriber[wire.Raw]: ...
+@overload
+def connect(pattern: Literal["service"], /, **options: Unpack[_Options]) -> Subscriber[wire.Service]: ...
+@overload
+def connect(*patterns: str, **options: Unpack[_Options]) -> Subscriber[Any]: ...
 def connect(
     *patterns: str, endpoint: str = LIVE, key: Path | str | None = None, queue: int = 1000
-) -> Subscriber:
+) -> Subscriber[Any]:
     """Subscribe to the topics that match any of the patterns.
 
     A pattern is a topic whose parts may hold the wildcards * and ?: "contact/*/*" (the default),
-    "contact/left/thumb_tip", "hand/*", "health/*/index_*", "service". `queue` bounds the messages kept
+    "contact/left/thumb_tip", "hand/*", "health/*/index_*", "service". What comes is `wire.Contact`,
+    `HandFrame`, `Health`, `Raw` or `Service`, as a type checker knows for the patterns of a whole topic. On
+    joining, the present state comes first, with `repeat` set: contacts under way as an update, the latest
+    hand frame, health and service. `queue` bounds the messages kept
     while this side is busy; beyond it the newest are lost, and counted as gaps. The connection comes back
     by itself when a daemon restarts. `key` is the file of this client's key for a daemon that asks for one
     (`handtouch keys`); left out: the file that the environment variable HANDTOUCH_KEY names; "" for none.
@@ -48,8 +76,16 @@ def connect(
     return Subscriber(patterns or ("contact/*/*",), endpoint, queue, key)
 
 
-class Subscriber:
-    """Messages of a daemon as typed objects: an iterator, an asynchronous iterator and a context manager."""
+class Subscriber(Generic[M]):
+    """Messages of a daemon as typed objects: an iterator and a context manager, blocking or for asyncio.
+
+        async with handtouch.connect("hand/*") as frames:
+            async for frame in frames:
+                force_n = handtouch.columns(frame)["force_n"]
+
+    For one thread, or one task, at a time. A daemon that restarts is followed: its `run` is another, and
+    nothing of the one before counts as a gap.
+    """
 
     def __init__(
         self, patterns: tuple[str, ...], endpoint: str, queue: int, key: Path | str | None = None
@@ -66,6 +102,7 @@ class Subscriber:
         """messages known to be lost, by the gaps in their seq"""
         self.malformed = 0
         """messages dropped because they don't keep the contract"""
+        self._run: int | None = None
         self._last_seq: dict[str, int] = {}
         self._heard_s = time.monotonic()
         self._ever = False
@@ -80,22 +117,36 @@ class Subscriber:
             self._socket.subscribe(prefix)
         self._door = _Door(self._socket, endpoint, key)
 
-    def recv(self, timeout_s: float | None = None) -> Any:
+    @overload
+    def recv(self) -> M: ...
+    @overload
+    def recv(self, timeout_s: float | None) -> M | None: ...
+    def recv(self, timeout_s: float | None = None) -> M | None:
         """The next message that matches, or None after `timeout_s` seconds without one.
 
         Raises PermissionError when the daemon doesn't let this client in.
         """
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while True:
+        while (message := self._take()) is None:
             wait_ms = None if end_s is None else max(0, round((end_s - time.monotonic()) * 1000))
-            ready = self._door.poll(wait_ms)
-            if not ready:
+            if not self._door.poll(wait_ms):
                 return None
-            if self._socket not in ready:
-                continue
-            message = self._accept(self._socket.recv_multipart())
-            if message is not None:
-                return message
+        return message
+
+    @overload
+    async def arecv(self) -> M: ...
+    @overload
+    async def arecv(self, timeout_s: float | None) -> M | None: ...
+    async def arecv(self, timeout_s: float | None = None) -> M | None:
+        """As `recv`, for asyncio. Cancelling it loses no message."""
+        await asyncio.sleep(0)  # a stream without a pause leaves the loop's other tasks their turn
+        try:
+            async with asyncio.timeout(timeout_s):
+                while (message := self._take()) is None:
+                    await self._door.wait()
+        except TimeoutError:
+            return None
+        return message
 
     @property
     def heard(self) -> bool:
@@ -110,28 +161,13 @@ class Subscriber:
         """
         return time.monotonic() - self._heard_s < SILENCE_S
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[M]:
         while True:
             yield self.recv()
 
-    async def __aiter__(self) -> AsyncIterator[Any]:
-        socket = zmq.asyncio.Socket.shadow(self._socket)
-        refused = asyncio.ensure_future(self._door.refused())
-        try:
-            while True:
-                coming = asyncio.ensure_future(socket.recv_multipart())
-                try:
-                    if not coming.done():
-                        await asyncio.wait((coming, refused), return_when=asyncio.FIRST_COMPLETED)
-                    if not coming.done():
-                        refused.result()
-                finally:
-                    coming.cancel()
-                message = self._accept(coming.result())
-                if message is not None:
-                    yield message
-        finally:
-            refused.cancel()
+    async def __aiter__(self) -> AsyncIterator[M]:
+        while True:
+            yield await self.arecv()
 
     def __enter__(self) -> Self:
         return self
@@ -139,10 +175,26 @@ class Subscriber:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Leave; the daemon notices within milliseconds."""
         self._door.close()
         self._socket.close()
+
+    def _take(self) -> M | None:
+        """The next message that is here already."""
+        while True:
+            try:
+                parts = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return None
+            if (message := self._accept(parts)) is not None:
+                return cast(M, message)
 
     def _accept(self, parts: list[bytes]) -> wire.Message | None:
         self._heard_s, self._ever = time.monotonic(), True
@@ -155,13 +207,26 @@ class Subscriber:
         except wire.WireError:
             self.malformed += 1
             return None
+        if message.run != self._run:
+            self._run = message.run
+            self._last_seq.clear()
         last = self._last_seq.get(topic)
-        if last is not None and message.seq > last + 1:
-            self.gaps += message.seq - last - 1
-        if not message.repeat or last is None or message.seq > last:
-            self._last_seq[topic] = message.seq
-            return message
-        return None  # a repeat for a late joiner that this subscriber has had
+        if last is not None:
+            if message.repeat and message.seq <= last:
+                return None  # for a late joiner; this subscriber has had it
+            self.gaps += max(0, message.seq - last - 1)
+        self._last_seq[topic] = message.seq
+        return message
+
+
+def columns(frame: wire.HandFrame | wire.Raw) -> dict[str, NDArray[Any]]:
+    """The columns of a frame as arrays by name, read only: (n,) or (n, elements), rows as `frame.links`."""
+    import numpy as np
+
+    return {
+        name: np.frombuffer(getattr(frame, name), dtype=kind).reshape((-1, elements) if elements > 1 else -1)
+        for name, (kind, elements) in wire.COLUMNS[type(frame)].items()
+    }
 
 
 def request(
@@ -238,11 +303,20 @@ class _Door:
             self._hear(self._monitor.recv_multipart())
         return ready
 
-    async def refused(self) -> None:
-        """Raises PermissionError when the daemon doesn't let this client in."""
-        monitor = zmq.asyncio.Socket.shadow(self._monitor)
-        while True:
-            self._hear(await monitor.recv_multipart())
+    async def wait(self) -> None:
+        """Until there may be something to take. Raises PermissionError."""
+        loop, woken = asyncio.get_running_loop(), asyncio.Event()
+        descriptors = [int(socket.getsockopt(zmq.FD)) for socket in (self._socket, self._monitor)]
+        for descriptor in descriptors:
+            loop.add_reader(descriptor, woken.set)
+        try:
+            while self._socket not in (ready := self.poll(0)):
+                if not ready:  # ZeroMQ tells its descriptors once of what is new, so ask it first
+                    await woken.wait()
+                    woken.clear()
+        finally:
+            for descriptor in descriptors:
+                loop.remove_reader(descriptor)
 
     def close(self) -> None:
         """Hear no more."""

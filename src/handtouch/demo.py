@@ -125,6 +125,6 @@ def in_process(deployment: Deployment) -> Deployment:
     return deployment.model_copy(update={"buses": buses, "daemon": daemon})
 
 
-def _subscribe(daemon: Daemon) -> Subscriber:
+def _subscribe(daemon: Daemon) -> Subscriber[wire.Message]:
     endpoint = daemon.publisher.endpoints["live"]
     return connect("contact/*/*", "health/*/*", "service", endpoint=endpoint, key="", queue=100_000)

@@ -88,7 +88,7 @@ class Rig:
     def printed(self, name: str) -> str:
         return (self.folder / f"{name}.txt").read_text()
 
-    def subscribe(self, *patterns: str) -> Subscriber:
+    def subscribe(self, *patterns: str) -> Subscriber[Any]:
         return connect(*patterns, endpoint=self.endpoints["live"], queue=100_000)
 
     def status(self) -> dict[str, Any]:

@@ -161,7 +161,7 @@ def test_garbage_on_the_raw_sockets_stops_no_tick(reachable: Reachable) -> None:
         connect("hand/*", endpoint=reachable.at("live"), key=reachable.key("reader"), queue=100_000) as hands,
         ExitStack() as open_still,
     ):
-        first = hands.recv(START_S)
+        first = hands.recv()
         for data in THROWN:
             for stream in ("live", "complete", "control"):
                 thrown = open_still.enter_context(
@@ -170,7 +170,7 @@ def test_garbage_on_the_raw_sockets_stops_no_tick(reachable: Reachable) -> None:
                 with suppress(OSError):  # it may hang up on us
                     thrown.sendall(data)
         assert reachable.ask("pilot")["service"]["ticks"] > before
-        seen = [first.tick, *(hands.recv(START_S).tick for _ in range(100))]
+        seen = [first.tick, *(hands.recv().tick for _ in range(100))]
         assert seen == list(range(first.tick, first.tick + 101))
         assert hands.gaps == 0
     assert reachable.end("run") == 0
@@ -180,7 +180,7 @@ def test_garbage_on_the_raw_sockets_stops_no_tick(reachable: Reachable) -> None:
 def test_a_client_with_a_key_comes_back_by_itself_when_the_daemon_restarts(reachable: Reachable) -> None:
     with connect("service", endpoint=reachable.at("live"), key=reachable.key("reader")) as messages:
         reachable.start("run")
-        before = messages.recv(START_S)
+        before = messages.recv()
         assert reachable.end("run", signal.SIGKILL) != 0
         reachable.start("run")
         after = messages.recv(START_S)

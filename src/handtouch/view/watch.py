@@ -100,7 +100,7 @@ class LineDisplay:
         sys.stdout.flush()
 
 
-def follow(messages: Subscriber, display: Display, done: Callable[[], bool]) -> None:
+def follow(messages: Subscriber[wire.Message], display: Display, done: Callable[[], bool]) -> None:
     """Show messages as they come until `done`."""
     next_frame_s = 0.0
     while not done():
