@@ -21,9 +21,10 @@ from handtouch.canbus.device import Device, DeviceBus
 from handtouch.commission.bench import Bench
 from handtouch.commission.edit import applied
 from handtouch.commission.order import ASKED, Near
+from handtouch.commission.outcome import Key, Outcome, Result
 from handtouch.commission.press import PressDetector
 from handtouch.commission.report import table
-from handtouch.commission.session import Key, Outcome, Result, Session
+from handtouch.commission.session import Session
 from handtouch.hand import network_of, surface_of
 
 PROMPT = re.compile(r"\[\d+/\d+\] right/(\w+): press (?:it anywhere|near electrode (\w+))")
@@ -166,7 +167,7 @@ def test_a_hand_that_is_as_its_file_says_is_well_and_nothing_changes(made: Calla
     outcomes, session = told(pads, Person(pads))
     assert {outcome.result for outcome in outcomes.values()} == {Result.WELL}
     assert all(outcome.well for outcome in outcomes.values())
-    edits = session.edits()
+    edits = session.ledger.edits()
     assert {link: edit.keys() for (_, link), edit in edits.items()} == {
         pad.link: {name: getattr(pad, name) for name in ("bus", "node_id", "node", "serial", "electrodes")}
         for pad in pads.truth.hands[0].pads
@@ -193,7 +194,7 @@ def test_three_nodes_in_a_ring_go_each_to_its_pad(made: Callable[..., Pads]) -> 
         **{link: {"node_id": ids[(i + 1) % 3], "serial": 1005 + i} for i, link in enumerate(links)},
     )
     outcomes, session = told(pads, Person(pads), file, yes=True)
-    found = {link: (edit.node_id, edit.serial) for (_, link), edit in session.edits().items()}
+    found = {link: (edit.node_id, edit.serial) for (_, link), edit in session.ledger.edits().items()}
     assert found == {pad.link: (pad.node_id, pad.serial) for pad in pads.truth.hands[0].pads}
     assert all(outcome.well for outcome in outcomes.values())
 
@@ -216,8 +217,8 @@ def test_nodes_swapped_between_two_buses_and_of_two_kinds_go_to_their_pads(made:
     person = Person(near_thumb, also=near_palm)
     person.instead = {"palm_heel": lambda near: near_palm.press("palm_heel", near)}
     _, session = told(near_thumb, person, with_pads(truth, thumb_middle=palms, palm_heel=thumbs), yes=True)
-    assert applied(truth, session.edits()) == truth
-    assert {link for _, link in session.edits()} == {"thumb_middle", "palm_heel"}
+    assert applied(truth, session.ledger.edits()) == truth
+    assert {link for _, link in session.ledger.edits()} == {"thumb_middle", "palm_heel"}
 
 
 def test_a_swap_is_taken_over_only_when_somebody_says_so(made: Callable[..., Pads]) -> None:
@@ -225,14 +226,14 @@ def test_a_swap_is_taken_over_only_when_somebody_says_so(made: Callable[..., Pad
     first, second = (pad.node_id for pad in pads.truth.hands[0].pads)
     file = with_pads(pads.truth, index_proximal={"node_id": second}, index_middle={"node_id": first})
     outcomes, session = told(pads, Person(pads))
-    assert session.edits()["right", "index_proximal"].node_id == first
+    assert session.ledger.edits()["right", "index_proximal"].node_id == first
     pads.nodes.stop()
     outcomes, session = told(pads, Person(pads), file)  # nobody there to ask
     assert outcomes["index_proximal"].result is Result.SKIPPED
-    assert not session.edits()
+    assert not session.ledger.edits()
     pads.nodes.stop()
     outcomes, session = told(pads, Person(pads, keys=[Key.ENTER]), file)
-    assert session.edits()["right", "index_proximal"].node_id == first
+    assert session.ledger.edits()["right", "index_proximal"].node_id == first
     assert all(outcome.well for outcome in outcomes.values())
 
 
@@ -308,7 +309,7 @@ def test_a_press_in_the_middle_again_and_again_gives_no_order(made: Callable[...
     assert outcomes["palm_heel"].result is Result.UNCLEAR
     assert "no order of the electrodes" in outcomes["palm_heel"].problems[0]
     assert sum("near electrode" in line for line in person.said) == 6
-    assert session.edits()["right", "palm_heel"].electrodes == pads.truth.hands[0].pads[0].electrodes
+    assert session.ledger.edits()["right", "palm_heel"].electrodes == pads.truth.hands[0].pads[0].electrodes
 
 
 def test_a_press_beyond_the_range_is_to_be_gentler(made: Callable[..., Pads]) -> None:
@@ -367,7 +368,7 @@ def test_serial_numbers_that_nodes_share_are_not_written(made: Callable[..., Pad
     for device in pads.devices.values():
         device.write(0x1018, 4, 77, keep=True)
     _, session = told(pads, Person(pads))
-    assert {edit.serial for edit in session.edits().values()} == {None}
+    assert {edit.serial for edit in session.ledger.edits().values()} == {None}
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """`handtouch commission CONFIG`: press one pad after another, find how the hand is wired, and write it down.
 
 Public name: `run`. `session` is the dialogue, `bench` the buses, `press` and `order` the judgement, `words`
-what a person is told, `edit` the deployment file, `report` the end.
+what a person is told, `ledger` who has which node, `edit` the deployment file, `report` the end.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from . import report
 from .bench import Bench
 from .dialogue import open_dialogue
 from .edit import applied, edited, write
-from .session import Result, Session
+from .outcome import Result
+from .session import Session
 
 __all__ = ["run"]
 
@@ -103,7 +104,7 @@ class _Record:
     def save(self, session: Session) -> None:
         """Write what was found so far. Raises OSError; ValueError, KeyError for a file that can't say it."""
         text = _text(self._path)  # as it is now: somebody may have edited it
-        edits = session.edits()
+        edits = session.ledger.edits()
         new = edited(text, edits)
         before = config.parse(text, str(self._path), self._folder)
         if config.parse(new, str(self._path), self._folder) != applied(before, edits):

@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from .outcome import Dialogue, Key
 from .press import PRESSED, PressDetector
-from .session import Dialogue, Key
 
 _REDRAW_NS = 100_000_000
 _BAR = 40

@@ -6,7 +6,8 @@ import difflib
 
 import numpy as np
 
-from .session import Outcome, Session
+from .outcome import Outcome
+from .session import Session
 
 _TITLES = ("pad", "node", "serial", "electrodes", "noise", "result")
 

@@ -2,16 +2,13 @@
 
 No clock, bus, file or terminal: samples come in with their times, words go out by a `Dialogue`.
 
-Public names: `Session`, `Outcome`, `Result`, `Dialogue`.
+Public name: `Session`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import Enum
+from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +22,9 @@ from handtouch.hand import network_of, surface_of
 from . import words
 from .bench import Sample
 from .edit import Edit
+from .ledger import Ledger
 from .order import Near, Reading, Shares, Verdict, judge
+from .outcome import Dialogue, Hand, Key, Outcome, Result
 from .press import Press, PressDetector, Rest, judge_rest, polarity, reacted
 
 _SECOND_NS = 1_000_000_000
@@ -40,75 +39,6 @@ _NO_ANSWER = (
     "name (`handtouch scan` tells); the pad isn't plugged into its node; its sheet has no supply; or the "
     "press was too light"
 )
-
-
-class Key(Enum):
-    """What the person may say."""
-
-    ENTER = ""
-    AGAIN = "a"
-    SKIP = "s"
-    QUIT = "q"
-
-
-class Dialogue(Protocol):
-    """Where words go, and keys come from."""
-
-    @property
-    def listens(self) -> bool:
-        """Whether anybody can still press a key."""
-
-    def say(self, text: str, style: str = "") -> None:
-        """A line that stays; `style`: "good", "bad", "ask" or nothing."""
-
-    def show(self, t_ns: int, slot: int, name: str, detector: PressDetector) -> None:
-        """The channels of a node as they are now."""
-
-    def key(self) -> Key | None:
-        """The next key pressed, None if there is none; doesn't wait."""
-
-
-class Hand(Protocol):
-    """The nodes, as `Bench` has them."""
-
-    @property
-    def nodes(self) -> list[NodeStatus]:
-        """Of each slot."""
-
-    def samples(self) -> Iterator[Sample]:
-        """Without end."""
-
-
-class Result(Enum):
-    """What became of a pad."""
-
-    WELL = "as configured"
-    CHANGED = "changed"
-    UNCLEAR = "not clear"
-    NO_ANSWER = "no answer"
-    SKIPPED = "skipped"
-    BEFORE = "done before"
-    LEFT = "left"
-
-
-@dataclass
-class Outcome:
-    """A pad: what was found, and what is wrong with it, in words. `slot` and `electrodes` where known."""
-
-    hand: str
-    pad: config.Pad
-    result: Result = Result.LEFT
-    slot: int | None = None
-    electrodes: tuple[Near, Near, Near, Near] | None = None
-    problems: list[str] = field(default_factory=list)
-
-    @property
-    def name(self) -> str:
-        return f"{self.hand}/{self.pad.link}"
-
-    @property
-    def well(self) -> bool:
-        return self.result in (Result.WELL, Result.CHANGED, Result.BEFORE) and not self.problems
 
 
 class _Said(Exception):  # noqa: N818 - no error: a key that ends what is being done
@@ -128,7 +58,8 @@ class Session:
     """Commissions the pads of a deployment, `chosen` by their rows; `save` is called after each.
 
     `yes`: what is found is taken over without asking. `patience_s`: how long to wait for a press or a key.
-    `outcomes` has one for every pad of the deployment, in its order, `rests` what its slots show at rest.
+    `outcomes` has one for every pad of the deployment, in its order, `rests` what its slots show at rest,
+    `ledger` which slot is whose.
     """
 
     def __init__(
@@ -149,7 +80,7 @@ class Session:
         self.chosen, self._yes = chosen, yes
         self._patience_ns = round(patience_s * 1e9)
         self._samples = hand.samples()
-        self._owner = list(range(len(self.outcomes)))  # slot of each pad; at first as configured
+        self.ledger = Ledger(self.outcomes, lambda: hand.nodes)
         kinds = [deployment.nodes[outcome.pad.node] for outcome in self.outcomes]
         self._noise = [kind.noise_counts for kind in kinds]
         channels = {name: channels_of(n.channels, n.eds) for name, n in deployment.nodes.items()}
@@ -171,26 +102,17 @@ class Session:
         except _Said:  # quit; skip and again were taken care of
             self._say("Left; what was found is kept.")
 
-    def edits(self) -> dict[tuple[str, str], Edit]:
-        """What the deployment file is to say of the pads that were found, and of those they swapped with."""
-        found = {row: self._edit(row) for row, slot in enumerate(self._owner) if self._touches(row, slot)}
-        kept = [row for row in range(len(self.outcomes)) if row not in found]
-        while robbed := self._robbed(kept, found):  # each may need a serial number that another pad has
-            found |= {row: self._edit(row) for row in robbed}
-            kept = [row for row in kept if row not in found]
-        return {(self.outcomes[row].hand, self.outcomes[row].pad.link): edit for row, edit in found.items()}
-
     def node_of(self, row: int) -> NodeStatus:
         """The node that a pad is connected to, as far as is known."""
-        return self._hand.nodes[self._owner[row]]
+        return self._hand.nodes[self.ledger.slot(row)]
 
     def rest_of(self, row: int) -> Rest | None:
         """What that node showed at rest."""
-        return self.rests[self._owner[row]] if self.rests else None
+        return self.rests[self.ledger.slot(row)] if self.rests else None
 
     def noise_counts(self, row: int) -> float:
         """What the deployment says of that node's noise."""
-        return self._noise[self._owner[row]]
+        return self._noise[self.ledger.slot(row)]
 
     # Before the first press -------------------------------------------------------------------------------
 
@@ -266,7 +188,7 @@ class Session:
         """Which node answers. Raises _NoPress and _Said."""
         while True:
             press = self._press(row, f"{title}: press it anywhere")
-            holder = self._held_by(press.slot, row)
+            holder = self.ledger.holder(press.slot, row)
             if holder is not None:
                 self._say(
                     f"  the node of {holder} answered, which was found before: was the right pad pressed? "
@@ -275,9 +197,9 @@ class Session:
                 )
                 self._go_on("Enter: press again, s: skip, q: quit")
                 continue
-            if press.slot == self._owner[row]:
+            if press.slot == self.ledger.slot(row):
                 return press.slot
-            other = self.outcomes[self._owner.index(press.slot)].name
+            other = self.outcomes[self.ledger.row(press.slot)].name
             self._say(
                 f"  the node of {other} answered ({self._node_text(press.slot)}): the nodes are swapped, or "
                 "another pad was pressed.",
@@ -312,7 +234,7 @@ class Session:
         self, row: int, slot: int, presses: list[tuple[Near, Press]], verdict: Verdict | None
     ) -> None:
         outcome = self.outcomes[row]
-        self._take(row, slot)
+        self.ledger.take(row, slot)
         noise, rest = float(self._detector.noise[slot]), self.rests[slot]
         findings = judge_rest(rest, self._noise[slot]) + polarity([press for _, press in presses], noise)
         outcome.problems = [str(finding) for finding in findings]
@@ -329,7 +251,7 @@ class Session:
         else:
             outcome.electrodes = verdict.electrodes
         before = Edit.of(outcome.pad)
-        edit = self._edit(row)
+        edit = self.ledger.edit(row)
         if outcome.electrodes is not None:
             outcome.result = Result.WELL if edit == before else Result.CHANGED
         for problem in outcome.problems:
@@ -339,20 +261,6 @@ class Session:
             self._say(f"  {self._node_text(slot)}, electrodes {order}: {outcome.result.value}.", "good")
         self._save(self)
 
-    def _take(self, row: int, slot: int) -> None:
-        """A node is this pad's; the pad that had it so far gets the other one's."""
-        other = self._owner.index(slot)
-        self._owner[other], self._owner[row] = self._owner[row], slot
-        self.outcomes[row].slot = slot
-        if other != row and self.outcomes[other].result is Result.BEFORE:
-            self.outcomes[other].result = Result.LEFT
-
-    def _held_by(self, slot: int, row: int) -> str | None:
-        """The pad that was found to have this node, now and not in an earlier run, if it is another one."""
-        other = self._owner.index(slot)
-        known = other != row and self.outcomes[other].slot is not None
-        return self.outcomes[other].name if known else None
-
     # Presses ----------------------------------------------------------------------------------------------
 
     def _press(self, row: int, prompt: str, expected: int | None = None) -> Press:
@@ -361,7 +269,7 @@ class Session:
         complaint: str | None = None
         for _ in range(_TRIES):
             self._say(prompt, "ask")
-            press = self._await_press(self._owner[row] if expected is None else expected)
+            press = self._await_press(self.ledger.slot(row) if expected is None else expected)
             complaint = self._complaint(press, expected)
             if complaint is None:
                 self._say(f"  felt by {self._node_text(press.slot)}; let go.")
@@ -440,33 +348,6 @@ class Session:
     def _shares_of(self, row: int) -> Shares:
         pad = self.outcomes[row].pad
         return Shares(network_of(pad, self._deployment.sheets[pad.sheet]), surface_of(pad))
-
-    # Results ----------------------------------------------------------------------------------------------
-
-    def _touches(self, row: int, slot: int) -> bool:
-        return self.outcomes[row].slot is not None or slot != row
-
-    def _robbed(self, kept: Sequence[int], found: Mapping[int, Edit]) -> list[int]:
-        """Pads whose serial number turned out to be another node's."""
-        serials = {edit.serial for edit in found.values()} - {None}
-        return [row for row in kept if self.outcomes[row].pad.serial in serials]
-
-    def _edit(self, row: int) -> Edit:
-        """A pad with the node that it is known or believed to have."""
-        outcome, slot = self.outcomes[row], self._owner[row]
-        node = self.outcomes[slot].pad  # as configured, what the slot stands for
-        electrodes = outcome.electrodes or outcome.pad.electrodes
-        return Edit(node.bus, node.node_id, node.node, self._serial(slot), electrodes)
-
-    def _serial(self, slot: int) -> int | None:
-        """As read from the node; none where it has none, or one that others have too."""
-        nodes = self._hand.nodes
-        if nodes[slot].identity is None:  # never heard: nothing better is known
-            told = {node.serial for node in nodes}
-            configured = self.outcomes[slot].pad.serial
-            return None if configured in told else configured
-        serial = nodes[slot].serial
-        return serial if serial and [node.serial for node in nodes].count(serial) == 1 else None
 
     def _node_text(self, slot: int) -> str:
         node = self._hand.nodes[slot]
