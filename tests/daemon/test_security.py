@@ -61,7 +61,7 @@ class Served:
         self.gate = Gate(self.context, folder)
         self.publisher = Publisher(self.context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", self.gate)
         self.control = Control(self.context, "tcp://127.0.0.1:*", self.gate)
-        self.control.commands["status"] = lambda: {"answer": 42}
+        self.control.commands["status"] = lambda _, __: {"answer": 42}
         self.live = self.publisher.endpoints["live"]
         self.skipped_ns = 0
         self.now_ns = _SECOND_NS
@@ -76,7 +76,7 @@ class Served:
             self.now_ns = time_ns + self.skipped_ns
             self.gate.poll(self.now_ns)
             self.publisher.take_subscriptions(self.now_ns)
-            self.control.poll()
+            self.control.poll(self.now_ns)
             self.publisher.send(_health(self.publisher.next_seq("health/h/thumb")))
 
     def until(self, met: Callable[[], bool]) -> None:
@@ -319,14 +319,14 @@ def test_ipc_is_the_file_systems_business(folder: Path, endpoints: dict[str, str
         gate = Gate(context, folder)
         publisher = Publisher(context, endpoints["live"], endpoints["complete"], gate)
         control = Control(context, endpoints["control"], gate)
-        control.commands["status"] = dict
+        control.commands["status"] = lambda _, __: {}
         with context.socket(zmq.REQ) as asker:
             asker.setsockopt(zmq.LINGER, 0)
             asker.connect(endpoints["control"])
             asker.send(b"?")
             while not asker.poll(5):
                 gate.poll(0)
-                control.poll()
+                control.poll(_SECOND_NS)
         publisher.close()
         control.close()
         gate.close()

@@ -15,9 +15,12 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from handtouch.canbus import eds
 from handtouch.canbus.channels import channels_of
@@ -28,6 +31,7 @@ from handtouch.canbus.router import SYNC_ID
 from handtouch.canbus.sync import Sync
 from handtouch.config import ConfigError, Deployment, load, with_bus
 from handtouch.daemon import histogram, logs
+from handtouch.daemon.commands import Commands
 from handtouch.daemon.control import Control
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.notify import Notifier, Pulse
@@ -35,6 +39,7 @@ from handtouch.daemon.pacer import Pacer
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.report import Report
+from handtouch.daemon.scene import Demand, Needs, Scenes, Wanted
 from handtouch.daemon.security import Gate
 from handtouch.keys import KeysError
 
@@ -44,11 +49,16 @@ _log = logging.getLogger("handtouch.daemon")
 class Daemon:
     """A deployment at work: `open` it, `run` it in one thread until told to stop, `close` it.
 
-    Raises BusError or OSError, each naming what is missing and a remedy, when a bus or an endpoint can't be
-    opened; KeysError for keys that can't be used.
+    `read` reads the deployment anew when control asks for it. Raises BusError or OSError, each naming what is
+    missing and a remedy, when a bus or an endpoint can't be opened; KeysError for keys that can't be used.
     """
 
-    def __init__(self, deployment: Deployment, model: PadModel | None = None) -> None:
+    def __init__(
+        self,
+        deployment: Deployment,
+        model: PadModel | None = None,
+        read: Callable[[], Deployment] | None = None,
+    ) -> None:
         self.deployment = deployment
         settings = deployment.daemon
         period_ns = round(settings.sync_period_ms * 1e6)
@@ -85,8 +95,13 @@ class Daemon:
             self.gate,
             self.control,
         )
-        self.pacer = Pacer(deployment, self.pipeline, self.master, self.sync)
-        self.control.commands["status"] = self.report.status
+        names = [(hand.name, pad.link) for hand in deployment.hands for pad in hand.pads]
+        scenes = Scenes(deployment.scene, names)
+        self.pacer = Pacer(deployment, scenes.needs.pads, self.pipeline, self.master, self.sync)
+        self.demand = Demand(scenes, self.publisher, 1e9 / period_ns, self._apply)
+        self.demand.step(time.monotonic_ns())
+        commands = Commands(deployment, read, self.pipeline, self.report, self.demand, self.pacer)
+        self.control.commands.update(commands.by_name)
 
     def __enter__(self) -> Daemon:
         return self
@@ -158,6 +173,13 @@ class Daemon:
                 else:
                     self.master.handle(port.name, can_id, data, t_ns)
 
+    def _apply(self, wanted: Wanted, needs: Needs, enabled: NDArray[np.bool_], now_ns: int) -> None:
+        """Do what is wanted now, and no more."""
+        self.pipeline.tick.want(*wanted)
+        self.pipeline.frames_every = self.demand.frames_every
+        self.pacer.set_needs(needs.pads & enabled, needs.raw, now_ns)
+        self.report.set_disabled(self.demand.disabled_by)
+
     def _after_tick(self, alive: Callable[[int], None]) -> None:
         """What may wait until the contacts are out."""
         lap = self.report.stages.lap
@@ -173,7 +195,8 @@ class Daemon:
         lap(histogram.REPORT, time.monotonic_ns())
         self.gate.poll(now_ns)
         self.publisher.take_subscriptions(now_ns)
-        self.control.poll()
+        self.demand.step(now_ns)
+        self.control.poll(now_ns)
         alive(now_ns)
         lap(histogram.REQUESTS, time.monotonic_ns())
 
@@ -183,11 +206,7 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
     try:
-        deployment = load(config_path)
-        for bus in buses:
-            deployment = with_bus(deployment, bus)
-        for kind in deployment.nodes.values():
-            channels_of(kind.channels, kind.eds)  # a mistake in it must show before a bus is touched
+        deployment = _read(config_path, buses)
     except (ConfigError, eds.EdsError) as error:
         print(error, file=sys.stderr)
         return 2
@@ -196,7 +215,7 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
         signal.signal(number, lambda *_: stop.set())
     notifier = Notifier()
     try:
-        daemon = Daemon(deployment)
+        daemon = Daemon(deployment, read=partial(_read, config_path, buses))
     except KeysError as error:  # no restart mends it
         print(error, file=sys.stderr)
         return 2
@@ -210,6 +229,16 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
         notifier.send("STOPPING=1")
     notifier.close()
     return 0
+
+
+def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
+    """The deployment in a file, with other buses. Raises ConfigError, EdsError."""
+    deployment = load(config_path)
+    for bus in buses:
+        deployment = with_bus(deployment, bus)
+    for kind in deployment.nodes.values():
+        channels_of(kind.channels, kind.eds)  # a mistake in it must show before a bus is touched
+    return deployment
 
 
 def _announce(daemon: Daemon) -> None:

@@ -63,6 +63,10 @@ class Messages:
                     outlet.send(self._contact(pad, event, ticked.t_ns, now_ns))
         self._tick.contacts.forget(ticked.ended)
 
+    def adopt(self, model: PadModel) -> None:
+        """Tell of another model of the same pads from now on."""
+        self._model = model
+
     def end_all(self, t_ns: int, outlet: Outlet) -> None:
         """Send the end of every contact, for the daemon stops."""
         touching = np.flatnonzero(self._tick.contacts.touching)
@@ -149,6 +153,8 @@ class Messages:
         located = all(map(math.isfinite, position))
         force_n = _finite(columns.force_n[pad])
         strength = "invalid" if force_n is None else "saturated" if columns.saturated[pad] else "valid"
+        if not self._tick.follower.weighed[pad]:
+            strength = "skipped"
         state = PadState(int(columns.state[pad]))
         return wire.Contact(
             v=wire.SCHEMA_VERSION,
@@ -167,7 +173,7 @@ class Messages:
             normal=tuple(columns.normal[pad].tolist()) if located else None,
             covariance_m2=tuple(columns.covariance_m2[pad].ravel().tolist()) if located else None,
             pad_m=tuple(columns.pad_m[pad].tolist()) if located else None,
-            location="valid" if located else "invalid",
+            location="valid" if located else "invalid" if self._tick.wanted[pad] else "skipped",
             force_n=force_n,
             force_std_n=_finite(columns.force_std_n[pad]) if strength == "valid" else None,
             peak_force_n=_finite(contacts.peak_n[pad]),

@@ -50,6 +50,7 @@ class PadModel:
         counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
         self.noise_counts = np.array(counts)
         self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
+        self.largest_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = np.ones((self.size, 4))
         self.offset_counts = np.zeros((self.size, 4))

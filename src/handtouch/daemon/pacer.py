@@ -1,12 +1,10 @@
 """What a scene doesn't need isn't done: pads outside it rest, untouched ones send when something moves.
 
-Public names: `Pacer`, `select`.
+Public names: `Pacer`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from fnmatch import fnmatchcase
 from typing import Protocol
 
 import numpy as np
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from handtouch.canbus.lifecycle import NodeState
 from handtouch.canbus.master import Master
 from handtouch.config import Deployment
+from handtouch.config.tables import Scene
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.wire import PadState
 
@@ -27,52 +26,53 @@ class Beat(Protocol):
     def set_period(self, period_ns: int, now_ns: int) -> None: ...
 
 
-def select(patterns: Sequence[str], names: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
-    """Which of the pads (hand, link) a scene's patterns name: "thumb_*", "left/index_distal".
-
-    Raises ValueError for a pattern that names none.
-    """
-    chosen = np.zeros(len(names), dtype=np.bool_)
-    for pattern in patterns:
-        full = pattern if "/" in pattern else f"*/{pattern}"
-        hits = [fnmatchcase(f"{hand}/{link}", full) for hand, link in names]
-        if not any(hits):
-            known = ", ".join(f"{hand}/{link}" for hand, link in names)
-            raise ValueError(f'no pad is named "{pattern}"; there are {known}')
-        chosen |= np.array(hits)
-    return chosen
-
-
 class Pacer:
     """Sets the pace of nodes and SYNC; `step` it after every tick. Times in ns.
 
-    `needed` (n,) are the pads in the scene; `slow`: every one of them waits for something to move, so SYNC is
-    slow and a sample that comes is worth a tick of its own.
+    `needed` (n,) are the pads in the scene, `kept` (n,) those of them that follow SYNC also while untouched;
+    `slow`: every one of them waits for something to move, so SYNC is slow and a sample that comes is worth a
+    tick of its own.
     """
 
-    def __init__(self, deployment: Deployment, pipeline: Pipeline, master: Master, sync: Beat) -> None:
-        pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
-        kinds = [deployment.nodes[pad.node] for _, pad in pads]
-        scene = deployment.scene
-        self.names = [(hand, pad.link) for hand, pad in pads]
-        self.needed: NDArray[np.bool_] = select(scene.links, self.names)
+    def __init__(
+        self,
+        deployment: Deployment,
+        needed: NDArray[np.bool_],
+        pipeline: Pipeline,
+        master: Master,
+        sync: Beat,
+    ) -> None:
+        pads = [pad for hand in deployment.hands for pad in hand.pads]
+        kinds = [deployment.nodes[pad.node] for pad in pads]
+        self.needed: NDArray[np.bool_] = needed.copy()
+        self.kept = np.zeros(len(pads), dtype=np.bool_)
         self.slow = False
         self._pipeline, self._master, self._sync = pipeline, master, sync
         self._delta = np.array([kind.idle.delta_counts if kind.idle else 0 for kind in kinds])
         self._idles = bool((self._delta > 0).any())
-        self._idle_after_ns = round(scene.idle_after_s * 1e9)
         self._full_ns = round(deployment.daemon.sync_period_ms * 1e6)
-        self._slow_ns = max(round(scene.idle_sync_period_ms * 1e6), self._full_ns)
+        self.set_idle(deployment.scene)
         self._active_ns = np.zeros(len(pads), dtype=np.int64)
         self._quiet = np.zeros((len(pads), 4), dtype=np.int64)  # counts of event-driven pads when last seen
         self._look_ns = 0
         self._paces = 0
 
-    def set_scene(self, needed: NDArray[np.bool_], now_ns: int) -> None:
-        """Other pads are needed from now on, (n,)."""
+    def set_idle(self, scene: Scene) -> None:
+        """Other times after which pads are idle, and of SYNC then."""
+        self._idle_after_ns = round(scene.idle_after_s * 1e9)
+        self._slow_ns = max(round(scene.idle_sync_period_ms * 1e6), self._full_ns)
+
+    def set_needs(self, needed: NDArray[np.bool_], kept: NDArray[np.bool_], now_ns: int) -> None:
+        """Other pads are needed, and kept at full rate, from now on, (n,)."""
         self._active_ns[needed & ~self.needed] = now_ns
-        self.needed = needed.copy()
+        self.needed, self.kept = needed.copy(), kept.copy()
         self._look_ns = 0
+
+    def attend(self, pads: NDArray[np.bool_], now_ns: int) -> None:
+        """Sample these pads (n,) with SYNC, as if something had moved."""
+        self._active_ns[pads] = now_ns
+        if (pads & ~self._pipeline.tick.synchronous).any():
+            self._look_ns = 0
 
     def step(self, now_ns: int) -> None:
         """Wake what moved, at once; let rest, now and then, what didn't."""
@@ -103,16 +103,22 @@ class Pacer:
         master, tick = self._master, self._pipeline.tick
         for slot in np.flatnonzero(self.needed == (master.states == NodeState.STOPPED)).tolist():
             master.rest(slot, not self.needed[slot], now_ns)
-        if not self._idles:
-            return
+        waiting = self.needed & ~tick.synchronous & (master.states == NodeState.OPERATIONAL)
+        if self._idles:
+            self._let_idle(now_ns)
+        rests = bool(waiting.any()) or not self.needed.any()
+        self._set_slow(rests and not self._with_sync().any(), now_ns)
+
+    def _let_idle(self, now_ns: int) -> None:
+        """Pads untouched for long enough become event-driven, others follow SYNC."""
+        master, tick = self._master, self._pipeline.tick
+        self._active_ns[self.kept] = now_ns
         untouched = now_ns - self._active_ns > self._idle_after_ns
         for slot in np.flatnonzero(self.needed & untouched & tick.synchronous).tolist():
             self._quiet[slot] = tick.counts[slot]
             master.pace(slot, True, now_ns)
         for slot in np.flatnonzero(self.needed & ~untouched & ~tick.synchronous).tolist():
             master.pace(slot, False, now_ns)
-        waiting = self.needed & ~tick.synchronous & (master.states == NodeState.OPERATIONAL)
-        self._set_slow(bool(waiting.any()) and not self._with_sync().any(), now_ns)
 
     def _with_sync(self) -> NDArray[np.bool_]:
         """Pads whose node is up and samples with SYNC."""

@@ -33,6 +33,8 @@ class Pipeline:
         self.messages = Messages(model, self.tick, run)
         self.node_state: NDArray[np.uint8] = np.full(model.size, PadState.STARTING, dtype=np.uint8)
         self.ticks = 0
+        self.frames_every = 1
+        """ticks from one frame of a hand to the next"""
         self.stepped: Callable[[], None] = lambda: None
         """called between the step of a tick and its messages, for who watches the time"""
         self._outlet = outlet
@@ -63,6 +65,12 @@ class Pipeline:
         self.begin(now_ns, now_ns)
         return self._tick(now_ns, _FOREVER_NS)
 
+    def adopt(self, model: PadModel, changed: NDArray[np.intp]) -> None:
+        """Go on with another model of the same pads, some of them changed; between two ticks."""
+        self.model = model
+        self.tick.adopt(model, changed)
+        self.messages.adopt(model)
+
     def settle(self) -> None:
         """Do what makes the next tick quick and can wait until messages are out; `begin` does it at last."""
         self.tick.settle()
@@ -78,7 +86,8 @@ class Pipeline:
         ticked = self.tick.step(self.slab, self.node_state, self.cycle, now_ns, until_ns)
         self.stepped()
         self.messages.send_contacts(ticked, now_ns, self._outlet)
-        self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
+        if self.ticks % self.frames_every == 0:
+            self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
         return ticked
 
     def _complete(self) -> bool:

@@ -67,10 +67,11 @@ class Report:
         self._sync = sync
         self._publisher = publisher
         self._gate, self._control = gate, control
-        self.listener: Callable[[wire.Message], None] = lambda _: None
+        self.listener: Callable[[wire.Health | wire.Service], None] = lambda _: None
         """is given every health and service message, subscribed or not"""
         self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
         self._names = [(hand, pad.link) for hand, pad in self._pads]
+        self._disabled_by: dict[int, str] = {}
         self._events_before: set[int] = set()
         self._told = np.full(n, PadState.STARTING, dtype=np.uint8)
         self._was_up = np.zeros(n, dtype=np.bool_)
@@ -87,6 +88,12 @@ class Report:
         """A tick took from `from_ns`, its last sample read, to `to_ns`, its messages out."""
         self._durations_ns.append(to_ns - from_ns)
         self.stages.ticked(self._pipeline.cycle.t_ns, self._sync.period_ns, from_ns, to_ns)
+
+    def set_disabled(self, disabled_by: Mapping[int, str]) -> None:
+        """Pads that somebody switched off, with the names of who did; they are off at once."""
+        if disabled_by != self._disabled_by:
+            self._disabled_by = dict(disabled_by)
+            self._translate()
 
     def poll(self, now_ns: int) -> None:
         """Take over the master's view of the nodes; tell what changed, and everything from time to time."""
@@ -131,6 +138,13 @@ class Report:
             "pads": [asdict(self._health(pad, now_ns, status, 0)) for pad, status in enumerate(statuses)],
         }
 
+    def summary(self) -> str:
+        """How the hands fare, in a line."""
+        states = self._master.states
+        up = int(np.count_nonzero((states == NodeState.OPERATIONAL) | (states == NodeState.STOPPED)))
+        hands = ", ".join(hand.name for hand in self._deployment.hands)
+        return f"{hands}: {up} of {len(self._pads)} nodes up, {self._speeds.get('ticks', 0.0):.0f} ticks/s"
+
     def _translate(self) -> None:
         """From node states to what the tick makes of them; a node that was up and is absent is lost."""
         for slot, state in enumerate(map(NodeState, self._master.states.tolist())):
@@ -139,6 +153,7 @@ class Report:
             self._pipeline.node_state[slot] = (
                 missing if state == NodeState.ABSENT else _PAD_OF_NODE.get(state, PadState.STARTING)
             )
+        self._pipeline.node_state[list(self._disabled_by)] = PadState.OFF
 
     def _health(self, pad: int, now_ns: int, status: NodeStatus, seq: int | None = None) -> wire.Health:
         hand, settings = self._pads[pad]
@@ -161,7 +176,7 @@ class Report:
             node=status.state.name.lower(),
             since_ns=status.since_ns,
             pace="off" if state == PadState.OFF else "event" if status.idle else "sync",
-            reason=explain(state, status.state, status.reason, counts, railed),
+            reason=self._why_disabled(pad) or explain(state, status.state, status.reason, counts, railed),
             serial=status.serial,
             rate_hz=float(self._rate_hz[pad]) if state <= PadState.TOUCHED else 0.0,
             samples=int(self._pipeline.tick.samples[pad]),
@@ -172,6 +187,10 @@ class Report:
             emergencies=tuple(str(emergency) for emergency in status.emergencies),
             repeat=False,
         )
+
+    def _why_disabled(self, pad: int) -> str:
+        by = self._disabled_by.get(pad)
+        return f"disabled by {by}; `handtouch enable` switches it on" if by else ""
 
     def _service(self, now_ns: int, seq: int) -> wire.Service:
         bit_rates = {bus.name: bus.bitrate_bit_s for bus in self._deployment.buses}

@@ -110,6 +110,11 @@ class Scenes:
         if known is None or known[0] != scene:
             self._rejoin()
 
+    def held_by(self, client: str) -> Wants | None:
+        """The scene of a client, if it holds one."""
+        held = self._clients.get(client)
+        return held[0] if held else None
+
     def leave(self, client: str) -> None:
         """A client needs its scene no more."""
         if self._clients.pop(client, None):
@@ -184,6 +189,8 @@ class Demand:
         self._listeners, self._tick_hz, self._apply = listeners, tick_hz, apply
         self._seen: object = None
         self._disabled_version = 0
+        self.frames_every = 1
+        """ticks from one frame of a hand to the next: as its busiest pad needs"""
         none = np.zeros(n, dtype=np.bool_)
         self.wanted = Wanted(none, none, np.zeros(n), np.ones(n, dtype=np.int64))
 
@@ -265,4 +272,5 @@ class Demand:
             tolerance_m=np.where(needs.location | needs.strength, needs.tolerance_m, 0.0),
             every=np.maximum(every, 1).astype(np.int64),
         )
+        self.frames_every = int(self.wanted.every[needs.pads].min()) if needs.pads.any() else 1
         self._apply(self.wanted, needs, enabled, now_ns)

@@ -136,13 +136,14 @@ class Tick:
         """since when that is so"""
         self.synchronous = np.ones(model.size, dtype=np.bool_)
         """pads that sample with SYNC; the others when something moves, and are not waited for"""
+        self.wanted = np.ones(model.size, dtype=np.bool_)
+        """pads whose contacts are located; `want` sets it"""
         self.follower = Follower(model)
         self._read = _NOTHING_READ  # contacts of the last step: pads and currents
         self._behind = np.full((model.size, 4), np.nan)  # their currents, smoothed: as they were a while ago
         self._located = self.columns.located.view("<f4").reshape(model.size, -1)
         self._none = np.zeros(model.size, dtype=np.bool_)
         self._steps = 0
-        self._wanted = np.ones(model.size, dtype=np.bool_)  # pads to locate
         self._every = np.ones(model.size, dtype=np.int64)  # steps from one update to the next
         self._sparse = False  # whether anything is not wanted at every step
         self._least_counts = -_SOURCE_STD * model.noise_counts[:, None]
@@ -161,10 +162,10 @@ class Tick:
         every: NDArray[np.int64],
     ) -> None:
         """Locate, weigh, and update every so many steps only what somebody wants; all (n,), copied."""
-        changed = np.flatnonzero((located != self._wanted) | (weighed != self.follower.weighed))
+        changed = np.flatnonzero((located != self.wanted) | (weighed != self.follower.weighed))
         self.forget(changed)
         self.follower.weighed[:], self.follower.tolerance_m[:] = weighed, tolerance_m
-        self._wanted[:], self._every[:] = located, every
+        self.wanted[:], self._every[:] = located, every
         self._sparse = not (located.all() and (every == 1).all())
 
     def solve_all(self) -> None:
@@ -224,7 +225,7 @@ class Tick:
         if self._sparse:
             due = self._steps % self._every[telling] == 0
             telling = telling[due | np.isin(telling, began)]
-            solved = telling[self._wanted[telling]]
+            solved = telling[self.wanted[telling]]
         if len(solved):
             self._solve(solved)
         if len(ended):
