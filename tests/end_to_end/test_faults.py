@@ -1,0 +1,32 @@
+"""A fault of each kind is told with its cause, disturbs nobody else, and is over when it is taken back."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+KINDS = 44
+
+
+@pytest.mark.timeout(300)
+def test_campaign_of_one_fault_of_each_kind_leaves_nothing_behind(tmp_path: Path) -> None:
+    """With the limits of a busy machine; the figures are in docs/benchmarks/faults.md."""
+    options = ["--faults", str(KINDS), "--rate", "5", "--period-ms", "20", "--patience", "4"]
+    done = subprocess.run(
+        [sys.executable, "benchmarks/stress_faults.py", *options, "--out", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    (results,) = json.loads((tmp_path / "faults.json").read_text()).values()
+    assert len(results["kinds"]) == KINDS == results["faults"]
+    assert all(row["told"] in (None, row["number"]) for row in results["kinds"])
+    assert results["samples_sent"] > 5000
+    assert results["samples_lost"] == len(results["exceptions"]) == results["exit_status"] == 0
