@@ -25,9 +25,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # small arrays all through: threads of the linear algebra would only fight the hot thread for a core
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     asked = build_parser().parse_args(arguments)
-    command: Command = asked.command
+    run: Command = asked.command
     try:
-        return command(asked)
+        return run(asked)
     except KeyboardInterrupt:
         return 0
     except BrokenPipeError:  # the reader of our output left, as `| head` does
@@ -37,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
+    from handtouch.control_cli import add_control
+
     parser = argparse.ArgumentParser(
         prog="handtouch",
         epilog=_EXIT,
@@ -46,16 +48,15 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_serving(commands)
     _add_looking(commands)
+    add_control(commands)
     _add_keys(commands)
     _add_checking(commands)
     return parser
 
 
 def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    demo = _command(
-        commands, "demo", _demo, "a simulated hand, the daemon and a live view, for half a minute"
-    )
-    demo.add_argument("--seconds", type=_positive, help="end after so long (default: when the scenario ends)")
+    demo = command(commands, "demo", _demo, "a simulated hand, the daemon and a live view, for half a minute")
+    demo.add_argument("--seconds", type=positive, help="end after so long (default: when the scenario ends)")
     demo.add_argument("--plain", action="store_true", help="lines instead of the live view")
     demo.add_argument(
         "--tolerances", action="store_true", help="hide tolerances of parts from the estimator too"
@@ -63,22 +64,20 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     demo.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
     demo.add_argument("--config", type=Path, help="deployment to simulate (default: the shipped hand)")
 
-    run = _command(commands, "run", _run, "serve the pads of a deployment until told to stop")
+    run = command(commands, "run", _run, "serve the pads of a deployment until told to stop")
     _add_config(run)
     _add_bus(run)
 
-    simulate = _command(
-        commands, "simulate", _simulate, "simulated nodes for a deployment, on its real buses"
-    )
+    simulate = command(commands, "simulate", _simulate, "simulated nodes for a deployment, on its real buses")
     _add_config(simulate)
     _add_bus(simulate)
     simulate.add_argument("--scenario", type=Path, help="touches to play (default: a tour over the pads)")
     simulate.add_argument("--truth", type=Path, help="write what really happened to this file, as JSON lines")
-    simulate.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    simulate.add_argument("--seconds", type=positive, help="end after so long (default: on Ctrl-C)")
     simulate.add_argument("--tolerances", action="store_true", help="tolerances of parts besides the noise")
     simulate.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
 
-    replay = _command(commands, "replay", _replay, "feed a recorded CAN log through the same pipeline")
+    replay = command(commands, "replay", _replay, "feed a recorded CAN log through the same pipeline")
     replay.add_argument(
         "log", type=Path, help="log in any format of python-can: candump .log, .asc, .blf, .gz ..."
     )
@@ -91,22 +90,22 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    watch = _command(commands, "watch", _watch, "show what a running daemon publishes")
+    watch = command(commands, "watch", _watch, "show what a running daemon publishes")
     watch.add_argument("pattern", nargs="*", help='topics such as "contact/*/thumb_*", "hand/*", "service"')
-    _add_endpoint(watch, LIVE, "stream to listen to")
+    add_endpoint(watch, LIVE, "stream to listen to")
     style = watch.add_mutually_exclusive_group()
     style.add_argument(
         "--plain", dest="style", action="store_const", const="plain", help="lines, in a terminal too"
     )
     style.add_argument("--json", dest="style", action="store_const", const="json", help="JSON lines")
-    watch.add_argument("--seconds", type=_positive, default=0.0, help="end after so long")
+    watch.add_argument("--seconds", type=positive, default=0.0, help="end after so long")
 
-    status = _command(commands, "status", _status, "how the daemon, its buses and its pads fare")
-    _add_endpoint(status, CONTROL, "control endpoint")
+    status = command(commands, "status", _status, "how the daemon, its buses and its pads fare")
+    add_endpoint(status, CONTROL, "control endpoint")
     status.add_argument("--json", action="store_true", help="as JSON")
 
 
-def _add_endpoint(parser: argparse.ArgumentParser, default: str, text: str) -> None:
+def add_endpoint(parser: argparse.ArgumentParser, default: str, text: str) -> None:
     parser.add_argument("--endpoint", default=default, help=f"{text} (default: {default})")
     parser.add_argument(
         "--key",
@@ -124,11 +123,11 @@ def _add_keys(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     actions = keys.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    make = _command(actions, "make", _keys_make, "make a daemon's keys, in a new folder")
+    make = command(actions, "make", _keys_make, "make a daemon's keys, in a new folder")
     make.add_argument("folder", type=Path, help="to make; [daemon] keys in the deployment names it")
     make.add_argument("--name", help="what clients call this daemon (default: the name of this machine)")
 
-    client = _command(actions, "client", _keys_client, "make a client's key, and let it in")
+    client = command(actions, "client", _keys_client, "make a client's key, and let it in")
     client.add_argument("folder", type=Path, help="the daemon's keys")
     client.add_argument("name", help="what the daemon calls the client")
     client.add_argument(
@@ -136,47 +135,47 @@ def _add_keys(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     client.add_argument("--out", type=Path, help="file for the client to take along (default: NAME.key)")
 
-    listed = _command(actions, "list", _keys_list, "who is let in")
+    listed = command(actions, "list", _keys_list, "who is let in")
     listed.add_argument("folder", type=Path, help="the daemon's keys")
     listed.add_argument("--json", action="store_true", help="as JSON")
 
-    revoke = _command(actions, "revoke", _keys_revoke, "let a client in no more")
+    revoke = command(actions, "revoke", _keys_revoke, "let a client in no more")
     revoke.add_argument("folder", type=Path, help="the daemon's keys")
     revoke.add_argument("name", help="of the client")
 
 
 def _add_checking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    check = _command(commands, "check", _check, "check a deployment, compute its bus load, warn")
+    check = command(commands, "check", _check, "check a deployment, compute its bus load, warn")
     check.add_argument("config", type=Path, nargs="?", help="deployment file")
     check.add_argument("--json", action="store_true", help="as JSON")
     check.add_argument(
         "--schema", action="store_true", help="print the JSON schema of deployment files instead"
     )
 
-    doctor = _command(commands, "doctor", _doctor, "what this machine lacks to serve a deployment")
+    doctor = command(commands, "doctor", _doctor, "what this machine lacks to serve a deployment")
     doctor.add_argument("config", type=Path, nargs="?", help="deployment file")
     doctor.add_argument("--json", action="store_true", help="as JSON")
 
     _add_scan(commands)
     _add_commission(commands)
 
-    figures = _command(commands, "figures", _figures, "redraw the paper's theoretical figures")
+    figures = command(commands, "figures", _figures, "redraw the paper's theoretical figures")
     figures.add_argument("--out", type=Path, default=Path("figures"), help="folder (default: figures)")
 
-    design = _command(commands, "design", _design, "expected location error of a pad as configured")
+    design = command(commands, "design", _design, "expected location error of a pad as configured")
     _add_config(design)
     design.add_argument("--link", help="pad to draw (default: the first)")
     design.add_argument("--out", type=Path, default=Path("design"), help="folder (default: design)")
 
 
 def _add_scan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    scan = _command(
+    scan = command(
         commands, "scan", _scan, "who is on the buses, with what a deployment file needs to know of them"
     )
     scan.add_argument("config", type=Path, nargs="?", help="deployment file to compare with")
     _add_bus(scan, "a bus to look at, or another python-can interface for one of the deployment")
     scan.add_argument(
-        "--seconds", type=_positive, help="listen for so long first (default: 1, with --listen 5)"
+        "--seconds", type=positive, help="listen for so long first (default: 1, with --listen 5)"
     )
     scan.add_argument("--json", action="store_true", help="as JSON")
     asking = scan.add_mutually_exclusive_group()
@@ -191,14 +190,14 @@ def _add_scan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     scan.add_argument(
         "--lss-wait-ms",
-        type=_positive,
+        type=positive,
         default=5.0,
         help="wait at least so long for LSS answers (default: 5)",
     )
 
 
 def _add_commission(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    commission = _command(
+    commission = command(
         commands,
         "commission",
         _commission,
@@ -217,11 +216,11 @@ def _add_commission(commands: argparse._SubParsersAction[argparse.ArgumentParser
     commission.add_argument("--dry-run", action="store_true", help="show what would change, write nothing")
     commission.add_argument("--yes", action="store_true", help="take swapped nodes over without asking")
     commission.add_argument(
-        "--seconds", type=_positive, default=60.0, help="wait so long for a press or a key (default: 60)"
+        "--seconds", type=positive, default=60.0, help="wait so long for a press or a key (default: 60)"
     )
 
 
-def _command(
+def command(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, function: Command, text: str
 ) -> argparse.ArgumentParser:
     description = text[0].upper() + text[1:] + "."
@@ -379,7 +378,7 @@ def _design(asked: argparse.Namespace) -> int:
     return design.run(asked.config, asked.out, link=asked.link)
 
 
-def _positive(text: str) -> float:
+def positive(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -406,4 +405,4 @@ def _seed(text: str) -> int:
 
 
 def _speed(text: str) -> float:
-    return 0.0 if text == "max" else _positive(text)
+    return 0.0 if text == "max" else positive(text)

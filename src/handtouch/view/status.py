@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from handtouch.client import CONTROL, request
+from handtouch.view.scene import scene_lines
 
 _WIDE = 200
 """Columns where there is no terminal to ask: a line a pad, for grep."""
@@ -59,6 +60,8 @@ def _show(answer: dict[str, Any], console: Console) -> None:
             + (f"; error frames: {', '.join(told)}" if told else "")
             + (f" [red]{problems}[/red]" if problems else "")
         )
+    for line in scene_lines(answer["scene"]):
+        console.print(line, highlight=False, markup=False)
     table = Table(box=None, pad_edge=False, header_style="dim")
     for column in ("link", "pad", "node", "id", "serial", "Hz", "missed", "beats missed", "reboots", "why"):
         number = column in ("id", "serial", "Hz", "missed", "beats missed", "reboots")
