@@ -25,6 +25,7 @@ import zmq
 
 from handtouch import config, keys
 from handtouch.canbus.receivers import RECEIVE_BUFFER_BYTES
+from handtouch.daemon import realtime
 
 State = Literal["ok", "warn", "fail"]
 _TAKEN = "is a daemon running (`handtouch status`)? Else choose another in [daemon]"
@@ -101,6 +102,18 @@ def examine(deployment: config.Deployment | None, machine: Machine | None = None
         yield from bus_findings(bus, machine)
     yield from endpoint_findings(deployment.daemon if deployment else config.Daemon())
     yield from key_findings(deployment.daemon if deployment else config.Daemon())
+    yield from realtime_findings(deployment.daemon if deployment else config.Daemon())
+
+
+def realtime_findings(daemon: config.Daemon) -> Iterator[Finding]:
+    """Whether a daemon of this user gets the priority, processors and memory that it asks for."""
+    if not (daemon.realtime_priority or daemon.cpus or daemon.lock_memory):
+        return
+    troubles = realtime.troubles(daemon)
+    for trouble in troubles:
+        yield Finding("real time", "warn", *trouble.split("; ", 1))
+    if not troubles:
+        yield Finding("real time", "ok", "priority, processors and memory as [daemon] asks")
 
 
 def key_findings(daemon: config.Daemon) -> Iterator[Finding]:

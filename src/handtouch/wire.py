@@ -7,6 +7,7 @@ SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil
 
 from __future__ import annotations
 
+import math
 import types
 import typing
 from collections.abc import Callable
@@ -209,7 +210,7 @@ class Service:
     """hand -> list of its links"""
     ticks: int
     overruns: int
-    """late ticks: messages out more than a period after their SYNC, or periods without any"""
+    """periods that passed without a tick because the daemon was late"""
     rate_hz: float
     tick_us: dict[str, Any]
     """median, p99 and max of the last half second's ticks, from the last sample to the last message"""
@@ -332,7 +333,8 @@ def _checked(topic: str, payload: dict[Any, Any], kind: type[Any]) -> dict[str, 
         except KeyError:
             raise WireError(f"{topic}: {name} is missing") from None
         except (TypeError, ValueError):
-            raise WireError(f"{topic}: {name} = {payload[name]!r:.60} has the wrong type") from None
+            given = type(payload[name]).__name__  # not the value: it may be nested too deeply to be told
+            raise WireError(f"{topic}: {name} can't be this {given}") from None
     return values
 
 
@@ -359,7 +361,12 @@ def _tuple(value: Any, item: Callable[[Any], Any], length: int | None) -> tuple[
 def _scalar(value: Any, accepted: tuple[type, ...], boolean: bool) -> Any:
     if not isinstance(value, accepted) or (isinstance(value, bool) and not boolean):
         raise TypeError
-    return float(typing.cast(float, value)) if accepted[0] is float else value
+    if accepted[0] is not float:
+        return value
+    number = float(typing.cast(float, value))
+    if not math.isfinite(number):
+        raise ValueError
+    return number
 
 
 _CHECKS = {

@@ -31,7 +31,7 @@ SERVICE = wire.Service(
     uptime_s=3.0, period_s=0.005,
     hands={"right": ["thumb_tip"]}, ticks=600, overruns=0, rate_hz=200.0,
     tick_us={"p50": 250.0, "p99": 400.0, "max": 500.0}, buses={"can0": {"load": 0.43}}, drops={},
-    subscriptions=(),
+    loop={}, contacts=0, refused={}, process={}, subscriptions=(),
 )  # fmt: skip
 
 

@@ -105,6 +105,8 @@ def _check_endpoints(daemon: Daemon) -> Iterator[Problem]:
             _is(daemon.keys),
             f"no such folder; `handtouch keys make {daemon.keys or 'keys'}` makes it",
         )
+    if daemon.metrics is not None and (trouble := _metrics_trouble(daemon.metrics)):
+        yield Problem("[daemon]: metrics", _is(daemon.metrics), trouble)
     seen: dict[str, str] = {}
     for key in ("live", "complete", "control", "inputs"):
         endpoint = getattr(daemon, key)
@@ -148,6 +150,18 @@ def _endpoint_trouble(endpoint: str, keys: bool) -> str:
         )
     if not re.fullmatch(r"\*|[A-Za-z0-9][A-Za-z0-9_.\-]*", host):
         return "needs the IPv4 address or the name of a network interface, such as eth0, or * for all"
+    return ""
+
+
+def _metrics_trouble(address: str) -> str:
+    host, _, port = address.rpartition(":")
+    if not host or not (port.isascii() and port.isdigit() and int(port[:6]) <= 65535):
+        return "must be HOST:PORT such as 127.0.0.1:9580"
+    if not _is_loopback(host):
+        return (
+            "reaches beyond this machine, and whoever asks gets an answer: keys don't guard HTTP; give "
+            f"127.0.0.1:{port}, and let a proxy with TLS or an SSH tunnel carry it to others"
+        )
     return ""
 
 

@@ -44,6 +44,20 @@ class Daemon(Table):
     )
     sync_period_ms: float = Field(5.0, ge=0.5, le=1000, description="period of SYNC and of the tick")
     window: Fraction = Field(0.6, description="part of the period after SYNC that a tick waits for samples")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        "info", description="how grave a message must be to be logged"
+    )
+    metrics: str | None = Field(
+        None,
+        description="loopback HOST:PORT that Prometheus reads from, e.g. 127.0.0.1:9580; left out: none",
+    )
+    realtime_priority: int = Field(
+        0, ge=0, le=99, description="SCHED_FIFO priority of the thread that ticks; 0: an ordinary thread"
+    )
+    cpus: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
+        (), description="processors that the thread that ticks may use; none given: any"
+    )
+    lock_memory: bool = Field(False, description="keep all memory of the daemon from being swapped out")
 
 
 class Bus(Table):

@@ -80,6 +80,11 @@ class Contacts:
         self._threshold = np.where(self.touching, self._least, on)
         self._need = np.stack([begin_samples, end_samples])
 
+    @property
+    def begun(self) -> int:
+        """Contacts that ever began."""
+        return self._next_id - 1
+
     def forget(self, ended: IntArray) -> None:
         """Clear the ids of ended contacts, once their last message is made."""
         self.id[ended] = 0

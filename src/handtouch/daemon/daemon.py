@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
@@ -30,9 +30,10 @@ from handtouch.canbus.port import BusError, Port
 from handtouch.canbus.router import SYNC_ID
 from handtouch.canbus.sync import Sync
 from handtouch.config import ConfigError, Deployment, load, with_bus
-from handtouch.daemon import histogram, logs
+from handtouch.daemon import histogram, logs, realtime
 from handtouch.daemon.commands import Commands
 from handtouch.daemon.control import Control
+from handtouch.daemon.metrics import PATH, Exporter
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.notify import Notifier, Pulse
 from handtouch.daemon.pacer import Pacer
@@ -135,6 +136,7 @@ class Daemon:
         sync, pacer, stages = self.sync, self.pacer, self.report.stages
         pipeline.stepped = lambda: stages.lap(histogram.TICK, time.monotonic_ns())
         sync.start(time.monotonic_ns())
+        stages.start(time.monotonic_ns())
         while not stop.is_set():
             now_ns = time.monotonic_ns()
             if (sync_ns := sync.poll(now_ns)) is not None:
@@ -203,8 +205,6 @@ class Daemon:
 
 def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     """`handtouch run`: serve a deployment until SIGINT or SIGTERM; exit status 0, 1 (no bus), 2 (config)."""
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
     try:
         deployment = _read(config_path, buses)
     except (ConfigError, eds.EdsError) as error:
@@ -213,22 +213,12 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    notifier = Notifier()
+    said = logs.start(deployment.daemon.log_level)
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
     try:
-        daemon = Daemon(deployment, read=partial(_read, config_path, buses))
-    except KeysError as error:  # no restart mends it
-        print(error, file=sys.stderr)
-        return 2
-    except (BusError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    with daemon:
-        _announce(daemon)
-        notifier.send("READY=1", f"STATUS=serving {daemon.pipeline.model.size} pads")
-        daemon.run(stop, _watchdog(notifier))
-        notifier.send("STOPPING=1")
-    notifier.close()
-    return 0
+        return _serve(deployment, stop, partial(_read, config_path, buses))
+    finally:
+        said.close()
 
 
 def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
@@ -241,24 +231,35 @@ def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
     return deployment
 
 
+def _serve(deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment]) -> int:
+    settings = deployment.daemon
+    notifier = Notifier()
+    with ExitStack() as opened:
+        opened.callback(notifier.close)
+        try:
+            daemon = opened.enter_context(Daemon(deployment, read=read))
+            if settings.metrics is not None:
+                exporter = opened.enter_context(closing(Exporter(settings.metrics)))
+                daemon.report.listener = exporter.take
+                _log.info("metrics http://%s%s", exporter.address, PATH)
+        except KeysError as error:  # no restart mends it
+            print(error, file=sys.stderr)
+            return 2
+        except (BusError, OSError) as error:
+            print(error, file=sys.stderr)
+            return 1
+        _announce(daemon)
+        for refused in realtime.apply(settings):
+            _log.warning("%s", refused)
+        watchdog_ns = int(os.environ.get("WATCHDOG_USEC", "0")) * 1000
+        daemon.run(stop, Pulse(notifier, watchdog_ns, daemon.report.summary).ticked)
+        notifier.send("STOPPING=1")
+    return 0
+
+
 def _announce(daemon: Daemon) -> None:
     where = ", ".join(f"{name} {endpoint}" for name, endpoint in daemon.publisher.endpoints.items())
     hands = ", ".join(f"{hand.name} ({len(hand.pads)} pads)" for hand in daemon.deployment.hands)
     buses = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in daemon.deployment.buses)
     _log.info("hand %s on bus %s", hands, buses)
     _log.info("%s, control %s", where, daemon.control.endpoint)
-
-
-def _watchdog(notifier: Notifier) -> Callable[[], None]:
-    """A function that reassures systemd's watchdog often enough, called after every tick."""
-    period_ns = int(os.environ.get("WATCHDOG_USEC", "0")) * 1000 // 3
-    last_ns = 0
-
-    def alive() -> None:
-        nonlocal last_ns
-        now_ns = time.monotonic_ns()
-        if period_ns and now_ns - last_ns >= period_ns:
-            last_ns = now_ns
-            notifier.send("WATCHDOG=1")
-
-    return alive

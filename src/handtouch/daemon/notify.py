@@ -1,9 +1,15 @@
-"""Tells systemd how the service fares (sd_notify protocol); does nothing where nobody listens."""
+"""Tells systemd how the service fares (sd_notify protocol); does nothing where nobody listens.
+
+Public names: `Notifier`, `Pulse`.
+"""
 
 from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Callable
+
+_STATUS_NS = 1_000_000_000
 
 
 class Notifier:
@@ -31,3 +37,29 @@ class Notifier:
         """Let go of the socket."""
         if self._socket is not None:
             self._socket.close()
+
+
+class Pulse:
+    """What systemd hears after ticks, and only then: READY after the first, its watchdog's food, the status.
+
+    `watchdog_ns`: how long systemd waits for a sign of life, 0 if it doesn't. Times in ns.
+    """
+
+    def __init__(self, notifier: Notifier, watchdog_ns: int, status: Callable[[], str]) -> None:
+        self._notifier, self._status = notifier, status
+        self._every_ns = watchdog_ns // 3
+        self._fed_ns = self._looked_ns = 0
+        self._told = ""
+
+    def ticked(self, now_ns: int) -> None:
+        """A tick is done."""
+        if self._every_ns and now_ns - self._fed_ns >= self._every_ns:
+            self._fed_ns = now_ns
+            self._notifier.send("WATCHDOG=1")
+        if self._told and now_ns - self._looked_ns < _STATUS_NS:
+            return
+        self._looked_ns = now_ns
+        status = self._status()
+        if status != self._told:
+            self._notifier.send(*([] if self._told else ["READY=1"]), f"STATUS={status}")
+            self._told = status

@@ -7,7 +7,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -103,9 +103,6 @@ class Report:
                 hand, link = self._names[event.slot]
                 _log.info("%s/%s: %s", hand, link, event, extra={"fields": {"hand": hand, "link": link}})
             self._translate()
-        if self.stages.told is not None:
-            (part, told), self.stages.told = self.stages.told, None
-            _loop_log.warning("ticks %s", told, extra={"fields": {"part": part}})
         state = self._pipeline.tick.columns.state
         visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
         changed = self._events_before | set(np.flatnonzero(visible != self._told).tolist())
@@ -122,6 +119,10 @@ class Report:
             rates = self._half_second.per_second(now_ns, self._totals())
             self._speeds = dict(zip(["ticks", *_of_buses(self._ports)], rates.tolist(), strict=True))
             self._tick_us = _summary(self._durations_ns)
+            if late := self.stages.take_late():
+                parts = (f"{name} {count} (up to {most_ns * 1e-6:.1f} ms)" for name, count, most_ns in late)
+                about = {"fields": {"part": late[0][0]}}
+                _loop_log.warning("late ticks, by what took the time: %s", ", ".join(parts), extra=about)
             self._durations_ns.clear()
             self._tell(self._service(now_ns, self._publisher.next_seq("service")))
 
@@ -134,8 +135,8 @@ class Report:
         now_ns = time.monotonic_ns()
         statuses = self._master.status()
         return {
-            "service": asdict(self._service(now_ns, 0)),
-            "pads": [asdict(self._health(pad, now_ns, status, 0)) for pad, status in enumerate(statuses)],
+            "service": _plain(self._service(now_ns, 0)),
+            "pads": [_plain(self._health(pad, now_ns, status, 0)) for pad, status in enumerate(statuses)],
         }
 
     def summary(self) -> str:
@@ -206,7 +207,7 @@ class Report:
             period_s=self._deployment.daemon.sync_period_ms * 1e-3,
             hands={hand.name: [pad.link for pad in hand.pads] for hand in self._deployment.hands},
             ticks=self._pipeline.ticks,
-            overruns=sum(self.stages.overruns.values()),
+            overruns=self._sync.overruns,
             rate_hz=self._speeds.get("ticks", 0.0),
             tick_us=self._tick_us,
             loop=self.stages.figures(),
@@ -252,6 +253,11 @@ class _Window:
         rates = (totals - self._totals).astype(np.float64) * (_SECOND_NS / max(1, now_ns - self.since_ns))
         self.since_ns, self._totals = now_ns, totals.copy()
         return rates
+
+
+def _plain(message: wire.Health | wire.Service) -> dict[str, Any]:
+    """Fields by name, not copied as `asdict` does: that takes the loop milliseconds."""
+    return {field.name: getattr(message, field.name) for field in fields(message)}
 
 
 def _process() -> dict[str, Any]:
