@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import re
 import typing
 from dataclasses import fields, replace
@@ -13,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch import wire
+from handtouch import columns, wire
 
 names = st.from_regex(r"[a-z][a-z0-9_]{0,12}", fullmatch=True)
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -35,11 +37,14 @@ def _values(hint: Any) -> st.SearchStrategy[Any]:
     return st.one_of(st.none(), *(_values(argument) for argument in arguments if argument is not type(None)))
 
 
-def _messages(kind: type[Any]) -> st.SearchStrategy[Any]:
+@st.composite
+def _messages(draw: st.DrawFn, kind: type[Any]) -> Any:
     hints = typing.get_type_hints(kind)
-    return st.builds(kind, **{name: _values(hint) for name, hint in hints.items()}).map(
-        lambda message: replace(message, v=wire.SCHEMA_VERSION)
-    )
+    values = {name: draw(_values(hint)) for name, hint in hints.items()}
+    for name, (of, elements) in wire.COLUMNS.get(kind, {}).items():
+        size = len(values["links"]) * elements * int(of[-1])
+        values[name] = draw(st.binary(min_size=size, max_size=size))
+    return kind(**{**values, "v": wire.SCHEMA_VERSION})
 
 
 any_message = st.one_of(*(_messages(topic.payload) for topic in wire.TOPICS))
@@ -101,5 +106,101 @@ def test_the_documentation_describes_every_field_of_every_topic() -> None:
     sections = dict(re.findall(r"^## `(\w+)[^\n]*\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S))
     for topic in wire.TOPICS:
         described = set(re.findall(r"^\| `(\w+)`", sections[topic.prefix], flags=re.M))
-        envelope = {"v", "seq", "t_ns", "repeat"}
+        envelope = {"v", "run", "seq", "t_ns", "repeat"}
         assert described | envelope == {field.name for field in fields(topic.payload)}, topic.prefix
+
+
+def test_the_documentation_tells_the_type_of_every_column() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "wire.md").read_text()
+    kinds = {"<u1": "uint8", "<u4": "uint32", "<i8": "int64", "<f4": "float32"}
+    for topic in wire.TOPICS:
+        for name, (kind, elements) in wire.COLUMNS.get(topic.payload, {}).items():
+            many = f"{elements} " if elements > 1 else ""
+            assert f"| `{name}` | column of {many}{kinds[kind]} |" in text
+
+
+@given(any_message, st.data())
+def test_a_damaged_message_is_decoded_or_refused_but_never_fatal(
+    message: wire.Message, data: st.DataObject
+) -> None:
+    parts = [bytearray(part) for part in wire.encode(message)]
+    for _ in range(data.draw(st.integers(1, 4))):
+        part = data.draw(st.sampled_from(parts))
+        at = data.draw(st.integers(0, max(0, len(part) - 1)))
+        how = data.draw(st.sampled_from(["change", "insert", "cut", "end"]))
+        if how == "change" and part:
+            part[at] = data.draw(st.integers(0, 255))
+        elif how == "insert":
+            part[at:at] = data.draw(st.binary(min_size=1, max_size=9))
+        elif how == "cut":
+            del part[at : at + data.draw(st.integers(1, 9))]
+        else:
+            del part[at:]
+    with contextlib.suppress(wire.WireError):
+        wire.decode([bytes(part) for part in parts])
+
+
+anything = st.recursive(
+    st.one_of(
+        st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(max_size=5),
+        st.binary(max_size=9), st.builds(msgpack.ExtType, st.integers(0, 127), st.binary(max_size=9)),
+        st.builds(msgpack.Timestamp, st.integers(0, 2**33), st.integers(0, 10**9 - 1)),
+    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3),
+    max_leaves=6,
+)  # fmt: skip
+
+
+@given(any_message, st.data())
+def test_any_value_in_any_field_is_decoded_or_refused_but_never_fatal(
+    message: wire.Message, data: st.DataObject
+) -> None:
+    topic, payload = wire.encode(message)
+    content = msgpack.unpackb(payload)
+    for name in data.draw(st.sets(st.sampled_from(sorted(content)), min_size=1, max_size=3)):
+        content[name] = data.draw(anything)
+    with contextlib.suppress(wire.WireError):
+        wire.decode([topic, msgpack.packb(content)])
+
+
+@pytest.mark.parametrize("depth", [100, 500, 900, 1100, 100_000])
+@pytest.mark.parametrize("name", [b"v", b"seq", b"emergencies", b"more"])
+def test_no_depth_of_nesting_is_fatal(depth: int, name: bytes) -> None:
+    deep = bytes([0x81, 0xA0 + len(name)]) + name + b"\x91" * depth + b"\xc0"
+    with pytest.raises(wire.WireError):
+        wire.decode([b"health/h/x", deep])
+    good = wire.encode(HEALTH)[1]
+    size = msgpack.unpackb(good)
+    extended = b"\xde" + (len(size) + 1).to_bytes(2, "big") + good[3:] + deep[1:]
+    with contextlib.suppress(wire.WireError):
+        wire.decode([b"health/h/x", extended])
+
+
+@given(_messages(wire.Contact), st.sampled_from([math.nan, math.inf, -math.inf]))
+def test_a_number_that_is_none_is_refused(contact: wire.Contact, number: float) -> None:
+    with pytest.raises(wire.WireError, match="force_n"):
+        wire.decode(wire.encode(replace(contact, force_n=number)))
+
+
+@given(_messages(wire.HandFrame), st.sampled_from(sorted(wire.COLUMNS[wire.HandFrame])))
+def test_a_column_with_a_row_too_many_is_refused(frame: wire.HandFrame, name: str) -> None:
+    longer = replace(frame, **{name: getattr(frame, name) + bytes(36)})
+    with pytest.raises(wire.WireError, match=name):
+        wire.decode(wire.encode(longer))
+
+
+@given(_messages(wire.HandFrame))
+def test_columns_are_arrays_with_a_row_for_each_link(frame: wire.HandFrame) -> None:
+    found = columns(frame)
+    assert list(found) == list(wire.COLUMNS[wire.HandFrame])
+    for name, array in found.items():
+        assert len(array) == len(frame.links)
+        assert array.tobytes() == getattr(frame, name)
+        assert not array.flags.writeable
+    assert found["covariance_m2"].shape == (len(frame.links), 9)
+
+
+HEALTH = wire.Health(
+    wire.SCHEMA_VERSION, 1, 1, 1, "h", "x", "can0", 1, "clear", "operational",
+    0, "sync", "", None, 0.0, 0, 0, None, 0, 0, (), False,
+)  # fmt: skip

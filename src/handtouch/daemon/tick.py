@@ -339,6 +339,6 @@ class Tick:
         columns.force_std_n[pads] = solved.force_std_n
         columns.saturated[pads] = solved.saturated
         columns.residual_std[pads] = solved.residual_std
-        self._located[pads, 10] = np.where(solved.saturated, np.nan, solved.force_std_n)
+        self._located[pads, 10] = np.where(np.isfinite(solved.force_std_n), solved.force_std_n, np.nan)
         self._located[pads, 11] = solved.residual_std
         self._located[pads, 12:] = solved.covariance_m2.reshape(-1, 9)
