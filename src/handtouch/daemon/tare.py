@@ -89,14 +89,13 @@ class Tare:
                 f"channel {ELECTRODES[worst]} scatters by {std[worst]:.1f} counts, its noise is {noise:.1f}: "
                 "something moves on it or disturbs it"
             )
-        # a drift that all channels together mistake for a contact that is about to end is none
-        drift = model.off_a[pad] / 4 / model.ampere_per_count[pad]
-        moved, allowed = np.abs(mean - model.offset_counts[pad]), drift + _OFF * noise
-        worst = int(np.argmax(moved - allowed))
-        if moved[worst] > allowed[worst]:
+        # whatever adds up to less than what ends a contact could be no contact that is to be kept
+        drift = model.off_a[pad] / model.ampere_per_count[pad].mean()
+        moved, allowed = np.abs(mean - model.offset_counts[pad]).sum(), drift + _OFF * noise
+        if moved > allowed:
             return (
-                f"channel {ELECTRODES[worst]} is {moved[worst]:.0f} counts from its baseline, noise and "
-                f"drift explain {allowed[worst]:.0f}: take the load off; if there is none, look at the "
-                "pad and give its offsets by `handtouch calibrate`"
+                f"its channels are {moved:.0f} counts from their baseline, noise and drift explain "
+                f"{allowed:.0f}: take the load off; if there is none, look at the pad, and give its offsets "
+                "by `handtouch calibrate`"
             )
         return ""

@@ -1,0 +1,253 @@
+"""What can be asked of a running daemon, from its command line and over the wire; nodes as loaded as told."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from handtouch import wire
+from handtouch.client import request
+from handtouch.config import load
+
+LONGEST_S = 60.0
+PRESS = [900, 700, 800, 600]
+BASELINE = [6, -5, 4, 6]
+NODES = """
+import sys, time
+from pathlib import Path
+import can, numpy as np
+from handtouch.canbus.device import DeviceBus
+from handtouch.config import load
+
+config, loads, port = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+pads = [pad for hand in load(config).hands for pad in hand.pads]
+chance = np.random.default_rng(5)
+
+def sample(t_ns):
+    counts = np.rint(chance.standard_normal((len(pads), 4))).astype(np.int64)
+    return counts + np.loadtxt(loads, dtype=np.int64)
+
+with can.Bus("239.74.163.2", interface="udp_multicast", port=port) as bus:
+    nodes = DeviceBus(bus, sample)
+    for pad in pads:
+        nodes.add(pad.node_id, serial=pad.serial)
+    nodes.start()
+    while True:
+        time.sleep(1)
+"""
+
+
+class Served:
+    """A daemon and nodes whose readings the test sets."""
+
+    def __init__(self, rig: Any) -> None:
+        self.rig = rig
+        self.links = [pad.link for hand in load(rig.config).hands for pad in hand.pads]
+        self._loads = rig.folder / "loads.dat"
+        self.load({})
+        port = rig.bus[0].split("port=")[1]
+        command = [*rig.command()[:-2], "-c", NODES, str(rig.config), str(self._loads), port]
+        with (rig.folder / "nodes.txt").open("w") as output:
+            rig.processes["nodes"] = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
+        rig.start("run")
+        rig.wait_operational()
+
+    def load(self, counts: Mapping[str, list[int]]) -> None:
+        """What the channels of pads read, besides noise; the others read nothing."""
+        rows = np.array([counts.get(link, [0] * 4) for link in self.links])
+        fresh = self._loads.with_suffix(".new")
+        np.savetxt(fresh, rows, fmt="%d")
+        fresh.replace(self._loads)
+
+    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        return request(command, endpoint=self.rig.endpoints["control"], timeout_s=LONGEST_S, **arguments)
+
+    def call(self, *arguments: str) -> tuple[int, str]:
+        """Exit status and output of a handtouch command."""
+        command = [sys.executable, "-m", "handtouch", *arguments, "--endpoint", self.rig.endpoints["control"]]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+        return done.returncode, done.stdout + done.stderr
+
+    def pad(self, link: str) -> Any:
+        return next(pad for pad in self.rig.status()["pads"] if pad["link"] == link)
+
+    def until_touched(self, *links: str) -> None:
+        self.rig.wait(
+            f"{links} touched",
+            lambda status: {p["link"] for p in status["pads"] if p["state"] == "touched"} == set(links),
+        )
+
+    def edit(self, change: Callable[[str], str]) -> None:
+        text = self.rig.config.read_text()
+        assert change(text) != text
+        self.rig.config.write_text(change(text))
+
+
+@pytest.fixture
+def served(rig: Any) -> Served:
+    return Served(rig)
+
+
+def test_tare_takes_a_baseline_off_and_refuses_a_loaded_pad(served: Served) -> None:
+    served.load({"index_distal": BASELINE, "palm_heel": PRESS})
+    served.until_touched("palm_heel")
+    status, told = served.call("tare", "--json")
+    assert status == 1, told
+    pads = {pad["link"]: pad for pad in json.loads(told)["pads"]}
+    assert [link for link, pad in pads.items() if not pad["tared"]] == ["palm_heel"]
+    assert "touched" in pads["palm_heel"]["reason"]
+    np.testing.assert_allclose(pads["index_distal"]["offset_counts"], BASELINE, atol=0.8)
+    served.load({"index_distal": [count + 15 for count in BASELINE]})
+    served.until_touched()
+    status, told = served.call("tare", "index_distal")
+    assert (status, "from their baseline" in told) == (1, True), told
+    served.load({"index_distal": BASELINE})
+    frame = next(iter(served.ask("snapshot")["hands"].values()))
+    current = np.frombuffer(frame["current_a"], "<f4")[frame["links"].index("index_distal")]
+    assert abs(current) < 12e-3 * 10 / 32767  # ampere: less than 12 counts, four of noise; it was 11 +- 2
+    assert served.call("tare", "palm_heel")[0] == 0
+
+
+def test_a_disabled_pad_is_off_until_it_is_enabled(served: Served) -> None:
+    served.load({"index_distal": PRESS, "palm_heel": PRESS})
+    served.until_touched("index_distal", "palm_heel")
+    with served.rig.subscribe("contact/*/index_distal") as contacts:
+        assert contacts.recv(LONGEST_S).event == "update"
+        status, told = served.call("disable", "index_*", "--name", "planner")
+        assert status == 0
+        assert "index_distal: disabled by planner" in told
+        while (contact := contacts.recv(LONGEST_S)).event != "end":
+            pass
+        assert contact.reason == "off"
+    served.until_touched("palm_heel")
+    off = served.rig.wait("nodes at rest", lambda s: [p["node"] for p in s["pads"]].count("stopped") == 3)
+    assert all(
+        pad["reason"].startswith("disabled by planner")
+        for pad in off["pads"]
+        if pad["link"].startswith("index_")
+    )
+    assert served.call("enable", "index_*") == (0, "every pad is enabled\n")
+    served.until_touched("index_distal", "palm_heel")
+
+
+def test_reload_changes_one_pad_and_leaves_the_contact_on_another(served: Served) -> None:
+    served.load({"index_distal": PRESS, "palm_heel": PRESS})
+    served.until_touched("index_distal", "palm_heel")
+    with served.rig.subscribe("contact/*/*") as contacts:
+        before = {contact.link: contact for contact in (contacts.recv(LONGEST_S) for _ in range(8))}
+        served.edit(
+            lambda text: text.replace(
+                'link = "index_distal"', 'link = "index_distal"\ntouch = { on_n = 50.0, off_n = 40.0 }'
+            )
+        )
+        trial = served.ask("reload", trial=True)
+        assert (trial["applied"], list(trial["pads"].values())) == (False, [["touch"]])
+        status, told = served.call("reload")
+        assert (status, "index_distal: changed: touch" in told) == (0, True), told
+        events: list[wire.Contact] = []
+        while not any(c.event == "end" for c in events):
+            events.append(contacts.recv(LONGEST_S))
+        events += [contacts.recv(LONGEST_S) for _ in range(20)]
+    ended = [c.link for c in events if c.event == "end"]
+    assert ended == ["index_distal"]  # its force is below the new threshold
+    kept = [c for c in events if c.link == "palm_heel"]
+    assert {(c.event, c.id) for c in kept} == {("update", before["palm_heel"].id)}
+    assert {c.calibration for c in kept} == {before["palm_heel"].calibration}
+    assert contacts.gaps == 0
+    assert all(math.dist(c.position_m or (), before["palm_heel"].position_m or ()) < 1e-3 for c in kept)
+
+
+def test_a_reload_that_is_wrong_or_would_need_a_restart_changes_nothing(served: Served) -> None:
+    text = served.rig.config.read_text()
+    served.edit(lambda text: text.replace("\non_n", "\non_m", 1))
+    status, told = served.call("reload")
+    assert status == 1
+    assert "nothing is changed" in told
+    assert "on_m" in told
+    served.rig.config.write_text(text)
+    served.edit(lambda text: text.replace("sync_period_ms = 20.0", "sync_period_ms = 10.0"))
+    status, told = served.call("reload")
+    assert (status, "[daemon] sync_period_ms" in told, "restart" in told) == (1, True, True), told
+    served.rig.config.write_text(text)
+    assert served.call("reload") == (0, "nothing has changed\n")
+    assert served.rig.status()["service"]["period_s"] == 0.02
+
+
+def test_what_nobody_hears_is_not_computed_but_a_snapshot_has_it(served: Served) -> None:
+    served.load({"palm_heel": PRESS})
+    served.until_touched("palm_heel")
+    row = next(pad for pad in served.rig.status()["scene"]["pads"] if pad["link"] == "palm_heel")
+    assert row["computed"] == ["touched"]
+    assert row["skipped"]["location"] == "nobody subscribed"
+    (contact,) = served.ask("snapshot")["contacts"]
+    assert (contact["link"], contact["location"], contact["strength"]) == ("palm_heel", "valid", "valid")
+    status, told = served.call("snapshot")
+    assert status == 0
+    assert "palm_heel: touched at (" in told
+    assert set(json.loads(served.call("snapshot", "--json")[1])["hands"]) == {contact["hand"]}
+    with served.rig.subscribe("contact/*/palm_heel") as contacts:
+        while (heard := contacts.recv(LONGEST_S)).location != "valid":
+            assert heard.location == "skipped"
+        row = next(pad for pad in served.rig.status()["scene"]["pads"] if pad["link"] == "palm_heel")
+        assert row["computed"] == ["touched", "location", "strength"]
+
+
+def test_a_scene_of_less_makes_messages_of_less_and_a_client_gets_more_for_its_lease(served: Served) -> None:
+    served.load({"palm_heel": PRESS})
+    status, told = served.call("scene", "--links", "palm_*", "--outputs", "location", "--rate-hz", "10")
+    assert status == 0, told
+    assert "scene of control: links palm_*; location; 10 Hz" in told
+    served.rig.wait("12 pads off", lambda s: [p["state"] for p in s["pads"]].count("off") == 12)
+    with served.rig.subscribe("contact/*/palm_heel", "hand/*") as messages:
+        got = [messages.recv(LONGEST_S) for _ in range(40)][10:]
+        updates = [m for m in got if isinstance(m, wire.Contact)]
+        assert {(m.location, m.strength, m.force_n) for m in updates} == {("valid", "skipped", None)}
+        steps = np.diff([m.t_ns for m in got if isinstance(m, wire.HandFrame)])
+        assert np.median(steps) == pytest.approx(5 * 20e6, rel=0.05)  # 50 Hz, thinned to 10
+        assert served.call("scene", "--name", "planner", "--links", "palm_*", "--lease-s", "1.5")[0] == 0
+        ends_s = time.monotonic() + 1.5
+        while (m := messages.recv(LONGEST_S)).__class__ is not wire.Contact or m.strength != "valid":
+            assert time.monotonic() < ends_s + LONGEST_S
+        while (m := messages.recv(LONGEST_S)).__class__ is not wire.Contact or m.strength != "skipped":
+            assert time.monotonic() < ends_s + LONGEST_S
+    assert [scene["of"] for scene in served.ask("scene")["scenes"]] == ["control"]
+    assert served.call("scene", "--reset")[0] == 0
+    served.rig.wait_operational()
+
+
+def test_a_calibration_is_told_by_the_next_contact(served: Served) -> None:
+    served.load({"palm_heel": PRESS})
+    with served.rig.subscribe("contact/*/palm_heel") as contacts:
+        before = contacts.recv(LONGEST_S)
+        while before.location != "valid":
+            before = contacts.recv(LONGEST_S)
+        command = ["calibrate", "palm_heel", "--name", "bench-1", "--gains", "2", "2", "2", "2"]
+        status, told = served.call(*command)
+        assert (status, before.calibration in told) == (0, True), told
+        while (after := contacts.recv(LONGEST_S)).calibration != "bench-1":
+            assert after.id == before.id
+        assert after.id == before.id
+        assert after.current_a == pytest.approx(2 * before.current_a, rel=0.02)
+    assert served.call("calibrate", "palm_heel", "--name", "x", "--gains", "0", "1", "1", "1")[0] == 1
+
+
+def test_without_a_daemon_every_command_says_so(tmp_path: Path) -> None:
+    nowhere = ["--endpoint", f"ipc://{tmp_path}/none"]
+    for command in (["scene"], ["tare"], ["log", "info"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "handtouch", *command, *nowhere],
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+            check=False,
+        )
+        assert (done.returncode, "is handtouch run up" in done.stderr) == (1, True)
