@@ -49,6 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_serving(commands)
     _add_looking(commands)
     add_control(commands)
+    _add_bridge(commands)
     _add_keys(commands)
     _add_checking(commands)
     return parser
@@ -112,6 +113,37 @@ def add_endpoint(parser: argparse.ArgumentParser, default: str, text: str) -> No
         metavar="FILE",
         help="key for a daemon that asks for one (default: the file that HANDTOUCH_KEY names, if set)",
     )
+
+
+def _add_bridge(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    bridge = command(commands, "bridge", _bridge, "carry the topics of daemons over a Zenoh network")
+    bridge.add_argument("config", type=Path, nargs="*", help="deployment files of daemons on this machine")
+    bridge.add_argument(
+        "--endpoint",
+        action="append",
+        default=[],
+        metavar="NAME=ENDPOINT",
+        help="a daemon by its complete stream, and what to call it on the network",
+    )
+    for option, text in (("connect", "of a router or peer to connect to"), ("listen", "to be reached at")):
+        bridge.add_argument(
+            f"--{option}", action="append", default=[], metavar="tcp/HOST:PORT", help=f"Zenoh endpoint {text}"
+        )
+    bridge.add_argument("--prefix", default="handtouch", help="before NAME/TOPIC (default: handtouch)")
+    bridge.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="PATTERN",
+        help="topics to carry (default: all but raw)",
+    )
+    bridge.add_argument(
+        "--control",
+        action="store_true",
+        help="pass on commands too, whoever on the network gives them",
+    )
+    bridge.add_argument("--key", metavar="FILE", help="key for daemons that ask for one")
+    bridge.add_argument("--zenoh", type=Path, metavar="FILE", help="Zenoh configuration: TLS, access control")
 
 
 def _add_keys(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -300,6 +332,24 @@ def _status(asked: argparse.Namespace) -> int:
     from handtouch.view import status
 
     return status.run(endpoint=asked.endpoint, key=asked.key, as_json=asked.json)
+
+
+def _bridge(asked: argparse.Namespace) -> int:
+    from handtouch import bridge
+
+    return bridge.run(
+        bridge.Options(
+            configs=asked.config,
+            endpoints=asked.endpoint,
+            connect=asked.connect,
+            listen=asked.listen,
+            prefix=asked.prefix,
+            topics=asked.topic,
+            control=asked.control,
+            key=asked.key,
+            zenoh=asked.zenoh,
+        )
+    )
 
 
 def _keys_make(asked: argparse.Namespace) -> int:
