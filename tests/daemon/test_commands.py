@@ -1,0 +1,274 @@
+"""What control can be asked for: arguments are checked first; what is not done is told with its reason."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from handtouch.config import ConfigError, Deployment, parse
+from handtouch.daemon.daemon import Daemon
+from handtouch.wire import PadState
+
+PERIOD_NS = 5_000_000
+COMMANDS = ("status", "snapshot", "scene", "tare", "calibrate", "enable", "disable", "reload", "log")
+KEYS = (
+    *("pads", "pad", "name", "links", "outputs", "tolerance_mm", "rate_hz", "lease_s", "reset", "gains"),
+    *("offset_counts", "trial", "level", "anything"),
+)
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.sampled_from(["*", "plane", "location", "strength", "raw", "bench-1", "debug", ""])
+    | st.binary(max_size=9),
+    lambda inner: st.lists(inner, max_size=4),
+    max_leaves=8,
+)
+
+
+class Bench:
+    """A real daemon whose loop is the test: on a bus without nodes, samples are written into its slab."""
+
+    def __init__(self, deployment: Deployment, model: Any, endpoints: dict[str, str]) -> None:
+        settings = deployment.daemon.model_copy(update=endpoints)
+        self.deployment = deployment.model_copy(update={"daemon": settings})
+        self.fresh: Callable[[], Deployment] = lambda: self.deployment
+        self.daemon = Daemon(self.deployment, model, lambda: self.fresh())
+        self.pipeline, self.control = self.daemon.pipeline, self.daemon.control
+        self.pipeline.node_state[:] = PadState.CLEAR
+        self.t_ns = 10**12
+        self.counts = np.zeros((3, 4))
+        self._noise = np.random.default_rng(3)
+
+    def tick(self) -> None:
+        self.t_ns += PERIOD_NS
+        self.pipeline.begin(self.t_ns, self.t_ns)
+        read = np.rint(self.counts + self._noise.normal(size=self.counts.shape)).astype("<i2")
+        for pad, row in enumerate(read):
+            self.pipeline.slab.write(pad, row.tobytes(), self.t_ns + 1000)
+        self.pipeline.advance(self.t_ns + 2000)
+        self.daemon.demand.step(self.t_ns)
+
+    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        """The answer, ticking on until it is there."""
+        request = msgpack.packb({"v": 1, "command": command, **arguments})
+        _, answer = self.control.begin(request, self.t_ns)
+        while not isinstance(answer, dict):
+            self.tick()
+            time.sleep(0 if command == "tare" else 0.001)  # a reload's thread needs its share
+            answer = self.control._try(command, partial(answer.poll, self.t_ns)) or answer
+        return dict(msgpack.unpackb(msgpack.packb(answer)))
+
+    def pads(self, answer: dict[str, Any]) -> dict[str, Any]:
+        assert answer["ok"], answer
+        return {pad["link"]: pad for pad in answer["pads"]}
+
+
+@pytest.fixture
+def served(bench: Any, endpoints: dict[str, str]) -> Iterator[Bench]:
+    from handtouch.daemon.model import PadModel
+
+    made = Bench(bench.deployment, PadModel(bench.deployment), endpoints)
+    for _ in range(5):
+        made.tick()
+    yield made
+    made.daemon.close()
+    logging.getLogger("handtouch").setLevel(logging.NOTSET)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(COMMANDS), st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=5))
+def test_any_arguments_are_answered_and_the_tick_goes_on(
+    served: Bench, command: str, arguments: dict[str, Any]
+) -> None:
+    request = msgpack.packb({"v": 1, "command": command, **arguments})
+    _, answer = served.control.begin(request, served.t_ns)
+    if isinstance(answer, dict):
+        assert msgpack.unpackb(msgpack.packb(answer))["v"] == 1
+        assert "failed" not in answer.get("error", "")
+    else:
+        answer.poll(served.t_ns)
+    ticks = served.pipeline.ticks
+    served.tick()
+    assert served.pipeline.ticks == ticks + 1
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "why"),
+    [
+        ("tare", {}, "pads is missing"),
+        ("tare", {"pads": []}, "at least 1"),
+        ("tare", {"pads": ["nowhere"]}, 'no pad is named "nowhere"'),
+        ("tare", {"pads": "plane"}, "tuple"),
+        ("scene", {"tolerance": 1}, "tolerance"),
+        ("scene", {"outputs": ["smell"]}, "location"),
+        ("scene", {"tolerance_mm": -1.0}, "greater than or equal to 0"),
+        ("scene", {"tolerance_mm": float("nan")}, "tolerance_mm"),
+        ("scene", {"links": ["thumb*"]}, "no pad is named"),
+        ("scene", {"reset": True, "rate_hz": 5.0}, "one after the other"),
+        ("scene", {"name": "a\nb"}, "name"),
+        ("calibrate", {"pad": "*", "name": "c", "gains": [1] * 4, "offset_counts": [0] * 4}, "3 pads"),
+        ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 3, "offset_counts": [0] * 4}, "gains"),
+        ("calibrate", {"pad": "plane", "name": "c", "gains": [11] * 4, "offset_counts": [0] * 4}, "gains"),
+        ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 4, "offset_counts": [2e4] * 4}, "half"),
+        ("log", {"level": "loud"}, "level"),
+        ("status", {"verbose": True}, "verbose"),
+    ],
+)
+def test_what_is_wrong_with_arguments_is_told_and_nothing_changes(
+    served: Bench, command: str, arguments: dict[str, Any], why: str
+) -> None:
+    before = served.daemon.demand.scenes.version
+    answer = served.ask(command, **arguments)
+    assert not answer["ok"]
+    assert why in answer["error"]
+    assert served.daemon.demand.scenes.version == before
+    assert not served.pipeline.model.tared
+
+
+def test_tare_takes_off_what_an_unloaded_pad_reads(served: Bench) -> None:
+    served.counts[0] = [5, -4, 3, 2]
+    (pad,) = served.pads(served.ask("tare", pads=["plane"])).values()
+    assert (pad["tared"], pad["samples"]) == (True, 200)
+    np.testing.assert_allclose(pad["offset_counts"], served.counts[0], atol=5 / np.sqrt(200))
+    served.counts[1] = [3, 3, 3, 3]
+    for _ in range(100):
+        served.tick()
+    noise_a = served.pipeline.model.noise_a[0].sum()
+    assert abs(served.pipeline.tick.columns.current_a[0]) < 4 * noise_a
+
+
+@pytest.mark.parametrize(
+    ("part", "noise", "why"),
+    [(10.0, 0.0, "touched"), (0.9, 0.0, "from their baseline"), (0.0, 12.0, "scatters")],
+    ids=["touched", "lightly loaded", "noisy"],
+)
+def test_tare_is_refused_with_the_reason(served: Bench, part: float, noise: float, why: str) -> None:
+    model = served.pipeline.model
+    counts = part * model.on_a[0] / 4 / model.ampere_per_count[0]  # of what begins a contact
+    extra = np.random.default_rng(9)
+    job = served.daemon.control.commands["tare"]({"pads": ["plane", "round"]}, served.t_ns)
+    answer = None
+    while answer is None:
+        served.counts[0] = counts + noise * extra.normal(size=4)
+        served.tick()
+        answer = job.poll(served.t_ns)  # type: ignore[union-attr]
+    plane, round_ = answer["pads"]
+    assert not plane["tared"]
+    assert why in plane["reason"]
+    assert round_["tared"]
+    assert not served.pipeline.model.offset_counts[0].any()
+
+
+def test_tare_is_refused_where_no_samples_come(served: Bench) -> None:
+    served.pipeline.node_state[2] = PadState.LOST
+    pad = served.pads(served.ask("tare", pads=["resisted"]))["resisted"]
+    assert not pad["tared"]
+    assert "lost" in pad["reason"]
+
+
+def test_a_calibration_scales_and_shifts_what_channels_tell(served: Bench) -> None:
+    served.counts[0] = 200
+    served.ask("calibrate", pad="plane", name="c1", gains=[2, 1, 1, 1], offset_counts=[100, 0, 0, 0])
+    for _ in range(3):
+        served.tick()
+    model = served.pipeline.model
+    amperes = served.deployment.nodes["n"].full_scale_ma * 1e-3 / 32767
+    expected = (2 * 100 + 3 * 200) * amperes
+    assert served.pipeline.tick.columns.current_a[0] == pytest.approx(expected, abs=10 * amperes)
+    assert model.calibration[:2] == ["c1", model.nominal[1]]
+
+
+def test_status_tells_what_is_computed_and_for_whom(served: Bench) -> None:
+    pads = served.pads(served.ask("status")["scene"] | {"ok": True})
+    assert pads["plane"]["computed"] == ["touched"]
+    assert pads["plane"]["skipped"]["location"] == "nobody subscribed"
+    served.ask("disable", pads=["round"], name="me")
+    pads = served.pads(served.ask("scene", links=["plane", "round"]))
+    assert pads["round"]["skipped"]["touched"] == "disabled by me"
+    assert pads["resisted"]["skipped"]["touched"] == "outside every scene"
+
+
+def test_a_snapshot_solves_what_nobody_wants_and_leaves_nothing_behind(served: Bench) -> None:
+    served.counts[0] = 400
+    for _ in range(4):
+        served.tick()
+    columns = served.pipeline.tick.columns
+    assert np.isnan(columns.position_m[0]).all()
+    (contact,) = served.ask("snapshot")["contacts"]
+    assert (contact["location"], contact["strength"], contact["link"]) == ("valid", "valid", "plane")
+    assert np.isnan(columns.position_m[0]).all()
+    assert np.isnan(columns.located.view("<f4")).all()
+
+
+def test_a_reload_keeps_corrections_and_contacts(served: Bench) -> None:
+    served.ask("calibrate", pad="round", name="c1", gains=[1.1] * 4, offset_counts=[2] * 4)
+    served.counts[0] = 400
+    for _ in range(4):
+        served.tick()
+    contact = int(served.pipeline.tick.contacts.id[0])
+    _change_sheet(served)
+    answer = served.ask("reload")
+    assert answer["ok"], answer
+    assert answer["tables"] == ["sheet.s"]
+    assert answer["pads"] == {f"h/{link}": ["sheet.s"] for link in ("plane", "round", "resisted")}
+    for _ in range(4):
+        served.tick()
+    model = served.pipeline.model
+    assert served.pipeline.tick.model is model
+    assert model.calibration[1] == "c1"
+    assert model.offset_counts[1].tolist() == [2] * 4
+    assert model.calibration[0] == model.nominal[0]
+    assert int(served.pipeline.tick.contacts.id[0]) == contact
+    assert model.on_a[0] != 0
+    assert served.ask("reload")["tables"] == []  # the new file is the present one now
+
+
+def test_a_trial_changes_nothing(served: Bench) -> None:
+    _change_sheet(served)
+    model = served.pipeline.model
+    assert served.ask("reload", trial=True)["tables"] == ["sheet.s"]
+    assert served.pipeline.model is model
+    assert served.ask("reload", trial=True)["tables"] == ["sheet.s"]
+
+
+def test_a_reload_refuses_what_needs_a_restart_or_is_wrong(served: Bench) -> None:
+    present = served.deployment
+    (hand,) = present.hands
+
+    def with_pad(**update: Any) -> Deployment:
+        pads = (hand.pads[0].model_copy(update=update), *hand.pads[1:])
+        return present.model_copy(update={"hands": (hand.model_copy(update={"pads": pads}),)})
+
+    def broken() -> Deployment:
+        return parse("nonsense = 1")
+
+    for fresh, why in (
+        (lambda: with_pad(node_id=9), "the node of h/plane"),
+        (lambda: with_pad(electrodes=("xa", "x0", "y0", "yb")), "wiring"),
+        (lambda: with_pad(link="other"), "the pads or their order"),
+        (broken, "nonsense"),
+    ):
+        served.fresh = fresh
+        answer = served.ask("reload")
+        assert not answer["ok"]
+        assert "nothing is changed" in answer["error"]
+        assert why in answer["error"]
+    with pytest.raises(ConfigError):
+        broken()
+
+
+def _change_sheet(served: Bench) -> None:
+    sheet = served.deployment.sheets["s"].model_copy(update={"ohm_per_square": 3000.0})
+    changed = served.deployment.model_copy(update={"sheets": {"s": sheet}})
+    served.fresh = lambda: changed

@@ -1,0 +1,210 @@
+"""The control endpoint: every request is answered or counted, whatever its bytes, and nothing stops it."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from handtouch.daemon.control import LARGEST_BYTES, MOST_JOBS, Control, RefusedError
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text() | st.integers(0, 9), inner, max_size=4)
+    ),
+    max_leaves=20,
+)
+
+
+class Later:
+    """A job that is done when told."""
+
+    def __init__(self) -> None:
+        self.answer: dict[str, Any] | None = None
+        self.polls = 0
+
+    def poll(self, _: int) -> dict[str, Any] | None:
+        self.polls += 1
+        return self.answer
+
+
+class Bench:
+    """A control endpoint with a quick command, one that refuses, one that fails and one that takes long."""
+
+    def __init__(self) -> None:
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.control = Control(self.context, "tcp://127.0.0.1:*")
+        self.jobs: list[Later] = []
+        self.control.commands.update(
+            quick=lambda arguments, now_ns: {"arguments": arguments, "now_ns": now_ns},
+            refusing=self._refuse,
+            failing=lambda _, __: {"x": 1 / 0},
+            long=self._begin,
+            unpackable=lambda _, __: {"x": object()},
+        )
+        self.now_ns = 0
+
+    def _refuse(self, _: dict[str, Any], __: int) -> dict[str, Any]:
+        raise RefusedError("not now")
+
+    def _begin(self, _: dict[str, Any], __: int) -> Later:
+        self.jobs.append(Later())
+        return self.jobs[-1]
+
+    def asker(self, kind: int = zmq.REQ) -> zmq.Socket[bytes]:
+        socket: zmq.Socket[bytes] = self.context.socket(kind)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(self.control.endpoint)
+        return socket
+
+    def poll(self) -> None:
+        self.now_ns += 1
+        self.control.poll(self.now_ns)
+
+    def answer(self, asker: zmq.Socket[bytes]) -> dict[str, Any]:
+        """Poll until the answer is there."""
+        for _ in range(3000):
+            self.poll()
+            if asker.poll(1):
+                return dict(msgpack.unpackb(asker.recv_multipart()[-1]))
+        raise AssertionError("no answer")
+
+    def ask(self, request: bytes | dict[str, Any]) -> dict[str, Any]:
+        with self.asker() as asker:
+            asker.send(request if isinstance(request, bytes) else msgpack.packb({"v": 1, **request}))
+            return self.answer(asker)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    made = Bench()
+    logging.getLogger("handtouch.control").setLevel(logging.CRITICAL)
+    yield made
+    logging.getLogger("handtouch.control").setLevel(logging.NOTSET)
+    made.control.close()
+    made.context.destroy(0)
+
+
+def test_a_command_gets_its_arguments_and_its_answer_says_ok(bench: Bench) -> None:
+    answer = bench.ask({"command": "quick", "x": [1, "a"]})
+    assert (answer["v"], answer["ok"], answer["arguments"]) == (1, True, {"x": [1, "a"]})
+
+
+@pytest.mark.parametrize(
+    ("request_", "why"),
+    [
+        (b"", "malformed"),
+        (b"\xc1", "malformed"),
+        (msgpack.packb([1, 2]), "malformed"),
+        (msgpack.packb({1: 2}), "malformed"),
+        (b"\x91" * 5000 + b"\x01", "malformed"),
+        (msgpack.packb({"v": 1}), "not a string"),
+        (msgpack.packb({"command": "quick"}), "version v = None"),
+        (msgpack.packb({"v": 2, "command": "quick"}), "speaks v = 1"),
+        (msgpack.packb({"v": True, "command": "quick"}), "speaks v = 1"),
+        (msgpack.packb({"v": 1, "command": ["quick"]}), "not a string"),
+        (msgpack.packb({"v": 1, "command": "nonsense"}), "unknown command"),
+        (msgpack.packb({"v": 1, "command": "quick", "x": b"x" * LARGEST_BYTES}), "at most"),
+        (msgpack.packb({"v": 1, "command": "refusing"}), "refusing: not now"),
+        (msgpack.packb({"v": 1, "command": "failing"}), "failing failed: division by zero"),
+        (msgpack.packb({"v": 1, "command": "unpackable"}), "can't be packed"),
+    ],
+)
+def test_what_is_wrong_with_a_request_is_answered_and_counted(
+    bench: Bench, request_: bytes, why: str
+) -> None:
+    before = bench.control.refused
+    answer = bench.ask(request_)
+    assert (answer["v"], answer["ok"]) == (1, False)
+    assert why in answer["error"]
+    assert len(answer["error"]) < 1000
+    assert bench.control.refused == before + 1
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=200) | VALUES.map(msgpack.packb))
+@example(b"\xc7\x0c\xff" + b"\xff" * 12)  # a timestamp that is none
+@example(b"\xd6\xff\x00\x00\x00\x00")
+def test_any_bytes_get_an_answer(bench: Bench, data: bytes) -> None:
+    _, answer = bench.control.begin(data, 0)
+    assert isinstance(answer, dict)
+    assert answer["v"] == 1
+    msgpack.packb(answer)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.binary(max_size=40), min_size=1, max_size=5))
+def test_any_parts_from_any_socket_leave_the_endpoint_at_work(bench: Bench, parts: list[bytes]) -> None:
+    with bench.asker(zmq.DEALER) as stranger:
+        stranger.send_multipart(parts)
+        if parts[0] == b"" and len(parts) > 1:
+            assert bench.answer(stranger)["v"] == 1
+    assert bench.ask({"command": "quick"})["ok"]
+
+
+def test_a_long_command_keeps_nobody_waiting_and_answers_when_it_is_done(bench: Bench) -> None:
+    with bench.asker() as patient:
+        patient.send(msgpack.packb({"v": 1, "command": "long"}))
+        while not bench.jobs:
+            bench.poll()
+        assert bench.ask({"command": "quick"})["ok"]
+        assert not patient.poll(0)
+        assert bench.jobs[0].polls > 0
+        bench.jobs[0].answer = {"found": 3}
+        assert bench.answer(patient)["found"] == 3
+    bench.jobs.clear()
+
+
+def test_jobs_are_bounded_and_outlive_the_client_that_asked(bench: Bench) -> None:
+    askers = [bench.asker() for _ in range(MOST_JOBS)]
+    for asker in askers:
+        asker.send(msgpack.packb({"v": 1, "command": "long"}))
+    while len(bench.jobs) < MOST_JOBS:
+        bench.poll()
+    assert "under way" in bench.ask({"command": "quick"})["error"]
+    for asker in askers:
+        asker.close()
+    for job in bench.jobs:
+        job.answer = {}
+    bench.poll()
+    assert bench.ask({"command": "quick"})["ok"]
+    bench.jobs.clear()
+
+
+def test_a_flood_is_answered_a_few_at_a_time(bench: Bench) -> None:
+    with bench.asker(zmq.DEALER) as flood:
+        for _ in range(50):
+            flood.send_multipart([b"", msgpack.packb({"v": 1, "command": "quick"})])
+        answers, polls = 0, itertools.count(1)
+        while answers < 50:
+            bench.poll()
+            next(polls)
+            arrived = 0
+            while flood.poll(2):
+                flood.recv_multipart()
+                arrived += 1
+            assert arrived <= 4  # two polls' worth, should one be slow
+            answers += arrived
+
+
+def test_who_waits_while_the_daemon_stops_is_told() -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    control = Control(context, "tcp://127.0.0.1:*")
+    control.commands["long"] = lambda _, __: Later()
+    with context.socket(zmq.REQ) as asker:
+        asker.connect(control.endpoint)
+        asker.send(msgpack.packb({"v": 1, "command": "long"}))
+        while not control._jobs:
+            control.poll(0)
+        control.close()
+        assert asker.poll(10_000)
+        assert "stops" in msgpack.unpackb(asker.recv())["error"]
+    context.destroy(0)
