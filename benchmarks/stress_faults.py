@@ -21,92 +21,25 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from pathlib import Path
 from typing import Any
 
-import can
-import numpy as np
-from bench_latency import CHANNEL, OUT, PORT, in_own_network, on_loopback
-from fault_kinds import KINDS, TPDO, Bench, Fault, Kind, S, Stranger
+from bench_latency import OUT, PORT, in_own_network, on_loopback
+from fault_acts import Fault, Kind
+from fault_bench import PRESSED, Bench, Cable, Resources, S, Stranger, open_bus, sampler
+from fault_kinds import KINDS
+from fault_report import by_kind, page, section, verdict
 
 from handtouch import connect, wire
 from handtouch.canbus.device import DeviceBus
 from handtouch.client import Subscriber
-from handtouch.config import Deployment, load
+from handtouch.config import load
 
-PRESSED = ("thumb_distal", "index_distal", "palm_heel")
-TOUCH = np.array([900, 700, 800, 600])
 WELL = ("clear", "touched")
 HOLD_NS = S // 3  # a node has to stay well for so long
 GIVE_UP_S = 30.0
-LEAK_KB_PER_MIN = 300.0
-
-
-class Cable:
-    """The nodes' bus: can be cut, counts the samples that went out, and notes the nodes' pauses."""
-
-    def __init__(self, bus: can.BusABC, pause_ns: int) -> None:
-        self.silent = False
-        self.samples = 0
-        self.pauses: list[tuple[int, int, int]] = []  # node id, from, to
-        self._bus, self._pause_ns = bus, pause_ns
-        self._last_ns: dict[int, int] = {}
-
-    def send(self, message: can.Message, timeout: float | None = None) -> None:
-        if self.silent:
-            return
-        self._bus.send(message, timeout)
-        node_id = message.arbitration_id - TPDO
-        if not 0 < node_id < 128:
-            return
-        self.samples += len(message.data) == 8
-        now_ns = time.monotonic_ns()
-        before_ns = self._last_ns.get(node_id, now_ns)
-        self._last_ns[node_id] = now_ns
-        if now_ns - before_ns > self._pause_ns:
-            self.pauses.append((node_id, before_ns, now_ns))
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        message = self._bus.recv(timeout)
-        return None if self.silent else message
-
-    def paused(self, node_id: int, t_ns: int) -> bool:
-        """Whether the node sent nothing for several periods around this time."""
-        return any(n == node_id and a <= t_ns <= b + S // 10 for n, a, b in self.pauses)
-
-
-class Resources:
-    """Memory, descriptors and threads of a process, once a second."""
-
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        self._process, self._pid = process, process.pid
-        self.rows: list[tuple[float, int, int, int]] = []
-
-    @property
-    def alive(self) -> bool:
-        return self._process.poll() is None
-
-    def look(self, t_ns: int) -> None:
-        if self.rows and t_ns * 1e-9 - self.rows[-1][0] < 1:
-            return
-        if not self.alive:
-            raise RuntimeError("the daemon has ended")
-        status = Path(f"/proc/{self._pid}/status").read_text()
-        rss_kb, threads = (int(re.search(rf"{name}:\s+(\d+)", status)[1]) for name in ("VmRSS", "Threads"))  # type: ignore[index]
-        self.rows.append((t_ns * 1e-9, rss_kb, len(os.listdir(f"/proc/{self._pid}/fd")), threads))
-
-    def summary(self) -> dict[str, Any]:
-        """The slope is that of the second half, if that is long enough: by then all has happened once."""
-        rows = np.array(self.rows)
-        late = rows[len(rows) // 2 :]
-        slope = np.polyfit(late[:, 0], late[:, 1], 1)[0] * 60 if len(late) > 60 else 0.0
-        return {
-            "rss_mb": [round(float(v) / 1024, 1) for v in (rows[0, 1], late[0, 1], rows[-1, 1])],
-            "rss_kb_per_min": round(float(slope), 1),
-            "descriptors": [int(v) for v in (rows[0, 2], late[0, 2], rows[-1, 2], rows[:, 2].max())],
-            "threads": [int(v) for v in (rows[0, 3], late[0, 3], rows[-1, 3], rows[:, 3].max())],
-        }
+ALONE_AT_ONCE = 4
 
 
 class Campaign:
@@ -125,7 +58,8 @@ class Campaign:
         self._chance = random.Random(asked.seed)
         self._asked = asked
         self._coming: deque[Kind] = deque(self._chance.sample(KINDS, len(KINDS)))
-        self._alone: list[Kind] = []
+        self._alone: list[Kind] = []  # waiting for everything else to be over
+        self._draining = False
         self._active: list[Fault] = []
         self._busy: dict[int, Fault] = {}
         self._free_ns: dict[int, int] = {}
@@ -169,11 +103,9 @@ class Campaign:
     def _start_due(self, now_ns: int) -> None:
         if now_ns < self._next_ns:
             return
-        if len(self._alone) >= 4 or (self._alone and self._active and self._active[0].kind.alone):
-            if self._active:
-                return  # everything else has to be over
-            self._begin(self._alone.pop(), None, now_ns)
-            while self._alone and not self._active:
+        if self._draining or len(self._alone) >= ALONE_AT_ONCE:
+            self._draining = bool(self._alone)
+            if self._alone and not self._active:  # everything else is over
                 self._begin(self._alone.pop(), None, now_ns)
             return
         if not self._coming:
@@ -305,7 +237,9 @@ class Campaign:
             self._free_ns[node_id] = now_ns
         for t_ns in fault.disturbed_ns:
             _once(fault, "paused" if self.bench.cable.paused(fault.nodes[0], t_ns) else "disturbed")
-        if set(fault.failures) - {"paused"}:
+        if "paused" in fault.failures:
+            fault.failures = ["paused"]  # nothing can be said of it
+        if fault.failures and fault.failures != ["paused"]:
             what = f"fault {fault.number}, {fault.kind.name}: {fault.failures}"
             print(what, *fault.history[:40], sep="\n  ", flush=True)
         if len(self.done) % 50 == 0:
@@ -327,148 +261,6 @@ def _once(fault: Fault, failure: str) -> None:
         fault.failures.append(failure)
 
 
-# Results ---------------------------------------------------------------------------------------------
-
-
-def by_kind(done: list[Fault]) -> list[dict[str, Any]]:
-    rows = []
-    for kind in KINDS:
-        faults = [fault for fault in done if fault.kind is kind]
-        if not faults:
-            continue
-        detect = [(max(f.told_ns.values()) - f.start_ns) * 1e-9 for f in faults if f.told_ns]
-        recover = [(max(f.well_ns.values()) - f.ended_ns) * 1e-9 for f in faults if f.well_ns]
-        asked = kind.told is not None or kind.told_by_bus is not None
-        failures = Counter(failure for f in faults for failure in set(f.failures))
-        rows.append(
-            {
-                "kind": kind.name,
-                "expected": kind.expected,
-                "number": len(faults),
-                "told": len(faults) - failures["not told"] if asked else None,
-                "detect_s": spread(detect) if asked else None,
-                "recover_s": None if kind.quiet or kind.loose else spread(recover),
-                "failures": dict(failures),
-            }
-        )
-    return rows
-
-
-def spread(values: list[float]) -> dict[str, float] | None:
-    """Median, 90 % and worst."""
-    if not values:
-        return None
-    median, p90, worst = np.percentile(values, [50, 90, 100]).tolist()
-    return {"median": round(median, 3), "p90": round(p90, 3), "worst": round(worst, 3)}
-
-
-def verdict(results: dict[str, Any]) -> list[str]:
-    """What is wrong; empty when all is as it should be."""
-    wrong = [
-        f"{row['kind']}: {number} {failure}"
-        for row in results["kinds"]
-        for failure, number in row["failures"].items()
-        if failure != "paused"
-    ]
-    told = Counter(f"{s['state']}, {s['reason']}" for s in results["surprises"])
-    wrong += [f"without a fault, {number} times: {what}" for what, number in told.items()]
-    wrong += [f"contact out of nothing: {ghost}" for ghost in results["ghosts"]]
-    wrong += [f"exception: {line}" for line in results["exceptions"]]
-    if results["samples_lost"]:
-        wrong.append(f"{results['samples_lost']} samples lost on the way")
-    used = results["resources"]
-    if used["rss_kb_per_min"] > LEAK_KB_PER_MIN:
-        wrong.append(f"memory grows by {used['rss_kb_per_min']} kB a minute")
-    if used["descriptors"][2] > used["descriptors"][1]:
-        wrong.append(f"descriptors grow: {used['descriptors']}")
-    if results["exit_status"]:
-        wrong.append(f"exit status {results['exit_status']}")
-    return wrong
-
-
-def page(every: dict[str, dict[str, Any]]) -> str:
-    parts = [
-        "# Fault campaign\n\nFaults of simulated nodes and of their bus at random times (Poisson, seeded), "
-        "several at once on different nodes;\neach lasts a random while and is taken back. The daemon is a "
-        "process of its own; a client on its stream judges by\nwhat `health` and `service` say. Times are "
-        "those of the messages, after the fault began and after it was taken\nback; figures that "
-        "are published once a second (`missed`, `emergencies`) or twice (`service`) are told no sooner. "
-        "A node is well\nagain when it is operational and its samples are trusted.\n\nBeside every fault: no "
-        "node without one changes its state, no pad that nothing touches shows a contact.\n\n"
-        "Made by `make stress ONLY=faults`; on SocketCAN by `tests/socketcan/vcan-run .venv/bin/python\n"
-        "benchmarks/stress_faults.py --interface socketcan --faults 60 --rate 1 --period-ms 20 "
-        "--patience 3`.\n"
-    ]
-    parts += [section(results) for results in every.values()]
-    return "\n".join(parts)
-
-
-def section(results: dict[str, Any]) -> str:
-    rows = "\n".join(
-        f"| {row['kind']} | {row['expected']} | {row['number']} | {share(row)} | {times(row['detect_s'])} "
-        f"| {times(row['recover_s'])} |"
-        for row in results["kinds"]
-    )
-    used, wrong = results["resources"], verdict(results)
-    undisturbed = results["undisturbed"]
-
-    def series(name: str) -> str:
-        return ", ".join(map(str, used[name]))
-
-    return f"""
-## {results["interface"]}
-
-{results["faults"]} faults in {results["seconds"]:.0f} s, {results["rate"]:g} a second, seed
-{results["seed"]}, limits times {results["patience"]:g}; 15 nodes at {1000 / results["period_ms"]:.0f} Hz.
-{results["machine"]}; load {results["load"]:.1f} at the end.
-
-Seconds: median, 90 %, worst.
-
-| fault | to be told | number | told | until told | until well |
-| --- | --- | --- | --- | --- | --- |
-{rows}
-
-A dash: nothing of the kind is asked for. Stuck channels and dead electrodes are for the supervisor of pads to
-name; here it is only asked that the node stays operational and the others undisturbed.
-
-| | |
-| --- | --- |
-| told wrongly, not recovered, or disturbed | {"; ".join(wrong) or "nothing"} |
-| samples sent by the nodes and lost on the way | {results["samples_lost"]} of {results["samples_sent"]} |
-| nodes without a fault: ticks without their sample | {undisturbed["missed"]} of {undisturbed["samples"]} |
-| of nodes without a fault, told because their process or SYNC paused | {results["excused"]} |
-| ticks overrun | {results["overruns"]} of {results["ticks"]} |
-| memory of the daemon, MB: start, half, end | {series("rss_mb")} |
-| its slope in the second half, kB a minute | {used["rss_kb_per_min"]:+.0f} |
-| file descriptors: start, half, end, most | {series("descriptors")} |
-| threads: start, half, end, most | {series("threads")} |
-| exceptions on stderr | {len(results["exceptions"])} |
-| exit status | {results["exit_status"]} |
-"""
-
-
-def share(row: dict[str, Any]) -> str:
-    return "-" if row["told"] is None else f"{100 * row['told'] / row['number']:.0f} %"
-
-
-def times(values: dict[str, float] | None) -> str:
-    return "-" if values is None else f"{values['median']:.2f}, {values['p90']:.2f}, {values['worst']:.2f}"
-
-
-def open_bus(interface: str) -> can.BusABC:
-    if interface == "socketcan":
-        return can.Bus("vcan0", interface="socketcan", ignore_config=True)
-    return can.Bus(CHANNEL, interface="udp_multicast", port=PORT, ignore_config=True)
-
-
-def sampler(deployment: Deployment, seed: int) -> Any:
-    """Counts of all pads: noise, and a steady touch on those that are pressed."""
-    pads = [pad for hand in deployment.hands for pad in hand.pads]
-    noise = np.random.default_rng(seed)
-    pressed = np.array([TOUCH if pad.link in PRESSED else 0 * TOUCH for pad in pads])
-    return lambda _: pressed + np.rint(noise.standard_normal((len(pads), 4))).astype(np.int64)
-
-
 def measure(folder: Path, asked: Any) -> dict[str, Any]:
     config = on_loopback(folder, PORT)
     config.write_text(
@@ -480,7 +272,7 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
     threading.excepthook = lambda args: raised.append(f"{args.exc_type.__name__}: {args.exc_value}")
     buses = [open_bus(asked.interface), open_bus(asked.interface)]
     cable = Cable(buses[0], round(3 * asked.period_ms * 1e6))
-    devices = DeviceBus(cable, sampler(deployment, asked.seed))  # type: ignore[arg-type]  # it quacks like one
+    devices = DeviceBus(cable, sampler(deployment, asked.seed))
     for pad in pads:
         devices.add(pad.node_id, serial=pad.serial)
     stranger = Stranger(buses[1])
@@ -529,11 +321,12 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
         "patience": asked.patience,
         "machine": f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}",
         "load": os.getloadavg()[0],
-        "faults": len(campaign.done),
+        "faults": len([f for f in campaign.done if f.failures != ["paused"]]),
         "seconds": seconds,
         "kinds": by_kind(campaign.done),
         "surprises": [s for s in campaign.surprises if s not in excused],
-        "excused": len(excused) + sum("paused" in f.failures for f in campaign.done),
+        "excused": len(excused),
+        "void": sum("paused" in f.failures for f in campaign.done),
         "ghosts": campaign.ghosts,
         "samples_sent": cable.samples,
         "samples_lost": cable.samples - bus["samples"],
