@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import zmq
 
 from handtouch import wire
-from handtouch.client import connect
+from handtouch.client import Subscriber, columns, connect
+from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import LIVE_QUEUE, Publisher
+from handtouch.wire import PadState
+
+NOW_NS = 10**9
+PERIOD_NS = 5_000_000
 
 
 @pytest.fixture
@@ -24,14 +32,14 @@ def publisher() -> Iterator[Publisher]:
 def _health(publisher: Publisher, link: str, text: str = "") -> wire.Health:
     topic = f"health/h/{link}"
     return wire.Health(
-        wire.SCHEMA_VERSION, publisher.run, publisher.next_seq(topic), 1, "h", link, "can0", 1, "clear", "operational",
-        0, "sync", text, None, 0.0, 0, 0, None, 0, 0, (), False,
+        wire.SCHEMA_VERSION, publisher.run, publisher.next_seq(topic), 1, "h", link, "can0", 1, "clear",
+        "operational", 0, "sync", text, None, 0.0, 0, 0, None, 0, 0, (), False,
     )  # fmt: skip
 
 
 def _until(publisher: Publisher, topic: str, wanted: bool = True) -> None:
     for _ in range(2000):
-        publisher.take_subscriptions(0)
+        publisher.take_subscriptions(NOW_NS)
         if publisher.wants(topic) == wanted:
             return
         for socket in publisher._sockets.values():
@@ -58,6 +66,18 @@ def test_nothing_is_encoded_for_nobody(publisher: Publisher, monkeypatch: pytest
     assert not publisher.wants("health/h/thumb")
 
 
+def _all_that_comes(publisher: Publisher, subscriber: Subscriber[Any], least: int) -> list[Any]:
+    """What reaches a subscriber: at least so many messages, and until nothing more comes."""
+    got: list[Any] = []
+    for _ in range(1000):
+        publisher.take_subscriptions(NOW_NS)
+        if (message := subscriber.recv(0.01)) is not None:
+            got.append(message)
+        elif len(got) >= least:
+            return got
+    raise AssertionError(f"only {got}")
+
+
 def test_a_late_joiner_gets_the_lasting_state_as_a_repeat_and_others_do_not_see_it_twice(
     publisher: Publisher,
 ) -> None:
@@ -66,17 +86,117 @@ def test_a_late_joiner_gets_the_lasting_state_as_a_repeat_and_others_do_not_see_
         publisher.send(_health(publisher, "thumb", "first"), lasting=True)
         first = early.recv()
         assert (first.reason, first.repeat) == ("first", False)
-        with connect("health/h/*", endpoint=publisher.endpoints["live"]) as late:
-            for _ in range(1000):
-                publisher.take_subscriptions(0)
-                repeat = late.recv(0.01)
-                if repeat is not None:
-                    break
-            assert repeat is not None
+        with connect("health/*/*", endpoint=publisher.endpoints["live"]) as late:  # the very same prefix
+            (repeat,) = _all_that_comes(publisher, late, 1)
             assert (repeat.reason, repeat.repeat, repeat.seq) == ("first", True, first.seq)
         publisher.send(_health(publisher, "thumb", "second"), lasting=True)
         assert early.recv().reason == "second"
         assert early.gaps == 0
+
+
+@pytest.mark.parametrize("stream", ["live", "complete"])
+def test_a_late_joiner_gets_contacts_under_way_and_the_hand_at_once(
+    publisher: Publisher, bench: Any, stream: str
+) -> None:
+    pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, publisher, publisher.run)
+    pipeline.node_state[:] = PadState.CLEAR
+    publisher.present.update(pipeline.messages.present())
+    touch = bench.counts(0, 0.3, 0.6, 1e-3).tobytes()
+
+    def cycle(number: int, samples: bytes) -> None:
+        t_ns = NOW_NS + number * PERIOD_NS
+        pipeline.begin(t_ns, t_ns)
+        for pad in range(3):
+            pipeline.slab.write(pad, samples if pad == 0 else bytes(8), t_ns + 1000)
+        pipeline.advance(t_ns + 4_000_000)
+
+    endpoint, patterns = publisher.endpoints[stream], ("contact/*/*", "hand/*", "raw/*")
+    for number in range(5):  # touched, and told to nobody
+        cycle(number, touch)
+    with connect(*patterns, endpoint=endpoint) as late:
+        contact, frame = _all_that_comes(publisher, late, 2)
+        assert (contact.event, contact.id, contact.link, contact.repeat) == ("update", 1, "plane", True)
+        assert (contact.run, contact.age_s) == (publisher.run, pytest.approx(-0.02))  # NOW_NS is before it
+        row = columns(frame)
+        assert frame.repeat
+        assert row["state"].tolist() == [1, 0, 0]
+        assert row["contact"].tolist() == [1, 0, 0]
+        assert row["position_m"][0] == pytest.approx(contact.position_m)
+        assert row["covariance_m2"][0] == pytest.approx(contact.covariance_m2)
+        assert row["pad_m"][0] == pytest.approx(contact.pad_m)
+        assert [row[name][0] for name in ("force_n", "force_std_n", "residual_std")] == pytest.approx(
+            [contact.force_n, contact.force_std_n, contact.residual_std], rel=1e-6
+        )
+        assert np.isnan(row["position_m"][1:]).all()
+        cycle(5, touch)
+        with connect(*patterns, endpoint=endpoint) as later:
+            assert {type(message) for message in _all_that_comes(publisher, later, 2)} >= {
+                wire.Contact,
+                wire.HandFrame,
+            }
+        cycle(6, touch)
+        news = _all_that_comes(publisher, late, 6)
+        assert [m.seq - contact.seq for m in news if isinstance(m, wire.Contact)] == [1, 2]
+        assert [m.seq - frame.seq for m in news if isinstance(m, wire.HandFrame)] == [1, 2]
+        assert not any(message.repeat for message in news)
+        assert late.gaps == 0
+    for number in range(7, 10):  # released while nobody listens
+        cycle(number, bytes(8))
+    with connect("contact/*/*", "hand/*", endpoint=endpoint) as last:
+        (frame,) = _all_that_comes(publisher, last, 1)
+        assert columns(frame)["state"].tolist() == [0, 0, 0]
+        assert np.isnan(columns(frame)["force_n"]).all()
+
+
+def test_who_was_away_sees_by_the_gap_how_much_there_was_to_tell(publisher: Publisher, bench: Any) -> None:
+    pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, publisher)
+    endpoint = publisher.endpoints["live"]
+    socket: zmq.Socket[bytes]
+    with connect("hand/h", endpoint=endpoint) as messages:
+        _until(publisher, "hand/h")
+        pipeline.tick_now(NOW_NS)
+        assert messages.recv().seq == 1
+        socket = messages._socket
+        socket.disconnect(endpoint)
+        while publisher.wants("hand/h"):
+            assert messages.recv(0.001) is None
+            publisher.take_subscriptions(NOW_NS)
+        for number in range(1, 8):
+            pipeline.tick_now(NOW_NS + number * PERIOD_NS)
+        socket.connect(endpoint)
+        _until(publisher, "hand/h")
+        pipeline.tick_now(NOW_NS + 8 * PERIOD_NS)
+        assert messages.recv().seq == 9
+        assert messages.gaps == 7
+
+
+def test_late_joiners_cost_a_tick_no_more_than_a_few_messages(
+    publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(100):
+        publisher.send(_health(publisher, f"link_{number}"), lasting=True)
+    encoded = 0
+    encode = wire.encode
+
+    def counted(message: wire.Message) -> list[bytes]:
+        nonlocal encoded
+        encoded += 1
+        return encode(message)
+
+    monkeypatch.setattr(wire, "encode", counted)
+    with ExitStack() as stack:
+        endpoint = publisher.endpoints["live"]
+        subscribers = [stack.enter_context(connect("health/*/*", endpoint=endpoint)) for _ in range(5)]
+        told: list[set[str]] = [set() for _ in subscribers]
+        most = 0
+        while min(map(len, told)) < 100:
+            before = encoded
+            publisher.take_subscriptions(NOW_NS)
+            most = max(most, encoded - before)
+            for subscriber, links in zip(subscribers, told, strict=True):
+                while (message := subscriber.recv(0.001)) is not None:
+                    links.add(message.link)
+    assert 0 < most <= 16
 
 
 def test_a_subscriber_that_stalls_loses_messages_and_nobody_else_does(publisher: Publisher) -> None:
@@ -86,7 +206,7 @@ def test_a_subscriber_that_stalls_loses_messages_and_nobody_else_does(publisher:
     with connect("health/*/*", endpoint=endpoint, queue=1), connect("health/*/*", endpoint=endpoint) as awake:
         _until(publisher, "health/h/thumb")
         for _ in range(200):  # both have joined when the second subscription has been taken, too
-            publisher.take_subscriptions(0)
+            publisher.take_subscriptions(NOW_NS)
             publisher._sockets["live"].poll(1)
         got = []
         for _ in range(count):
