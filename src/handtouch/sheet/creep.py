@@ -1,0 +1,125 @@
+"""Creep: a reading that lags behind its load and follows a release at once.
+
+Public names: `Creep`, `CreepStep`.
+
+A step of load gives load * (instant + sum_i weight_i (1 - exp(-t / time_i))): a chain of Kelvin-Voigt
+elements. Each element holds the load that it has come to feel, never more than what presses now, so a release
+is abrupt. A power law is a sum of such elements whose times lie evenly on a logarithmic scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import nnls
+
+FloatArray = npt.NDArray[np.float64]
+
+_FIT_PER_DECADE = 40
+
+
+@dataclass(frozen=True)
+class Creep:
+    """Answer to a unit step of load: instant + sum_i weights_i (1 - exp(-t / times_s_i)).
+
+    times_s: rising. The reading at last is `total` times the load. Raises ValueError for times that don't
+    rise from above 0, weights below 0, or an instant share that isn't positive.
+    """
+
+    instant: float
+    weights: tuple[float, ...]
+    times_s: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not 0 < self.instant < np.inf:
+            raise ValueError(f"instant must be positive and finite, got {self.instant}")
+        if len(self.weights) != len(self.times_s):
+            raise ValueError(f"{len(self.weights)} weights for {len(self.times_s)} times")
+        if not all(0 <= weight < np.inf for weight in self.weights):
+            raise ValueError(f"weights must be at least 0 and finite, got {self.weights}")
+        if not all(
+            low < high < np.inf for low, high in zip((0.0, *self.times_s), self.times_s, strict=False)
+        ):
+            raise ValueError(f"times_s must be positive, finite and rise, got {self.times_s}")
+
+    @classmethod
+    def first_order(cls, instant: float, time_s: float) -> Creep:
+        """One element; the reading at last is the load."""
+        return cls(instant, (1 - instant,), (time_s,))
+
+    @classmethod
+    def power_law(
+        cls, exponent: float, shortest_s: float = 1e-3, longest_s: float = 3600.0, modes: int = 7
+    ) -> Creep:
+        """Elements whose answer is nearest to (t / 1 s)^exponent from `shortest_s` to `longest_s`.
+
+        Least relative error on a logarithmic scale of time, weights kept above 0 (NNLS); `power_law_error`
+        says how near. exponent: 0 to 1, typically 0.02 to 0.1. Raises ValueError for an exponent out of
+        range, or too many decades for so few modes.
+        """
+        if not 0 < exponent < 1:
+            raise ValueError(f"exponent must lie between 0 and 1, got {exponent}")
+        decades = np.log10(longest_s / shortest_s)
+        t = np.geomspace(shortest_s, longest_s, int(_FIT_PER_DECADE * decades))
+        times = np.geomspace(shortest_s, longest_s, modes)
+        columns = np.column_stack([np.ones_like(t), -np.expm1(-t[:, None] / times)])
+        weights, _ = nnls(columns / t[:, None] ** exponent, np.ones_like(t))
+        if weights[0] == 0:
+            raise ValueError(f"{modes} modes are too few for an exponent of {exponent}")
+        return cls(float(weights[0]), tuple(weights[1:].tolist()), tuple(times.tolist()))
+
+    @property
+    def total(self) -> float:
+        """Reading over load, at last."""
+        return self.instant + sum(self.weights)
+
+    def response(self, t_s: npt.ArrayLike) -> FloatArray:
+        """Reading (...) at times (...) after a unit step of load."""
+        t = np.asarray(t_s, np.float64)[..., None]
+        grown = -np.expm1(-t / np.array(self.times_s)) @ np.array(self.weights)
+        return np.asarray(self.instant + grown)
+
+    def power_law_error(self, exponent: float, t_s: npt.ArrayLike) -> float:
+        """Greatest relative departure from (t / 1 s)^exponent at the given times."""
+        t = np.asarray(t_s, np.float64)
+        return float(np.abs(self.response(t) / t**exponent - 1).max())
+
+    def start(self, pads: int) -> FloatArray:
+        """State (1 + modes, pads) of sheets at rest: the load, then what each element feels of it [N]."""
+        return np.zeros((1 + len(self.times_s), pads))
+
+    def at(self, dt_s: float) -> CreepStep:
+        """What one step of `dt_s` needs, computed once."""
+        return CreepStep(self, dt_s)
+
+
+class CreepStep:
+    """Creep over one interval; n steps of dt under a constant load are one of n dt."""
+
+    def __init__(self, creep: Creep, dt_s: float) -> None:
+        decay = np.exp(-dt_s / np.array(creep.times_s))
+        modes, weights = len(decay), np.array(creep.weights)
+        self._reading = np.append(creep.instant, weights)
+        # An element goes to decay * state + (1 - decay) * load, or to the load where that is less.
+        self._move = np.column_stack([-np.expm1(-dt_s / np.array(creep.times_s)), np.diag(decay)])
+        # Elements keep their order, the quickest nearest to the load. If the first k feel more than the load
+        # they follow it at once, and reading = slope_k load + sum over the others of weight decay state: one
+        # straight line for each k. The reading is the least of them, so the load is the greatest answer.
+        others = np.triu(np.ones((modes + 1, modes))) * (weights * decay)
+        slope = creep.total - others.sum(1)
+        self._lines = np.column_stack([np.ones(modes + 1), -others]) / slope[:, None]
+
+    def forward(self, state: FloatArray, load_n: FloatArray) -> FloatArray:
+        """Reading (n,) at the end of an interval under load (n,) >= 0; `state` is carried on in place."""
+        state[0] = load_n
+        np.minimum(self._move @ state, state[0], out=state[1:])
+        return np.asarray(self._reading @ state)
+
+    def inverse(self, state: FloatArray, reading_n: FloatArray) -> FloatArray:
+        """The load (n,) whose reading this is; exact. `state` is carried on in place."""
+        state[0] = reading_n
+        load = np.maximum.reduce(self._lines @ state, out=state[0])
+        np.minimum(self._move @ state, load, out=state[1:])
+        return np.array(load)
