@@ -352,11 +352,11 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=OUT, help="folder for faults.md and faults.json")
     parser.add_argument("--keep", action="store_true", help="the daemon's log too, as faults.txt")
     asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
     if asked.interface == "udp_multicast":
         in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         results = measure(Path(folder), asked)
-    asked.out.mkdir(parents=True, exist_ok=True)
     kept = asked.out / "faults.json"
     every = json.loads(kept.read_text()) if kept.exists() else {}
     every[asked.interface] = results
