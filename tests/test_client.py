@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, assert_type
 
 import msgpack
 import pytest
@@ -56,10 +58,14 @@ def test_a_repeat_is_taken_once(publisher: Any, subscriber: Subscriber[Any]) -> 
     assert subscriber.gaps == 0
 
 
-def test_a_restarted_daemon_begins_to_count_again(publisher: Any, subscriber: Subscriber[Any]) -> None:
-    for seq in (700, 1, 2):
-        publisher.send_multipart(_parts(seq))
-    assert [subscriber.recv().seq for _ in range(3)] == [700, 1, 2]
+@pytest.mark.parametrize("seqs", [(700, 1, 2), (3, 700, 701), (5, 5, 6)])
+def test_a_restarted_daemon_counts_anew_and_that_is_no_gap(
+    publisher: Any, subscriber: Subscriber[Any], seqs: tuple[int, int, int]
+) -> None:
+    publisher.send_multipart(_parts(seqs[0], run=1))
+    publisher.send_multipart(_parts(seqs[1], run=2, repeat=True))  # for us, who have just come back
+    publisher.send_multipart(_parts(seqs[2], run=2))
+    assert [subscriber.recv().seq for _ in range(3)] == list(seqs)
     assert subscriber.gaps == 0
 
 
@@ -99,3 +105,98 @@ def test_a_pattern_that_no_topic_matches_is_refused(pattern: str) -> None:
 def test_request_names_the_endpoint_when_nobody_answers(endpoints: dict[str, str]) -> None:
     with pytest.raises(TimeoutError, match=endpoints["control"]):
         handtouch.request("status", endpoint=endpoints["control"], timeout_s=0.1)
+
+
+def test_a_pattern_of_a_whole_topic_tells_a_type_checker_what_comes() -> None:
+    def types() -> None:  # for mypy: never called
+        assert_type(handtouch.connect().recv(), wire.Contact)
+        assert_type(handtouch.connect("contact/*/*", queue=5).recv(1.0), wire.Contact | None)
+        assert_type(next(iter(handtouch.connect("hand/*"))), wire.HandFrame)
+        assert_type(handtouch.connect("service").recv(), wire.Service)
+        assert_type(handtouch.connect("hand/*", "raw/*").recv(), Any)
+
+    assert callable(types)
+
+
+async def _take(subscriber: Subscriber[Any], count: int) -> list[int]:
+    got: list[int] = []
+    async for message in subscriber:
+        got.append(message.seq)
+        if len(got) == count:
+            break
+    return got
+
+
+def test_asyncio_gets_what_was_there_and_what_comes(publisher: Any, subscriber: Subscriber[Any]) -> None:
+    async def main() -> list[int]:
+        async with subscriber:
+            publisher.send_multipart(_parts(1))
+            first = await _take(subscriber, 1)
+            waiting = asyncio.create_task(_take(subscriber, 2))
+            for seq in (2, 3):
+                await asyncio.sleep(0)
+                publisher.send_multipart(_parts(seq))
+            return first + await waiting
+
+    assert asyncio.run(main()) == [1, 2, 3]
+    with pytest.raises(zmq.ZMQError):
+        subscriber.recv(0)  # `async with` has closed it
+
+
+def test_time_outs_and_cancelling_lose_no_message(publisher: Any, subscriber: Subscriber[Any]) -> None:
+    async def main() -> list[int]:
+        assert await subscriber.arecv(0) is None
+        assert await subscriber.arecv(0.01) is None
+        got: list[int] = []
+        for seq in range(1, 201):
+            task = asyncio.create_task(subscriber.arecv())
+            for _ in range(seq % 4):
+                await asyncio.sleep(0)
+            publisher.send_multipart(_parts(seq))
+            for _ in range(seq % 3):
+                await asyncio.sleep(0)
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                got.append((await task).seq)
+        while (message := await subscriber.arecv(0.2)) is not None:
+            got.append(message.seq)
+        return got
+
+    assert asyncio.run(main()) == list(range(1, 201))
+    assert subscriber.gaps == 0
+
+
+def test_a_stream_without_a_pause_leaves_other_tasks_their_turn(
+    publisher: Any, subscriber: Subscriber[Any]
+) -> None:
+    async def main() -> int:
+        turns = 0
+
+        async def other() -> None:
+            nonlocal turns
+            while True:
+                turns += 1
+                await asyncio.sleep(0)
+
+        for seq in range(1, 101):
+            publisher.send_multipart(_parts(seq))
+        task = asyncio.create_task(other())
+        await _take(subscriber, 100)
+        task.cancel()
+        return turns
+
+    assert asyncio.run(main()) >= 100
+
+
+def test_a_subscriber_leaves_nothing_in_a_loop_that_goes_on(
+    publisher: Any, endpoints: dict[str, str]
+) -> None:
+    async def main() -> None:
+        for _ in range(20):  # each takes the file descriptors of the one before
+            async with handtouch.connect("health/*/*", endpoint=endpoints["live"]) as messages:
+                seq = 0
+                while await messages.arecv(0.01) is None:
+                    seq += 1
+                    publisher.send_multipart(_parts(seq))
+
+    asyncio.run(main())

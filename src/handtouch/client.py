@@ -320,6 +320,8 @@ class _Door:
 
     def close(self) -> None:
         """Hear no more."""
+        if self._monitor.closed:
+            return
         self._poller.unregister(self._monitor)
         self._socket.disable_monitor()
         self._monitor.close()

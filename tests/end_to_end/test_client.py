@@ -1,0 +1,135 @@
+"""What a subscriber of the real daemon can tell: no contact, a silent sensor and a dead daemon apart."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from handtouch import wire
+from handtouch.client import Subscriber, columns, connect
+
+LONGEST_S = 60.0
+EVERYTHING = ("contact/*/*", "hand/*", "health/*/*", "service")
+
+
+def _until(
+    rig: Any,
+    messages: Subscriber[Any],
+    met: Callable[[Any], bool],
+    each: Callable[[Any], None] = lambda _: None,
+) -> Any:
+    """The first message that meets a condition; `each` gets all of them."""
+    end_s = time.monotonic() + LONGEST_S
+    while time.monotonic() < end_s:
+        if (message := messages.recv(0.1)) is not None:
+            each(message)
+            if met(message):
+                return message
+    raise AssertionError(f"never came\n{rig.all_printed()}")
+
+
+def _is(kind: type[Any], **values: Any) -> Callable[[Any], bool]:
+    return lambda m: isinstance(m, kind) and all(getattr(m, name) == value for name, value in values.items())
+
+
+def test_no_contact_a_silent_sensor_and_a_dead_daemon_are_told_apart(rig: Any) -> None:
+    rig.simulate()
+    rig.start("run")
+    rig.wait_operational()
+    states: dict[str, int] = {}
+
+    def note(message: Any) -> None:
+        if isinstance(message, wire.HandFrame):
+            states.update(zip(message.links, columns(message)["state"].tolist(), strict=True))
+
+    with rig.subscribe(*EVERYTHING) as messages:
+        # no contact: it was released, its pad is sampled, and the daemon lives
+        ended = _until(rig, messages, _is(wire.Contact, event="end"), note)
+        assert ended.reason == "released"
+        frame = _until(
+            rig, messages, lambda m: isinstance(m, wire.HandFrame) and m.seq > 0 and m.t_ns >= ended.t_ns
+        )
+        assert columns(frame)["state"][frame.links.index(ended.link)] == wire.PadState.CLEAR
+        assert messages.alive
+
+        # a silent sensor: pads of frozen nodes are stale, then lost, contacts end so, and the daemon lives
+        _until(rig, messages, _is(wire.Contact, event="begin"), note)
+        rig.processes["simulate"].send_signal(signal.SIGSTOP)
+        try:
+            ended = _until(rig, messages, _is(wire.Contact, event="end"), note)
+            if ended.reason == "released":  # in its last moment
+                ended = None
+            _until(rig, messages, _is(wire.Health, state="stale"), note)
+            _until(rig, messages, _is(wire.Health, state="lost"), note)
+            _until(rig, messages, lambda _: set(states.values()) == {int(wire.PadState.LOST)}, note)
+            assert ended is None or ended.reason in ("stale", "lost")
+            _until(rig, messages, _is(wire.Service), note)
+            assert messages.alive
+        finally:
+            rig.processes["simulate"].send_signal(signal.SIGCONT)
+        run = _until(rig, messages, _is(wire.Contact, event="begin"), note).run  # all is well again
+
+        # a dead daemon: nothing comes, not even its heartbeat, and nothing says that the contact ended
+        rig.end("run", signal.SIGKILL)
+        end_s = time.monotonic() + LONGEST_S
+        while messages.alive:
+            assert time.monotonic() < end_s
+            messages.recv(0.1)
+        assert messages.recv(0) is None
+
+        for endpoint in rig.endpoints.values():
+            if os.path.exists(path := endpoint.removeprefix("ipc://")):
+                os.unlink(path)
+        rig.start("run")
+        back = _until(rig, messages, _is(wire.Contact, event="update"), note)
+        assert messages.alive
+        assert back.run > run
+        assert messages.gaps == 0
+        assert messages.malformed == 0
+
+
+@pytest.mark.parametrize("stream", ["live", "complete"])
+def test_a_late_joiner_is_told_the_present_at_once_and_nobody_else_twice(rig: Any, stream: str) -> None:
+    rig.simulate()
+    rig.start("run")
+    rig.wait_operational()
+    endpoint = rig.endpoints[stream]
+    told, repeated = set[type[Any]](), set[type[Any]]()
+    with connect(*EVERYTHING, endpoint=endpoint, queue=100_000) as early:
+        seen: dict[str, list[int]] = defaultdict(list)
+
+        def note(message: Any) -> None:
+            seen[wire.topic_of(message)].append(message.seq)
+
+        end_s = time.monotonic() + LONGEST_S
+        # of a topic with a message at every tick, the next one mostly comes before the repeat is made
+        while not (told >= {wire.Contact, wire.HandFrame} and repeated >= {wire.Health, wire.Service}):
+            assert time.monotonic() < end_s, (told, repeated)
+            _until(rig, early, lambda m: isinstance(m, wire.Contact) and m.event != "end", note)
+            with connect(*EVERYTHING, endpoint=endpoint) as late:  # the same prefixes
+                first: dict[str, Any] = {}
+                while len([topic for topic in first if topic.startswith("health/")]) < 15:
+                    message = late.recv(LONGEST_S)
+                    assert message is not None, rig.all_printed()
+                    first.setdefault(wire.topic_of(message), message)
+                    told.add(type(message))
+                    if message.repeat:
+                        assert not isinstance(message, wire.Contact) or message.event == "update"
+                        repeated.add(type(message))
+                assert late.gaps == 0
+        _until(rig, early, _is(wire.Service), note)
+        assert early.gaps == 0
+    for topic, seqs in seen.items():
+        assert seqs == list(range(seqs[0], seqs[0] + len(seqs))), topic
+
+
+def test_drops_of_both_streams_are_named_in_service(rig: Any) -> None:
+    rig.start("run")
+    with rig.subscribe("service") as messages:
+        assert messages.recv().drops == {"live": 0, "complete": 0}
