@@ -37,6 +37,8 @@ class Outlet(Protocol):
 
     def write(self, record: logging.LogRecord) -> None: ...
 
+    def close(self) -> None: ...
+
 
 def set_level(level: str) -> None:
     """Say what is at least so grave, from now on. Raises ValueError naming the levels."""
@@ -123,6 +125,8 @@ class Logs(logging.Handler):
         except queue.Full:
             return
         self._thread.join(_FLUSH_S)
+        if not self._thread.is_alive():
+            self._outlet.close()
 
     def _write(self) -> None:
         while True:
@@ -166,6 +170,9 @@ class Lines:
         except OSError:
             return
 
+    def close(self) -> None:
+        """Nothing: the file is its opener's."""
+
 
 class Journal:
     """The journal's own protocol: every record with its fields, for `journalctl HANDTOUCH_LINK=...`."""
@@ -190,6 +197,10 @@ class Journal:
             self._socket.sendto(b"".join(_field(key, value) for key, value in values.items()), self._address)
         except OSError:
             self._otherwise.write(record)
+
+    def close(self) -> None:
+        """Give the socket back."""
+        self._socket.close()
 
 
 def _field(key: str, value: str) -> bytes:

@@ -64,7 +64,8 @@ class Exporter:
         self._ours, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._ours.setblocking(False)
         self._closing = threading.Event()
-        self._process: subprocess.Popen[bytes] | None = None
+        self.process: int | None = None
+        """id of the process, once it runs"""
         self._keeper = threading.Thread(target=self._keep, name="handtouch-metrics", daemon=True)
         self._keeper.start()
 
@@ -89,8 +90,9 @@ class Exporter:
         command = [sys.executable, "-m", "handtouch.daemon.metrics", *map(str, files)]
         while not self._closing.is_set():
             with contextlib.suppress(OSError, ValueError):  # closed meanwhile
-                self._process = subprocess.Popen(command, pass_fds=files, stdin=subprocess.DEVNULL)
-                status = self._process.wait()
+                started = subprocess.Popen(command, pass_fds=files, stdin=subprocess.DEVNULL)
+                self.process = started.pid
+                status = started.wait()
                 if not self._closing.wait(_RESTART_S):
                     _log.warning(
                         "the process that serves metrics ended with status %d; started again", status
