@@ -1,6 +1,7 @@
 """Ratios of a pad's four channel gains from ordinary contacts, without a reference.
 
-Public: `GainEstimator` (contacts in, `GainEstimate` out) and `gain_deviation` (what a shape of pad permits).
+Public: `GainEstimator` (contacts in, `GainEstimate` out); `gain_deviation` and `fisher_covariance` (what a
+shape of pad, and contacts on it, permit at best).
 
 A point contact has three unknowns and gives four currents. The one number left over, the score, is the part
 of the misfit along the left null vector n of the fit's whitened Jacobian: a standard normal number if the
@@ -20,6 +21,7 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit
 
 from handtouch.field.estimate import estimate
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
@@ -36,6 +38,7 @@ _NOISIEST = 0.02  # of the total: weaker contacts tell little, and that with a b
 _CELLS = 10  # a side
 _MEMORY = 128.0  # contacts over which the share of points is learnt
 _LEAST_SPREAD = 25.0  # variance of the scores of contacts that are no points, at least
+_LEAST_KEPT = 0.2  # of a batch's information, however doubtful its contacts
 _DAY_NS = 86_400e9
 
 # orthonormal directions of four log gains that sum to zero
@@ -56,7 +59,7 @@ class GainEstimate:
     """What the contacts tell of the gains, channels in the order x0, xa, y0, yb.
 
     gains: (4,), factors that correct the currents; their product is 1, a common factor is not observable.
-    covariance: (4, 4), of the logarithms of the gains; singular, as they sum to zero.
+    covariance: (4, 4), of the logarithms of the gains; singular, as they sum to zero. Widened by the misfit.
     contacts: how many were used. weight: how many of them count, once those at one place and those that
         are no points are discounted. points: share of them that are points.
     misfit: root mean square score of the points of late, near 1 where model and noise are right.
@@ -158,9 +161,10 @@ class GainEstimator:
     @property
     def estimate(self) -> GainEstimate:
         """The gains as the batches so far tell them."""
-        covariance = _BASIS @ _inverse(self._information) @ _BASIS.T
         squares, counted = self._misfit
         misfit = float(np.sqrt(squares / counted)) if counted > 0 else float("nan")
+        # scores wider than the noise makes them: what is wrong with the points widens the gains too
+        covariance = _BASIS @ _inverse(self._information) @ _BASIS.T * max(1.0, np.nan_to_num(misfit) ** 2)
         std = float(np.sqrt(np.diag(covariance).max()))
         status, reason = self._judge(std)
         return GainEstimate(
@@ -259,9 +263,17 @@ def gain_deviation(model: ForwardModel, contacts: int = 400) -> float:
     """
     at = 0.1 + 0.8 * (np.arange(20) + 0.5) / 20
     x, y = (grid.ravel() for grid in np.meshgrid(at * model.a, at * model.b))
-    slope = _slopes(model, x, y, np.ones((4, x.size)), np.ones(x.size))[1]
-    mean = slope @ slope.T / x.size * contacts
-    return float(np.sqrt(np.diag(_BASIS @ np.linalg.pinv(mean, rcond=1e-14) @ _BASIS.T).max()))
+    covariance = fisher_covariance(model, x, y, 1.0) * x.size / contacts
+    return float(np.sqrt(np.diag(covariance).max()))
+
+
+def fisher_covariance(model: ForwardModel, x: FloatArray, y: FloatArray, noise: ArrayLike) -> FloatArray:
+    """Fisher bound of the log gains, (4, 4), of contacts at x, y (n,) that nothing else is known of.
+
+    noise: of the channels as a part of each contact's total, as `channel_noise` takes it.
+    """
+    slope = _slopes(model, x, y, channel_noise(noise, (4, *x.shape)), np.ones(x.shape))[1]
+    return np.asarray(_BASIS @ np.linalg.pinv(slope @ slope.T, rcond=1e-14) @ _BASIS.T)
 
 
 @dataclass
@@ -303,13 +315,15 @@ class _Mixture:
         for _ in range(_MIXTURE_ROUNDS):
             z = (view.score + step @ view.slope) ** 2 / spread**2
             wide = max(self.squares / self.others, _LEAST_SPREAD)
-            odds = (
-                self.others / self.points / np.sqrt(wide) * np.exp(np.minimum(z * (1 - 1 / wide) / 2, 700.0))
-            )
-            other = odds / (1 + odds)
+            log_odds = np.log(self.others / self.points) - np.log(wide) / 2 + z * (1 - 1 / wide) / 2
+            other = expit(log_odds)
             self.points, self.others = points + (1 - other).sum(), others + other.sum()
             self.squares = squares + other @ z
-            weight = share * (1 - other + other / wide)
+            weight = 1 - other + other / wide
+            # what isn't known of a contact's kind takes from the information (Louis 1982)
+            doubt = other * (1 - other) * (1 - 1 / wide) ** 2 * z
+            kept = max(1 - (share @ doubt) / (share @ weight), _LEAST_KEPT)
+            weight = kept * share * weight
             step = step_for(weight)
         fade = min(1.0, _MEMORY / (self.points + self.others))
         self.points, self.others, self.squares = (fade * v for v in (self.points, self.others, self.squares))
