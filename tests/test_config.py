@@ -275,6 +275,14 @@ MISTAKES = {
         ("[[bus]]", '[daemon]\nlive = "tcp://127.0.0.1:99999"\n[[bus]]'),
         '[daemon]: live = "tcp://127.0.0.1:99999": must end in a port, 1 to 65535, or *',
     ),
+    "metrics for other machines": (
+        ("[[bus]]", '[daemon]\nmetrics = "0.0.0.0:9580"\n[[bus]]'),
+        '[daemon]: metrics = "0.0.0.0:9580": reaches beyond this machine, and whoever asks gets an answer',
+    ),
+    "metrics without a port": (
+        ("[[bus]]", '[daemon]\nmetrics = "127.0.0.1"\n[[bus]]'),
+        '[daemon]: metrics = "127.0.0.1": must be HOST:PORT such as 127.0.0.1:9580',
+    ),
     "endpoint of a host that looks like loopback": (
         ("[[bus]]", '[daemon]\nlive = "tcp://127.evil.example:5580"\n[[bus]]'),
         '[daemon]: live = "tcp://127.evil.example:5580": reaches beyond this machine; only loopback',

@@ -68,19 +68,19 @@ def run(options: Options) -> int:
     try:
         with ExitStack() as opened:
             relays = list(_open(options, opened))
-            failed = [_Thread(relay, stop) for relay in relays]
+            threads = [_Thread(relay, stop) for relay in relays]
             stop.wait()
-            for thread in failed:
+            for thread in threads:
                 thread.join()
     except (BridgeError, ConfigError) as error:
         print(error, file=sys.stderr)
         return 2
     finally:
         said.close()
-    for thread in failed:
+    for thread in threads:
         if thread.error is not None:
             print(thread.error, file=sys.stderr)
-    return 1 if any(thread.error for thread in failed) else 0
+    return 1 if any(thread.error for thread in threads) else 0
 
 
 def robots(options: Options) -> list[Robot]:

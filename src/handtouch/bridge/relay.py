@@ -132,11 +132,12 @@ class Commands:
     """Passes queries at ROOT/control on to the daemon: payload and answer as in docs/wire.md, "Control"."""
 
     def __init__(self, session: Session, root: str, endpoint: str, key: str | None) -> None:
+        self._at = f"{root}/control"
         self._endpoint, self._key = endpoint, key
         self._queue: queue.Queue[zenoh.Query | None] = queue.Queue(_COMMANDS)
         self._thread = threading.Thread(target=self._serve, name=f"control-{root}", daemon=True)
         self._thread.start()
-        self._queryable = session.declare_queryable(f"{root}/control", self._take)
+        self._queryable = session.declare_queryable(self._at, self._take)
 
     def close(self) -> None:
         """Take no more."""
@@ -145,6 +146,8 @@ class Commands:
         self._thread.join()
 
     def _take(self, query: zenoh.Query) -> None:
+        if str(query.key_expr) != self._at:
+            return  # a wildcard asks for topics; it is no command to everybody
         try:
             self._queue.put_nowait(query)
         except queue.Full:

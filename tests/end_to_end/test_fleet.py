@@ -1,0 +1,330 @@
+"""Beyond one hand: hands on several buses, daemons side by side, robots on a Zenoh network."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+
+from handtouch import wire
+
+from .conftest import START_S, Rig
+
+pytest.importorskip("zenoh", reason="needs the extra zenoh")
+
+REMOTE = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+for key, value in (("mode", '"peer"'), ("scouting/multicast/enabled", "false"),
+                   ("listen/endpoints", json.dumps(sys.argv[1:]))):
+    config.insert_json5(key, value)
+def tell(what, **values):
+    print(json.dumps({"what": what, **values}), flush=True)
+with zenoh.open(config) as session:
+    session.declare_subscriber("lab/**", lambda sample: tell("sample", key=str(sample.key_expr),
+        encoding=str(sample.encoding), payload=bytes(sample.payload).hex()))
+    session.liveliness().declare_subscriber("lab/**", lambda sample: tell(
+        "alive" if sample.kind == zenoh.SampleKind.PUT else "gone", key=str(sample.key_expr)), history=True)
+    tell("ready")
+    for line in sys.stdin:
+        asked = json.loads(line)
+        payload = bytes.fromhex(asked["payload"]) if "payload" in asked else None
+        for reply in session.get(asked["get"], payload=payload, timeout=10.0):
+            if reply.ok is not None:
+                tell("reply", key=str(reply.ok.key_expr), payload=bytes(reply.ok.payload).hex())
+        tell("answered")
+"""
+
+
+def named(rig: Rig, hand: str) -> Rig:
+    rig.config.write_text(rig.config.read_text().replace('name = "right"', f'name = "{hand}"'))
+    return rig
+
+
+class Remote:
+    """A Zenoh subscriber in a process of its own that knows nothing of handtouch."""
+
+    def __init__(self, prefix: list[str], *listen: str) -> None:
+        self.process = subprocess.Popen(
+            [*prefix, sys.executable, "-c", REMOTE, *listen],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.samples: list[dict[str, Any]] = []
+        self.alive: set[str] = set()
+        self.next("ready")
+
+    def next(self, what: str, key: str = "") -> dict[str, Any]:
+        """Read on to the next line about something."""
+        assert self.process.stdout is not None
+        end_s = time.monotonic() + START_S
+        while time.monotonic() < end_s:
+            told: dict[str, Any] = json.loads(self.process.stdout.readline())
+            if told["what"] == "sample":
+                self.samples.append(told)
+            elif told["what"] == "alive":
+                self.alive.add(told["key"])
+            elif told["what"] == "gone":
+                self.alive.discard(told["key"])
+            if told["what"] == what and told.get("key", "").startswith(key):
+                return told
+        raise AssertionError(f"no {what} {key}; {len(self.samples)} samples, alive: {self.alive}")
+
+    def get(self, selector: str, payload: bytes | None = None) -> dict[str, bytes]:
+        assert self.process.stdin is not None
+        asked = {"get": selector} | ({} if payload is None else {"payload": payload.hex()})
+        self.process.stdin.write(json.dumps(asked) + "\n")
+        self.process.stdin.flush()
+        replies = {}
+        assert self.process.stdout is not None
+        while (told := json.loads(self.process.stdout.readline()))["what"] != "answered":
+            if told["what"] == "reply":
+                replies[told["key"]] = bytes.fromhex(told["payload"])
+            elif told["what"] == "sample":
+                self.samples.append(told)
+        return replies
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture
+def networks() -> Iterator[tuple[list[str], list[list[str]]]]:
+    """Prefixes of commands in three network namespaces: one in the middle (10.88.1.1, 10.88.2.1), two robots
+    (10.88.1.2 and 10.88.2.2), which reach it alone.
+    """
+    rootless = [] if os.geteuid() == 0 else ["--map-root-user"]
+    user = ["--user", "--preserve-credentials"] if rootless else []
+    keepers: list[subprocess.Popen[str]] = []
+
+    def keep(prefix: list[str], how: list[str]) -> list[str]:
+        ready = "ip link set lo up && ip route add 239.0.0.0/8 dev lo && echo $$ && exec cat"
+        keeper = subprocess.Popen(
+            [*prefix, "unshare", "--net", *how, "sh", "-c", ready],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        keepers.append(keeper)
+        assert keeper.stdout is not None
+        answer = keeper.stdout.readline().strip()
+        if not answer.isdigit():
+            pytest.skip(f"no network namespace to be had: {answer}")
+        return ["nsenter", "--target", answer, *user, "--net", "--"]
+
+    try:
+        if shutil.which("nsenter") is None or shutil.which("ip") is None:
+            pytest.skip("nsenter (util-linux) or ip (iproute2) is missing")
+        middle = keep([], rootless)
+        robots = [keep(middle, []), keep(middle, [])]
+        for number, robot in enumerate(robots, 1):
+            near, far = f"near{number}", f"far{number}"
+            pair = ["ip", "link", "add", near, "type", "veth", "peer", "name", far, "netns", robot[2]]
+            done = subprocess.run([*middle, *pair], capture_output=True, text=True, check=False)
+            if done.returncode != 0:
+                pytest.skip(f"no virtual cable to be had: {done.stderr.strip()}")
+            for prefix, end, host in ((middle, near, 1), (robot, far, 2)):
+                address = ["ip", "address", "add", f"10.88.{number}.{host}/24", "dev", end]
+                subprocess.run([*prefix, *address], check=True)
+                subprocess.run([*prefix, "ip", "link", "set", end, "up"], check=True)
+        yield middle, robots
+    finally:
+        for keeper in reversed(keepers):
+            keeper.kill()
+            keeper.communicate()
+
+
+def rig_in(folder: Path, prefix: list[str], port: int) -> Rig:
+    """A deployment with ipc endpoints of its own; what it prints and binds is in the folder."""
+    folder.mkdir()
+    endpoints = {stream: f"ipc://{folder}/{stream}" for stream in ("live", "complete", "control", "inputs")}
+    return Rig(folder, endpoints, prefix, [f"can0=udp_multicast:239.74.163.2,port={port}"])
+
+
+@pytest.fixture
+def short_path(endpoints: dict[str, str]) -> Path:
+    """A folder whose path is short enough for ipc endpoints below it."""
+    return Path(endpoints["live"].removeprefix("ipc://")).parent
+
+
+def test_two_hands_on_two_buses_are_served_by_one_daemon(rig: Rig, free_port: int) -> None:
+    text = rig.config.read_text()
+    bus = re.search(r"\[\[bus\]\]\n.*?\n(?=\n*\[)", text, re.DOTALL)
+    assert bus is not None
+    hand = text[text.index("[[hand]]") :]
+    other = hand.replace('"right"', '"left"').replace("can0", "can1").replace("serial = 1", "serial = 2")
+    second = bus[0].replace("can0", "can1") + "\n" + other
+    rig.config.write_text(text.replace(bus[0], bus[0] + "\n") + "\n" + second)
+    rig.bus.append(f"can1=udp_multicast:239.74.163.3,port={free_port + 1}")
+    rig.scenario.write_text(
+        "repeat = true\n"
+        + "".join(
+            f'[[touch]]\nhand = "{name}"\nlink = "index_distal"\nfrom_s = 0.1\nduration_s = 0.6\n'
+            "path = [[0.5, 0.5]]\nforce_n = [1.5]\n"
+            for name in ("right", "left")
+        )
+    )
+    rig.simulate()
+    rig.start("run")
+    status = rig.wait_operational(30)
+    assert {(pad["hand"], pad["bus"]) for pad in status["pads"]} == {("right", "can0"), ("left", "can1")}
+    touched: set[str] = set()
+    with rig.subscribe("contact/*/*", "hand/*") as messages:
+        ticks: dict[str, set[int]] = {"right": set(), "left": set()}
+        while len(touched) < 2 or len(ticks["right"] & ticks["left"]) < 20:
+            message = messages.recv(START_S)
+            assert message is not None, rig.all_printed()
+            if isinstance(message, wire.Contact):
+                touched.add(message.hand)
+            else:
+                ticks[message.hand].add(message.tick)
+    assert all(bus["samples"] > 0 for bus in rig.status()["service"]["buses"].values())
+
+
+def test_daemons_side_by_side_keep_to_their_own_endpoints_and_buses(
+    short_path: Path, network: list[str], free_port: int
+) -> None:
+    left = named(rig_in(short_path / "left", network, free_port), "left")
+    right = rig_in(short_path / "right", network, free_port + 1)
+    try:
+        for rig in (left, right):
+            rig.simulate()
+            rig.start("run")
+        for rig, hand in ((left, "left"), (right, "right")):
+            status = rig.wait_operational()
+            assert {pad["hand"] for pad in status["pads"]} == {hand}
+        again = subprocess.run(
+            left.command("run", str(left.config), "--bus", left.bus[0]),
+            capture_output=True,
+            text=True,
+            timeout=START_S,
+        )
+        assert again.returncode == 1
+        assert "another daemon has it" in again.stderr
+        assert left.end("run") == 0
+        ticks = right.status()["service"]["ticks"]
+        right.wait("ticking on", lambda status: status["service"]["ticks"] > ticks)
+    finally:
+        left.end_all()
+        right.end_all()
+
+
+def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_follows_their_restarts(
+    short_path: Path, networks: tuple[list[str], list[list[str]]], free_port: int
+) -> None:
+    middle, prefixes = networks
+    robots = [
+        named(rig_in(short_path / f"r{number}", prefix, free_port), hand)
+        for number, (prefix, hand) in enumerate(zip(prefixes, ("left", "right"), strict=True), 1)
+    ]
+    listen = [f"tcp/10.88.{number}.1:7447" for number in (1, 2)]
+    remote = None
+    try:
+        for number, robot in enumerate(robots, 1):
+            robot.simulate()
+            robot.start("run")
+            with (robot.folder / "bridge.txt").open("w") as printed:  # before there is anybody to connect to
+                robot.processes["bridge"] = subprocess.Popen(
+                    robot.command(
+                        *("bridge", str(robot.config), "--prefix", f"lab/robot{number}", "--control"),
+                        *("--connect", listen[number - 1]),
+                    ),
+                    stderr=printed,
+                    text=True,
+                )
+        for robot in robots:
+            robot.wait_operational()
+        remote = Remote(middle, *listen)
+        for number, hand in ((1, "left"), (2, "right")):
+            root = f"lab/robot{number}/hand"
+            frame = remote.next("sample", f"{root}/hand/{hand}")
+            assert frame["encoding"] == "application/msgpack"
+            parts = [b"hand/" + hand.encode(), bytes.fromhex(frame["payload"])]
+            message = wire.decode(parts)  # the very bytes of docs/wire.md
+            assert isinstance(message, wire.HandFrame)
+            begun = remote.next("sample", f"{root}/contact/{hand}/index_distal")
+            decoded = wire.decode([f"contact/{hand}/index_distal".encode(), bytes.fromhex(begun["payload"])])
+            assert isinstance(decoded, wire.Contact)
+        assert remote.alive == {"lab/robot1/hand", "lab/robot2/hand"}
+
+        latest = remote.get("lab/robot1/hand/health/**")  # as one that comes late asks
+        assert len(latest) == 15
+        assert set(remote.get("lab/*/hand/service")) == {f"lab/robot{n}/hand/service" for n in (1, 2)}
+        for request, ok in ((msgpack.packb({"v": 1, "command": "status"}), True), (b"\xc1", False)):
+            (answer,) = remote.get("lab/robot2/hand/control", request).values()
+            assert msgpack.unpackb(answer)["ok"] is ok
+
+        assert robots[0].end("run") == 0
+        remote.next("gone", "lab/robot1/hand")
+        assert remote.get("lab/robot1/hand/**") == {}
+        robots[0].start("run")
+        remote.next("alive", "lab/robot1/hand")
+
+        remote.close()  # and the network's other end restarts too
+        remote = Remote(middle, *listen)
+        for number in (1, 2):
+            remote.next("sample", f"lab/robot{number}/hand/service")
+        for robot in robots:
+            assert robot.end("bridge") == 0
+            assert " 0 lost before" in robot.printed("bridge")
+    finally:
+        for robot in robots:
+            robot.end_all()
+        if remote is not None:
+            remote.close()
+
+
+def test_commands_stay_away_from_the_network_unless_asked_for(rig: Rig, free_port: int) -> None:
+    rig.start("run")
+    rig.status()
+    listen = f"tcp/127.0.0.1:{free_port}"
+    remote = Remote(rig.command()[:-3], listen)
+    try:
+        rig.processes["bridge"] = subprocess.Popen(
+            rig.command("bridge", str(rig.config), "--prefix", "lab", "--connect", listen), text=True
+        )
+        remote.next("sample", "lab/hand/service")
+        assert remote.get("lab/hand/control", msgpack.packb({"v": 1, "command": "status"})) == {}
+    finally:
+        remote.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["--connect", "tcp/127.0.0.1:7447"], "whom to carry"),
+        (["--endpoint", "left=ipc:///tmp/x"], "where is the Zenoh network"),
+        (["--endpoint", "ipc:///tmp/x", "--connect", "tcp/127.0.0.1:1"], "NAME=ENDPOINT"),
+        (
+            ["--endpoint", "a=ipc:///x", "--endpoint", "a=ipc:///y", "--connect", "tcp/127.0.0.1:1"],
+            "another name",
+        ),
+        (["--endpoint", "a=ipc:///x", "--control", "--connect", "tcp/127.0.0.1:1"], "deployment files"),
+        (["--endpoint", "a=ipc:///x", "--connect", "nonsense"], "Zenoh can't be opened"),
+        (["--endpoint", "a=nonsense", "--connect", "tcp/127.0.0.1:1"], "no ZeroMQ endpoint"),
+    ],
+)
+def test_a_bridge_that_cannot_be_is_refused_with_the_remedy(arguments: list[str], why: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "handtouch", "bridge", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=START_S,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert why in done.stderr
+    assert "Traceback" not in done.stderr
