@@ -62,6 +62,14 @@ class Compensator:
         self._settle_s, self._waited_s = settle_s, 0.0
         self._flow_s, self._impulse = np.zeros(pads), np.zeros(pads)  # of load, since the back force settled
         self._ones = np.ones(pads)
+        self._threshold_n = np.array(np.broadcast_to(model.adaptation.threshold_n, pads), np.float64)
+        noise, swelling, warmth_k = model.fluctuation, model.temperature, self.doubt.warmth_k
+        self._unknowable = (
+            noise.press_std**2 + (swelling.gain_per_k * warmth_k) ** 2,
+            noise.noise_std**2,
+            (swelling.preload_n_per_k * warmth_k) ** 2,
+        )
+        """Variance that goes as the square of what is felt, as what is felt, and that is always there."""
         self._last = (self._flow_s,) * 4
         self._prepare(0.0)
 
@@ -96,16 +104,15 @@ class Compensator:
         """Standard deviation of the last load [N], of all pads or some. Where nothing is felt it is that of a
         load that may be anything which wouldn't be felt."""
         load, before, felt, reading = (column[pads] for column in self._last)
-        model, doubt = self.model, self.doubt
-        noise, swelling = model.fluctuation, model.temperature
-        press = noise.press_std**2 + (swelling.gain_per_k * doubt.warmth_k) ** 2
-        variance = (press * felt + noise.noise_std**2) * felt
-        variance += self.back_std_n[pads] ** 2
-        variance += (doubt.creep * (felt - reading)) ** 2
-        variance += (doubt.hysteresis * (load - before)) ** 2
-        variance += (swelling.preload_n_per_k * doubt.warmth_k) ** 2
-        unfelt = (self._adaptation.back_n + self._back.threshold_n)[pads]
-        return np.sqrt(np.where(felt > 0, variance, unfelt**2 / 3))
+        press, flicker, fixed = self._unknowable
+        variance = (press * felt + flicker) * felt
+        variance += np.square(self.back_std_n[pads])
+        variance += np.square(self.doubt.creep * (felt - reading))
+        if load is not before:
+            variance += np.square(self.doubt.hysteresis * (load - before))
+        variance += fixed
+        unfelt = self._adaptation.back_n[pads] + self._threshold_n[pads]
+        return np.sqrt(np.where(felt > 0, variance, np.square(unfelt) / 3))
 
     def _step(self, apparent_n: FloatArray) -> FloatArray:
         reading = np.maximum(apparent_n, 0.0)
