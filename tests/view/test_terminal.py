@@ -107,6 +107,14 @@ def test_every_kind_of_message_has_a_line() -> None:
     assert "200 ticks/s" in line(SERVICE)
 
 
+def test_what_rests_is_told_but_is_no_news() -> None:
+    assert "operational (event)" in line(replace(HEALTH, pace="event"))
+    pads = [replace(HEALTH, link=f"pad_{n}", state="off", node="stopped", pace="off") for n in range(40)]
+    page = _page(_view(*pads, replace(HEALTH, link="last", state="lost")), height=20)
+    assert "lost" in page
+    assert "last" in page
+
+
 def test_a_location_without_covariance_has_no_standard_deviation() -> None:
     assert location_std_m(replace(CONTACT, covariance_m2=None)) != location_std_m(CONTACT)
 

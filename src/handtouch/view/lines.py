@@ -45,9 +45,10 @@ def health_line(health: wire.Health) -> str:
     """A pad and its node in one line."""
     serial = "" if health.serial is None else f" serial {health.serial}"
     why = f": {health.reason}" if health.reason else ""
+    pace = " (event)" if health.pace == "event" else ""
     return (
         f"{health.t_ns * 1e-9:14.4f}  health  {health.hand}/{health.link:<16}  {health.state:8} "
-        f"node {health.node_id} on {health.bus} {health.node}{serial}, {health.rate_hz:.0f} Hz, "
+        f"node {health.node_id} on {health.bus} {health.node}{pace}{serial}, {health.rate_hz:.0f} Hz, "
         f"{health.missed} missed{why}"
     )
 

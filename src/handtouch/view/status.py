@@ -30,7 +30,7 @@ def run(*, endpoint: str = CONTROL, key: str | None = None, as_json: bool = Fals
         print(json.dumps(answer, indent=2))
     else:
         _show(answer, Console(width=None if sys.stdout.isatty() else _WIDE))
-    return 0 if all(pad["state"] in ("clear", "touched") for pad in answer["pads"]) else 1
+    return 0 if all(pad["state"] in ("clear", "touched", "off") for pad in answer["pads"]) else 1
 
 
 def _show(answer: dict[str, Any], console: Console) -> None:
@@ -41,7 +41,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
         + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
     )
-    drops = ", ".join(f"{count} on {stream}" for stream, count in service["drops"].items()) or "none"
+    drops = ", ".join(f"{count} on {stream}" for stream, count in service["drops"].items() if count) or "none"
     console.print(
         f"messages dropped: {drops}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
     )
@@ -70,7 +70,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         table.add_row(
             f"{pad['hand']}/{pad['link']}",
             pad["state"],
-            pad["node"],
+            pad["node"] + (" (event)" if pad["pace"] == "event" else ""),
             str(pad["node_id"]),
             "" if pad["serial"] is None else str(pad["serial"]),
             f"{pad['rate_hz']:.0f}",

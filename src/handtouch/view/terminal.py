@@ -26,7 +26,9 @@ _STYLE_OF_STATE = {
     "lost": "bold red",
     "faulted": "bold red",
     "starting": "dim",
+    "off": "dim",
 }
+_NO_NEWS = ("clear", "touched", "off")
 _Key = tuple[str, str]
 
 
@@ -128,9 +130,7 @@ class HandView:
         names = {key: self._name(health) for key, health in self._health.items()}
         shown = list(self._health)
         if len(shown) > room:  # then those that there is something to say of come first
-            news = [
-                k for k in shown if k in self._contacts or self._health[k].state not in ("clear", "touched")
-            ]
+            news = [k for k in shown if k in self._contacts or self._health[k].state not in _NO_NEWS]
             shown = (news + [key for key in shown if key not in news])[: max(0, room - 1)]
         table = Table(expand=True, box=None, pad_edge=False, header_style="dim")
         longest = max(map(len, names.values()), default=4)
