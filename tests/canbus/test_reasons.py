@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-from handtouch.canbus.lifecycle import NodeState
+import pytest
+
+from handtouch.canbus.lifecycle import (
+    Answer,
+    BootUp,
+    Event,
+    Heartbeat,
+    Life,
+    NodeState,
+    Tick,
+    Timing,
+    advance,
+)
 
 
 def test_status_tells_why_a_node_boots_until_it_is_up(rig: Any) -> None:
@@ -32,3 +44,22 @@ def test_node_that_answers_as_soon_as_it_is_lost_is_still_said_to_be_lost(rig: A
     booting = [event for event in rig.run(600) if event.new is NodeState.BOOTING]
     assert booting
     assert "lost: no heartbeat for" in booting[0].reason
+
+
+@pytest.mark.parametrize(
+    ("event", "told"),
+    [
+        (BootUp(), "boot-up message"),
+        (Heartbeat(5), "heartbeat: node is operational"),
+        (Answer(), "answers over SDO"),
+    ],
+)
+def test_node_that_is_back_as_soon_as_it_is_lost_is_still_said_to_have_been_lost(
+    event: Event, told: str
+) -> None:
+    timing = Timing(100_000_000, 350_000_000)
+    running = Life(state=NodeState.OPERATIONAL, nmt=5, heartbeat_ns=0)
+    lost, _ = advance(running, Tick(), 351_000_000, timing)
+    back, _ = advance(lost, event, 351_000_001, timing)
+    assert back.state is NodeState.BOOTING
+    assert back.reason == f"{told}, but was lost: no heartbeat for 351 ms"

@@ -277,10 +277,11 @@ def _heartbeat(life: Life, nmt: int, t_ns: int, timing: Timing) -> Next:
         life = replace(life, heartbeat_ns=t_ns)
     just_stopped = nmt == NMT_STOPPED != life.nmt
     woken = life.nmt == NMT_STOPPED != nmt
-    life = replace(life, nmt=nmt, heard_ns=t_ns, must_beat=False)
     told = f"heartbeat: node is {NMT_NAMES.get(nmt, f'in NMT state {nmt}')}"
+    back = _back(life, told)
+    life = replace(life, nmt=nmt, heard_ns=t_ns, must_beat=False)
     if life.state is NodeState.ABSENT or (life.state in _IN_BOOT and just_stopped):
-        return _boot(life, t_ns, told, timing)
+        return _boot(life, t_ns, back, timing)
     if life.state is NodeState.FAULTED and woken and not (life.twins or life.babbles):
         life = replace(life, due_ns=t_ns)  # while stopped it couldn't answer
     # A heartbeat sent before our command may still arrive after it.
@@ -307,6 +308,7 @@ def _follow(life: Life, told: str, t_ns: int, timing: Timing, settled: bool) -> 
 
 def _boot_up(life: Life, t_ns: int, timing: Timing) -> Next:
     by_itself = life.state is not NodeState.ABSENT
+    told = _back(life, "rebooted by itself" if by_itself else "boot-up message")
     life = replace(
         life,
         nmt=NMT_PREOPERATIONAL,
@@ -316,17 +318,20 @@ def _boot_up(life: Life, t_ns: int, timing: Timing) -> Next:
         failures=0,  # those of its life before say nothing of this one
         reboots=life.reboots + by_itself,
     )
-    return _boot(life, t_ns, "rebooted by itself" if by_itself else "boot-up message", timing)
+    return _boot(life, t_ns, told, timing)
 
 
 def _answer(life: Life, t_ns: int, timing: Timing) -> Next:
     life = replace(life, heard_ns=t_ns)
     if life.state is not NodeState.ABSENT:
         return life, ()
-    told = "answers over SDO"
-    if life.must_beat:  # it may answer before anybody has read that it was lost
-        told = f"{told}, but was {life.reason.partition(';')[0]}"
-    return _boot(replace(life, nmt=None), t_ns, told, timing)
+    return _boot(replace(life, nmt=None), t_ns, _back(life, "answers over SDO"), timing)
+
+
+def _back(life: Life, told: str) -> str:
+    """That a lost node is back, and that it was lost: it may be back before anybody has read that."""
+    was_lost = life.state is NodeState.ABSENT and life.must_beat
+    return f"{told}, but was {life.reason.partition(';')[0]}" if was_lost else told
 
 
 def _done(life: Life, event: Done, t_ns: int, timing: Timing) -> Next:
