@@ -82,6 +82,8 @@ class Kind:
     loose: bool = False
     bus_wide: bool = False
     alone: bool = False
+    lag: float = 0.0
+    """periods by which its samples are late: a pause that makes it stale is so much shorter"""
     within_s: float = 1.0
     well_s: float = 2.0
     weight: float = 1.0
@@ -103,7 +105,7 @@ def line(**settings: Any) -> Callable[[Fault, Any], None]:
 
 def late(fault: Fault, bench: Any) -> None:
     """For the tick of the next period."""
-    fault.node.line = Line(late_ns=round(1.2 * bench.period_ns))
+    fault.node.line = Line(late_ns=round(fault.kind.lag * bench.period_ns))
 
 
 def no_line(fault: Fault, _: Any) -> None:

@@ -32,11 +32,11 @@ LONG_NS = 250_000_000  # a pause that may cost a node its heartbeats
 class Cable:
     """The nodes' bus: can be cut, counts the samples that went out, and notes the nodes' pauses."""
 
-    def __init__(self, bus: can.BusABC, pause_ns: int) -> None:
+    def __init__(self, bus: can.BusABC, period_ns: int) -> None:
         self.silent = False
         self.samples = 0
         self.pauses: list[tuple[int, int, int]] = []  # node id, from, to
-        self._bus, self._pause_ns = bus, pause_ns
+        self._bus, self._period_ns = bus, period_ns
         self._last_ns: dict[int, int] = {}
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
@@ -50,17 +50,23 @@ class Cable:
         now_ns = time.monotonic_ns()
         before_ns = self._last_ns.get(node_id, now_ns)
         self._last_ns[node_id] = now_ns
-        if now_ns - before_ns > self._pause_ns:
+        if now_ns - before_ns > 1.5 * self._period_ns:
             self.pauses.append((node_id, before_ns, now_ns))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         message = self._bus.recv(timeout)
         return None if self.silent else message
 
-    def paused(self, node_id: int, t_ns: int) -> bool:
-        """Whether the node's program paused around this time; after a long pause the node is started anew."""
+    def paused(self, node_id: int, t_ns: int, lag: float = 0.0) -> bool:
+        """Whether the node's program paused around this time, for three periods less `lag`.
+
+        After a long pause the node has to be started anew.
+        """
+        least_ns = (3 - lag) * self._period_ns
         return any(
-            node == node_id and start <= t_ns <= end + (S if end - start > LONG_NS else S // 10)
+            node == node_id
+            and end - start > least_ns
+            and start <= t_ns <= end + (S if end - start > LONG_NS else S // 10)
             for node, start, end in self.pauses
         )
 

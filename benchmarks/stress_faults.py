@@ -236,7 +236,8 @@ class Campaign:
             del self._busy[node_id]
             self._free_ns[node_id] = now_ns
         for t_ns in fault.disturbed_ns:
-            _once(fault, "paused" if self.bench.cable.paused(fault.nodes[0], t_ns) else "disturbed")
+            paused = self.bench.cable.paused(fault.nodes[0], t_ns, fault.kind.lag)
+            _once(fault, "paused" if paused else "disturbed")
         if "paused" in fault.failures:
             fault.failures = ["paused"]  # nothing can be said of it
         if fault.failures and fault.failures != ["paused"]:
@@ -271,7 +272,7 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
     raised: list[str] = []
     threading.excepthook = lambda args: raised.append(f"{args.exc_type.__name__}: {args.exc_value}")
     buses = [open_bus(asked.interface), open_bus(asked.interface)]
-    cable = Cable(buses[0], round(3 * asked.period_ms * 1e6))
+    cable = Cable(buses[0], round(asked.period_ms * 1e6))
     devices = DeviceBus(cable, sampler(deployment, asked.seed))
     for pad in pads:
         devices.add(pad.node_id, serial=pad.serial)
