@@ -2,7 +2,8 @@
 
 The pipeline of the daemon, from the last sample to encoded messages, with 15 and 60 pads that all are touched
 by sliding contacts; every case sees the same samples. Cases take turns, so that a machine that slows down
-slows all. And what the cheapest locator would cost beside a contact's map. Writes docs/benchmarks/scene.{md,json}.
+slows all. And what the cheapest locator would cost beside a contact's map.
+Writes docs/benchmarks/scene.{md,json}.
 """
 
 from __future__ import annotations

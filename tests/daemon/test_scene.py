@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from handtouch import wire
 from handtouch.config.tables import Wants
+from handtouch.daemon.follow import POSITION, Follower
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.scene import CONTROL, FILE, MOST_CLIENTS, Demand, Scenes, join, select
 from handtouch.wire import PadState
@@ -239,6 +240,31 @@ def test_sliding_contacts_stay_within_the_tolerance(bench: Any, tolerance_mm: fl
             off.append(np.linalg.norm(places[0] - places[1], axis=1).max())
     assert max(off) * 1e3 <= tolerance_mm
     assert draws[id(tolerant)] < 0.8 * draws[id(exact)]
+
+
+@pytest.mark.parametrize("tolerance_mm", [0.05, 0.2, 1.0, 10.0])
+def test_a_map_is_trusted_no_farther_than_the_tolerance(bench: Any, tolerance_mm: float) -> None:
+    model, chance = bench.model, np.random.default_rng(8)
+    pads, sides = np.arange(3), bench.model.locator.sides
+
+    def currents(at: Any) -> Any:
+        return (model.locator.fractions(pads, *at.T) * (20 * model.on_a)).T
+
+    follower, found, trusted = Follower(model), 0.0, 0
+    follower.tolerance_m[:] = tolerance_mm * 1e-3
+    for _ in range(100):
+        drawn = chance.uniform(0.1, 0.9, (3, 2)) * sides
+        follower.draw(pads, currents(drawn), drawn, solved=True)
+        for _ in range(20):
+            way = chance.normal(size=(3, 2)) * 1e-3 * np.sqrt(tolerance_mm)
+            at = np.clip(drawn + way, 0.02 * sides, 0.98 * sides)
+            values, off = follower.read(pads, currents(at))
+            inside = off.max(axis=1) <= 1
+            true = model.placement.place(pads, *at.T, np.zeros((3, 2, 2))).position_m
+            apart = np.linalg.norm(values[:, POSITION] - true, axis=1)[inside]
+            found, trusted = max(found, *apart, 0.0), trusted + len(apart)
+    assert trusted > 500
+    assert found * 1e3 <= tolerance_mm
 
 
 def test_a_disabled_pad_is_not_computed_whoever_wants_it(bench: Any) -> None:

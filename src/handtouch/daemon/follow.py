@@ -35,7 +35,8 @@ _VAGUE = 0.1  # of `reach`: a place less certain than this has no tangent worth 
 _TOTAL = 0.05  # relative change of the total that a parabola of the force spans
 NEAR = 8.0  # ends of trust from which one Gauss-Newton step leads back into it
 _FORCE_BEND = 0.01  # of the force: where the parabola bends more, trust spans less
-_WIDEST = 0.5  # of `reach`: what a tolerance lets a map span at most
+_TOLERATED = 0.4  # of a tolerance: the bend as a rule where trust ends; off the middle it is up to twice that
+_WIDEST = 0.35  # of `reach`: what a tolerance lets a map span at most
 _LEAST_INFORMATION = 1e-6  # of a place, per squared `reach`
 _VALID, _SATURATED = int(Status.VALID), int(Status.SATURATED)
 
@@ -100,7 +101,7 @@ class Follower:
         firm = vague <= _VAGUE
         tolerated = self.tolerance_m.take(pads)
         if np.count_nonzero(tolerated):
-            widest = np.minimum(np.sqrt(tolerated / at.tangent.reach.max(axis=1)), _WIDEST)
+            widest = np.minimum(np.sqrt(_TOLERATED * tolerated / at.tangent.reach.max(axis=1)), _WIDEST)
             trust = np.maximum(trust, widest)
         if solved:  # where an edge or a corner holds the most likely place, it has no tangent
             step = np.matmul(at.by_current, currents[:, :, None])[:, :, 0]
