@@ -33,6 +33,25 @@ def run(*, endpoint: str = CONTROL, key: str | None = None, as_json: bool = Fals
     return 0 if all(pad["state"] in ("clear", "touched", "off") for pad in answer["pads"]) else 1
 
 
+def _show_loop(service: dict[str, Any], console: Console) -> None:
+    """Where a period goes, what made ticks late, and what was refused."""
+    loop, process = service["loop"], service["process"]
+    means = (
+        f"{stage} {1e3 * figures['sum_s'] / sum(figures['counts']):.2f}"
+        for stage, figures in loop["stages"].items()
+        if figures["counts"]
+    )
+    console.print(f"a period, ms: {', '.join(means) or 'none yet'}; late ticks: {_counts(loop['late'])}")
+    console.print(
+        f"memory {process['memory_bytes'] / 1e6:.0f} MB, {process['cpu_s']:.0f} s of processor time, of which "
+        f"the loop {process['loop_cpu_s']:.0f} s; refused: {_counts(service['refused'])}"
+    )
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "none"
+
+
 def _show(answer: dict[str, Any], console: Console) -> None:
     service = answer["service"]
     tick = service["tick_us"]
@@ -45,6 +64,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
     console.print(
         f"messages dropped: {drops}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
     )
+    _show_loop(service, console)
     for name, bus in service["buses"].items():
         sync = bus["sync"]
         counts = ", ".join(
