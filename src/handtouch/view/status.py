@@ -43,8 +43,8 @@ def _show_loop(service: dict[str, Any], console: Console) -> None:
     )
     console.print(f"a period, ms: {', '.join(means) or 'none yet'}; late ticks: {_counts(loop['late'])}")
     console.print(
-        f"memory {process['memory_bytes'] / 1e6:.0f} MB, {process['cpu_s']:.0f} s of processor time, of which "
-        f"the loop {process['loop_cpu_s']:.0f} s; refused: {_counts(service['refused'])}"
+        f"memory {process['memory_bytes'] / 1e6:.0f} MB, {process['cpu_s']:.0f} s of processor time, "
+        f"of which the loop {process['loop_cpu_s']:.0f} s; refused: {_counts(service['refused'])}"
     )
 
 
