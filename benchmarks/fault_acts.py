@@ -104,7 +104,7 @@ def line(**settings: Any) -> Callable[[Fault, Any], None]:
 
 
 def late(fault: Fault, bench: Any) -> None:
-    """For the tick of the next period."""
+    """After their tick, before the next SYNC."""
     fault.node.line = Line(late_ns=round(fault.kind.lag * bench.period_ns))
 
 

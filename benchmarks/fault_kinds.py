@@ -111,7 +111,7 @@ KINDS = (
     # quiet: nothing but counters may change
     Kind("lost: 1 sample in 20", "`missed`", line(lost_every=20), no_line,
          told=missed, quiet=True, within_s=2.8),
-    Kind("late samples", "`missed`", late, no_line, lag=1.2,
+    Kind("late samples", "`missed`", late, no_line, lag=0.8,
          told=missed, quiet=True, within_s=2.8),
     Kind("duplicate samples", "nothing", line(duplicate=0.5), no_line, quiet=True),
     Kind("heartbeats lost, two at most", "`heartbeats_missed`", **attribute("send_heartbeat", False, True),
