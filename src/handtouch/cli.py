@@ -13,7 +13,7 @@ from handtouch import __version__
 LIVE = "tcp://127.0.0.1:5580"
 CONTROL = "tcp://127.0.0.1:5581"
 
-_EXIT = (
+EXIT = (
     "Exit status: 0 all is well, 1 something failed or is not well (check: warnings), 2 wrong usage or file."
 )
 
@@ -38,10 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     from handtouch.control_cli import add_control
+    from handtouch.supervise.calibrations_cli import add_calibrations
 
     parser = argparse.ArgumentParser(
         prog="handtouch",
-        epilog=_EXIT,
+        epilog=EXIT,
         description="Gives a robot hand a sense of touch: CANopen touch sensors in, contacts out.",
     )
     parser.add_argument("--version", action="version", version=f"handtouch {__version__}")
@@ -52,6 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_bridge(commands)
     _add_keys(commands)
     _add_checking(commands)
+    add_calibrations(commands)
     return parser
 
 
@@ -151,7 +153,7 @@ def _add_keys(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "keys",
         help="keys for a daemon that other machines reach",
         description="Keys for a daemon that other machines reach, and for its clients.",
-        epilog=_EXIT,
+        epilog=EXIT,
     )
     actions = keys.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
@@ -256,7 +258,7 @@ def command(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, function: Command, text: str
 ) -> argparse.ArgumentParser:
     description = text[0].upper() + text[1:] + "."
-    parser = commands.add_parser(name, help=text, description=description, epilog=_EXIT)
+    parser = commands.add_parser(name, help=text, description=description, epilog=EXIT)
     parser.set_defaults(command=function)
     return parser
 

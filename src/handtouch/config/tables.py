@@ -42,6 +42,12 @@ class Daemon(Table):
         description="folder, beside this file, of the keys that TCP clients need (`handtouch keys make`); "
         "left out: any local client may connect, and no other machine can",
     )
+    store: str | None = Field(
+        None,
+        min_length=1,
+        description="file of the calibration store, beside this file; left out: "
+        "$XDG_STATE_HOME/handtouch/calibrations.db, or in the state folder of the service",
+    )
     sync_period_ms: float = Field(5.0, ge=0.5, le=1000, description="period of SYNC and of the tick")
     window: Fraction = Field(0.6, description="part of the period after SYNC that a tick waits for samples")
     log_level: Literal["debug", "info", "warning", "error"] = Field(

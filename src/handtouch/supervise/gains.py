@@ -122,7 +122,9 @@ class GainEstimator:
         if covariance is not None:
             known = _BASIS.T @ np.asarray(covariance, dtype=np.float64) @ _BASIS
             self._information = _inverse(known + 1e-18 * np.eye(3))
-        self._cells = np.zeros((_CELLS, _CELLS))
+        # which places told what is given isn't known: as if each had told half of what its model error allows
+        already = 0.0 if covariance is None or model_error == 0 else model_error**-2
+        self._cells = np.full((_CELLS, _CELLS), already)
         self._mixture = _Mixture()
         self._pending: list[FloatArray] = []
         self._contacts, self._weight = 0, 0.0

@@ -1,0 +1,269 @@
+"""Kill a process that calibrates and stores, at random instants; the store must hold what it had committed.
+
+Also measures what a write costs under the journal modes that SQLite has, and how long opening takes.
+Prints its tables and writes docs/benchmarks/store.md, store.json and store.png.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import sqlite3
+import struct
+import sys
+import tempfile
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import matplotlib
+import numpy as np
+
+from handtouch.field import Rectangle
+from handtouch.supervise.calibration import (
+    Calibration,
+    Gains,
+    Law,
+    Offsets,
+    Provenance,
+    SheetState,
+    four,
+    matrix,
+)
+from handtouch.supervise.gains import GainEstimator
+from handtouch.supervise.store import Store
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+ROOT = Path(__file__).parent.parent
+KILLS = 500
+LONGEST_S = 0.25
+SERIALS = (1001, 1002, 1003)
+CONFIG = "nominal-0123456789ab"
+_RECORD = struct.Struct("<II")
+
+
+def calibration(serial: int, number: int, estimator: GainEstimator) -> Calibration:
+    """Gains from contacts, and values that only this version of this unit has."""
+    generator = np.random.default_rng((serial, number))
+    pad = Rectangle(1.4, 1.0)
+    x, y = generator.uniform(0.1, 0.9, (2, 32)) * [[pad.a], [pad.b]]
+    estimator.add(pad.fractions(x, y) + 1e-3 * generator.normal(size=(4, 32)), 1e-3, number)
+    found = estimator.estimate
+    return Calibration(
+        Gains(four(found.gains), matrix(found.covariance)),
+        Offsets(four(generator.normal(0, 3, 4)), (1.0, 1.0, 1.0, 1.0)),
+        Law(20_000.0, 1.5, 2400.0, matrix(np.diag([1e-4] * 3))),
+        SheetState("stress", number, mark(serial, number)),
+    )
+
+
+def mark(serial: int, number: int) -> bytes:
+    """What the sheet's state of a version must be: 200 to 20,000 bytes."""
+    generator = np.random.default_rng((serial, number, 1))
+    return generator.bytes(int(200 * 10 ** generator.uniform(0, 2)))
+
+
+def calibrate_and_store(path: Path, pipe: int) -> None:
+    """For ever; every commit is told on the pipe before going on."""
+    with Store(path) as store:
+        estimators = {serial: GainEstimator(Rectangle(1.4, 1.0)) for serial in SERIALS}
+        while True:
+            for serial, estimator in estimators.items():
+                newest = store.newest(serial)
+                number = 1 if newest is None else newest.number + 1
+                made = store.write(
+                    serial,
+                    CONFIG,
+                    calibration(serial, number, estimator),
+                    Provenance("stress", 32 * number),
+                    datetime.now(UTC),
+                )
+                os.write(pipe, _RECORD.pack(serial, made.number))
+
+
+def kill_once(path: Path, after_s: float) -> list[tuple[int, int]]:
+    """Start a process, kill it, and return what it told to be committed."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        try:
+            calibrate_and_store(path, writing)
+        finally:
+            os._exit(1)
+    os.close(writing)
+    time.sleep(after_s)
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    if not os.WIFSIGNALED(status):
+        raise RuntimeError(f"the writer ended by itself with status {status}")
+    with os.fdopen(reading, "rb") as pipe:
+        return list(_RECORD.iter_unpack(pipe.read()))
+
+
+def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
+    """KILLS times: kill, open, compare all that is there with all that was told."""
+    path, generator = folder / "store.db", np.random.default_rng(1)
+    told: dict[int, int] = dict.fromkeys(SERIALS, 0)
+    counts = dict.fromkeys(("undone", "untold", "lost", "wrong", "unopened"), 0)
+    openings = []
+    for _ in range(KILLS):
+        for serial, number in kill_once(path, float(generator.uniform(0, LONGEST_S))):
+            told[serial] = max(told[serial], number)
+        counts["undone"] += path.with_name("store.db-journal").exists()
+        begin = time.perf_counter()
+        try:
+            store = Store(path)
+        except Exception as error:  # noqa: BLE001 what the benchmark counts
+            print(error, file=sys.stderr)
+            counts["unopened"] += 1
+            continue
+        openings.append(1e3 * (time.perf_counter() - begin))
+        with store:
+            for serial in SERIALS:
+                versions = store.versions(serial)
+                counts["lost"] += len(versions) < told[serial]
+                # one commit more than was told: killed between the two
+                counts["untold"] += len(versions) == told[serial] + 1
+                counts["wrong"] += len(versions) > told[serial] + 1
+                counts["wrong"] += [v.number for v in versions] != list(range(1, len(versions) + 1))
+                for version in versions[told[serial] - 5 :]:
+                    sheet = version.calibration.sheet
+                    counts["wrong"] += sheet is None or sheet.data != mark(serial, version.number)
+                told[serial] = len(versions)
+    row = {
+        "kills": KILLS,
+        "commits": sum(told.values()),
+        "interrupted writes undone": counts["undone"],
+        "committed but not told yet": counts["untold"],
+        "lost commits": counts["lost"],
+        "wrong contents": counts["wrong"],
+        "not opened": counts["unopened"],
+    }
+    return row, openings
+
+
+def modes(folder: Path) -> list[dict[str, Any]]:
+    """A row of 2 kB a transaction, as bare SQLite writes it."""
+    rows = []
+    for journal, synchronous in (
+        ("WAL", "NORMAL"),
+        ("WAL", "FULL"),
+        ("DELETE", "FULL"),
+        ("DELETE", "EXTRA"),
+    ):
+        connection = sqlite3.connect(folder / f"{journal}-{synchronous}.db", isolation_level=None)
+        connection.execute(f"PRAGMA journal_mode = {journal}")
+        connection.execute(f"PRAGMA synchronous = {synchronous}")
+        connection.execute("CREATE TABLE t (id INTEGER PRIMARY KEY, data BLOB)")
+        took = []
+        for _ in range(500):
+            begin = time.perf_counter()
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute("INSERT INTO t (data) VALUES (randomblob(2000))")
+            connection.execute("COMMIT")
+            took.append(1e3 * (time.perf_counter() - begin))
+        connection.close()
+        rows.append({"journal": journal, "synchronous": synchronous, **_quantiles(took)})
+    return rows
+
+
+def writes_and_openings(folder: Path) -> list[dict[str, Any]]:
+    """`Store.write` of a whole calibration, and opening (which checks everything), by versions."""
+    path, rows, took = folder / "long.db", [], []
+    estimator = GainEstimator(Rectangle(1.4, 1.0))
+    made = calibration(1, 1, estimator)
+    for number in range(1, 3001):
+        if number == 1:
+            store = Store(path)
+        begin = time.perf_counter()
+        store.write(1 + number % 15, CONFIG, made, Provenance("long"), datetime.now(UTC))
+        took.append(1e3 * (time.perf_counter() - begin))
+        if number in (100, 1000, 3000):
+            store.close()
+            opened = []
+            for _ in range(5):
+                begin = time.perf_counter()
+                Store(path).close()
+                opened.append(1e3 * (time.perf_counter() - begin))
+            rows.append(
+                {
+                    "versions": number,
+                    "file, MB": path.stat().st_size / 1e6,
+                    "opening, ms": float(np.median(opened)),
+                    **{f"write {name}": value for name, value in _quantiles(took[-100:]).items()},
+                }
+            )
+            store = Store(path)
+    store.close()
+    return rows
+
+
+def _quantiles(took_ms: list[float]) -> dict[str, float]:
+    return {
+        "median, ms": float(np.median(took_ms)),
+        "99 %, ms": float(np.quantile(took_ms, 0.99)),
+        "most, ms": max(took_ms),
+    }
+
+
+def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
+    heads = list(rows[0])
+    lines = [f"## {title}", "", note, "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for row in rows:
+        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
+        lines.append("| " + " | ".join(cells) + " |")
+    print("\n".join(lines), end="\n\n", flush=True)
+    return [*lines, ""]
+
+
+def draw(path: Path, openings: list[float]) -> None:
+    figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
+    axes.plot(openings, ".", ms=3)
+    axes.set(xlabel="kill", ylabel="opening and checking, ms", ylim=(0, None))
+    axes.set_title("Opening the store after each kill, while it grows")
+    figure.savefig(path, dpi=100)
+
+
+def main() -> None:
+    machine = (
+        f"{os.cpu_count()} x {platform.machine()}, {platform.system()} {platform.release()}, "
+        f"Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}"
+    )
+    with tempfile.TemporaryDirectory(dir=ROOT, prefix=".stress-") as name:  # on a disk: /tmp may be memory
+        folder = Path(name)
+        killed, openings = kills(folder)
+        tables = {
+            "Kill -9 while calibrating and storing": (
+                f"A process estimates gains and writes versions of three units without a pause; killed 0 to "
+                f"{1e3 * LONGEST_S:.0f} ms after its start. It tells every commit on a pipe. A kill doesn't "
+                "lose what the kernel has; for power loss see `docs/calibrations.md`.",
+                [killed],
+            ),
+            "Journal modes of SQLite": ("500 transactions each, a row of 2 kB.", modes(folder)),
+            "The store": (
+                "A whole calibration a write; opening checks every digest.",
+                writes_and_openings(folder),
+            ),
+        }
+    page = ["# The calibration store", "", f"Made by `make stress ONLY=store`; {machine}.", ""]
+    for title, (note, rows) in tables.items():
+        page += table(title, note, rows)
+    out = ROOT / "docs" / "benchmarks"
+    draw(out / "store.png", openings)
+    (out / "store.md").write_text("\n".join([*page, "![opening](store.png)", ""]))
+    record = {"machine": machine, "tables": {title: rows for title, (_, rows) in tables.items()}}
+    (out / "store.json").write_text(json.dumps(record, indent=1) + "\n")
+    if killed["lost commits"] or killed["wrong contents"] or killed["not opened"]:
+        sys.exit("the store has lost something")
+
+
+if __name__ == "__main__":
+    main()
