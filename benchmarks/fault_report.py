@@ -102,9 +102,10 @@ def section(results: dict[str, Any]) -> str:
     return f"""
 ## {results["interface"]}
 
-{results["faults"]} faults in {results["seconds"]:.0f} s, {results["rate"]:g} a second, seed
-{results["seed"]}, limits times {results["patience"]:g}; 15 nodes at {1000 / results["period_ms"]:.0f} Hz.
-{results["machine"]}; load {results["load"]:.1f} at the end.
+{results["faults"]} faults in {results["seconds"]:.0f} s, {results["rate"]:g} a second,
+seed {results["seed"]}.
+15 nodes at {1000 / results["period_ms"]:.0f} Hz. Limits: {results["patience"]:g} times those of a robot.
+On {results["machine"]}; load {results["load"]:.1f} at the end.
 
 Seconds: median, 90 %, worst.
 

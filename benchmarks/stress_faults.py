@@ -320,7 +320,7 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
         "rate": asked.rate,
         "period_ms": asked.period_ms,
         "patience": asked.patience,
-        "machine": f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}",
+        "machine": machine(),
         "load": os.getloadavg()[0],
         "faults": len([f for f in campaign.done if f.failures != ["paused"]]),
         "seconds": seconds,
@@ -340,6 +340,12 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
         "exit_status": status,
         "bus_errors_of_nodes": devices.bus_errors,
     }
+
+
+def machine() -> str:
+    """Where this was measured."""
+    where = os.environ.get("VCAN_RUN", "host")
+    return f"{where}, {platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
 
 
 def main() -> int:
