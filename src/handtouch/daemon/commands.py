@@ -208,6 +208,8 @@ class Commands:
         if fresh.model is not None:
             fresh.model.take_over(self._pipeline.model)
             self._pipeline.adopt(fresh.model, np.array(sorted(fresh.pads), dtype=np.intp))
+        if fresh.deployment.daemon.log_level != self.deployment.daemon.log_level:
+            set_level(fresh.deployment.daemon.log_level)
         self.deployment = fresh.deployment
         self._demand.scenes.set_file(fresh.deployment.scene)
         self._pacer.set_idle(fresh.deployment.scene)

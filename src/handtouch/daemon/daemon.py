@@ -45,6 +45,7 @@ from handtouch.daemon.security import Gate
 from handtouch.keys import KeysError
 
 _log = logging.getLogger("handtouch.daemon")
+_GIL_SWITCH_S = 0.0005  # a thread that boots a node or builds a model lets the hot one in after so long
 
 
 class Daemon:
@@ -233,6 +234,7 @@ def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
 
 def _serve(deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment]) -> int:
     settings = deployment.daemon
+    sys.setswitchinterval(_GIL_SWITCH_S)
     notifier = Notifier()
     with ExitStack() as opened:
         opened.callback(notifier.close)

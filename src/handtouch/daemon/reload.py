@@ -1,7 +1,7 @@
 """Reload: the deployment file read again while the hand is served; what is unchanged goes on undisturbed.
 
-Public names: `Reload`, `Change`, `changes`, `fixed`. Reading and building take a second, so a thread does
-them; the result is taken over between two ticks.
+Public names: `Reload`, `Fresh`, `changes`, `fixed`. Reading and building take a second, so a thread does them
+(it makes the loop no later than a process of its own would); the result is taken over between two ticks.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]], lis
             what.append("touch")
         if what:
             pads[number] = what
-    tables = [name for name in ("scene", "touch") if getattr(old, name) != getattr(new, name)]
+    tables = [name for name in ("daemon", "scene", "touch") if getattr(old, name) != getattr(new, name)]
     for name in ("nodes", "sheets"):
         before_all, after_all = getattr(old, name), getattr(new, name)
         keys = sorted(before_all.keys() | after_all.keys())
@@ -103,7 +103,7 @@ def changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]], lis
 
 def fixed(old: Deployment, new: Deployment) -> list[str]:
     """What differs and can't change while the daemon runs, in words."""
-    told = [f"[daemon] {key} differs" for key in _keys(old.daemon, new.daemon)]
+    told = [f"[daemon] {key} differs" for key in _keys(old.daemon, new.daemon) if key != "log_level"]
     if old.buses != new.buses:
         told.append("[[bus]] differs")
     names = [[(hand.name, pad.link) for hand in d.hands for pad in hand.pads] for d in (old, new)]
