@@ -350,8 +350,8 @@ def main() -> None:
         ),
         "What compensation leaves": (
             "S1 with a loop of 10 % and power-law creep (exponent 0.05), 0 to 5 N and back in two minutes, "
-            "without fluctuation; % of 5 N. The worst error of a known sheet is at the very end, where the "
-            "load is less than the back force and not felt. Stated standard deviation: with the default doubt.",
+            "without fluctuation; % of 5 N. The worst error of a known sheet is at the end, where the "
+            "load is less than the back force and not felt. Stated: with the default doubt.",
             loops(),
         ),
         "Power law as a sum of exponentials": (

@@ -141,6 +141,35 @@ def test_a_reading_that_is_no_number_spoils_only_its_own_load() -> None:
     assert load[1] == good[1] > 0
 
 
+@pytest.mark.parametrize("settle_s", [0.0, 5.0])
+def test_a_back_force_that_is_known_can_be_given(settle_s: float) -> None:
+    """As after a restart: the load is right at once, and its doubt the one that was given."""
+    model = replace(S1, fluctuation=Fluctuation())
+    state, compensator = model.start(2), Compensator(model, 2, settle_s=settle_s)
+    for _ in range(200):
+        apparent = model.at(10.0).forward(state, 3.0)
+    compensator.assume(state.adaptation.back_n, 0.1)
+    apparent = model.at(0.01).forward(state, 3.0)
+    np.testing.assert_allclose(compensator.step(apparent, 0.01), 3.0, rtol=1e-4)
+    np.testing.assert_allclose(compensator.std_n(), 0.1, rtol=0.01)
+    with pytest.raises(ValueError, match="back_n"):
+        compensator.assume(-1.0, 0.0)
+
+
+def test_a_renewed_sheet_is_a_fresh_one_and_the_others_go_on() -> None:
+    renewed, kept, fresh = (Compensator(WHOLE, 3, settle_s=0.5) for _ in range(3))
+    for compensator in (renewed, kept):
+        for _ in range(50):
+            compensator.step(np.array([1.0, 2.0, 3.0]), 1.0)
+    renewed.renew(np.array([1]))
+    reading = np.array([2.0, 1.0, 2.5])
+    loads = [compensator.step(reading, 1.0) for compensator in (renewed, kept, fresh)]
+    stated = [compensator.std_n() for compensator in (renewed, kept, fresh)]
+    for values in (loads, stated):
+        assert values[0][1] == values[2][1] != values[1][1]
+        assert values[0][[0, 2]].tolist() == values[1][[0, 2]].tolist()
+
+
 def test_a_step_back_in_time_is_refused() -> None:
     with pytest.raises(ValueError, match="dt_s"):
         Compensator(S1, 1).step(np.ones(1), -1.0)
@@ -166,6 +195,15 @@ class TestTrack:
         for time in times:
             answer = asked.apparent_n(time)
         assert answer.tolist() == fresh.apparent_n(times[-1]).tolist()
+
+    def test_potential_and_temperature_are_functions_of_time_too(self) -> None:
+        calm = replace(S1, fluctuation=Fluctuation())
+        track = SheetTrack(
+            calm, 1, lambda _: 2.0, step_s=0.01, powered=lambda t: t < 2, warmer_k=lambda t: 10 * (t > 1)
+        )
+        cold, warm, off = (float(track.apparent_n(t)[0]) for t in (0.995, 1.995, 2.5))
+        assert warm / cold == pytest.approx(1.1, abs=0.02)
+        assert off == 0
 
     def test_the_factor_is_what_the_layer_adds(self) -> None:
         track = self.track()

@@ -130,7 +130,6 @@ class AdaptationStep:
     def _wipe_out(self, state: AdaptationState, load_n: FloatArray) -> None:
         pressed = load_n > self.threshold_n
         over = ~pressed & (state.peak_n > 0)
-        small = over & (state.peak_n < self._wipe * state.back_n)
-        state.back_n[small] = 0.0
+        state.back_n[over & (state.peak_n < self._wipe * state.back_n)] = 0.0
         np.maximum(state.peak_n, load_n, out=state.peak_n)
         state.peak_n *= pressed

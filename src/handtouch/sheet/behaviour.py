@@ -103,16 +103,16 @@ class SheetStep:
         nothing is felt. warmer_k: temperature above that at which the contact law holds. All broadcast to
         (n,). Raises ValueError for a load that is negative or not finite.
         """
-        pads = state.adaptation.back_n.shape
-        load = np.broadcast_to(np.asarray(load_n, np.float64), pads)
+        load = np.asarray(load_n, np.float64)
+        if load.shape != state.adaptation.back_n.shape:
+            load = np.broadcast_to(load, state.adaptation.back_n.shape)
         if not ((load >= 0) & np.isfinite(load)).all():
             raise ValueError(f"loads must be at least 0 and finite, got {load}")
         warmth = np.asarray(warmer_k, np.float64)
         swelling = self._model.temperature
         pressing = np.maximum(load + swelling.preload_n_per_k * warmth, 0.0)
         pressing = self._model.hysteresis.step(state.plays, pressing)
-        on = np.broadcast_to(np.asarray(powered, np.bool_), pads)
-        felt = self._adaptation.forward(state.adaptation, pressing, on)
+        felt = self._adaptation.forward(state.adaptation, pressing, np.asarray(powered, np.bool_))
         reading = self._creep.forward(state.elements, felt) * (1 + swelling.gain_per_k * warmth)
         return self._model.fluctuation.step(state.fluctuation, reading, self._dt_s)
 
@@ -123,8 +123,8 @@ class SheetTrack:
     The sheet goes along a grid of `step_s` from time 0, whoever asks when, so a time has one answer:
     `apparent_n(t)` depends on `t_s` alone. Asking backwards is allowed and costs the history again.
 
-    loads: true loads (n,) [N] at a time [s], a pure function. Raises ValueError for a step that isn't
-    positive.
+    loads, powered, warmer_k: true loads (n,) [N], and what `SheetStep.forward` takes with them, at a time
+    [s]. What they say of the past must not change. Raises ValueError for a step that isn't positive.
     """
 
     def __init__(
@@ -135,10 +135,13 @@ class SheetTrack:
         *,
         seed: int = 1,
         step_s: float = 2e-3,
+        powered: Callable[[float], npt.ArrayLike] = lambda _: True,
+        warmer_k: Callable[[float], npt.ArrayLike] = lambda _: 0.0,
     ) -> None:
         if not 0 < step_s < np.inf:
             raise ValueError(f"step_s must be positive and finite, got {step_s}")
-        self._model, self._loads, self._step_s = model, loads, step_s
+        self._model, self._step_s = model, step_s
+        self._loads, self._powered, self._warmer_k = loads, powered, warmer_k
         self._fresh = model.start(pads, seed)
         self._stride = model.at(step_s)
         self._restart()
@@ -150,9 +153,9 @@ class SheetTrack:
             self._restart()
         while self._count < count:
             self._count += 1
-            self._stride.forward(self._state, self._loads(self._count * self._step_s))
+            self._forward(self._stride, self._state, self._count * self._step_s)
         rest = self._model.at(max(t_s - count * self._step_s, 0.0))
-        return rest.forward(self._state.copy(), self._loads(t_s))
+        return self._forward(rest, self._state.copy(), t_s)
 
     def factor(self, t_s: float) -> FloatArray:
         """Apparent over true load (n,), 0 where nothing presses; its power alpha multiplies the layer's
@@ -160,6 +163,9 @@ class SheetTrack:
         load = np.asarray(self._loads(t_s), np.float64)
         apparent = self.apparent_n(t_s)
         return np.divide(apparent, load, out=np.zeros_like(apparent), where=load > 0)
+
+    def _forward(self, step: SheetStep, state: SheetState, t_s: float) -> FloatArray:
+        return step.forward(state, self._loads(t_s), self._powered(t_s), self._warmer_k(t_s))
 
     def _restart(self) -> None:
         self._state, self._count = self._fresh.copy(), 0

@@ -45,7 +45,7 @@ class Compensator:
     """Of n pads with sheets of one model; starts with fresh sheets under potential, at the law's temperature.
 
     settle_s: how often the back force is carried on [s]. 0, at every step, makes the inverse exact; between,
-    it is held, which is off by settle_s / time_s of the load at most and costs a tick a third.
+    it is held, which is off by settle_s / time_s of the load at most and makes most steps cost a third.
     """
 
     def __init__(
@@ -71,12 +71,34 @@ class Compensator:
         )
         """Variance that goes as the square of what is felt, as what is felt, and that is always there."""
         self._last = (self._flow_s,) * 4
+        self._resumed = False  # what presses then has pressed since ever, as far as creep is concerned
         self._prepare(0.0)
 
     @property
     def back_n(self) -> FloatArray:
         """The back force (n,) [N] as far as it is known; 0 of a fresh or rested sheet."""
         return self._adaptation.back_n
+
+    def assume(self, back_n: npt.ArrayLike, std_n: npt.ArrayLike) -> None:
+        """Take the back force [N] and its standard deviation from elsewhere, each (n,) or (): a store, or a
+        load that was measured in another way. What presses at the next step is taken to have pressed for
+        long, so a start while touched is no creep. Raises ValueError for what is negative or not finite."""
+        for name, value in (("back_n", back_n), ("std_n", std_n)):
+            checked = np.asarray(value, np.float64)
+            if not ((checked >= 0) & np.isfinite(checked)).all():
+                raise ValueError(f"{name} must be at least 0 and finite, got {checked}")
+        self._settle()
+        self.back_n[:] = back_n
+        self.back_std_n[:] = std_n
+        self._resumed = True
+
+    def renew(self, pads: npt.NDArray[np.intp]) -> None:
+        """Fresh sheets on some pads."""
+        self._settle()
+        state = self._adaptation
+        rows = (state.back_n, state.peak_n, state.flowed_s, self.back_std_n, *self._plays, *self._elements)
+        for row in rows:
+            row[pads] = 0.0
 
     def set_powered(self, powered: npt.ArrayLike) -> None:
         """Potential from now on, (n,) or (); without it the back force fades."""
@@ -108,7 +130,7 @@ class Compensator:
         variance = (press * felt + flicker) * felt
         variance += np.square(self.back_std_n[pads])
         variance += np.square(self.doubt.creep * (felt - reading))
-        if load is not before:
+        if len(self._plays):
             variance += np.square(self.doubt.hysteresis * (load - before))
         variance += fixed
         unfelt = self._adaptation.back_n[pads] + self._threshold_n[pads]
@@ -119,7 +141,9 @@ class Compensator:
         swelling = self.model.temperature
         if self._warmer_k:
             reading /= 1 + swelling.gain_per_k * self._warmer_k
-        felt = self._creep.inverse(self._elements, reading)
+        creep = self.model.creep.at(math.inf) if self._resumed else self._creep
+        felt = creep.inverse(self._elements, reading)
+        self._resumed = False
         flows = felt > 0
         before = self._hold(felt, flows) if self._settle_s else self._undo(felt, flows)
         load = self._undo_plays.step(self._plays, before) if len(self._plays) else before
