@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -222,25 +223,25 @@ class GainEstimator:
 
     def _take(self, currents: FloatArray, sigma: FloatArray) -> None:
         """A batch (4, n): iterate on it around what is known, then keep its information."""
-        known, information, place = self._log_gains, self._information, None
+        known, place = self._log_gains, None
         for _ in range(_ROUNDS):
             gains = np.exp(self._log_gains)[:, None]
             view = _View.at(self._model, currents * gains, sigma * gains, place)
             place = view.place
             share, cells = self._shares(view)
+            spread = np.sqrt(1 + (self._model_error * view.sharpness) ** 2)
             mixture = replace(self._mixture)
             prior = _BASIS.T @ (known - self._log_gains)
-            step, precision = mixture.solve(view, share, self._model_error, self._information, prior)
-            information = self._information + np.einsum("n,in,jn->ij", precision, view.slope, view.slope)
-            self._log_gains = self._log_gains + _BASIS @ step
-            if step @ information @ step < _SETTLED**2:
+            found = mixture.solve(view, share, spread, self._information, prior)
+            information = self._information + (view.slope * found.precision) @ view.slope.T
+            self._log_gains = self._log_gains + _BASIS @ found.step
+            if found.step @ information @ found.step < _SETTLED**2:
                 break
         self._information, self._mixture, self._cells = information, mixture, cells
         self._contacts += len(share)
-        self._weight += float((precision * (1 + (self._model_error * view.sharpness) ** 2)).sum())
-        scores = view.score + step @ view.slope
+        self._weight += float(found.precision @ spread**2)
         fade = 1 - len(share) / _MEMORY
-        self._misfit = fade * self._misfit + [float(precision @ scores**2), float(precision.sum())]
+        self._misfit = fade * self._misfit + [found.points @ found.squares, found.points.sum()]
 
     def _shares(self, view: _View) -> tuple[FloatArray, FloatArray]:
         """How much each contact still tells where others have been (n,), and the cells after them.
@@ -296,13 +297,14 @@ class _Mixture:
         return self.others / (self.points + self.others)
 
     def solve(
-        self, view: _View, share: FloatArray, model_error: float, information: FloatArray, prior: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Step of the gains (3,) that the contacts and the prior make most likely, and precisions (n,).
+        self, view: _View, share: FloatArray, spread: FloatArray, information: FloatArray, prior: FloatArray
+    ) -> _Solution:
+        """Step of the gains that the contacts and the prior, (3,) with its information, make most likely.
 
-        From the least absolute scores, which no minority can carry away, by expectation and maximisation.
+        share (n,): of a contact's information that counts; spread (n,): standard deviation of a point's
+        score. From the least absolute scores, which no minority can carry away, by expectation and
+        maximisation.
         """
-        spread = np.sqrt(1 + (model_error * view.sharpness) ** 2)
 
         def step_for(precision: FloatArray) -> FloatArray:
             weighted = view.slope * precision
@@ -329,7 +331,16 @@ class _Mixture:
             step = step_for(weight)
         fade = min(1.0, _MEMORY / (self.points + self.others))
         self.points, self.others, self.squares = (fade * v for v in (self.points, self.others, self.squares))
-        return step, weight
+        return _Solution(step, weight, 1 - other, z)
+
+
+class _Solution(NamedTuple):
+    """step (3,); of each contact (n,): precision of its score, probability of a point, squared score."""
+
+    step: FloatArray
+    precision: FloatArray
+    points: FloatArray
+    squares: FloatArray
 
 
 @dataclass(frozen=True)
