@@ -58,11 +58,12 @@ class Cable:
         return None if self.silent else message
 
     def paused(self, node_id: int, t_ns: int, lag: float = 0.0) -> bool:
-        """Whether the node's program paused around this time, for three periods less `lag`.
+        """Whether the node's program or SYNC paused around this time, for two periods less `lag`.
 
-        After a long pause the node has to be started anew.
+        A pad is stale after three, counted from the SYNC of its newest sample, not from its sending. After a
+        long pause the node has to be started anew.
         """
-        least_ns = (3 - lag) * self._period_ns
+        least_ns = (2 - lag) * self._period_ns
         return any(
             node == node_id
             and end - start > least_ns

@@ -79,6 +79,8 @@ def page(every: dict[str, dict[str, Any]]) -> str:
         "are published once a second (`missed`, `emergencies`) or twice (`service`) are told no sooner. "
         "A node is well\nagain when it is operational and its samples are trusted.\n\nBeside every fault: no "
         "node without one changes its state, no pad that nothing touches shows a contact.\n\n"
+        "A machine that is busy with other things pauses nodes and daemon: what was told while a node sent nothing "
+        "though nothing\nwas wrong with it is counted apart, as void; a stale pad for a tick or two may be left.\n\n"
         "Made by `make stress ONLY=faults`; on SocketCAN by `tests/socketcan/vcan-run .venv/bin/python\n"
         "benchmarks/stress_faults.py --interface socketcan --faults 60 --rate 1 --period-ms 20 "
         "--patience 3`.\n"
