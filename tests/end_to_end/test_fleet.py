@@ -23,13 +23,15 @@ from .conftest import START_S, Rig
 pytest.importorskip("zenoh", reason="needs the extra zenoh")
 
 REMOTE = """
-import json, sys, time, zenoh
+import json, sys, threading, zenoh
+turn = threading.Lock()
 config = zenoh.Config()
 for key, value in (("mode", '"peer"'), ("scouting/multicast/enabled", "false"),
                    ("listen/endpoints", json.dumps(sys.argv[1:]))):
     config.insert_json5(key, value)
 def tell(what, **values):
-    print(json.dumps({"what": what, **values}), flush=True)
+    with turn:
+        print(json.dumps({"what": what, **values}), flush=True)
 with zenoh.open(config) as session:
     session.declare_subscriber("lab/**", lambda sample: tell("sample", key=str(sample.key_expr),
         encoding=str(sample.encoding), payload=bytes(sample.payload).hex()))
@@ -169,14 +171,6 @@ def test_two_hands_on_two_buses_are_served_by_one_daemon(rig: Rig, free_port: in
     second = bus[0].replace("can0", "can1") + "\n" + other
     rig.config.write_text(text.replace(bus[0], bus[0] + "\n") + "\n" + second)
     rig.bus.append(f"can1=udp_multicast:239.74.163.3,port={free_port + 1}")
-    rig.scenario.write_text(
-        "repeat = true\n"
-        + "".join(
-            f'[[touch]]\nhand = "{name}"\nlink = "index_distal"\nfrom_s = 0.1\nduration_s = 0.6\n'
-            "path = [[0.5, 0.5]]\nforce_n = [1.5]\n"
-            for name in ("right", "left")
-        )
-    )
     rig.simulate()
     rig.start("run")
     status = rig.wait_operational(30)
