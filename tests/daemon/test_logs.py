@@ -182,3 +182,10 @@ def test_a_stream_is_the_journals_only_if_systemd_says_so_of_this_very_one() -> 
     assert logs._is_journal(2, f"{status.st_dev}:{status.st_ino}")
     assert not logs._is_journal(2, f"{status.st_dev}:{status.st_ino + 1}")
     assert not logs._is_journal(2, "")
+
+
+def test_causes_without_end_take_no_memory_without_end_and_are_limited_together() -> None:
+    limit = Limit(burst=3, window_ns=10 * SECOND)
+    passed = sum(limit.passes(("bus", "node %d", str(number)), 0) for number in range(100_000))
+    assert passed <= 1003
+    assert limit.over(11 * SECOND) == [(("bus", "node %d", ""), 99_000 - 3)]

@@ -24,6 +24,9 @@ _ROOT = "handtouch"
 _QUEUE = 1000
 _BURST, _WINDOW_NS = 10, 10_000_000_000
 """Messages of one cause that are said in a window of time."""
+_CAUSES = 1000
+"""Known at a time; beyond them, what a message is about is no longer told apart."""
+_LOOK_NS = 1_000_000_000
 _FLUSH_S = 1.0
 """Longest that the end waits for a reader who doesn't read."""
 _JOURNAL = "/run/systemd/journal/socket"
@@ -75,6 +78,8 @@ class Limit:
     def passes(self, cause: Cause, now_ns: int) -> bool:
         """Whether to say another of this cause."""
         with self._lock:
+            if len(self._causes) >= _CAUSES and cause not in self._causes:
+                cause = (*cause[:2], "")
             seen = self._causes.setdefault(cause, [now_ns, 0])
             if now_ns - seen[0] >= self._window_ns and seen[1] <= self._burst:
                 seen[:] = [now_ns, 0]
@@ -101,6 +106,7 @@ class Logs(logging.Handler):
         self._limit = limit or Limit()
         self._queue: queue.Queue[logging.LogRecord | None] = queue.Queue(_QUEUE)
         self._told_dropped = 0
+        self._looked_ns = clock()
         self._thread = threading.Thread(target=self._write, name="handtouch-log", daemon=True)
         self._thread.start()
 
@@ -138,12 +144,18 @@ class Logs(logging.Handler):
                 if record is None:
                     return
                 self._outlet.write(record)
-            for (name, text, about), count in self._limit.over(self._clock()):
+            self._tell_unsaid(self._clock())
+
+    def _tell_unsaid(self, now_ns: int) -> None:
+        """How much was not said, and why; looked at now and then."""
+        if now_ns - self._looked_ns >= _LOOK_NS:
+            self._looked_ns = now_ns
+            for (name, text, about), count in self._limit.over(now_ns):
                 about = f" about {about}" if about else ""
                 self._say(name, f'{count} more like "{text}"{about} in the last ten seconds')
-            if self.dropped > self._told_dropped:
-                lost, self._told_dropped = self.dropped - self._told_dropped, self.dropped
-                self._say(_ROOT, f"{lost} log messages were lost: nobody read them in time")
+        if self.dropped > self._told_dropped:
+            lost, self._told_dropped = self.dropped - self._told_dropped, self.dropped
+            self._say(_ROOT, f"{lost} log messages were lost: nobody read them in time")
 
     def _say(self, name: str, text: str) -> None:
         self._outlet.write(logging.LogRecord(name, logging.WARNING, "", 0, text, None, None))
