@@ -1,0 +1,50 @@
+"""What a running daemon tells those who watch it: figures for Prometheus, from first tick to last."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from typing import Any
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from .conftest import START_S
+
+SCRAPE = "import sys, urllib.request; print(urllib.request.urlopen(sys.argv[1], timeout=60).read().decode())"
+
+
+def scrape(rig: Any, port: int) -> dict[str, list[Any]]:
+    """Samples by name, as somebody on the daemon's own network reads them."""
+    url = f"http://127.0.0.1:{port}/metrics"
+    command = [*rig.command()[:-3], sys.executable, "-c", SCRAPE, url]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=START_S, check=False)
+    found: dict[str, list[Any]] = {}
+    for family in text_string_to_metric_families(done.stdout):
+        for sample in family.samples:
+            found.setdefault(sample.name.removeprefix("handtouch_"), []).append(sample)
+    return found
+
+
+def test_prometheus_sees_pads_ticks_and_where_the_time_goes(rig: Any, free_port: int) -> None:
+    text = rig.config.read_text()
+    rig.config.write_text(text.replace("[daemon]\n", f'[daemon]\nmetrics = "127.0.0.1:{free_port}"\n', 1))
+    rig.simulate()
+    rig.start("run")
+    rig.wait_operational()
+    end_s = time.monotonic() + START_S
+    found = scrape(rig, free_port)
+    while sum(s.value for s in found.get("node_state", []) if s.labels["state"] == "operational") < 15:
+        assert time.monotonic() < end_s, rig.all_printed()
+        found = scrape(rig, free_port)
+    assert found["up"][0].value == 1
+    ticks = found["ticks_total"][0].value
+    assert ticks > 0
+    assert 0 < found["tick_latency_seconds_count"][0].value <= ticks
+    status = rig.status()["service"]
+    for stage in ("wait", "receive", "tick", "send"):
+        (total,) = [s.value for s in found["stage_seconds_sum"] if s.labels["stage"] == stage]
+        assert 0 < total <= status["loop"]["stages"][stage]["sum_s"]
+    assert sum(figures["sum_s"] for figures in status["loop"]["stages"].values()) <= status["uptime_s"]
+    assert rig.end("run") == 0
+    assert scrape(rig, free_port) == {}  # the process is gone with its daemon
