@@ -73,6 +73,7 @@ def mark(serial: int, number: int) -> bytes:
 def calibrate_and_store(path: Path, pipe: int) -> None:
     """For ever; every commit is told on the pipe before going on."""
     with Store(path) as store:
+        os.write(pipe, _RECORD.pack(0, 0))
         estimators = {serial: GainEstimator(Rectangle(1.4, 1.0)) for serial in SERIALS}
         while True:
             for serial, estimator in estimators.items():
@@ -88,8 +89,8 @@ def calibrate_and_store(path: Path, pipe: int) -> None:
                 os.write(pipe, _RECORD.pack(serial, made.number))
 
 
-def kill_once(path: Path, after_s: float) -> list[tuple[int, int]]:
-    """Start a process, kill it, and return what it told to be committed."""
+def kill_once(path: Path, after_s: float, opened: bool) -> list[tuple[int, int]]:
+    """Start a process, kill it so long after its start, or after it opened the store; what it committed."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -99,13 +100,15 @@ def kill_once(path: Path, after_s: float) -> list[tuple[int, int]]:
         finally:
             os._exit(1)
     os.close(writing)
+    if opened and os.read(reading, _RECORD.size) != _RECORD.pack(0, 0):
+        raise RuntimeError("the writer could not open the store")
     time.sleep(after_s)
     os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     if not os.WIFSIGNALED(status):
         raise RuntimeError(f"the writer ended by itself with status {status}")
     with os.fdopen(reading, "rb") as pipe:
-        return list(_RECORD.iter_unpack(pipe.read()))
+        return [record for record in _RECORD.iter_unpack(pipe.read()) if record != (0, 0)]
 
 
 def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
@@ -114,10 +117,12 @@ def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
     told: dict[int, int] = dict.fromkeys(SERIALS, 0)
     counts = dict.fromkeys(("undone", "untold", "lost", "wrong", "unopened"), 0)
     openings = []
-    for _ in range(KILLS):
-        for serial, number in kill_once(path, float(generator.uniform(0, LONGEST_S))):
+    for kill in range(KILLS):
+        after_s = float(generator.uniform(0, LONGEST_S))
+        for serial, number in kill_once(path, after_s, opened=kill % 2 == 1):
             told[serial] = max(told[serial], number)
-        counts["undone"] += path.with_name("store.db-journal").exists()
+        journal = path.with_name("store.db-journal")
+        counts["undone"] += journal.exists() and journal.stat().st_size > 0
         begin = time.perf_counter()
         try:
             store = Store(path)
@@ -242,9 +247,10 @@ def main() -> None:
         killed, openings = kills(folder)
         tables = {
             "Kill -9 while calibrating and storing": (
-                f"A process estimates gains and writes versions of three units without a pause; killed 0 to "
-                f"{1e3 * LONGEST_S:.0f} ms after its start. It tells every commit on a pipe. A kill doesn't "
-                "lose what the kernel has; for power loss see `docs/calibrations.md`.",
+                f"A process estimates gains and writes versions of three units without a pause; half "
+                f"of them are killed 0 to {1e3 * LONGEST_S:.0f} ms after their start, half so long after "
+                "they had opened the store. They tell every commit on a pipe. A kill doesn't lose what the kernel "
+                "has; for power loss see `docs/calibrations.md`.",
                 [killed],
             ),
             "Journal modes of SQLite": ("500 transactions each, a row of 2 kB.", modes(folder)),

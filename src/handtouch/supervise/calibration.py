@@ -150,6 +150,11 @@ class Version:
     provenance: Provenance
     calibration: Calibration
 
+    @property
+    def name(self) -> str:
+        """What contacts tell of it, as "1001-3"."""
+        return f"{self.serial}-{self.number}"
+
     def to_json(self) -> dict[str, Any]:
         """All of it, the sheet's state as base64."""
         sheet = self.calibration.sheet
