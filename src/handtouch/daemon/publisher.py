@@ -66,6 +66,8 @@ class Publisher:
 
     def take_subscriptions(self, now_ns: int) -> None:
         """Read what subscribers asked for or gave up; repeat the present for those who come late."""
+        if self._repeats:  # asked for at the tick before: what nobody heard until then is computed by now
+            self._repeat(now_ns)
         for stream, socket in self._sockets.items():
             for _ in range(_SUBSCRIPTIONS_PER_POLL):  # who asks without end must not stop the tick
                 try:
@@ -87,8 +89,6 @@ class Publisher:
                     continue  # not a subscription: nobody has anything else to say here
                 self.subscriptions = frozenset().union(*self._asked.values())
                 self._wanted.clear()
-        if self._repeats:
-            self._repeat(now_ns)
 
     def wants(self, topic: str) -> bool:
         """Whether anybody subscribed to a prefix of the topic."""
