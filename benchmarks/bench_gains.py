@@ -277,8 +277,8 @@ def main() -> None:
     ]
     title = "With elongated contacts among them"
     tables[title] = (
-        f"{TRIALS_ELONGATED} trials each. Some contacts are two points 0.06 to 0.3 of the shorter side apart, at "
-        "any angle. The bound is that of as many points.",
+        f"{TRIALS_ELONGATED} trials each. Some contacts are two points 0.06 to 0.3 of the shorter side "
+        "apart, at any angle. The bound is that of as many points.",
         edges,
     )
     page += table(title, *tables[title])

@@ -249,8 +249,8 @@ def main() -> None:
             "Kill -9 while calibrating and storing": (
                 f"A process estimates gains and writes versions of three units without a pause; half "
                 f"of them are killed 0 to {1e3 * LONGEST_S:.0f} ms after their start, half so long after "
-                "they had opened the store. They tell every commit on a pipe. A kill doesn't lose what the kernel "
-                "has; for power loss see `docs/calibrations.md`.",
+                "they had opened the store. They tell every commit on a pipe. A kill doesn't lose what the "
+                "kernel has; for power loss see `docs/calibrations.md`.",
                 [killed],
             ),
             "Journal modes of SQLite": ("500 transactions each, a row of 2 kB.", modes(folder)),

@@ -110,8 +110,11 @@ def connect(path: Path) -> tuple[sqlite3.Connection, bool]:
     """
     _refuse_foreign(path)
     writable = os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
-    inode = path.stat().st_ino
-    connection = _connection(path, writable)
+    try:
+        inode = path.stat().st_ino
+        connection = _connection(path, writable)
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(f"{path}: the calibration store can't be opened: {error}") from error
     try:
         with _damage_told():
             connection.execute("PRAGMA synchronous = EXTRA")
