@@ -9,6 +9,10 @@ import pytest
 
 from handtouch.canbus.device import Line
 from handtouch.canbus.lifecycle import Babble, Life, NodeState, Role, Timing, advance
+from handtouch.canbus.master import Master, NodeEvent, NodeSpec
+from handtouch.canbus.port import Port
+from handtouch.canbus.slab import Slab
+from handtouch.config import Bus
 
 OPERATIONAL, FAULTED = NodeState.OPERATIONAL, NodeState.FAULTED
 MS = 1_000_000
@@ -40,6 +44,37 @@ def test_babble_that_goes_on_through_a_reboot_is_told_again(rig: Any) -> None:
     rig.run(1500)
     assert rig.state(2) is FAULTED
     assert "times as often" in rig.status(2).reason
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_another_sync_on_one_bus_makes_nobody_there_babble(make_rig: Any, size: int) -> None:
+    """Three nodes follow ours at 200 Hz, those on a bus of somebody else's drives that one's at 1 kHz."""
+    ours, theirs = rigs = [make_rig(3), make_rig(size)]
+    specs: list[NodeSpec] = []
+    slab, ports = Slab(3 + size), {}
+    for name, rig, sync in (("ours", ours, "producer"), ("theirs", theirs, "consumer")):
+        bus = Bus(name=name, interface="virtual", channel=name, sync=sync)  # type: ignore[arg-type]
+        rig.slab, rig.port = slab, Port(bus, rig.wire, slab)
+        ports[name] = rig.port
+        for number in range(1, rig.size + 1):
+            specs.append(rig.spec(number, slot=len(specs), bus=name, name=f"{name}{number}"))
+        rig.plug_all()
+    ours.master = theirs.master = master = Master(ports, specs, 5 * MS)
+    master.start(ours.t_ns)
+    for _ in range(3000):
+        for rig in rigs:
+            rig.t_ns += MS
+        if ours.t_ns // MS % 5 == 0:
+            ours.sync()
+        theirs.port.send(0x80, b"")
+        for rig in rigs:
+            rig.devices.advance(rig.t_ns)
+            for frame in rig.port.drain():
+                master.handle(rig.port.name, *frame)
+        master.poll(ours.t_ns)
+        master._workers.work()  # type: ignore[union-attr]
+    assert master.states.tolist() == [OPERATIONAL] * (3 + size)
+    assert not [e for e in master.take_events() if isinstance(e, NodeEvent) and e.new is FAULTED]
 
 
 @pytest.mark.parametrize("role", [Role.GUEST, Role.LISTENER])

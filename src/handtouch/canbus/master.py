@@ -107,6 +107,11 @@ class Master:
         self._next_due_ns = 0
         self._repeats = (0, self._slab.repeats.copy())  # since when they are counted, and how many had come
         self._babbling: set[int] = set()
+        self._neighbours = [  # slots of each bus's nodes, and whether its SYNC has our period
+            (np.array(slots), port.bus.sync == "producer")
+            for port in ports.values()
+            if (slots := [node.spec.slot for node in self._nodes if node.port is port])
+        ]
         self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_EVENTS_KEPT)
         self._results: deque[tuple[Member, Outcome | None, Result | None]] = deque()  # from the workers
         self._workers: ThreadPoolExecutor | None = None
@@ -253,13 +258,19 @@ class Master:
                     self._advance(self._by_slot[slot], Silence(int(ages[slot])), t_ns)
 
     def _watch_repeats(self, t_ns: int) -> None:
-        """Which nodes send far more samples than SYNC asks for; a SYNC too many shows in most of them."""
+        """Which nodes send far more samples than SYNC asks for.
+
+        A SYNC too many, or one that somebody else sends as often as he likes, shows in most of a bus's nodes.
+        """
         since_ns, before = self._repeats
         self._repeats = (t_ns, self._slab.repeats.copy())
         extra = self._slab.repeats - before
-        usual = np.sort(extra)[(len(extra) - 1) // 2] if len(extra) > 1 else 0
         periods = max((t_ns - since_ns) / self._sync_period_ns, 1.0)
-        babbling = set(np.flatnonzero(extra - usual > BABBLE * periods).tolist())
+        babbling: set[int] = set()
+        for slots, is_ours in self._neighbours:
+            alone = len(slots) == 1 and is_ours
+            usual = 0 if alone else np.sort(extra[slots])[(len(slots) - 1) // 2]
+            babbling.update(slots[extra[slots] - usual > BABBLE * periods].tolist())
         for slot in babbling | self._babbling:
             times = 1 + round(extra[slot] / periods) if slot in babbling else 0
             self._advance(self._by_slot[slot], Babble(times), t_ns)
