@@ -240,7 +240,8 @@ def draw(path: Path, openings: list[float]) -> None:
 def main() -> None:
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, {platform.system()} {platform.release()}, "
-        f"Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}"
+        f"Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}, "
+        f"load {os.getloadavg()[0]:.1f}"
     )
     with tempfile.TemporaryDirectory(dir=ROOT, prefix=".stress-") as name:  # on a disk: /tmp may be memory
         folder = Path(name)
