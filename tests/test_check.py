@@ -47,6 +47,20 @@ def test_a_mistake_has_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert report["problems"][0]["value"] == "5.0"
 
 
+def test_an_object_that_cannot_be_has_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(TEXT.replace("drive_v = 5.0", 'drive_v = 5.0\nexcitation = "0x2100:0"'))
+    assert check.run(path, json=False, schema=False) == 2
+    assert capsys.readouterr().err.startswith(
+        f'{path}: [node.four_channel]: excitation: "0x2100:0": its type'
+    )
+
+
+def test_a_full_scale_that_no_channel_reaches_is_doubtful() -> None:
+    (doubt,) = doubts(("drive_v = 5.0", "drive_v = 5.0\nfull_scale_counts = 40000"))
+    assert "full_scale_counts = 40000: its channels count to 32767 at most" in doubt
+
+
 def test_a_doubt_has_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(TEXT.replace("serial = 1001\n", ""))

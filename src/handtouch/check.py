@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from handtouch import config
-from handtouch.canbus.channels import full_scale_counts
+from handtouch.canbus.channels import full_scale_counts, greatest_count
 from handtouch.canbus.load import burst_s, bus_load
+from handtouch.canbus.nodes import checked
 from handtouch.config.checks import rectangle_mm
 
 BUSY_LOAD = 0.7
@@ -30,7 +31,7 @@ def run(path: Path | None, json: bool, schema: bool) -> int:
         print("handtouch check: give a deployment file, or --schema", file=sys.stderr)
         return 2
     try:
-        deployment = config.load(path)
+        deployment = checked(config.load(path), str(path))
     except config.ConfigError as error:
         _refuse(error, json)
         return 2
@@ -90,6 +91,11 @@ def warnings(deployment: config.Deployment) -> Iterator[str]:
             yield (
                 f"[node.{name}]: heartbeat_timeout_ms = {node.heartbeat_timeout_ms}: one late heartbeat of "
                 f"{node.heartbeat_ms} ms makes a lost node; three periods are usual"
+            )
+        if node.full_scale_counts and node.full_scale_counts > (most := greatest_count(node)):
+            yield (
+                f"[node.{name}]: full_scale_counts = {node.full_scale_counts}: its channels count to {most} "
+                "at most, so full_scale_ma is never reached; is the type of the channels right?"
             )
     for hand in deployment.hands:
         yield from _serial_warnings(hand)

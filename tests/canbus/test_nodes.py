@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from handtouch import shipped
 from handtouch.canbus.boot import Idle
 from handtouch.canbus.channels import STANDARD_CHANNELS, Channel, Object
-from handtouch.canbus.eds import EdsError
-from handtouch.canbus.nodes import NodeSpec, node_specs
-from handtouch.config import parse
+from handtouch.canbus.nodes import NodeSpec, checked, node_specs
+from handtouch.config import ConfigError, Deployment, parse
 
 PATH = shipped.path("utah_mit.toml")
 KIND = "[node.four_channel]"
 
 
-def specs(more: str = "", tables: str = "") -> list[NodeSpec]:
-    """Of the shipped hand, with something added to its kind of node."""
+def deployment(more: str = "", tables: str = "", bus: str = "") -> Deployment:
+    """The shipped hand, with something added to its kind of node or to its bus."""
     text = PATH.read_text(encoding="utf-8")
     assert KIND in text
     head, tail = text.split(KIND)
     line, rest = tail.split("\n", 1)
-    return node_specs(parse(f"{head}{KIND}{line}\n{more}\n{rest}\n{tables}", str(PATH), PATH.parent))
+    head = head.replace("[[bus]]\n", f"[[bus]]\n{bus}\n")
+    return parse(f"{head}{KIND}{line}\n{more}\n{rest}\n{tables}", str(PATH), PATH.parent)
+
+
+def specs(more: str = "", tables: str = "") -> list[NodeSpec]:
+    """Of that hand."""
+    return node_specs(deployment(more, tables))
 
 
 def test_every_pad_is_a_node_in_the_slot_of_its_order() -> None:
@@ -41,13 +48,54 @@ def test_idling_is_timed_by_the_sync_period() -> None:
     assert made[0].idle == Idle(40, 200, 50, deltas, Object(0x6423, 0, 1))
 
 
-def test_delta_beyond_its_object_is_named() -> None:
-    small = 'delta_objects = ["0x6426:1:u8", "0x6426:2:u8", "0x6426:3:u8", "0x6426:4:u8"]'
+IDLE = "\n[node.four_channel.idle]\ndelta_counts = 256\n"
+SMALL = 'delta_objects = ["0x6426:1:u8", "0x6426:2:u32", "0x6426:3:u32", "0x6426:4:u32"]'
+
+
+@pytest.mark.parametrize(
+    ("more", "tables", "message"),
+    [
+        (
+            'channels = ["0x6401:1", "0x6401:2", "0x6401:2", "0x6401:4"]',
+            "",
+            r'channels: "0x6401:2" is given twice',
+        ),
+        (
+            'channels = ["6401:1", "0x6401:2", "0x6401:3", "0x6401:4"]',
+            "",
+            'channels: "6401:1" is no object; write',
+        ),
+        (
+            'channels = ["0x2500:1", "0x2500:2", "0x2500:3", "0x2500:4"]',
+            "",
+            "channels: .* its type is not known",
+        ),
+        ('excitation = "0x2100:0"', "", 'excitation: "0x2100:0": its type is not told; write it'),
+        ('excitation = "on"', "", 'excitation: "on" is no object; write'),
+        ("", IDLE + SMALL, r'idle\]: delta_objects: "0x6426:1:u8": delta_counts = 256 is beyond its type'),
+        (
+            "",
+            IDLE + 'enable_object = "0x6423:0"',
+            r"idle\]: enable_object: .* its type is not told; write it",
+        ),
+    ],
+)
+def test_objects_that_cannot_be_are_named_with_file_section_and_key(
+    more: str, tables: str, message: str
+) -> None:
     with pytest.raises(
-        EdsError, match=r'"0x6426:1:u8": delta_counts = 256 is beyond its type; choose a smaller'
-    ):
-        specs("", f"[node.four_channel.idle]\ndelta_counts = 256\n{small}")
-    assert specs("", f"[node.four_channel.idle]\ndelta_counts = 255\n{small}")
+        ConfigError, match=rf"^{re.escape(str(PATH))}: \[node.four_channel.*{message}"
+    ) as error:
+        checked(deployment(more, tables), str(PATH))
+    assert len(error.value.problems) == 1
+
+
+def test_what_a_listener_needs_to_know_and_no_eds_tells_is_named() -> None:
+    wide = 'channels = ["0x6402:1", "0x6402:2", "0x6402:3", "0x6402:4"]'
+    listener = deployment(wide, bus='role = "listener"')
+    with pytest.raises(ConfigError, match="come in several PDOs; give the node's eds"):
+        checked(listener, "hand.toml")
+    assert checked(deployment(wide), "hand.toml")
 
 
 def test_channels_of_the_configuration_are_those_of_every_node() -> None:

@@ -1,7 +1,7 @@
 """The objects that carry a node's four channels, with their integer types, from configuration and EDS.
 
 Public names: `Channel`, `Channels`, `STANDARD_CHANNELS`, `ELECTRODES`, `channels_of`, `in_order`, `parse`,
-`full_scale_counts`, `PROFILE_TYPES`.
+`full_scale_counts`, `greatest_count`, `PROFILE_TYPES`.
 """
 
 from __future__ import annotations
@@ -138,4 +138,9 @@ def _type(bits: int, signed: bool) -> str:
 
 def full_scale_counts(node: Node) -> int:
     """Count that stands for a node's `full_scale_ma`: as configured, else the greatest of its type."""
-    return node.full_scale_counts or min(c.limits[1] for c in channels_of(node.channels, node.eds))
+    return node.full_scale_counts or greatest_count(node)
+
+
+def greatest_count(node: Node) -> int:
+    """Count that every channel of a node can reach."""
+    return min(channel.limits[1] for channel in channels_of(node.channels, node.eds))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import boot, emergency
+from .eds import EdsError
 from .lifecycle import (
     NMT_BOOT_UP,
     Action,
@@ -431,7 +432,7 @@ def _owners(ports: Mapping[str, Port], nodes: Sequence[Member]) -> dict[str, lis
         for tpdo in node.mapping.tpdos if node.mapping else ():
             other = heard.setdefault((spec.bus, tpdo.cob_id), spec.name)
             if other != spec.name:
-                raise ValueError(
+                raise EdsError(
                     f'nodes "{other}" and "{spec.name}" both send 0x{tpdo.cob_id:X} by their EDS; '
                     "give each an EDS, or DCF, with the identifiers that it has"
                 )

@@ -1,19 +1,21 @@
 """What the master is told of a node and what it tells.
 
-Public names: `NodeSpec`, `node_specs`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
+Public names: `NodeSpec`, `node_specs`, `checked`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from handtouch.config import Deployment, Node
+from handtouch.config import ConfigError, Deployment, Node, Problem
 
 from .boot import Identity, Idle
 from .channels import STANDARD_CHANNELS, Channels, Object, channels_of, in_order, written
 from .eds import EdsError
 from .emergency import Emergency
 from .lifecycle import NodeState
+from .mapping import from_eds
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +70,51 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
     return specs
 
 
+def checked(deployment: Deployment, file: str) -> Deployment:
+    """The deployment, if nodes can have the objects that it names. Raises ConfigError with all mistakes."""
+    problems = [*_problems(deployment)]
+    if problems:
+        raise ConfigError(file, tuple(problems))
+    return deployment
+
+
+def _problems(deployment: Deployment) -> Iterator[Problem]:
+    listened = {bus.name for bus in deployment.buses if bus.role == "listener"}
+    for name, kind in deployment.nodes.items():
+        place = f"[node.{name}]: "
+        try:
+            channels = channels_of(kind.channels, kind.eds)
+            for hand in deployment.hands:
+                for pad in hand.pads:
+                    if pad.node == name and pad.bus in listened:
+                        from_eds(kind.eds, pad.node_id, channels)
+        except EdsError as error:
+            yield Problem(f"{place}channels", "", str(error))
+        if kind.excitation is not None:
+            yield from _unwritable(f"{place}excitation", kind.excitation)
+        if kind.idle is not None:
+            place = f"[node.{name}.idle]: "
+            for text in kind.idle.delta_objects:
+                yield from _unwritable(f"{place}delta_objects", text, kind.idle.delta_counts)
+            if kind.idle.enable_object:
+                yield from _unwritable(f"{place}enable_object", kind.idle.enable_object)
+
+
+def _unwritable(place: str, text: str, value: int = 1) -> Iterator[Problem]:
+    try:
+        size = written(text).size
+    except EdsError as error:
+        yield Problem(place, "", str(error))
+        return
+    if value >= 1 << 8 * size:
+        yield Problem(place, "", f'"{text}": delta_counts = {value} is beyond its type; choose a smaller one')
+
+
 def _idle(kind: Node, sync_period_ms: float) -> Idle | None:
     """Events come no faster than samples would."""
     if kind.idle is None:
         return None
     enable, deltas = kind.idle.enable_object, tuple(map(written, kind.idle.delta_objects))
-    for text, delta in zip(kind.idle.delta_objects, deltas, strict=True):
-        if kind.idle.delta_counts >= 1 << 8 * delta.size:
-            raise EdsError(
-                f'"{text}": delta_counts = {kind.idle.delta_counts} is beyond its type; choose a smaller one'
-            )
     return Idle(
         kind.idle.delta_counts,
         kind.idle.period_ms,

@@ -15,7 +15,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from handtouch import client, config
-from handtouch.canbus.eds import EdsError
+from handtouch.canbus.nodes import checked
 from handtouch.canbus.port import BusError
 
 from . import report
@@ -53,8 +53,8 @@ def run(
         if (running := _daemon(wired.daemon.control)) is not None:
             print(running, file=sys.stderr)
             return 1
-        bench = Bench(wired)
-    except (config.ConfigError, EdsError) as error:
+        bench = Bench(checked(wired, str(path)))
+    except config.ConfigError as error:
         print(error, file=sys.stderr)
         return 2
     except BusError as error:

@@ -22,10 +22,9 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from handtouch.canbus import eds
-from handtouch.canbus.channels import channels_of
+from handtouch.canbus.eds import EdsError
 from handtouch.canbus.master import Master
-from handtouch.canbus.nodes import node_specs
+from handtouch.canbus.nodes import checked, node_specs
 from handtouch.canbus.port import BusError, Port
 from handtouch.canbus.router import SYNC_ID
 from handtouch.canbus.sync import Sync
@@ -208,7 +207,7 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     """`handtouch run`: serve a deployment until SIGINT or SIGTERM; exit status 0, 1 (no bus), 2 (config)."""
     try:
         deployment = _read(config_path, buses)
-    except (ConfigError, eds.EdsError) as error:
+    except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
     stop = threading.Event()
@@ -223,13 +222,11 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
 
 
 def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
-    """The deployment in a file, with other buses. Raises ConfigError, EdsError."""
+    """The deployment in a file, with other buses. Raises ConfigError."""
     deployment = load(config_path)
     for bus in buses:
         deployment = with_bus(deployment, bus)
-    for kind in deployment.nodes.values():
-        channels_of(kind.channels, kind.eds)  # a mistake in it must show before a bus is touched
-    return deployment
+    return checked(deployment, str(config_path))  # a mistake must show before a bus is touched
 
 
 def _serve(deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment]) -> int:
@@ -244,7 +241,7 @@ def _serve(deployment: Deployment, stop: threading.Event, read: Callable[[], Dep
                 exporter = opened.enter_context(closing(Exporter(settings.metrics)))
                 daemon.report.listener = exporter.take
                 _log.info("metrics http://%s%s", exporter.address, PATH)
-        except KeysError as error:  # no restart mends it
+        except (KeysError, EdsError) as error:  # no restart mends it
             print(error, file=sys.stderr)
             return 2
         except (BusError, OSError) as error:

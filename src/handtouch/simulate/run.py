@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from handtouch import config, shipped
 from handtouch.canbus.channels import ELECTRODES, channels_of, parse
 from handtouch.canbus.device import Device, DeviceBus
+from handtouch.canbus.nodes import checked
 from handtouch.canbus.port import BusError, open_bus
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
@@ -188,6 +189,7 @@ def run(
         deployment = config.load(config_path)
         for other in buses:
             deployment = config.with_bus(deployment, other)
+        checked(deployment, str(config_path))
         played = Scenario.load(scenario) if scenario else _usual(deployment)
         hand = SimulatedHand.open(deployment, played, world or World.ideal_parts(), record=truth is not None)
     except BusError as error:
