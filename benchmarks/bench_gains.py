@@ -223,7 +223,8 @@ def draw(path: Path, fisher: list[dict[str, Any]], swaps: list[dict[str, Any]]) 
                 )
     left.set(xscale="log", yscale="log", xlabel="contacts", ylabel="gain error, rms %")
     left.set_title("Gain error (the bound is a line of slope -1/2)")
-    left.legend(fontsize=6)
+    left.set_ylim(top=30)  # room for the legend
+    left.legend(fontsize=6, ncols=2, loc="upper center")
     for label in WORLDS:
         rows = [r for r in swaps if r["world"] == label]
         (line,) = right.plot(
