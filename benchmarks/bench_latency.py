@@ -1,9 +1,10 @@
 """From the last frame of a SYNC to the subscriber: latency, processor share and losses of the real daemon.
 
 Nodes, daemon and subscriber are three processes on a udp_multicast bus over loopback (in a network namespace
-of their own where that is to be had). The floor, measured in the same run, is a bare loop in place of the
-daemon: it sends SYNC, receives the same frames with the same library, sends a message of the same size when
-the last has come, and computes nothing. Writes docs/benchmarks/latency.{md,json}.
+of their own where that is to be had), or on vcan0 under `tests/socketcan/vcan-run`. The floor is a bare loop
+in place of the daemon: it sends SYNC, receives the same frames with the same library, sends a message of the
+same size when the last has come, and computes nothing. Daemon and floor take turns, with contacts at rest and
+with sliding ones; ratios are of medians over the turns. Writes docs/benchmarks/latency.{md,json}.
 """
 
 from __future__ import annotations
@@ -13,29 +14,42 @@ import json
 import multiprocessing
 import os
 import platform
+import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import can
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 
-from handtouch import shipped
+from handtouch import shipped, wire
 from handtouch.canbus.device import DeviceBus
-from handtouch.client import connect, request
-from handtouch.config import load
+from handtouch.client import request
+from handtouch.config import Deployment, load
+from handtouch.daemon import histogram
+from handtouch.daemon.daemon import Daemon
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.world import World
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 CHANNEL, PORT = "239.74.163.9", 43999
+VCAN = Path("/sys/class/net/vcan0")
 TOUCHED = 5
+ROUND_S = 5.0
+PATHS = {"resting": "[[0.4, 0.4]]", "sliding": "[[0.3, 0.3], [0.7, 0.4], [0.3, 0.5], [0.7, 0.6], [0.4, 0.7]]"}
+"""Of the contacts, through which they go within ROUND_S, and back."""
+MOST = 400_000
+FLOOR_ID = b"hand/floor"
 
 
 class StampedBus:
@@ -56,30 +70,35 @@ class StampedBus:
 
 
 def open_bus() -> can.BusABC:
+    """The bus that all processes share."""
+    if VCAN.exists():
+        return can.Bus(VCAN.name, interface="socketcan", ignore_config=True)
     return can.Bus(CHANNEL, interface="udp_multicast", port=PORT, ignore_config=True)
 
 
-def scenario(links: list[str], touched: int) -> Scenario:
-    """`touched` pads pressed for good, each sliding a little so that no two samples are alike."""
+def film(deployment: Deployment, path: str) -> NDArray[np.int64]:
+    """Counts (k, pads, 4), one sample a SYNC period: contacts on TOUCHED pads go along the path and back."""
+    links = [pad.link for hand in deployment.hands for pad in hand.pads]
     touches = "\n".join(
-        f'[[touch]]\nlink = "{link}"\nfrom_s = 0.5\nduration_s = 3600.0\nforce_n = [1.5]\nradius_mm = 2.5\n'
-        "path = [[0.4, 0.4], [0.6, 0.6]]"
-        for link in links[:touched]
+        f'[[touch]]\nlink = "{link}"\nfrom_s = 0\nduration_s = {ROUND_S + 1}\nramp_s = 0.4\nforce_n = [1.5]\n'
+        f"radius_mm = 2.5\npath = {path}"
+        for link in links[:TOUCHED]
     )
-    return Scenario.parse(touches)
+    hand = VirtualHand(deployment, Scenario.parse(touches), World.ideal_parts())
+    times_s = np.arange(0.5, 0.5 + ROUND_S, deployment.daemon.sync_period_ms * 1e-3)
+    there = np.stack([hand.sample(t_s) for t_s in times_s])
+    return np.concatenate([there, there[::-1]])
 
 
-def nodes(config: Path, touched: int, stamps: Any, stop: Event) -> None:
-    """The simulated nodes, as a process."""
+def nodes(config: Path, samples: NDArray[np.int64], stamps: Any, stop: Event) -> None:
+    """The simulated nodes, as a process; they play the samples again and again."""
     deployment = load(config)
     pads = [pad for hand in deployment.hands for pad in hand.pads]
-    virtual = VirtualHand(deployment, scenario([pad.link for pad in pads], touched), World.ideal_parts())
-    start_ns = time.monotonic_ns()
-    last_id = 0x280 + pads[-1].node_id
+    period_ns = round(deployment.daemon.sync_period_ms * 1e6)
     with open_bus() as bus:
         devices = DeviceBus(
-            StampedBus(bus, last_id, stamps),  # type: ignore[arg-type]  # it quacks like one
-            lambda t_ns: virtual.sample((t_ns - start_ns) * 1e-9),
+            StampedBus(bus, 0x280 + pads[-1].node_id, stamps),  # type: ignore[arg-type]  # it quacks like one
+            lambda t_ns: samples[t_ns // period_ns % len(samples)],
         )
         for pad in pads:
             devices.add(pad.node_id, serial=pad.serial)
@@ -94,7 +113,7 @@ def bare_loop(endpoint: str, count: int, size: int, period_s: float, stop: Event
     socket = context.socket(zmq.PUB)
     socket.bind(endpoint)
     slab = bytearray(8 * 128)
-    payload = bytes(size)
+    payload = bytes(size - len(FLOOR_ID) - 8)
     with open_bus() as bus:
         booted: set[int] = set()
         while len(booted) < count:
@@ -110,97 +129,212 @@ def bare_loop(endpoint: str, count: int, size: int, period_s: float, stop: Event
             bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
             missing = count
             while missing:
-                message = bus.recv(period_s)
+                message = bus.recv(1.0)  # all come, only late: who gave up would be one frame ahead for good
                 if message is None:
                     break
                 if 0x280 < message.arbitration_id < 0x300:
                     start = 8 * (message.arbitration_id - 0x280)
                     slab[start : start + 8] = message.data
                     missing -= 1
-            socket.send_multipart([b"hand/floor", t_ns.to_bytes(8, "little") + payload])
+            socket.send_multipart([FLOOR_ID, t_ns.to_bytes(8, "little") + payload])
             next_s += period_s
     socket.close()
     context.term()
 
 
-def latencies_us(sent_ns: np.ndarray[Any, Any], received: list[tuple[int, int]]) -> np.ndarray[Any, Any]:
-    """From the last frame of each SYNC to the message of the tick that took it in."""
-    sync_ns = np.array([sync for sync, _ in received])
-    got_ns = np.array([got for _, got in received])
-    which = np.searchsorted(sent_ns, sync_ns)
-    known = which < len(sent_ns)
-    late_us = (got_ns[known] - sent_ns[which[known]]) * 1e-3
-    return np.asarray(
-        late_us[late_us > 0]
-    )  # a message that left without the last frame has none to count from
+class Tracer(histogram.StageClock):
+    """Remembers when each part of the loop ended."""
+
+    def __init__(self, now_ns: int) -> None:
+        super().__init__(now_ns)
+        self.trace: list[tuple[int, int]] = []
+
+    def lap(self, stage: int, now_ns: int) -> None:
+        self.trace.append((stage, now_ns))
+        super().lap(stage, now_ns)
+
+    def slept(self, wake_ns: int, now_ns: int) -> None:
+        self.trace.append((histogram.WAIT, now_ns))
+        super().slept(wake_ns, now_ns)
 
 
-def measure_floor(config: Path, seconds: float, size: int, period_s: float, pads: int) -> dict[str, Any]:
-    endpoint = f"ipc://{config.parent}/floor"
-    stamps, stop = multiprocessing.Array("q", 1 + 400_000, lock=False), multiprocessing.Event()
-    workers = [
-        multiprocessing.Process(target=nodes, args=(config, TOUCHED, stamps, stop)),
-        multiprocessing.Process(target=bare_loop, args=(endpoint, pads, size, period_s, stop)),
-    ]
-    for worker in workers:
-        worker.start()
-    context = zmq.Context()
-    socket = context.socket(zmq.SUB)
-    socket.subscribe("")
-    socket.connect(endpoint)
-    received: list[tuple[int, int]] = []
-    cpu = ProcessorShare()
-    end_s = float("inf")
-    warm_up = round(1.0 / period_s)
-    while time.monotonic() < end_s:
-        _, payload = socket.recv_multipart()
-        received.append((int.from_bytes(payload[:8], "little"), time.monotonic_ns()))
-        if end_s == float("inf") and len(received) == warm_up:
-            received.clear()
-            cpu.start(workers[1].pid or 0)
-            end_s = time.monotonic() + seconds
-    share = cpu.stop()
-    stop.set()
-    for worker in workers:
-        worker.join()
-    socket.close()
-    context.term()
-    return summary(latencies_us(np.array(stamps[1 : 1 + stamps[0]]), received), share)
+def traced(config: Path, out: Path, stop: Event) -> None:
+    """The daemon with a tracer, as a process."""
+    with Daemon(load(config)) as daemon:
+        tracer = Tracer(time.monotonic_ns())
+        daemon.report.stages = tracer
+        over = threading.Event()
+
+        def end() -> None:
+            stop.wait()
+            over.set()
+
+        threading.Thread(target=end, daemon=True).start()
+        daemon.run(over)
+    np.save(out, np.array(tracer.trace, dtype=np.int64))
 
 
-def measure_daemon(config: Path, seconds: float) -> dict[str, Any]:
-    deployment = load(config)
-    stamps, stop = multiprocessing.Array("q", 1 + 400_000, lock=False), multiprocessing.Event()
-    worker = multiprocessing.Process(target=nodes, args=(config, TOUCHED, stamps, stop))
+class Turn(NamedTuple):
+    """What one turn gave: rows (k, 2) of the SYNC a message is of and when it came, ns, and what else."""
+
+    came_ns: NDArray[np.int64]
+    last_frames_ns: NDArray[np.int64]
+    figures: dict[str, Any]
+    size: int
+
+    def latencies_us(self) -> NDArray[np.float64]:
+        """From the last frame of each SYNC to the message of the tick that took it in."""
+        sync_ns, got_ns = self.came_ns.T
+        which = np.searchsorted(self.last_frames_ns, sync_ns)
+        known = which < len(self.last_frames_ns)
+        late_us = (got_ns[known] - self.last_frames_ns[which[known]]) * 1e-3
+        return np.asarray(late_us[late_us > 0])  # one that left without the last frame has none to count from
+
+
+def receive(socket: zmq.Socket[bytes], seconds: float) -> list[tuple[list[bytes], int]]:
+    """What comes within so long, with its time; decoded later: the subscriber is the floor's, too."""
+    received: list[tuple[list[bytes], int]] = []
+    end_ns = time.monotonic_ns() + round(seconds * 1e9)
+    now_ns = 0
+    while now_ns < end_ns:
+        parts = socket.recv_multipart()
+        now_ns = time.monotonic_ns()
+        received.append((parts, now_ns))
+    return received
+
+
+def sync_of(parts: list[bytes]) -> int | None:
+    """The SYNC that a message is of; None for one that is there for late joiners."""
+    if parts[0] == FLOOR_ID:
+        return int.from_bytes(parts[1][:8], "little")
+    frame = wire.decode(parts)
+    return None if frame.repeat else frame.t_ns
+
+
+def wait_for_touch(socket: zmq.Socket[bytes]) -> None:
+    """Until TOUCHED pads are, and for a while longer; a floor is ready when it speaks."""
+    while True:
+        parts = socket.recv_multipart()
+        if parts[0] == FLOOR_ID:
+            break
+        frame = wire.decode(parts)
+        if isinstance(frame, wire.HandFrame) and frame.state.count(wire.PadState.TOUCHED) == TOUCHED:
+            break
+    receive(socket, 1.0)
+
+
+def serve_and_receive(
+    config: Path,
+    samples: NDArray[np.int64],
+    endpoint: str,
+    server: Callable[[Event], BaseProcess | subprocess.Popen[bytes]],
+    seconds: float,
+) -> Turn:
+    """A turn with this server between nodes and a subscriber."""
+    stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
+    worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
     worker.start()
-    daemon = subprocess.Popen([sys.executable, "-m", "handtouch", "run", str(config)])
-    received: list[tuple[int, int]] = []
+    process = server(stop)
+    control, figures = load(config).daemon.control, {}
     cpu = ProcessorShare()
-    with connect("hand/*", endpoint=deployment.daemon.live, queue=100_000) as messages:
-        while messages.recv().state.count(1) != TOUCHED:  # all up and touched
-            time.sleep(0)
-        before = request("status", endpoint=deployment.daemon.control)
-        cpu.start(daemon.pid)
-        end_s = time.monotonic() + seconds
-        while time.monotonic() < end_s:
-            message = messages.recv()
-            received.append((message.t_ns, time.monotonic_ns()))
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVHWM, 100_000)
+        socket.subscribe("hand/")
+        socket.connect(endpoint)
+        wait_for_touch(socket)
+        is_daemon = isinstance(process, subprocess.Popen)
+        before = request("status", endpoint=control) if is_daemon else {}
+        cpu.start(process.pid or 0)
+        received = receive(socket, seconds)
         share = cpu.stop()
-        gaps = messages.gaps
-    after = request("status", endpoint=deployment.daemon.control)
-    daemon.terminate()
-    daemon.wait()
-    stop.set()
+        if is_daemon:
+            figures = losses(before, request("status", endpoint=control))
+    if isinstance(process, subprocess.Popen):
+        process.terminate()
+        process.wait()
+        stop.set()
+    else:
+        stop.set()
+        process.join()
     worker.join()
-    result = summary(latencies_us(np.array(stamps[1 : 1 + stamps[0]]), received), share)
-    missed = sum(pad["missed"] for pad in after["pads"]) - sum(pad["missed"] for pad in before["pads"])
+    known = [(sync, at_ns) for parts, at_ns in received if (sync := sync_of(parts)) is not None]
+    size = sum(len(part) for part in received[-1][0])
+    last_frames_ns = np.array(stamps[1 : 1 + stamps[0]])
+    return Turn(np.array(known), last_frames_ns, {"processor_share": share, **figures}, size)
+
+
+def losses(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+    """What went wrong between two answers to `status`."""
+
+    def grown(figure: Callable[[dict[str, Any]], int]) -> int:
+        return figure(after) - figure(before)
+
     return {
-        **result,
-        "messages_lost": gaps,
-        "samples_missed": missed,
-        "overruns": after["service"]["overruns"] - before["service"]["overruns"],
-        "tick_us": after["service"]["tick_us"],
+        "messages_lost": grown(lambda status: sum(status["service"]["drops"].values())),
+        "samples_missed": grown(lambda status: sum(pad["missed"] for pad in status["pads"])),
+        "overruns": grown(lambda status: status["service"]["overruns"]),
     }
+
+
+def daemon_turn(config: Path, samples: NDArray[np.int64], seconds: float) -> Turn:
+    """A turn of `handtouch run`."""
+    command = [sys.executable, "-m", "handtouch", "run", str(config)]
+    live = load(config).daemon.live
+    return serve_and_receive(config, samples, live, lambda _: subprocess.Popen(command), seconds)
+
+
+def floor_turn(config: Path, samples: NDArray[np.int64], seconds: float, size: int) -> Turn:
+    """A turn of the bare loop, whose messages have so many bytes in all."""
+    endpoint = f"ipc://{config.parent}/floor"
+    period_s = load(config).daemon.sync_period_ms * 1e-3
+
+    def server(stop: Event) -> BaseProcess:
+        args = endpoint, samples.shape[1], size, period_s, stop
+        process = multiprocessing.Process(target=bare_loop, args=args)
+        process.start()
+        return process
+
+    return serve_and_receive(config, samples, endpoint, server, seconds)
+
+
+def where_it_goes(config: Path, samples: NDArray[np.int64], seconds: float) -> dict[str, float]:
+    """Medians, in us, of the parts of the way from the last frame to the subscriber."""
+    out = config.parent / "trace.npy"
+
+    def server(stop: Event) -> BaseProcess:
+        process = multiprocessing.Process(target=traced, args=(config, out, stop))
+        process.start()
+        return process
+
+    turn = serve_and_receive(config, samples, load(config).daemon.live, server, seconds)
+    stage, at_ns = np.load(out).T
+    rows = []
+    for sync_ns, got_ns in turn.came_ns.tolist():
+        which = int(np.searchsorted(turn.last_frames_ns, sync_ns))
+        if which == len(turn.last_frames_ns):
+            continue
+        last_ns = int(turn.last_frames_ns[which])
+        begin, end = np.searchsorted(at_ns, [sync_ns, got_ns + 2_000_000])
+        tick = begin + np.flatnonzero(stage[begin:end] == histogram.TICK)
+        if not len(tick) or stage[tick[0] - 2 : tick[0] + 2].tolist() != list(_WAY):
+            continue
+        woke, received, ticked, sent = at_ns[tick[0] - 2 : tick[0] + 2].tolist()
+        if received < last_ns:
+            continue
+        started = max(woke, last_ns)
+        rows.append((started - last_ns, received - started, ticked - received, sent - ticked, got_ns - sent))
+    return dict(zip(PARTS, np.median(np.array(rows) * 1e-3, axis=0).tolist(), strict=True))
+
+
+_WAY = histogram.WAIT, histogram.RECEIVE, histogram.TICK, histogram.SEND
+PARTS = (
+    "until the loop turns to the bus",
+    "receiving what waits",
+    "tick",
+    "encoding and sending",
+    "until the subscriber has it",
+)
 
 
 class ProcessorShare:
@@ -219,41 +353,15 @@ class ProcessorShare:
         return int(fields[11]) + int(fields[12])
 
 
-def summary(late_us: np.ndarray[Any, Any], share: float) -> dict[str, Any]:
-    p50, p99, worst = np.percentile(late_us, [50, 99, 100]).tolist()
-    return {"n": len(late_us), "p50_us": p50, "p99_us": p99, "max_us": worst, "processor_share": share}
+def resident_mb(pid: int) -> float:
+    """Memory of a process that is in RAM."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * 4096 / 1e6
 
 
-def write(results: dict[str, Any]) -> str:
-    rows = "\n".join(
-        f"| {name} | {r['p50_us']:.0f} | {r['p99_us']:.0f} | {r['max_us']:.0f} "
-        f"| {100 * r['processor_share']:.0f} % |"
-        for name, r in results["runs"].items()
-    )
-    daemon, floor = results["runs"]["daemon"], results["runs"]["floor"]
-    text = f"""# Latency: last frame of a SYNC to the subscriber
-
-{results["pads"]} pads at {results["rate_hz"]:.0f} Hz, {TOUCHED} touched, for {results["seconds"]:.0f} s each.
-Nodes, daemon and subscriber are three processes; udp_multicast over loopback, ZeroMQ over ipc.
-{results["machine"]}.
-
-| | p50, us | p99, us | worst, us | processor share |
-| --- | --- | --- | --- | --- |
-{rows}
-
-Ratio to the floor (a bare loop that receives the same frames and sends a message of the same size): median
-{daemon["p50_us"] / floor["p50_us"]:.2f}, p99 {daemon["p99_us"] / floor["p99_us"]:.2f}.
-
-Of {daemon["n"]} ticks: {daemon["messages_lost"]} messages lost, {daemon["samples_missed"]} samples missed,
-{daemon["overruns"]} overruns. The tick itself, from the last sample read to the last message out: median
-{daemon["tick_us"]["p50"]:.0f} us.
-
-Made by `make bench ONLY=latency`.
-"""
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "latency.md").write_text(text)
-    (OUT / "latency.json").write_text(json.dumps(results, indent=1) + "\n")
-    return text
+def descriptors(pid: int) -> int:
+    """Open files of a process."""
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def in_own_network() -> None:
@@ -275,37 +383,121 @@ def on_loopback(folder: Path, port: int) -> Path:
     """The shipped hand on a udp_multicast bus, its endpoints in `folder`; path of the deployment."""
     endpoints = "\n".join(f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs"))
     text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{endpoints}\n")
-    channel = f'channel = "{CHANNEL}"\noptions = {{ port = {port} }}'
-    text = text.replace('"socketcan"', '"udp_multicast"').replace('channel = "can0"', channel)
+    if VCAN.exists():
+        text = text.replace('channel = "can0"', f'channel = "{VCAN.name}"')
+    else:
+        channel = f'channel = "{CHANNEL}"\noptions = {{ port = {port} }}'
+        text = text.replace('"socketcan"', '"udp_multicast"').replace('channel = "can0"', channel)
     config = folder / "hand.toml"
     config.write_text(text)
     return config
 
 
+def machine() -> str:
+    """Where this was measured."""
+    where = f"{os.environ['VCAN_RUN']}, " if "VCAN_RUN" in os.environ else ""
+    return f"{where}{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+
+
+def measure(config: Path, turns: int, seconds: float) -> dict[str, Any]:
+    """Turns of daemon and floor, for each way that contacts move."""
+    deployment = load(config)
+    films = {name: film(deployment, path) for name, path in PATHS.items()}
+    rows: list[dict[str, Any]] = []
+    for number in range(turns):
+        for motion, samples in films.items():
+            daemon = daemon_turn(config, samples, seconds)
+            floor = floor_turn(config, samples, seconds, daemon.size)
+            for who, turn in (("daemon", daemon), ("floor", floor)):
+                late_us = turn.latencies_us()
+                p50, p99, worst = np.percentile(late_us, [50, 99, 100]).tolist()
+                figures = {"n": len(late_us), "p50_us": p50, "p99_us": p99, "max_us": worst, **turn.figures}
+                rows.append({"turn": number, "contacts": motion, "who": who, "bytes": turn.size, **figures})
+                print(rows[-1], flush=True)
+    return {
+        "machine": machine(),
+        "load": os.getloadavg()[0],
+        "rate_hz": 1e3 / deployment.daemon.sync_period_ms,
+        "pads": len(deployment.hands[0].pads),
+        "bus": deployment.buses[0].interface,
+        "seconds": seconds,
+        "turns": rows,
+        "parts_us": where_it_goes(config, films["sliding"], seconds),
+    }
+
+
+def write(results: dict[str, dict[str, Any]]) -> str:
+    """The page, of one or both buses."""
+    text = "# Latency: last frame of a SYNC to the subscriber\n" + "".join(map(section, results.values()))
+    text += "\nMade by `make bench ONLY=latency`, with SocketCAN under `tests/socketcan/vcan-run`.\n"
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / "latency.md").write_text(text)
+    (OUT / "latency.json").write_text(json.dumps(results, indent=1) + "\n")
+    return text
+
+
+def section(results: dict[str, Any]) -> str:
+    """What was found on one bus."""
+    rows, ratios = [], []
+    for motion in PATHS:
+        middle = {}
+        for who in ("daemon", "floor"):
+            turns = [row for row in results["turns"] if (row["contacts"], row["who"]) == (motion, who)]
+            middle[who] = [
+                statistics.median(turn[key] for turn in turns)
+                for key in ("p50_us", "p99_us", "max_us", "processor_share")
+            ]
+            p50, p99, worst, share = middle[who]
+            rows.append(f"| {motion} | {who} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {share:.0%} |")
+        ratios.append(
+            f"* {motion}: median {middle['daemon'][0] / middle['floor'][0]:.2f}, "
+            f"p99 {middle['daemon'][1] / middle['floor'][1]:.2f}"
+        )
+    served = [row for row in results["turns"] if row["who"] == "daemon"]
+    lost, missed, overruns = (
+        sum(row[key] for row in served) for key in ("messages_lost", "samples_missed", "overruns")
+    )
+    ticks, count = sum(row["n"] for row in served), len(served) // len(PATHS)
+    parts = "\n".join(f"| {part} | {us:.0f} |" for part, us in results["parts_us"].items())
+    return f"""
+## On {results["bus"]}
+
+{results["pads"]} pads at {results["rate_hz"]:.0f} Hz, {TOUCHED} touched; medians of {count}
+turns of {results["seconds"]:.0f} s each, daemon and floor by turns. Nodes, daemon and subscriber are three
+processes, with ZeroMQ over ipc. {results["machine"]};
+load average when it ended {results["load"]:.1f}.
+
+| contacts | | p50, us | p99, us | worst, us | processor share |
+| --- | --- | --- | --- | --- | --- |
+{chr(10).join(rows)}
+
+Ratio to the floor, a bare loop that receives the same frames and sends a message of the same size:
+
+{chr(10).join(ratios)}
+
+Of {ticks} ticks of the daemon: {lost} messages lost, {missed} samples missed, {overruns} overruns.
+
+Where the daemon's way goes with sliding contacts, from a turn with a trace (medians of the parts, us):
+
+| part | us |
+| --- | --- |
+{parts}
+"""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--seconds", type=float, default=10.0, help="of a turn")
+    parser.add_argument("--turns", type=int, default=5)
     asked = parser.parse_args()
-    in_own_network()
+    if not VCAN.exists():
+        in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        config = on_loopback(Path(folder), PORT)
-        deployment = load(config)
-        period_s = deployment.daemon.sync_period_ms * 1e-3
-        pads = sum(len(hand.pads) for hand in deployment.hands)
-        runs = {"daemon": measure_daemon(config, asked.seconds)}
-        runs["floor"] = measure_floor(config, asked.seconds, 1300, period_s, pads)
-    machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    print(
-        write(
-            {
-                "runs": runs,
-                "pads": pads,
-                "rate_hz": 1 / period_s,
-                "seconds": asked.seconds,
-                "machine": machine,
-            }
-        )
-    )
+        found = measure(on_loopback(Path(folder), PORT), asked.turns, asked.seconds)
+    path = OUT / "latency.json"
+    results = json.loads(path.read_text()) if path.exists() else {}
+    results = {bus: results[bus] for bus in ("udp_multicast", "socketcan") if bus in results}
+    print(write({**results, found["bus"]: found}))
 
 
 if __name__ == "__main__":

@@ -13,24 +13,13 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench_latency import PORT, in_own_network, on_loopback
+from bench_latency import PORT, descriptors, in_own_network, on_loopback, resident_mb
 
 from handtouch.client import connect, request
 from handtouch.config import load
 
 SETTLED_S = 20.0
 GROWTH_MB = 5.0
-
-
-def resident_mb(pid: int) -> float:
-    """Memory of a process that is in RAM."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * 4096 / 1e6
-
-
-def descriptors(pid: int) -> int:
-    """Open files of a process."""
-    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def soak(config: Path, minutes: float) -> int:

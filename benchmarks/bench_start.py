@@ -1,0 +1,198 @@
+"""How long until the daemon's first frame, and until a command line answers; where the time goes.
+
+15 simulated nodes are there, on udp_multicast over loopback, and a subscriber waits for `handtouch run` to
+start: the first hand frame, and the first in which every pad delivers. Again with the files of Python and its
+packages put out of the page cache, as far as the kernel lets go of what others have mapped. Writes
+docs/benchmarks/start.{md,json}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zmq
+from bench_latency import OUT, PATHS, PORT, film, in_own_network, machine, nodes, on_loopback
+
+from handtouch import wire
+from handtouch.config import load
+
+AIMS_S = {"first frame": 3.0, "help": 0.3}
+STEPS = """
+import sys, time
+from pathlib import Path
+start = time.perf_counter()
+times = []
+def lap(name):
+    global start
+    now = time.perf_counter(); times.append((name, now - start)); start = now
+import numpy, scipy; lap("numpy and scipy")
+import can, canopen; lap("python-can and canopen")
+import pydantic; lap("pydantic")
+import handtouch.daemon.daemon as d; lap("everything else that the daemon imports")
+deployment = d.load(Path(sys.argv[1])); lap("reading the deployment")
+model = d.PadModel(deployment); lap("model of the pads: tables of their surfaces")
+daemon = d.Daemon(deployment, model); lap("opening endpoints and buses")
+for name, took in times: print(f"{took} {name}")
+"""
+
+
+def forget_files() -> None:
+    """Ask the kernel to drop the pages of Python's and the packages' files."""
+    folders = {Path(sys.prefix), Path(os.__file__).parent, Path(__file__).parents[1] / "src"}
+    for folder in folders:
+        for path in folder.rglob("*"):
+            if path.suffix in (".py", ".pyc", ".so", ".toml", ".eds") or ".so." in path.name:
+                try:
+                    descriptor = os.open(path, os.O_RDONLY)
+                except OSError:  # a dangling link, or not ours to read
+                    continue
+                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+                os.close(descriptor)
+
+
+def first_frames(config: Path) -> dict[str, float]:
+    """Seconds from the start of `handtouch run` to its first hand frame, and to one of all pads at work."""
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RECONNECT_IVL, 10)
+        socket.setsockopt(zmq.RCVTIMEO, 60_000)
+        socket.subscribe("hand/")
+        socket.connect(load(config).daemon.live)
+        start_s = time.monotonic()
+        daemon = subprocess.Popen(
+            [sys.executable, "-m", "handtouch", "run", str(config)], stderr=subprocess.DEVNULL
+        )
+        found: dict[str, float] = {}
+        try:
+            while "all pads" not in found:
+                frame = wire.decode(socket.recv_multipart())
+                now_s = time.monotonic() - start_s
+                assert isinstance(frame, wire.HandFrame)
+                found.setdefault("first frame", now_s)
+                if max(frame.state) <= wire.PadState.TOUCHED:
+                    found["all pads"] = now_s
+        finally:
+            daemon.terminate()
+            daemon.wait()
+    return found
+
+
+def help_once() -> dict[str, float]:
+    """Seconds that `handtouch --help` takes."""
+    start_s = time.monotonic()
+    subprocess.run([sys.executable, "-m", "handtouch", "--help"], check=True, stdout=subprocess.DEVNULL)
+    return {"help": time.monotonic() - start_s}
+
+
+def steps(config: Path) -> dict[str, float]:
+    """Seconds of the parts of a start, without the dialogue with the nodes."""
+    done = subprocess.run(
+        [sys.executable, "-c", STEPS, str(config)], check=True, capture_output=True, text=True
+    )
+    rows = [line.split(" ", 1) for line in done.stdout.splitlines()]
+    return {name: float(took) for took, name in rows}
+
+
+def medians(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Of each figure."""
+    return {name: statistics.median(row[name] for row in rows) for name in rows[0]}
+
+
+def measure(config: Path, runs: int) -> dict[str, Any]:
+    """Warm and cold by turns."""
+    once: dict[str, Callable[[], dict[str, float]]] = {
+        "first": lambda: first_frames(config),
+        "help": help_once,
+        "steps": lambda: steps(config),
+    }
+    found: dict[str, dict[str, list[dict[str, float]]]] = {
+        cache: {name: [] for name in once} for cache in ("warm", "cold")
+    }
+    for _ in range(runs):
+        for cache, rows in found.items():
+            for name, measured in once.items():
+                if cache == "cold":
+                    forget_files()
+                rows[name].append(measured())
+                print(cache, rows[name][-1], flush=True)
+    return {cache: {name: medians(rows[name]) for name in once} for cache, rows in found.items()}
+
+
+def write(results: dict[str, Any]) -> str:
+    """The page."""
+    warm, cold = ({**results[cache]["first"], **results[cache]["help"]} for cache in ("warm", "cold"))
+    told = {
+        "first frame": "`handtouch run` to the first hand frame at a subscriber",
+        "all pads": "to the first in which all pads deliver",
+        "help": "`handtouch --help`",
+    }
+    rows = "\n".join(
+        f"| {text} | {warm[name]:.2f} | {cold[name]:.2f} | {AIMS_S.get(name, '')} |"
+        for name, text in told.items()
+    )
+    parts = "\n".join(
+        f"| {name} | {took:.2f} | {results['cold']['steps'][name]:.2f} |"
+        for name, took in results["warm"]["steps"].items()
+    )
+    text = f"""# Start
+
+15 simulated nodes are there, on udp_multicast over loopback. Seconds, medians of {results["runs"]} runs,
+warm and cold by turns; before a cold one the files of Python and its packages are put out of the page cache,
+but for what other processes have mapped. {results["machine"]};
+load average when it ended {results["load"]:.1f}.
+
+| | warm | cold | aim |
+| --- | --- | --- | --- |
+{rows}
+
+Where it goes before the dialogue with the nodes begins:
+
+| | warm | cold |
+| --- | --- | --- |
+{parts}
+
+Made by `make bench ONLY=start`.
+"""
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / "start.md").write_text(text)
+    (OUT / "start.json").write_text(json.dumps(results, indent=1) + "\n")
+    return text
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=10)
+    asked = parser.parse_args()
+    in_own_network()
+    with tempfile.TemporaryDirectory(prefix="ht.") as folder:
+        config = on_loopback(Path(folder), PORT)
+        stamps, stop = multiprocessing.Array("q", 1 + 1000, lock=False), multiprocessing.Event()
+        samples = film(load(config), PATHS["resting"])
+        worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
+        worker.start()
+        results = measure(config, asked.runs)
+        stop.set()
+        worker.join()
+    results |= {"runs": asked.runs, "machine": machine(), "load": os.getloadavg()[0]}
+    print(write(results))
+    return int(
+        any(
+            results["warm"][key][name] > AIMS_S[name]
+            for key, name in (("first", "first frame"), ("help", "help"))
+        )
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,418 @@
+"""Many pads at 1 kHz for a long time through the real daemon, in one process; the limit; an hour of memory.
+
+The daemon's hot loop runs in a thread, on in-process buses of 8 pads each with their bounded queues. Its
+nodes are simulated ones until they are booted; then one thread answers each SYNC with messages made before, a
+tenth of the pads touched by sliding contacts, and keeps the heartbeats up. --seconds says how long the run of
+60 pads at 1 kHz takes, --hours how much of the memory run, in which samples of 15 pads at 1 kHz go through
+pipeline and publisher as fast as they can, contacts coming and going, while their stamps tell the time.
+Writes docs/benchmarks/rate.{md,json}; exit status 1 if a sample was lost or the memory grows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import zmq
+from bench_latency import OUT, PATHS, TOUCHED, descriptors, film, machine, resident_mb
+from numpy.typing import NDArray
+
+from handtouch import shipped
+from handtouch.canbus.device import DeviceBus
+from handtouch.config import Bus, Deployment, load
+from handtouch.daemon.daemon import Daemon
+from handtouch.daemon.model import PadModel
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.publisher import Publisher
+from handtouch.wire import PadState
+
+PADS_PER_BUS = 8
+AIM = 0.60
+LIMITS = ((60, 1000), (60, 1500), (60, 2000), (60, 3000), (120, 1000), (240, 500), (240, 1000), (480, 500))
+"""Pads and SYNCs a second that are tried, one after the other, for where the loop no longer keeps up."""
+LIMIT_S = 8.0
+MISSED = 1e-3
+"""Of the samples, or of the periods: more than that is an overrun, less a moment of the machine's."""
+PERIOD_NS = 1_000_000
+BOOT_PERIOD_NS = 50_000_000
+SAMPLES = 1000
+GROWTH_MB_PER_H = 2.0
+
+
+def hands_of(pads: int, rate_hz: float, folder: Path) -> Deployment:
+    """So many pads as hands of the shipped kind, PADS_PER_BUS to an in-process bus."""
+    shipped_hand = load(shipped.path("utah_mit.toml"))
+    (hand,) = shipped_hand.hands
+    hands = []
+    for first in range(0, pads, len(hand.pads)):
+        some = tuple(
+            pad.model_copy(
+                update={"bus": f"b{n // PADS_PER_BUS}", "node_id": 1 + n % PADS_PER_BUS, "serial": 1000 + n}
+            )
+            for n, pad in enumerate(hand.pads[: pads - first], first)
+        )
+        hands.append(hand.model_copy(update={"name": f"h{first}", "pads": some}))
+    buses = tuple(
+        Bus(name=f"b{n}", interface="virtual", channel=f"{folder.name}.{n}")
+        for n in range(-(-pads // PADS_PER_BUS))
+    )
+    endpoints = {name: f"ipc://{folder}/{name}" for name in ("live", "complete", "control", "inputs")}
+    settings = shipped_hand.daemon.model_copy(update={"sync_period_ms": 1e3 / rate_hz, **endpoints})
+    return shipped_hand.model_copy(update={"daemon": settings, "buses": buses, "hands": tuple(hands)})
+
+
+class Nodes:
+    """The nodes of a deployment: simulated until `feed`, then a thread that sends what was made before."""
+
+    def __init__(self, deployment: Deployment, samples: NDArray[np.int64]) -> None:
+        self._pads = [pad for hand in deployment.hands for pad in hand.pads]
+        self._names = [bus.name for bus in deployment.buses]
+        self._buses = [can.Bus(bus.channel, interface="virtual") for bus in deployment.buses]
+        self._simulated = []
+        for name, bus in zip(self._names, self._buses, strict=True):
+            devices = DeviceBus(bus, lambda _: np.zeros((PADS_PER_BUS, 4), dtype=np.int64))
+            for pad in self._pads:
+                if pad.bus == name:
+                    devices.add(pad.node_id, serial=pad.serial)
+            devices.start()
+            self._simulated.append(devices)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="feeder")
+        self._messages = self._made(samples)
+        self.answered = 0
+
+    def feed(self, daemon: Daemon) -> None:
+        """Take the place of the simulated nodes of a daemon that has booted them all."""
+        receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
+        self._queues = [receiver._bus.queue for receiver in receivers]
+        for devices in self._simulated:
+            devices.stop()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Fall silent."""
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        for devices in self._simulated:
+            devices.stop()
+        for bus in self._buses:
+            bus.shutdown()
+
+    def _made(self, samples: NDArray[np.int64]) -> list[list[list[can.Message]]]:
+        """Per sample and bus, its frames; samples (k, pads, 4)."""
+
+        def frame(pad: int, counts: NDArray[np.int64]) -> can.Message:
+            can_id = 0x280 + self._pads[pad].node_id
+            return can.Message(
+                arbitration_id=can_id, data=counts.astype("<i2").tobytes(), is_extended_id=False
+            )
+
+        on_bus = [[n for n, pad in enumerate(self._pads) if pad.bus == name] for name in self._names]
+        return [[[frame(pad, row[pad]) for pad in pads] for pads in on_bus] for row in samples]
+
+    def _run(self) -> None:
+        messages = self._messages
+        alive = [
+            [
+                can.Message(arbitration_id=0x700 + pad.node_id, data=[5], is_extended_id=False)
+                for pad in self._pads
+                if pad.bus == name
+            ]
+            for name in self._names
+        ]
+        heard_s = 0.0
+        last: Any = self._buses[-1]  # the SYNC of a cycle comes there last
+        while not self._over.is_set():
+            message = last.recv(0.05)
+            for bus in self._buses[:-1]:
+                queue: Any = bus
+                queue.queue.queue.clear()
+            if time.monotonic() - heard_s > 0.1:
+                heard_s = time.monotonic()
+                for queue, frames in zip(self._queues, alive, strict=True):
+                    put(queue, frames)
+            if message is not None and message.arbitration_id == 0x80:
+                for queue, frames in zip(self._queues, messages[self.answered % len(messages)], strict=True):
+                    put(queue, frames)
+                self.answered += 1
+
+
+def put(queue: Any, frames: list[can.Message]) -> None:
+    """Into an in-process bus at once; its `send` copies deeply, at three times the cost of receiving."""
+    with queue.mutex:
+        queue.queue.extend(frames)
+        queue.not_empty.notify()
+
+
+def touches(pads: int, part: float) -> NDArray[np.int64]:
+    """Counts (k, pads, 4): that part of the pads touched, sliding; no two hands at the same place."""
+    deployment = load(shipped.path("utah_mit.toml"))
+    kilohertz = deployment.daemon.model_copy(update={"sync_period_ms": 1.0})
+    one = film(deployment.model_copy(update={"daemon": kilohertz}), PATHS["sliding"])[:SAMPLES]
+    there_and_back = np.concatenate([one, one[::-1]])
+    noise = np.random.default_rng(1)
+    counts = np.rint(noise.standard_normal((len(there_and_back), pads, 4))).astype(np.int64)
+    for n in np.linspace(0, pads - 1, round(part * pads)).astype(int).tolist():
+        counts[:, n] += np.roll(there_and_back[:, n % TOUCHED], 7 * n, axis=0)
+    return counts
+
+
+def served(pads: int, rate_hz: int, seconds: float) -> dict[str, Any]:
+    """The daemon at this rate for so long."""
+    with tempfile.TemporaryDirectory(prefix="ht.") as folder, ExitStack() as opened:
+        deployment = hands_of(pads, rate_hz, Path(folder))
+        nodes = Nodes(deployment, touches(pads, 0.1))
+        opened.callback(nodes.stop)
+        daemon = opened.enter_context(Daemon(deployment))
+        period_ns = daemon.sync.period_ns
+        daemon.sync.set_period(BOOT_PERIOD_NS, time.monotonic_ns())
+        stop = threading.Event()
+        thread = threading.Thread(target=daemon.run, args=(stop,), name="hot")
+        thread.start()
+        opened.callback(thread.join)
+        opened.callback(stop.set)
+        reader = multiprocessing.Process(target=read, args=(deployment.daemon.live,), daemon=True)
+        reader.start()
+        opened.callback(reader.join)
+        opened.callback(reader.terminate)
+        wait_until_up(daemon)
+        nodes.feed(daemon)
+        daemon.sync.set_period(period_ns, time.monotonic_ns())
+        time.sleep(2.0)
+        return watch(daemon, nodes, thread, pads, rate_hz, seconds)
+
+
+def read(endpoint: str) -> None:
+    """A subscriber to all hands, as a process."""
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.subscribe("hand/")
+        socket.connect(endpoint)
+        while True:
+            socket.recv_multipart()
+
+
+def wait_until_up(daemon: Daemon) -> None:
+    """Until every node is operational. Raises RuntimeError if that takes a minute."""
+    end_s = time.monotonic() + 60
+    while np.count_nonzero(daemon.pipeline.node_state) and time.monotonic() < end_s:
+        time.sleep(0.05)
+    if np.count_nonzero(daemon.pipeline.node_state):
+        raise RuntimeError("the nodes never became operational")
+
+
+def watch(
+    daemon: Daemon,
+    nodes: Nodes,
+    thread: threading.Thread,
+    pads: int,
+    rate_hz: int,
+    seconds: float,
+) -> dict[str, Any]:
+    """What the daemon does for so long, while a subscriber reads its hand frames."""
+    clock = time.pthread_getcpuclockid(thread.ident or 0)
+    receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
+    counters = [port.counters for port in daemon.ports.values()]
+
+    def totals() -> NDArray[np.int64]:
+        tick, bus = daemon.pipeline.tick, [(c.samples, c.overflow) for c in counters]
+        samples, overflow = np.sum(bus, axis=0).tolist()
+        missed, taken = int(tick.missed.sum()), int(tick.samples.sum())
+        return np.array(
+            [nodes.answered, daemon.pipeline.ticks, daemon.sync.overruns, missed, taken, samples, overflow]
+        )
+
+    before, busy_s, start_s = totals(), time.clock_gettime(clock), time.monotonic()
+    longest, told_s = 0, start_s
+    while (now_s := time.monotonic()) - start_s < seconds:
+        longest = max(longest, *(len(receiver._queue) for receiver in receivers))
+        time.sleep(0.05)
+        if now_s - told_s > 60:
+            told_s = now_s
+            print(f"{seconds - now_s + start_s:.0f} s to go", flush=True)
+    took_s, busy_s = time.monotonic() - start_s, time.clock_gettime(clock) - busy_s
+    answered, ticks, overruns, missed, taken, samples, overflow = (totals() - before).tolist()
+    return {
+        "pads": pads,
+        "rate_hz": rate_hz,
+        "seconds": round(took_s, 1),
+        "touched": round(0.1 * pads),
+        "syncs_answered": answered,
+        "ticks": ticks,
+        "overruns": overruns,
+        "missed": missed,
+        "samples": samples,
+        "samples_taken": taken,
+        "lost": max(0, (answered - 2) * pads - samples) + overflow,
+        "longest_queue": longest,
+        "hot_core": busy_s / took_s,
+        "sustained": missed <= MISSED * samples and overruns <= MISSED * rate_hz * took_s,
+    }
+
+
+def remember(hours: float) -> dict[str, Any]:
+    """Memory, descriptors and objects while samples of so many hours go through pipeline and publisher."""
+    deployment = load(shipped.path("utah_mit.toml"))
+    moving = film(deployment, PATHS["sliding"])
+    untouched = np.rint(np.random.default_rng(2).standard_normal((len(moving), *moving.shape[1:])))
+    script = np.concatenate([moving, untouched.astype(np.int64)]).astype("<i2")
+    rows: list[tuple[float, float, int, int, int]] = []
+    with tempfile.TemporaryDirectory(prefix="ht.") as folder, zmq.Context() as context:
+        publisher = Publisher(context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
+        pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.8, publisher)
+        pipeline.node_state[:] = PadState.CLEAR
+        reader = context.socket(zmq.SUB)
+        reader.subscribe("")
+        reader.connect(publisher.endpoints["complete"])
+        time.sleep(0.3)
+        publisher.take_subscriptions(0)
+        steps = round(hours * 3600e9 / PERIOD_NS)
+        received = 0
+        for step in range(steps):
+            t_ns = (step + 1) * PERIOD_NS
+            pipeline.begin(t_ns, t_ns)
+            sample: bytes = script[step % len(script)].tobytes()
+            for pad in range(pipeline.slab.size):
+                pipeline.slab.write(pad, sample[8 * pad : 8 * pad + 8], t_ns + 1000 * pad)
+            pipeline.advance(t_ns + 20_000)
+            pipeline.settle()
+            while reader.poll(0):
+                reader.recv_multipart()
+                received += 1
+            if step % max(1, steps // 60) == 0:
+                objects = sum(gc.get_count())
+                rows.append(
+                    (t_ns / 3600e9, resident_mb(os.getpid()), descriptors(os.getpid()), objects, received)
+                )
+        begun = pipeline.tick.contacts.begun
+        drops = dict(publisher.drops)
+        reader.close(0)
+        publisher.close()
+    figures = np.array(rows)
+    late = figures[len(figures) // 3 :]  # pools fill at first
+    slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0])
+    return {
+        "hours": hours,
+        "ticks": steps,
+        "contacts": begun,
+        "messages": received,
+        "drops": drops,
+        "mb_first": rows[1][1],
+        "mb_third": float(late[0, 1]),
+        "mb_last": rows[-1][1],
+        "mb_per_hour": slope,
+        "descriptors": [rows[1][2], rows[-1][2]],
+        "collections": [generation["collections"] for generation in gc.get_stats()],
+    }
+
+
+def write(new: dict[str, Any]) -> str:
+    """The page, with what earlier runs of the other parts have left."""
+    path = OUT / "rate.json"
+    results = (json.loads(path.read_text()) if path.exists() else {}) | new
+    text = ["# Rates that one core sustains, and memory", ""]
+    if long := results.get("long"):
+        text += [
+            "The real daemon in one process with its nodes, eight pads to an in-process bus with a",
+            "bounded queue, a tenth of the pads touched by sliding contacts, one subscriber to all",
+            "hands. The share of a core is the hot thread's: SYNC, receive, tick, send and all the",
+            f"rest; the aim is {AIM:.0%}.",
+            f"{long['machine']}; load average when it ended {long['load']:.1f}, with the daemon's own.",
+            "",
+            *table([long]),
+        ]
+    if rows := results.get("limits"):
+        text += [
+            f"How far it goes, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples late, or",
+            "of the periods skipped:",
+            "",
+            *table(rows),
+        ]
+        if sustained := [row for row in rows if row["sustained"]]:
+            best = max(sustained, key=lambda row: row["pads"] * row["rate_hz"])
+            product = best["pads"] * best["rate_hz"]
+            text += [
+                f"The largest product sustained is {best['pads']} pads at {best['rate_hz']} Hz,",
+                f"{product} samples/s: {product / 15:.0f} hands of 15 pads x Hz.",
+                "",
+            ]
+    if memory := results.get("memory"):
+        text += [
+            "## Memory",
+            "",
+            f"{memory['hours']:g} h of 15 pads at 1 kHz, compressed: {memory['ticks']} ticks through pipeline",
+            f"and publisher, {memory['contacts']} contacts begun, {memory['messages']} messages received by a",
+            f"subscriber to everything, {sum(memory['drops'].values())} dropped. Resident",
+            f"{memory['mb_first']:.1f} MB at first, {memory['mb_third']:.1f} after a third,",
+            f"{memory['mb_last']:.1f} at the end: {memory['mb_per_hour']:+.2f} MB an hour from there on (least squares). Descriptors",
+            f"{memory['descriptors'][0]} and {memory['descriptors'][1]}.",
+            "",
+        ]
+    text.append("Made by `make soak ONLY=rate`.")
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / "rate.md").write_text("\n".join(text) + "\n")
+    path.write_text(json.dumps(results, indent=1) + "\n")
+    return "\n".join(text)
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """Lines of runs of the daemon."""
+    return [
+        "| pads | SYNCs/s | s | ticks | samples | lost | late | periods skipped | queue | core | |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+        *(
+            "| {pads} | {rate_hz} | {seconds} | {ticks} | {samples} | {lost} | {missed} | {overruns} "
+            "| {longest_queue} | {hot_core:.0%} |".format(**row)
+            + (" |" if row["sustained"] else " overrun |")
+            for row in rows
+        ),
+        "",
+    ]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=600.0, help="of 60 pads at 1 kHz; 0: not that")
+    parser.add_argument("--hours", type=float, default=1.0, help="of the memory run, compressed; 0: not that")
+    parser.add_argument(
+        "--limits", action=argparse.BooleanOptionalAction, default=True, help="how far it goes"
+    )
+    asked = parser.parse_args()
+    OUT.mkdir(parents=True, exist_ok=True)
+    failed = False
+    if asked.seconds:
+        long = served(60, 1000, asked.seconds) | {"machine": machine(), "load": os.getloadavg()[0]}
+        print(long, flush=True)
+        failed |= long["lost"] > 0
+        write({"long": long})
+    if asked.limits:
+        rows = []
+        for pads, rate_hz in LIMITS:
+            rows.append(served(pads, rate_hz, LIMIT_S))
+            print(rows[-1], flush=True)
+        write({"limits": rows})
+    if asked.hours:
+        memory = remember(asked.hours)
+        print(memory)
+        failed |= (
+            memory["mb_per_hour"] > GROWTH_MB_PER_H or memory["descriptors"][0] < memory["descriptors"][1]
+        )
+        write({"memory": memory})
+    print(write({}))
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
