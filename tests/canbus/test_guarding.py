@@ -130,6 +130,25 @@ def test_life_guarding_of_the_node_never_fires_while_we_run(rig: Any) -> None:
     assert rig.status(1).reboots == 0
 
 
+def test_guarded_node_is_asked_in_time_however_slow_sync_is(make_guarded: Make) -> None:
+    """Who polls when `wake_ns` has come, and once a second with SYNC otherwise, keeps it."""
+    rig = make_guarded(1)
+    rig.syncs = False
+    rig.plug_all()
+    rig.start()
+    for ms in range(10_000):
+        rig.t_ns += 1_000_000
+        rig.devices.advance(rig.t_ns)
+        rig.pump()
+        if ms % 1000 == 0 or rig.t_ns >= rig.master.wake_ns:
+            rig.master.poll(rig.t_ns)
+        rig.master._workers.work()
+    assert rig.wire.asked.count(0x701) >= 65
+    assert rig.status(1).emergencies == ()
+    assert rig.status(1).heartbeats_missed == 0
+    assert ABSENT not in [e.new for e in rig.master.take_events()]
+
+
 def test_two_guarded_nodes_with_one_id_are_told(rig: Any) -> None:
     twin = rig.devices.add_twin(1, serial=999)
     twin.plug()

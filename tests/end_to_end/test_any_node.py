@@ -10,6 +10,8 @@ import pytest
 
 from handtouch.simulate.truth import read
 
+from .conftest import PERIOD_MS
+
 EDS = Path(__file__).parents[1] / "data" / "eds"
 NODES = {
     "CiA 404, int32 in two PDOs": (
@@ -53,6 +55,21 @@ def test_a_touch_is_found_whatever_the_node(rig: Any, name: str) -> None:
     ]
     assert len(errors) > 20
     assert np.median(errors) < 0.3e-3
+
+
+def test_guarded_nodes_are_asked_in_time_though_sync_comes_once_a_second(rig: Any) -> None:
+    """Each would say so, and stop its samples, after 0.3 s without being asked."""
+    eds, keys = NODES["unsigned between other objects, mapping fixed, guarded"]
+    text = rig.config.read_text().replace("drive_v = 5.0", f'eds = "{EDS / eds}"\n{keys}drive_v = 5.0', 1)
+    rig.config.write_text(text.replace(f"sync_period_ms = {PERIOD_MS}", "sync_period_ms = 1000.0"))
+    rig.simulate()
+    rig.start("run")
+    before = rig.wait_operational()
+    after = rig.wait("four more", lambda s: s["service"]["ticks"] >= before["service"]["ticks"] + 4)
+    for pad in after["pads"]:
+        assert pad["node"] == "operational", pad
+        assert pad["reboots"] == 0
+        assert not pad["emergencies"], pad
 
 
 def _nearest(places: dict[tuple[str, int], Any], contact: Any) -> int | None:

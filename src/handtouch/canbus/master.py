@@ -154,6 +154,11 @@ class Master:
         if t_ns >= self._next_due_ns:
             self._tick(t_ns)
 
+    @property
+    def wake_ns(self) -> int:
+        """When to `poll` at the latest, were ticks far apart: a time-out, a retry, a node to be guarded."""
+        return self._next_due_ns
+
     def rest(self, slot: int, resting: bool, t_ns: int) -> None:
         """A node isn't needed for now: excitation off, stopped; or it is again."""
         node = self._by_slot[slot]

@@ -44,6 +44,9 @@ from handtouch.daemon.security import Gate
 from handtouch.keys import KeysError
 
 _log = logging.getLogger("handtouch.daemon")
+
+_COLD_NS = 1_000_000
+"""After a rest of that length others have had the caches: a tick would take several times as long."""
 _GIL_SWITCH_S = 0.0005  # a thread that boots a node or builds a model lets the hot one in after so long
 
 
@@ -61,6 +64,7 @@ class Daemon:
         read: Callable[[], Deployment] | None = None,
     ) -> None:
         self.deployment = deployment
+        self._rested_ns = 0
         settings = deployment.daemon
         period_ns = round(settings.sync_period_ms * 1e6)
         with ExitStack() as opened:
@@ -133,7 +137,7 @@ class Daemon:
 
     def _loop(self, stop: threading.Event, alive: Callable[[int], None]) -> None:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
-        sync, pacer, stages = self.sync, self.pacer, self.report.stages
+        sync, pacer, master, stages = self.sync, self.pacer, self.master, self.report.stages
         pipeline.stepped = lambda: stages.lap(histogram.TICK, time.monotonic_ns())
         sync.start(time.monotonic_ns())
         stages.start(time.monotonic_ns())
@@ -141,12 +145,14 @@ class Daemon:
             now_ns = time.monotonic_ns()
             if (sync_ns := sync.poll(now_ns)) is not None:
                 self._begin(sync_ns, now_ns)
-            wake_ns = sync.wake_ns
+            wake_ns = min(sync.wake_ns, master.wake_ns)  # nodes may not be able to wait for a slow SYNC
             if not cycle.ticked:
                 wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns)
             wait_s = max(0, wake_ns - now_ns) * 1e-9
             select.select(ports, (), (), wait_s)
-            stages.slept(wake_ns, time.monotonic_ns())
+            woke_ns = time.monotonic_ns()
+            self._rested_ns = woke_ns - now_ns
+            stages.slept(wake_ns, woke_ns)
             self._receive(ports)
             now_ns = time.monotonic_ns()
             stages.lap(histogram.RECEIVE, now_ns)
@@ -158,11 +164,15 @@ class Daemon:
                 stages.lap(histogram.SEND, sent_ns)
                 self.report.ticked(now_ns, sent_ns)
                 self._after_tick(alive)
+            elif now_ns >= master.wake_ns:
+                master.poll(now_ns)
 
     def _begin(self, sync_ns: int, now_ns: int) -> None:
         """A SYNC was sent or seen: a new period."""
         self.report.stages.begin(self.sync.overruns, not self.pipeline.cycle.ticked)
         self.pipeline.begin(sync_ns, now_ns)
+        if self._rested_ns > _COLD_NS:  # now, while the nodes sample and answer
+            self.pipeline.rehearse()
         self.report.stages.lap(histogram.SYNC, time.monotonic_ns())
 
     def _receive(self, ports: list[Port]) -> None:
