@@ -64,6 +64,7 @@ class Wanted:
     heartbeat_ms: int
     idle: Idle | None = None
     excitation: Object | None = None
+    event_timer_ms: int = 5
 
 
 def found(enabled: bool = True, transmission: int = 1) -> Tpdo:

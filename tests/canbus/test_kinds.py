@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from handtouch import shipped
 from handtouch.canbus.channels import ELECTRODES, channels_of, in_order
 from handtouch.canbus.eds import EdsError
 from handtouch.canbus.lifecycle import NodeState
@@ -217,3 +219,32 @@ def test_identifier_of_another_service_is_a_fault(make_rig: Make, cob_id: int) -
     rig.run(200)
     assert rig.state(1) is NodeState.FAULTED
     assert f"TPDO2 has identifier 0x{cob_id:X}, which CANopen uses otherwise" in rig.status(1).reason
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_node_that_cannot_follow_sync_sends_as_often_by_its_event_timer(
+    make_rig: Make, tmp_path: Path, strict: bool
+) -> None:
+    """Its EDS allows no transmission type but 254 and 255; no SYNC is needed."""
+    text = shipped.path("handtouch-node.eds").read_text(encoding="utf-8")
+    head, tail = text.split("[1801sub2]\n")
+    assert "DefaultValue=1\n" in tail
+    eds = tmp_path / "events.eds"
+    eds.write_text(
+        f"{head}[1801sub2]\nLowLimit=254\n" + tail.replace("DefaultValue=1\n", "DefaultValue=255\n", 1)
+    )
+    rig = make_rig(2, device={"eds": str(eds), "strict_pdo": strict}, event_timer_ms=5)
+    rig.syncs = False
+    rig.plug_all()
+    rig.start()
+    events = rig.run(1000)
+    assert [rig.state(n) for n in (1, 2)] == [NodeState.OPERATIONAL] * 2
+    told = [e.reason for e in events if "by its event timer" in e.reason]
+    assert len(told) == 2
+    assert re.match(r"sends every 5 ms by its event timer, not with SYNC: .*0x1801:02: refused", told[0])
+    before = rig.port.counters.samples
+    assert rig.run(1000) == []
+    assert rig.port.counters.samples - before == pytest.approx(400, abs=4)
+    rig.node(1).reboot()
+    rig.run(500)
+    assert rig.state(1) is NodeState.OPERATIONAL

@@ -22,6 +22,7 @@ EVENT_DRIVEN = 255
 LIFE_TIME_FACTOR = 3
 """Guard times that a guarded node waits for our remote frame before it tells an error."""
 
+_EVENT_DRIVEN = (254, EVENT_DRIVEN)  # by the maker's events, or the profile's
 _IDENTITY, _HEARTBEAT, _GUARD_TIME, _LIFE_TIME = 0x1018, 0x1017, 0x100C, 0x100D
 
 
@@ -68,6 +69,9 @@ class Settings(Protocol):
     @property
     def excitation(self) -> Object | None: ...
 
+    @property
+    def event_timer_ms(self) -> int: ...
+
 
 @dataclass(frozen=True, slots=True)
 class Paced:
@@ -85,7 +89,7 @@ class Configured:
     may_idle: bool
     """it can be made event-driven"""
     refusal: str = ""
-    """why not, though it should"""
+    """what it refused, and what it does instead"""
 
 
 def identify(sdo: Sdo, expected: Expected) -> Identity:
@@ -117,6 +121,7 @@ def configure(
 ) -> Configured:
     """Set what differs: PDOs enabled and synchronous, heartbeat time; each is read back.
 
+    A node that can't follow SYNC sends as often by its event timer, if all its channels come in one PDO.
     A node without heartbeat gets it as guard time. One that has just `booted` is told its heartbeat time
     anyhow: another with its id may have answered in its place, and is known by its heartbeats alone. `halt`
     makes the node pre-operational; called only if a PDO must be changed, which many nodes refuse while they
@@ -124,20 +129,26 @@ def configure(
     """
     if any(not tpdo.enabled or tpdo.transmission != SYNCHRONOUS for tpdo in mapping.tpdos):
         halt()
+    refusal, single = "", len(mapping.tpdos) == 1  # several would come one by one
     for tpdo in mapping.tpdos:
         if tpdo.transmission != SYNCHRONOUS:
-            _set_transmission(sdo, tpdo, SYNCHRONOUS)
+            try:
+                _set_transmission(sdo, tpdo, SYNCHRONOUS)
+            except StepError as error:
+                if error.silent or not single or tpdo.transmission not in _EVENT_DRIVEN:
+                    raise
+                _set_event_timer(sdo, tpdo, wanted.event_timer_ms)
+                refusal = f"sends every {wanted.event_timer_ms} ms by its event timer, not with SYNC: {error}"
         if not tpdo.enabled:
             _switch_on(sdo, tpdo)
-    may_idle = wanted.idle is not None and len(mapping.tpdos) == 1  # several would come one by one
-    refusal = ""
+    may_idle = wanted.idle is not None and single and not refusal
     if wanted.idle is not None and may_idle:
         try:
             prepare_idle(sdo, mapping.tpdos[0], wanted.idle, halt)
         except StepError as error:  # it does without
             if error.silent:
                 raise
-            may_idle, refusal = False, str(error)
+            may_idle, refusal = False, f"stays synchronous while idle: {error}"
             _switch_on(sdo, mapping.tpdos[0])
     excite(sdo, wanted.excitation, True)
     return Configured(_supervise(sdo, wanted.heartbeat_ms, booted), may_idle, refusal)
@@ -190,6 +201,14 @@ def _set_transmission(sdo: Sdo, tpdo: Tpdo, kind: int) -> None:
             raise
         with _switched_off(sdo, tpdo):
             sdo.write(index, 2, kind, 1, what)
+
+
+def _set_event_timer(sdo: Sdo, tpdo: Tpdo, period_ms: int) -> None:
+    """CiA 301: not while the PDO is valid."""
+    index, what = COMMUNICATION + tpdo.number - 1, f"event timer of TPDO{tpdo.number}"
+    if sdo.read(index, 5, what) != period_ms:
+        with _switched_off(sdo, tpdo):
+            sdo.write(index, 5, period_ms, 2, what)
 
 
 @contextmanager

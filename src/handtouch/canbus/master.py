@@ -360,7 +360,7 @@ class Master:
                 if node.watched is None:
                     node.watched, node.crowded = (t_ns, node.heartbeats), 0
                 if result.refusal:
-                    self._tell(node, node.life.state, f"stays synchronous while idle: {result.refusal}", t_ns)
+                    self._tell(node, node.life.state, result.refusal, t_ns)
             elif isinstance(result, PdoMapping) and (clash := self._route(node, result)):
                 outcome = Failed(outcome.step, outcome.attempt, clash)
             self._advance(node, outcome, t_ns)

@@ -23,6 +23,7 @@ class NodeSpec:
     """A node as the configuration describes it; identity fields left None are not checked.
 
     `channels` are those of the electrodes x0, xa, y0, yb. `remap`: they may be mapped to a TPDO over SDO.
+    `event_timer_ms`: how often it sends if it can't follow SYNC.
     """
 
     slot: int
@@ -40,6 +41,7 @@ class NodeSpec:
     excitation: Object | None = None
     heartbeat_ms: int = 100
     heartbeat_timeout_ms: int = 350
+    event_timer_ms: int = 5
 
 
 def node_specs(deployment: Deployment) -> list[NodeSpec]:
@@ -65,6 +67,7 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
                 excitation=written(kind.excitation) if kind.excitation else None,
                 heartbeat_ms=kind.heartbeat_ms,
                 heartbeat_timeout_ms=kind.heartbeat_timeout_ms,
+                event_timer_ms=max(1, round(deployment.daemon.sync_period_ms)),
             )
         )
     return specs
