@@ -91,6 +91,18 @@ def test_untouched_pads_wait_for_something_to_move_and_sync_slows_down(served: S
     assert served.beat.period_ns == PERIOD_NS
 
 
+def test_sync_stays_at_full_rate_while_a_node_that_is_woken_has_not_answered(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whenever the next look at what may rest comes."""
+    served.wait(IDLE_NS + 200 * MS)
+    assert served.beat.period_ns == SLOW_NS
+    monkeypatch.setattr(served.nodes, "pace", lambda *_: None)
+    for _ in range(40):
+        served.wait(PERIOD_NS, counts=[[12] * 4, [0] * 4, [0] * 4])
+        assert served.beat.period_ns == PERIOD_NS
+
+
 def test_touched_pads_follow_sync(served: Served) -> None:
     served.wait(2 * IDLE_NS, counts=[[500] * 4, [0] * 4, [0] * 4])
     assert served.nodes.idle.tolist() == [False, True, True]

@@ -107,7 +107,9 @@ class Pacer:
         if self._idles:
             self._let_idle(now_ns)
         rests = bool(waiting.any()) or not self.needed.any()
-        self._set_slow(rests and not self._with_sync().any(), now_ns)
+        # one that is just being woken has yet to say that it follows SYNC
+        woken = waiting & (now_ns - self._active_ns <= self._idle_after_ns)
+        self._set_slow(rests and not (woken | self._with_sync()).any(), now_ns)
 
     def _let_idle(self, now_ns: int) -> None:
         """Pads untouched for long enough become event-driven, others follow SYNC."""
