@@ -335,8 +335,8 @@ def write(new: dict[str, Any]) -> str:
         ]
     if rows := results.get("limits"):
         text += [
-            f"How far it goes, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples late, or",
-            "of the periods skipped:",
+            f"How far it goes, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples late,",
+            "or of the periods skipped:",
             "",
             *table(rows),
         ]
@@ -352,11 +352,12 @@ def write(new: dict[str, Any]) -> str:
         text += [
             "## Memory",
             "",
-            f"{memory['hours']:g} h of 15 pads at 1 kHz, compressed: {memory['ticks']} ticks through pipeline",
-            f"and publisher, {memory['contacts']} contacts begun, {memory['messages']} messages received by a",
-            f"subscriber to everything, {sum(memory['drops'].values())} dropped. Resident",
+            f"{memory['hours']:g} h of 15 pads at 1 kHz, compressed: {memory['ticks']} ticks through",
+            f"pipeline and publisher, {memory['contacts']} contacts begun, {memory['messages']} messages",
+            f"received by a subscriber to everything, {sum(memory['drops'].values())} dropped. Resident",
             f"{memory['mb_first']:.1f} MB at first, {memory['mb_third']:.1f} after a third,",
-            f"{memory['mb_last']:.1f} at the end: {memory['mb_per_hour']:+.2f} MB an hour from there on (least squares). Descriptors",
+            f"{memory['mb_last']:.1f} at the end: {memory['mb_per_hour']:+.2f} MB an hour from there on",
+            "(least squares). Descriptors",
             f"{memory['descriptors'][0]} and {memory['descriptors'][1]}.",
             "",
         ]

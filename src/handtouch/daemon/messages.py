@@ -87,6 +87,12 @@ class Messages:
             if outlet.wants(f"raw/{hand}"):
                 outlet.send(self._raw(hand, slab))
 
+    def rehearse(self, outlet: Outlet) -> None:
+        """Encode the frames of the hands that somebody wants, and throw them away."""
+        for hand in self._model.rows_of_hand:
+            if outlet.wants(f"hand/{hand}"):
+                wire.encode(self._hand(hand))
+
     def present(self) -> dict[str, Callable[[int], wire.Message | None]]:
         """Topic -> what there is to repeat of it, at a time [ns]: contacts under way, and hands."""
         return {
