@@ -77,7 +77,7 @@ def test_own_frames_do_not_come_back(port: Port) -> None:
 def test_interface_may_go_down_and_come_up(port: Port) -> None:
     run("ip link set vcan0 down")
     try:
-        assert eventually(port, lambda: port.counters.receive_errors == 1)
+        assert eventually(port, lambda: port.counters.receive_failures == 1)
         assert "ip link set vcan0 up" in look(port).problem
         assert port.state.condition is Condition.DOWN
         assert not port.send(0x80, b"")

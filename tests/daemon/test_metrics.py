@@ -24,7 +24,7 @@ BUS = {
     "causes": {"bit error": 3},
     "sync": {"by": "loop", "jitter_us": {"p50": 10.0, "p99": 50.0, "max": 80.0}, "others": 2, "problem": ""},
     "frames": 1000, "sent": 20, "bits": 123456, "samples": 900, "short": 1, "foreign": 2, "errors": 3,
-    "send_failures": 4, "queue_full": 5, "receive_errors": 6, "overflow": 7,
+    "send_failures": 4, "queue_full": 5, "receive_failures": 6, "overflow": 7,
 }  # fmt: skip
 
 

@@ -174,7 +174,7 @@ def test_garbled_lines_are_counted_and_an_adapter_may_be_pulled_out(rig: Any, hu
         time.sleep(0.05)  # apart, as they would come
     rig.wait(
         "counted the garbage",
-        lambda status: status["service"]["buses"]["can0"]["receive_errors"] > before["receive_errors"],
+        lambda status: status["service"]["buses"]["can0"]["receive_failures"] > before["receive_failures"],
     )
     contacts(rig, ends=1)
     rig.wait_operational()

@@ -167,7 +167,7 @@ class ThreadReceiver:
             self._raise_signal()
         lost, errors = self._lost, self._errors
         router.counters.overflow += lost - self._counted[0]
-        router.counters.receive_errors += errors - self._counted[1]
+        router.counters.receive_failures += errors - self._counted[1]
         self._counted = (lost, errors)
         return others
 

@@ -38,7 +38,7 @@ class Counters:
     errors: int = 0  # error frames
     send_failures: int = 0  # other than those of a full queue
     queue_full: int = 0  # frames not sent because the transmit queue had no room
-    receive_errors: int = 0
+    receive_failures: int = 0
     overflow: int = 0  # frames lost between the controller and us, in the kernel's queue or our own
 
 

@@ -115,7 +115,7 @@ class _SocketReceiver:
             self.trouble = trouble_of(error)
 
     def _failed(self, router: Router, error: Exception) -> None:
-        router.counters.receive_errors += 1
+        router.counters.receive_failures += 1
         self.trouble = trouble_of(error)
         self._errors += 1
         if is_hopeless(error, self._errors):
@@ -128,7 +128,7 @@ class _SocketReceiver:
         try:
             self._use(self._opener())
         except Exception as error:  # noqa: BLE001 - as above
-            router.counters.receive_errors += 1
+            router.counters.receive_failures += 1
             self.trouble = given_up(error)
             return None
         self._errors = 0

@@ -37,7 +37,7 @@ _NODE_STATES = (
 )
 _BUS_STATES = ("active", "warning", "passive", "bus-off", "down")
 _CARRIED = ("frames", "sent", "bits", "samples")
-_TROUBLES = ("short", "foreign", "errors", "send_failures", "queue_full", "receive_errors", "overflow")
+_TROUBLES = ("short", "foreign", "errors", "send_failures", "queue_full", "receive_failures", "overflow")
 _log = logging.getLogger("handtouch.metrics")
 
 Labels = Mapping[str, object]
