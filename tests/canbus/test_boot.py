@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from handtouch.canbus.boot import Expected, Identity, Idle, configure, identify
+from handtouch.canbus.boot import Expected, Identity, Idle, check_identity, configure, identify
 from handtouch.canbus.channels import STANDARD_CHANNELS, Channel, Channels, Object
 from handtouch.canbus.mapping import Mapping, Tpdo, read_mapping
 from handtouch.canbus.sdo import Outdated, Sdo, StepError
@@ -76,16 +76,18 @@ def identity(*values: int) -> dict[tuple[int, int], tuple[int, int]]:
 
 
 def test_identity_is_read_whole() -> None:
-    assert identify(Node(identity(1, 2, 3, 4)).sdo, Expected(1, 2, 3, 4)) == Identity(1, 2, 3, 4)
+    found = identify(Node(identity(1, 2, 3, 4)).sdo)
+    assert found == Identity(1, 2, 3, 4)
+    check_identity(found, Expected(1, 2, 3, 4))
 
 
 def test_only_the_vendor_id_is_mandatory() -> None:
-    assert identify(Node(identity(9)).sdo, Expected()) == Identity(9)
+    assert identify(Node(identity(9)).sdo) == Identity(9)
 
 
 def test_node_without_serial_number_is_not_the_one_with_the_configured_one() -> None:
     with pytest.raises(StepError, match="serial number is none, configured is 4") as caught:
-        identify(Node(identity(1, 2, 3)).sdo, Expected(serial=4))
+        check_identity(Identity(1, 2, 3), Expected(serial=4))
     assert caught.value.stranger
 
 
@@ -236,7 +238,7 @@ def test_silence_and_refusal_are_told_apart() -> None:
     node = Node(identity(1))
     node.deaf.add(0x1018)
     with pytest.raises(StepError, match="reading vendor id, 0x1018:01: no answer") as silence:
-        identify(node.sdo, Expected())
+        identify(node.sdo)
     assert silence.value.silent
     with pytest.raises(
         StepError, match=r"refused by the node \(Code 0x06020000, Object does not exist\)"
@@ -300,4 +302,4 @@ def test_outdated_attempt_asks_nothing_more() -> None:
     node = Node(identity(1))
     node.sdo.outdated = lambda: True
     with pytest.raises(Outdated):
-        identify(node.sdo, Expected())
+        identify(node.sdo)

@@ -311,8 +311,9 @@ def test_swapped_unit_is_faulted_until_the_right_one_is_back(make_rig: Make) -> 
     rig = make_rig(1, serial=101)
     rig.boot()
     rig.node(1).swap(7)
-    rig.run(500)
+    told = rig.run(500)
     assert rig.state(1) is FAULTED
+    assert [(e.before, e.after) for e in told if isinstance(e, SerialChanged)] == [(101, 7)]
     rig.node(1).swap(101)
     rig.run(500)
     assert rig.state(1) is OPERATIONAL

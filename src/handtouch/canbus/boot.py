@@ -92,14 +92,18 @@ class Configured:
     """what it refused, and what it does instead"""
 
 
-def identify(sdo: Sdo, expected: Expected) -> Identity:
-    """Read 0x1018. Raises StepError where it differs from what is expected."""
-    identity = Identity(
+def identify(sdo: Sdo) -> Identity:
+    """Read 0x1018."""
+    return Identity(
         sdo.read(_IDENTITY, 1, "vendor id"),
         sdo.read_optional(_IDENTITY, 2, "product code"),
         sdo.read_optional(_IDENTITY, 3, "revision"),
         sdo.read_optional(_IDENTITY, 4, "serial number"),
     )
+
+
+def check_identity(identity: Identity, expected: Expected) -> None:
+    """Raises StepError where a node is another than expected."""
     for what, key, found, wanted in (
         ("vendor id", "vendor_id", identity.vendor_id, expected.vendor_id),
         ("product code", "product_code", identity.product_code, expected.product_code),
@@ -113,7 +117,6 @@ def identify(sdo: Sdo, expected: Expected) -> Identity:
                 f"put the right node there, or correct {key} in the deployment",
                 stranger=True,
             )
-    return identity
 
 
 def configure(

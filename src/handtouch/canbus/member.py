@@ -112,6 +112,8 @@ def outcome(node: Member, step: Action, attempt: int, idle: bool) -> tuple[Outco
     ended: Outcome = Done(step, attempt)
     try:
         result = _carry_out(node, step, idle)
+        if isinstance(result, boot.Identity):  # a stranger's is worth knowing too
+            boot.check_identity(result, _expected(node.spec))
     except Outdated:
         return None, None
     except StepError as error:
@@ -121,11 +123,14 @@ def outcome(node: Member, step: Action, attempt: int, idle: bool) -> tuple[Outco
     return ended, result
 
 
+def _expected(spec: NodeSpec) -> boot.Expected:
+    return boot.Expected(spec.vendor_id, spec.product_code, spec.revision, spec.serial)
+
+
 def _carry_out(node: Member, step: Action, idle: bool) -> Result | None:
     spec = node.spec
     if step is Action.IDENTIFY:
-        expected = boot.Expected(spec.vendor_id, spec.product_code, spec.revision, spec.serial)
-        return boot.identify(node.sdo, expected)
+        return boot.identify(node.sdo)
 
     def halt() -> None:
         if node.life.nmt != NMT_PREOPERATIONAL and node.timing.role is Role.MASTER:
