@@ -115,7 +115,7 @@ class Slides:
         x, y = (self._place * model.locator.sides).T
         current = model.locator.fractions(pads, x, y).T * (STRENGTH * model.on_a[:, None])
         noise = self._chance.normal(size=(model.size, 4))
-        return np.rint(current / model.ampere_per_count + noise).astype("<i2")
+        return np.asarray(np.rint(current / model.ampere_per_count + noise), dtype="<i2")
 
 
 def measure(hand_count: int, ticks: int) -> list[dict[str, Any]]:
