@@ -56,7 +56,7 @@ types: $(VENV)/.dev ## static types
 	$(BIN)/mypy --strict
 
 unit: $(VENV)/.dev ## all tests that need no SocketCAN, with coverage
-	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadgroup --cov --cov-report=term:skip-covered $(ARGS)
+	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --cov --cov-report=term:skip-covered $(ARGS)
 
 socketcan: $(VENV)/.dev ## the tests on real SocketCAN; skipped with the reason where there is none, which fails CI
 	@tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $(ARGS); status=$$?; \

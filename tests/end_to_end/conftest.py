@@ -20,13 +20,6 @@ from handtouch import shipped
 from handtouch.client import Subscriber, connect, request
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One after another, where tests run side by side: real daemons at real rates need the processor."""
-    for item in items:
-        if Path(__file__).parent in item.path.parents:
-            item.add_marker(pytest.mark.xdist_group("end_to_end"))
-
-
 START_S = 90.0
 """Longest that anything may take on a busy machine; nothing waits so long when all is well."""
 

@@ -90,6 +90,9 @@ class Reader:
         self._process.kill()
         self._process.wait()
         self._thread.join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
