@@ -19,7 +19,6 @@ import pytest
 from handtouch import shipped
 from handtouch.client import Subscriber, connect, request
 
-
 START_S = 90.0
 """Longest that anything may take on a busy machine; nothing waits so long when all is well."""
 
