@@ -16,13 +16,15 @@ from hypothesis import strategies as st
 
 from handtouch.config import ConfigError, Deployment, parse
 from handtouch.daemon.daemon import Daemon
+from handtouch.daemon.model import PadModel
+from handtouch.supervise.calibration import Calibration, Gains, Law, Offsets
 from handtouch.wire import PadState
 
 PERIOD_NS = 5_000_000
 COMMANDS = ("status", "snapshot", "scene", "tare", "calibrate", "enable", "disable", "reload", "log")
 KEYS = (
     *("pads", "pad", "name", "links", "outputs", "tolerance_mm", "rate_hz", "lease_s", "reset", "gains"),
-    *("offset_counts", "trial", "level", "anything"),
+    *("offset_counts", "law", "trial", "level", "anything"),
 )
 VALUES = st.recursive(
     st.none()
@@ -76,8 +78,6 @@ class Bench:
 
 @pytest.fixture
 def served(bench: Any, endpoints: dict[str, str]) -> Iterator[Bench]:
-    from handtouch.daemon.model import PadModel
-
     made = Bench(bench.deployment, PadModel(bench.deployment), endpoints)
     for _ in range(5):
         made.tick()
@@ -121,6 +121,8 @@ def test_any_arguments_are_answered_and_the_tick_goes_on(
         ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 3, "offset_counts": [0] * 4}, "gains"),
         ("calibrate", {"pad": "plane", "name": "c", "gains": [11] * 4, "offset_counts": [0] * 4}, "gains"),
         ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 4, "offset_counts": [2e4] * 4}, "half"),
+        ("calibrate", {"pad": "plane", "gains": [1] * 4}, "name is missing"),
+        ("calibrate", {"pad": "plane", "name": "c", "law": {"alpha": 1.5}}, "contact_ohm_mm2 is missing"),
         ("log", {"level": "loud"}, "level"),
         ("status", {"verbose": True}, "verbose"),
     ],
@@ -232,6 +234,45 @@ def test_a_reload_keeps_corrections_and_contacts(served: Bench) -> None:
     assert int(served.pipeline.tick.contacts.id[0]) == contact
     assert model.on_a[0] != 0
     assert served.ask("reload")["tables"] == []  # the new file is the present one now
+
+
+def test_a_law_weighs_from_the_next_sample_on_and_what_is_not_given_stays(served: Bench) -> None:
+    served.counts[0] = 900.0
+    for _ in range(4):
+        served.tick()
+    model = served.pipeline.model
+    on_a = model.on_a.copy()
+    (before,) = served.ask("snapshot")["contacts"]
+    file = served.ask("calibrate", pad="plane")
+    assert file["now"] == file["before"] == file["nominal"]
+    assert file["law"] == {"contact_ohm_mm2": 20000.0, "alpha": 1.5, "ohm_per_square": 2400.0}
+    law = {**file["law"], "contact_ohm_mm2": 20000.0 * 8}
+    now = served.ask("calibrate", pad="plane", name="c2", law=law)
+    assert (now["law"], now["gains"], now["now"]) == (law, file["gains"], "c2")
+    served.tick()
+    (after,) = served.ask("snapshot")["contacts"]
+    assert (before["id"], after["calibration"]) == (after["id"], "c2")
+    assert after["force_n"] == pytest.approx(4 * before["force_n"], rel=0.02)  # 8^(1 / alpha)
+    assert model.on_a[0] == pytest.approx(on_a[0] / 8, rel=0.1)
+    assert (model.on_a[1:] == on_a[1:]).all()
+    served.ask("calibrate", pad="plane", name="c3", offset_counts=[1] * 4)
+    assert served.ask("calibrate", pad="plane")["law"] == law
+
+
+def test_a_calibration_of_the_store_is_applied_whole_and_its_lack_is_the_file_again(served: Bench) -> None:
+    model = served.pipeline.model
+    nothing, none = ((0.0,) * 3,) * 3, ((0.0,) * 4,) * 4
+    law, gains = Law(1e4, 1.2, 3000.0, nothing), Gains((1.1, 0.9, 1.0, 1.0), none)
+    on_a = model.on_a.copy()
+    model.apply(0, Calibration(gains, Offsets((1.0,) * 4, (0.1,) * 4), law), "7-1")
+    assert (model.law(0), model.calibration[0], model.gains[0, 0]) == (law, "7-1", 1.1)
+    fresh = PadModel(served.deployment)
+    fresh.take_over(model)
+    assert (fresh.law(0), fresh.on_a[0]) == (law, model.on_a[0])
+    model.apply(0, Calibration(), "7-2")
+    assert model.law(0).ohm_per_square == 2400.0
+    assert model.on_a == pytest.approx(on_a)
+    assert not model.tared
 
 
 def test_a_trial_changes_nothing(served: Bench) -> None:

@@ -6,6 +6,7 @@ Public names: `Commands`.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Annotated, Any, Literal, TypeVar
@@ -24,6 +25,7 @@ from handtouch.daemon.reload import Fresh, Reload
 from handtouch.daemon.report import Report
 from handtouch.daemon.scene import Demand, select
 from handtouch.daemon.tare import Tare
+from handtouch.supervise.calibration import Law
 
 _log = logging.getLogger("handtouch.control")
 
@@ -33,6 +35,7 @@ Patterns = Annotated[
 Who = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=64)]
 Gain = Annotated[float, Field(ge=0.1, le=10)]
 Offset = Annotated[float, Field(ge=-1e9, le=1e9)]
+Resistance = Annotated[float, Field(ge=1e-3, le=1e12)]
 
 
 class _Nothing(Table):
@@ -57,11 +60,18 @@ class _Scene(Table):
     reset: bool = False
 
 
+class _Law(Table):
+    contact_ohm_mm2: Resistance
+    alpha: Annotated[float, Field(ge=0.1, le=10)]
+    ohm_per_square: Resistance
+
+
 class _Calibrate(Table):
     pad: Annotated[str, Field(max_length=200)]
-    name: Name
-    gains: Annotated[tuple[Gain, Gain, Gain, Gain], Field(strict=False)]
-    offset_counts: Annotated[tuple[Offset, Offset, Offset, Offset], Field(strict=False)]
+    name: Name | None = None
+    gains: Annotated[tuple[Gain, Gain, Gain, Gain], Field(strict=False)] | None = None
+    offset_counts: Annotated[tuple[Offset, Offset, Offset, Offset], Field(strict=False)] | None = None
+    law: _Law | None = None
 
 
 class _Reload(Table):
@@ -159,22 +169,43 @@ class Commands:
         return Tare(self._names, chosen, self._pipeline.tick, self._pacer, now_ns)
 
     def _calibrate(self, arguments: dict[str, Any], now_ns: int) -> Reply:  # noqa: ARG002
+        """Change what is given of a pad's calibration, and tell all of it."""
         asked = _checked(_Calibrate, arguments)
         pads = np.flatnonzero(self._chosen([asked.pad]))
         if len(pads) != 1:
             raise RefusedError(f"pad = {asked.pad!r} names {len(pads)} pads; a calibration is of one")
         (pad,) = pads.tolist()
-        model, tick = self._pipeline.model, self._pipeline.tick
-        largest = float(self._pipeline.model.largest_counts[pad]) / 2
-        if max(map(abs, asked.offset_counts)) > largest:
-            raise RefusedError(
-                f"offset_counts = {list(asked.offset_counts)}: beyond half the range, {largest:.0f}"
-            )
+        model = self._pipeline.model
         before = model.calibration[pad]
-        model.calibrate(pad, asked.gains, asked.offset_counts, asked.name)
-        tick.forget(pads)
-        _log.info("%s: calibration %s -> %s", "/".join(self._names[pad]), before, asked.name)
-        return {"hand": self._names[pad][0], "link": self._names[pad][1], "before": before, "now": asked.name}
+        if asked.model_fields_set > {"pad"}:
+            if asked.name is None:
+                raise RefusedError("name is missing: contacts tell the calibration by it")
+            self._put(pad, asked, asked.name)
+            _log.info("%s: calibration %s -> %s", "/".join(self._names[pad]), before, asked.name)
+        hand, link = self._names[pad]
+        law = model.law(pad)
+        return {
+            "hand": hand,
+            "link": link,
+            "before": before,
+            "now": model.calibration[pad],
+            "nominal": model.nominal[pad],
+            "gains": model.gains[pad].tolist(),
+            "offset_counts": model.offset_counts[pad].tolist(),
+            "law": {key: getattr(law, key) for key in _Law.model_fields},
+        }
+
+    def _put(self, pad: int, asked: _Calibrate, name: str) -> None:
+        model = self._pipeline.model
+        offsets = model.offset_counts[pad] if asked.offset_counts is None else np.array(asked.offset_counts)
+        largest = float(model.largest_counts[pad]) / 2
+        if np.abs(offsets).max() > largest:
+            raise RefusedError(f"offset_counts = {offsets.tolist()}: beyond half the range, {largest:.0f}")
+        law = model.laws[pad]
+        if asked.law is not None:
+            law = Law(**asked.law.model_dump(), covariance=((0.0,) * 3,) * 3)
+        model.calibrate(pad, model.gains[pad] if asked.gains is None else asked.gains, offsets, name, law)
+        self._pipeline.adopt(model, np.array([pad]))
 
     def _disable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
         asked = _checked(_Switch, arguments)
@@ -211,6 +242,7 @@ class Commands:
         if fresh.deployment.daemon.log_level != self.deployment.daemon.log_level:
             set_level(fresh.deployment.daemon.log_level)
         self.deployment = fresh.deployment
+        self._pipeline.journal.serve(fresh.deployment, now_ns=time.monotonic_ns())
         self._demand.scenes.set_file(fresh.deployment.scene)
         self._pacer.set_idle(fresh.deployment.scene)
         changed = [*fresh.tables, *("/".join(self._names[pad]) for pad in fresh.pads)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,7 @@ from handtouch.field import LocatorBank
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.strength import ContactLaw, Strength
 from handtouch.hand import Placement, mount_of, network_of, surface_of
+from handtouch.supervise.calibration import Calibration, Law
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +28,7 @@ class PadModel:
     `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` (n, 4) of the electrodes
     x0, xa, y0, yb, their noise as `noise_counts` (n,) and `noise_a` (n, 4), what they read untouched as
     `offset_counts` and `offset_a` (n, 4), zero unless `tared`; `gains` (n, 4) are in `ampere_per_count`;
+    `laws` (n,) are those that a calibration has put in the place of the file's, else None;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
     middle of the pad; `begin_samples`, `end_samples`. `locator` finds contacts, `placement` puts them on
     their links, `force` weighs them.
@@ -41,7 +44,7 @@ class PadModel:
         self.hands = [hand for hand, _ in entries]
         self.links = [pad.link for pad in pads]
         self.rows_of_hand = _rows(self.hands)
-        self.nominal = [_nominal(pad, deployment) for pad in pads]
+        self.nominal = [nominal_of(pad, deployment) for pad in pads]
         self.calibration = list(self.nominal)
         kinds = {name: channels_of(node.channels, node.eds) for name, node in deployment.nodes.items()}
         self.ampere_per_count = np.array(
@@ -66,6 +69,8 @@ class PadModel:
         self.locator = LocatorBank(networks, tolerance=finest / 10)
         self.placement = Placement([(surface_of(pad), *mount_of(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
+        self.laws: list[Law | None] = [None] * self.size
+        self._file_laws = [law_of(sheet) for sheet in sheets]
         self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
         self._series_form = np.stack([network.series_form for network in networks])
         self._has_series = np.array([any(pad.series_ohm) for pad in pads])
@@ -76,15 +81,37 @@ class PadModel:
             np.array([sheet.contact_radius_std_mm * 1e-3 for sheet in sheets]),
             np.array([sheet.reference_kpa * 1e3 for sheet in sheets]),
         )
-        self.on_a, self.off_a = (self._threshold(force, networks) for force in (self.on_n, self.off_n))
+        self._middle = self._middles(networks)
+        self.on_a, self.off_a = (self._threshold(force) for force in (self.on_n, self.off_n))
 
-    def calibrate(self, pad: int, gains: ArrayLike, offset_counts: ArrayLike, name: str) -> None:
-        """Correct the channels x0, xa, y0, yb of a pad: offsets off, then times gains; tell it by `name`."""
+    def apply(self, pad: int, calibration: Calibration, name: str) -> None:
+        """Take over what is known of the unit of a pad, all of it but the state of its sheet.
+
+        What isn't known is as the deployment file says.
+        """
+        gains = calibration.gains.factors if calibration.gains else (1.0,) * 4
+        offsets = calibration.offsets.counts if calibration.offsets else (0.0,) * 4
+        self.calibrate(pad, gains, offsets, name, calibration.law)
+
+    def calibrate(
+        self, pad: int, gains: ArrayLike, offset_counts: ArrayLike, name: str, law: Law | None = None
+    ) -> None:
+        """Correct the channels x0, xa, y0, yb of a pad: offsets off, then times gains; tell it by `name`.
+
+        `law` weighs its contacts, None: the file's. Where series resistors shape the currents, locations go
+        on with the file's sheet resistance.
+        """
+        if law != self.laws[pad]:
+            self._weigh_by(pad, law)
         self.gains[pad] = gains
         self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
         self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
         self.calibration[pad] = name
         self.tare(pad, offset_counts)
+
+    def law(self, pad: int) -> Law:
+        """What weighs the contacts of a pad: the law of its calibration, or the file's."""
+        return self.laws[pad] or self._file_laws[pad]
 
     def tare(self, pad: int, offset_counts: ArrayLike) -> None:
         """What the channels (4,) of a pad read that nothing touches."""
@@ -97,7 +124,7 @@ class PadModel:
         for pad in range(self.size):
             corrected = bool((other.gains[pad] != 1).any()) or other.calibration[pad] != other.nominal[pad]
             name = other.calibration[pad] if corrected else self.calibration[pad]
-            self.calibrate(pad, other.gains[pad], other.offset_counts[pad], name)
+            self.calibrate(pad, other.gains[pad], other.offset_counts[pad], name, other.laws[pad])
 
     def force(
         self,
@@ -128,14 +155,28 @@ class PadModel:
             fractions = currents / currents.sum(axis=0)
         return np.asarray(np.einsum("in,nij,jn->n", fractions, self._series_form[index], fractions))
 
-    def _threshold(self, force_n: FloatArray, networks: Sequence[ElectrodeNetwork]) -> FloatArray:
-        """Total current of a contact of that force in the middle of each pad."""
+    def _weigh_by(self, pad: int, law: Law | None) -> None:
+        """Put a law in force, and the thresholds [A] with it."""
+        self.laws[pad] = law
+        taken, old = law or self._file_laws[pad], self._law
+        contact, alpha = np.array(old.contact_ohm_m2), np.array(old.alpha)
+        contact[pad], alpha[pad] = taken.contact_ohm_mm2 * 1e-6, taken.alpha
+        self._sheet_ohm[pad] = taken.ohm_per_square
+        self._law = replace(old, contact_ohm_m2=contact, alpha=alpha)
+        self.on_a[pad] = self._threshold(self.on_n)[pad]
+        self.off_a[pad] = self._threshold(self.off_n)[pad]
+
+    def _middles(self, networks: Sequence[ElectrodeNetwork]) -> tuple[FloatArray, FloatArray | float]:
+        """Spreading radius [m] in the middle of each pad, and what resistors add there [ohm]."""
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
         pads = np.arange(self.size)
         scale = self.placement.place(pads, x, y, np.zeros((self.size, 2, 2))).scale
         radius_m = self.locator.conformal_radius(pads, x, y) * scale
-        resistors = self._resistors(pads, self.locator.fractions(pads, x, y))
-        return self._law.current(force_n, self._drive_v, self._sheet_ohm, radius_m, resistors)
+        return radius_m, self._resistors(pads, self.locator.fractions(pads, x, y))
+
+    def _threshold(self, force_n: FloatArray) -> FloatArray:
+        """Total current of a contact of that force in the middle of each pad."""
+        return self._law.current(force_n, self._drive_v, self._sheet_ohm, *self._middle)
 
 
 def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:
@@ -166,7 +207,12 @@ def _networks(pads: list[config.Pad], sheets: list[config.Sheet]) -> list[Electr
     return networks
 
 
-def _nominal(pad: config.Pad, deployment: Deployment) -> str:
+def law_of(sheet: config.Sheet) -> Law:
+    """What the deployment file says of a sheet; it tells no covariance."""
+    return Law(sheet.contact_ohm_mm2, sheet.alpha, sheet.ohm_per_square, ((0.0,) * 3,) * 3)
+
+
+def nominal_of(pad: config.Pad, deployment: Deployment) -> str:
     """Name of the calibration that the deployment file itself is; it changes with the pad's tables."""
     parts = (pad, deployment.nodes[pad.node], deployment.sheets[pad.sheet])
     text = "".join(part.model_dump_json() for part in parts)
