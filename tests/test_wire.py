@@ -6,7 +6,7 @@ import contextlib
 import math
 import re
 import typing
-from dataclasses import fields, replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +66,22 @@ def test_a_field_of_the_wrong_type_or_a_missing_one_is_refused_by_name(
     with pytest.raises(wire.WireError, match=name):
         wire.decode([topic, msgpack.packb(content)])
     del content[name]
+    optional = {field.name: field.default for field in fields(message) if field.default is not MISSING}
+    if name in optional:
+        left_out = replace(message, **{name: optional[name]})
+        assert wire.decode([topic, msgpack.packb(content)]) == left_out
+        return
     with pytest.raises(wire.WireError, match=name):
         wire.decode([topic, msgpack.packb(content)])
+
+
+@given(_messages(wire.Contact), _messages(wire.HandFrame))
+def test_what_no_scene_asks_for_takes_no_byte(contact: wire.Contact, frame: wire.HandFrame) -> None:
+    for message in (contact, frame):
+        defaults = {f.name: f.default for f in fields(message) if f.default is not MISSING}
+        sent = msgpack.unpackb(wire.encode(replace(message, **defaults))[1])
+        assert {"palm", "base_position_m", "group"} <= defaults.keys()
+        assert not defaults.keys() & sent.keys()
 
 
 @given(any_message, names.map("x_{}".format), integers)

@@ -220,12 +220,16 @@ class Subscriber(Generic[M]):
 
 
 def columns(frame: wire.HandFrame | wire.Raw) -> dict[str, NDArray[Any]]:
-    """The columns of a frame as arrays by name, read only: (n,) or (n, elements), rows as `frame.links`."""
+    """The columns of a frame as arrays by name, read only: (n,) or (n, elements), rows as `frame.links`.
+
+    Columns of what no scene asks for (palm and base frame) aren't there.
+    """
     import numpy as np
 
     return {
         name: np.frombuffer(getattr(frame, name), dtype=kind).reshape((-1, elements) if elements > 1 else -1)
         for name, (kind, elements) in wire.COLUMNS[type(frame)].items()
+        if getattr(frame, name) or not frame.links
     }
 
 

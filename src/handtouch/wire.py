@@ -1,8 +1,9 @@
 """The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
 
 Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Service`; `encode`, `decode`, `topic_of`,
-`WireError`, `PadState`, `COLUMNS`. `docs/wire.md` describes every field for readers in other languages.
-SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil, never NaN.
+`WireError`, `PadState`, `Placing`, `COLUMNS`. `docs/wire.md` describes every field for readers in other
+languages. SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil, never NaN. Fields with a
+default are left out of a message that has none of them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import math
 import types
 import typing
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from enum import IntEnum
 from operator import attrgetter
 from typing import Any, Union
@@ -45,6 +46,18 @@ class PadState(IntEnum):
     """the node hasn't been brought up yet"""
     OFF = 6
     """switched off: outside the scene"""
+
+
+class Placing(IntEnum):
+    """Whether a contact is known in the frame of palm or base; messages have the names in small letters."""
+
+    SKIPPED = 0
+    """no scene asks for it"""
+    VALID = 1
+    STALE = 2
+    """the joint states that it depends on are too old"""
+    INVALID = 3
+    """no place on the link, or joints that nobody ever told"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +106,20 @@ class Contact:
     """why a contact ended: released, stale, lost, faulted, off, restarted or stopped; else empty"""
     repeat: bool
     """the present state for a late joiner, under the seq that the topic has reached"""
+    group: int = 0
+    """the same for contacts that one object may bridge; 0: no scene asks for palm or base"""
+    palm: str = "skipped"
+    """Placing of the three that follow"""
+    palm_position_m: Vector3 | None = None
+    palm_normal: Vector3 | None = None
+    palm_covariance_m2: Floats9 | None = None
+    base: str = "skipped"
+    """Placing of the three that follow"""
+    base_position_m: Vector3 | None = None
+    base_normal: Vector3 | None = None
+    base_covariance_m2: Floats9 | None = None
+    joints_age_s: float | None = None
+    """from the sample to the nearest joint state, the worst of the joints in between"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +160,26 @@ class HandFrame:
     residual_std: bytes
     """float32"""
     repeat: bool
+    group: bytes = b""
+    """uint32, 0 for none; this and the following: as in `Contact`, no bytes where no scene asks for them"""
+    palm: bytes = b""
+    """uint8, Placing"""
+    palm_position_m: bytes = b""
+    """float32 x 3"""
+    palm_normal: bytes = b""
+    """float32 x 3"""
+    palm_covariance_m2: bytes = b""
+    """float32 x 9"""
+    base: bytes = b""
+    """uint8, Placing"""
+    base_position_m: bytes = b""
+    """float32 x 3"""
+    base_normal: bytes = b""
+    """float32 x 3"""
+    base_covariance_m2: bytes = b""
+    """float32 x 9"""
+    joints_age_s: bytes = b""
+    """float32"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +295,16 @@ COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
         "saturated": ("<u1", 1),
         "residual": _F4,
         "residual_std": _F4,
+        "group": ("<u4", 1),
+        "palm": ("<u1", 1),
+        "palm_position_m": ("<f4", 3),
+        "palm_normal": ("<f4", 3),
+        "palm_covariance_m2": ("<f4", 9),
+        "base": ("<u1", 1),
+        "base_position_m": ("<f4", 3),
+        "base_normal": ("<f4", 3),
+        "base_covariance_m2": ("<f4", 9),
+        "joints_age_s": _F4,
     },
     Raw: {"counts": ("<i8", 4), "sample_ns": ("<i8", 1), "fresh": ("<u1", 1)},
 }
@@ -272,9 +329,18 @@ TOPICS = (
     Topic("service", 0, Service, "twice a second"),
 )
 _BY_PREFIX = {topic.prefix: topic for topic in TOPICS}
-_FIELDS = {
-    topic.payload: (names := [field.name for field in fields(topic.payload)], attrgetter(*names))
+_DEFAULTS = {
+    topic.payload: {f.name: f.default for f in fields(topic.payload) if f.default is not MISSING}
     for topic in TOPICS
+}
+_FIELDS = {
+    kind: (names := [f.name for f in fields(kind) if f.name not in defaults], attrgetter(*names))
+    for kind, defaults in _DEFAULTS.items()
+}
+_OPTIONAL = {
+    kind: (list(defaults), attrgetter(*defaults), tuple(defaults.values()))
+    for kind, defaults in _DEFAULTS.items()
+    if defaults
 }
 _PACKER = msgpack.Packer()
 
@@ -292,8 +358,19 @@ def topic_of(message: Message) -> str:
 
 def encode(message: Message) -> list[bytes]:
     """The two parts of a message, ready for a ZeroMQ multipart send."""
-    names, values = _FIELDS[type(message)]
-    return [topic_of(message).encode(), _PACKER.pack(dict(zip(names, values(message), strict=True)))]
+    return [topic_of(message).encode(), _PACKER.pack(plain(message))]
+
+
+def plain(message: Message) -> dict[str, Any]:
+    """The map that a message is sent as."""
+    kind = type(message)
+    names, values = _FIELDS[kind]
+    told = dict(zip(names, values(message), strict=True))
+    if kind in _OPTIONAL:
+        names, values, defaults = _OPTIONAL[kind]
+        if (optional := values(message)) != defaults:
+            told.update(zip(names, optional, strict=True))
+    return told
 
 
 def decode(parts: typing.Sequence[bytes]) -> Message:
@@ -318,7 +395,10 @@ def decode(parts: typing.Sequence[bytes]) -> Message:
         raise WireError(f"{name}: schema version {payload.get('v')!r}, this reader knows {SCHEMA_VERSION}")
     message = row.payload(**_checked(name, payload, row.payload))
     for column, (kind, elements) in COLUMNS.get(row.payload, {}).items():
-        if len(getattr(message, column)) != len(message.links) * elements * int(kind[-1]):
+        size = len(getattr(message, column))
+        if size == 0 and column in _DEFAULTS[row.payload]:
+            continue
+        if size != len(message.links) * elements * int(kind[-1]):
             raise WireError(f"{name}: {column} doesn't have one row of {elements} {kind} per link")
     if topic_of(message) != name:
         raise WireError(f"{name}: payload belongs to {topic_of(message)}")
@@ -328,10 +408,12 @@ def decode(parts: typing.Sequence[bytes]) -> Message:
 def _checked(topic: str, payload: dict[Any, Any], kind: type[Any]) -> dict[str, Any]:
     values = {}
     for name, check in _CHECKS[kind]:
+        if name not in payload:
+            if name in _DEFAULTS[kind]:
+                continue
+            raise WireError(f"{topic}: {name} is missing")
         try:
             values[name] = check(payload[name])
-        except KeyError:
-            raise WireError(f"{topic}: {name} is missing") from None
         except (TypeError, ValueError):
             given = type(payload[name]).__name__  # not the value: it may be nested too deeply to be told
             raise WireError(f"{topic}: {name} can't be this {given}") from None

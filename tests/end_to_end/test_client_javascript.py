@@ -12,7 +12,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,7 @@ def _in_order(values: tuple[Any, ...], lines: list[Any]) -> bool:
 
 def _plain(message: wire.Message) -> Any:
     """A message as the reader prints it."""
-    plain: dict[str, Any] = asdict(message)
+    plain = wire.plain(message)
     if isinstance(message, wire.HandFrame | wire.Raw):
         plain |= {name: array.tolist() for name, array in columns(message).items()}
     return json.loads(json.dumps(_without_nan(plain)))
