@@ -1,9 +1,9 @@
 """The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
 
-Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Service`; `encode`, `decode`, `topic_of`,
-`WireError`, `PadState`, `Placing`, `COLUMNS`. `docs/wire.md` describes every field for readers in other
-languages. SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil, never NaN. Fields with a
-default are left out of a message that has none of them.
+Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Service`, `TickInputs`, `State`,
+`Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `COLUMNS`, `INPUTS`. `docs/wire.md`
+describes every field for readers in other languages.
+SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil, never NaN.
 """
 
 from __future__ import annotations
@@ -277,7 +277,76 @@ class Service:
     repeat: bool
 
 
-Message = Contact | HandFrame | Health | Raw | Service
+@dataclass(frozen=True, slots=True)
+class TickInputs:
+    """`tick`: all that one tick of all hands was made from; with `state` and `config` it can be made again.
+
+    Columns are as INPUTS; their rows are the pads in the order of `config`.
+    """
+
+    v: int
+    run: int
+    seq: int
+    t_ns: int
+    """SYNC of the tick's cycle"""
+    tick: int
+    previous_ns: int
+    """SYNC of the cycle before"""
+    now_ns: int
+    """when the tick was"""
+    until_ns: int | None
+    """samples that arrived from then on are of the next cycle"""
+    stopped: bool
+    """no tick, but the end of all contacts: the daemon stopped"""
+    counts: bytes
+    arrived_ns: bytes
+    fresh: bytes
+    node_state: bytes
+    """uint8, PadState.CLEAR where the node is up, else what its pad is instead"""
+    synchronous: bytes
+    period_ns: bytes
+    paced_ns: bytes
+    limits: bytes | None
+    """int64 x 8, counts at the bottom and at the top of the four channels, when they have changed"""
+    others: dict[str, Any]
+    """inputs of other kinds, by name"""
+    repeat: bool
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """`state`: all that is kept from tick to tick, as it was after the tick `tick`."""
+
+    v: int
+    run: int
+    seq: int
+    t_ns: int
+    tick: int
+    state: bytes
+    """msgpack map: path of each value inside the pipeline -> value; of the same build only"""
+    limits: bytes
+    """as of `tick`"""
+    repeat: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """`config`: the deployment that the daemon serves, and the build that serves it."""
+
+    v: int
+    run: int
+    seq: int
+    t_ns: int
+    deployment: str
+    """as JSON, with the keys of the deployment file"""
+    files: dict[str, Any]
+    """path of each file that it names -> text"""
+    build: dict[str, Any]
+    """versions of what computes, and the processor"""
+    repeat: bool
+
+
+Message = Contact | HandFrame | Health | Raw | Service | TickInputs | State | Config
 
 _F4 = ("<f4", 1)
 COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
@@ -310,6 +379,17 @@ COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
 }
 """Payload -> column -> (type of its elements: order, kind, bytes; elements per row)."""
 
+INPUTS = {
+    "counts": ("<i8", 4),
+    "arrived_ns": ("<i8", 1),
+    "fresh": ("<u1", 1),
+    "node_state": ("<u1", 1),
+    "synchronous": ("<u1", 1),
+    "period_ns": ("<i8", 1),
+    "paced_ns": ("<i8", 1),
+}
+"""Columns of `TickInputs`, as in COLUMNS."""
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -327,7 +407,11 @@ TOPICS = (
     Topic("health", 2, Health, "at every change, and once a second"),
     Topic("raw", 1, Raw, "one per tick"),
     Topic("service", 0, Service, "twice a second"),
+    Topic("tick", 0, TickInputs, "one per tick"),
+    Topic("state", 0, State, "to who subscribes, and when something other than a tick changes it"),
+    Topic("config", 0, Config, "to who subscribes, and when it is read again"),
 )
+_ALONE: dict[type[Any], str] = {topic.payload: topic.prefix for topic in TOPICS if not topic.parts}
 _BY_PREFIX = {topic.prefix: topic for topic in TOPICS}
 _DEFAULTS = {
     topic.payload: {f.name: f.default for f in fields(topic.payload) if f.default is not MISSING}
@@ -353,7 +437,7 @@ def topic_of(message: Message) -> str:
         return f"health/{message.hand}/{message.link}"
     if isinstance(message, HandFrame):
         return f"hand/{message.hand}"
-    return f"raw/{message.hand}" if isinstance(message, Raw) else "service"
+    return f"raw/{message.hand}" if isinstance(message, Raw) else _ALONE[type(message)]
 
 
 def encode(message: Message) -> list[bytes]:

@@ -137,6 +137,11 @@ class Slab:
         """Which of the counts (size, 4) are at an end of their channel's range."""
         return (counts >= self._top) | (counts <= self._bottom)
 
+    @property
+    def limits(self) -> NDArray[np.int64]:
+        """Counts (size, 8) from which on the four channels are at the bottom, and at the top, of their range."""
+        return np.hstack([self._bottom, self._top])
+
     def begin_cycle(self, t_ns: int) -> None:
         """A SYNC at `t_ns`: fresh is what arrived since then, some of which may be here already."""
         np.greater_equal(self.t_ns, t_ns, out=self.fresh, casting="unsafe")

@@ -83,6 +83,8 @@ class Daemon:
                 self.publisher.run,
             )
             self.publisher.present.update(self.pipeline.messages.present())
+            self.publisher.present.update(self.pipeline.journal.present())
+            self.pipeline.journal.serve(deployment, time.monotonic_ns())
             self.ports: dict[str, Port] = {}
             for bus in deployment.buses:
                 self.ports[bus.name] = port = Port.open(bus, self.pipeline.slab)

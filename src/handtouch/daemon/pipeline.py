@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from handtouch.canbus.slab import Slab
 from handtouch.daemon.cycle import Cycle
+from handtouch.daemon.journal import Journal
 from handtouch.daemon.messages import Messages, Outlet
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.tick import Tick, Ticked
@@ -38,6 +39,7 @@ class Pipeline:
         self.stepped: Callable[[], None] = lambda: None
         """called between the step of a tick and its messages, for who watches the time"""
         self._outlet = outlet
+        self.journal = Journal(self, run, outlet)
         self._expected = self.tick.expected()
         self._expected_count = 0
 
@@ -49,6 +51,7 @@ class Pipeline:
         if not self.cycle.ticked:
             self._tick(now_ns, t_ns)
         self.settle()
+        self.journal.between(now_ns)
         self.slab.begin_cycle(t_ns)
         self.cycle.begin(t_ns)
         self._expected = self.tick.expected()
@@ -88,6 +91,7 @@ class Pipeline:
         """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""
         self.messages.end_all(now_ns, self._outlet)
         self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
+        self.journal.ticked(now_ns, _FOREVER_NS, stopped=True)
 
     def _tick(self, now_ns: int, until_ns: int) -> Ticked:
         self.cycle.ticked = True
@@ -97,6 +101,7 @@ class Pipeline:
         self.messages.send_contacts(ticked, now_ns, self._outlet)
         if self.ticks % self.frames_every == 0:
             self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
+        self.journal.ticked(now_ns, until_ns)
         return ticked
 
     def _complete(self) -> bool:

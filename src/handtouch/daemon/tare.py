@@ -76,6 +76,7 @@ class Tare:
         if why := self._trouble(pad, model, mean, std):
             return {**told, "tared": False, "reason": why}
         model.tare(pad, mean)
+        self._tick.forget(np.array([pad]))
         return {**told, "tared": True, "reason": "", "offset_counts": mean.tolist()}
 
     def _trouble(self, pad: int, model: PadModel, mean: NDArray[np.float64], std: NDArray[np.float64]) -> str:

@@ -138,6 +138,8 @@ class Tick:
         """pads that sample with SYNC; the others when something moves, and are not waited for"""
         self.wanted = np.ones(model.size, dtype=np.bool_)
         """pads whose contacts are located; `want` sets it"""
+        self.disturbed = False
+        """something other than a step has changed what is kept; `Journal` takes notice"""
         self.follower = Follower(model)
         self._read = _NOTHING_READ  # contacts of the last step: pads and currents
         self._behind = np.full((model.size, 4), np.nan)  # their currents, smoothed: as they were a while ago
@@ -188,6 +190,7 @@ class Tick:
     def forget(self, pads: IntArray) -> None:
         """What was found on these pads holds no more."""
         columns = self.columns
+        self.disturbed = True
         self.follower.forget(pads)
         columns.values[pads] = columns.force_std_n[pads] = self._located[pads] = np.nan
 
