@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from handtouch.daemon.follow import Follower
+from handtouch.daemon.follow import FORCE, XY, Follower
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.tick import Tick
 from handtouch.field.strength import Status
@@ -177,3 +178,35 @@ def test_a_new_contact_owes_nothing_to_the_one_before(bench: Any) -> None:
     expected = Reference.of(bench.model, there)
     np.testing.assert_allclose(tick.columns.position_m, expected.position_m, atol=1e-7)
     np.testing.assert_allclose(tick.columns.force_n, expected.force_n, rtol=1e-4)
+
+
+def test_covariance_holds_the_error_of_gains_that_are_not_known(bench: Any) -> None:
+    """A thousand units whose gains are off by as much as is said scatter as is stated."""
+    rng = np.random.default_rng(11)
+    deviation, model = 0.02, copy.deepcopy(bench.model)
+    model.doubt(0, deviation**2 * (np.eye(4) - 0.25), quarantined=False)
+    follower, pads = Follower(model), np.array([0])
+    true = np.array([[0.4, 0.65]])
+    straight = reading(model, np.repeat(true, 3, axis=0), 2e-3, None)[:1]
+    told = follower.solve(pads, straight, np.full((1, 2), np.nan)).covariance_m2[0]
+    logs = rng.normal(0, deviation, (1000, 4))
+    logs -= logs.mean(axis=1, keepdims=True)
+    found = model.locator.estimate(
+        np.zeros(1000, int), (straight * np.exp(logs)).T, model.noise_a[[0] * 1000].T
+    )
+    placed = model.placement.place(np.zeros(1000, int), found.x, found.y, np.zeros((1000, 2, 2)))
+    seen = np.cov(placed.position_m.T)
+    assert np.sqrt(np.diag(told))[:2] == pytest.approx(np.sqrt(np.diag(seen))[:2], rel=0.1)
+
+
+def test_no_force_is_told_of_a_pad_in_quarantine(bench: Any) -> None:
+    model = copy.deepcopy(bench.model)
+    model.doubt(1, 0.05**2 * (np.eye(4) - 0.25), quarantined=True)
+    follower = Follower(model)
+    currents = reading(model, np.full((3, 2), 0.5), 2e-3, None)
+    solved = follower.solve(PADS, currents, np.full((3, 2), np.nan))
+    values, off = follower.read(PADS, currents)
+    assert np.isfinite(values[:, XY]).all()
+    assert (off <= 1).all()
+    assert np.isnan(values[:, FORCE]).tolist() == [False, True, False]
+    assert np.isnan(solved.force_std_n).tolist() == [False, True, False]

@@ -99,6 +99,8 @@ class Follower:
         vague = spread.max(axis=1)
         trust = np.maximum(np.sqrt(_BEND * spread.min(axis=1)), _NOISE * vague)
         firm = vague <= _VAGUE
+        if self._model.doubted:  # wider, but a map is trusted no farther for it
+            at.doubt(currents, self._model.gain_covariance[pads])
         tolerated = self.tolerance_m.take(pads)
         if np.count_nonzero(tolerated):
             widest = np.minimum(np.sqrt(_TOLERATED * tolerated / at.tangent.reach.max(axis=1)), _WIDEST)
@@ -112,6 +114,8 @@ class Follower:
         values = maps[:, _TRUST:]
         by_place, covariance_m2, scales = self._place(pads, at, width, values)
         weighed = self.weighed.take(pads)
+        if self._model.doubted:
+            weighed &= ~self._model.quarantined.take(pads)
         if np.count_nonzero(weighed):
             strength = self._weigh(pads, currents, at, width, scales, by_place, maps)
         else:
@@ -227,3 +231,9 @@ class _Linear(NamedTuple):
         by_total = fractions * weight / norm[:, None] - (mixing * by_current).sum(axis=1)
         total = (by_total * currents).sum(axis=1)
         return cls(tangent, covariance, by_current, total, by_total / total[:, None])
+
+    def doubt(self, currents: FloatArray, log_gain_covariance: FloatArray) -> None:
+        """Add to the covariance what gains (k, 4, 4) do that aren't known, all of (x, y, total) alike."""
+        by_total = self.per_total * self.total[:, None]
+        by_log_gain = np.concatenate([self.by_current, by_total[:, None]], axis=1) * currents[:, None]
+        self.covariance[:] += by_log_gain @ log_gain_covariance @ np.swapaxes(by_log_gain, 1, 2)

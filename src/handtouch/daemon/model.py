@@ -27,7 +27,8 @@ class PadModel:
 
     `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` (n, 4) of the electrodes
     x0, xa, y0, yb, their noise as `noise_counts` (n,) and `noise_a` (n, 4), what they read untouched as
-    `offset_counts` and `offset_a` (n, 4), zero unless `tared`; `gains` (n, 4) are in `ampere_per_count`;
+    `offset_counts` and `offset_a` (n, 4), zero unless `tared`; `gains` (n, 4) are in `ampere_per_count`,
+    `gain_covariance` (n, 4, 4) is that of their logarithms, `quarantined` (n,): no force is told;
     `laws` (n,) are those that a calibration has put in the place of the file's, else None;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
     middle of the pad; `begin_samples`, `end_samples`. `locator` finds contacts, `placement` puts them on
@@ -56,6 +57,9 @@ class PadModel:
         self.largest_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = np.ones((self.size, 4))
+        self.gain_covariance = np.zeros((self.size, 4, 4))
+        self.quarantined = np.zeros(self.size, dtype=np.bool_)
+        self.doubted = False
         self.offset_counts = np.zeros((self.size, 4))
         self.offset_a = np.zeros((self.size, 4))
         self.tared = False
@@ -112,6 +116,12 @@ class PadModel:
     def law(self, pad: int) -> Law:
         """What weighs the contacts of a pad: the law of its calibration, or the file's."""
         return self.laws[pad] or self._file_laws[pad]
+
+    def doubt(self, pad: int, log_gain_covariance: ArrayLike, quarantined: bool) -> None:
+        """Gains of a pad are that uncertain, (4, 4) of their logarithms; `quarantined`: tell no force."""
+        self.gain_covariance[pad] = log_gain_covariance
+        self.quarantined[pad] = quarantined
+        self.doubted = bool(self.gain_covariance.any() or self.quarantined.any())
 
     def tare(self, pad: int, offset_counts: ArrayLike) -> None:
         """What the channels (4,) of a pad read that nothing touches."""
