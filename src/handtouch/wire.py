@@ -1,9 +1,10 @@
 """The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
 
 Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Service`, `TickInputs`, `State`,
-`Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `COLUMNS`, `INPUTS`. `docs/wire.md`
-describes every field for readers in other languages.
-SI units; `t_ns` is the host's monotonic clock; a number that isn't known is nil, never NaN.
+`Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `Placing`, `COLUMNS`, `INPUTS`.
+`docs/wire.md` describes every field for readers in other languages. SI units; `t_ns` is the host's monotonic
+clock; a number that isn't known is nil, never NaN. Fields with a default are left out of a message that has
+none of them.
 """
 
 from __future__ import annotations

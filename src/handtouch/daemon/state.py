@@ -153,9 +153,7 @@ def _restored(before: Any, saved: Any, path: str) -> Any:
         return type(before)(saved)
     if is_dataclass(before) and not isinstance(before, type):
         parts = {name: _restored(getattr(before, name), item, path) for name, item in saved.items()}
-        return (
-            before if parts == {name: getattr(before, name) for name in parts} else replace(before, **parts)
-        )
+        return replace(before, **parts)
     return saved
 
 
