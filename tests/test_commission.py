@@ -14,6 +14,7 @@ import can
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.text import Text
 
 from handtouch import cli, commission, config, shipped
 from handtouch.canbus.channels import ELECTRODES
@@ -21,10 +22,10 @@ from handtouch.canbus.device import Device, DeviceBus
 from handtouch.commission.bench import Bench
 from handtouch.commission.edit import applied
 from handtouch.commission.order import ASKED, Near
-from handtouch.commission.outcome import Key, Outcome, Result
-from handtouch.commission.press import PressDetector
+from handtouch.commission.outcome import Outcome, Result
 from handtouch.commission.report import table
 from handtouch.commission.session import Session
+from handtouch.dialogue import Key
 from handtouch.hand import network_of, surface_of
 
 PROMPT = re.compile(r"\[\d+/\d+\] right/(\w+): press (?:it anywhere|near electrode (\w+))")
@@ -111,7 +112,7 @@ class Person:
             self.pads.release()
             self.pending.append(self.keys.pop(0))
 
-    def show(self, t_ns: int, slot: int, name: str, detector: PressDetector) -> None:
+    def show(self, t_ns: int, draw: Callable[[], Text]) -> None:
         pass
 
     def key(self) -> Key | None:

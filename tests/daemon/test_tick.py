@@ -72,18 +72,11 @@ def test_force_is_that_of_the_contact_law_with_or_without_resistors(
     driver: Driver, pad: int, force_n: float
 ) -> None:
     model = driver.bench.model
-    current = model._threshold(np.full(3, force_n), _networks(driver))[pad]
+    current = model._threshold(np.full(3, force_n))[pad]
     touch = {pad: driver.bench.counts(pad, 0.5, 0.5, current)}
     driver.step(touch)
     driver.step(touch)
     assert driver.tick.columns.force_n[pad] == pytest.approx(force_n, rel=0.01)
-
-
-def _networks(driver: Driver) -> Any:
-    from handtouch.hand import network_of
-
-    pads = driver.bench.deployment.hands[0].pads
-    return [network_of(pad, driver.bench.deployment.sheets["s"]) for pad in pads]
 
 
 def test_the_end_keeps_the_last_place_of_the_touch(driver: Driver) -> None:

@@ -17,10 +17,10 @@ from pathlib import Path
 from handtouch import client, config
 from handtouch.canbus.nodes import checked
 from handtouch.canbus.port import BusError
+from handtouch.dialogue import open_dialogue
 
 from . import report
 from .bench import Bench
-from .dialogue import open_dialogue
 from .edit import applied, edited, write
 from .outcome import Result
 from .session import Session

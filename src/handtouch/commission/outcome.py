@@ -1,6 +1,6 @@
-"""What commissioning has to do with: the person, the hand, and what became of each pad.
+"""What commissioning has to do with: the hand, and what became of each pad.
 
-Public names: `Key`, `Dialogue`, `Hand`, `Result`, `Outcome`.
+Public names: `Hand`, `Result`, `Outcome`.
 """
 
 from __future__ import annotations
@@ -15,33 +15,6 @@ from handtouch.canbus.nodes import NodeStatus
 
 from .bench import Sample
 from .order import Near
-from .press import PressDetector
-
-
-class Key(Enum):
-    """What the person may say."""
-
-    ENTER = ""
-    AGAIN = "a"
-    SKIP = "s"
-    QUIT = "q"
-
-
-class Dialogue(Protocol):
-    """Where words go, and keys come from."""
-
-    @property
-    def listens(self) -> bool:
-        """Whether anybody can still press a key."""
-
-    def say(self, text: str, style: str = "") -> None:
-        """A line that stays; `style`: "good", "bad", "ask" or nothing."""
-
-    def show(self, t_ns: int, slot: int, name: str, detector: PressDetector) -> None:
-        """The channels of a node as they are now."""
-
-    def key(self) -> Key | None:
-        """The next key pressed, None if there is none; doesn't wait."""
 
 
 class Hand(Protocol):

@@ -17,14 +17,16 @@ from handtouch import config
 from handtouch.canbus.channels import channels_of
 from handtouch.canbus.lifecycle import NodeState
 from handtouch.canbus.nodes import NodeStatus
+from handtouch.dialogue import Dialogue, Key
 from handtouch.hand import network_of, surface_of
 
 from . import words
+from .bars import bars
 from .bench import Sample
 from .edit import Edit
 from .ledger import Ledger
 from .order import Near, Reading, Shares, Verdict, judge
-from .outcome import Dialogue, Hand, Key, Outcome, Result
+from .outcome import Hand, Outcome, Result
 from .press import Press, PressDetector, Rest, judge_rest, polarity, reacted
 
 _SECOND_NS = 1_000_000_000
@@ -298,9 +300,7 @@ class Session:
             press = self._detector.feed(sample.t_ns, sample.counts, sample.alive)
             strongest = int(np.argmax(self._detector.level))
             shown = strongest if strongest in self._detector.pressed else slot
-            self._dialogue.show(
-                sample.t_ns, shown, name if shown == slot else self.outcomes[shown].name, self._detector
-            )
+            self._show(sample.t_ns, shown, name if shown == slot else self.outcomes[shown].name)
             if press is not None:
                 return press
             if sample.t_ns - begun_ns > self._patience_ns:
@@ -320,9 +320,7 @@ class Session:
             if detector.ready:
                 return
             if detector.pressed:
-                self._dialogue.show(
-                    sample.t_ns, detector.pressed[0], self.outcomes[detector.pressed[0]].name, detector
-                )
+                self._show(sample.t_ns, detector.pressed[0], self.outcomes[detector.pressed[0]].name)
             waited_ns = sample.t_ns - begun_ns
             if waited_ns > 3 * _SECOND_NS and not told and detector.pressed:
                 names = ", ".join(self.outcomes[slot].name for slot in detector.pressed)
@@ -384,6 +382,9 @@ class Session:
     def _quit_if_asked(self) -> None:
         if self._dialogue.key() is Key.QUIT:
             raise _Said(Key.QUIT)
+
+    def _show(self, t_ns: int, slot: int, name: str) -> None:
+        self._dialogue.show(t_ns, lambda: bars(slot, name, self._detector))
 
     def _say(self, text: str, style: str = "") -> None:
         self._dialogue.say(text, style)

@@ -1,6 +1,6 @@
 """Words to a terminal or a pipe, and keys from it.
 
-Public names: `open_dialogue`, `Terminal`, `Lines`.
+Public names: `Key`, `Dialogue`, `open_dialogue`, `Terminal`, `Lines`.
 """
 
 from __future__ import annotations
@@ -12,19 +12,42 @@ import sys
 import termios
 import tty
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from enum import Enum
+from typing import Protocol
 
-import numpy as np
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from .outcome import Dialogue, Key
-from .press import PRESSED, PressDetector
-
 _REDRAW_NS = 100_000_000
-_BAR = 40
 _STYLES = {"": "", "ask": "bold", "good": "green", "bad": "yellow"}
+
+
+class Key(Enum):
+    """What the person may say."""
+
+    ENTER = ""
+    AGAIN = "a"
+    SKIP = "s"
+    QUIT = "q"
+
+
+class Dialogue(Protocol):
+    """Where words go, and keys come from."""
+
+    @property
+    def listens(self) -> bool:
+        """Whether anybody can still press a key."""
+
+    def say(self, text: str, style: str = "") -> None:
+        """A line that stays; `style`: "good", "bad", "ask" or nothing."""
+
+    def show(self, t_ns: int, draw: Callable[[], Text]) -> None:
+        """What is felt now, in the place of what was shown before; drawn only where somebody sees it."""
+
+    def key(self) -> Key | None:
+        """The next key pressed, None if there is none; doesn't wait."""
 
 
 @contextlib.contextmanager
@@ -44,7 +67,7 @@ def open_dialogue() -> Iterator[Dialogue]:
 
 
 class Terminal:
-    """Lines above, the channels of the pad in question below; single keys, without Enter behind them."""
+    """Lines above, what is felt now below; single keys, without Enter behind them."""
 
     listens = True
 
@@ -57,11 +80,11 @@ class Terminal:
         self._live.update(Text(""))
         self._live.console.print(Text(text, style=_STYLES[style]))
 
-    def show(self, t_ns: int, slot: int, name: str, detector: PressDetector) -> None:
-        """Four bars, ten times a second."""
+    def show(self, t_ns: int, draw: Callable[[], Text]) -> None:
+        """Ten times a second."""
         if t_ns - self._drawn_ns >= _REDRAW_NS:
             self._drawn_ns = t_ns
-            self._live.update(bars(slot, name, detector), refresh=True)
+            self._live.update(draw(), refresh=True)
 
     def key(self) -> Key | None:
         """The next key; others than ours are ignored."""
@@ -87,7 +110,7 @@ class Lines:
         """A line."""
         print(text, flush=True)
 
-    def show(self, t_ns: int, slot: int, name: str, detector: PressDetector) -> None:
+    def show(self, t_ns: int, draw: Callable[[], Text]) -> None:
         """Nothing: only what stays is written."""
 
     def key(self) -> Key | None:
@@ -105,22 +128,6 @@ class Lines:
                 self.listens = False
             *lines, self._part = (self._part + data).split(b"\n")
             self._waiting.extend(line.decode(errors="replace") for line in lines)
-
-
-def bars(slot: int, name: str, detector: PressDetector) -> Text:
-    """The channels of a slot, on a scale to the strongest, from the least that counts as a press."""
-    deltas = detector.deltas[slot]
-    scale = max(float(np.abs(deltas).max()), PRESSED * float(detector.noise[slot]) / 2)
-    pressed = detector.level[slot] > PRESSED
-    text = Text()
-    for channel, delta in enumerate(deltas.tolist(), 1):
-        filled = round(_BAR * abs(delta) / scale)
-        text.append(f"  {channel} ", "dim")
-        text.append("█" * filled, "cyan" if pressed else "dim")
-        text.append("·" * (_BAR - filled), "dim")
-        text.append(f" {delta:+7.0f}\n")
-    text.append(f"  {name}   a: again, s: skip, q: quit", "dim")
-    return text
 
 
 def _key(text: str) -> Key | None:
