@@ -91,10 +91,14 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
         name: node.model_copy(update={"eds": str((folder or Path()) / node.eds)}) if node.eds else node
         for name, node in deployment.nodes.items()
     }
+    hands = tuple(
+        hand.model_copy(update={"urdf": str((folder or Path()) / hand.urdf)}) if hand.urdf else hand
+        for hand in deployment.hands
+    )
     daemon = deployment.daemon
     if daemon.keys:
         daemon = daemon.model_copy(update={"keys": str((folder or Path()) / daemon.keys)})
-    return _checked(deployment.model_copy(update={"nodes": nodes, "daemon": daemon}), file)
+    return _checked(deployment.model_copy(update={"nodes": nodes, "daemon": daemon, "hands": hands}), file)
 
 
 def with_bus(deployment: Deployment, text: str) -> Deployment:

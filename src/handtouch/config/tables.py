@@ -15,7 +15,7 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
 Electrode = Literal["x0", "xa", "y0", "yb"]
-Output = Literal["location", "strength", "raw"]
+Output = Literal["location", "strength", "raw", "palm", "base"]
 Four = Annotated[tuple[Positive, Positive, Positive, Positive], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -208,6 +208,11 @@ Surface = Annotated[Plane | Cylinder | Cone | Sphere, Field(discriminator="kind"
 class Mount(Table):
     """Where the pad frame (origin at its centre, x towards xa, y towards yb, z outward) sits on its link."""
 
+    link: str | None = Field(
+        None,
+        min_length=1,
+        description="link of the URDF that carries the pad; left out: the one of the pad's name",
+    )
     position_mm: Three = Field((0.0, 0.0, 0.0), description="origin of the pad frame in the link frame")
     rpy_deg: Three = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw about fixed axes, as in URDF")
 
@@ -248,6 +253,30 @@ class Hand(Table):
     """`[[hand]]`: a hand and its pads."""
 
     name: Name = Field(description="name of the hand in topics")
+    urdf: str | None = Field(
+        None,
+        min_length=1,
+        description="the robot's description, beside this file; left out: no palm or base frame",
+    )
+    palm_link: str | None = Field(
+        None, min_length=1, description="link of the URDF whose frame is the palm's; left out: its root"
+    )
+    base_link: str | None = Field(
+        None, min_length=1, description="link of the URDF whose frame is the base's; left out: its root"
+    )
+    joint_names: dict[str, str] = Field(
+        default_factory=dict, description="joint of the URDF -> its name in joint states, if another"
+    )
+    joint_prefix: str = Field(
+        "", description="what joint states put before the names of joints, e.g. left_; not before joint_names"
+    )
+    joints_stale_ms: Positive = Field(
+        100.0,
+        description="a contact farther in time from the nearest joint state has no place in palm and base",
+    )
+    group_mm: NonNegative = Field(
+        25.0, description="contacts that lie this close may be of one object, and are told as a group"
+    )
     pads: Annotated[tuple[Pad, ...], Field(strict=False, min_length=1)] = Field(alias="pad")
 
 
@@ -259,7 +288,8 @@ class Wants(Table):
     )
     outputs: Annotated[tuple[Output, ...], Field(strict=False)] = Field(
         ("location", "strength"),
-        description="what is used of a contact; raw: its pads are sampled with every SYNC, touched or not",
+        description="what is used of a contact; raw: its pads are sampled with every SYNC, touched or not; "
+        "palm, base: places in these frames, which need [[hand]] urdf and joint states",
     )
     tolerance_mm: NonNegative = Field(
         0.0, le=10, description="error of a location that does no harm; 0: as good as the currents tell it"
