@@ -39,16 +39,21 @@ class Gains:
 
 @dataclass(frozen=True)
 class Offsets:
-    """What the channels read untouched [counts], and the variance of that [counts^2]."""
+    """What channels read untouched [counts], the variance of that [counts^2]; noise of readings if known."""
 
     counts: Four
     variance: Four
+    noise: Four | None = None
 
     def __post_init__(self) -> None:
         _set(self, "counts", _vector(self.counts, 4, "offsets.counts"))
         _set(self, "variance", _vector(self.variance, 4, "offsets.variance"))
         if min(self.variance) < 0:
             raise ValueError(f"offsets.variance = {self.variance}: a variance is not negative")
+        if self.noise is not None:
+            _set(self, "noise", _vector(self.noise, 4, "offsets.noise"))
+            if min(self.noise) < 0:
+                raise ValueError(f"offsets.noise = {self.noise}: a standard deviation is not negative")
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,10 @@ class Calibration:
     def to_json(self) -> dict[str, Any]:
         """Everything but the sheet's state, ready for `json.dumps`; numbers keep all their digits."""
         parts = {"gains": self.gains, "offsets": self.offsets, "law": self.law}
-        return {name: asdict(part) for name, part in parts.items() if part is not None}
+        records = {name: asdict(part) for name, part in parts.items() if part is not None}
+        if self.offsets is not None and self.offsets.noise is None:
+            del records["offsets"]["noise"]
+        return records
 
     @classmethod
     def from_json(cls, record: object, sheet: SheetState | None = None) -> Calibration:
@@ -298,7 +306,7 @@ def changes(before: Calibration, after: Calibration) -> list[tuple[str, Sequence
     rows: list[tuple[str, Any, Any]] = []
     for part, names in (
         ("gains", ("factors",)),
-        ("offsets", ("counts", "variance")),
+        ("offsets", ("counts", "variance", "noise")),
         ("law", ("contact_ohm_mm2", "alpha", "ohm_per_square")),
         ("sheet", ("kind", "version", "data")),
     ):

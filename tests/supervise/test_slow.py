@@ -1,0 +1,183 @@
+"""The slow half: units calibrate themselves, are known from the store, and wait in quarantine till then."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from handtouch.supervise.archive import Archive
+from handtouch.supervise.calibration import Calibration, Gains, Provenance
+from handtouch.supervise.link import Calibrate, Judged, Word
+from handtouch.supervise.slow import SlowHalf
+from handtouch.supervise.store import Store
+
+from .conftest import LINKS, NOW, PERIOD_NS, Bench
+
+Session = list[Any]
+Swapped = tuple[list[Word], Path]
+
+
+def half(bench: Bench, path: Path) -> SlowHalf:
+    return SlowHalf(bench.start, Archive(path))
+
+
+def play(slow: SlowHalf, bench: Bench, session: Session, since: int = 0) -> list[Word]:
+    """All that is said while the session is played."""
+    words: list[Word] = []
+    for number, (counts, contact) in enumerate(session):
+        message = bench.block(counts, contact, (since + number) * 13 * PERIOD_NS)
+        words += slow.take(message, NOW)
+    return words
+
+
+def judged(words: list[Word], pad: int) -> Judged:
+    return [word for word in words if isinstance(word, Judged) and word.pad == pad][-1]
+
+
+def calibrations(words: list[Word], pad: int) -> list[Calibrate]:
+    return [word for word in words if isinstance(word, Calibrate) and word.pad == pad]
+
+
+@pytest.fixture(scope="module")
+def swapped(
+    bench: Bench, session: Session, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[Word], Path]:
+    """Three new units where others were, and what was said while their pads were touched; and the store."""
+    path = tmp_path_factory.mktemp("swapped") / "c.db"
+    slow = half(bench, path)
+    words = slow.take(bench.introduce([11, 12, 13], [1, 2, 3]), NOW)
+    words += play(slow, bench, session)
+    slow.finish(NOW)
+    return words, path
+
+
+def test_a_swapped_unit_is_in_quarantine_and_says_what_helps(bench: Bench, tmp_path: Path) -> None:
+    words = half(bench, tmp_path / "c.db").take(bench.introduce([11, 2, 3], [1, None, None]), NOW)
+    told = judged(words, 0)
+    assert told.trust == "quarantined"
+    assert told.findings[0].kind == "swapped unit"
+    assert "serial 1 was here, 11 is" in told.findings[0].cause
+    assert "touch the pad all over" in told.findings[0].remedy
+    assert [judged(words, pad).trust for pad in (1, 2)] == ["nominal", "nominal"]
+
+
+def test_contacts_bring_a_swapped_unit_back_with_its_own_gains(bench: Bench, swapped: Swapped) -> None:
+    words, path = swapped
+    for pad in (0, 1):
+        assert judged(words, pad).trust == "trusted"
+        assert judged(words, pad).findings == ()
+        last = calibrations(words, pad)[-1]
+        off = np.log(last.gains) - np.log(bench.gains[pad])
+        deviation = np.sqrt(np.diag(np.reshape(last.covariance, (4, 4))))
+        assert np.abs(off).max() < 0.01
+        assert (np.abs(off) < 4 * deviation).all()
+    with Store(path) as store:
+        kept = store.versions(11)[0]
+    assert kept.provenance.method == "gains from contacts"
+    assert kept.provenance.contacts >= 32
+    assert 0 < kept.provenance.residual < 2  # less than 1: the model is better than is assumed
+    assert (kept.provenance.hand, kept.provenance.link, kept.config) == ("h", "square", "nominal-square")
+
+
+def test_gains_are_corrected_step_by_step_before_they_are_trusted(bench: Bench, swapped: Swapped) -> None:
+    words, _ = swapped
+    first = calibrations(words, 1)[0]
+    assert first.name == "12-learning"
+    before = np.abs(np.log(bench.gains[1])).max()
+    assert np.abs(np.log(first.gains) - np.log(bench.gains[1])).max() < before / 2
+
+
+def test_a_pad_whose_shape_hides_its_gains_asks_for_a_person(swapped: Swapped) -> None:
+    words, _ = swapped
+    told = judged(words, LINKS.index("strip"))
+    assert told.trust == "person"
+    assert "hides its gains" in told.findings[0].evidence
+    assert "handtouch calibrate" in told.findings[0].remedy
+    assert calibrations(words, 2) == []
+
+
+def test_a_unit_that_is_known_is_trusted_at_once(bench: Bench, swapped: Swapped) -> None:
+    _, path = swapped
+    slow = half(bench, path)
+    words = slow.take(bench.introduce([11, 12, 5], [7, None, None]), NOW + timedelta(hours=1))
+    for pad, serial in ((0, 11), (1, 12)):
+        assert judged(words, pad).trust == "trusted"
+        (recalled,) = calibrations(words, pad)
+        assert recalled.name.startswith(f"{serial}-")
+        assert np.log(recalled.gains) == pytest.approx(np.log(bench.gains[pad]), abs=0.01)
+        assert recalled.offset_counts == (0.0,) * 4
+
+
+def test_a_swap_while_nobody_looked_is_noticed_by_the_store(bench: Bench, swapped: Swapped) -> None:
+    _, path = swapped
+    words = half(bench, path).take(bench.introduce([99, 12, 13]), NOW)
+    assert judged(words, 0).trust == "quarantined"
+    assert "serial 11 was here, 99 is" in judged(words, 0).findings[0].cause
+
+
+def test_a_calibration_under_other_tables_is_not_applied_and_told(bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "c.db"
+    gains = Gains((1.1, 1.0, 1.0, 1.0), tuple((0.0,) * 4 for _ in range(4)))
+    with Store(path) as store:
+        store.write(11, "nominal-other", Calibration(gains), Provenance("by hand"), NOW)
+    words = half(bench, path).take(bench.introduce([11, 2, 3]), NOW)
+    assert calibrations(words, 0) == []
+    assert judged(words, 0).trust == "nominal"
+    assert "it was made under nominal-other" in judged(words, 0).calibrating
+
+
+def test_units_that_share_a_number_or_have_none_learn_nothing(
+    bench: Bench, session: Session, tmp_path: Path
+) -> None:
+    slow = half(bench, tmp_path / "c.db")
+    words = slow.take(bench.introduce([7, 7, 0], [None, None, 3]), NOW)
+    assert "2 nodes tell the serial number 7" in judged(words, 0).calibrating
+    assert judged(words, 2).trust == "person"
+    assert "no serial number" in judged(words, 2).calibrating
+    words = play(slow, bench, session[:40])
+    assert not any(isinstance(word, Calibrate) for word in words)
+    slow.finish(NOW)
+    with Store(tmp_path / "c.db") as store:
+        assert store.units() == []
+
+
+def test_gains_that_jump_put_a_trusted_unit_into_quarantine_and_out_again(
+    bench: Bench, session: Session, swapped: Swapped
+) -> None:
+    slow = half(bench, swapped[1])
+    slow.take(bench.introduce([11, 12, 5]), NOW)
+    jump = np.array([1.3, 1.0, 1.0, 0.8])
+    words = play(slow, bench, [(counts * jump, contact) for counts, contact in session])
+    told = [word for word in words if isinstance(word, Judged) and word.pad == 0]
+    changed = next(word for word in told if word.trust == "quarantined")
+    assert changed.findings[0].kind == "changed gains"
+    assert told[-1].trust == "trusted"
+
+
+def test_a_damaged_store_is_told_put_aside_and_the_work_goes_on(bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "c.db"
+    with Store(path) as store:
+        store.write(11, "nominal-square", Calibration(), Provenance("by hand"), NOW)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
+    path.write_bytes(data)
+    archive = Archive(path)
+    slow = SlowHalf(bench.start, archive)
+    words = slow.take(bench.introduce([11, 2, 3]), NOW)
+    assert "is damaged" in archive.trouble
+    assert any("store" in finding.kind for finding in judged(words, 0).findings)
+    assert len(list(tmp_path.glob("c.db.damaged-*"))) == 1
+    assert archive.keep(11, slow._rows[0].place, Provenance("x"), NOW, gains=None) is not None
+
+
+def test_a_store_that_cannot_be_used_stops_nothing(bench: Bench, session: Session, tmp_path: Path) -> None:
+    path = tmp_path / "c.db"
+    path.write_text("not a store")
+    slow = half(bench, path)
+    words = slow.take(bench.introduce([11, 2, 3], [1, None, None]), NOW) + play(slow, bench, session)
+    assert judged(words, 0).trust == "trusted"
+    assert path.read_text() == "not a store"
