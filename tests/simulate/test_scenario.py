@@ -85,6 +85,7 @@ def test_a_tour_touches_every_pad(deployment: config.Deployment) -> None:
 
 
 GOOD = '[[touch]]\nlink = "a"\nfrom_s = 0.0\nduration_s = 1.0\npath = [[0.5, 0.5]]\nforce_n = [1.0]\n'
+GUM = '[[fault]]\nkind = "gum"\nlink = "a"\nfrom_s = 3.0\nplace = [0.5, 0.5]\n'
 
 
 @pytest.mark.parametrize(
@@ -94,10 +95,10 @@ GOOD = '[[touch]]\nlink = "a"\nfrom_s = 0.0\nduration_s = 1.0\npath = [[0.5, 0.5
         (GOOD.replace("[[0.5, 0.5]]", "[[0.5, 1.0]]"), ['[[touch]] 1 "a": path[0][1] = 1.0', "0.98"]),
         (GOOD.replace("[1.0]", "[]"), ["force_n = []"]),
         (GOOD.replace("duration_s = 1.0\n", ""), ["duration_s", "is missing"]),
-        (
-            GOOD + GOOD.replace("from_s = 0.0", "from_s = 0.5"),
-            ['[[touch]] 2 "a": from_s = 0.5', "[[touch]] 1"],
-        ),
+        (GOOD + GUM.replace("gum", "chewing_gum"), ['[[fault]] 1 "a".kind = "chewing_gum"', '"moisture"']),
+        (GOOD + GUM + "force = 1.0\n", ['[[fault]] 1 "a": force', "force_n"]),
+        (GOOD + GUM.replace("0.5, 0.5", "0.5, 1.5"), ['[[fault]] 1 "a": place[1] = 1.5', "0.98"]),
+        (GOOD + GUM + "until_s = 2.0\n", ['[[fault]] 1 "a"', "until_s = 2.0 must come after from_s = 3.0"]),
         ("repeat = true", ["touch", "is missing"]),
         ("touch = [", ["TOML", "mend"]),
     ],

@@ -47,16 +47,18 @@ class ConfigError(ValueError):
 def problems_of(
     raw: Mapping[str, Any], error: ValidationError, tables: Tables, kinds: Tables
 ) -> tuple[Problem, ...]:
-    """Every mistake that pydantic found in a file's tables; `kinds` are the surfaces by their `kind`."""
+    """Every mistake that pydantic found in a file's tables; `kinds` are the definitions by `kind`."""
     found = [_Mistake(raw, item, tables, kinds) for item in error.errors()]
     slips = {(mistake.section, mistake.meant) for mistake in found if mistake.meant}
     told = (mistake.tell() for mistake in found if (mistake.section, mistake.key) not in slips)
     return tuple(dict.fromkeys(problem for problem in told if problem))
 
 
+_WITH_KINDS = (["surface"], ["fault"])  # tables that one of several definitions holds for, by their `kind`
 _SCALARS = ("str", "int", "float", "bool")  # how pydantic marks the alternatives of a union of plain values
 _PLAIN = (
     ("Input should be ", "must be "),
+    ("Value error, ", ""),
     ("a valid dictionary", "a table of keys"),
     ("a valid ", "a "),
     ("a tuple", "a list"),
@@ -109,6 +111,8 @@ class _Mistake:
                 remedy = remedy.replace(theirs, ours)
         if self.kind == "tuple_type" and isinstance(self.error["input"], dict):
             return Problem(f"[{self.key}]", "", f"must be a list of tables: write [[{self.key}]]")
+        if self.kind == "value_error":  # of a whole table; it says itself what is wrong
+            return Problem(self.place, "", remedy)
         if self.kind == "model_type":
             remedy = "must be a table of keys"
         return Problem(self.place, value, remedy + self._meaning())
@@ -160,7 +164,7 @@ def _locate(
                 shown[-1] += f"[{step}]"
             continue
         if step == "[key]" or (
-            isinstance(here, dict) and here.get("kind") == step and path[-1:] == ["surface"]
+            isinstance(here, dict) and here.get("kind") == step and path[-1:] in _WITH_KINDS
         ):
             continue  # pydantic's own marks, not keys of the file
         if isinstance(here, dict):
@@ -177,7 +181,7 @@ def _model(
     path: list[str], table: Mapping[str, Any], tables: Tables, kinds: Tables
 ) -> type[BaseModel] | None:
     """The definition that the table at a path must follow."""
-    if path[-1:] == ["surface"]:
+    if path[-1:] in _WITH_KINDS:
         return kinds.get(str(table.get("kind")))
     return tables.get(".".join(path)) or tables.get(".".join([*path[:-1], "*"]))
 

@@ -12,22 +12,21 @@ on the sheet.
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import i0e, i1e
+from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES, Channels, channels_of, in_order
-from handtouch.hand import mount_of
+from handtouch.simulate import noise
+from handtouch.simulate.built import BuiltPad
+from handtouch.simulate.faults import Fault
+from handtouch.simulate.pad import layer_ohm
 from handtouch.simulate.scenario import Pressing, Scenario
-from handtouch.simulate.shape import Shape, shape_of
-from handtouch.simulate.sheet import Gaps, SheetBank, SheetMaps, solve
+from handtouch.simulate.sheet import SheetBank
 from handtouch.simulate.truth import Truth, Vector
-from handtouch.simulate.world import Parts, World
+from handtouch.simulate.world import World
 
 FloatArray = NDArray[np.float64]
 _QUANTISATION_VARIANCE = 1 / 12  # of a rounded count
@@ -36,23 +35,32 @@ _QUANTISATION_VARIANCE = 1 / 12  # of a rounded count
 class VirtualHand:
     """The pads of a deployment, or those on one bus of it, under a scenario in a world.
 
-    Rows are the pads in the order of the file: `pads` are (hand's name, pad).
+    Rows are the pads in the order of the file: `pads` are (hand's name, pad). Besides the scenario's own,
+    `faults` befall it.
     """
 
     def __init__(
-        self, deployment: config.Deployment, scenario: Scenario, world: World, bus: str | None = None
+        self,
+        deployment: config.Deployment,
+        scenario: Scenario,
+        world: World,
+        bus: str | None = None,
+        faults: Sequence[Fault] = (),
     ) -> None:
         self.pads = [
             (hand.name, pad) for hand in deployment.hands for pad in hand.pads if bus in (None, pad.bus)
         ]
         self._scenario = scenario
-        self._seed = world.seed, zlib.crc32((bus or "").encode())
-        self._rows = [_Row.of(deployment, hand, pad, world) for hand, pad in self.pads]
-        self._bank = SheetBank([row.maps for row in self._rows])
+        acting = (*scenario.faults, *faults)
+        self._rows = [BuiltPad.of(deployment, hand, pad, scenario, world, acting) for hand, pad in self.pads]
+        self._bank = SheetBank([row.circuit.maps for row in self._rows])
         self._electric = _Electric(self._rows)
         self._noise = np.array([row.noise_counts for row in self._rows])
-        limits = np.array([[channel.limits for channel in row.channels] for row in self._rows])
+        self._keys = np.array([row.keys for row in self._rows]).reshape(-1, 4)
+        self._gains = np.array([row.counts_per_ampere for row in self._rows])
+        limits = np.array([row.limits for row in self._rows])
         self._low, self._high = limits[:, :, 0], limits[:, :, 1]
+        self._special = [number for number, row in enumerate(self._rows) if not row.plain]
         self._contacts = [
             [
                 (number, 1e-3 * (touch.radius_mm or world.radius_mm(row.sheet, index)))
@@ -64,14 +72,19 @@ class VirtualHand:
 
     def sample(self, t_s: float) -> NDArray[np.int64]:
         """Counts (pads, 4) of the electrodes x0, xa, y0, yb, `t_s` after the start of the scenario."""
-        moment = max(round(t_s * 1e9), 0)
-        counts = np.random.default_rng((*self._seed, moment)).standard_normal((len(self._rows), 4))
-        counts *= self._noise[:, None]
-        if contacts := self._at(t_s):
+        counts = self._noise[:, None] * noise.normal(self._keys, round(t_s * 1e9))
+        if contacts := [contact for contact in self._at(t_s) if contact.row not in self._special]:
             currents, _ = self._currents(contacts)
             rows = [contact.row for contact in contacts]
-            counts[rows] += currents * self._electric.counts_per_ampere[rows]
-        return np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
+            counts[rows] += currents * self._gains[rows]
+        read = np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
+        for number in self._special:
+            read[number] = self.counts(number, [t_s])[0]
+        return read
+
+    def counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:
+        """Counts (n, 4) of one pad at times (n,): those that `sample` gives, many at once."""
+        return self._rows[pad_row].counts(times_s)
 
     def truth(self, t_s: float, t_ns: int = 0) -> list[Truth]:
         """The contacts of the sample at `t_s`; `t_ns` is the host's time of it."""
@@ -108,7 +121,7 @@ class VirtualHand:
         shape = row.shape
         s_m, phi = pressing.x * shape.length_m, pressing.y * shape.arc
         parallel_m = float(shape.radius(s_m))
-        in_counts = jacobian * self._electric.counts_per_ampere[contact.row][:, None]
+        in_counts = jacobian * self._gains[contact.row][:, None]
         in_counts[:, :2] /= (shape.length_m, shape.arc * parallel_m)
         variance = row.noise_counts**2 + _QUANTISATION_VARIANCE
         covariance = variance * np.linalg.inv(in_counts.T @ in_counts)
@@ -135,53 +148,18 @@ class _Contact:
     radius_m: float
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A pad as it was built."""
-
-    hand: str
-    pad: config.Pad
-    node: config.Node
-    channels: Channels
-    sheet: config.Sheet
-    parts: Parts
-    shape: Shape
-    maps: SheetMaps
-    rotation: FloatArray
-    translation: FloatArray
-    noise_counts: float
-
-    @classmethod
-    def of(cls, deployment: config.Deployment, hand: str, pad: config.Pad, world: World) -> _Row:
-        node, shape, parts = deployment.nodes[pad.node], shape_of(pad.surface), world.parts(hand, pad)
-        maps, sheet = solve(shape, _gaps(shape, parts)), deployment.sheets[pad.sheet]
-        noise = node.noise_counts if world.noise_counts is None else world.noise_counts
-        channels = in_order(channels_of(node.channels, node.eds), pad.electrodes)
-        return cls(hand, pad, node, channels, sheet, parts, shape, maps, *mount_of(pad), noise)
-
-    @property
-    def counts_per_ampere(self) -> FloatArray:
-        """(4,) of the electrodes x0, xa, y0, yb."""
-        full = [self.node.full_scale_counts or channel.limits[1] for channel in self.channels]
-        scale = [self.node.channel_scale[self.pad.electrodes.index(name)] for name in ELECTRODES]
-        of_channel = np.array(full) / (self.node.full_scale_ma * 1e-3 * np.array(scale))
-        return np.asarray(of_channel * np.array(self.parts.gain))
-
-
 class _Electric:
-    """The circuits of all pads: supply, contact, sheet, resistors, channels."""
+    """The healthy circuits of all pads: supply, contact, sheet, resistors."""
 
-    def __init__(self, rows: Sequence[_Row]) -> None:
-        self._drive_v = np.array([row.node.drive_v for row in rows])
+    def __init__(self, rows: Sequence[BuiltPad]) -> None:
+        self._drive_v = np.array([row.circuit.drive_v for row in rows])
         self._sheet_ohm = np.array([row.sheet.ohm_per_square for row in rows])
         self._alpha = np.array([row.sheet.alpha for row in rows])
         self._reference_pa = np.array([row.sheet.reference_kpa * 1e3 for row in rows])
         self._contact_ohm_m2 = np.array([row.sheet.contact_ohm_mm2 * 1e-6 for row in rows])
-        self._series_ohm = np.array([row.parts.series_ohm for row in rows])
-        self.counts_per_ampere = np.array([row.counts_per_ampere for row in rows])
-        conductance = np.stack([row.maps.conductance for row in rows])
-        mixing = conductance * self._series_ohm[:, None, :] / self._sheet_ohm[:, None, None]
-        self.spread = np.linalg.inv(np.eye(4) + mixing)
+        circuits = [row.circuit.healthy for row in rows]
+        self._lift = np.array([circuit.lift for circuit in circuits])
+        self.spread = np.array([circuit.channels for circuit in circuits])
         """(rows, 4, 4): what the channels collect of the shares that grounded electrodes would."""
 
     def solve(
@@ -193,28 +171,20 @@ class _Electric:
         radius_m: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """What each channel collects of a contact's current, (k, 4), and that current (k,) [A]."""
-        collected = (self.spread[rows] @ shares[:, :, None])[:, :, 0]
-        pressure = force_n / (math.pi * radius_m**2)
-        contact_ohm_m2 = (
-            self._contact_ohm_m2[rows] * (self._reference_pa[rows] / pressure) ** self._alpha[rows]
+        column = shares[:, :, None]
+        collected = (self.spread[rows] @ column)[:, :, 0]
+        sheet_ohm = self._sheet_ohm[rows]
+        ohm = layer_ohm(
+            force_n,
+            radius_m,
+            sheet_ohm,
+            self._contact_ohm_m2[rows],
+            self._reference_pa[rows],
+            self._alpha[rows],
         )
-        x = radius_m * np.sqrt(self._sheet_ohm[rows] / contact_ohm_m2)
-        disc = i0e(x) / (x * i1e(x))  # paper eqs. 9-11; the scaling cancels
-        beyond = np.maximum(log_radius - np.log(radius_m), 0.0)
-        ohm = self._sheet_ohm[rows] / (2 * math.pi) * (disc + beyond)
-        ohm += (shares * self._series_ohm[rows] * collected).sum(1)
+        ohm += sheet_ohm / (2 * math.pi) * np.maximum(log_radius - np.log(radius_m), 0.0)
+        ohm += (column.transpose(0, 2, 1) @ self._lift[rows] @ column)[:, 0, 0]
         return collected, self._drive_v[rows] / ohm
-
-
-def _gaps(shape: Shape, parts: Parts) -> Gaps:
-    """Gaps in the coordinates of the shape."""
-    ends = shape.radius([0.0, shape.length_m])
-    units = (*ends.tolist(), 1.0, 1.0)  # metres per unit of the coordinate along the side
-    x0, xa, y0, yb = (
-        (1e-3 * before / unit, 1e-3 * after / unit)
-        for before, after, unit in zip(parts.gap_before_mm, parts.gap_after_mm, units, strict=True)
-    )
-    return Gaps(x0, xa, y0, yb)
 
 
 def _vector(values: FloatArray) -> Vector:

@@ -9,20 +9,25 @@ import itertools
 import math
 import tomllib
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from handtouch.config import Deployment
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.tables import Name, Positive, Table
+from handtouch.simulate.faults import FAULTS, INFLUENCES, Acting
 
+FloatArray = NDArray[np.float64]
 _Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
 _Point = Annotated[tuple[_Fraction, _Fraction], Field(strict=False)]
 _TOUR_S, _TOUR_STEP_S = 1.6, 1.0
+_KINDS = {**FAULTS, **INFLUENCES}
 
 
 class Pressing(NamedTuple):
@@ -83,6 +88,26 @@ class Touch(Table):
         before, after = self.force_n[step], self.force_n[step + 1]
         return before + (after - before) * _gentle(at - step)
 
+    def places(self, times_s: FloatArray) -> FloatArray:
+        """`place` at many times (n,): (2, n)."""
+        way = np.array(self.path).T
+        if way.shape[1] == 1:
+            return np.repeat(way, len(times_s), axis=1)
+        passed = self._lengths[-1] * _gentles((times_s - self.from_s) / self.duration_s)
+        return np.stack([np.interp(passed, self._lengths, along) for along in way])
+
+    def forces(self, times_s: FloatArray) -> FloatArray:
+        """`force` at many times (n,)."""
+        ramp = min(self.ramp_s, self.duration_s / 2)
+        since, left = times_s - self.from_s, self.until_s - times_s
+        levels, span = np.array(self.force_n), self.duration_s - 2 * ramp
+        plateau = levels[:1]
+        if len(levels) > 1 and span > 0:
+            at = np.clip((since - ramp) / span, 0.0, 1.0) * (len(levels) - 1)
+            step = np.minimum(at.astype(int), len(levels) - 2)
+            plateau = levels[step] + np.diff(levels)[step] * _gentles(at - step)
+        return np.asarray(_gentles(since / ramp) * _gentles(left / ramp) * plateau)
+
     @cached_property
     def _lengths(self) -> list[float]:
         """Length of the path up to each way point."""
@@ -93,6 +118,9 @@ class Scenario(Table):
     """What happens to a hand; after the last touch it ends, or begins again after `pause_s`."""
 
     touches: Annotated[tuple[Touch, ...], Field(strict=False, min_length=1)] = Field(alias="touch")
+    faults: Annotated[tuple[Acting, ...], Field(strict=False)] = Field(
+        (), alias="fault", description="what is wrong with pads, and when"
+    )
     repeat: bool = Field(False, description="whether it begins again when it has ended")
     pause_s: float = Field(1.0, ge=0, description="time after the last touch, before it ends or begins again")
 
@@ -117,9 +145,7 @@ class Scenario(Table):
         try:
             scenario = cls.model_validate(raw)
         except ValidationError as error:
-            raise ConfigError(file, problems_of(raw, error, {"": cls, "touch": Touch}, {})) from error
-        if problems := tuple(scenario._overlaps()):
-            raise ConfigError(file, problems)
+            raise ConfigError(file, problems_of(raw, error, {"": cls, "touch": Touch}, _KINDS)) from error
         return scenario
 
     @classmethod
@@ -154,26 +180,26 @@ class Scenario(Table):
         ]
 
     def check_links(self, links: Iterable[str], file: str = "scenario") -> None:
-        """Raise ConfigError for a touch on a link that carries no pad."""
+        """Raise ConfigError for a touch or a fault on a link that carries no pad."""
         known = sorted(set(links))
         problems = [
             Problem(
-                f"[[touch]] {number}: link", f' = "{touch.link}"', f"carries no pad; pads: {', '.join(known)}"
+                f"[[{table}]] {number}: link",
+                f' = "{entry.link}"',
+                f"carries no pad; pads: {', '.join(known)}",
             )
-            for number, touch in enumerate(self.touches, 1)
-            if touch.link not in known
+            for table, entries in (("touch", self.touches), ("fault", self.faults))
+            for number, entry in enumerate(entries, 1)
+            if entry.link not in known
         ]
         if problems:
             raise ConfigError(file, tuple(problems))
 
-    def _overlaps(self) -> Iterator[Problem]:
-        for (i, one), (j, other) in itertools.combinations(enumerate(self.touches, 1), 2):
-            if one.link == other.link and one.from_s < other.until_s and other.from_s < one.until_s:
-                yield Problem(
-                    f'[[touch]] {j} "{other.link}": from_s',
-                    f" = {other.from_s}",
-                    f"[[touch]] {i} still presses on that pad then; one contact at a time, please",
-                )
+
+def _gentles(part: FloatArray) -> FloatArray:
+    """`_gentle` of many."""
+    part = np.clip(part, 0.0, 1.0)
+    return np.asarray(part * part * (3 - 2 * part))
 
 
 def _gentle(part: float) -> float:

@@ -1,6 +1,7 @@
 """Finite elements for the potential in a sheet on its own curved surface: the simulator's forward path.
 
-Public names: `solve` (a sheet with its electrodes) -> `SheetMaps`; `SheetBank` looks them up for many pads.
+Public names: `solve` (a sheet with its electrodes) -> `SheetMaps`; `SheetBank` looks them up for many pads;
+`mutual` -> `Mutual`, between contacts.
 
 The sheet obeys d/ds (r du/ds) + d/dphi (1/r du/dphi) = 0 in arc length s and angle phi, r(s) being the
 radius; electrodes hold the potential on the sides, the gaps at the corners insulate. By reciprocity the
@@ -45,6 +46,7 @@ _VALUES = np.linalg.inv(
 )  # Lagrange's polynomials in powers
 _SLOPES = np.append(_POWERS[1:, None] * _VALUES[1:], np.zeros((1, _TABLE_DEGREE + 1)), axis=0)
 _ROWS = np.arange(5)
+_MUTUAL_DEGREE = 5
 
 
 class Gaps(NamedTuple):
@@ -55,6 +57,12 @@ class Gaps(NamedTuple):
     xa: tuple[float, float]
     y0: tuple[float, float]
     yb: tuple[float, float]
+
+    def at_least(self, shape: Shape) -> Gaps:
+        """The same, no gap so small that electrodes would short a corner."""
+        sides = (shape.arc, shape.arc, shape.length_m, shape.length_m)
+        least = [_LEAST_GAP * side for side in sides]
+        return Gaps(*((max(a, d), max(b, d)) for (a, b), d in zip(self, least, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,56 @@ def solve(shape: Shape, gaps: Gaps, degree: int = 8) -> SheetMaps:
     finer = _basis_matrix(_RADIUS_BREAKS, fine)
     log_radius = finer @ sheet.log_radius(shape.length_m * coarse, shape.arc * coarse) @ finer.T
     return SheetMaps(conductance, np.stack([*shares, log_radius]))
+
+
+class Mutual:
+    """Resistance between places of a sheet of 1 ohm per square with grounded electrodes (Green's function).
+
+    For pads with several contacts at a time.
+    """
+
+    def __init__(self, shape: Shape, gaps: Gaps) -> None:
+        nodes = _nodes(_RADIUS_BREAKS)
+        table = _Sheet(shape, gaps, _MUTUAL_DEGREE).mutual(shape.length_m * nodes, shape.arc * nodes)
+        self._shape = shape
+        self._table = table.reshape(4 * (len(nodes),))
+
+    def ohm(self, one: FloatArray, other: FloatArray, nearest_m: FloatArray) -> FloatArray:
+        """Ohms (n,) between places (2, n), fractions of the pad, taken no nearer than `nearest_m` (n,)."""
+        shape = self._shape
+        s = shape.length_m * np.stack([one[0], other[0]])
+        along, across = np.diff(shape.isothermal(s), axis=0)[0], shape.arc * (other[1] - one[1])
+        least = nearest_m / shape.radius(s).mean(0)
+        distance = np.maximum(np.hypot(along, across), least)
+        return np.asarray(self._regular(one, other) - np.log(distance) / (2 * math.pi))
+
+    def _regular(self, one: FloatArray, other: FloatArray) -> FloatArray:
+        if (other == other[:, :1]).all():  # the usual case: one of them stays where it is
+            (k, of_k, _), (m, of_m, _) = (_basis(_RADIUS_BREAKS, axis[:1]) for axis in other)
+            part = np.einsum("abij,i,j->ab", self._table[:, :, k[0]][..., m[0]], of_k[0], of_m[0])
+            (i, of_i, _), (j, of_j, _) = (_basis(_RADIUS_BREAKS, axis) for axis in one)
+            near = part[i[:, :, None], j[:, None, :]]
+            return np.asarray(np.einsum("tij,ti,tj->t", near, of_i, of_j))
+        if (one == one[:, :1]).all():
+            return self._regular(other, one)
+        found = np.empty(one.shape[1])
+        for at in np.array_split(np.arange(len(found)), max(len(found) // 500, 1)):
+            weights = [_basis(_RADIUS_BREAKS, axis) for axis in (*one[:, at], *other[:, at])]
+            (i, wi, _), (j, wj, _), (k, wk, _), (m, wm, _) = weights
+            patch = self._table[
+                i[:, :, None, None, None],
+                j[:, None, :, None, None],
+                k[:, None, None, :, None],
+                m[:, None, None, None, :],
+            ]
+            found[at] = np.einsum("tijkm,ti,tj,tk,tm->t", patch, wi, wj, wk, wm, optimize=True)
+        return found
+
+
+@lru_cache(maxsize=24)
+def mutual(shape: Shape, gaps: Gaps) -> Mutual:
+    """Of a sheet; remembered."""
+    return Mutual(shape, gaps)
 
 
 class SheetBank:
@@ -121,8 +179,7 @@ class _Sheet:
 
     def __init__(self, shape: Shape, gaps: Gaps, degree: int) -> None:
         self._shape = shape
-        bare = [_at_least(gap, _LEAST_GAP * shape.arc) for gap in (gaps.x0, gaps.xa)]
-        bare += [_at_least(gap, _LEAST_GAP * shape.length_m) for gap in (gaps.y0, gaps.yb)]
+        bare = gaps.at_least(shape)
         s, phi = _axis(shape.length_m, bare[2:], degree), _axis(shape.arc, bare[:2], degree)
         self._s, self._phi = s, phi
         radius = shape.radius(s.at)
@@ -188,9 +245,27 @@ class _Sheet:
     def log_radius(self, s: FloatArray, phi: FloatArray) -> FloatArray:
         """Logarithm of the conformal radius [m] at the points of the grid s x phi.
 
-        The potential of a unit current at P is -ln(d) / 2 pi + h, d being the distance in the plane of
-        (integral of ds / r, phi): that much is harmonic, so that h has only the values and fluxes that
-        make up for it on the boundary. At P itself h is the resistance of a contact of unit radius.
+        It is 2 pi times the regular part of the potential at the very place of the current: the resistance
+        of a contact of unit radius.
+        """
+        load, constant = self._regular(s, phi)
+        regular = np.einsum("pb,bp->p", self.response(s, phi), load) + constant
+        return np.asarray(2 * math.pi * regular).reshape(len(s), len(phi))
+
+    def mutual(self, s: FloatArray, phi: FloatArray) -> FloatArray:
+        """Potential at each point of the grid s x phi per current into each, (points, points), with
+        ln(d) / 2 pi added to it, d being their distance in the plane of (integral of ds / r, phi)."""
+        load, constant = self._regular(s, phi)
+        radius = np.repeat(self._shape.radius(s), len(phi))
+        return np.asarray(self.response(s, phi) @ load + constant - np.log(radius) / (2 * math.pi))
+
+    def _regular(self, s: FloatArray, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Currents into the boundary (boundary, points) and constants (points,) of the regular part h of the
+        potential of a unit current at each point of the grid s x phi.
+
+        The potential of a unit current at P is -ln(d r) / 2 pi + h, d being the distance from P in the plane
+        of (integral of ds / r, phi): that much is harmonic, so that h has only the values and fluxes that
+        make up for it on the boundary.
         """
         points = np.stack(np.broadcast_arrays(self._shape.isothermal(s)[:, None], phi)).reshape(2, -1)
         radius = np.repeat(self._shape.radius(s), len(phi))
@@ -211,8 +286,7 @@ class _Sheet:
         insulated = self._boundary[self._on] @ load
         currents, constant = self.impose(np.concatenate(potentials) - insulated, -load.sum(0, keepdims=True))
         load[self._on] += currents
-        regular = np.einsum("pb,bp->p", self.response(s, phi), load) + constant
-        return np.asarray(2 * math.pi * regular).reshape(len(s), len(phi))
+        return load, constant
 
 
 @dataclass(frozen=True)
@@ -245,10 +319,6 @@ def _axis(length: float, gaps: Sequence[tuple[float, float]], degree: int) -> Ax
     return Axis.graded(length, [end for before, after in gaps for end in (before, length - after)], degree)
 
 
-def _at_least(gap: tuple[float, float], least: float) -> tuple[float, float]:
-    return max(gap[0], least), max(gap[1], least)
-
-
 def _nodes(breaks: FloatArray) -> FloatArray:
     """Nodes of a table's elements, as fractions of a side."""
     half = np.diff(breaks)[:, None] / 2
@@ -270,3 +340,7 @@ def _basis_matrix(breaks: FloatArray, at: FloatArray) -> FloatArray:
     matrix = np.zeros((len(at), int(nodes.max()) + 1))
     matrix[np.arange(len(at))[:, None], nodes] = weights
     return matrix
+
+
+TABLE_AT: Final[FloatArray] = _nodes(_BREAKS)
+"""Where the tables of `SheetMaps` have their nodes, as fractions of a side."""

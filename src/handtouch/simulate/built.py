@@ -1,0 +1,172 @@
+"""A pad as it was built, in a world and under a scenario: its counts at any times.
+
+Public name: `BuiltPad`. No clock and no state: the same time gives the same counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch import config
+from handtouch.canbus.channels import ELECTRODES, channels_of, in_order
+from handtouch.hand import mount_of
+from handtouch.simulate import noise
+from handtouch.simulate.faults import Fault, StuckChannel
+from handtouch.simulate.pad import PadCircuit, Played
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.shape import Shape, shape_of
+from handtouch.simulate.sheet import Gaps, solve
+from handtouch.simulate.world import Parts, World
+
+FloatArray = NDArray[np.float64]
+CountArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltPad:
+    """One pad: what presses on it, what is wrong with it, its sheet and its channels."""
+
+    hand: str
+    pad: config.Pad
+    sheet: config.Sheet
+    circuit: PadCircuit
+    touches: Played
+    faults: tuple[Fault, ...]
+    rotation: FloatArray
+    translation: FloatArray
+    noise_counts: float
+    keys: NDArray[np.uint64]
+    """(4,) of the noise of its channels."""
+    limits: CountArray
+    """(4, 2)."""
+    counts_per_ampere: FloatArray
+    """(4,) of the channels x0, xa, y0, yb."""
+    round_s: float
+    """After this the scenario begins again; infinite: never."""
+
+    @classmethod
+    def of(
+        cls,
+        deployment: config.Deployment,
+        hand: str,
+        pad: config.Pad,
+        scenario: Scenario,
+        world: World,
+        faults: Sequence[Fault],
+    ) -> BuiltPad:
+        """Build it; of touches and faults it takes those on its link."""
+        node, sheet, parts = deployment.nodes[pad.node], deployment.sheets[pad.sheet], world.parts(hand, pad)
+        channels = in_order(channels_of(node.channels, node.eds), pad.electrodes)
+        limits = np.array([channel.limits for channel in channels])
+        scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES])
+        full = np.array([node.full_scale_counts or high for high in limits[:, 1]])
+        per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(parts.gain)
+        shape = shape_of(pad.surface)
+        gaps = _gaps(shape, parts)
+        circuit = PadCircuit(
+            shape,
+            gaps,
+            solve(shape, gaps),
+            sheet,
+            np.array(parts.series_ohm),
+            node.drive_v,
+            limits[:, 1] / per_ampere,
+        )
+        touches = [
+            (touch, 1e-3 * (touch.radius_mm or world.radius_mm(sheet, number)))
+            for number, touch in enumerate(scenario.touches)
+            if touch.link == pad.link
+        ]
+        keys = [noise.key(world.seed, "noise", hand, pad.link, name) for name in ELECTRODES]
+        return cls(
+            hand,
+            pad,
+            sheet,
+            circuit,
+            Played(touches),
+            tuple(fault for fault in faults if fault.link == pad.link),
+            *mount_of(pad),
+            node.noise_counts if world.noise_counts is None else world.noise_counts,
+            np.array(keys),
+            limits,
+            per_ampere,
+            scenario.duration_s if scenario.repeat else np.inf,
+        )
+
+    @property
+    def shape(self) -> Shape:
+        """Its surface."""
+        return self.circuit.shape
+
+    @property
+    def plain(self) -> bool:
+        """Whether it has never more than one contact, and nothing wrong with it."""
+        return not self.faults and self.touches.depth <= 1
+
+    def counts(self, times_s: ArrayLike) -> CountArray:
+        """Counts (n, 4) of the electrodes x0, xa, y0, yb at times (n,) from the start of the scenario."""
+        t = np.atleast_1d(np.asarray(times_s, np.float64))
+        read = self._read(t, self._lasting)
+        for fault in self._stuck:
+            self._hold(fault, t, read)
+        return read
+
+    def currents(self, times_s: FloatArray) -> FloatArray:
+        """Currents (n, 4) [A] that the wires of its electrodes bring to the amplifiers."""
+        since = self._since(times_s)
+        return self.circuit.currents(since, self.touches, self.faults, np.ones(len(since)))
+
+    def _read(self, times_s: FloatArray, faults: Sequence[Fault]) -> CountArray:
+        since = self._since(times_s)
+        amperes = self.circuit.currents(since, self.touches, faults, np.ones(len(since)))
+        for fault in faults:
+            if order := fault.permutation:
+                amperes = np.where(fault.active(since)[:, None], amperes[:, order], amperes)
+        counts = amperes * self.counts_per_ampere
+        for fault in faults:
+            at = np.flatnonzero(fault.active(since))
+            counts[at] = fault.signal(counts[at])
+        moments = np.rint(times_s * 1e9).astype(np.int64)
+        counts += self.noise_counts * noise.normal(self.keys, moments[:, None])
+        read = np.clip(np.rint(counts), *self.limits.T).astype(np.int64)
+        for fault in faults:
+            at = np.flatnonzero(fault.active(since))
+            held = read[at]
+            fault.freeze(held, self.limits)
+            read[at] = held
+        return read
+
+    def _hold(self, fault: StuckChannel, times_s: FloatArray, read: CountArray) -> None:
+        at = np.flatnonzero(fault.active(self._since(times_s)))
+        if len(at):
+            channel = ELECTRODES.index(fault.electrode)
+            read[at, channel] = self._read(np.array([fault.from_s]), self._lasting)[0, channel]
+
+    def _since(self, times_s: FloatArray) -> FloatArray:
+        """Times in the round of the scenario."""
+        return times_s % self.round_s if np.isfinite(self.round_s) else times_s
+
+    @cached_property
+    def _stuck(self) -> list[StuckChannel]:
+        """Faults that hold what a channel showed when they began."""
+        return [fault for fault in self.faults if isinstance(fault, StuckChannel) and fault.count is None]
+
+    @cached_property
+    def _lasting(self) -> list[Fault]:
+        return [fault for fault in self.faults if fault not in self._stuck]
+
+
+def _gaps(shape: Shape, parts: Parts) -> Gaps:
+    """Gaps in the coordinates of the shape."""
+    ends = shape.radius([0.0, shape.length_m])
+    units = (*ends.tolist(), 1.0, 1.0)  # metres per unit of the coordinate along the side
+    x0, xa, y0, yb = (
+        (1e-3 * before / unit, 1e-3 * after / unit)
+        for before, after, unit in zip(parts.gap_before_mm, parts.gap_after_mm, units, strict=True)
+    )
+    return Gaps(x0, xa, y0, yb)
