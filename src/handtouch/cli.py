@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     from handtouch.control_cli import add_control
+    from handtouch.record.cli import add_record
     from handtouch.supervise.calibrations_cli import add_calibrations
 
     parser = argparse.ArgumentParser(
@@ -49,6 +50,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_serving(commands)
     _add_looking(commands)
+    add_record(commands)
     add_control(commands)
     _add_bridge(commands)
     _add_keys(commands)
@@ -79,17 +81,6 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     simulate.add_argument("--seconds", type=positive, help="end after so long (default: on Ctrl-C)")
     simulate.add_argument("--tolerances", action="store_true", help="tolerances of parts besides the noise")
     simulate.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
-
-    replay = command(commands, "replay", _replay, "feed a recorded CAN log through the same pipeline")
-    replay.add_argument(
-        "log", type=Path, help="log in any format of python-can: candump .log, .asc, .blf, .gz ..."
-    )
-    _add_config(replay)
-    replay.add_argument(
-        "--speed", type=_speed, default=0.0, help="1 as recorded, 2 twice as fast, max (default)"
-    )
-    replay.add_argument("--json", action="store_true", help="every contact message as a JSON line")
-    replay.add_argument("--publish", action="store_true", help="publish on the deployment's endpoints too")
 
 
 def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -312,12 +303,6 @@ def _simulate(asked: argparse.Namespace) -> int:
     )
 
 
-def _replay(asked: argparse.Namespace) -> int:
-    from handtouch.daemon import replay
-
-    return replay.run(asked.log, asked.config, speed=asked.speed, as_json=asked.json, publish=asked.publish)
-
-
 def _watch(asked: argparse.Namespace) -> int:
     from handtouch.view import watch
 
@@ -454,7 +439,3 @@ def _seed(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number, 0 or above")
     return int(text)
-
-
-def _speed(text: str) -> float:
-    return 0.0 if text == "max" else positive(text)

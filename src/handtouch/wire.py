@@ -341,7 +341,7 @@ class Config:
     deployment: str
     """as JSON, with the keys of the deployment file"""
     files: dict[str, Any]
-    """path of each file that it names -> text"""
+    """path of each file that it names -> its bytes"""
     build: dict[str, Any]
     """versions of what computes, and the processor"""
     repeat: bool

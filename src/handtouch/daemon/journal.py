@@ -123,8 +123,9 @@ class Journal:
 
 
 def _files(deployment: Deployment) -> dict[str, Any]:
-    paths = sorted({node.eds for node in deployment.nodes.values() if node.eds})
-    return {path: Path(path).read_text(encoding="utf-8", errors="surrogateescape") for path in paths}
+    """Every file that the deployment names and that a model of it needs, as far as it is still there."""
+    named = {node.eds for node in deployment.nodes.values() if node.eds}
+    return {path: Path(path).read_bytes() for path in sorted(named) if Path(path).is_file()}
 
 
 @cache

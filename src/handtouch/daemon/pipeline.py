@@ -86,6 +86,11 @@ class Pipeline:
         """
         self.tick.rehearse()
         self.messages.rehearse(self._outlet)
+    def tick_again(self, now_ns: int, until_ns: int | None) -> Ticked:
+        """A recorded tick; slab, cycle and `node_state` hold what it was made from."""
+        self.settle()
+        return self._tick(now_ns, _FOREVER_NS if until_ns is None else until_ns)
+
 
     def end(self, now_ns: int) -> None:
         """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""

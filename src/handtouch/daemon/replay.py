@@ -1,4 +1,6 @@
-"""Feeds a recorded CAN log through the same pipeline as a live bus: identical contacts each time.
+"""`handtouch replay`: what was recorded through the same pipeline as live: identical contacts each time.
+
+A CAN log drives the pipeline as a bus does (`replay`); a recording has every tick's own input (`rerun`).
 
 Public names: `replay`, `Summary`, `run`.
 """
@@ -216,41 +218,115 @@ def pacer(speed: float) -> Callable[[int], None]:
 
 
 def run(
-    log: Path, config_path: Path, *, speed: float = 0, as_json: bool = False, publish: bool = False
+    path: Path,
+    config_path: Path | None = None,
+    *,
+    speed: float = 0,
+    nominal: bool = False,
+    as_json: bool = False,
+    report: Path | None = None,
+    publish: bool = False,
 ) -> int:
-    """`handtouch replay`: print contacts, or publish them too.
+    """`handtouch replay`: print contacts, or publish them too, and tell how they compare with recorded ones.
 
-    Exit status 0, 1 (a log that can't be read or holds no sample of the deployment), 2 (config).
+    Exit status 0, 1 (it can't be read, holds no sample of the deployment, or contacts come out otherwise than
+    recorded by the same deployment), 2 (usage or config).
     """
+    take = _print_json if as_json else _print_line
     try:
-        deployment = load(config_path)
-    except ConfigError as error:
+        deployment = load(config_path) if config_path else None
+        if is_recording(path):
+            return _rerun(path, deployment, nominal, speed, take, report, publish)
+        if deployment is None:
+            print(
+                f"{path}: a CAN log needs the deployment file of its hand: replay LOG CONFIG", file=sys.stderr
+            )
+            return 2
+        if nominal or report:
+            print("--nominal and --report are for MCAP recordings", file=sys.stderr)
+            return 2
+        with ExitStack() as stack:
+            publisher, pace = _served(deployment, publish, speed, stack)
+            summary = replay(path, deployment, take, pace=pace, publisher=publisher)
+    except (ConfigError, KeysError) as error:
         print(error, file=sys.stderr)
         return 2
+    except (OSError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    return _tell(summary, path, config_path)
+
+
+def _rerun(
+    path: Path,
+    deployment: Deployment | None,
+    nominal: bool,
+    speed: float,
+    take: Callable[[wire.Contact], None],
+    report: Path | None,
+    publish: bool,
+) -> int:
+    from handtouch.daemon import rerun
+    from handtouch.daemon.compare import Comparison, tell_anew, tell_same
+    from handtouch.record import Recording
+
+    recording = Recording(path)
+    if deployment is None and (nominal or publish):
+        deployment = rerun.first_deployment(recording)
+        again = not nominal
+    else:
+        again = deployment is None
+    comparison = Comparison()
+
+    def both(contact: wire.Contact) -> None:
+        take(contact)
+        comparison.add_replayed(contact)
+
+    began_s = time.monotonic()
     with ExitStack() as stack:
-        publisher = gate = None
-        try:
-            if publish:
-                context = stack.enter_context(zmq.Context())
-                settings = deployment.daemon
-                gate = Gate(context, Path(settings.keys) if settings.keys else None)
-                stack.callback(gate.close)
-                publisher = Publisher(context, settings.live, settings.complete, gate)
-                stack.callback(publisher.close)
-            pace = pacer(speed)
-            summary = replay(
-                log,
-                deployment,
-                _print_json if as_json else _print_line,
-                pace=_serving(pace, publisher, gate) if publisher and gate else pace,
-                publisher=publisher,
-            )
-        except KeysError as error:
-            print(error, file=sys.stderr)
-            return 2
-        except (OSError, ValueError) as error:
-            print(error, file=sys.stderr)
-            return 1
+        publisher, pace = _served(deployment, publish, speed, stack) if deployment else (None, pacer(speed))
+        feeder = (
+            rerun.Again(take, publisher)
+            if again or deployment is None
+            else rerun.Anew(deployment, both, publisher, nominal=nominal, recorded=comparison.add_recorded)
+        )
+        for entry in recording.read("config", "state", "contact", "tick"):
+            if entry.topic == "tick":
+                pace(entry.payload["now_ns"])
+            feeder.feed(entry)
+    seconds = time.monotonic() - began_s
+    if again:
+        return tell_same(recording, feeder.found, seconds, report)
+    return tell_anew(recording, feeder.found, comparison, seconds, report)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is MCAP rather than a CAN log."""
+    from handtouch.record.read import MAGIC
+
+    if path.suffix == ".mcap" or not path.is_file():
+        return path.suffix == ".mcap"
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def _served(
+    deployment: Deployment, publish: bool, speed: float, stack: ExitStack
+) -> tuple[Publisher | None, Callable[[int], None]]:
+    """A publisher if there is to be one, and what keeps the pace."""
+    pace = pacer(speed)
+    if not publish:
+        return None, pace
+    context = stack.enter_context(zmq.Context())
+    settings = deployment.daemon
+    gate = Gate(context, Path(settings.keys) if settings.keys else None)
+    stack.callback(gate.close)
+    publisher = Publisher(context, settings.live, settings.complete, gate)
+    stack.callback(publisher.close)
+    return publisher, _serving(pace, publisher, gate)
+
+
+def _tell(summary: Summary, path: Path, config_path: Path | None) -> int:
     counts = ", ".join(
         f"{name}: {c.frames} frames, {c.samples} samples, {c.short} short, {c.foreign} foreign"
         for name, c in summary.buses.items()
@@ -264,7 +340,7 @@ def run(
         return 0
     others = ", ".join(f"{channel} ({count} frames)" for channel, count in summary.unmatched.items())
     print(
-        f"{log}: no frame is a sample of {config_path}; do its buses' channels and node ids fit the log?"
+        f"{path}: no frame is a sample of {config_path}; do its buses' channels and node ids fit the log?"
         + (f" Channels of the log that it doesn't have: {others}" if others else ""),
         file=sys.stderr,
     )

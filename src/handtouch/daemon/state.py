@@ -88,12 +88,14 @@ def _places(root: object) -> Iterator[tuple[str, Any, str]]:
                 continue
             if isinstance(value, dict) and all(isinstance(item, _FIXED) for item in value.values()):
                 continue
-            if _is_ours(value):
-                if id(value) not in seen:
-                    seen.add(id(value))
-                    waiting.append((f"{path}.", value))
-            else:
+            inside = _inside(value)
+            if inside is None:
                 yield path, owner, name
+                continue
+            for suffix, item in inside:
+                if id(item) not in seen:
+                    seen.add(id(item))
+                    waiting.append((f"{path}{suffix}.", item))
 
 
 def _attributes(owner: object) -> list[str]:
@@ -101,9 +103,35 @@ def _attributes(owner: object) -> list[str]:
     return [*getattr(owner, "__dict__", {}), *slots]
 
 
+def _inside(value: Any) -> list[tuple[str, Any]] | None:
+    """Objects to walk into, by what leads to them from the attribute; None for what is a value itself."""
+    if _is_walked(value):
+        return [("", value)]
+    pairs: list[tuple[Any, Any]] = []
+    if isinstance(value, dict):
+        pairs = list(value.items())
+    elif isinstance(value, list) or type(value) is tuple:
+        pairs = list(enumerate(value))
+    objects = [(f"[{key!r}]", item) for key, item in pairs if _is_walked(item)]
+    return (
+        objects if objects and len(objects) + sum(item is None for _, item in pairs) == len(pairs) else None
+    )
+
+
+def _is_walked(value: object) -> bool:
+    """Whether it is an object of ours that changes; named tuples, enumerations, frozen facts are values."""
+    if isinstance(value, (tuple, Enum, *_FIXED, *_MADE, *_FED)) or not _is_ours(value):
+        return False
+    facts = is_dataclass(value) and not any(_holds_array(getattr(value, part.name)) for part in fields(value))
+    return not (facts and type(value).__setattr__ is not object.__setattr__)
+
+
+def _holds_array(value: object) -> bool:
+    return isinstance(value, np.ndarray) or _is_ours(value)
+
+
 def _is_ours(value: object) -> bool:
-    named = isinstance(value, tuple | Enum)  # named tuples and members of enumerations are values
-    return type(value).__module__.startswith("handtouch.") and not named
+    return type(value).__module__.startswith("handtouch.")
 
 
 def _saved(value: Any, path: str) -> Any:
