@@ -62,7 +62,7 @@ def test_a_field_of_the_wrong_type_or_a_missing_one_is_refused_by_name(
     topic, payload = wire.encode(message)
     content = msgpack.unpackb(payload)
     name = data.draw(st.sampled_from([field for field in content if field != "v"]))
-    content[name] = [{"not": "this"}]
+    content[name] = [["not this"]]
     with pytest.raises(wire.WireError, match=name):
         wire.decode([topic, msgpack.packb(content)])
     del content[name]

@@ -218,6 +218,16 @@ class Health:
     emergencies: tuple[str, ...]
     """latest EMCY messages as text, newest last"""
     repeat: bool
+    trust: str = ""
+    """nominal, trusted, quarantined or person, who has to calibrate it; this and the next are empty where
+    nobody supervises"""
+    calibration: str = ""
+    """what its readings are corrected by; the name is that of its contacts"""
+    calibrating: str = ""
+    """how far its calibration by itself is, in words"""
+    findings: tuple[dict[str, Any], ...] = ()
+    """what the supervisor has found: maps of kind, cause, evidence, remedy, since_ns, confidence, pad_m,
+    size_m"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,6 +286,8 @@ class Service:
     """stream -> messages that some subscriber's full queue couldn't take"""
     subscriptions: tuple[str, ...]
     repeat: bool
+    supervisor: dict[str, Any] | None = None
+    """how the slow half of the supervisor fares; None where there is none"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -422,8 +434,16 @@ _FIELDS = {
     kind: (names := [f.name for f in fields(kind) if f.name not in defaults], attrgetter(*names))
     for kind, defaults in _DEFAULTS.items()
 }
+
+
+def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    """Of several attributes, or of one: `attrgetter` makes a tuple of several only."""
+    get = attrgetter(*names)
+    return get if len(names) > 1 else lambda message: (get(message),)
+
+
 _OPTIONAL = {
-    kind: (list(defaults), attrgetter(*defaults), tuple(defaults.values()))
+    kind: (names := list(defaults), _getter(names), tuple(defaults.values()))
     for kind, defaults in _DEFAULTS.items()
     if defaults
 }
@@ -452,8 +472,8 @@ def plain(message: Message) -> dict[str, Any]:
     names, values = _FIELDS[kind]
     told = dict(zip(names, values(message), strict=True))
     if kind in _OPTIONAL:
-        names, values, defaults = _OPTIONAL[kind]
-        if (optional := values(message)) != defaults:
+        names, get, defaults = _OPTIONAL[kind]
+        if (optional := get(message)) != defaults:
             told.update(zip(names, optional, strict=True))
     return told
 

@@ -9,7 +9,7 @@ import re
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,9 @@ GARBAGE = {
 def _health(seq: int) -> wire.Health:
     """A message; only its topic and its number matter here."""
     zero: dict[str, Any] = {"int": 0, "float": 0.0, "str": "", "bool": False, "tuple[str, ...]": ()}
-    values: dict[str, Any] = {field.name: zero.get(str(field.type)) for field in fields(wire.Health)}
+    values: dict[str, Any] = {
+        field.name: zero.get(str(field.type)) for field in fields(wire.Health) if field.default is MISSING
+    }
     return wire.Health(**{**values, "v": wire.SCHEMA_VERSION, "seq": seq, "hand": "h", "link": "thumb"})
 
 
