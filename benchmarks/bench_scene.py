@@ -82,7 +82,7 @@ class Case:
         self.sent_bytes += sum(map(len, wire.encode(message)))
 
     def _apply(self, wanted: Any, needs: Any, *_: Any) -> None:
-        self.pipeline.tick.want(*wanted)
+        self.pipeline.want(wanted)
         self.pipeline.frames_every = self.demand.frames_every
         self.pipeline.node_state[~needs.pads] = wire.PadState.OFF
 

@@ -17,6 +17,8 @@ from handtouch.canbus.channels import full_scale_counts, greatest_count
 from handtouch.canbus.load import burst_s, bus_load
 from handtouch.canbus.nodes import checked
 from handtouch.config.checks import rectangle_mm
+from handtouch.hand.robot import check as check_robots
+from handtouch.hand.robot import doubts as robot_doubts
 
 BUSY_LOAD = 0.7
 POOR_ASPECT = 3.0
@@ -31,7 +33,7 @@ def run(path: Path | None, json: bool, schema: bool) -> int:
         print("handtouch check: give a deployment file, or --schema", file=sys.stderr)
         return 2
     try:
-        deployment = checked(config.load(path), str(path))
+        deployment = check_robots(checked(config.load(path), str(path)), str(path))
     except config.ConfigError as error:
         _refuse(error, json)
         return 2
@@ -97,6 +99,7 @@ def warnings(deployment: config.Deployment) -> Iterator[str]:
                 f"[node.{name}]: full_scale_counts = {node.full_scale_counts}: its channels count to {most} "
                 "at most, so full_scale_ma is never reached; is the type of the channels right?"
             )
+    yield from robot_doubts(deployment)
     for hand in deployment.hands:
         yield from _serial_warnings(hand)
         for pad in hand.pads:

@@ -288,6 +288,8 @@ class Service:
     repeat: bool
     supervisor: dict[str, Any] | None = None
     """how the slow half of the supervisor fares; None where there is none"""
+    inputs: dict[str, Any] | None = None
+    """what came to the inputs endpoint: received, age_s, dropped, problem"""
 
 
 @dataclass(frozen=True, slots=True)

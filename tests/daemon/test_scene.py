@@ -116,7 +116,7 @@ class Served:
 
     def _apply(self, wanted: Any, needs: Any, enabled: Any, now_ns: int) -> None:
         del needs, enabled, now_ns
-        self.pipeline.tick.want(*wanted)
+        self.pipeline.want(wanted)
         self.pipeline.frames_every = self.demand.frames_every
 
     def wants(self, topic: str) -> bool:

@@ -8,13 +8,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from handtouch import wire
 from handtouch.config import Deployment, Table
 from handtouch.config.tables import Name, Output, Wants
 from handtouch.daemon.control import Command, Job, RefusedError, Reply
@@ -127,8 +127,8 @@ class Commands:
         tick, wanted = self._pipeline.tick, self._demand.wanted
         tick.solve_all()
         made = {topic: make(now_ns) for topic, make in self._pipeline.messages.present().items()}
-        tick.want(*wanted)
-        told = {topic: asdict(message) for topic, message in made.items() if message is not None}
+        self._pipeline.want(wanted)
+        told = {topic: wire.plain(message) for topic, message in made.items() if message is not None}
         return {
             "hands": {topic[len("hand/") :]: m for topic, m in told.items() if topic.startswith("hand/")},
             "contacts": [message for topic, message in told.items() if topic.startswith("contact/")],

@@ -32,6 +32,7 @@ from handtouch.config import ConfigError, Deployment, load, with_bus
 from handtouch.daemon import histogram, logs, realtime
 from handtouch.daemon.commands import Commands
 from handtouch.daemon.control import Control
+from handtouch.daemon.inputs import Inputs
 from handtouch.daemon.metrics import PATH, Exporter
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.notify import Notifier, Pulse
@@ -41,6 +42,9 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.report import Report
 from handtouch.daemon.scene import Demand, Needs, Scenes, Wanted
 from handtouch.daemon.security import Gate
+from handtouch.hand.joints import JointStates
+from handtouch.hand.robot import Robots
+from handtouch.hand.robot import check as check_robots
 from handtouch.keys import KeysError
 
 _log = logging.getLogger("handtouch.daemon")
@@ -75,13 +79,18 @@ class Daemon:
             opened.callback(self.publisher.close)
             self.control = Control(context, settings.control, self.gate)
             opened.callback(self.control.close)
+            robots = Robots(deployment)
+            self.inputs = self._open_inputs(context, robots)
+            opened.callback(self.inputs.close)
             self.pipeline = Pipeline(
                 model or PadModel(deployment),
                 period_ns,
                 settings.window,
                 self.publisher,
                 self.publisher.run,
+                robots,
             )
+            self.pipeline.frames.joints_at = self.inputs.joints_at
             self.publisher.present.update(self.pipeline.messages.present())
             self.publisher.present.update(self.pipeline.journal.present())
             self.pipeline.journal.serve(deployment, time.monotonic_ns())
@@ -102,10 +111,14 @@ class Daemon:
             self.gate,
             self.control,
         )
-        names = [(hand.name, pad.link) for hand in deployment.hands for pad in hand.pads]
+        self.report.inputs = self.inputs.figures
+        names = pad_names(deployment)
         scenes = Scenes(deployment.scene, names)
         self.pacer = Pacer(deployment, scenes.needs.pads, self.pipeline, self.master, self.sync)
         self.demand = Demand(scenes, self.publisher, 1e9 / period_ns, self._apply)
+        self.demand.placeable[:] = False
+        for rows in robots.rows:
+            self.demand.placeable[rows] = True
         self.demand.step(time.monotonic_ns())
         commands = Commands(deployment, read, self.pipeline, self.report, self.demand, self.pacer)
         self.control.commands.update(commands.by_name)
@@ -119,6 +132,11 @@ class Daemon:
     def close(self) -> None:
         """Give buses and endpoints back."""
         self._opened.close()
+
+    def _open_inputs(self, context: zmq.Context[zmq.Socket[bytes]], robots: Robots) -> Inputs:
+        parts = zip(robots.hands, robots.joint_names, robots.kinematics, strict=True)
+        states = {hand: JointStates(names, kinematics.continuous) for hand, names, kinematics in parts}
+        return Inputs(context, self.deployment.daemon.inputs, self.gate, states, pad_names(self.deployment))
 
     def run(self, stop: threading.Event, alive: Callable[[int], None] = lambda _: None) -> None:
         """Serve until `stop` is set; `alive` is called after every tick, with the time in ns.
@@ -173,6 +191,7 @@ class Daemon:
         """A SYNC was sent or seen: a new period."""
         self.report.stages.begin(self.sync.overruns, not self.pipeline.cycle.ticked)
         self.pipeline.begin(sync_ns, now_ns)
+        self.inputs.poll(now_ns)
         if self._rested_ns > _COLD_NS:  # now, while the nodes sample and answer
             self.pipeline.rehearse()
         self.report.stages.lap(histogram.SYNC, time.monotonic_ns())
@@ -189,7 +208,7 @@ class Daemon:
 
     def _apply(self, wanted: Wanted, needs: Needs, enabled: NDArray[np.bool_], now_ns: int) -> None:
         """Do what is wanted now, and no more."""
-        self.pipeline.tick.want(*wanted)
+        self.pipeline.want(wanted)
         self.pipeline.frames_every = self.demand.frames_every
         self.pacer.set_needs(needs.pads & enabled, needs.raw, now_ns)
         self.report.set_disabled(self.demand.disabled_by)
@@ -215,6 +234,11 @@ class Daemon:
         lap(histogram.REQUESTS, time.monotonic_ns())
 
 
+def pad_names(deployment: Deployment) -> list[tuple[str, str]]:
+    """Hand and link of every pad, in the order of the deployment."""
+    return [(hand.name, pad.link) for hand in deployment.hands for pad in hand.pads]
+
+
 def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     """`handtouch run`: serve a deployment until SIGINT or SIGTERM; exit status 0, 1 (no bus), 2 (config)."""
     try:
@@ -238,7 +262,8 @@ def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
     deployment = load(config_path)
     for bus in buses:
         deployment = with_bus(deployment, bus)
-    return checked(deployment, str(config_path))  # a mistake must show before a bus is touched
+    deployment = checked(deployment, str(config_path))  # a mistake must show before a bus is touched
+    return check_robots(deployment, str(config_path))
 
 
 def _serve(deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment]) -> int:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.canbus.slab import Slab
+from handtouch.daemon.frames import Frames
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.tick import Tick, Ticked
 from handtouch.wire import PadState
@@ -43,8 +44,9 @@ class Messages:
     `seq` counts what there was to tell, whether anybody wanted it or not: who was away sees a gap.
     """
 
-    def __init__(self, model: PadModel, tick: Tick, run: int = 0) -> None:
+    def __init__(self, model: PadModel, tick: Tick, run: int = 0, frames: Frames | None = None) -> None:
         self._model = model
+        self._placing = frames or Frames(model.hands)
         self._tick = tick
         self._run = run
         self._seq: NDArray[np.int64] = np.zeros(model.size, dtype=np.int64)
@@ -62,6 +64,7 @@ class Messages:
                 if outlet.wants(self._topics[pad]):
                     outlet.send(self._contact(pad, event, ticked.t_ns, now_ns))
         self._tick.contacts.forget(ticked.ended)
+        self._placing.forget(ticked.ended)
 
     def adopt(self, model: PadModel) -> None:
         """Tell of another model of the same pads from now on."""
@@ -133,6 +136,7 @@ class Messages:
             residual=located["residual"].tobytes(),
             residual_std=located["residual_std"].tobytes(),
             repeat=repeat,
+            **self._placing.columns(rows),
         )
 
     def _raw(self, hand: str, slab: Slab) -> wire.Raw:
@@ -171,7 +175,7 @@ class Messages:
             id=int(contacts.id[pad]),
             hand=model.hands[pad],
             link=model.links[pad],
-            frame=model.links[pad],
+            frame=model.frames[pad],
             begin_ns=begin_ns,
             duration_s=((sample_ns if event != "end" else t_ns) - begin_ns) * 1e-9,
             age_s=(now_ns - sample_ns) * 1e-9,
@@ -192,6 +196,7 @@ class Messages:
             calibration=model.calibration[pad],
             reason=self._reason or REASONS.get(state, "released") if event == "end" else "",
             repeat=repeat,
+            **self._placing.tell(pad),
         )
 
 

@@ -25,9 +25,10 @@ FloatArray = NDArray[np.float64]
 class PadModel:
     """Columns of the n pads of a deployment, in its order; the same order as the slab's.
 
-    `hands`, `links`, `calibration` (n,) names; `rows_of_hand`; `ampere_per_count` (n, 4) of the electrodes
-    x0, xa, y0, yb, their noise as `noise_counts` (n,) and `noise_a` (n, 4), what they read untouched as
-    `offset_counts` and `offset_a` (n, 4), zero unless `tared`; `gains` (n, 4) are in `ampere_per_count`,
+    `hands`, `links`, `frames` (links of the URDF) and `calibration` (n,) are names; `rows_of_hand`;
+    `ampere_per_count` (n, 4) of the electrodes x0, xa, y0, yb, their noise as `noise_counts` (n,) and
+    `noise_a` (n, 4), what they read untouched as `offset_counts` and `offset_a` (n, 4), zero unless `tared`;
+    `gains` (n, 4) are in `ampere_per_count`,
     `gain_covariance` (n, 4, 4) is that of their logarithms, `quarantined` (n,): no force is told;
     `laws` (n,) are those that a calibration has put in the place of the file's, else None;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
@@ -44,6 +45,7 @@ class PadModel:
         self.size = len(pads)
         self.hands = [hand for hand, _ in entries]
         self.links = [pad.link for pad in pads]
+        self.frames = [pad.mount.link or pad.link for pad in pads]
         self.rows_of_hand = _rows(self.hands)
         self.nominal = [nominal_of(pad, deployment) for pad in pads]
         self.calibration = list(self.nominal)

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from handtouch.canbus.slab import Slab
 from handtouch.daemon.cycle import Cycle
+from handtouch.daemon.frames import Frames
 from handtouch.daemon.journal import Journal
 from handtouch.daemon.messages import Messages, Outlet
 from handtouch.daemon.model import PadModel
+from handtouch.daemon.scene import Wanted
 from handtouch.daemon.tick import Tick, Ticked
+from handtouch.hand.robot import Robots
 from handtouch.wire import PadState
 
 _FOREVER_NS = np.iinfo(np.int64).max
@@ -23,15 +26,24 @@ class Pipeline:
 
     Call `begin` at each SYNC, write samples into `slab`, and `advance` as time passes. `node_state` (n,)
     uint8 is for the owner to keep: PadState.CLEAR where a node is up, else what its pad is instead.
-    `run` is the daemon's, for its messages.
+    `run` is the daemon's, for its messages; `robots` tell where links are in palm and base.
     """
 
-    def __init__(self, model: PadModel, period_ns: int, window: float, outlet: Outlet, run: int = 0) -> None:
+    def __init__(
+        self,
+        model: PadModel,
+        period_ns: int,
+        window: float,
+        outlet: Outlet,
+        run: int = 0,
+        robots: Robots | None = None,
+    ) -> None:
         self.model = model
         self.slab = Slab(model.size)
         self.cycle = Cycle(period_ns, window)
         self.tick = Tick(model, period_ns)
-        self.messages = Messages(model, self.tick, run)
+        self.frames = Frames(model.hands, robots)
+        self.messages = Messages(model, self.tick, run, self.frames)
         self.node_state: NDArray[np.uint8] = np.full(model.size, PadState.STARTING, dtype=np.uint8)
         self.ticks = 0
         self.frames_every = 1
@@ -40,8 +52,14 @@ class Pipeline:
         """called between the step of a tick and its messages, for who watches the time"""
         self._outlet = outlet
         self.journal = Journal(self, run, outlet)
+        self.journal.others["joints"] = self.frames.journal
         self._expected = self.tick.expected()
         self._expected_count = 0
+
+    def want(self, wanted: Wanted) -> None:
+        """Compute what somebody wants, and no more."""
+        self.tick.want(wanted.located, wanted.weighed, wanted.tolerance_m, wanted.every)
+        self.frames.want(wanted.palm, wanted.base)
 
     def begin(self, t_ns: int, now_ns: int) -> None:
         """A SYNC was sent or seen at `t_ns`: samples that arrived since then belong to it.
@@ -85,12 +103,13 @@ class Pipeline:
         it when samples are about to come.
         """
         self.tick.rehearse()
+        self.frames.rehearse()
         self.messages.rehearse(self._outlet)
+
     def tick_again(self, now_ns: int, until_ns: int | None) -> Ticked:
         """A recorded tick; slab, cycle and `node_state` hold what it was made from."""
         self.settle()
         return self._tick(now_ns, _FOREVER_NS if until_ns is None else until_ns)
-
 
     def end(self, now_ns: int) -> None:
         """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""
@@ -102,6 +121,7 @@ class Pipeline:
         self.cycle.ticked = True
         self.ticks += 1
         ticked = self.tick.step(self.slab, self.node_state, self.cycle, now_ns, until_ns)
+        self.frames.step(ticked, self.tick.columns, self.tick.contacts.id)
         self.stepped()
         self.messages.send_contacts(ticked, now_ns, self._outlet)
         if self.ticks % self.frames_every == 0:

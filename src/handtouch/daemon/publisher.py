@@ -143,7 +143,7 @@ class Publisher:
 def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str, gate: Gate, right: str) -> str:
     """Bind and return the endpoint with its real port; OSError names purpose, endpoint and remedy.
 
-    The gate lets in those with the right ("read", "control").
+    The gate lets in those with the right ("read", "control"; "inputs" asks for control, too).
     """
     _check_file(endpoint, purpose)
     gate.guard(socket, endpoint, right)

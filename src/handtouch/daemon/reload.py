@@ -106,6 +106,8 @@ def fixed(old: Deployment, new: Deployment) -> list[str]:
     told = [f"[daemon] {key} differs" for key in _keys(old.daemon, new.daemon) if key != "log_level"]
     if old.buses != new.buses:
         told.append("[[bus]] differs")
+    for before, after in zip(old.hands, new.hands, strict=False):
+        told += [f"[[hand]] {after.name}: {key} differs" for key in _keys(before, after) if key != "pads"]
     names = [[(hand.name, pad.link) for hand in d.hands for pad in hand.pads] for d in (old, new)]
     if names[0] != names[1]:
         told.append("the pads or their order differ")

@@ -69,6 +69,8 @@ class Report:
         self._gate, self._control = gate, control
         self.listener: Callable[[wire.Health | wire.Service], None] = lambda _: None
         """is given every health and service message, subscribed or not"""
+        self.inputs: Callable[[int], dict[str, Any]] = lambda _: {}
+        """what came to the inputs endpoint until a time [ns]"""
         self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
         self._names = [(hand, pad.link) for hand, pad in self._pads]
         self._disabled_by: dict[int, str] = {}
@@ -229,6 +231,7 @@ class Report:
                 sorted(prefix.decode("utf-8", "replace") for prefix in self._publisher.subscriptions)
             ),
             repeat=False,
+            inputs=self.inputs(now_ns),
         )
 
     def _totals(self) -> NDArray[np.int64]:

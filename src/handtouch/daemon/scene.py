@@ -31,6 +31,8 @@ class Needs(NamedTuple):
     location: BoolArray
     strength: BoolArray
     raw: BoolArray
+    palm: BoolArray
+    base: BoolArray
     tolerance_m: NDArray[np.float64]
     rate_hz: NDArray[np.float64]
     """inf: at every SYNC"""
@@ -55,14 +57,15 @@ def select(patterns: Sequence[str], names: Sequence[Name]) -> BoolArray:
 def join(scenes: Sequence[Wants], names: Sequence[Name]) -> Needs:
     """The union of scenes over the pads. Raises ValueError for a pattern that names none."""
     n = len(names)
-    pads, location, strength, raw = (np.zeros(n, dtype=np.bool_) for _ in range(4))
-    needs = Needs(pads, location, strength, raw, np.full(n, np.inf), np.zeros(n))
+    needs = Needs(*(np.zeros(n, dtype=np.bool_) for _ in range(6)), np.full(n, np.inf), np.zeros(n))
     for scene in scenes:
         chosen = select(scene.links, names)
         needs.pads[chosen] = True
-        needs.location[chosen] |= "location" in scene.outputs
-        needs.strength[chosen] |= "strength" in scene.outputs
-        needs.raw[chosen] |= "raw" in scene.outputs
+        for output in ("location", "strength", "raw", "palm", "base"):
+            getattr(needs, output)[chosen] |= output in scene.outputs
+        needs.location[chosen] |= bool(
+            {"palm", "base"} & set(scene.outputs)
+        )  # they are of a place on the link
         np.minimum(needs.tolerance_m, scene.tolerance_mm * 1e-3, out=needs.tolerance_m, where=chosen)
         np.maximum(needs.rate_hz, scene.rate_hz or np.inf, out=needs.rate_hz, where=chosen)
     needs.tolerance_m[~needs.pads] = 0.0
@@ -168,6 +171,8 @@ class Wanted(NamedTuple):
     tolerance_m: NDArray[np.float64]
     every: NDArray[np.int64]
     """ticks from one update to the next"""
+    palm: BoolArray
+    base: BoolArray
 
 
 class Demand:
@@ -186,13 +191,15 @@ class Demand:
         n = len(scenes.names)
         self.scenes = scenes
         self.disabled_by: dict[int, str] = {}
+        self.placeable = np.ones(n, dtype=np.bool_)
+        """pads whose place in palm and base can be known"""
         self._listeners, self._tick_hz, self._apply = listeners, tick_hz, apply
         self._seen: object = None
         self._disabled_version = 0
         self.frames_every = 1
         """ticks from one frame of a hand to the next: as its busiest pad needs"""
         none = np.zeros(n, dtype=np.bool_)
-        self.wanted = Wanted(none, none, np.zeros(n), np.ones(n, dtype=np.int64))
+        self.wanted = Wanted(none, none, np.zeros(n), np.ones(n, dtype=np.int64), none, none)
 
     def step(self, now_ns: int) -> None:
         """Notice what changed, if anything did."""
@@ -240,16 +247,23 @@ class Demand:
     def _outputs(self, pad: int, heard: bool) -> tuple[list[str], dict[str, str]]:
         needs = self.scenes.needs
         raw = self._listeners.wants(f"raw/{self.scenes.names[pad][0]}")
-        on = {"location": self.wanted.located, "strength": self.wanted.weighed}
+        wanted = self.wanted
+        on = {
+            "location": wanted.located,
+            "strength": wanted.weighed,
+            "palm": wanted.palm,
+            "base": wanted.base,
+        }
         computed = ["touched", *(output for output, pads in on.items() if pads[pad]), *["raw"] * raw]
         skipped = {}
-        for output in ("touched", "location", "strength"):
+        for output in ("touched", *on):
             if pad in self.disabled_by:
                 skipped[output] = f"disabled by {self.disabled_by[pad]}"
             elif not needs.pads[pad]:
                 skipped[output] = "outside every scene"
             elif output == "touched" or on[output][pad]:
-                continue
+                if output in ("palm", "base") and not self.placeable[pad]:
+                    skipped[output] = "the hand has no URDF, or handtouch[urdf] isn't installed"
             elif not heard:
                 skipped[output] = "nobody subscribed"
             else:
@@ -271,6 +285,8 @@ class Demand:
             weighed=heard & needs.strength,
             tolerance_m=np.where(needs.location | needs.strength, needs.tolerance_m, 0.0),
             every=np.maximum(every, 1).astype(np.int64),
+            palm=heard & needs.palm,
+            base=heard & needs.base,
         )
         self.frames_every = int(self.wanted.every[needs.pads].min()) if needs.pads.any() else 1
         self._apply(self.wanted, needs, enabled, now_ns)

@@ -34,7 +34,7 @@ _HANDSHAKES_PER_POLL = 2
 _EVENTS_PER_POLL = 100
 _HANDSHAKE_MS = 5000
 """A connection that hasn't shown by then who it is, is closed."""
-_LARGEST_BYTES = {"read": 4096, "control": 1_000_000}
+_LARGEST_BYTES = {"read": 4096, "control": 1_000_000, "inputs": 65_536}
 """Largest message that a client may send; of the streams it only ever asks for topics."""
 _TOLD_AGAIN_NS = 10_000_000_000
 _FAILURES = (
@@ -122,7 +122,7 @@ class Gate:
         who, where = b"", f"from {address.decode('ascii', 'replace')}"
         if client is None:
             self._refuse("unknown_key", f"{key} {where}", now_ns)
-        elif right == b"control" and client.rights != "control":
+        elif right in (b"control", b"inputs") and client.rights != "control":
             self._refuse("no_right", f"{client.name} {where}", now_ns)
         else:
             who = client.name.encode()

@@ -24,9 +24,10 @@ from handtouch.daemon.pipeline import Pipeline
 from handtouch.field import LocatorBank
 from handtouch.field.strength import ContactLaw
 from handtouch.hand import Placement
+from handtouch.hand.robot import Robots
 
 _FIXED = (slice, range, frozenset, type, memoryview, FunctionType, MethodType, BuiltinFunctionType, partial)
-_MADE = (LocatorBank, Placement, ContactLaw)
+_MADE = (LocatorBank, Placement, ContactLaw, Robots)
 """Follow from the deployment alone."""
 _FED = (Slab,)
 """Filled anew for every tick."""

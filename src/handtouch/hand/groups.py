@@ -16,21 +16,22 @@ _FACING = -0.5
 
 
 class Groups:
-    """Groups of the contacts on n pads of one hand; `within_m` apart joins two of them.
+    """Groups of the contacts on n pads; `within_m` (n,) apart joins two of one `hand` (n,), by number.
 
     `id` (n,) uint32: of a group, the contact id of one that is or was in it; of a contact by itself, its own;
     0 without contact. A group keeps its id as long as anything of it is left; where it falls apart, the part
     with the contact that gave the id keeps it, else the one with the oldest contact.
     """
 
-    def __init__(self, n: int, within_m: float) -> None:
+    def __init__(self, within_m: FloatArray, hand: NDArray[np.intp]) -> None:
+        n = len(hand)
         self.id = np.zeros(n, dtype=np.uint32)
-        self._within_m = within_m
+        self._within2, self._hand = within_m**2, hand
         self._joined = np.zeros((n, n), dtype=np.bool_)
         self._contact = np.zeros(n, dtype=np.uint32)
 
     def step(self, contact: NDArray[np.uint32], position_m: FloatArray, normal: FloatArray) -> None:
-        """Contact ids (n,), 0 for none; places and normals (n, 3) in one frame, NaN where they aren't known.
+        """Contact ids (n,), 0 for none; places and normals (n, 3) in the hand's frame, NaN if not known.
 
         Two contacts of which one isn't known stay joined, or apart, as they were.
         """
@@ -50,8 +51,9 @@ class Groups:
         before = self._joined[square]
         apart = position_m[:, None] - position_m
         distance2 = np.einsum("ijk,ijk->ij", apart, apart)
-        limit2 = np.where(before, (_APART * self._within_m) ** 2, self._within_m**2)
+        limit2 = np.where(before, _APART**2, 1.0) * self._within2[here]
         near = (distance2 <= limit2) & (normal @ normal.T >= _FACING)
+        near &= self._hand[here, None] == self._hand[here]
         joined = np.where(np.isnan(distance2), before, near)
         np.fill_diagonal(joined, False)
         if changed or not np.array_equal(joined, before):

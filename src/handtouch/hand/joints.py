@@ -33,6 +33,11 @@ class Joints(NamedTuple):
     std_rad: FloatArray
     """(m,) standard deviation as told, 0 where that wasn't"""
 
+    @classmethod
+    def unknown(cls, t_ns: int, m: int) -> Joints:
+        """Of m joints that nobody told."""
+        return cls(t_ns, np.full(m, np.nan), np.full(m, np.inf), np.zeros(m))
+
 
 class _State(NamedTuple):
     t_ns: int
@@ -86,9 +91,11 @@ class JointStates:
 
     def at(self, t_ns: int) -> Joints:
         """All joints at a time: between two states on the line, beyond the last one a little way further."""
-        m = len(self.names)
-        found = Joints(t_ns, np.full(m, np.nan), np.full(m, np.inf), np.zeros(m))
-        for ours, _, states in sorted(self._sources.values(), key=lambda source: source[2][-1].t_ns):
+        found = Joints.unknown(t_ns, len(self.names))
+        sources = list(self._sources.values())
+        if len(sources) > 1:  # of a joint that several tell, the newest counts
+            sources.sort(key=lambda source: source[2][-1].t_ns)
+        for ours, _, states in sources:
             position, age_ns, std = self._match(states, t_ns, self._continuous[ours])
             found.position_rad[ours], found.age_s[ours] = position, age_ns * 1e-9
             found.std_rad[ours] = 0.0 if std is None else std

@@ -70,13 +70,14 @@ class Kinematics:
 
     def move(self, position_rad: FloatArray) -> None:
         """Put the joints at these positions (m,): radians, metres where they slide. NaN counts as 0."""
-        turned = self._matrix @ np.nan_to_num(position_rad) + self._offset
+        if np.isnan(position_rad).any():
+            position_rad = np.nan_to_num(position_rad)
+        turned = self._matrix @ position_rad + self._offset
         q = self._rest.copy()
         q[self._plain_q] = turned[self._plain_v]
-        q[self._turning_q], q[self._turning_q + 1] = (
-            np.cos(turned[self._turning_v]),
-            np.sin(turned[self._turning_v]),
-        )
+        if len(self._turning_q):
+            angle = turned[self._turning_v]
+            q[self._turning_q], q[self._turning_q + 1] = np.cos(angle), np.sin(angle)
         self._pin.forwardKinematics(self._model, self._data, q)
         self._q = q
         self._here: dict[int, Any] = {}
