@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handtouch.cli import CONTROL, Command, add_endpoint, command, positive
+from handtouch.cli import CONTROL, LIVE, Command, add_endpoint, command, positive
 
 if TYPE_CHECKING:
     from handtouch.view import control
@@ -19,15 +21,7 @@ def add_control(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     _add_scene(commands)
     _asking(commands, "snapshot", _snapshot, "the whole hand as it is now")
 
-    calibrate = _asking(commands, "calibrate", _calibrate, "give a pad gains and offsets, under a name")
-    calibrate.add_argument("pad", help='pad, such as "left/index_distal"')
-    calibrate.add_argument("--name", required=True, help="of the calibration, as contacts will tell it")
-    calibrate.add_argument(
-        "--gains", type=float, nargs=4, metavar="G", default=[1.0] * 4, help="of the channels x0, xa, y0, yb"
-    )
-    calibrate.add_argument(
-        "--offsets", type=float, nargs=4, metavar="COUNTS", default=[0.0] * 4, help="what they read untouched"
-    )
+    _add_calibrate(commands)
 
     for name, text in (("disable", "switch pads off: no contacts, no power"), ("enable", "switch pads on")):
         switch = _asking(commands, name, _switch, text)
@@ -40,6 +34,58 @@ def add_control(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
     log = _asking(commands, "log", _log, "how much the daemon says")
     log.add_argument("level", choices=("debug", "info", "warning", "error"))
+
+
+def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    calibrate = _asking(
+        commands,
+        "calibrate",
+        _calibrate,
+        "find a pad's contact law by known weights (--weights), or give it a calibration (--name); with "
+        "neither, show what is in force",
+    )
+    calibrate.add_argument("pad", metavar="PAD", help='pad, such as "left/index_distal"')
+
+    guided = calibrate.add_argument_group("guided, by known weights")
+    guided.add_argument(
+        "--weights", metavar="LIST", help="such as 20,50,100,200,500; 200@4: on a radius of 4 mm"
+    )
+    guided.add_argument(
+        "--config", type=Path, metavar="FILE", help="deployment file that the daemon runs with"
+    )
+    guided.add_argument("--unit", choices=("gf", "n"), default="gf", help="of the weights (default: gf)")
+    guided.add_argument(
+        "--repeats", type=_count, default=3, metavar="N", help="times that each is read (default: 3)"
+    )
+    guided.add_argument(
+        "--radius-mm", type=positive, metavar="MM", help="of what they stand on (default: contact_radius_mm)"
+    )
+    guided.add_argument(
+        "--radius-std-mm", type=positive, metavar="MM", help="how sure that is (default: the file's, or 5 %%)"
+    )
+    guided.add_argument("--log", type=Path, metavar="FILE", help="record the readings")
+    guided.add_argument(
+        "--from", dest="from_file", type=Path, metavar="FILE", help="fit a recorded session anew"
+    )
+    guided.add_argument("--plot", type=Path, metavar="PNG", help="draw current against force")
+    guided.add_argument("--yes", action="store_true", help="put the law in force without asking")
+    guided.add_argument("--no-store", dest="store", action="store_false", help="only until the daemon ends")
+    guided.add_argument(
+        "--seconds", type=positive, default=60.0, metavar="S", help="wait so long for a weight (default: 60)"
+    )
+    guided.add_argument("--live", default=LIVE, help=f"live endpoint (default: {LIVE})")
+
+    direct = calibrate.add_argument_group("direct; what isn't given stays as it is")
+    direct.add_argument("--name", help="of the calibration, as contacts will tell it")
+    direct.add_argument("--gains", type=float, nargs=4, metavar="G", help="of the channels x0, xa, y0, yb")
+    direct.add_argument("--offsets", type=float, nargs=4, metavar="COUNTS", help="what they read untouched")
+    direct.add_argument(
+        "--law",
+        type=float,
+        nargs=3,
+        metavar=("K", "ALPHA", "OHM"),
+        help="contact_ohm_mm2, alpha and ohm_per_square, as in [sheet.NAME]",
+    )
 
 
 def _add_scene(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -99,11 +145,47 @@ def _snapshot(asked: argparse.Namespace) -> int:
 
 
 def _calibrate(asked: argparse.Namespace) -> int:
+    guided = asked.weights is not None or asked.from_file is not None
+    direct = {"gains": asked.gains, "offset_counts": asked.offsets, "law": asked.law}
+    given = {key: value for key, value in direct.items() if value is not None}
+    if wrong := _mixed(asked, guided, bool(given)):
+        print(f"handtouch calibrate: {wrong}", file=sys.stderr)
+        return 2
+    if guided:
+        return _guided(asked)
     from handtouch.view import control
 
-    return control.run_calibrate(
-        _to(asked), pad=asked.pad, name=asked.name, gains=asked.gains, offset_counts=asked.offsets
+    if asked.law is not None:
+        given["law"] = dict(zip(("contact_ohm_mm2", "alpha", "ohm_per_square"), asked.law, strict=True))
+    if asked.name is not None:
+        given["name"] = asked.name
+    return control.run_calibrate(_to(asked), pad=asked.pad, **given)
+
+
+def _mixed(asked: argparse.Namespace, guided: bool, given: bool) -> str:
+    """What doesn't go together, and the remedy; empty if all does."""
+    if guided and (given or asked.name is not None):
+        return "--weights and --from find a law, --name, --gains, --offsets and --law give one: take either"
+    if guided and asked.config is None:
+        return "--config FILE is missing: the deployment file that the daemon runs with"
+    if asked.weights is not None and asked.from_file is not None:
+        return "--weights reads new weights, --from takes recorded ones: take either"
+    if given and asked.name is None:
+        return "--name NAME is missing: contacts tell the calibration by it"
+    return ""
+
+
+def _guided(asked: argparse.Namespace) -> int:
+    from handtouch import calibrate
+
+    keys = ("pad", "config", "unit", "repeats", "radius_mm", "radius_std_mm", "log", "from_file", "plot")
+    options = calibrate.Options(
+        **{key: getattr(asked, key) for key in (*keys, "yes", "store")},
+        weights=asked.weights or "",
+        as_json=asked.json,
+        patience_s=asked.seconds,
     )
+    return calibrate.run(options, calibrate.Asked(asked.live, asked.endpoint, asked.key))
 
 
 def _switch(asked: argparse.Namespace) -> int:
@@ -134,3 +216,9 @@ def _to(asked: argparse.Namespace) -> control.Asking:
 
 def _listed(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 100:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, 1 to 100")
+    return int(text)

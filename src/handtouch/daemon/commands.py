@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError
 
 from handtouch import wire
 from handtouch.config import Deployment, Table
-from handtouch.config.tables import Name, Output, Wants
+from handtouch.config.tables import Output, Wants
 from handtouch.daemon.control import Command, Job, RefusedError, Reply
 from handtouch.daemon.logs import set_level
 from handtouch.daemon.pacer import Pacer
@@ -33,6 +33,7 @@ Patterns = Annotated[
     tuple[Annotated[str, Field(max_length=200)], ...], Field(strict=False, min_length=1, max_length=1000)
 ]
 Who = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=64)]
+Calibration = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
 Gain = Annotated[float, Field(ge=0.1, le=10)]
 Offset = Annotated[float, Field(ge=-1e9, le=1e9)]
 Resistance = Annotated[float, Field(ge=1e-3, le=1e12)]
@@ -68,7 +69,7 @@ class _Law(Table):
 
 class _Calibrate(Table):
     pad: Annotated[str, Field(max_length=200)]
-    name: Name | None = None
+    name: Calibration | None = None
     gains: Annotated[tuple[Gain, Gain, Gain, Gain], Field(strict=False)] | None = None
     offset_counts: Annotated[tuple[Offset, Offset, Offset, Offset], Field(strict=False)] | None = None
     law: _Law | None = None

@@ -81,14 +81,8 @@ def run_snapshot(to: Asking) -> int:
 
 
 def run_calibrate(to: Asking, **asked: Any) -> int:
-    """`handtouch calibrate`: give a pad gains and offsets under a name."""
-    return to.ask(
-        "calibrate",
-        lambda answer: [
-            f"{answer['hand']}/{answer['link']}: calibration {answer['now']}, was {answer['before']}"
-        ],
-        **asked,
-    )
+    """`handtouch calibrate`: give a pad gains, offsets or a law under a name; without them, show its own."""
+    return to.ask("calibrate", _calibrated, **asked)
 
 
 def run_switch(to: Asking, on: bool, pads: Sequence[str], name: str) -> int:
@@ -130,6 +124,18 @@ def _tared(pad: Answer) -> str:
         return f"{name}: not tared: {pad['reason']}"
     told = ", ".join(f"{offset:.1f}" for offset in offsets)
     return f"{name}: tared at {told} counts ({pad['samples']} samples)"
+
+
+def _calibrated(answer: Answer) -> Iterable[str]:
+    was = "" if answer["before"] == answer["now"] else f", was {answer['before']}"
+    yield f"{answer['hand']}/{answer['link']}: calibration {answer['now']}{was}"
+    law = answer["law"]
+    yield f"gains    {'  '.join(f'{gain:.5g}' for gain in answer['gains'])}"
+    yield f"offsets  {'  '.join(f'{offset:.1f}' for offset in answer['offset_counts'])} counts"
+    yield (
+        f"law      contact_ohm_mm2 {law['contact_ohm_mm2']:.5g}, alpha {law['alpha']:.4g}, "
+        f"ohm_per_square {law['ohm_per_square']:.5g}"
+    )
 
 
 def _snapshot(answer: Answer) -> Iterable[str]:
