@@ -15,16 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from handtouch import config
 from handtouch.canbus.channels import ELECTRODES, channels_of, in_order
 from handtouch.hand import mount_of
+from handtouch.sheet import SheetModel
 from handtouch.simulate import noise
-from handtouch.simulate.faults import Fault, StuckChannel
+from handtouch.simulate.faults import Fault, Gum, StuckChannel
+from handtouch.simulate.history import History
 from handtouch.simulate.pad import PadCircuit, Played
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.shape import Shape, shape_of
 from handtouch.simulate.sheet import Gaps, solve
-from handtouch.simulate.world import Parts, World
+from handtouch.simulate.world import Climate, Parts, World
 
 FloatArray = NDArray[np.float64]
 CountArray = NDArray[np.int64]
+_GAIN_PER_K = 0.01  # of an ideal sheet: that of the paper's
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,9 @@ class BuiltPad:
     """(4, 2)."""
     counts_per_ampere: FloatArray
     """(4,) of the channels x0, xa, y0, yb."""
+    climate: Climate
+    """Of this pad alone."""
+    model: SheetModel | None
     round_s: float
     """After this the scenario begins again; infinite: never."""
 
@@ -95,6 +101,8 @@ class BuiltPad:
             np.array(keys),
             limits,
             per_ampere,
+            Climate(world, [(hand, pad.link)]),
+            world.model(hand, pad.link),
             scenario.duration_s if scenario.repeat else np.inf,
         )
 
@@ -116,18 +124,56 @@ class BuiltPad:
             self._hold(fault, t, read)
         return read
 
-    def currents(self, times_s: FloatArray) -> FloatArray:
-        """Currents (n, 4) [A] that the wires of its electrodes bring to the amplifiers."""
+    def yields(self, times_s: FloatArray) -> FloatArray:
+        """Apparent over true force (n,): what the sheet makes of what presses on it."""
+        if self.history is None:
+            return np.asarray(1 + _GAIN_PER_K * self._warmer_k(times_s))
+        return self.history.yields(times_s)
+
+    @cached_property
+    def history(self) -> History | None:
+        """What its sheet goes through; None for an ideal sheet."""
+        if self.model is None:
+            return None
+        changes, settles, begins = self.touches.changes
+        gum = [fault.from_s for fault in self.faults if isinstance(fault, Gum)]
+        ends = [fault.until_s for fault in self.faults if isinstance(fault, Gum) and fault.until_s]
+        after = [from_s + step for from_s in gum for step in np.arange(0, 4, 0.05)]
+        return History(
+            self.model,
+            self.keys[0] + np.uint64(7),
+            self._load,
+            self._warmer_k,
+            np.concatenate([changes, after, ends]),
+            np.concatenate([settles, gum, ends]),
+            np.concatenate([begins, gum]),
+            self.round_s,
+        )
+
+    def _load(self, since_s: FloatArray) -> FloatArray:
+        """Total force (n,) [N] at times of a round."""
+        total = self.touches.contacts(since_s)[1].sum(0)
+        for fault in self.faults:
+            found = fault.contacts(since_s, self.circuit.size_m)
+            if found is not None and found.force_n is not None:
+                total += found.force_n
+        return np.asarray(total)
+
+    def _warmer_k(self, times_s: FloatArray) -> FloatArray:
         since = self._since(times_s)
-        return self.circuit.currents(since, self.touches, self.faults, np.ones(len(since)))
+        return np.asarray(
+            self.climate.warmer_k(times_s) + sum(fault.warmer_k(since) for fault in self.faults)
+        )
 
     def _read(self, times_s: FloatArray, faults: Sequence[Fault]) -> CountArray:
         since = self._since(times_s)
-        amperes = self.circuit.currents(since, self.touches, faults, np.ones(len(since)))
+        yields, drive = self.yields(times_s), self.climate.drive(times_s)
+        amperes = self.circuit.currents(since, self.touches, faults, yields, drive)
         for fault in faults:
             if order := fault.permutation:
                 amperes = np.where(fault.active(since)[:, None], amperes[:, order], amperes)
-        counts = amperes * self.counts_per_ampere
+        counts = amperes * self.counts_per_ampere * self.climate.gain(times_s)[:, None]
+        counts += self.climate.zero(times_s)[:, 0]
         for fault in faults:
             at = np.flatnonzero(fault.active(since))
             counts[at] = fault.signal(counts[at])

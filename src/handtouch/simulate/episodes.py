@@ -144,16 +144,23 @@ def _wet_object(draw: np.random.Generator, link: str, size: Size, duration_s: fl
     """Held, it cools the pad, and its water bridges the layers as long as it is there; then it dries soon."""
     touches = _grasp(draw, link, duration_s)
     held = max(touches, key=lambda touch: touch.duration_s)
-    times = {"link": link, "from_s": held.from_s, "until_s": held.until_s}
     wet = Moisture(
-        **times,
+        link=link,
+        from_s=held.from_s,
+        until_s=held.until_s,
         place=held.path[0],
         radius_mm=float(draw.uniform(0.15, 0.3)) * min(size),
         leak_ohm=float(np.exp(draw.uniform(math.log(2e4), math.log(2e5)))),
         grow_s=float(draw.uniform(2, 10)),
         dry_s=float(draw.uniform(2, 8)),
     )
-    cold = Heat(**times, warmer_by_k=float(draw.uniform(-15, -5)), time_s=float(draw.uniform(10, 40)))
+    cold = Heat(
+        link=link,
+        from_s=held.from_s,
+        until_s=held.until_s,
+        warmer_by_k=float(draw.uniform(-15, -5)),
+        time_s=float(draw.uniform(10, 40)),
+    )
     return Episode("wet_object", duration_s, _scenario(touches), (wet, cold))
 
 

@@ -26,7 +26,7 @@ from handtouch.simulate.pad import layer_ohm
 from handtouch.simulate.scenario import Pressing, Scenario
 from handtouch.simulate.sheet import SheetBank
 from handtouch.simulate.truth import Truth, Vector
-from handtouch.simulate.world import World
+from handtouch.simulate.world import Climate, World
 
 FloatArray = NDArray[np.float64]
 _QUANTISATION_VARIANCE = 1 / 12  # of a rounded count
@@ -60,6 +60,7 @@ class VirtualHand:
         self._gains = np.array([row.counts_per_ampere for row in self._rows])
         limits = np.array([row.limits for row in self._rows])
         self._low, self._high = limits[:, :, 0], limits[:, :, 1]
+        self._climate = Climate(world, [(row.hand, row.pad.link) for row in self._rows])
         self._special = [number for number, row in enumerate(self._rows) if not row.plain]
         self._contacts = [
             [
@@ -73,10 +74,14 @@ class VirtualHand:
     def sample(self, t_s: float) -> NDArray[np.int64]:
         """Counts (pads, 4) of the electrodes x0, xa, y0, yb, `t_s` after the start of the scenario."""
         counts = self._noise[:, None] * noise.normal(self._keys, round(t_s * 1e9))
+        gains, at = self._gains, np.array([t_s])
+        if not self._climate.steady:
+            counts += self._climate.zero(at)[0]
+            gains = gains * self._climate.gain(at) * self._climate.drive(at)
         if contacts := [contact for contact in self._at(t_s) if contact.row not in self._special]:
-            currents, _ = self._currents(contacts)
+            currents, _ = self._currents(contacts, t_s)
             rows = [contact.row for contact in contacts]
-            counts[rows] += currents * self._gains[rows]
+            counts[rows] += currents * gains[rows]
         read = np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
         for number in self._special:
             read[number] = self.counts(number, [t_s])[0]
@@ -93,7 +98,7 @@ class VirtualHand:
             return []
         return [
             self._truth(contact, currents, jacobian, t_ns)
-            for contact, currents, jacobian in zip(contacts, *self._currents(contacts), strict=True)
+            for contact, currents, jacobian in zip(contacts, *self._currents(contacts, t_s), strict=True)
         ]
 
     def _at(self, t_s: float) -> list[_Contact]:
@@ -103,12 +108,14 @@ class VirtualHand:
             for row, radius_m in self._contacts[pressing.touch]
         ]
 
-    def _currents(self, contacts: Sequence[_Contact]) -> tuple[FloatArray, FloatArray]:
+    def _currents(self, contacts: Sequence[_Contact], t_s: float) -> tuple[FloatArray, FloatArray]:
         """Currents (k, 4) [A] and their derivatives (k, 4, 3) by x and y [fractions of the pad] and total."""
         rows = np.array([contact.row for contact in contacts])
         x, y, force, radius = np.array(
             [(c.pressing.x, c.pressing.y, c.pressing.force_n, c.radius_m) for c in contacts]
         ).T
+        at = np.array([t_s])
+        force = force * [self._rows[row].yields(at)[0] for row in rows]
         values, slopes = self._bank.look_up(rows, x, y)
         shares, log_radius = values[:4].T, values[4]
         collected, total = self._electric.solve(rows, shares, log_radius, force, radius)

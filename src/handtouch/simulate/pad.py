@@ -27,6 +27,7 @@ from handtouch.simulate.sheet import Gaps, SheetBank, SheetMaps, mutual
 from handtouch.simulate.tear import beyond, torn
 
 FloatArray = NDArray[np.float64]
+_SILENT_N = 1e-6  # less is nothing, and would divide by nothing
 _EVEN_DISC = 0.25  # resistance of a disc that feeds its current evenly, beside ln(R / a), in rho / 2 pi
 
 
@@ -39,7 +40,7 @@ def layer_ohm(
     alpha: FloatArray | float,
 ) -> FloatArray:
     """rho / 2 pi times the first term of eq. 11: a disc's own resistance [ohm], layer and sheet under it."""
-    pressure = force_n / (math.pi * radius_m**2)
+    pressure = np.maximum(force_n, _SILENT_N) / (math.pi * radius_m**2)
     x = radius_m * np.sqrt(sheet_ohm / contact_ohm_m2 * (pressure / reference_pa) ** alpha)
     return np.asarray(sheet_ohm / (2 * math.pi) * i0e(x) / (x * i1e(x)))  # the scaling cancels
 
@@ -74,6 +75,16 @@ class Played:
     def depth(self) -> int:
         """The most touches at a time."""
         return len(self._lanes)
+
+    @property
+    def changes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times [s] at which the force is to be looked at; those after which a sheet has to settle, those at
+        which a touch begins."""
+        touches = [touch for lane in self._lanes for touch, _ in lane]
+        looked = [touch.knots() for touch in touches]
+        settles = [t for touch in touches for t in (touch.from_s, touch.from_s + touch.ramp_s, touch.until_s)]
+        begins = np.array([touch.from_s for touch in touches])
+        return np.concatenate([np.zeros(0), *looked]), np.array(settles), begins
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Places (depth, 2, n), forces (depth, n) [N], 0 where nothing presses, and radii (depth, n) [m]."""

@@ -108,6 +108,14 @@ class Touch(Table):
             plateau = levels[step] + np.diff(levels)[step] * _gentles(at - step)
         return np.asarray(_gentles(since / ramp) * _gentles(left / ramp) * plateau)
 
+    def knots(self) -> FloatArray:
+        """Times between which its force is nearly straight."""
+        ramp = min(self.ramp_s, self.duration_s / 2)
+        rise = ramp * np.linspace(0, 1, 9)
+        steps = 6 * (len(self.force_n) - 1) + 1
+        plateau = np.linspace(self.from_s + ramp, self.until_s - ramp, steps)
+        return np.concatenate([self.from_s + rise, plateau, self.until_s - rise])
+
     @cached_property
     def _lengths(self) -> list[float]:
         """Length of the path up to each way point."""
