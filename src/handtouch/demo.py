@@ -121,7 +121,9 @@ def in_process(deployment: Deployment) -> Deployment:
         for bus in deployment.buses
     )
     settings = dict.fromkeys(("live", "complete", "control", "inputs"), "tcp://127.0.0.1:*")
-    daemon = deployment.daemon.model_copy(update={**settings, "keys": None, "window": _WINDOW})
+    # simulated units have no place in the calibration store
+    alone = {**settings, "keys": None, "window": _WINDOW, "supervise": False}
+    daemon = deployment.daemon.model_copy(update=alone)
     return deployment.model_copy(update={"buses": buses, "daemon": daemon})
 
 

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from handtouch import wire
+
+DOUBTED = ("quarantined", "person")
+"""Trust in a pad whose calibration isn't its own."""
 
 
 def contact_line(contact: wire.Contact) -> str:
@@ -46,11 +51,24 @@ def health_line(health: wire.Health) -> str:
     serial = "" if health.serial is None else f" serial {health.serial}"
     why = f": {health.reason}" if health.reason else ""
     pace = " (event)" if health.pace == "event" else ""
+    if health.trust in DOUBTED:
+        pace += f" {health.trust}"
+    why += "".join(f"; {finding_text(finding)}" for finding in health.findings)
     return (
         f"{health.t_ns * 1e-9:14.4f}  health  {health.hand}/{health.link:<16}  {health.state:8} "
         f"node {health.node_id} on {health.bus} {health.node}{pace}{serial}, {health.rate_hz:.0f} Hz, "
         f"{health.missed} missed{why}"
     )
+
+
+def finding_text(finding: Mapping[str, Any]) -> str:
+    """What a supervisor found, why it thinks so and what helps, in a sentence; whatever keys are missing."""
+    where = finding.get("pad_m")
+    at = f" at ({1e3 * where[0]:.0f}, {1e3 * where[1]:.0f}) mm" if where else ""
+    size = f", {1e3 * finding['size_m']:.0f} mm across" if finding.get("size_m") else ""
+    evidence = f" ({finding['evidence']})" if finding.get("evidence") else ""
+    remedy = f": {finding['remedy']}" if finding.get("remedy") else ""
+    return f"{finding.get('cause') or finding.get('kind', '?')}{at}{size}{evidence}{remedy}"
 
 
 def line(message: wire.Message) -> str:

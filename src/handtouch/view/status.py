@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from handtouch.client import CONTROL, request
+from handtouch.view.lines import DOUBTED, finding_text
 from handtouch.view.scene import scene_lines
 
 _WIDE = 200
@@ -30,7 +31,32 @@ def run(*, endpoint: str = CONTROL, key: str | None = None, as_json: bool = Fals
         print(json.dumps(answer, indent=2))
     else:
         _show(answer, Console(width=None if sys.stdout.isatty() else _WIDE))
-    return 0 if all(pad["state"] in ("clear", "touched", "off") for pad in answer["pads"]) else 1
+    return 0 if all(map(_is_well, answer["pads"])) else 1
+
+
+def _is_well(pad: dict[str, Any]) -> bool:
+    return pad["state"] in ("clear", "touched", "off") and pad.get("trust") not in DOUBTED
+
+
+def _show_supervisor(answer: dict[str, Any], console: Console) -> None:
+    """How the slow half fares, and all that it found."""
+    figures = answer["service"].get("supervisor")
+    if figures is None:
+        return
+    lag = "" if figures["lag_s"] is None else f", {figures['lag_s']:.1f} s behind"
+    died = f" (died last: {figures['died_of']})" if figures["died_of"] else ""
+    process = "" if figures["pid"] is None else f", process {figures['pid']}"
+    console.print(
+        f"supervisor {figures['state']}{process}{lag}, {figures['restarts']} restarts{died}; "
+        f"units: {figures['word'] or 'not known yet'}",
+        highlight=False,
+    )
+    if figures["store"]:
+        console.print(f"calibration store: {figures['store']}", highlight=False, markup=False, style="red")
+    for pad in answer["pads"]:
+        for finding in pad.get("findings", ()):
+            text = f"{pad['hand']}/{pad['link']}: {finding_text(finding)}"
+            console.print(text, highlight=False, markup=False, style="yellow")
 
 
 def _show_loop(service: dict[str, Any], console: Console) -> None:
@@ -89,7 +115,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
     for pad in answer["pads"]:
         table.add_row(
             f"{pad['hand']}/{pad['link']}",
-            pad["state"],
+            pad["state"] + (f" ({pad['trust']})" if pad.get("trust") in DOUBTED else ""),
             pad["node"] + (" (event)" if pad["pace"] == "event" else ""),
             str(pad["node_id"]),
             "" if pad["serial"] is None else str(pad["serial"]),
@@ -100,3 +126,4 @@ def _show(answer: dict[str, Any], console: Console) -> None:
             "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]])),
         )
     console.print(table)
+    _show_supervisor(answer, console)

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from handtouch import wire
-from handtouch.view.lines import location_std_m, strength_text
+from handtouch.view.lines import DOUBTED, finding_text, location_std_m, strength_text
 
 _EVENTS = 6
 _FRAME_ROWS, _FRAME_COLUMNS = 2, 4
@@ -64,6 +64,7 @@ class HandView:
                 text = f"{self._name(message)}: pad {_pad_state(message)}, node {message.node}"
                 why = f": {message.reason}" if message.reason else ""
                 self._note(message.t_ns, text + why, _pad_state(message))
+            self._note_findings(before, message)
         elif isinstance(message, wire.Service):
             self._service = message
 
@@ -96,6 +97,14 @@ class HandView:
         self._contacts[key] = contact
         if contact.event == "begin":
             self._note(contact.t_ns, f"{self._name(contact)}: #{contact.id} begins", "touched")
+
+    def _note_findings(self, before: wire.Health | None, health: wire.Health) -> None:
+        known = {finding.get("kind") for finding in before.findings} if before else set()
+        for finding in health.findings:
+            if finding.get("kind") not in known:
+                self._note(health.t_ns, f"{self._name(health)}: {finding_text(finding)}", "stale")
+        if before and before.trust in DOUBTED and health.trust not in DOUBTED:
+            self._note(health.t_ns, f"{self._name(health)}: {health.trust} again", "clear")
 
     def _note(self, t_ns: int, text: str, state: str) -> None:
         self._events.append(
@@ -158,7 +167,8 @@ def _pad_state(health: wire.Health) -> str:
 
 def _pad(health: wire.Health, contact: wire.Contact | None) -> Text:
     state = "touched" if contact else _pad_state(health)
-    return Text(state, style=_STYLE_OF_STATE.get(state, ""))
+    doubted = health.trust in DOUBTED and state in _NO_NEWS
+    return Text(state, style="yellow" if doubted else _STYLE_OF_STATE.get(state, ""))
 
 
 def _node(health: wire.Health, _: wire.Contact | None) -> Text:

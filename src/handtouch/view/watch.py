@@ -73,7 +73,8 @@ class LineDisplay:
     def _is_news(self, message: wire.Message) -> bool:
         if isinstance(message, wire.Health):
             pad_state = "clear" if message.state == "touched" else message.state
-            state = (pad_state, message.node, message.reason, *message.emergencies)
+            kinds = tuple(str(finding.get("kind")) for finding in message.findings)
+            state = (pad_state, message.node, message.reason, message.trust, *kinds, *message.emergencies)
             pad = (message.hand, message.link)
             known, self._health[pad] = self._health.get(pad), state
             return state != known
