@@ -45,9 +45,19 @@ force_n = [2.0]
 
 
 class Rig:
-    """Starts `handtouch simulate` and `handtouch run` for a deployment, and subscribes to it."""
+    """Starts `handtouch simulate` and `handtouch run` for a deployment, and subscribes to it.
 
-    def __init__(self, folder: Path, endpoints: dict[str, str], prefix: list[str], bus: list[str]) -> None:
+    Without a supervisor unless that is what is tested: its process takes a second to start.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        endpoints: dict[str, str],
+        prefix: list[str],
+        bus: list[str],
+        supervise: bool = False,
+    ) -> None:
         self.folder = folder
         self.endpoints = endpoints
         self.bus = bus
@@ -57,6 +67,7 @@ class Rig:
         settings = "\n".join(f'{stream} = "{endpoint}"' for stream, endpoint in endpoints.items())
         text = shipped.path("utah_mit.toml").read_text()
         assert "[daemon]\n" in text
+        settings += f'\nsupervise = {str(supervise).lower()}\nstore = "calibrations.db"'
         text = text.replace("[daemon]\n", f"[daemon]\n{settings}\n")
         # slower than on a robot: a machine that tests other things too may not get round to it in 5 ms
         text, changed = re.subn(r"sync_period_ms = [\d.]+", f"sync_period_ms = {PERIOD_MS}", text)
