@@ -510,11 +510,9 @@ def served(tmp_path: Path) -> Iterator[tuple[Daemon, Path, Callable[..., Person]
     endpoints = "".join(
         f'{stream} = "tcp://127.0.0.1:*"\n' for stream in ("live", "complete", "control", "inputs")
     )
-    file.write_text(
-        TEXT.replace('channel = "none"', f'channel = "{channel}"').replace(
-            "[daemon]\n", f"[daemon]\n{endpoints}"
-        )
-    )
+    text = TEXT.replace('channel = "none"', f'channel = "{channel}"')
+    text = text.replace("[daemon]\n", f"[daemon]\n{endpoints}")
+    file.write_text(text.replace("store.db", str(tmp_path / "store.db")))
     stop = threading.Event()
     with can.Bus(interface="virtual", channel=channel) as wire, Daemon(config.load(file)) as daemon:
         nodes = DeviceBus(wire, sample)

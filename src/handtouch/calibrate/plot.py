@@ -62,6 +62,7 @@ def draw(path: Path, pad: str, fit: Fit, readings: Sequence[Reading], circuits: 
     Raises ImportError without matplotlib, OSError.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -80,12 +81,16 @@ def draw(path: Path, pad: str, fit: Fit, readings: Sequence[Reading], circuits: 
     right.legend(frameon=False, fontsize=9)
     for axes in (left, right):
         axes.grid(visible=True, which="both", color="#e4e4e4", linewidth=0.6)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
     sheet = f"sheet {law.ohm_per_square:.0f} Ω/sq" + ("" if fit.observed else " (the file's)")
     alpha = intervals["alpha"]
     figure.suptitle(
-        f"{pad}: k = {law.contact_ohm_mm2:.4g} Ω mm², alpha = {law.alpha:.3f} "
+        f"{pad}: k = {law.contact_ohm_mm2:.5g} Ω mm², alpha = {law.alpha:.3f} "
         f"({alpha.low:.2f} to {alpha.high:.2f}), {sheet}, scatter {fit.scatter:.1%} of the load",
         fontsize=11,
     )
@@ -99,7 +104,7 @@ def _current(
     grid = np.geomspace(force.min() / _BEYOND, force.max() * _BEYOND, 200)
     law, half = fit.band(grid, _middle(circuits), readings[0].weight.radius_m)
     axes.fill_between(grid, 1e3 * np.exp(law - half), 1e3 * np.exp(law + half), color=_BAND, alpha=0.2, lw=0)
-    axes.loglog(grid, 1e3 * np.exp(law), color=_FIT, label="law, with its 95 % band")
+    axes.loglog(grid, 1e3 * np.exp(law), color=_FIT, label=_once(axes, "law, with its 95 % band"))
     current = [1e3 * reading.current_a for reading in readings]
     axes.loglog(force, current, mark, color=_INK, markersize=5, fillstyle="none", label=label)
 
@@ -117,12 +122,18 @@ def _contact(
     grid = np.geomspace(force.min() / _BEYOND, force.max() * _BEYOND, 200)
     law, _ = fit.band(grid, circuit, readings[0].weight.radius_m)
     line = circuit.drive_v / np.exp(law) - _plane(fit, circuit, radius)
-    axes.loglog(grid, line / 1e3, color=_FIT, label=f"law, slope -{fit.law.alpha:.2f} where it is straight")
+    told = f"law, slope -{fit.law.alpha:.2f} where it is straight"
+    axes.loglog(grid, line / 1e3, color=_FIT, label=_once(axes, told))
     above = contact > 0
-    told = contact[above] / 1e3
-    axes.loglog(force[above], told, mark, color=_INK, markersize=5, fillstyle="none", label=label)
+    kiloohm = contact[above] / 1e3
+    axes.loglog(force[above], kiloohm, mark, color=_INK, markersize=5, fillstyle="none", label=label)
     if lost := int((contact <= 0).sum()):
         axes.text(0.03, 0.03, f"{lost} readings lie below the plane", transform=axes.transAxes, color=_FAINT)
+
+
+def _once(axes: Axes, label: str) -> str:
+    """The label, or none where it is there already."""
+    return "_" if label in axes.get_legend_handles_labels()[1] else label
 
 
 def _plane(fit: Fit, circuit: Circuit, radius_m: float) -> float:
