@@ -76,10 +76,18 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     simulate = command(commands, "simulate", _simulate, "simulated nodes for a deployment, on its real buses")
     _add_config(simulate)
     _add_bus(simulate)
-    simulate.add_argument("--scenario", type=Path, help="touches to play (default: a tour over the pads)")
+    simulate.add_argument(
+        "--scenario", type=Path, help="touches, faults and swaps to play (default: the session, or a tour)"
+    )
     simulate.add_argument("--truth", type=Path, help="write what really happened to this file, as JSON lines")
     simulate.add_argument("--seconds", type=positive, help="end after so long (default: on Ctrl-C)")
     simulate.add_argument("--tolerances", action="store_true", help="tolerances of parts besides the noise")
+    simulate.add_argument(
+        "--sheet", choices=("S1", "S2"), help="sheets that creep and fade as this one of the paper"
+    )
+    simulate.add_argument(
+        "--drift", action="store_true", help="zeros, temperature and supply that wander slowly"
+    )
     simulate.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
 
 
@@ -293,12 +301,13 @@ def _simulate(asked: argparse.Namespace) -> int:
     from handtouch.simulate import run as simulate
     from handtouch.simulate.world import World
 
+    world = World.named(asked.seed, tolerances=asked.tolerances, sheet=asked.sheet, drift=asked.drift)
     return simulate.run(
         asked.config,
         buses=tuple(asked.bus),
         scenario=asked.scenario,
         truth=asked.truth,
-        world=World(seed=asked.seed) if asked.tolerances else World.ideal_parts(asked.seed),
+        world=world,
         seconds=asked.seconds,
     )
 

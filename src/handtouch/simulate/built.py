@@ -49,6 +49,8 @@ class BuiltPad:
     """(4, 2)."""
     counts_per_ampere: FloatArray
     """(4,) of the channels x0, xa, y0, yb."""
+    swapped: tuple[tuple[float, FloatArray], ...]
+    """When another unit was put in [s], and its gains (4,) relative to those of the first one."""
     climate: Climate
     """Of this pad alone."""
     model: SheetModel | None
@@ -101,6 +103,11 @@ class BuiltPad:
             np.array(keys),
             limits,
             per_ampere,
+            tuple(
+                (swap.at_s, np.array(swap.gain or world.gain_of(swap.serial)) / np.array(parts.gain))
+                for swap in sorted(scenario.swaps, key=lambda swap: swap.at_s)
+                if swap.link == pad.link
+            ),
             Climate(world, [(hand, pad.link)]),
             world.model(hand, pad.link),
             scenario.duration_s if scenario.repeat else np.inf,
@@ -114,7 +121,7 @@ class BuiltPad:
     @property
     def plain(self) -> bool:
         """Whether it has never more than one contact, and nothing wrong with it."""
-        return not self.faults and self.touches.depth <= 1
+        return not (self.faults or self.swapped) and self.touches.depth <= 1
 
     def counts(self, times_s: ArrayLike) -> CountArray:
         """Counts (n, 4) of the electrodes x0, xa, y0, yb at times (n,) from the start of the scenario."""
@@ -173,6 +180,9 @@ class BuiltPad:
             if order := fault.permutation:
                 amperes = np.where(fault.active(since)[:, None], amperes[:, order], amperes)
         counts = amperes * self.counts_per_ampere * self.climate.gain(times_s)[:, None]
+        for from_s, gains in self.swapped:
+            later = [at_s for at_s, _ in self.swapped if at_s > from_s]
+            counts[(times_s >= from_s) & (times_s < min(later, default=np.inf))] *= gains
         counts += self.climate.zero(times_s)[:, 0]
         for fault in faults:
             at = np.flatnonzero(fault.active(since))

@@ -91,6 +91,12 @@ class VirtualHand:
         """Counts (n, 4) of one pad at times (n,): those that `sample` gives, many at once."""
         return self._rows[pad_row].counts(times_s)
 
+    def switch(self, pad_row: int, t_s: float, on: bool) -> None:
+        """A pad's potential goes on or off at `t_s`, later than any switch before: without it, its sheet
+        recovers. On from the start."""
+        if history := self._rows[pad_row].history:
+            history.switch(t_s, on)
+
     def truth(self, t_s: float, t_ns: int = 0) -> list[Truth]:
         """The contacts of the sample at `t_s`; `t_ns` is the host's time of it."""
         contacts = self._at(t_s)

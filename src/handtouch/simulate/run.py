@@ -27,7 +27,7 @@ from handtouch.canbus.port import BusError, open_bus
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.hand import VirtualHand
-from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.scenario import Scenario, Swap
 from handtouch.simulate.truth import Truth
 from handtouch.simulate.world import World
 
@@ -69,7 +69,7 @@ class SimulatedHand:
             for bus, virtual in zip(buses, virtuals, strict=True):
                 wire = open_bus(bus)
                 opened.callback(wire.shutdown)
-                stages.append(_Stage(deployment, bus.name, wire, virtual, start, record))
+                stages.append(_Stage(deployment, bus.name, wire, virtual, start, record, scenario.swaps))
             return cls(stages, opened.pop_all())
 
     def start(self) -> None:
@@ -134,6 +134,7 @@ class _Stage:
         virtual: VirtualHand,
         start: _Start,
         record: bool,
+        swaps: Sequence[Swap],
     ) -> None:
         self.name = name
         self.times_ns: deque[int] = deque()
@@ -153,6 +154,13 @@ class _Stage:
             )
             device.wired = tuple(map(ELECTRODES.index, pad.electrodes))
             self.devices[f"{hand}/{pad.link}"] = device
+        self._excited = [True] * len(virtual.pads)
+        self._swaps = [
+            (swap.at_s, swap.serial, self.devices[f"{hand}/{pad.link}"])
+            for swap in sorted(swaps, key=lambda swap: swap.at_s)
+            for hand, pad in virtual.pads
+            if pad.link == swap.link
+        ]
 
     def truth(self, times_ns: Sequence[int]) -> list[Truth]:
         return [
@@ -165,7 +173,19 @@ class _Stage:
     def _sample(self, t_ns: int) -> NDArray[np.int64]:
         if self._record:
             self.times_ns.append(t_ns)
-        return self._virtual.sample(self._start.since_s(t_ns))
+        since_s = self._start.since_s(t_ns)
+        self._handle(since_s)
+        return self._virtual.sample(since_s)
+
+    def _handle(self, since_s: float) -> None:
+        """Swap the nodes whose time has come, and tell the sheets of potentials that went on or off."""
+        while self._swaps and since_s >= self._swaps[0][0]:
+            _, serial, device = self._swaps.pop(0)
+            device.swap(serial)
+        for row, device in enumerate(self.devices.values()):
+            if device.excited != self._excited[row]:
+                self._excited[row] = device.excited
+                self._virtual.switch(row, since_s, device.excited)
 
 
 def run(

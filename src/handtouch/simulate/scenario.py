@@ -1,6 +1,6 @@
 """Scenario file (TOML) -> frozen, checked touches on links: where, when and how hard.
 
-Public names: `Scenario`, `Touch`, `Pressing`. Mistakes are reported as in a deployment file.
+Public names: `Scenario`, `Touch`, `Swap`, `Pressing`. Mistakes are reported as in a deployment file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError
 
 from handtouch.config import Deployment
 from handtouch.config.problems import ConfigError, Problem, problems_of
-from handtouch.config.tables import Name, Positive, Table
+from handtouch.config.tables import Four, Name, Positive, Table, Unsigned32
 from handtouch.simulate.faults import FAULTS, INFLUENCES, Acting
 
 FloatArray = NDArray[np.float64]
@@ -122,12 +122,26 @@ class Touch(Table):
         return [0.0, *itertools.accumulate(math.dist(a, b) for a, b in itertools.pairwise(self.path))]
 
 
+class Swap(Table):
+    """`[[swap]]`: a pad's node is taken out and another unit put in."""
+
+    link: Name = Field(description="link whose pad gets another node")
+    at_s: float = Field(ge=0, description="when, from the start; once, also where the scenario repeats")
+    serial: Unsigned32 = Field(description="serial number of the new one")
+    gain: Four | None = Field(
+        None, description="gains of its channels, relative to what is configured; left out: drawn by serial"
+    )
+
+
 class Scenario(Table):
     """What happens to a hand; after the last touch it ends, or begins again after `pause_s`."""
 
     touches: Annotated[tuple[Touch, ...], Field(strict=False, min_length=1)] = Field(alias="touch")
     faults: Annotated[tuple[Acting, ...], Field(strict=False)] = Field(
         (), alias="fault", description="what is wrong with pads, and when"
+    )
+    swaps: Annotated[tuple[Swap, ...], Field(strict=False)] = Field(
+        (), alias="swap", description="nodes that are replaced, and when"
     )
     repeat: bool = Field(False, description="whether it begins again when it has ended")
     pause_s: float = Field(1.0, ge=0, description="time after the last touch, before it ends or begins again")
@@ -153,7 +167,9 @@ class Scenario(Table):
         try:
             scenario = cls.model_validate(raw)
         except ValidationError as error:
-            raise ConfigError(file, problems_of(raw, error, {"": cls, "touch": Touch}, _KINDS)) from error
+            raise ConfigError(
+                file, problems_of(raw, error, {"": cls, "touch": Touch, "swap": Swap}, _KINDS)
+            ) from error
         return scenario
 
     @classmethod
@@ -188,7 +204,7 @@ class Scenario(Table):
         ]
 
     def check_links(self, links: Iterable[str], file: str = "scenario") -> None:
-        """Raise ConfigError for a touch or a fault on a link that carries no pad."""
+        """Raise ConfigError for a touch, fault or swap on a link that carries no pad."""
         known = sorted(set(links))
         problems = [
             Problem(
@@ -196,7 +212,7 @@ class Scenario(Table):
                 f' = "{entry.link}"',
                 f"carries no pad; pads: {', '.join(known)}",
             )
-            for table, entries in (("touch", self.touches), ("fault", self.faults))
+            for table, entries in (("touch", self.touches), ("fault", self.faults), ("swap", self.swaps))
             for number, entry in enumerate(entries, 1)
             if entry.link not in known
         ]

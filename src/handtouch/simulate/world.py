@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.canbus.channels import ELECTRODES
-from handtouch.sheet import S2, SheetModel
+from handtouch.sheet import S1, S2, SheetModel
 from handtouch.simulate import noise
 
 FloatArray = NDArray[np.float64]
@@ -85,12 +85,27 @@ class World:
         before, after = gaps
         return Parts(_four(gain), _four(series), _four(before), _four(after))
 
+    def gain_of(self, serial: int) -> Four:
+        """Gains of the channels of a unit that is put in instead of another."""
+        drawn = np.random.default_rng((self.seed, serial, 1)).uniform(-1, 1, 4)
+        return _four(1 + self.gain_tolerance * drawn)
+
     @classmethod
     def drifting(cls, seed: int = 1, sheet: SheetModel = S2) -> World:
         """Parts with tolerances, real sheets, and electronics that drift: an ordinary day."""
-        return cls(
-            seed,
-            sheet=sheet,
+        return cls(seed, sheet=sheet)._with_drift()
+
+    @classmethod
+    def named(cls, seed: int, *, tolerances: bool, sheet: str | None, drift: bool) -> World:
+        """As the command line has it; a sheet by its name, S1 or S2."""
+        world = cls(seed) if tolerances else cls.ideal_parts(seed)
+        if sheet:
+            world = replace(world, sheet={"S1": S1, "S2": S2}[sheet])
+        return world._with_drift() if drift else world
+
+    def _with_drift(self) -> World:
+        return replace(
+            self,
             drift_counts_per_s=0.05,
             warmth_k_per_s=0.01,
             offset_counts_per_k=2.0,

@@ -192,6 +192,11 @@ class Device(Switches):
         return self._excited_at is None or self._bus.number - self._excited_at > inputs.SETTLE_SAMPLES
 
     @property
+    def excited(self) -> bool:
+        """Whether its pad is under potential."""
+        return self.plugged and self._excited_at is not None
+
+    @property
     def undisturbed(self) -> bool:
         """Whether its TPDOs carry what the sampler gives, unchanged."""
         straight = self.settled and self._excited_at is not None and tuple(self.wired) == inputs.STRAIGHT
