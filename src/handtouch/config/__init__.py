@@ -7,6 +7,7 @@ Keys carry their unit (`width_mm`, `sync_period_ms`); the objects keep the units
 
 from __future__ import annotations
 
+import contextlib
 import re
 import tomllib
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from handtouch import shipped
 from handtouch.config.checks import problems_in
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.tables import (
@@ -92,7 +94,7 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
         for name, node in deployment.nodes.items()
     }
     hands = tuple(
-        hand.model_copy(update={"urdf": str((folder or Path()) / hand.urdf)}) if hand.urdf else hand
+        hand.model_copy(update={"urdf": _found(hand.urdf, folder or Path())}) if hand.urdf else hand
         for hand in deployment.hands
     )
     daemon = deployment.daemon
@@ -142,6 +144,14 @@ def json_schema() -> dict[str, Any]:
         **schema,
         "title": "handtouch deployment",
     }
+
+
+def _found(name: str, folder: Path) -> str:
+    """Path of a file beside the deployment, or of a shipped one: copies of a deployment leave it behind."""
+    if not (folder / name).is_file() and Path(name).name == name:
+        with contextlib.suppress(FileNotFoundError):
+            return str(shipped.path(name))
+    return str(folder / name)
 
 
 def _checked(deployment: Deployment, file: str) -> Deployment:

@@ -264,7 +264,7 @@ class Hand(Table):
     urdf: str | None = Field(
         None,
         min_length=1,
-        description="the robot's description, beside this file; left out: no palm or base frame",
+        description="the robot's description, beside this file or shipped; left out: no palm or base frame",
     )
     palm_link: str | None = Field(
         None, min_length=1, description="link of the URDF whose frame is the palm's; left out: its root"
