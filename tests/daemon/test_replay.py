@@ -76,7 +76,8 @@ def test_other_formats_of_python_can_give_the_same_touches(
     got: list[Contact] = []
     replay(copy, deployment, got.append)
     assert Counter((c.link, c.event) for c in got) == Counter((c.link, c.event) for c in session[0])
-    assert [c.position_m for c in got] == [c.position_m for c in session[0]]
+    for one, other in zip(got, session[0], strict=True):  # some round their stamps
+        assert one.position_m == pytest.approx(other.position_m, abs=1e-6)
 
 
 def test_a_log_that_is_none_is_named_with_what_can_be_read(deployment: Deployment, tmp_path: Path) -> None:

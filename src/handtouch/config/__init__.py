@@ -21,6 +21,7 @@ from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.tables import (
     SURFACES,
     TABLES,
+    Behaviour,
     Bus,
     Cone,
     Cylinder,
@@ -39,6 +40,7 @@ from handtouch.config.tables import (
 )
 
 __all__ = [
+    "Behaviour",
     "Bus",
     "Cone",
     "ConfigError",

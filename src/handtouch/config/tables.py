@@ -154,6 +154,48 @@ class Node(Table):
     )
 
 
+class Behaviour(Table):
+    """`[sheet.NAME.behaviour]`: how a sheet creeps, adapts and remembers, to be undone; left out: it doesn't."""
+
+    preset: Literal["S1", "S2"] = Field(
+        "S1", description="sheet of the paper that it is like; keys below that are left out are that one's"
+    )
+    adaptation_share: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        None, description="part of a lasting load that it gets used to"
+    )
+    adaptation_time_s: Positive | None = Field(None, description="time constant of that, under load")
+    recovery_time_s: Positive | None = Field(
+        None, description="time constant of recovering, without potential"
+    )
+    fatigue_s: Positive | None = Field(
+        None, description="time under load in its life after which it adapts twice as fast"
+    )
+    threshold_n: NonNegative | None = Field(None, description="least force that it feels")
+    creep_share: Annotated[float, Field(ge=0, lt=1)] | None = Field(
+        None, description="part of a reading that comes late"
+    )
+    creep_time_s: Positive | None = Field(None, description="time constant of that")
+    loop: Annotated[float, Field(ge=0, lt=0.4)] = Field(
+        0.0, description="width of its hysteresis loop half-way to loop_full_n, as a part of that; 0: none"
+    )
+    loop_full_n: Positive = Field(5.0, description="load up to which that loop was measured")
+    press_std: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        None, description="relative spread of the readings of equal presses (1 sigma)"
+    )
+    gain_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.05, description="relative error of forces on a fresh sheet, the same for all presses (1 sigma)"
+    )
+    doubt: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.2, description="relative error of these numbers of creep, adaptation and hysteresis (1 sigma)"
+    )
+    silence_s: Positive = Field(
+        600.0, description="time untouched after which what it got used to may as well be forgotten"
+    )
+    history_std_n: NonNegative = Field(
+        0.1, description="what it may have got used to before the daemon started (1 sigma)"
+    )
+
+
 class Sheet(Table):
     """`[sheet.NAME]`: a resistive sandwich with its contact law, k / pressure^alpha (paper eq. 12)."""
 
@@ -164,6 +206,9 @@ class Sheet(Table):
     contact_radius_mm: Positive = Field(description="radius assumed for a contact")
     contact_radius_std_mm: NonNegative = Field(
         description="how far from that a contact's radius may be (1 sigma)"
+    )
+    behaviour: Behaviour | None = Field(
+        None, description="how it creeps, adapts and remembers; left out: its readings are taken as they are"
     )
 
 
@@ -232,6 +277,11 @@ class Touch(Table):
     off_n: Positive = Field(0.03, description="and ends below this one")
     begin_samples: int = Field(2, ge=1, le=100, description="samples in a row above on_n before it begins")
     end_samples: int = Field(2, ge=1, le=100, description="samples in a row below off_n before it ends")
+    slow_touch_s: Positive = Field(
+        20.0,
+        description="what takes longer to rise to off_n is no touch but drift, and followed; less: faster "
+        "drift is followed, and more slow touches are missed",
+    )
 
 
 class Pad(Table):
@@ -342,6 +392,7 @@ TABLES: dict[str, type[Table]] = {
     "node.*": Node,
     "node.*.idle": Idle,
     "sheet.*": Sheet,
+    "sheet.*.behaviour": Behaviour,
     "touch": Touch,
     "hand": Hand,
     "hand.pad": Pad,

@@ -192,21 +192,22 @@ class Commands:
             "now": model.calibration[pad],
             "nominal": model.nominal[pad],
             "gains": model.gains[pad].tolist(),
-            "offset_counts": model.offset_counts[pad].tolist(),
+            "offset_counts": self._pipeline.tick.baseline.expected[pad].tolist(),
             "law": {key: getattr(law, key) for key in _Law.model_fields},
         }
 
     def _put(self, pad: int, asked: _Calibrate, name: str) -> None:
         model = self._pipeline.model
-        offsets = model.offset_counts[pad] if asked.offset_counts is None else np.array(asked.offset_counts)
-        largest = float(model.largest_counts[pad]) / 2
-        if np.abs(offsets).max() > largest:
-            raise RefusedError(f"offset_counts = {offsets.tolist()}: beyond half the range, {largest:.0f}")
+        offsets, largest = asked.offset_counts, float(model.largest_counts[pad]) / 2
+        if offsets is not None and max(map(abs, offsets)) > largest:
+            raise RefusedError(f"offset_counts = {list(offsets)}: beyond half the range, {largest:.0f}")
         law = model.laws[pad]
         if asked.law is not None:
             law = Law(**asked.law.model_dump(), covariance=((0.0,) * 3,) * 3)
-        model.calibrate(pad, model.gains[pad] if asked.gains is None else asked.gains, offsets, name, law)
+        model.calibrate(pad, model.gains[pad] if asked.gains is None else asked.gains, name, law)
         self._pipeline.adopt(model, np.array([pad]))
+        if offsets is not None:
+            self._pipeline.tick.assume(pad, offsets)
 
     def _disable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
         asked = _checked(_Switch, arguments)
@@ -243,6 +244,8 @@ class Commands:
         if fresh.deployment.daemon.log_level != self.deployment.daemon.log_level:
             set_level(fresh.deployment.daemon.log_level)
         self.deployment = fresh.deployment
+        if self._report.supervisor is not None and fresh.pads:
+            self._report.supervisor.adopt(fresh.deployment, time.monotonic_ns())
         self._pipeline.journal.serve(fresh.deployment, now_ns=time.monotonic_ns())
         self._demand.scenes.set_file(fresh.deployment.scene)
         self._pacer.set_idle(fresh.deployment.scene)

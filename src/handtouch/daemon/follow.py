@@ -134,6 +134,11 @@ class Follower:
         residual_std = np.sqrt(((by_current * self._model.noise_a[pads]) ** 2).sum(axis=1))
         return Solved(covariance_m2, *strength, residual_std)
 
+    def force_slopes(self, pads: IntArray) -> FloatArray:
+        """Change of the force (k,) with the relative change of the total, where the maps were drawn [N]."""
+        row = self._maps[pads, _TRUST + FORCE]
+        return np.asarray(row[:, 5] + 2 * row[:, 6])
+
     # Details: each fills its rows of `values` and of `by_place`, their change per reach along x and y -------
 
     def _place(

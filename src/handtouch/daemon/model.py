@@ -18,6 +18,7 @@ from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.strength import ContactLaw, Strength
 from handtouch.hand import Placement, mount_of, network_of, surface_of
 from handtouch.supervise.calibration import Calibration, Law
+from handtouch.supervise.strength import SheetBehaviour, behaviour_of
 
 FloatArray = NDArray[np.float64]
 
@@ -26,14 +27,14 @@ class PadModel:
     """Columns of the n pads of a deployment, in its order; the same order as the slab's.
 
     `hands`, `links`, `frames` (links of the URDF) and `calibration` (n,) are names; `rows_of_hand`;
-    `ampere_per_count` (n, 4) of the electrodes x0, xa, y0, yb, their noise as `noise_counts` (n,) and
-    `noise_a` (n, 4), what they read untouched as `offset_counts` and `offset_a` (n, 4), zero unless `tared`;
-    `gains` (n, 4) are in `ampere_per_count`,
+    `ampere_per_count` (n, 4) of the electrodes x0, xa, y0, yb, their noise as `noise_counts` (n,) and `noise_a` (n, 4); `gains` (n, 4) are in
+    `ampere_per_count` (what channels read untouched is followed by the tick: `Tick.baseline`),
     `gain_covariance` (n, 4, 4) is that of their logarithms, `quarantined` (n,): no force is told;
     `laws` (n,) are those that a calibration has put in the place of the file's, else None;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
-    middle of the pad; `begin_samples`, `end_samples`. `locator` finds contacts, `placement` puts them on
-    their links, `force` weighs them.
+    middle of the pad; `begin_samples`, `end_samples`; `slow_touch_s`: what takes longer to reach `off_n` is
+    drift; `behaviours` (n,): how sheets creep, adapt and remember, None where that isn't modelled. `locator`
+    finds contacts, `placement` puts them on their links, `force` weighs them.
     """
 
     def __init__(self, deployment: Deployment) -> None:
@@ -62,13 +63,13 @@ class PadModel:
         self.gain_covariance = np.zeros((self.size, 4, 4))
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
         self.doubted = False
-        self.offset_counts = np.zeros((self.size, 4))
-        self.offset_a = np.zeros((self.size, 4))
-        self.tared = False
         self.on_n = np.array([touch.on_n for touch in touches])
         self.off_n = np.array([touch.off_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
         self.end_samples = np.array([touch.end_samples for touch in touches])
+        self.slow_touch_s = np.array([touch.slow_touch_s for touch in touches])
+        kinds_of_sheet = {name: _behaviour(sheet) for name, sheet in deployment.sheets.items()}
+        self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]
         networks = _networks(pads, sheets)
         full_scale_a = np.array([node.full_scale_ma * 1e-3 for node in nodes])
         finest = float((self.noise_a.min(axis=1) / full_scale_a).min())  # noise of the strongest contact
@@ -91,18 +92,15 @@ class PadModel:
         self.on_a, self.off_a = (self._threshold(force) for force in (self.on_n, self.off_n))
 
     def apply(self, pad: int, calibration: Calibration, name: str) -> None:
-        """Take over what is known of the unit of a pad, all of it but the state of its sheet.
+        """Take over the gains and the law of the unit of a pad; offsets are for `Tick.baseline`.
 
         What isn't known is as the deployment file says.
         """
         gains = calibration.gains.factors if calibration.gains else (1.0,) * 4
-        offsets = calibration.offsets.counts if calibration.offsets else (0.0,) * 4
-        self.calibrate(pad, gains, offsets, name, calibration.law)
+        self.calibrate(pad, gains, name, calibration.law)
 
-    def calibrate(
-        self, pad: int, gains: ArrayLike, offset_counts: ArrayLike, name: str, law: Law | None = None
-    ) -> None:
-        """Correct the channels x0, xa, y0, yb of a pad: offsets off, then times gains; tell it by `name`.
+    def calibrate(self, pad: int, gains: ArrayLike, name: str, law: Law | None = None) -> None:
+        """Multiply the currents of the channels x0, xa, y0, yb of a pad by gains; tell it by `name`.
 
         `law` weighs its contacts, None: the file's. Where series resistors shape the currents, locations go
         on with the file's sheet resistance.
@@ -113,7 +111,16 @@ class PadModel:
         self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
         self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
         self.calibration[pad] = name
-        self.tare(pad, offset_counts)
+
+    @property
+    def on_counts(self) -> FloatArray:
+        """(n,) sum of the channels that begins a contact."""
+        return np.asarray(self.on_a / self.ampere_per_count.mean(axis=1))
+
+    @property
+    def off_counts(self) -> FloatArray:
+        """(n,) sum of the channels that ends it."""
+        return np.asarray(self.off_a / self.ampere_per_count.mean(axis=1))
 
     def law(self, pad: int) -> Law:
         """What weighs the contacts of a pad: the law of its calibration, or the file's."""
@@ -125,18 +132,12 @@ class PadModel:
         self.quarantined[pad] = quarantined
         self.doubted = bool(self.gain_covariance.any() or self.quarantined.any())
 
-    def tare(self, pad: int, offset_counts: ArrayLike) -> None:
-        """What the channels (4,) of a pad read that nothing touches."""
-        self.offset_counts[pad] = offset_counts
-        self.offset_a[pad] = self.offset_counts[pad] * self.ampere_per_count[pad]
-        self.tared = bool(self.offset_counts.any())
-
     def take_over(self, other: PadModel) -> None:
         """Correct all pads as the model did that this one replaces."""
         for pad in range(self.size):
             corrected = bool((other.gains[pad] != 1).any()) or other.calibration[pad] != other.nominal[pad]
             name = other.calibration[pad] if corrected else self.calibration[pad]
-            self.calibrate(pad, other.gains[pad], other.offset_counts[pad], name, other.laws[pad])
+            self.calibrate(pad, other.gains[pad], name, other.laws[pad])
 
     def force(
         self,
@@ -189,6 +190,10 @@ class PadModel:
     def _threshold(self, force_n: FloatArray) -> FloatArray:
         """Total current of a contact of that force in the middle of each pad."""
         return self._law.current(force_n, self._drive_v, self._sheet_ohm, *self._middle)
+
+
+def _behaviour(sheet: config.Sheet) -> SheetBehaviour | None:
+    return behaviour_of(sheet.behaviour) if sheet.behaviour else None
 
 
 def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:

@@ -57,7 +57,7 @@ class Tare:
 
     def _finish(self, pad: int, model: PadModel) -> dict[str, Any]:
         hand, link = self._names[pad]
-        before = model.offset_counts[pad].copy()
+        before = self._tick.baseline.expected[pad].copy()
         told = {
             "hand": hand,
             "link": link,
@@ -75,7 +75,7 @@ class Tare:
         told |= {"mean_counts": mean.tolist(), "std_counts": std.tolist()}
         if why := self._trouble(pad, model, mean, std):
             return {**told, "tared": False, "reason": why}
-        model.tare(pad, mean)
+        self._tick.assume(pad, mean, std / np.sqrt(count))
         self._tick.forget(np.array([pad]))
         return {**told, "tared": True, "reason": "", "offset_counts": mean.tolist()}
 
@@ -91,8 +91,9 @@ class Tare:
                 "something moves on it or disturbs it"
             )
         # whatever adds up to less than what ends a contact could be no contact that is to be kept
-        drift = model.off_a[pad] / model.ampere_per_count[pad].mean()
-        moved, allowed = np.abs(mean - model.offset_counts[pad]).sum(), drift + _OFF * noise
+        baseline = self._tick.baseline
+        moved = np.abs(mean - baseline.expected[pad]).sum()
+        allowed = model.off_counts[pad] + _OFF * np.hypot(noise, baseline.std[pad])
         if moved > allowed:
             return (
                 f"its channels are {moved:.0f} counts from their baseline, noise and drift explain "

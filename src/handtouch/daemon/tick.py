@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from handtouch.canbus.slab import Slab
 from handtouch.daemon.contacts import BoolArray, Contacts, IntArray
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.follow import FORCE, NEAR, NORMAL, PAD, POSITION, RESIDUAL, VALUES, XY, Follower, Solved
 from handtouch.daemon.model import PadModel
+from handtouch.supervise.baseline import Baseline
+from handtouch.supervise.strength import ForceReference, SheetStrength, StrengthState
 from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
@@ -27,6 +29,7 @@ _SOURCE_STD, _SOURCE_PART = 10.0, 0.02
 _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
     int, (PadState.CLEAR, PadState.TOUCHED, PadState.STALE, PadState.FAULTED)
 )
+_INVALID = int(StrengthState.INVALID)
 _FOREVER_NS = np.iinfo(np.int64).max
 LOCATED = np.dtype(
     [
@@ -71,9 +74,11 @@ class Columns:
     residual: FloatArray
     force_n: FloatArray
     """NaN where there is no valid strength, a lower bound where it is saturated"""
+    raw_force_n: FloatArray
+    """as the contact law has it, before the sheet's behaviour is undone"""
+    force_std_n: FloatArray
     covariance_m2: FloatArray
     """(n, 3, 3); this and the following are of the contact's last solution"""
-    force_std_n: FloatArray
     saturated: NDArray[np.bool_]
     residual_std: FloatArray
     """of a point contact, from the noise of the channels"""
@@ -99,8 +104,9 @@ class Columns:
             pad_m=values[:, PAD],
             residual=values[:, RESIDUAL],
             force_n=values[:, FORCE],
-            covariance_m2=unknown(3, 3),
+            raw_force_n=unknown(),
             force_std_n=unknown(),
+            covariance_m2=unknown(3, 3),
             saturated=np.zeros(n, dtype=np.bool_),
             residual_std=unknown(),
             located=np.full((n, LOCATED.itemsize // 4), np.nan, dtype="<f4").view(LOCATED)[:, 0],
@@ -140,6 +146,16 @@ class Tick:
         """pads whose contacts are located; `want` sets it"""
         self.disturbed = False
         """something other than a step has changed what is kept; `Journal` takes notice"""
+        self.baseline = Baseline(
+            model.noise_counts,
+            model.on_counts,
+            model.off_counts,
+            model.slow_touch_s,
+            model.rows_of_hand.values(),
+        )
+        """what pads read untouched"""
+        self.strength = SheetStrength(model.behaviours, period_ns)
+        """what sheets do to forces, undone"""
         self.follower = Follower(model)
         self._read = _NOTHING_READ  # contacts of the last step: pads and currents
         self._behind = np.full((model.size, 4), np.nan)  # their currents, smoothed: as they were a while ago
@@ -149,7 +165,11 @@ class Tick:
         self._every = np.ones(model.size, dtype=np.int64)  # steps from one update to the next
         self._sparse = False  # whether anything is not wanted at every step
         self._least_counts = -_SOURCE_STD * model.noise_counts[:, None]
+        self._excess = np.zeros((model.size, 4))  # counts above the baseline
         self._currents = np.zeros((model.size, 4))
+        self._law_std = np.full(model.size, np.nan)  # of forces, from noise and the contact's radius alone
+        self._raw_std = np.full(model.size, np.nan)  # and from the baseline
+        self._cycle_ns = 0
         self._taken_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the samples that were used
 
     def expected(self) -> NDArray[np.bool_]:
@@ -164,6 +184,8 @@ class Tick:
         every: NDArray[np.int64],
     ) -> None:
         """Locate, weigh, and update every so many steps only what somebody wants; all (n,), copied."""
+        if self.strength.any:  # what sheets remember has to be known of every contact
+            located, weighed = located | self.strength.modelled, weighed | self.strength.modelled
         changed = np.flatnonzero((located != self.wanted) | (weighed != self.follower.weighed))
         self.forget(changed)
         self.follower.weighed[:], self.follower.tolerance_m[:] = weighed, tolerance_m
@@ -177,9 +199,35 @@ class Tick:
         touching = np.flatnonzero(self.contacts.touching)
         if len(touching):
             self._solve(touching)
+            self._tell_forces(np.flatnonzero(self.contacts.touching & self.strength.modelled))
+
+    def assume(self, pad: int, offset_counts: ArrayLike, std_counts: ArrayLike = 0.0) -> None:
+        """What the channels (4,) of a pad read untouched, from a store or a tare, and how sure that is."""
+        self.baseline.assume(pad, offset_counts, std_counts)
+        self.disturbed = True
+
+    def renew(self, pad: int) -> None:
+        """Another unit, with another sheet, is in the place of a pad."""
+        self.baseline.renew(pad)
+        self.strength.recalibrated(pad, new_sheet=True)
+        self.disturbed = True
+
+    def turn(self, gravity: FloatArray | None) -> None:
+        """Direction of gravity in each link's frame (n, 3), from joint states; None: not known any more."""
+        self.baseline.turn(gravity)
+        self.disturbed = True
+
+    def refer(self, reference: ForceReference) -> int:
+        """Compare forces with what something else measured; the number of pads that it tells anything of."""
+        self.disturbed = True
+        return self.strength.refer(reference, self.columns.sample_ns, self.contacts.touching)
 
     def adopt(self, model: PadModel, changed: IntArray) -> None:
         """Go on with another model of the same pads, of which some have changed; contacts go on."""
+        self.strength = self.strength.adopt(self.model.behaviours, model.behaviours)
+        self.baseline.adopt(model.noise_counts, model.on_counts, model.off_counts, model.slow_touch_s)
+        for pad in changed.tolist():
+            self.strength.recalibrated(pad)
         before, self.model = self.follower, model
         self.follower = Follower(model)
         self.follower.take_over(before)
@@ -193,6 +241,7 @@ class Tick:
         self.disturbed = True
         self.follower.forget(pads)
         columns.values[pads] = columns.force_std_n[pads] = self._located[pads] = np.nan
+        columns.raw_force_n[pads] = np.nan
 
     def step(
         self,
@@ -211,11 +260,10 @@ class Tick:
         operational = np.logical_not(node_state)  # CLEAR is 0
         sampled = self._take_in(slab, operational, cycle, until_ns)
         self.counts = counts = slab.read()
+        excess = np.subtract(counts, self.baseline.expected, out=self._excess)
         absurd, stale = self._absurd(counts, slab), self._stale(now_ns, sampled)
         trusted = operational & ~(absurd | stale)
-        np.multiply(counts, model.ampere_per_count, out=self._currents)
-        if model.tared:
-            self._currents -= model.offset_a
+        np.multiply(excess, model.ampere_per_count, out=self._currents)
         np.copyto(columns.current_a, self._currents @ _ALL_CHANNELS, where=sampled)
         began, ended, telling = contacts.step(columns.current_a, sampled, trusted, columns.sample_ns)
         self._resolve_states(node_state, operational, absurd, stale)
@@ -223,6 +271,10 @@ class Tick:
             columns.values[began] = np.nan  # no use to start from where the last contact was
             self.follower.forget(began)
             self._behind[began] = np.nan
+            self.baseline.begin(began)
+            self.strength.begin(began)
+        self._gather(sampled & trusted)
+        self._cycle_ns = cycle.t_ns
         self._steps += 1
         solved = telling
         if self._sparse:
@@ -231,6 +283,12 @@ class Tick:
             solved = telling[self.wanted[telling]]
         if len(solved):
             self._solve(solved)
+        if self.strength.any:
+            raw = self.columns.raw_force_n
+            self._tell_forces(self.strength.step(raw, self._raw_std, contacts.touching, cycle.t_ns))
+        if len(solved):
+            peak = contacts.peak_n
+            peak[solved] = np.fmax(peak.take(solved), columns.force_n.take(solved))
         if len(ended):
             self._located[ended] = np.nan
         updated = np.setdiff1d(telling, began) if len(began) else telling
@@ -268,8 +326,7 @@ class Tick:
 
     def _absurd(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
         """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take."""
-        railed, least = slab.railed(counts), self._least_counts
-        read = counts - self.model.offset_counts if self.model.tared else counts
+        railed, least, read = slab.railed(counts), self._least_counts, self._excess
         if not np.count_nonzero(railed) and not np.count_nonzero(read < least):
             return self._none
         source = _SOURCE_PART * np.abs(read).sum(axis=1) - least[:, 0]
@@ -305,8 +362,36 @@ class Tick:
         self._read = touched, currents
         self.columns.values[touched] = values
         self._located[touched, :10] = values[:, PAD.start :]
-        peak = self.contacts.peak_n
-        peak[touched] = np.fmax(peak.take(touched), values[:, FORCE])
+        self.columns.raw_force_n[touched] = values[:, FORCE]
+
+    def _gather(self, trusted: BoolArray) -> None:
+        """Samples of untouched pads, for the baseline; what may be a contact in a moment is none of these."""
+        free = trusted & (self.columns.current_a <= self.model.on_a)
+        free &= ~self.contacts.touching
+        self.baseline.gather(self._excess, free)
+
+    def _tell_forces(self, pads: IntArray) -> None:
+        """Forces on sheets whose behaviour is undone, in the place of what the contact law alone says."""
+        columns, strength = self.columns, self.strength
+        force = np.where(strength.state[pads] == _INVALID, np.nan, strength.force_n[pads])
+        std = np.where(columns.saturated[pads], np.inf, strength.std_n[pads])
+        columns.force_n[pads], columns.force_std_n[pads] = force, std
+        self._located[pads, 9] = force
+        self._located[pads, 10] = np.where(np.isfinite(std), std, np.nan)
+
+    def _doubt(self, pads: IntArray) -> None:
+        """Standard deviations of forces, from the law's and the baseline's."""
+        columns = self.columns
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = self.baseline.std[pads] * self.model.ampere_per_count[pads].mean(axis=1)
+            by_baseline = self.follower.force_slopes(pads) * off / (self._currents[pads] @ _ALL_CHANNELS)
+        std = np.hypot(self._law_std[pads], by_baseline)
+        self._raw_std[pads] = std
+        if self.strength.any:
+            plain = ~self.strength.modelled[pads]
+            pads, std = pads[plain], std[plain]
+        columns.force_std_n[pads] = std
+        self._located[pads, 10] = np.where(np.isfinite(std), std, np.nan)
 
     def _solve_anew(self, pads: IntArray, currents: FloatArray, values: FloatArray, off: FloatArray) -> None:
         """Put into `values` and `off` what holds of contacts whose maps don't."""
@@ -322,10 +407,14 @@ class Tick:
             values[lost], off[lost] = self.follower.read(some, currents[lost])
 
     def settle(self) -> None:
-        """Draw anew the maps that contacts are about to leave, where their currents are heading.
+        """Carry the baseline on; draw anew the maps that contacts are about to leave, where they are heading.
 
         Call it between two steps, when nobody waits: it makes the next step cheap, and changes no contact.
         """
+        if self._cycle_ns and self.baseline.learn(self._cycle_ns, self.contacts.touching):
+            touching = np.flatnonzero(self.contacts.touching)
+            if len(touching):
+                self._doubt(touching)
         pads, currents = self._read
         self._read = _NOTHING_READ
         if not len(pads):
@@ -345,9 +434,9 @@ class Tick:
     def _keep(self, pads: IntArray, solved: Solved) -> None:
         columns = self.columns
         columns.covariance_m2[pads] = solved.covariance_m2
-        columns.force_std_n[pads] = solved.force_std_n
+        self._law_std[pads] = solved.force_std_n
         columns.saturated[pads] = solved.saturated
         columns.residual_std[pads] = solved.residual_std
-        self._located[pads, 10] = np.where(np.isfinite(solved.force_std_n), solved.force_std_n, np.nan)
+        self._doubt(pads)
         self._located[pads, 11] = solved.residual_std
         self._located[pads, 12:] = solved.covariance_m2.reshape(-1, 9)
