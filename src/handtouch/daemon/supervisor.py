@@ -1,0 +1,242 @@
+"""The daemon's side of the slow half: sends it what comes in, and does between two ticks what it says.
+
+Public name: `Supervisor`. Everything here is of the hot thread; the process is `process.Process`. A unit that
+took another's place is put into quarantine here, at once, whether the slow half lives or not.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from handtouch.canbus.master import Master, NodeEvent, NodeState, SerialChanged
+from handtouch.config import Deployment
+from handtouch.daemon.blocks import Blocks
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.process import Process
+from handtouch.supervise.calibration import Law
+from handtouch.supervise.link import (
+    Alive,
+    Calibrate,
+    Judged,
+    Start,
+    Word,
+    WordError,
+    plain,
+    read_word,
+    serials,
+)
+
+_UNKNOWN_GAINS = 0.05**2 * (np.eye(4) - 0.25)
+"""Covariance of log gains of a unit that nobody knows; their sum can't be seen."""
+_KNOWN = (NodeState.CONFIGURING, NodeState.OPERATIONAL)
+"""By then a node has told who it is."""
+_log = logging.getLogger("handtouch.supervise")
+
+
+class Supervisor:
+    """Call `step` after every tick, and `note` with what happened to nodes. Times in ns.
+
+    `judged`: of each pad, what the slow half said of it last, None before; `malformed`: its words that were
+    no words, and those that came too late: for a unit that isn't there any more.
+    """
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        pipeline: Pipeline,
+        master: Master,
+        store: str,
+        process: Process | None = None,
+    ) -> None:
+        self._pipeline, self._master = pipeline, master
+        self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
+        self._store = store
+        self._start = self._start_of(deployment)
+        self.process = process or Process(lambda: self._start.dump())
+        self.judged: list[Judged | None] = [None] * pipeline.model.size
+        self.malformed = self.late = 0
+        self.changed: set[int] = set()
+        """pads that there is something new to tell of; whoever tells it clears it"""
+        self._blocks = Blocks(pipeline.model.size)
+        self._serials: list[int | None] = [None] * pipeline.model.size
+        self._before: list[int | None] = [pad.serial for _, pad in self._pads]
+        self._sent_ns = 0
+        self._alive: Alive | None = None
+
+    def start(self, now_ns: int) -> None:
+        """Start the slow half."""
+        self.process.start(now_ns)
+
+    def adopt(self, deployment: Deployment, now_ns: int) -> None:
+        """The file was read again: the slow half begins anew with it."""
+        self._start = self._start_of(deployment)
+        self.process.renew(now_ns)
+
+    def close(self) -> None:
+        """End the slow half."""
+        self.process.close()
+
+    def note(self, events: Sequence[NodeEvent | SerialChanged], now_ns: int) -> None:
+        """Nodes have changed: see who is there now."""
+        if not any(isinstance(event, SerialChanged) or event.new in _KNOWN for event in events):
+            return
+        swapped = [event for event in events if isinstance(event, SerialChanged)]
+        known = [status.serial for status in self._master.status()]
+        for event in swapped:
+            if event.after is None:
+                known[event.slot] = 0  # there is one, and it tells no number
+        for pad, (before, after) in enumerate(zip(self._serials, known, strict=True)):
+            if after is None or after == before:
+                continue
+            if before is not None:
+                self._before[pad] = before
+            self._serials[pad] = after
+            self.judged[pad] = None
+            if self._before[pad] is not None and self._before[pad] != after:
+                self._quarantine(pad)
+        self._introduce(now_ns)
+
+    def step(self, now_ns: int) -> None:
+        """After a tick: gather it; now and then send what was gathered and do what was said."""
+        if self.process.pid is None:
+            if self.process.step(now_ns):
+                self._blocks.clear()
+                self._alive = None
+                self._introduce(now_ns)
+            return
+        block = self._blocks.add(self._pipeline)
+        if block is None:
+            return
+        if self.process.send(block.dump()):
+            self._sent_ns = int(block.t_ns[-1])
+        for said in self.process.words(now_ns):
+            self._take(said)
+        self.process.step(now_ns)
+
+    def figures(self) -> dict[str, Any]:
+        """How the slow half fares, for `service`."""
+        process, alive = self.process, self._alive
+        return {
+            "state": process.state,
+            "pid": process.pid,
+            "restarts": process.restarts,
+            "died_of": process.why,
+            "lag_s": (self._sent_ns - alive.t_ns) * 1e-9 if alive else None,
+            "dropped": process.dropped,
+            "malformed": self.malformed,
+            "late": self.late,
+            "word": alive.word if alive else "",
+            "store": alive.store if alive else "",
+        }
+
+    def told(self, pad: int) -> dict[str, Any]:
+        """What `health` says of a pad: trust, calibration, calibrating, findings."""
+        judged = self.judged[pad]
+        quarantined = bool(self._pipeline.model.quarantined[pad])
+        name = self._pipeline.model.calibration[pad]
+        if judged is None:
+            return {"trust": "quarantined" if quarantined else "nominal", "calibration": name}
+        return {
+            "trust": judged.trust,
+            "calibration": name,
+            "calibrating": judged.calibrating,
+            "findings": tuple(map(plain, judged.findings)),
+        }
+
+    # Details ----------------------------------------------------------------------------------------------
+
+    def _start_of(self, deployment: Deployment) -> Start:
+        model = self._pipeline.model
+        scale = np.array(model.ampere_per_count / model.gains)
+        return Start(deployment, self._store, tuple(model.nominal), scale, model.noise_counts)
+
+    def _introduce(self, now_ns: int) -> None:
+        self.process.send(serials(self._serials, self._before, now_ns))
+
+    def _quarantine(self, pad: int) -> None:
+        """Another unit: nothing that was known of the one before holds."""
+        model = self._pipeline.model
+        model.calibrate(pad, np.ones(4), model.nominal[pad])
+        model.doubt(pad, _UNKNOWN_GAINS, quarantined=True)
+        self._pipeline.adopt(model, np.array([pad]))
+        self._pipeline.tick.renew(pad)
+        self.changed.add(pad)
+        _log.warning(
+            "%s: serial %s was here, %s is: in quarantine until it is calibrated",
+            self._name(pad), self._before[pad], self._serials[pad], extra=self._fields(pad),
+        )  # fmt: skip
+
+    def _take(self, said: bytes) -> None:
+        """Do what a word says: all of it or nothing."""
+        try:
+            word = read_word(said)
+        except WordError as error:
+            self.malformed += 1
+            _log.warning("%s", error)
+            return
+        if isinstance(word, Alive):
+            self._alive = word
+        elif word.pad >= len(self._pads):
+            self.malformed += 1
+        elif word.serial != self._serials[word.pad]:
+            self.late += 1
+        else:
+            self._do(word)
+
+    def _do(self, word: Word) -> None:
+        if isinstance(word, Calibrate):
+            self._calibrate(word)
+        elif isinstance(word, Judged):
+            self._judge(word)
+
+    def _calibrate(self, word: Calibrate) -> None:
+        model, pad = self._pipeline.model, word.pad
+        offsets, tick, pads = word.offset_counts, self._pipeline.tick, np.array([pad])
+        if offsets is not None and max(map(abs, offsets)) > model.largest_counts[pad] / 2:
+            self.malformed += 1
+            return
+        law = model.laws[pad] if word.law is None else Law(**word.law.model_dump())
+        reweighed = law != model.laws[pad]
+        model.calibrate(pad, word.gains, word.name, law)
+        model.doubt(pad, np.array(word.covariance).reshape(4, 4), bool(model.quarantined[pad]))
+        if reweighed:
+            self._pipeline.adopt(model, pads)
+        if offsets is not None:
+            tick.assume(pad, offsets, word.offset_std or 0.0)
+        if word.back_n is not None:
+            tick.strength.assume(pad, word.back_n, word.back_std_n)
+        tick.forget(pads)
+        self.changed.add(pad)
+        _log.info("%s: calibration %s", self._name(pad), word.name, extra=self._fields(pad))
+
+    def _judge(self, word: Judged) -> None:
+        model, pad, before = self._pipeline.model, word.pad, self.judged[word.pad]
+        self.judged[pad] = word
+        quarantined = word.trust in ("quarantined", "person")
+        if quarantined != model.quarantined[pad]:
+            model.doubt(pad, model.gain_covariance[pad], quarantined)
+            self._pipeline.tick.forget(np.array([pad]))
+        known = {finding.kind for finding in before.findings} if before else set()
+        trust = before.trust if before else "nominal"
+        for finding in word.findings:
+            if finding.kind not in known:
+                self._say(pad, f"{finding.cause} ({finding.evidence}): {finding.remedy}")
+        for kind in sorted(known - {finding.kind for finding in word.findings}):
+            self._say(pad, f"{kind}: over")
+        if word.trust != trust:
+            self._say(pad, f"{trust} -> {word.trust}: {word.calibrating}")
+        if (trust, known) != (word.trust, {finding.kind for finding in word.findings}) or before is None:
+            self.changed.add(pad)
+
+    def _say(self, pad: int, text: str) -> None:
+        _log.warning("%s: %s", self._name(pad), text, extra=self._fields(pad))
+
+    def _name(self, pad: int) -> str:
+        return f"{self._pads[pad][0]}/{self._pads[pad][1].link}"
+
+    def _fields(self, pad: int) -> dict[str, Any]:
+        return {"fields": {"hand": self._pads[pad][0], "link": self._pads[pad][1].link}}
