@@ -291,6 +291,7 @@ class _Door:
             self._monitor = socket.get_monitor_socket(_HANDSHAKES)
             socket.connect(endpoint)
         except zmq.ZMQError as error:
+            getattr(self, "_monitor", socket).close()
             socket.close()
             raise ValueError(
                 f"{endpoint!r} is no ZeroMQ endpoint ({error.strerror}); one looks like tcp://127.0.0.1:5580"

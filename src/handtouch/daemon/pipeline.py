@@ -86,6 +86,11 @@ class Pipeline:
         self.begin(now_ns, now_ns)
         return self._tick(now_ns, _FOREVER_NS)
 
+    def tick_again(self, now_ns: int, until_ns: int | None) -> Ticked:
+        """A recorded tick; slab, cycle and `node_state` hold what it was made from."""
+        self.settle()
+        return self._tick(now_ns, _FOREVER_NS if until_ns is None else until_ns)
+
     def adopt(self, model: PadModel, changed: NDArray[np.intp]) -> None:
         """Go on with another model of the same pads, some of them changed; between two ticks."""
         self.model = model
@@ -106,13 +111,9 @@ class Pipeline:
         self.frames.rehearse()
         self.messages.rehearse(self._outlet)
 
-    def tick_again(self, now_ns: int, until_ns: int | None) -> Ticked:
-        """A recorded tick; slab, cycle and `node_state` hold what it was made from."""
-        self.settle()
-        return self._tick(now_ns, _FOREVER_NS if until_ns is None else until_ns)
-
     def end(self, now_ns: int) -> None:
         """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""
+        self.settle()
         self.messages.end_all(now_ns, self._outlet)
         self.messages.send_frames(self.slab, self.ticks, self.cycle.t_ns, self._outlet)
         self.journal.ticked(now_ns, _FOREVER_NS, stopped=True)

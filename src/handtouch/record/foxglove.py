@@ -46,6 +46,7 @@ class Foxglove:
         made = []
         if prefix == "contact":
             if payload["event"] != "update":
+                self._scene_ns = 0  # at once
                 made.append(_log(t_ns, _INFO, of, _contact_words(payload)))
             if payload["event"] == "end":
                 self._touching.pop(of, None)

@@ -1,0 +1,121 @@
+"""A recording can be read up to where it was cut, by whatever it was cut."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from handtouch.record import Recording
+from handtouch.record.file import RecordingFile
+
+
+@given(st.floats(0, 1))
+@settings(max_examples=25, deadline=None)
+def test_a_file_cut_anywhere_gives_what_was_before_the_cut(recorded: Path, part: float) -> None:
+    whole = recorded.read_bytes()
+    cut = recorded.with_name("cut.mcap")
+    cut.write_bytes(whole[: int(part * len(whole))])
+    complete = list(Recording(recorded))
+    recording = Recording(cut)
+    kept = list(recording)
+    assert kept == complete[: len(kept)]
+    assert recording.cut or part == 1 or len(kept) == len(complete)
+
+
+@given(st.integers(8, 10**9), st.integers(1, 255))
+@settings(max_examples=25, deadline=None)
+def test_a_damaged_byte_costs_what_comes_after_it_at_most(recorded: Path, at: int, change: int) -> None:
+    data = bytearray(recorded.read_bytes())
+    data[at % len(data)] ^= change
+    damaged = recorded.with_name("damaged.mcap")
+    damaged.write_bytes(data)
+    try:
+        for entry in Recording(damaged):
+            assert isinstance(entry.payload, dict)
+    except ValueError as error:
+        assert "no MCAP file" in str(error)  # noqa: PT017 - the only error that there may be
+
+
+def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
+    other = tmp_path / "notes.txt"
+    other.write_text("nothing of that kind")
+    with pytest.raises(ValueError, match=r"notes\.txt: is no MCAP"):
+        Recording(other)
+    with pytest.raises(ValueError, match="is a folder"):
+        Recording(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        Recording(tmp_path / "absent.mcap")
+
+
+def test_a_file_that_exists_is_not_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_text("precious")
+    with pytest.raises(FileExistsError):
+        RecordingFile(path, {})
+    assert path.read_text() == "precious"
+
+
+_WRITER = """
+import sys
+from pathlib import Path
+from handtouch.record.file import RecordingFile
+file = RecordingFile(Path(sys.argv[1]), {"host": "here"})
+for number in range(10**9):
+    file.write("service", b'{"n": %d}' % number, number)
+    if number % 100 == 99:
+        file.flush()
+        print(number + 1, flush=True)
+"""
+
+
+def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(tmp_path: Path) -> None:
+    path = tmp_path / "killed.mcap"
+    with subprocess.Popen(
+        [sys.executable, "-c", _WRITER, str(path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        flushed = [int(process.stdout.readline()) for _ in range(20)][-1]
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    recording = Recording(path)
+    numbers = [entry.payload["n"] for entry in recording]
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) >= flushed
+    assert recording.cut
+    assert recording.about == {"host": "here"}
+
+
+def _fill(file: RecordingFile, flushed: list[int]) -> None:
+    for number in range(10**6):
+        noise = os.urandom(20).hex().encode()
+        file.write("service", b'{"n": %d, "noise": "%s"}' % (number, noise), 1)
+        if number % 10 == 9:
+            file.flush()
+            flushed.append(number + 1)
+
+
+def test_a_full_disk_leaves_all_that_fitted(tmp_path: Path) -> None:
+    path = tmp_path / "full.mcap"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    flushed: list[int] = []
+    try:
+        file = RecordingFile(path, {})
+        with pytest.raises(OSError, match="too large"):
+            _fill(file, flushed)
+        file.abandon()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
+    assert flushed
+    assert path.stat().st_size <= 20_000
+    assert [entry.payload["n"] for entry in Recording(path)] == list(range(flushed[-1]))
