@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from handtouch.client import Subscriber, columns, connect, request
+    from handtouch.robot import Robot
 
 __version__ = "0.1.0"
-__all__ = ["Subscriber", "__version__", "columns", "connect", "request"]
+__all__ = ["Robot", "Subscriber", "__version__", "columns", "connect", "request"]
 
 
 def __getattr__(name: str) -> Any:
@@ -20,4 +21,8 @@ def __getattr__(name: str) -> Any:
         from handtouch import client
 
         return getattr(client, name)
+    if name == "Robot":
+        from handtouch.robot import Robot
+
+        return Robot
     raise AttributeError(f"module 'handtouch' has no attribute {name!r}")
