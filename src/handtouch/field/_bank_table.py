@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
+from handtouch.field._spline import spline_operator
 from handtouch.field.model import FloatArray, ForwardModel
 
 TERMS = 6  # coefficients of a quintic
@@ -48,17 +47,9 @@ class Grid:
 GRIDS = (Grid(64, 0.2), Grid(88, 0.15), Grid(128, 0.1))
 
 
-@cache
-def _spline_operator(cells: int) -> FloatArray:
-    """Node values to the coefficients of each cell: (cells, TERMS, cells + 1)."""
-    spline = make_interp_spline(np.arange(cells + 1.0), np.eye(cells + 1), k=TERMS - 1)
-    left = np.arange(float(cells))
-    return np.stack([spline(left, nu=k) / math.factorial(k) for k in range(TERMS)], axis=1)
-
-
 def tabulate(values: FloatArray) -> FloatArray:
     """Polynomials (cells, cells, TERMS, TERMS, m) through node values (cells + 1, cells + 1, m)."""
-    operator = _spline_operator(len(values) - 1)
+    operator = spline_operator(len(values) - 1, TERMS - 1)
     return np.asarray(np.einsum("ipx,jqy,xym->ijpqm", operator, operator, values, optimize=True))
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from handtouch.field._conformal import FloatArray, Meridian, Revolved, check_arc
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
 
 _STEPS = 128  # table steps per spline segment
 _ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -102,6 +105,8 @@ class SplineProfile:
         self._unit = math.ldexp(1.0, math.frexp(float(np.abs([axial, radius]).max()))[1])
         points = np.stack([forward * axial, radius], axis=1) / self._unit
         knots = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        from scipy.interpolate import CubicSpline  # here and below: a daemon's start does without
+
         self._spline = CubicSpline(knots, points)
         steps = np.linspace(0, 1, _STEPS, endpoint=False)
         self._nodes = np.append((knots[:-1, None] + np.diff(knots)[:, None] * steps).ravel(), knots[-1])
@@ -157,14 +162,16 @@ class SplineProfile:
         return np.asarray(np.hypot(*np.moveaxis(self._spline(t, 1), -1, 0)))
 
     def _table(self, pieces: FloatArray, slope: FloatArray) -> CubicHermiteSpline:
-        return CubicHermiteSpline(
-            self._nodes, np.concatenate([[0.0], np.cumsum(pieces)]), slope, extrapolate=False
-        )
+        return _hermite(self._nodes, np.concatenate([[0.0], np.cumsum(pieces)]), slope)
 
     def _inverse(self, table: CubicHermiteSpline) -> CubicHermiteSpline:
-        return CubicHermiteSpline(
-            table(self._nodes), self._nodes, 1 / table(self._nodes, 1), extrapolate=False
-        )
+        return _hermite(table(self._nodes), self._nodes, 1 / table(self._nodes, 1))
+
+
+def _hermite(x: FloatArray, y: FloatArray, slope: FloatArray) -> CubicHermiteSpline:
+    from scipy import interpolate
+
+    return interpolate.CubicHermiteSpline(x, y, slope, extrapolate=False)
 
 
 def _solve(table: CubicHermiteSpline, inverse: CubicHermiteSpline, value: FloatArray) -> FloatArray:

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from handtouch.field._ratio_inverse import RatioInverse
 from handtouch.field._separable import SideRatio
@@ -44,6 +43,8 @@ class RatioTable:
             self._tabulate(pad, cells)
 
     def _tabulate(self, pad: Rectangle, cells: int) -> None:
+        from scipy.interpolate import CubicSpline  # costs a daemon's start a fifth of a second
+
         nodes = np.linspace(-1, 1, cells + 1)
         splines = [CubicSpline(nodes, place) for place in _places(pad, nodes)]
         between = nodes[:-1] + 1 / cells

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
 from handtouch.field.network import Electrode, ElectrodeNetwork
@@ -30,8 +29,16 @@ def surface_of(pad: config.Pad) -> Surface:
 
 def mount_of(pad: config.Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotation (3, 3) and translation (3,) [m] that carry the pad's frame into its link's frame."""
-    rotation = Rotation.from_euler("xyz", pad.mount.rpy_deg, degrees=True).as_matrix()
-    return np.asarray(rotation, np.float64), np.array(pad.mount.position_mm) * _MM
+    return rotation_of(np.radians(pad.mount.rpy_deg)), np.array(pad.mount.position_mm) * _MM
+
+
+def rotation_of(rpy_rad: ArrayLike) -> NDArray[np.float64]:
+    """Matrix (3, 3) of roll, pitch and yaw [rad] about the fixed axes x, y and z, in turn, as in URDF."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy_rad), np.cos(rpy_rad)
+    roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return np.asarray(yaw @ pitch @ roll)
 
 
 def network_of(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
+from handtouch.field._spline import spline_operator
 from handtouch.field.surface import Surface
 
 FloatArray = NDArray[np.float64]
@@ -119,4 +119,4 @@ def _meridian(surface: Surface) -> FloatArray:
         ],
         axis=1,
     )
-    return np.asarray(CubicSpline(np.arange(_INTERVALS + 1), columns).c.transpose(1, 0, 2))
+    return np.asarray((spline_operator(_INTERVALS, 3) @ columns)[:, ::-1])

@@ -16,7 +16,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+
+from handtouch.hand.pads import rotation_of
 
 FloatArray = NDArray[np.float64]
 MOVABLE = ("revolute", "continuous", "prismatic")
@@ -208,8 +209,7 @@ def _origin(element: Element, place: str) -> tuple[FloatArray, FloatArray]:
     if origin is None:
         return np.eye(3), np.zeros(3)
     rpy = _numbers(origin, "rpy", 3, place, "0 0 0")
-    rotation = Rotation.from_euler("xyz", rpy).as_matrix()
-    return np.asarray(rotation, np.float64), np.array(_numbers(origin, "xyz", 3, place, "0 0 0"))
+    return rotation_of(rpy), np.array(_numbers(origin, "xyz", 3, place, "0 0 0"))
 
 
 def _child(element: Element, tag: str, place: str) -> Element:

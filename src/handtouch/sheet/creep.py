@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import nnls
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -59,6 +58,8 @@ class Creep:
         says how near. exponent: 0 to 1, typically 0.02 to 0.1. Raises ValueError for an exponent out of
         range, or too many decades for so few modes.
         """
+        from scipy.optimize import nnls  # here: it takes longer to import than most daemons' tables
+
         if not 0 < exponent < 1:
             raise ValueError(f"exponent must lie between 0 and 1, got {exponent}")
         decades = np.log10(longest_s / shortest_s)
