@@ -363,6 +363,11 @@ class Scene(Wants):
     idle_after_s: Positive = Field(
         2.0, description="a pad untouched for so long becomes event-driven, where its node can"
     )
+    rest_after_s: Positive | None = Field(
+        None,
+        description="a hand untouched for so long rests the sheets that fade, half of them at a time, without "
+        "potential: they recover, and feel nothing until something touches another pad; left out: never",
+    )
     idle_sync_period_ms: float = Field(
         50.0,
         ge=1,
