@@ -151,10 +151,9 @@ class Nodes:
 
 
 def put(queue: Any, frames: list[can.Message]) -> None:
-    """Into an in-process bus at once; its `send` copies deeply, at three times the cost of receiving."""
-    with queue.mutex:
-        queue.queue.extend(frames)
-        queue.not_empty.notify()
+    """Into an in-process bus, as its `send` does, which copies deeply, too: three times the cost."""
+    for frame in frames:
+        queue.put(frame)
 
 
 def touches(pads: int, part: float) -> NDArray[np.int64]:

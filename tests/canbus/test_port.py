@@ -9,6 +9,7 @@ import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -100,19 +101,19 @@ def test_frame_that_comes_while_the_signal_is_lowered_is_not_forgotten(
 ) -> None:
     """Read in another order, the signal of the second frame was taken and the third raised none."""
     receiver: Any = port._receiver
-    lower = os.eventfd_read
+    lower = receivers._eventfd_read
 
-    def meanwhile(descriptor: int) -> int:
+    def meanwhile(descriptor: int, value: Any) -> int:
         if when == "before":
             receiver._put(frame(0x701, b"\x02"))
-        value = lower(descriptor)
+        failed: int = lower(descriptor, value)
         if when == "after":
             receiver._put(frame(0x701, b"\x02"))
-        return value
+        return failed
 
     receiver._put(frame(0x701, b"\x01"))
     with monkeypatch.context() as patch:
-        patch.setattr(os, "eventfd_read", meanwhile)
+        patch.setattr(receivers, "_eventfd_read", meanwhile)
         got = port.drain()
     receiver._put(frame(0x701, b"\x03"))
     assert readable(port)
@@ -142,6 +143,42 @@ def test_overflow_keeps_the_newest_and_is_counted(
     assert eventually(lambda: port._receiver._lost == 12)  # type: ignore[attr-defined]  # the reader's
     assert [data[0] for _, data, _ in port.drain()] == list(range(12, 20))
     assert port.counters.overflow == 12
+    port.close()
+
+
+def test_bus_in_this_process_holds_as_many_frames_as_its_option_says(channel: str, other: can.BusABC) -> None:
+    bus = Bus(name="palm", interface="virtual", channel=channel, options={"rx_queue_size": 3})
+    port = Port.open(bus, Slab(1))
+    for number in range(5):
+        other.send(frame(0x700, bytes((number,))))
+    assert [data[0] for _, data, _ in port.drain()] == [2, 3, 4]
+    assert port.counters.overflow == 2
+    port.close()
+    other.send(frame(0x700, b""))  # nobody hears it
+
+
+def test_senders_at_once_on_a_bus_in_this_process_lose_nothing(channel: str) -> None:
+    """Each has a thread, the receiver none: `drain` is all there is."""
+    before = threading.active_count()
+    port = Port.open(Bus(name="palm", interface="virtual", channel=channel), Slab(1))
+    assert threading.active_count() == before
+    buses = [can.Bus(interface="virtual", channel=channel) for _ in range(4)]
+
+    def send(bus: can.BusABC) -> None:
+        for number in range(200):
+            bus.send(frame(0x700, bytes((number,))))
+
+    threads = [threading.Thread(target=send, args=(bus,)) for bus in buses]
+    for thread in threads:
+        thread.start()
+    got: list[int] = []
+    while any(thread.is_alive() for thread in threads) or readable(port):
+        if readable(port, 0.1):
+            got += [data[0] for _, data, _ in port.drain()]
+    assert sorted(got) == sorted(4 * list(range(200)))
+    assert port.counters.overflow == 0
+    for bus in buses:
+        bus.shutdown()
     port.close()
 
 

@@ -18,7 +18,7 @@ from handtouch.config import Bus
 
 from .bus_state import BusState, Condition, code_of, is_queue_full, trouble_of
 from .load import frame_bits
-from .receivers import CyclicSender, Receiver, ThreadReceiver
+from .receivers import CyclicSender, InProcessReceiver, Receiver, ThreadReceiver
 from .router import Counters, Frame, Router
 from .slab import Slab
 from .sockets import PolledReceiver, SocketcanReceiver
@@ -188,6 +188,8 @@ def _receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
         return SocketcanReceiver(opener, str(bus.channel))
     if bus.interface == "udp_multicast":
         return PolledReceiver(opener)
+    if bus.interface == "virtual":
+        return InProcessReceiver(opener)
     return ThreadReceiver(opener, bus.interface)
 
 

@@ -1,15 +1,16 @@
-"""Reading a CAN bus without blocking: what a receiver is, and one for any python-can bus.
+"""Reading a CAN bus without blocking: what a receiver is; one for any python-can bus, one for in-process.
 
 A receiver has a file descriptor that becomes readable when frames wait and stays the same when the bus is
 opened anew, and `drain`, which hands all that waits to a router. None ever raises for what the bus does:
 errors are counted, told in `trouble`, and the bus is opened again with growing pauses. Two more: `sockets`.
 
-Public names: `Receiver`, `CyclicSender`, `ThreadReceiver`, `Retry`, `RECEIVE_BUFFER_BYTES`, `DRAIN_LIMIT`,
-`QUEUE_FRAMES`.
+Public names: `Receiver`, `CyclicSender`, `ThreadReceiver`, `InProcessReceiver`, `Retry`,
+`RECEIVE_BUFFER_BYTES`, `DRAIN_LIMIT`, `QUEUE_FRAMES`.
 """
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import socket
@@ -17,10 +18,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from queue import Queue
 from time import monotonic_ns
 from typing import Protocol
 
 import can
+from can.interfaces import virtual
 
 from .bus_state import Condition, Trouble, code_of, trouble_of
 from .router import Frame, Router
@@ -32,7 +35,7 @@ a full 1 Mbit/s bus. After a pause of that length every heartbeat is overdue: no
 DRAIN_LIMIT = 4096
 """Frames read in one go at most, so that a flood can't keep the caller from its tick."""
 QUEUE_FRAMES = 16384
-"""Frames that a reader thread holds at most, 1.9 s of a full bus; older ones are dropped and counted."""
+"""Frames that wait for `drain` at most, 1.9 s of a full bus; older ones are dropped and counted."""
 
 _TELLS_STATE = frozenset({"ixxat", "etas"})  # elsewhere python-can's `state` is what was asked for
 _SEND_TIMEOUT_S = 0.01  # an adapter that hangs must not hold up the other buses for longer
@@ -42,6 +45,13 @@ _SO_RCVBUFFORCE = 33
 _GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is of no more use
 _OLDEST_STAMP_NS = 10_000_000_000
 _OFFSET_NS = 5_000
+
+# Unlike os.eventfd_write these keep the GIL: no other thread is let in amid a burst.
+_LIBC = ctypes.PyDLL(None)
+_eventfd_write = _LIBC.eventfd_write
+_eventfd_write.argtypes = [ctypes.c_int, ctypes.c_uint64]
+_eventfd_read = _LIBC.eventfd_read
+_eventfd_read.argtypes = [ctypes.c_int, ctypes.POINTER(ctypes.c_uint64)]
 
 Opener = Callable[[], can.BusABC]
 
@@ -114,12 +124,10 @@ def clock_offset_ns() -> int:
     return (before + after) // 2 - wall
 
 
-class ThreadReceiver:
-    """Any python-can bus: a thread waits in its `recv`, fills a bounded queue and signals an eventfd."""
+class _QueuedReceiver:
+    """Frames wait in a bounded queue that other threads fill; the first of a burst signals an eventfd."""
 
-    def __init__(self, opener: Opener, interface: str) -> None:
-        self._opener = opener
-        self._tells_state = interface in _TELLS_STATE
+    def __init__(self, opener: Opener) -> None:
         self._queue: deque[tuple[can.Message, int]] = deque(maxlen=QUEUE_FRAMES)  # with their arrival
         self._lost = 0
         self._errors = 0
@@ -128,22 +136,11 @@ class ThreadReceiver:
         self._bus: can.BusABC | None = opener()
         self._eventfd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._signalled = False
+        self._read_value = ctypes.c_uint64()
         self._owed = False  # a signal whose flag has been lowered already
-        self._closing = threading.Event()
-        self._open = True  # the same, cheaper to look at
-        self._thread = threading.Thread(target=self._run, name=f"can-{interface}", daemon=True)
-        self._thread.start()
 
     def fileno(self) -> int:
         return self._eventfd
-
-    def close(self) -> None:
-        self._open = False
-        self._closing.set()
-        self._thread.join(timeout=5)
-        if self._bus is not None:
-            self._drop(self._bus)
-        os.close(self._eventfd)
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
         bus = self._bus
@@ -174,17 +171,43 @@ class ThreadReceiver:
     def _lower_signal(self) -> None:
         # Before the queue is read: what comes meanwhile is either read there or raises the signal again.
         if self._signalled or self._owed:
-            try:
-                os.eventfd_read(self._eventfd)
-                self._owed = False
-            except BlockingIOError:  # the reader is just about to raise it
-                self._owed = True
+            # it fails where the reader is just about to raise it
+            self._owed = _eventfd_read(self._eventfd, ctypes.byref(self._read_value)) != 0
             self._signalled = False
 
     def _raise_signal(self) -> None:
         if not self._signalled:
             self._signalled = True
-            os.eventfd_write(self._eventfd, 1)
+            _eventfd_write(self._eventfd, 1)
+
+    def _put(self, message: can.Message) -> None:
+        queue = self._queue
+        if len(queue) == queue.maxlen:
+            self._lost += 1
+        queue.append((message, monotonic_ns()))  # its own stamp may be of the adapter's clock
+        if not self._signalled:
+            self._raise_signal()
+
+
+class ThreadReceiver(_QueuedReceiver):
+    """Any python-can bus: a thread waits in its `recv`."""
+
+    def __init__(self, opener: Opener, interface: str) -> None:
+        super().__init__(opener)
+        self._opener = opener
+        self._tells_state = interface in _TELLS_STATE
+        self._closing = threading.Event()
+        self._open = True  # the same, cheaper to look at
+        self._thread = threading.Thread(target=self._run, name=f"can-{interface}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._open = False
+        self._closing.set()
+        self._thread.join(timeout=5)
+        if self._bus is not None:
+            self._drop(self._bus)
+        os.close(self._eventfd)
 
     def _run(self) -> None:
         retry = Retry()
@@ -228,14 +251,6 @@ class ThreadReceiver:
                 break
         return came
 
-    def _put(self, message: can.Message) -> None:
-        queue = self._queue
-        if len(queue) == QUEUE_FRAMES:
-            self._lost += 1
-        queue.append((message, monotonic_ns()))  # its own stamp may be of the adapter's clock
-        if not self._signalled:
-            self._raise_signal()
-
     def _failed(self, trouble: Trouble) -> None:
         self._errors += 1
         self.trouble = trouble
@@ -258,6 +273,57 @@ class ThreadReceiver:
             self._failed(given_up(error))
         else:
             self.trouble = None
+
+
+class InProcessReceiver(_QueuedReceiver):
+    """python-can's virtual bus: who sends a frame puts it into our queue; there is no thread."""
+
+    def __init__(self, opener: Opener) -> None:
+        super().__init__(opener)
+        bus = self._bus
+        if not isinstance(bus, virtual.VirtualBus):
+            raise TypeError(f"{bus} is no virtual bus")
+        if bus.queue.maxsize:  # the bus's option rx_queue_size
+            self._queue = deque(maxlen=bus.queue.maxsize)
+        self._several = threading.Lock()  # senders at once
+        with virtual.channels_lock:
+            bus.channel.remove(bus.queue)
+            bus.queue = _Inbox(self._take)
+            bus.channel.append(bus.queue)
+
+    def close(self) -> None:
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+        with self._several:  # a sender may be about to signal
+            os.close(self._eventfd)
+
+    def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """As python-can does it, but without a deep copy for everyone, which costs five times as much."""
+        bus = self._bus
+        if not isinstance(bus, virtual.VirtualBus):
+            raise OSError(errno.ENODEV, "closed")
+        for inbox in bus.channel:
+            if inbox is not bus.queue or bus.receive_own_messages:
+                sent = message(can_id, data, remote)
+                sent.timestamp, sent.channel, sent.is_rx = time.time(), bus.channel_id, inbox is not bus.queue
+                inbox.put(sent, timeout=_SEND_TIMEOUT_S)
+
+    def _take(self, message: can.Message) -> None:
+        with self._several:
+            if self._bus is not None:
+                self._put(message)
+
+
+class _Inbox(Queue[can.Message]):
+    """A queue of a virtual channel that hands on what is put to it."""
+
+    def __init__(self, take: Callable[[can.Message], None]) -> None:
+        super().__init__()
+        self._take = take
+
+    def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:  # noqa: ARG002
+        self._take(item)
 
 
 def message(can_id: int, data: bytes, remote: bool = False) -> can.Message:

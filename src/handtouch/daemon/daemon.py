@@ -51,6 +51,8 @@ _log = logging.getLogger("handtouch.daemon")
 
 _COLD_NS = 1_000_000
 """After a rest of that length others have had the caches: a tick would take several times as long."""
+_HOUSE_NS = 4_000_000
+"""Least time between two looks at nodes, buses, health and requests: a tick every millisecond needn't."""
 _GIL_SWITCH_S = 0.0005  # a thread that boots a node or builds a model lets the hot one in after so long
 
 
@@ -69,6 +71,7 @@ class Daemon:
     ) -> None:
         self.deployment = deployment
         self._rested_ns = 0
+        self._house_ns = 0  # when to look after the rest again
         settings = deployment.daemon
         period_ns = round(settings.sync_period_ms * 1e6)
         with ExitStack() as opened:
@@ -157,8 +160,10 @@ class Daemon:
 
     def _loop(self, stop: threading.Event, alive: Callable[[int], None]) -> None:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
+        by_descriptor = {port.fileno(): port for port in ports}
+        descriptors = list(by_descriptor)
         sync, pacer, master, stages = self.sync, self.pacer, self.master, self.report.stages
-        pipeline.stepped = lambda: stages.lap(histogram.TICK, time.monotonic_ns())
+        pipeline.stepped = self._stepped
         sync.start(time.monotonic_ns())
         stages.start(time.monotonic_ns())
         while not stop.is_set():
@@ -169,17 +174,20 @@ class Daemon:
             if not cycle.ticked:
                 wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns)
             wait_s = max(0, wake_ns - now_ns) * 1e-9
-            select.select(ports, (), (), wait_s)
+            readable = select.select(descriptors, (), (), wait_s)[0]
             woke_ns = time.monotonic_ns()
             self._rested_ns = woke_ns - now_ns
             stages.slept(wake_ns, woke_ns)
-            self._receive(ports)
+            # one that is gone shows nothing, and is opened again from `drain`
+            every = not readable or woke_ns >= self._house_ns
+            self._receive(ports if every else [by_descriptor[ready] for ready in readable])
             now_ns = time.monotonic_ns()
             stages.lap(histogram.RECEIVE, now_ns)
             ticked = pipeline.advance(now_ns)
             if ticked is None and pacer.slow and pipeline.slab.fresh_count:
                 ticked = pipeline.tick_now(now_ns)
             if ticked is not None:
+                self.publisher.release()
                 sent_ns = time.monotonic_ns()
                 stages.lap(histogram.SEND, sent_ns)
                 self.report.ticked(now_ns, sent_ns)
@@ -187,10 +195,15 @@ class Daemon:
             elif now_ns >= master.wake_ns:
                 master.poll(now_ns)
 
+    def _stepped(self) -> None:
+        self.report.stages.lap(histogram.TICK, time.monotonic_ns())
+        self.publisher.hold()
+
     def _begin(self, sync_ns: int, now_ns: int) -> None:
         """A SYNC was sent or seen: a new period."""
         self.report.stages.begin(self.sync.overruns, not self.pipeline.cycle.ticked)
         self.pipeline.begin(sync_ns, now_ns)
+        self.publisher.release()
         self.inputs.poll(now_ns)
         if self._rested_ns > _COLD_NS:  # now, while the nodes sample and answer
             self.pipeline.rehearse()
@@ -219,8 +232,16 @@ class Daemon:
         self.pipeline.settle()
         now_ns = time.monotonic_ns()
         lap(histogram.SETTLE, now_ns)
-        self.master.poll(now_ns)
         self.pacer.step(now_ns)
+        if now_ns >= self._house_ns:
+            self._house_ns = now_ns + _HOUSE_NS
+            self._keep_house(now_ns)
+        alive(now_ns)
+        lap(histogram.REQUESTS, time.monotonic_ns())
+
+    def _keep_house(self, now_ns: int) -> None:
+        lap = self.report.stages.lap
+        self.master.poll(now_ns)
         for port in self.ports.values():
             port.look(now_ns)
         lap(histogram.NODES, time.monotonic_ns())
@@ -230,8 +251,6 @@ class Daemon:
         self.publisher.take_subscriptions(now_ns)
         self.demand.step(now_ns)
         self.control.poll(now_ns)
-        alive(now_ns)
-        lap(histogram.REQUESTS, time.monotonic_ns())
 
 
 def pad_names(deployment: Deployment) -> list[tuple[str, str]]:

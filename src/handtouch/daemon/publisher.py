@@ -48,6 +48,7 @@ class Publisher:
         self._seq: Counter[str] = Counter()
         self._repeats: dict[tuple[str, str], None] = {}  # (stream, topic) that somebody waits for, in order
         self._wanted: dict[str, bool] = {}
+        self._held: list[list[bytes]] | None = None
         for stream, endpoint, queue in (("live", live, LIVE_QUEUE), ("complete", complete, COMPLETE_QUEUE)):
             socket: zmq.Socket[bytes] = context.socket(zmq.XPUB)
             self._sockets[stream] = socket
@@ -111,14 +112,33 @@ class Publisher:
         if not self.wants(topic):
             return
         parts = wire.encode(message)
-        for stream, socket in self._sockets.items():
-            if any(parts[0].startswith(prefix) for prefix in self._asked[stream]):
-                self._try_send(stream, socket, parts)
+        if self._held is None:
+            self._send_all([parts])
+        else:
+            self._held.append(parts)
+
+    def hold(self) -> None:
+        """Keep what is sent until `release`: ZeroMQ's thread is woken once, not for every message."""
+        if self._held is None:
+            self._held = []
+
+    def release(self) -> None:
+        """Send what was held, on the live stream first."""
+        held, self._held = self._held, None
+        if held:
+            self._send_all(held)
 
     def close(self) -> None:
         """Close both streams; what is queued has 0.2 s to leave."""
         for socket in self._sockets.values():
             socket.close()
+
+    def _send_all(self, messages: list[list[bytes]]) -> None:
+        for stream, socket in self._sockets.items():
+            asked = tuple(self._asked[stream])
+            for parts in messages:
+                if parts[0].startswith(asked):
+                    self._try_send(stream, socket, parts)
 
     def _repeat(self, now_ns: int) -> None:
         sent = 0

@@ -46,6 +46,8 @@ LOCATED = np.dtype(
 _ALL_CHANNELS = np.ones(4)
 _LEAVING = 0.7
 """Of a map's trust: beyond it, it is drawn anew before the contact leaves it."""
+_ALONG = 0.3
+"""Beyond this, it is drawn along with one that has to be: a further one costs a tenth of the first."""
 _TREND = 4
 """Ticks of exponential smoothing, which lags behind a steady change by one less."""
 _NOTHING_READ = np.zeros(0, dtype=np.intp), np.zeros((0, 4))
@@ -424,8 +426,9 @@ class Tick:
         self._behind[pads] = behind
         ahead = currents + (currents - behind) / (_TREND - 1)
         values, off = self.follower.read(pads, ahead)
-        leaving = np.flatnonzero(off.max(axis=1) > _LEAVING)
-        if len(leaving):
+        far = off.max(axis=1)
+        if np.count_nonzero(far > _LEAVING):
+            leaving = np.flatnonzero(far > _ALONG)
             self._draw(pads[leaving], ahead[leaving], values[leaving, XY])
 
     def _draw(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> None:
