@@ -125,6 +125,7 @@ class Journal:
 def _files(deployment: Deployment) -> dict[str, Any]:
     """Every file that the deployment names and that a model of it needs, as far as it is still there."""
     named = {node.eds for node in deployment.nodes.values() if node.eds}
+    named |= {hand.urdf for hand in deployment.hands if hand.urdf}
     return {path: Path(path).read_bytes() for path in sorted(named) if Path(path).is_file()}
 
 

@@ -28,7 +28,9 @@ from handtouch.daemon.journal import build
 from handtouch.daemon.messages import Outlet
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pipeline import Pipeline
-from handtouch.daemon.scene import Scenes
+from handtouch.daemon.scene import Scenes, Wanted
+from handtouch.hand.joints import Joints
+from handtouch.hand.robot import Robots
 from handtouch.record.read import Entry
 
 Take = Callable[[wire.Contact], None]
@@ -113,6 +115,7 @@ class Again:
         self._outlet = _Outlet(take, publisher)
         self._deployment: Deployment | None = None
         self._model: PadModel | None = None
+        self._robots: Robots | None = None
         self._told = ""
         self._limits: NDArray[np.int64] | None = None
         self._recorded: dict[tuple[str, int], dict[str, Any]] = {}
@@ -143,16 +146,26 @@ class Again:
             return
         self._told = payload["deployment"]
         with recorded_deployment(payload) as deployment:
-            self._deployment, self._model = deployment, PadModel(deployment)
+            self._deployment, self._model, self._robots = deployment, PadModel(deployment), Robots(deployment)
         self.pipeline = None  # the state follows
 
     def _restore(self, payload: dict[str, Any]) -> None:
-        if self._deployment is None or self._model is None:
+        if self._model is None:
             return
         if self.pipeline is None:
-            self.pipeline = _pipeline(self._deployment, self._model, self._outlet, payload["run"])
+            self.pipeline = self._new_pipeline(payload["run"], self._robots)
         state.restore(self.pipeline, state.unpack(payload["state"]))
         self._limits = _limits(payload["limits"])
+
+    def _new_pipeline(self, run: int, robots: Robots | None) -> Pipeline:
+        """Of the recorded deployment."""
+        assert self._model is not None
+        assert self._deployment is not None
+        settings = self._deployment.daemon
+        period_ns = round(settings.sync_period_ms * 1e6)
+        pipeline = Pipeline(self._model, period_ns, settings.window, self._outlet, run, robots)
+        pipeline.slab = FedSlab(self._model.size)
+        return pipeline
 
     def _tick(self, payload: dict[str, Any]) -> None:
         pipeline = self.pipeline
@@ -214,13 +227,13 @@ class Anew(Again):
         self._corrections: dict[str, Any] = {}
 
     def _restore(self, payload: dict[str, Any]) -> None:
-        if self._model is None or self._deployment is None:
+        if self._model is None:
             return
         saved = state.unpack(payload["state"])
         self._limits = _limits(payload["limits"])
         corrections = {path: value for path, value in saved.items() if path.startswith("model.")}
         if self.pipeline is None:
-            self._shadow = _pipeline(self._deployment, self._model, self._outlet, payload["run"])
+            self._shadow = self._new_pipeline(payload["run"], self._robots)
             self.pipeline = self._adopted(saved, payload["run"])
         elif corrections != self._corrections and self._shadow is not None and not self._nominal:
             state.restore(self._shadow, saved)
@@ -231,20 +244,20 @@ class Anew(Again):
     def _adopted(self, saved: dict[str, Any], run: int) -> Pipeline:
         """A pipeline that goes on with our deployment. Raises ValueError where the pads differ."""
         assert self._model is not None
-        assert self._deployment is not None
         model = PadModel(self._new)
         names = [list(zip(m.hands, m.links, strict=True)) for m in (self._model, model)]
         if names[0] != names[1]:
             told = ["/".join(name) for name in sorted(set(names[0]) ^ set(names[1]))]
             raise ValueError(f"its pads differ from the recording's: {', '.join(told) or 'in their order'}")
-        pipeline = _pipeline(self._deployment, self._model, self._outlet, run)
+        pipeline = self._new_pipeline(run, Robots(self._new))
         state.restore(pipeline, saved)
         if not self._nominal:
             model.take_over(self._model)
         pipeline.adopt(model, np.arange(model.size))
         needs = Scenes(self._new.scene, names[1]).needs
         every = np.ones(model.size, dtype=np.int64)
-        pipeline.tick.want(needs.pads, needs.pads & needs.strength, needs.tolerance_m, every)
+        strength = needs.pads & needs.strength
+        pipeline.want(Wanted(needs.pads, strength, needs.tolerance_m, every, needs.palm, needs.base))
         return pipeline
 
     def _compare(self) -> None:
@@ -281,9 +294,11 @@ def recorded_deployment(payload: dict[str, Any]) -> Iterator[Deployment]:
         for number, (name, data) in enumerate(payload["files"].items()):
             path = Path(folder) / f"{number}-{Path(name).name}"
             path.write_bytes(data)
-            for node in told["node"].values():
-                if node.get("eds") == name:
-                    node["eds"] = str(path)
+            for table, key in [(node, "eds") for node in told["node"].values()] + [
+                (hand, "urdf") for hand in told["hand"]
+            ]:
+                if table.get(key) == name:
+                    table[key] = str(path)
         yield Deployment.model_validate_json(json.dumps(told))
 
 
@@ -313,6 +328,8 @@ def fill(
     """Put what a tick was made from where the tick looks for it."""
     assert isinstance(pipeline.slab, FedSlab)
     pipeline.slab.feed(columns, limits)
+    told = {(hand, t_ns): _joints(t_ns, parts) for hand, t_ns, *parts in payload["others"].get("joints", ())}
+    pipeline.frames.joints_at = lambda hand, t_ns: told.get((hand, t_ns))
     pipeline.node_state[:] = columns["node_state"]
     pipeline.cycle.t_ns, pipeline.cycle.previous_ns = payload["t_ns"], payload["previous_ns"]
     tick = pipeline.tick
@@ -320,11 +337,8 @@ def fill(
     tick.period_ns[:], tick.paced_ns[:] = columns["period_ns"], columns["paced_ns"]
 
 
-def _pipeline(deployment: Deployment, model: PadModel, outlet: _Outlet, run: int) -> Pipeline:
-    settings = deployment.daemon
-    pipeline = Pipeline(model, round(settings.sync_period_ms * 1e6), settings.window, outlet, run)
-    pipeline.slab = FedSlab(model.size)
-    return pipeline
+def _joints(t_ns: int, parts: list[bytes]) -> Joints:
+    return Joints(t_ns, *(np.frombuffer(part) for part in parts))
 
 
 def _limits(data: bytes) -> NDArray[np.int64]:
