@@ -1,0 +1,313 @@
+"""Faults obey the laws of the sheet and its wires; what is many at once is the same one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TypeVar
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from handtouch import config, shipped
+from handtouch.hand import network_of
+from handtouch.simulate.episodes import CASES, episode, size_mm
+from handtouch.simulate.faults import (
+    FAULTS,
+    DeadElectrode,
+    Fault,
+    GainStep,
+    Gum,
+    Heat,
+    Moisture,
+    Offset,
+    SaturatedChannel,
+    ShortedElectrode,
+    StuckChannel,
+    SwappedCables,
+    TornCorner,
+)
+from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.world import World
+
+CALM = dataclasses.replace(World.ideal_parts(3), noise_counts=0.0)
+FULL_MA = 0.02  # fine enough that rounding is out of the way
+HELD = np.array([10.0])
+AT: dict[str, object] = {"link": "flat", "from_s": 5.0}
+Kind = TypeVar("Kind", bound=Fault)
+
+
+def on_flat(kind: type[Kind], **own: object) -> Kind:
+    """A fault of the flat pad from 5 s on."""
+    return kind.model_validate(AT | own)
+
+
+def press(*places: tuple[float, float], link: str = "flat", force_n: float = 1.0) -> Scenario:
+    """Long, steady touches, all at once."""
+    return Scenario.model_validate(
+        {
+            "touch": [
+                {"link": link, "from_s": 0.0, "duration_s": 1e4, "path": (place,), "force_n": (force_n,)}
+                for place in places
+            ]
+        }
+    )
+
+
+FAR = Scenario.model_validate(
+    {"touch": [{"link": "tip", "from_s": 0.0, "duration_s": 1.0, "path": ((0.5, 0.5),), "force_n": (1.0,)}]}
+)
+"""Nothing ever touches the flat pad."""
+
+
+def currents(
+    deployment: config.Deployment,
+    scenario: Scenario,
+    *faults: Fault,
+    t_s: float = 10.0,
+    full_ma: float = FULL_MA,
+) -> NDArray[np.float64]:
+    """Of the flat pad, in counts, hardly rounded: a fine converter."""
+    node = deployment.nodes["plain"]
+    fine = deployment.model_copy(
+        update={"nodes": {"plain": node.model_copy(update={"full_scale_ma": full_ma})}}
+    )
+    return VirtualHand(fine, scenario, CALM, faults=faults).counts(0, [t_s])[0].astype(np.float64)
+
+
+@pytest.mark.parametrize("electrode", range(4))
+def test_a_dead_electrode_leaves_all_current_to_the_other_three(
+    deployment: config.Deployment, electrode: int
+) -> None:
+    name = ("x0", "xa", "y0", "yb")[electrode]
+    whole = currents(deployment, press((0.4, 0.6), force_n=0.05))
+    left = currents(deployment, press((0.4, 0.6), force_n=0.05), on_flat(DeadElectrode, electrode=name))
+    others = np.delete(np.arange(4), electrode)
+    assert abs(left[electrode]) <= 1
+    assert (left[others] > whole[others]).all()
+    assert 0.85 * whole.sum() < left.sum() <= whole.sum()  # a little less: there is more sheet in its way
+    conductance = network_of(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
+    taken = conductance[electrode, others] / -conductance[electrode, electrode]
+    shares = (whole[others] + taken * whole[electrode]) / whole.sum()  # Kirchhoff at the floating electrode
+    assert shares.sum() == pytest.approx(1, abs=1e-3)
+    np.testing.assert_allclose(left[others] / left.sum(), shares, atol=1e-3)
+
+
+def test_swapped_cables_permute_the_channels(deployment: config.Deployment) -> None:
+    whole = currents(deployment, press((0.3, 0.6), force_n=0.05))
+    swapped = currents(
+        deployment, press((0.3, 0.6), force_n=0.05), on_flat(SwappedCables, order=("y0", "xa", "yb", "x0"))
+    )
+    np.testing.assert_array_equal(swapped, whole[[2, 1, 3, 0]])
+
+
+def test_electrodes_that_are_shorted_together_share_evenly(deployment: config.Deployment) -> None:
+    whole = currents(deployment, press((0.2, 0.6), force_n=0.05))
+    fault = on_flat(ShortedElectrode, electrode="x0", to="yb", short_ohm=1e-3)
+    shorted = currents(deployment, press((0.2, 0.6), force_n=0.05), fault)
+    assert shorted[0] == pytest.approx(shorted[3], abs=1.5)
+    assert shorted[[0, 3]].sum() == pytest.approx(whole[[0, 3]].sum(), rel=0.05)
+    np.testing.assert_allclose(shorted[[1, 2]], whole[[1, 2]], atol=0.05 * whole.sum())
+
+
+def test_an_electrode_shorted_to_the_layer_saturates_and_drives_its_neighbours_untouched(
+    deployment: config.Deployment,
+) -> None:
+    hand = VirtualHand(deployment, FAR, CALM, faults=(on_flat(ShortedElectrode, electrode="x0"),))
+    counts = hand.counts(0, HELD)[0]
+    assert counts[0] == 32767
+    conductance = network_of(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
+    drive = counts[1:] * 10e-3 / 32767 * 2400.0 / -conductance[0, 1:]
+    assert np.ptp(drive) < 1e-2 * drive.mean()  # one potential drives all three
+    assert 4.5 < drive.mean() < 5.0  # all of the supply but what the short takes
+
+
+@pytest.mark.parametrize("corner", ["x0y0", "x0yb", "xay0", "xayb"])
+def test_a_tear_without_length_is_no_tear(deployment: config.Deployment, corner: str) -> None:
+    whole = currents(deployment, press((0.4, 0.6), force_n=0.05))
+    torn = currents(
+        deployment,
+        press((0.4, 0.6), force_n=0.05),
+        on_flat(TornCorner, corner=corner, along_x_mm=0, along_y_mm=0),
+    )
+    np.testing.assert_array_equal(torn, whole)
+
+
+def test_a_tear_takes_current_from_the_electrodes_that_it_frees_and_keeps_the_rest(
+    deployment: config.Deployment,
+) -> None:
+    scenario = press((0.4, 0.5), force_n=0.05)
+    whole = currents(deployment, scenario)
+    lost = []
+    for share in (0.1, 0.3, 0.5):
+        tear = on_flat(TornCorner, corner="x0y0", along_x_mm=share * 40, along_y_mm=share * 25)
+        torn = currents(deployment, scenario, tear)
+        lost.append(whole[[0, 2]].sum() - torn[[0, 2]].sum())
+        assert (torn[[1, 3]] >= whole[[1, 3]]).all()
+        assert torn.sum() == pytest.approx(whole.sum(), rel=1e-3)
+    assert lost == sorted(lost)
+    assert lost[-1] > 0.05 * whole.sum()
+
+
+def test_what_is_torn_off_feels_nothing(deployment: config.Deployment) -> None:
+    tear = on_flat(TornCorner, corner="xayb", along_x_mm=16, along_y_mm=10)
+    np.testing.assert_array_equal(currents(deployment, press((0.9, 0.9)), tear), 0)
+
+
+def residual(deployment: config.Deployment, counts: NDArray[np.float64]) -> float:
+    """What is left of the four currents when a point is fitted to them, in parts of their sum."""
+    network = network_of(deployment.hands[0].pads[0], deployment.sheets["firm"])
+    found = network.estimate(counts, 1.0)
+    expected = network.fractions(found.x, found.y)
+    return float(np.abs(counts / counts.sum() - expected / expected.sum()).max())
+
+
+def test_a_leak_has_a_residual_and_a_point_has_none(deployment: config.Deployment) -> None:
+    point = currents(deployment, press((0.5, 0.5), force_n=0.05))
+    wet = on_flat(Moisture, place=(0.5, 0.5), radius_mm=10, leak_ohm=4e5, grow_s=0.1)
+    leak = currents(deployment, FAR, wet)
+    assert residual(deployment, point) < 1e-4
+    assert residual(deployment, leak) > 20 * residual(deployment, point)
+
+
+def test_a_small_leak_is_its_conductance_and_dries_as_it_should(deployment: config.Deployment) -> None:
+    wet = Moisture(
+        link="flat",
+        from_s=0.0,
+        until_s=100.0,
+        place=(0.5, 0.5),
+        radius_mm=6,
+        leak_ohm=1e6,
+        grow_s=20.0,
+        dry_s=50.0,
+    )
+    sums = [currents(deployment, FAR, wet, t_s=t).sum() for t in (20.0, 99.0, 150.0)]
+    full = 5.0 / 1e6 / (1e-3 * FULL_MA) * 32767
+    np.testing.assert_allclose(
+        sums, full * np.array([1 - np.exp(-1), 1 - np.exp(-4.95), np.exp(-1)]), rtol=0.01
+    )
+
+
+def test_gum_is_a_contact_at_its_place_that_stays(deployment: config.Deployment) -> None:
+    gum = on_flat(Gum, place=(0.3, 0.6), radius_mm=2.0, force_n=0.05, press_n=0, relax=0.0)
+    before = currents(deployment, FAR, gum, t_s=4.9)
+    np.testing.assert_array_equal(before, 0)
+    later = currents(deployment, FAR, gum, t_s=5000.0)
+    touch = press((0.3, 0.6)).model_dump(by_alias=True)
+    touch["touch"] = [touch["touch"][0] | {"radius_mm": 2.0, "path": ((0.3, 0.6),), "force_n": (0.05,)}]
+    np.testing.assert_allclose(later, currents(deployment, Scenario.model_validate(touch)), atol=1)
+
+
+def test_two_contacts_take_from_each_other_and_far_ones_less(deployment: config.Deployment) -> None:
+    def lost(apart: float) -> float:
+        one, other = (0.5 - apart / 2, 0.5), (0.5 + apart / 2, 0.5)
+        first, second, both = (
+            currents(deployment, press(*places, force_n=0.5), full_ma=10.0).sum()
+            for places in ((one,), (other,), (one, other))
+        )
+        return float(1 - both / (first + second))
+
+    losses = [lost(apart) for apart in (0.25, 0.5, 0.8)]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[-1] > 0
+    assert losses[0] > 5 * losses[-1]
+
+
+def test_greens_function_is_symmetric(deployment: config.Deployment) -> None:
+    hand = VirtualHand(deployment, press((0.3, 0.4), (0.7, 0.8)), CALM)
+    turned = VirtualHand(deployment, press((0.7, 0.8), (0.3, 0.4)), CALM)
+    np.testing.assert_array_equal(hand.counts(0, HELD), turned.counts(0, HELD))
+
+
+def test_channels_drift_jump_stick_and_saturate_as_told(deployment: config.Deployment) -> None:
+    scenario = press((0.4, 0.6), force_n=0.05)
+    whole = currents(deployment, scenario)
+    np.testing.assert_array_equal(
+        currents(deployment, scenario, on_flat(Offset, electrode="xa", counts=50.0)) - whole, [0, 50, 0, 0]
+    )
+    stepped = currents(deployment, scenario, on_flat(GainStep, electrode="yb", factor=1.5))
+    np.testing.assert_allclose(stepped / whole, [1, 1, 1, 1.5], rtol=2e-4)
+    assert currents(deployment, scenario, on_flat(SaturatedChannel, electrode="y0"))[2] == 32767
+    stuck = VirtualHand(deployment, scenario, World(3), faults=(on_flat(StuckChannel, electrode="x0"),))
+    counts = stuck.counts(0, np.arange(4.0, 8.0, 0.01))
+    assert np.ptp(counts[:90, 0]) > 0
+    assert np.ptp(counts[110:, 0]) == 0
+    assert np.ptp(counts[110:, 1]) > 0
+
+
+def test_warmth_conducts_better_and_goes_again(deployment: config.Deployment) -> None:
+    scenario = press((0.4, 0.6), force_n=0.05)
+    heat = Heat(link="flat", from_s=5.0, until_s=500.0, warmer_by_k=20.0, time_s=10.0)
+    whole = currents(deployment, scenario).sum()
+    warm, after = (currents(deployment, scenario, heat, t_s=t).sum() for t in (400.0, 900.0))
+    assert 1.1 * whole < warm < 1.4 * whole
+    assert after == pytest.approx(whole, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", [*FAULTS, *CASES])
+def test_many_at_once_are_the_same_one_by_one(deployment: config.Deployment, name: str) -> None:
+    pad = deployment.hands[0].pads[0]
+    played = episode(name, 2, pad, 20.0)
+    assert (played.fault is None) == (name in CASES)
+    hand = VirtualHand(deployment, played.scenario, World.drifting(2), "near", played.acting)
+    times = np.linspace(0.0, 20.0, 41)
+    np.testing.assert_array_equal(hand.counts(0, times), [hand.sample(t)[0] for t in times])
+
+
+@pytest.mark.parametrize("name", [name for name in FAULTS if name != "swapped_cables"])
+def test_a_fault_changes_nothing_before_it_begins_and_something_after(
+    deployment: config.Deployment, name: str
+) -> None:
+    pad = deployment.hands[0].pads[0]
+    played = episode(name, 4, pad, 40.0)
+    assert played.fault is not None
+    times = np.linspace(0.0, 40.0, 400)
+    sick, well = (
+        VirtualHand(deployment, played.scenario, CALM, "near", faults).counts(0, times)
+        for faults in (played.acting, ())
+    )
+    before = times < played.fault.from_s
+    np.testing.assert_array_equal(sick[before], well[before])
+    assert (sick[~before] != well[~before]).any()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([*FAULTS, *CASES]))
+def test_every_episode_is_a_valid_scenario_and_its_seed_makes_it(seed: int, name: str) -> None:
+    pad = config.load(shipped.path("utah_mit.toml")).hands[0].pads[0]
+    one, again = episode(name, seed, pad), episode(name, seed, pad)
+    assert one == again
+    assert one.name == name
+    assert all(touch.until_s <= one.duration_s + 1e-9 for touch in one.scenario.touches)
+    if one.fault is not None:
+        assert one.fault.from_s < one.duration_s / 2
+
+
+def test_sides_of_a_pad_are_those_of_its_surface(deployment: config.Deployment) -> None:
+    assert size_mm(deployment.hands[0].pads[0]) == pytest.approx((40.0, 25.0))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: on_flat(SwappedCables, order=("x0", "xa", "y0", "yb")),
+        lambda: on_flat(SwappedCables, order=("x0", "x0", "y0", "yb")),
+        lambda: on_flat(ShortedElectrode, electrode="x0", to="x0"),
+        lambda: Offset(link="flat", from_s=5.0, until_s=4.0, electrode="x0", counts=3.0),
+    ],
+)
+def test_a_fault_that_makes_no_sense_is_refused(wrong: object) -> None:
+    with pytest.raises(ValidationError):
+        wrong()  # type: ignore[operator]
+
+
+def test_the_shipped_scenario_of_faults_suits_the_shipped_hand() -> None:
+    hand = config.load(shipped.path("utah_mit.toml"))
+    played = Scenario.load(shipped.path("utah_mit_faults.toml"))
+    played.check_links(pad.link for pad in hand.hands[0].pads)
+    assert {type(fault) for fault in played.faults} == {Gum, Moisture, DeadElectrode, TornCorner}
+    assert played.swaps[0].serial == 4711
