@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from handtouch.canbus.eds import EdsError
 from handtouch.canbus.master import Master
-from handtouch.canbus.nodes import checked, node_specs
+from handtouch.canbus.nodes import NodeSpec, checked, node_specs
 from handtouch.canbus.port import BusError, Port
 from handtouch.canbus.router import SYNC_ID
 from handtouch.canbus.sync import Sync
@@ -42,10 +43,12 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.report import Report
 from handtouch.daemon.scene import Demand, Needs, Scenes, Wanted
 from handtouch.daemon.security import Gate
+from handtouch.daemon.supervisor import Supervisor
 from handtouch.hand.joints import JointStates
 from handtouch.hand.robot import Robots
 from handtouch.hand.robot import check as check_robots
 from handtouch.keys import KeysError
+from handtouch.supervise.store import store_path
 
 _log = logging.getLogger("handtouch.daemon")
 
@@ -61,6 +64,7 @@ class Daemon:
 
     `read` reads the deployment anew when control asks for it. Raises BusError or OSError, each naming what is
     missing and a remedy, when a bus or an endpoint can't be opened; KeysError for keys that can't be used.
+    `beside`: folder of the deployment's file, where its calibration store may be.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class Daemon:
         deployment: Deployment,
         model: PadModel | None = None,
         read: Callable[[], Deployment] | None = None,
+        beside: Path | None = None,
     ) -> None:
         self.deployment = deployment
         self._rested_ns = 0
@@ -102,7 +107,7 @@ class Daemon:
                 self.ports[bus.name] = port = Port.open(bus, self.pipeline.slab)
                 opened.callback(port.close)
             self._opened = opened.pop_all()
-        self.master = Master(self.ports, node_specs(deployment), period_ns)
+        self.master = Master(self.ports, self._specs(), period_ns)
         self.sync = Sync(list(self.ports.values()), period_ns)
         self.report = Report(
             deployment,
@@ -115,6 +120,13 @@ class Daemon:
             self.control,
         )
         self.report.inputs = self.inputs.figures
+        self.supervisor: Supervisor | None = None
+        if settings.supervise:
+            store = str(store_path(settings.store, beside))
+            self.supervisor = Supervisor(deployment, self.pipeline, self.master, store)
+            self.supervisor.rested = self._rest
+            self._opened.callback(self.supervisor.close)
+        self.report.supervisor = self.supervisor
         names = pad_names(deployment)
         scenes = Scenes(deployment.scene, names)
         self.pacer = Pacer(deployment, scenes.needs.pads, self.pipeline, self.master, self.sync)
@@ -136,6 +148,13 @@ class Daemon:
         """Give buses and endpoints back."""
         self._opened.close()
 
+    def _specs(self) -> list[NodeSpec]:
+        """Of all nodes; where a replacement is welcome, a serial number is nothing that a node must have."""
+        specs, settings = node_specs(self.deployment), self.deployment.daemon
+        if not settings.supervise or settings.another_unit == "refuse":
+            return specs
+        return [replace(spec, serial=None) for spec in specs]
+
     def _open_inputs(self, context: zmq.Context[zmq.Socket[bytes]], robots: Robots) -> Inputs:
         parts = zip(robots.hands, robots.joint_names, robots.kinematics, strict=True)
         states = {hand: JointStates(names, kinematics.continuous) for hand, names, kinematics in parts}
@@ -146,6 +165,8 @@ class Daemon:
 
         At the end contacts end and nodes are stopped.
         """
+        if self.supervisor is not None:
+            self.supervisor.start(time.monotonic_ns())
         self.master.start(time.monotonic_ns())
         gc.collect()
         gc.freeze()
@@ -156,6 +177,8 @@ class Daemon:
             self.sync.stop()
             self.pipeline.end(now_ns)
             self.master.stop(now_ns)
+            if self.supervisor is not None:
+                self.supervisor.close()
             gc.unfreeze()
 
     def _loop(self, stop: threading.Event, alive: Callable[[int], None]) -> None:
@@ -223,8 +246,18 @@ class Daemon:
         """Do what is wanted now, and no more."""
         self.pipeline.want(wanted)
         self.pipeline.frames_every = self.demand.frames_every
-        self.pacer.set_needs(needs.pads & enabled, needs.raw, now_ns)
+        self._raw = needs.raw
+        if self.supervisor is None:
+            self.pacer.set_needs(needs.pads & enabled, needs.raw, now_ns)
+        else:
+            self.supervisor.needed = needs.pads & enabled
+            self._rest(now_ns)
         self.report.set_disabled(self.demand.disabled_by)
+
+    def _rest(self, now_ns: int) -> None:
+        """What the scenes hold, but for the pads that rest."""
+        assert self.supervisor is not None
+        self.pacer.set_needs(self.supervisor.needed & ~self.supervisor.turns.resting, self._raw, now_ns)
 
     def _after_tick(self, alive: Callable[[int], None]) -> None:
         """What may wait until the contacts are out."""
@@ -233,6 +266,9 @@ class Daemon:
         now_ns = time.monotonic_ns()
         lap(histogram.SETTLE, now_ns)
         self.pacer.step(now_ns)
+        if self.supervisor is not None:
+            self.supervisor.step(now_ns)
+            lap(histogram.SUPERVISE, time.monotonic_ns())
         if now_ns >= self._house_ns:
             self._house_ns = now_ns + _HOUSE_NS
             self._keep_house(now_ns)
@@ -271,7 +307,7 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     said = logs.start(deployment.daemon.log_level)
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
     try:
-        return _serve(deployment, stop, partial(_read, config_path, buses))
+        return _serve(deployment, stop, partial(_read, config_path, buses), config_path.parent)
     finally:
         said.close()
 
@@ -285,14 +321,16 @@ def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
     return check_robots(deployment, str(config_path))
 
 
-def _serve(deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment]) -> int:
+def _serve(
+    deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment], beside: Path
+) -> int:
     settings = deployment.daemon
     sys.setswitchinterval(_GIL_SWITCH_S)
     notifier = Notifier()
     with ExitStack() as opened:
         opened.callback(notifier.close)
         try:
-            daemon = opened.enter_context(Daemon(deployment, read=read))
+            daemon = opened.enter_context(Daemon(deployment, read=read, beside=beside))
             if settings.metrics is not None:
                 exporter = opened.enter_context(closing(Exporter(settings.metrics)))
                 daemon.report.listener = exporter.take

@@ -25,6 +25,7 @@ from handtouch.daemon.logs import Logs
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.security import Gate
+from handtouch.daemon.supervisor import Supervisor
 from handtouch.supervise.health import explain
 from handtouch.wire import PadState
 
@@ -71,6 +72,7 @@ class Report:
         """is given every health and service message, subscribed or not"""
         self.inputs: Callable[[int], dict[str, Any]] = lambda _: {}
         """what came to the inputs endpoint until a time [ns]"""
+        self.supervisor: Supervisor | None = None
         self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
         self._names = [(hand, pad.link) for hand, pad in self._pads]
         self._disabled_by: dict[int, str] = {}
@@ -105,11 +107,16 @@ class Report:
                 hand, link = self._names[event.slot]
                 _log.info("%s/%s: %s", hand, link, event, extra={"fields": {"hand": hand, "link": link}})
             self._translate()
+            if self.supervisor is not None:
+                self.supervisor.note(events, now_ns)
         state = self._pipeline.tick.columns.state
         visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
         changed = self._events_before | set(np.flatnonzero(visible != self._told).tolist())
         self._events_before = {event.slot for event in events}  # told when a tick has taken them in
         self._told[:] = visible
+        if self.supervisor is not None and self.supervisor.changed:
+            changed |= self.supervisor.changed
+            self.supervisor.changed.clear()
         if now_ns - self._second.since_ns >= _SECOND_NS:
             self._rate_hz = self._second.per_second(now_ns, self._pipeline.tick.samples)
             changed = set(range(len(self._pads)))
@@ -189,6 +196,7 @@ class Report:
             heartbeats_missed=status.heartbeats_missed,
             emergencies=tuple(str(emergency) for emergency in status.emergencies),
             repeat=False,
+            **(self.supervisor.told(pad) if self.supervisor is not None else {}),
         )
 
     def _why_disabled(self, pad: int) -> str:
@@ -231,6 +239,7 @@ class Report:
                 sorted(prefix.decode("utf-8", "replace") for prefix in self._publisher.subscriptions)
             ),
             repeat=False,
+            supervisor=self.supervisor.figures() if self.supervisor is not None else None,
             inputs=self.inputs(now_ns),
         )
 

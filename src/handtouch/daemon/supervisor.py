@@ -7,20 +7,23 @@ took another's place is put into quarantine here, at once, whether the slow half
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handtouch.canbus.master import Master, NodeEvent, NodeState, SerialChanged
 from handtouch.config import Deployment
 from handtouch.daemon.blocks import Blocks
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.process import Process
+from handtouch.daemon.rest import Turns
 from handtouch.supervise.calibration import Law
 from handtouch.supervise.link import (
     Alive,
     Calibrate,
+    Finding,
     Judged,
     Start,
     Word,
@@ -32,6 +35,10 @@ from handtouch.supervise.link import (
 
 _UNKNOWN_GAINS = 0.05**2 * (np.eye(4) - 0.25)
 """Covariance of log gains of a unit that nobody knows; their sum can't be seen."""
+_RESTS = (
+    "rests without potential, for its sheet has got used to load and hides light touches; it feels nothing "
+    "until another pad of the hand is touched, or its turn is over"
+)
 _KNOWN = (NodeState.CONFIGURING, NodeState.OPERATIONAL)
 """By then a node has told who it is."""
 _log = logging.getLogger("handtouch.supervise")
@@ -61,6 +68,12 @@ class Supervisor:
         self.malformed = self.late = 0
         self.changed: set[int] = set()
         """pads that there is something new to tell of; whoever tells it clears it"""
+        self.needed = np.ones(pipeline.model.size, dtype=np.bool_)
+        """pads (n,) that a scene holds"""
+        self.rested: Callable[[int], None] = lambda _: None
+        """is called with the time when other pads rest, `turns.resting`"""
+        rows = pipeline.model.rows_of_hand.values()
+        self.turns = Turns(rows, pipeline.model.size, deployment.scene.rest_after_s)
         self._blocks = Blocks(pipeline.model.size)
         self._serials: list[int | None] = [None] * pipeline.model.size
         self._before: list[int | None] = [pad.serial for _, pad in self._pads]
@@ -102,6 +115,9 @@ class Supervisor:
 
     def step(self, now_ns: int) -> None:
         """After a tick: gather it; now and then send what was gathered and do what was said."""
+        touching = self._pipeline.tick.contacts.touching
+        if self.turns.due(now_ns, touching):
+            self._rest(now_ns, touching)
         if self.process.pid is None:
             if self.process.step(now_ns):
                 self._blocks.clear()
@@ -138,14 +154,29 @@ class Supervisor:
         judged = self.judged[pad]
         quarantined = bool(self._pipeline.model.quarantined[pad])
         name = self._pipeline.model.calibration[pad]
+        rests = (self._resting(pad),) if self.turns.resting[pad] else ()
         if judged is None:
-            return {"trust": "quarantined" if quarantined else "nominal", "calibration": name}
+            trust = "quarantined" if quarantined else "nominal"
+            return {"trust": trust, "calibration": name, "findings": rests}
         return {
             "trust": judged.trust,
             "calibration": name,
             "calibrating": judged.calibrating,
-            "findings": tuple(map(plain, judged.findings)),
+            "findings": (*rests, *map(plain, judged.findings)),
         }
+
+    def _rest(self, now_ns: int, touching: NDArray[np.bool_]) -> None:
+        """Let fading sheets rest, or wake them."""
+        strength, turns = self._pipeline.tick.strength, self.turns
+        before = turns.resting.copy()
+        if not turns.step(now_ns, touching, self.needed, strength.back[0], self._pipeline.model.on_n):
+            return
+        for group in strength.groups.all:
+            group.compensator.set_powered(~turns.resting[group.pads])
+        for pad in np.flatnonzero(turns.resting != before).tolist():
+            self._say(pad, _RESTS if turns.resting[pad] else "is awake again")
+            self.changed.add(pad)
+        self.rested(now_ns)
 
     # Details ----------------------------------------------------------------------------------------------
 
@@ -231,6 +262,17 @@ class Supervisor:
             self._say(pad, f"{trust} -> {word.trust}: {word.calibrating}")
         if (trust, known) != (word.trust, {finding.kind for finding in word.findings}) or before is None:
             self.changed.add(pad)
+
+    def _resting(self, pad: int) -> dict[str, Any]:
+        back_n = float(self._pipeline.tick.strength.back[0][pad])
+        finding = Finding(
+            kind="fading sheet",
+            cause="its sheet has got used to load",
+            evidence=f"to {back_n:.2f} N, and a touch counts from {self._pipeline.model.on_n[pad]:.2f} N",
+            remedy="it rests without potential and feels nothing: touch another pad of the hand to wake it",
+            since_ns=self._pipeline.cycle.t_ns,
+        )
+        return plain(finding)
 
     def _say(self, pad: int, text: str) -> None:
         _log.warning("%s: %s", self._name(pad), text, extra=self._fields(pad))
