@@ -47,10 +47,21 @@ class Grid:
 GRIDS = (Grid(64, 0.2), Grid(88, 0.15), Grid(128, 0.1))
 
 
-def tabulate(values: FloatArray) -> FloatArray:
-    """Polynomials (cells, cells, TERMS, TERMS, m) through node values (cells + 1, cells + 1, m)."""
-    operator = spline_operator(len(values) - 1, TERMS - 1)
-    return np.asarray(np.einsum("ipx,jqy,xym->ijpqm", operator, operator, values, optimize=True))
+def tabulate(values: FloatArray, out: FloatArray, workspace: FloatArray | None = None) -> FloatArray:
+    """Polynomials (cells^2, TERMS, m TERMS) into `out` through node values (cells + 1, cells + 1, m).
+
+    By cell (y, x), power of y, power of x and column. workspace: as large as `out`, returned for the next
+    table; one big product and one transposition, for the tables are as large as what the start may cost.
+    """
+    cells, columns = len(values) - 1, values.shape[2]
+    operator = spline_operator(cells, TERMS - 1)
+    along_y = np.tensordot(operator, values, axes=(2, 0)).transpose(0, 1, 3, 2)  # cell, power, column, x
+    workspace = np.empty(out.size) if workspace is None else workspace
+    both = workspace.reshape(-1, cells * TERMS)
+    np.matmul(along_y.reshape(-1, cells + 1), operator.reshape(-1, cells + 1).T, out=both)
+    of = both.reshape(cells, TERMS, columns, cells, TERMS)
+    out.reshape(cells, cells, TERMS, TERMS, columns)[:] = of.transpose(0, 3, 1, 4, 2)
+    return workspace
 
 
 def log_ratios(currents: FloatArray) -> FloatArray:
@@ -75,34 +86,30 @@ def start_table(model: ForwardModel, grid: Grid) -> FloatArray:
 
 @dataclass(frozen=True)
 class PadTable:
-    """One model tabulated on a grid.
+    """One model on a grid, as far as is needed to judge it; `tabulate` makes the polynomials of `values`.
 
-    columns: (cells^2, TERMS, COLUMNS TERMS): by cell (y, x), power of y, power of x and column: the fraction
-    of each channel and ln of the spreading radius. error: the largest of a fraction, measured between the
-    nodes, from `MARGIN` inwards; edge_error: the largest anywhere.
+    values: (cells + 1, cells + 1, COLUMNS) at the nodes (y, x): the fraction of each channel and ln of the
+    spreading radius. error: the largest of a fraction, measured between the nodes, from `MARGIN` inwards;
+    edge_error: the largest anywhere.
     """
 
-    columns: FloatArray
+    values: FloatArray
     starts: FloatArray
     error: float
     edge_error: float
 
     @classmethod
     def of(cls, model: ForwardModel, grid: Grid) -> PadTable:
-        """Tabulate `model` and measure what that costs."""
+        """Evaluate `model` and measure what tabulating costs."""
         x, y = grid.points(model, np.arange(grid.cells + 1.0))
         values = np.stack([*model.fractions(x, y), np.log(_spreading_radius(model, x, y))], axis=-1)
-        columns = tabulate(values)
         between = np.arange(0.5, grid.cells)
-        halves = 0.5 ** np.arange(TERMS)
-        found = np.einsum("ijpqm,p,q->mij", columns[..., :4], halves, halves, optimize=True)
+        middle = np.tensordot(spline_operator(grid.cells, TERMS - 1), 0.5 ** np.arange(TERMS), axes=(1, 0))
+        found = middle @ np.moveaxis(values[..., :4], -1, 0) @ middle.T
         error = np.abs(found - model.fractions(*grid.points(model, between))).max(axis=0)
         inside = np.abs(grid.place(between) - 0.5) <= 0.5 - MARGIN
         return cls(
-            columns.reshape(-1, TERMS, TERMS * COLUMNS),
-            start_table(model, grid),
-            float(error[np.ix_(inside, inside)].max()),
-            float(error.max()),
+            values, start_table(model, grid), float(error[np.ix_(inside, inside)].max()), float(error.max())
         )
 
 

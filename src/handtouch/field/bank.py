@@ -8,7 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field._bank_table import COLUMNS, GRIDS, RATIO_CELLS, RATIO_SPAN, TERMS, PadTable, log_ratios
+from handtouch.field._bank_table import (
+    COLUMNS,
+    GRIDS,
+    RATIO_CELLS,
+    RATIO_SPAN,
+    TERMS,
+    PadTable,
+    log_ratios,
+    tabulate,
+)
 from handtouch.field.estimate import CORNER, LOST, PointEstimate, best_direction, covariance_of
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
@@ -50,7 +59,10 @@ class LocatorBank:
         self._model = np.array([order[id(model)] for model in models], dtype=np.intp)
         self._grid = grid
         self._top = np.nextafter(float(grid.cells), 0)
-        self._table = np.ascontiguousarray(np.concatenate([table.columns for table in tables]))
+        self._table = np.empty((len(tables) * grid.cells**2, TERMS, COLUMNS * TERMS))
+        workspace = None
+        for table, part in zip(tables, self._table.reshape(len(tables), -1), strict=True):
+            workspace = tabulate(table.values, part, workspace)
         self._starts = np.stack([table.starts for table in tables]).reshape(-1)
         self._guesses = np.stack([m.fractions(*(_GUESSES * (m.a, m.b)).T).T for m in distinct])
         self.sides = np.array([(model.a, model.b) for model in distinct])[self._model]
