@@ -1,0 +1,146 @@
+"""What robots tell is taken in, or counted and dropped with its cause; nothing that arrives is fatal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+from hypothesis import given
+from hypothesis import strategies as st
+
+from handtouch.daemon.inputs import Inputs
+from handtouch.daemon.security import Gate
+from handtouch.hand.joints import JointStates
+from handtouch.inputs import InputError, JointState, LinkForces, decode, encode
+from handtouch.robot import Robot
+
+NOW = 10**12
+PADS = [("left", "tip"), ("right", "tip"), ("right", "palm")]
+finite = st.floats(-1e6, 1e6)
+
+
+@st.composite
+def _inputs(draw: st.DrawFn) -> JointState | LinkForces:
+    names = tuple(draw(st.lists(st.text(max_size=9), min_size=1, max_size=5, unique=True)))
+    column = st.lists(finite, min_size=len(names), max_size=len(names)).map(np.array)
+    positive = column.map(np.abs)
+    t_ns = draw(st.none() | st.integers(0, 2**62))
+    if draw(st.booleans()):
+        return LinkForces("right", t_ns, names, draw(column), draw(positive))
+    others = (draw(st.none() | column), draw(st.none() | column), draw(st.none() | positive))
+    return JointState("right", t_ns, names, draw(column), *others)
+
+
+def _same(one: Any, two: Any) -> bool:
+    return type(one) is type(two) and all(
+        np.array_equal(getattr(one, name), getattr(two, name)) for name in type(one).__slots__
+    )
+
+
+@given(_inputs())
+def test_every_input_survives_the_wire(message: JointState | LinkForces) -> None:
+    assert _same(decode(encode(message)), message)
+
+
+@given(_inputs(), st.data())
+def test_a_missing_or_wrong_key_is_refused_by_name(
+    message: JointState | LinkForces, data: st.DataObject
+) -> None:
+    topic, payload = encode(message)
+    content = msgpack.unpackb(payload)
+    key = data.draw(st.sampled_from(sorted(content)))
+    wrong: Any
+    for wrong in ("x", [["x"]], [float("nan")] * 5, {}):
+        with pytest.raises(InputError, match=key):
+            decode([topic, msgpack.packb({**content, key: wrong})])
+    if key in ("v", "names", "links", "position_rad", "force_n", "std_n"):
+        del content[key]
+        with pytest.raises(InputError, match=key):
+            decode([topic, msgpack.packb(content)])
+
+
+@given(st.sampled_from([b"joints/right", b"force/right", b"joints", b"x/y", b"\xff"]), st.binary(max_size=50))
+def test_any_bytes_are_refused_but_never_fatal(topic: bytes, payload: bytes) -> None:
+    with pytest.raises(InputError):
+        decode([topic, payload])
+
+
+@pytest.fixture
+def inputs() -> Any:
+    with zmq.Context() as context:
+        states = {"right": JointStates(("a", "b"))}
+        made = Inputs(context, "tcp://127.0.0.1:*", Gate(context), states, PADS)
+        yield made
+        made.close()
+
+
+def joints(hand: str = "right", t_ns: int | None = NOW, names: tuple[str, ...] = ("a", "b")) -> list[bytes]:
+    return encode(JointState(hand, t_ns, names, np.full(len(names), 0.5)))
+
+
+@pytest.mark.parametrize(
+    ("parts", "cause", "said"),
+    [
+        ([b"joints/right", b"\xc1"], "malformed", "msgpack"),
+        ([b"joints/right"], "malformed", "1 parts"),
+        (joints("nobody"), "unknown_hand", "joints/nobody; there are left, right"),
+        (joints("left"), "no_urdf", "joints/left"),
+        (joints(names=("x", "y")), "unknown_joints", "tells x, y; the URDF has a, b"),
+        (joints(t_ns=NOW + 10**15), "clock", "s off; leave it nil"),
+        (joints(t_ns=5), "clock", "s off"),
+        (encode(LinkForces("right", NOW, ("toe",), np.ones(1), np.ones(1))), "unknown_link", "'toe'"),
+    ],
+)
+def test_what_can_not_be_used_is_counted_and_named(
+    inputs: Any, parts: list[bytes], cause: str, said: str
+) -> None:
+    inputs.take(parts, NOW)
+    figures = inputs.figures(NOW)
+    assert figures["dropped"] == {cause: 1}
+    assert said in figures["problem"]
+    assert not figures["received"]
+
+
+def test_states_of_the_same_time_are_late_and_those_without_a_time_are_of_now(inputs: Any) -> None:
+    inputs.take(joints(), NOW)
+    inputs.take(joints(), NOW)
+    inputs.take(joints(t_ns=None), NOW + 5)
+    assert inputs.dropped == {"late": 1}
+    assert inputs.joints_at("right", NOW + 5).age_s.tolist() == [0.0, 0.0]
+    assert inputs.joints_at("left", NOW) is None
+    assert inputs.figures(NOW + 10**9)["age_s"]["joints/right"] == pytest.approx(1.0)
+
+
+def test_forces_are_kept_by_pad(inputs: Any) -> None:
+    message = LinkForces("right", NOW, ("palm", "toe"), np.array([2.0, 1.0]), np.array([0.1, 0.1]))
+    inputs.take(encode(message), NOW)
+    assert inputs.forces.force_n[2] == 2.0
+    assert inputs.forces.std_n[2] == 0.1
+    assert inputs.forces.t_ns.tolist() == [0, 0, NOW]
+    assert inputs.dropped == {"unknown_link": 1}
+
+
+def test_a_flood_costs_a_bounded_number_of_messages_a_period(inputs: Any) -> None:
+    with Robot(inputs.endpoint, key="") as robot:
+        while not robot.connected(0.05):  # the daemon polls in every period
+            inputs.poll(NOW)
+        for number in range(60):
+            robot.send_joints("right", {"a": 0.1}, t_ns=NOW + number)
+        before = -1
+        while sum(inputs.received.values()) < 16:  # the sender's own queue holds 16 while the wire is slow
+            inputs.poll(NOW)
+            assert sum(inputs.received.values()) - max(before, 0) <= 32
+            before = sum(inputs.received.values())
+
+
+def test_the_robots_side_refuses_numbers_that_are_none(inputs: Any) -> None:
+    with Robot(inputs.endpoint, key="") as robot:
+        with pytest.raises(ValueError, match="not finite: a"):
+            robot.send_joints("right", {"a": float("nan")})
+        with pytest.raises(ValueError, match=r"same names.*b"):
+            robot.send_joints("right", {"a": 1.0}, velocity_rad_s={"b": 1.0})
+        with pytest.raises(ValueError, match="there are none"):
+            robot.send_forces("right", {}, 0.1)

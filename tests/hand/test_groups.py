@@ -1,0 +1,89 @@
+"""Contacts that one object may bridge are one group, whose name lasts."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from handtouch.hand.groups import Groups
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def groups(n: int = 4, hand: tuple[int, ...] | None = None) -> Groups:
+    return Groups(np.full(n, 0.02), np.array(hand or [0] * n))
+
+
+def step(
+    made: Groups, ids: list[int], x_m: list[float], normals: list[NDArray[np.float64]] | None = None
+) -> list[int]:
+    places = np.stack([[x, 0.0, 0.0] for x in x_m])
+    made.step(np.array(ids, dtype=np.uint32), places, np.stack(normals or [UP] * len(ids)))
+    return made.id.tolist()
+
+
+def test_near_contacts_are_a_group_and_others_are_by_themselves() -> None:
+    assert step(groups(), [5, 7, 0, 9], [0.0, 0.015, np.nan, 0.1]) == [5, 5, 0, 9]
+
+
+def test_a_chain_of_contacts_is_one_group() -> None:
+    assert step(groups(), [5, 7, 8, 9], [0.0, 0.015, 0.03, 0.045]) == [5] * 4
+
+
+def test_pads_that_face_each_other_grip_two_sides() -> None:
+    assert step(groups(2), [5, 7], [0.0, 0.005], [UP, -UP]) == [5, 7]
+
+
+def test_hands_have_groups_of_their_own() -> None:
+    assert step(groups(2, (0, 1)), [5, 7], [0.0, 0.0]) == [5, 7]
+
+
+def test_a_group_keeps_its_name_when_the_contact_that_gave_it_ends() -> None:
+    made = groups(3)
+    assert step(made, [5, 7, 8], [0.0, 0.015, 0.03]) == [5, 5, 5]
+    assert step(made, [0, 7, 8], [np.nan, 0.015, 0.03]) == [0, 5, 5]
+    assert step(made, [9, 7, 8], [0.1, 0.015, 0.03]) == [9, 5, 5]
+
+
+def test_what_falls_apart_has_two_names_and_what_joins_one() -> None:
+    made = groups(2)
+    assert step(made, [5, 7], [0.0, 0.015]) == [5, 5]
+    assert step(made, [5, 7], [0.0, 0.024]) == [5, 5]  # joined until a quarter farther
+    assert step(made, [5, 7], [0.0, 0.03]) == [5, 7]
+    assert step(made, [5, 7], [0.0, 0.024]) == [5, 7]
+    assert step(made, [5, 7], [0.0, 0.01]) == [5, 5]
+
+
+def test_the_link_in_between_ends_and_parts_the_group() -> None:
+    made = groups(3)
+    assert step(made, [5, 6, 7], [0.0, 0.018, 0.036]) == [5, 5, 5]
+    assert step(made, [5, 0, 7], [0.0, np.nan, 0.036]) == [5, 0, 7]
+
+
+def test_while_places_are_unknown_groups_stay_as_they_were() -> None:
+    made = groups(2)
+    step(made, [5, 7], [0.0, 0.015])
+    assert step(made, [5, 7], [np.nan, np.nan]) == [5, 5]
+
+
+@given(st.lists(st.lists(st.tuples(st.booleans(), st.floats(0, 0.1)), min_size=5, max_size=5), max_size=8))
+def test_names_are_never_shared_by_parts_that_are_apart(story: list[list[tuple[bool, float]]]) -> None:
+    made, ids, following = groups(5), [0] * 5, 1
+    for moment in story:
+        for pad, (touching, _) in enumerate(moment):
+            if touching and not ids[pad]:
+                ids[pad], following = following, following + 1
+            elif not touching:
+                ids[pad] = 0
+        x = [at if number else np.nan for number, (_, at) in zip(ids, moment, strict=True)]
+        named = step(made, ids, x)
+        order = sorted((at, name) for at, name, number in zip(x, named, ids, strict=True) if number)
+        assert all(name for _, name in order)
+        assert not any(named[pad] for pad in range(5) if not ids[pad])
+        for (left, one), (right, two) in itertools.pairwise(order):
+            assert one == two or right - left > 0.02
+            assert one != two or right - left <= 0.025 + 1e-12

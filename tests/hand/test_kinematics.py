@@ -1,0 +1,147 @@
+"""Kinematics agree with products of transforms, for the shipped hand and one that nobody here described."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from handtouch import shipped
+from handtouch.hand import urdf
+from handtouch.hand.kinematics import Kinematics
+
+FloatArray = NDArray[np.float64]
+WITH_MIMIC = """
+<robot name="r">
+  <link name="base"/><link name="palm"/><link name="turn"/><link name="slide"/><link name="follow"/>
+  <joint name="wrist" type="revolute"><parent link="base"/><child link="palm"/>
+    <origin xyz="0.1 0 0" rpy="0.1 0.2 0.3"/>
+    <axis xyz="0 1 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="turn" type="continuous"><parent link="palm"/><child link="turn"/>
+    <origin xyz="0 0.1 0" rpy="0.5 0 0"/>
+    <axis xyz="0 0 1"/></joint>
+  <joint name="slide" type="prismatic"><parent link="turn"/><child link="slide"/><origin xyz="0 0.1 0"/>
+    <axis xyz="1 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="follow" type="revolute"><parent link="slide"/><child link="follow"/><origin xyz="0 0 0.1"/>
+    <axis xyz="1 0 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>
+    <mimic joint="turn" multiplier="-0.5" offset="0.2"/>
+  </joint>
+</robot>
+"""
+
+
+def allegro() -> Path:
+    """The Allegro hand's description, from a package that is installed for the tests."""
+    spec = importlib.util.find_spec("cmeel")
+    assert spec is not None
+    assert spec.origin is not None
+    site = Path(spec.origin).parents[1]
+    folder = site / "cmeel.prefix/share/example-robot-data/robots/allegro_hand_description/urdf"
+    return folder / "allegro_right_hand.urdf"
+
+
+def pose(robot: urdf.Description, link: str, position: dict[str, float]) -> FloatArray:
+    """Homogeneous transform (4, 4) from a link to the root."""
+    found = np.eye(4)
+    for joint in robot.chain(link):
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = joint.rotation, joint.translation_m
+        move = np.eye(4)
+        name, factor, offset = joint.mimic or (joint.name, 1.0, 0.0)
+        by = factor * position.get(name, 0.0) + offset
+        if joint.kind == "prismatic":
+            move[:3, 3] = by * joint.axis
+        elif joint.kind != "fixed":
+            move[:3, :3] = Rotation.from_rotvec(by * joint.axis).as_matrix()
+        found = found @ step @ move
+    return found
+
+
+@pytest.fixture(scope="module", params=["shipped", "allegro", "mimic"])
+def hand(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[urdf.Description, Kinematics]:
+    path = {"shipped": shipped.path("utah_mit.urdf"), "allegro": allegro()}.get(request.param)
+    if path is None:
+        path = tmp_path_factory.mktemp("urdf") / "mimic.urdf"
+        path.write_text(WITH_MIMIC)
+    robot = urdf.read(path)
+    palm = {"shipped": "palm", "allegro": "palm_link", "mimic": "palm"}[request.param]
+    return robot, Kinematics(robot, list(robot.bodies), palm, robot.root)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_poses_are_the_products_of_the_joints_transforms(
+    hand: tuple[urdf.Description, Kinematics], seed: int
+) -> None:
+    robot, kinematics = hand
+    position = np.random.default_rng(seed).uniform(-1.5, 1.5, len(kinematics.joints))
+    kinematics.move(position)
+    by_name = dict(zip(kinematics.joints, position.tolist(), strict=True))
+    palm = pose(robot, "palm" if "palm" in robot.bodies else "palm_link", by_name)
+    for number, link in enumerate(robot.bodies):
+        in_base = pose(robot, link, by_name)
+        for expected, found in (
+            (in_base, kinematics.in_base(number)),
+            (np.linalg.solve(palm, in_base), kinematics.in_palm(number)),
+        ):
+            np.testing.assert_allclose(found.rotation, expected[:3, :3], atol=1e-12)
+            np.testing.assert_allclose(found.translation_m, expected[:3, 3], atol=1e-12)
+
+
+def test_slopes_are_finite_differences(hand: tuple[urdf.Description, Kinematics]) -> None:
+    _, kinematics = hand
+    m, link = len(kinematics.joints), len(kinematics.palm_needs) - 1
+    position, point = np.random.default_rng(3).uniform(-1, 1, m), np.array([0.01, -0.02, 0.03])
+
+    def at(joints: FloatArray, in_base: bool) -> FloatArray:
+        kinematics.move(joints)
+        found = kinematics.in_base(link) if in_base else kinematics.in_palm(link)
+        return np.asarray(found.rotation @ point + found.translation_m)
+
+    for in_base in (False, True):
+        kinematics.move(position)
+        slope = kinematics.slope(link, point, in_base)
+        step = 1e-6 * np.eye(m)
+        expected = (
+            np.stack([at(position + d, in_base) - at(position - d, in_base) for d in step], axis=1) / 2e-6
+        )
+        np.testing.assert_allclose(slope, expected, atol=1e-8)
+        needs = (kinematics.base_needs if in_base else kinematics.palm_needs)[link]
+        assert not np.abs(slope[:, ~needs]).max(initial=0.0) > 0
+
+
+def test_the_shipped_hand_has_sixteen_joints_and_closes_over_its_palm() -> None:
+    robot = urdf.read(shipped.path("utah_mit.urdf"))
+    tips = ["thumb_distal", "index_distal", "middle_distal", "ring_distal"]
+    kinematics = Kinematics(robot, [*tips, "palm_heel"], "palm", "base")
+    assert len(kinematics.joints) == 16
+    assert kinematics.palm_needs.sum(axis=1).tolist() == [4, 4, 4, 4, 0]
+    closed = np.array([0.0 if name.endswith("abduction") else 0.9 for name in kinematics.joints])
+    for number, tip in enumerate(tips):
+        kinematics.move(np.zeros(16))
+        open_hand = kinematics.in_palm(number).translation_m.copy()
+        kinematics.move(closed)
+        found = kinematics.in_palm(number).translation_m
+        assert found[2] > 0.02, tip  # out of the palm
+        assert abs(found[0]) < abs(open_hand[0]) + 0.01
+    kinematics.move(closed)
+    thumb, index = kinematics.in_palm(0).translation_m, kinematics.in_palm(1).translation_m
+    assert math.dist(thumb, index) < 0.1
+
+
+def test_joints_that_mimic_follow_and_are_not_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "r.urdf"
+    path.write_text(WITH_MIMIC)
+    kinematics = Kinematics(urdf.read(path), ["follow"], "palm", "base")
+    assert kinematics.joints == ("wrist", "turn", "slide")
+    assert kinematics.continuous.tolist() == [False, True, False]
+    assert kinematics.palm_needs.tolist() == [[False, True, True]]
