@@ -95,7 +95,7 @@ class Contact:
     force_std_n: float | None
     peak_force_n: float | None
     strength: str
-    """valid, saturated (force_n is a lower bound) or invalid"""
+    """valid, saturated (force_n is a lower bound), unestimated (too little is known yet) or invalid"""
     current_a: float
     residual: float | None
     """excess of the two x currents over those of a point, part of the total; positive: elongated along x"""
@@ -121,6 +121,8 @@ class Contact:
     base_covariance_m2: Floats9 | None = None
     joints_age_s: float | None = None
     """from the sample to the nearest joint state, the worst of the joints in between"""
+    raw_force_n: float | None = None
+    """before the behaviour of the sheet was undone; None where that isn't modelled"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +183,8 @@ class HandFrame:
     """float32 x 9"""
     joints_age_s: bytes = b""
     """float32"""
+    unestimated: bytes = b""
+    """uint8, 1 where force_n isn't to be relied on yet; no bytes where there is none"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,6 +393,7 @@ COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
         "base_normal": ("<f4", 3),
         "base_covariance_m2": ("<f4", 9),
         "joints_age_s": _F4,
+        "unestimated": ("<u1", 1),
     },
     Raw: {"counts": ("<i8", 4), "sample_ns": ("<i8", 1), "fresh": ("<u1", 1)},
 }

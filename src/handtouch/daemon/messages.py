@@ -26,6 +26,7 @@ REASONS = {
 }
 """Why a contact ended, by what became of its pad; any other is released."""
 _STOPPED = "stopped"
+_WITH_STD = ("valid", "unestimated")
 
 
 class Outlet(Protocol):
@@ -114,6 +115,7 @@ class Messages:
     def _hand(self, hand: str, repeat: bool = False) -> wire.HandFrame:
         columns, rows = self._tick.columns, self._model.rows_of_hand[hand]
         located = columns.located[rows]
+        unestimated = self._tick.unestimated(rows)
         return wire.HandFrame(
             v=wire.SCHEMA_VERSION,
             run=self._run,
@@ -136,6 +138,7 @@ class Messages:
             residual=located["residual"].tobytes(),
             residual_std=located["residual_std"].tobytes(),
             repeat=repeat,
+            unestimated=unestimated.tobytes() if np.count_nonzero(unestimated) else b"",
             **self._placing.columns(rows),
         )
 
@@ -163,8 +166,11 @@ class Messages:
         located = all(map(math.isfinite, position))
         force_n = _finite(columns.force_n[pad])
         strength = "invalid" if force_n is None else "saturated" if columns.saturated[pad] else "valid"
+        if strength == "valid" and self._tick.unestimated(pad):
+            strength = "unestimated"
         if not self._tick.follower.weighed[pad]:
             strength = "skipped"
+        modelled = self._tick.strength.modelled[pad]
         state = PadState(int(columns.state[pad]))
         return wire.Contact(
             v=wire.SCHEMA_VERSION,
@@ -185,7 +191,7 @@ class Messages:
             pad_m=tuple(columns.pad_m[pad].tolist()) if located else None,
             location="valid" if located else "invalid" if self._tick.wanted[pad] else "skipped",
             force_n=force_n,
-            force_std_n=_finite(columns.force_std_n[pad]) if strength == "valid" else None,
+            force_std_n=_finite(columns.force_std_n[pad]) if strength in _WITH_STD else None,
             peak_force_n=_finite(contacts.peak_n[pad]),
             strength=strength,
             current_a=float(columns.current_a[pad]),
@@ -196,6 +202,7 @@ class Messages:
             calibration=model.calibration[pad],
             reason=self._reason or REASONS.get(state, "released") if event == "end" else "",
             repeat=repeat,
+            raw_force_n=_finite(columns.raw_force_n[pad]) if modelled else None,
             **self._placing.tell(pad),
         )
 

@@ -29,7 +29,7 @@ _SOURCE_STD, _SOURCE_PART = 10.0, 0.02
 _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
     int, (PadState.CLEAR, PadState.TOUCHED, PadState.STALE, PadState.FAULTED)
 )
-_INVALID = int(StrengthState.INVALID)
+_UNESTIMATED, _INVALID = int(StrengthState.UNESTIMATED), int(StrengthState.INVALID)
 _FOREVER_NS = np.iinfo(np.int64).max
 LOCATED = np.dtype(
     [
@@ -193,6 +193,12 @@ class Tick:
         self.follower.weighed[:], self.follower.tolerance_m[:] = weighed, tolerance_m
         self.wanted[:], self._every[:] = located, every
         self._sparse = not (located.all() and (every == 1).all())
+
+    def unestimated(self, pads: slice | int) -> BoolArray:
+        """Pads that are touched and whose force isn't to be relied on yet: too little is known of their
+        baseline, or of what their sheet does."""
+        unsure = self.baseline.unsure[pads] | (self.strength.state[pads] == _UNESTIMATED)
+        return np.asarray(unsure & self.contacts.touching[pads])
 
     def solve_all(self) -> None:
         """Locate and weigh what is touched, wanted or not, as it is now; the next `want` forgets it."""

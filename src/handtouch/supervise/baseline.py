@@ -26,6 +26,7 @@ BLOCK_NS = 97_000_000  # no multiple of a period: what rounds stamps shifts no s
 _PAUSE_NS = 3600 * 10**9
 _TIME_S = 10.0  # of following
 _NOISE_S = 60.0  # of learning the noise
+_NOISE_BLOCKS = 10  # from one block that noise is learned from to the next
 _LEAST_SAMPLES = 4  # in a block, to tell a variance from
 _SPEED_S = 60.0  # of untouched time that a drift's speed is measured over
 _SPEED_PART = 0.2  # of what such a measurement changes
@@ -81,6 +82,7 @@ class Baseline:
         """what each hand's pads have drifted by together, a channel"""
         self._sum, self._squares, self._buffer = np.zeros((n, 4)), np.zeros((n, 4)), np.zeros((n, 4))
         self._count = np.zeros(n)
+        self._blocks = np.zeros(1, np.int64)
         self._since_ns = np.full(1, -_PAUSE_NS)  # when the block began
         self._known_ns = np.zeros(n, np.int64)  # until when each pad's drift is taken in
         self._anchor, self._anchored_s = np.zeros(n), np.zeros(n)
@@ -174,7 +176,9 @@ class Baseline:
         np.copyto(self._known_ns, t_ns, where=free | self.waiting)
         moved = self._follow(mean, free, dt_s)
         self._drift(moved @ _ONES, free, elapsed_ns * 1e-9, dt_s)
-        self._learn_noise(mean, free, dt_s)
+        self._blocks[0] += 1
+        if self._blocks[0] % _NOISE_BLOCKS == 0:
+            self._learn_noise(mean, free)
         if self.gravity is not None:
             self._learn_gravity(mean, free, dt_s)
         self._expect()
@@ -233,12 +237,12 @@ class Baseline:
             self.drift[due] += _SPEED_PART * (speed - self.drift[due])
             self._anchor[due], self._anchored_s[due] = own[due], 0.0
 
-    def _learn_noise(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> None:
+    def _learn_noise(self, mean: FloatArray, free: BoolArray) -> None:
         """Scatter about the mean of a block, in which no baseline moves."""
         enough = free & (self._count >= _LEAST_SAMPLES)
         spare = np.maximum(self._count - 1, 1.0)[:, None]
         variance = (self._squares - self._sum * mean) / spare
-        part = -np.expm1(-dt_s / _NOISE_S) * enough
+        part = -np.expm1(-_NOISE_BLOCKS * BLOCK_NS * 1e-9 / _NOISE_S) * enough
         self.noise_squared += (variance - self.noise_squared) * part[:, None]
 
     def _learn_gravity(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> None:

@@ -23,6 +23,7 @@ IntArray = npt.NDArray[np.intp]
 
 SETTLE_S = 0.1
 _LEAST_CONTACTS, _LEAST_S = 3, 5.0  # of evidence
+_LEAST_N = 1e-6
 _VAGUE = 0.5  # of a force: less certain than this, it is none
 _HOUR_S = 3600.0
 _GAIN_WANDERS = 0.05  # of the logarithm, in an hour
@@ -87,6 +88,9 @@ class SheetStrength:
         self._period_ns = period_ns
         self._until_ns = np.zeros(1, np.int64)  # until when the sheets were carried on
         self._apparent = np.zeros(n)
+        self._waited_s = np.zeros(1)  # since uncertainty was judged
+        self._news = np.zeros(n, np.bool_)  # contacts that began since
+        self._doubt = np.full(n, np.nan)  # standard deviation over force
         self.groups = _Groups(behaviours)
 
     def adopt(
@@ -132,7 +136,7 @@ class SheetStrength:
 
     @property
     def back(self) -> tuple[FloatArray, FloatArray]:
-        """What sheets have got used to, and its standard deviation (n,) [N]; NaN where that isn't modelled."""
+        """What sheets have got used to, and its standard deviation (n,) [N]; NaN where not modelled."""
         back, std = np.full(len(self.force_n), np.nan), np.full(len(self.force_n), np.nan)
         for group in self.groups.all:
             back[group.rows], std[group.rows] = group.compensator.back_n, group.compensator.back_std_n
@@ -142,6 +146,7 @@ class SheetStrength:
         """Contacts began on these pads."""
         self.contacts[began] += 1
         self._begin_s[began] = self.touched_s[began]
+        self._news[began] = True
 
     def step(self, raw_n: FloatArray, raw_std_n: FloatArray, touching: BoolArray, t_ns: int) -> IntArray:
         """Carry all sheets on to `t_ns`, and weigh what touches modelled ones now, whose pads (k,) are the
@@ -156,10 +161,16 @@ class SheetStrength:
         for group in self.groups.all:
             load = group.compensator.step(apparent[group.rows], dt_s)
             self.force_n[group.rows] = load
+        self._waited_s[0] += dt_s
         pressed: IntArray = (touching & self.modelled).nonzero()[0]
-        if len(pressed):
-            self.touched_s[pressed] += dt_s
-            self._judge(pressed, raw_std_n)
+        if not len(pressed):
+            self._waited_s[0] = 0.0
+            return pressed
+        force = self.force_n.take(pressed) * self._gain.take(pressed)
+        if self._waited_s[0] >= SETTLE_S or np.count_nonzero(self._news):
+            self._judge(pressed, force, raw_std_n, touching)
+        self.force_n[pressed] = force
+        self.std_n[pressed] = force * self._doubt.take(pressed)
         return pressed
 
     def refer(self, reference: ForceReference, sample_ns: npt.NDArray[np.int64], touching: BoolArray) -> int:
@@ -195,15 +206,19 @@ class SheetStrength:
         self._vouched[pads] = True
         return len(pads)
 
-    def _judge(self, pressed: IntArray, raw_std_n: FloatArray) -> None:
-        """Gain, uncertainty and state of the pads that are touched."""
-        force = self.force_n[pressed] * self._gain[pressed]
+    def _judge(
+        self, pressed: IntArray, force: FloatArray, raw_std_n: FloatArray, touching: BoolArray
+    ) -> None:
+        """Uncertainty and state of the pads that are touched: now and then, and when a contact begins."""
+        self.touched_s += self._waited_s * touching
+        self._waited_s[0] = 0.0
+        self._news[:] = False
         for group in self.groups.all:
             self.std_n[group.rows] = group.compensator.std_n()
         variance = np.square(self.std_n[pressed]) + np.square(raw_std_n[pressed])
         variance += np.square(force * self.log_gain_std[pressed])
         std = np.sqrt(variance)
-        self.force_n[pressed], self.std_n[pressed] = force, std
+        self._doubt[pressed] = std / np.maximum(force, _LEAST_N)
         enough = (self.contacts[pressed] >= _LEAST_CONTACTS) & (self.touched_s[pressed] >= _LEAST_S)
         known = enough | self._vouched[pressed]
         sane = std < _VAGUE * force  # False for what isn't finite
@@ -215,7 +230,7 @@ class SheetStrength:
         if gone_ns > 10**9 * _HOUR_S or gone_ns < 0:
             self._until_ns[0] = t_ns
             return 0.0
-        periods = round(gone_ns / self._period_ns)
+        periods = (gone_ns + self._period_ns // 2) // self._period_ns
         self._until_ns[0] += periods * self._period_ns
         return periods * self._period_ns * 1e-9
 
