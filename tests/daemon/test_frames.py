@@ -101,13 +101,13 @@ def test_uncertain_joints_widen_the_covariance_as_samples_of_them_do() -> None:
     )
     rng = np.random.default_rng(2)
     touched = Touched(TIP)
-    places = []
-    for _ in range(2000):
-        joints = Joints.unknown(100 * MS, len(NAMES))._replace(
-            position_rad=position + std * rng.normal(size=len(NAMES)), age_s=np.zeros(len(NAMES))
-        )
-        touched.frames.joints_at = lambda _, __, joints=joints: joints
-        places.append(touched.step().tell(TIP)["palm_position_m"])
+
+    def joints_at(_: str, t_ns: int) -> Joints:
+        about = position + std * rng.normal(size=len(NAMES))
+        return Joints(t_ns, about, np.zeros(len(NAMES)), np.zeros(len(NAMES)))
+
+    touched.frames.joints_at = joints_at
+    places = [touched.step().tell(TIP)["palm_position_m"] for _ in range(2000)]
     np.testing.assert_allclose(added, np.cov(np.array(places).T), atol=0.1 * added.max())
 
 
@@ -134,7 +134,11 @@ def test_joints_that_nobody_told_and_places_that_are_not_known_are_invalid() -> 
 def test_nothing_is_computed_that_no_scene_asks_for() -> None:
     touched = Touched(TIP, HEEL, joints=told(100))
     asked: list[str] = []
-    touched.frames.joints_at = lambda hand, _: asked.append(hand)  # type: ignore[func-returns-value]
+
+    def joints_at(hand: str, _: int) -> None:
+        asked.append(hand)
+
+    touched.frames.joints_at = joints_at
     nobody = np.zeros(len(PADS), dtype=np.bool_)
     touched.frames.want(nobody, nobody)
     frames = touched.step()
