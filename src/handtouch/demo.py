@@ -19,6 +19,7 @@ from handtouch import shipped, wire
 from handtouch.client import Subscriber, connect
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.daemon import Daemon
+from handtouch.hand import kinematics
 from handtouch.simulate.run import SimulatedHand
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import score
@@ -47,7 +48,7 @@ def run(
     """
     logging.basicConfig(level=logging.ERROR)
     try:
-        deployment = in_process(load(config_path or shipped.path(DEPLOYMENT)))
+        deployment = _placed(in_process(load(config_path or shipped.path(DEPLOYMENT))))
         scenario = Scenario.tour(deployment) if config_path else Scenario.load(shipped.path(SCENARIO))
     except ConfigError as error:
         print(error, file=sys.stderr)
@@ -66,6 +67,7 @@ def run(
             deployment, scenario, World(seed=seed) if tolerances else World.ideal_parts(seed)
         )
         with hand, Daemon(deployment) as daemon, _subscribe(daemon) as messages:
+            hand.tell_joints(deployment, scenario, daemon.inputs.endpoint)
             hand.start()
             served = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
             served.start()
@@ -105,6 +107,14 @@ class _Keeper:
 
     def __exit__(self, *_: object) -> None:
         self._display.__exit__(None, None, None)
+
+
+def _placed(deployment: Deployment) -> Deployment:
+    """The deployment with contacts told in the palm, where that can be done."""
+    if not kinematics.available() or not any(hand.urdf for hand in deployment.hands):
+        return deployment
+    scene = deployment.scene.model_copy(update={"outputs": (*deployment.scene.outputs, "palm")})
+    return deployment.model_copy(update={"scene": scene})
 
 
 def in_process(deployment: Deployment) -> Deployment:

@@ -27,6 +27,7 @@ from handtouch.canbus.port import BusError, open_bus
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.joints import JointFeed
 from handtouch.simulate.scenario import Scenario, Swap
 from handtouch.simulate.truth import Truth
 from handtouch.simulate.world import World
@@ -43,8 +44,7 @@ class SimulatedHand:
     """
 
     def __init__(self, stages: Sequence[_Stage], opened: contextlib.ExitStack) -> None:
-        self._stages = stages
-        self._opened = opened
+        self._stages, self._opened = stages, opened
         self.devices: dict[str, Device] = {
             name: device for stage in stages for name, device in stage.devices.items()
         }
@@ -76,6 +76,18 @@ class SimulatedHand:
         """Plug in every node."""
         for stage in self._stages:
             stage.nodes.start()
+
+    def tell_joints(self, deployment: config.Deployment, scenario: Scenario, endpoint: str) -> None:
+        """Tell a daemon where the joints are, from now on, if a URDF has some and the scenario moves them."""
+        if scenario.motions and any(hand.urdf for hand in deployment.hands):
+            start, round_s = self._stages[0].start, scenario.duration_s
+
+            def since_s() -> float:
+                t_s = start.peek_s(time.monotonic_ns())
+                return t_s % round_s if scenario.repeat else t_s
+
+            feed = JointFeed(deployment, scenario.motions, since_s, endpoint)
+            self._opened.callback(feed.close)
 
     def stop(self) -> None:
         """Silence all nodes and shut the buses down, for good."""
@@ -122,6 +134,11 @@ class _Start:
                 self._t_ns = t_ns
             return (t_ns - self._t_ns) * 1e-9
 
+    def peek_s(self, t_ns: int) -> float:
+        """As `since_s`, 0 as long as it hasn't begun."""
+        with self._lock:
+            return 0.0 if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
+
 
 class _Stage:
     """One bus with its nodes."""
@@ -139,7 +156,7 @@ class _Stage:
         self.name = name
         self.times_ns: deque[int] = deque()
         self.devices: dict[str, Device] = {}
-        self._virtual, self._start, self._record = virtual, start, record
+        self._virtual, self.start, self._record = virtual, start, record
         self.nodes = DeviceBus(bus, self._sample)
         for hand, pad in virtual.pads:
             node = deployment.nodes[pad.node]
@@ -164,7 +181,7 @@ class _Stage:
 
     def truth(self, times_ns: Sequence[int]) -> list[Truth]:
         return [
-            record for t_ns in times_ns for record in self._virtual.truth(self._start.since_s(t_ns), t_ns)
+            record for t_ns in times_ns for record in self._virtual.truth(self.start.since_s(t_ns), t_ns)
         ]
 
     def take_times(self) -> list[int]:
@@ -173,7 +190,7 @@ class _Stage:
     def _sample(self, t_ns: int) -> NDArray[np.int64]:
         if self._record:
             self.times_ns.append(t_ns)
-        since_s = self._start.since_s(t_ns)
+        since_s = self.start.since_s(t_ns)
         self._handle(since_s)
         return self._virtual.sample(since_s)
 
@@ -224,6 +241,7 @@ def run(
         except OSError as error:
             print(f"{truth}: {error.strerror}", file=sys.stderr)
             return 1
+        hand.tell_joints(deployment, played, deployment.daemon.inputs.replace("//*:", "//127.0.0.1:"))
         _play(hand, deployment, file, seconds, stop or _stop_on_signal())
     return 0
 

@@ -22,6 +22,7 @@ from handtouch.config import Deployment
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.tables import Four, Name, Positive, Table, Unsigned32
 from handtouch.simulate.faults import FAULTS, INFLUENCES, Acting
+from handtouch.simulate.joints import Motion
 
 FloatArray = NDArray[np.float64]
 _Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
@@ -143,6 +144,9 @@ class Scenario(Table):
     swaps: Annotated[tuple[Swap, ...], Field(strict=False)] = Field(
         (), alias="swap", description="nodes that are replaced, and when"
     )
+    motions: Annotated[tuple[Motion, ...], Field(strict=False)] = Field(
+        (), alias="joint", description="how the joints move; a hand without any stands still"
+    )
     repeat: bool = Field(False, description="whether it begins again when it has ended")
     pause_s: float = Field(1.0, ge=0, description="time after the last touch, before it ends or begins again")
 
@@ -167,9 +171,8 @@ class Scenario(Table):
         try:
             scenario = cls.model_validate(raw)
         except ValidationError as error:
-            raise ConfigError(
-                file, problems_of(raw, error, {"": cls, "touch": Touch, "swap": Swap}, _KINDS)
-            ) from error
+            tables = {"": cls, "touch": Touch, "swap": Swap, "joint": Motion}
+            raise ConfigError(file, problems_of(raw, error, tables, _KINDS)) from error
         return scenario
 
     @classmethod

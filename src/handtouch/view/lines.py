@@ -22,11 +22,22 @@ def contact_line(contact: wire.Contact) -> str:
         parts.append(f"at ({x:7.2f}, {y:7.2f}, {z:7.2f}) mm +- {1e3 * location_std_m(contact):.3f}")
     else:
         parts.append("location invalid" + " " * 24)
+    if contact.palm != "skipped":
+        parts.append(palm_text(contact))
     parts.append(strength_text(contact))
     if contact.event == "end":
         peak = "" if contact.peak_force_n is None else f", peak {contact.peak_force_n:.2f} N"
         parts.append(f"{contact.reason} after {contact.duration_s:.2f} s{peak}")
     return "  ".join(parts)
+
+
+def palm_text(contact: wire.Contact) -> str:
+    """Where in the palm, or why that isn't known."""
+    if contact.palm_position_m is None:
+        age = "" if contact.joints_age_s is None else f", joints {contact.joints_age_s:.2f} s old"
+        return f"palm {contact.palm}{age}".ljust(37)
+    x, y, z = (1e3 * value for value in contact.palm_position_m)
+    return f"palm ({x:7.2f}, {y:7.2f}, {z:7.2f}) mm"
 
 
 def strength_text(contact: wire.Contact) -> str:
