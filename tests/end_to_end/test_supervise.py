@@ -1,5 +1,5 @@
-"""The supervisor at work in a real daemon: a unit is swapped, calibrates itself and is trusted again; the slow
-half is killed, and nobody who listens to contacts notices."""
+"""The supervisor at work in a real daemon: a swapped unit calibrates itself and is trusted again; the slow half
+is killed, and nobody who listens to contacts notices."""
 
 from __future__ import annotations
 

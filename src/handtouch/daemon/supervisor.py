@@ -41,6 +41,8 @@ _RESTS = (
 )
 _KNOWN = (NodeState.CONFIGURING, NodeState.OPERATIONAL)
 """By then a node has told who it is."""
+_NO_PLACE = 0.5**2 * (np.eye(4) - 0.25)
+"""The same where a fault makes places worth nothing: they are stated to be anywhere on the pad, about."""
 _log = logging.getLogger("handtouch.supervise")
 
 
@@ -74,6 +76,8 @@ class Supervisor:
         """is called with the time when other pads rest, `turns.resting`"""
         rows = pipeline.model.rows_of_hand.values()
         self.turns = Turns(rows, pipeline.model.size, deployment.scene.rest_after_s)
+        self._vague = np.zeros(pipeline.model.size, dtype=np.bool_)
+        self._covariance = np.zeros((pipeline.model.size, 4, 4))
         self._blocks = Blocks(pipeline.model.size)
         self._serials: list[int | None] = [None] * pipeline.model.size
         self._before: list[int | None] = [pad.serial for _, pad in self._pads]
@@ -192,7 +196,8 @@ class Supervisor:
         """Another unit: nothing that was known of the one before holds."""
         model = self._pipeline.model
         model.calibrate(pad, np.ones(4), model.nominal[pad])
-        model.doubt(pad, _UNKNOWN_GAINS, quarantined=True)
+        self._covariance[pad] = _UNKNOWN_GAINS
+        self._doubt(pad, quarantined=True)
         self._pipeline.adopt(model, np.array([pad]))
         self._pipeline.tick.renew(pad)
         self.changed.add(pad)
@@ -200,6 +205,10 @@ class Supervisor:
             "%s: serial %s was here, %s is: in quarantine until it is calibrated",
             self._name(pad), self._before[pad], self._serials[pad], extra=self._fields(pad),
         )  # fmt: skip
+
+    def _doubt(self, pad: int, quarantined: bool) -> None:
+        covariance = _NO_PLACE if self._vague[pad] else self._covariance[pad]
+        self._pipeline.model.doubt(pad, covariance, quarantined)
 
     def _take(self, said: bytes) -> None:
         """Do what a word says: all of it or nothing."""
@@ -233,7 +242,8 @@ class Supervisor:
         law = model.laws[pad] if word.law is None else Law(**word.law.model_dump())
         reweighed = law != model.laws[pad]
         model.calibrate(pad, word.gains, word.name, law)
-        model.doubt(pad, np.array(word.covariance).reshape(4, 4), bool(model.quarantined[pad]))
+        self._covariance[pad] = np.reshape(word.covariance, (4, 4))
+        self._doubt(pad, bool(model.quarantined[pad]))
         if reweighed:
             self._pipeline.adopt(model, pads)
         if offsets is not None:
@@ -247,9 +257,13 @@ class Supervisor:
     def _judge(self, word: Judged) -> None:
         model, pad, before = self._pipeline.model, word.pad, self.judged[word.pad]
         self.judged[pad] = word
-        quarantined = word.trust in ("quarantined", "person")
-        if quarantined != model.quarantined[pad]:
-            model.doubt(pad, model.gain_covariance[pad], quarantined)
+        mute = word.trust in ("quarantined", "person") or not all(
+            finding.strength for finding in word.findings
+        )
+        vague = not all(finding.location for finding in word.findings)
+        if (mute, vague) != (model.quarantined[pad], self._vague[pad]):
+            self._vague[pad] = vague
+            self._doubt(pad, mute)
             self._pipeline.tick.forget(np.array([pad]))
         known = {finding.kind for finding in before.findings} if before else set()
         trust = before.trust if before else "nominal"

@@ -135,7 +135,8 @@ def read_block(message: dict[str, Any], pads: int) -> Block:
 
 
 class Finding(Table):
-    """What is wrong with a pad, why one thinks so, and what helps."""
+    """What is wrong with a pad, why one thinks so, and what helps; location, strength: whether they can be
+    relied on while it lasts."""
 
     kind: Annotated[str, Field(pattern=r"^[a-z][a-z ]*$", max_length=40)]
     cause: Text
@@ -145,6 +146,8 @@ class Finding(Table):
     confidence: Annotated[float, Field(ge=0, le=1)] = 1.0
     pad_m: Pair | None = None
     size_m: float | None = None
+    location: bool = True
+    strength: bool = True
 
 
 class Alive(Table):

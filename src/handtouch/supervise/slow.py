@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import network_of
 from handtouch.supervise import archive as archives
 from handtouch.supervise.archive import Archive
-from handtouch.supervise.calibration import Gains, Provenance, Version, four, matrix
+from handtouch.supervise.calibration import Four, Gains, Provenance, Version, four, matrix
 from handtouch.supervise.link import (
     Alive,
     Block,
@@ -38,8 +39,19 @@ from handtouch.supervise.upkeep import Upkeep, back_force
 _log = logging.getLogger("handtouch.supervise")
 _ALIVE_NS = 500_000_000
 _MOST_FINDINGS = 8
-Diagnose = Callable[[Block], Sequence[tuple[int, Finding]]]
-"""From a block to what is the matter with which pads, all of it that lasts."""
+
+
+class Diagnosing(Protocol):
+    """Who says what is the matter with pads: `diagnoses.Diagnoses`."""
+
+    def take(self, block: Block) -> Sequence[tuple[int, Finding]]:
+        """All that lasts, by pad."""
+
+    def tare(self, pad: int, offset_counts: ArrayLike) -> None:
+        """What the channels (4,) of a pad read untouched, as stored."""
+
+    def calibrate(self, pad: int, gains: Four) -> None:
+        """The unit in the place of a pad has other gains than the one before, or is known better."""
 
 
 @dataclass
@@ -57,7 +69,7 @@ class _Row:
 class SlowHalf:
     """Takes what the daemon sends, block after block; `take` gives what is to be said to it."""
 
-    def __init__(self, start: Start, archive: Archive, diagnose: Diagnose = lambda _: ()) -> None:
+    def __init__(self, start: Start, archive: Archive, diagnoses: Diagnosing | None = None) -> None:
         deployment = start.deployment
         entries = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
         models: dict[object, ElectrodeNetwork] = {}
@@ -70,7 +82,7 @@ class SlowHalf:
             place = archives.Place(hand, pad.link, start.nominal[number])
             self._rows.append(_Row(place, Unit(models[make]), Places(noise[number])))
         self._ampere_per_count = start.ampere_per_count
-        self._archive, self._diagnose = archive, diagnose
+        self._archive, self._diagnoses = archive, diagnoses
         self._upkeep = Upkeep(len(entries))
         self._found: dict[int, list[Finding]] = {}
         self._block: Block | None = None
@@ -119,6 +131,8 @@ class SlowHalf:
             own = archives.grown_old(version, now) if version else None
             row.unit.enter(serial, last, own, obstacle, self._t_ns)
             self._upkeep.forget(pad)
+            if self._diagnoses is not None:
+                self._diagnoses.calibrate(pad, row.unit.gains.factors)
             name = f"{row.place.hand}/{row.place.link}"
             _log.info(
                 "%s: unit %d is %s%s", name, serial, row.unit.trust,
@@ -126,6 +140,7 @@ class SlowHalf:
             )  # fmt: skip
             if version is not None:
                 words.append(self._recall(pad, version, now))
+                self._tare(pad, version)
 
     def _work(self, block: Block, now: datetime, words: list[Word]) -> None:
         self._t_ns = int(block.t_ns[-1])
@@ -140,7 +155,7 @@ class SlowHalf:
     def _learn(self, pad: int, block: Block, now: datetime, words: list[Word]) -> None:
         """Give the contacts of a pad to its unit, and do what follows."""
         row = self._rows[pad]
-        if not row.unit.learns:
+        if not row.unit.learns or pad in self._found:  # what is wrong with a pad is nothing to learn from
             return
         fresh = block.fresh[:, pad]
         currents = (block.counts[:, pad] - block.offset_counts[pad]) * self._ampere_per_count[pad]
@@ -156,6 +171,8 @@ class SlowHalf:
                 assert row.unit.serial is not None
                 name = version.name if version else f"{row.unit.serial}-learning"
                 words.append(_calibrate(pad, row.unit.serial, name, row.unit.gains))
+                if self._diagnoses is not None:
+                    self._diagnoses.calibrate(pad, row.unit.gains.factors)
 
     def _keep_gains(self, row: _Row, now: datetime) -> Version | None:
         estimate, serial = row.unit.estimate, row.unit.serial
@@ -175,7 +192,15 @@ class SlowHalf:
         offsets, sheet = self._upkeep.due(pad, self._t_ns, last)
         if offsets is not None or sheet is not None:
             origin = Provenance("baseline and sheet followed")
-            self._archive.keep(serial, row.place, origin, now, offsets=offsets, sheet=sheet)
+            first = self._archive.own(serial, row.place, now)[0] is None
+            version = self._archive.keep(serial, row.place, origin, now, offsets=offsets, sheet=sheet)
+            if version is not None and first:
+                self._tare(pad, version)
+
+    def _tare(self, pad: int, version: Version) -> None:
+        """From now on, what stands off the baseline of a version is something to explain."""
+        if self._diagnoses is not None and version.calibration.offsets is not None:
+            self._diagnoses.tare(pad, version.calibration.offsets.counts)
 
     def _recall(self, pad: int, version: Version, now: datetime) -> Calibrate:
         """All that is stored of the unit in a place."""
@@ -197,7 +222,7 @@ class SlowHalf:
 
     def _find(self, block: Block) -> None:
         self._found = {}
-        for pad, finding in self._diagnose(block):
+        for pad, finding in self._diagnoses.take(block) if self._diagnoses else ():
             self._found.setdefault(pad, []).append(finding)
 
     def _tell(self, pad: int, words: list[Word]) -> None:
