@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
 _STEPS = 128  # table steps per spline segment
-_ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 @dataclass(frozen=True)
@@ -114,12 +113,13 @@ class SplineProfile:
             raise ValueError(
                 "radius_m: the smooth curve through the points crosses the axis; give more points"
             )
+        abscissae, weights = np.polynomial.legendre.leggauss(8)
         half = np.diff(self._nodes) / 2
-        samples = (self._nodes[:-1] + half)[:, None] + half[:, None] * _ABSCISSAE
+        samples = (self._nodes[:-1] + half)[:, None] + half[:, None] * abscissae
         speed = self._speed(samples)
-        self._arc = self._table(half * (speed @ _WEIGHTS), self._speed(self._nodes))
+        self._arc = self._table(half * (speed @ weights), self._speed(self._nodes))
         self._log = self._table(
-            half * ((speed / self._spline(samples)[..., 1]) @ _WEIGHTS),
+            half * ((speed / self._spline(samples)[..., 1]) @ weights),
             self._speed(self._nodes) / self._spline(self._nodes)[..., 1],
         )
         self._from_arc = self._inverse(self._arc)

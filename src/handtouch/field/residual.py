@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtri
 
 from handtouch.field.estimate import BoolArray, PointEstimate, estimate
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
@@ -91,7 +91,7 @@ def resolvable_separation(
     `point_test` at `false_alarm`. Infinite where they would have to leave the pad first.
     """
     x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-    wanted = _threshold(false_alarm) + float(ndtri(detection))
+    wanted = _threshold(false_alarm) + NormalDist().inv_cdf(detection)
     direction = math.cos(angle), math.sin(angle)
     with np.errstate(all="ignore"):
         room = [
@@ -119,7 +119,7 @@ def resolvable_separation(
 def _threshold(false_alarm: float) -> float:
     if not 0 < false_alarm < 1:
         raise ValueError(f"false_alarm = {false_alarm}: a rate lies between 0 and 1")
-    return -float(ndtri(false_alarm / 2))
+    return -NormalDist().inv_cdf(false_alarm / 2)
 
 
 @dataclass(frozen=True)
