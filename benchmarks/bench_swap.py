@@ -1,0 +1,275 @@
+"""Measure how well a swapped unit locates, by contacts since: the daemon's slow half on hidden gains.
+
+Prints its table and writes docs/benchmarks/swap.md, swap.json and swap.png; with --quick it only prints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import msgpack
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.daemon.model import PadModel
+from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.simulate.world import World
+from handtouch.supervise.archive import Archive
+from handtouch.supervise.link import Block, Calibrate, Judged, Start, serials
+from handtouch.supervise.slow import SlowHalf
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+FloatArray = NDArray[np.float64]
+
+ROOT = Path(__file__).parent.parent
+SHAPES = {"1:1": 20.0, "1.8:1": 36.0}
+WIDTH_MM = 20.0
+GAIN_TOLERANCE = 0.087
+"""Evenly spread: 5 % rms."""
+COUNTS = (0, 16, 32, 64, 96, 128, 192, 256, 384, 512)
+TICKS = 12
+"""Samples of a contact."""
+PERIOD_NS = 5_000_000
+STEP_S = (TICKS + 1) * PERIOD_NS * 1e-9
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+DEPLOYMENT = """
+[[bus]]
+name = "can0"
+interface = "virtual"
+channel = "bench"
+
+[node.n]
+drive_v = 5.0
+full_scale_ma = 10.0
+noise_counts = 2.0
+
+[sheet.s]
+ohm_per_square = 2400.0
+contact_ohm_mm2 = 20000.0
+alpha = 1.5
+contact_radius_mm = 2.0
+contact_radius_std_mm = 0.4
+
+[[hand]]
+name = "h"
+"""
+PAD = """
+[[hand.pad]]
+link = "{link}"
+bus = "can0"
+node_id = {node_id}
+node = "n"
+sheet = "s"
+surface = {{ kind = "plane", length_mm = {length}, width_mm = 20.0 }}
+gap_mm = 0.6
+"""
+
+
+def deployment_of(units: int) -> config.Deployment:
+    """As many pads of each shape."""
+    rows = [(shape, unit) for shape in SHAPES for unit in range(units)]
+    pads = "".join(
+        PAD.format(link=f"p{k}", node_id=k + 1, length=SHAPES[shape]) for k, (shape, _) in enumerate(rows)
+    )
+    return config.parse(DEPLOYMENT + pads)
+
+
+def touches(model: PadModel, count: int, seed: int) -> Scenario:
+    """`count` contacts anywhere on every pad, 8 % of a side from its edges, of 0.5 to 5 N."""
+    generator = np.random.default_rng(seed)
+    made = []
+    for number in range(count):
+        at = generator.uniform(0.08, 0.92, (model.size, 2))
+        force = np.exp(generator.uniform(np.log(0.5), np.log(5.0), model.size))
+        made += [
+            Touch(
+                link=link,
+                from_s=number * STEP_S,
+                duration_s=TICKS * PERIOD_NS * 1e-9,
+                ramp_s=0.005,
+                path=((float(x), float(y)),),
+                force_n=(float(newton),),
+            )
+            for link, (x, y), newton in zip(model.links, at, force, strict=True)
+        ]
+    return Scenario(touch=tuple(made))
+
+
+def block_of(hand: VirtualHand, number: int, pads: int) -> dict[str, Any]:
+    """The ticks of a contact and one without, as the daemon sends them."""
+    first_s = number * STEP_S
+    counts = np.array([hand.sample(first_s + (k + 0.5) * PERIOD_NS * 1e-9) for k in range(TICKS + 1)])
+    contact = np.full((TICKS + 1, pads), number + 1, np.uint32)
+    contact[-1] = 0
+    times = round(first_s * 1e9) + PERIOD_NS * np.arange(TICKS + 1, dtype=np.int64)
+    block = Block(
+        times,
+        np.repeat(times[:, None], pads, axis=1),
+        counts.astype(np.int32),
+        np.ones((TICKS + 1, pads), np.bool_),
+        (contact > 0).astype(np.uint8),
+        contact,
+        np.zeros((pads, 4)),
+        np.full(pads, np.nan),
+        np.ones((pads, 4)),
+        np.full(pads, np.nan),
+        np.full(pads, np.nan),
+    )
+    message: dict[str, Any] = msgpack.unpackb(block.dump())
+    return message
+
+
+def test_set(deployment: config.Deployment, model: PadModel, world: World) -> tuple[FloatArray, FloatArray]:
+    """Counts (100, pads, 4) of other contacts, as single samples, and where they are (100, pads, 3) [m]."""
+    hand = VirtualHand(deployment, touches(model, 100, 77), world)
+    times = [number * STEP_S + 0.5 * STEP_S for number in range(100)]
+    counts = np.array([hand.sample(t_s) for t_s in times])
+    places = np.zeros((100, model.size, 3))
+    for number, t_s in enumerate(times):
+        for truth in hand.truth(t_s):
+            places[number, model.links.index(truth.link)] = truth.position_m
+    return counts.astype(np.float64), places
+
+
+def errors_mm(model: PadModel, counts: FloatArray, places: FloatArray) -> FloatArray:
+    """Location errors (pads, 100) with the gains that the model has now."""
+    found = []
+    for pad in range(model.size):
+        index = np.full(len(counts), pad)
+        currents = (counts[:, pad] * model.ampere_per_count[pad]).T
+        at = model.locator.estimate(index, currents, model.noise_a[pad][:, None])
+        placed = model.placement.place(index, at.x, at.y, np.zeros((index.size, 2, 2)))
+        found.append(1e3 * np.linalg.norm(placed.position_m - places[:, pad], axis=1))
+    return np.array(found)
+
+
+def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Rows of the table."""
+    deployment = deployment_of(units)
+    model = PadModel(deployment)
+    world = World(5, gain_tolerance=GAIN_TOLERANCE, gap_tolerance_mm=0.1, resistor_tolerance=0)
+    hand = VirtualHand(deployment, touches(model, max(counts), 3), world)
+    readings, places = test_set(deployment, model, world)
+    start = Start(deployment, "", tuple(model.nominal), model.ampere_per_count.copy(), model.noise_counts)
+    trust = ["nominal"] * model.size
+    deviation = np.full(model.size, np.nan)
+    taken: dict[int, tuple[FloatArray, list[str], FloatArray]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        slow = SlowHalf(start, Archive(Path(folder) / "calibrations.db"))
+        new, old = [1000 + k for k in range(model.size)], [k + 1 for k in range(model.size)]
+        words = slow.take(msgpack.unpackb(serials(new, old, 0)), NOW)
+        for number in range(max(counts) + 1):
+            for word in words:
+                if isinstance(word, Judged):
+                    trust[word.pad] = word.trust
+                elif isinstance(word, Calibrate):
+                    model.calibrate(word.pad, word.gains, word.name)
+                    deviation[word.pad] = np.sqrt(np.diag(np.reshape(word.covariance, (4, 4))).max())
+            if number in counts:
+                taken[number] = errors_mm(model, readings, places), list(trust), deviation.copy()
+            if number < max(counts):
+                words = slow.take(block_of(hand, number, model.size), NOW)
+        slow.finish(NOW)
+    for pad, (name, entry) in enumerate(hand.pads):
+        model.calibrate(pad, 1 / np.array(world.parts(name, entry).gain), "true")
+    least = errors_mm(model, readings, places)
+    rows = []
+    for first, shape in enumerate(SHAPES):
+        own = slice(first * units, (first + 1) * units)
+        for number in counts:
+            error, state, std = taken[number]
+            rows.append(
+                {
+                    "pad": shape,
+                    "contacts since": number,
+                    "location error, rms mm": float(np.sqrt(np.mean(error[own] ** 2))),
+                    "95 % below, mm": float(np.quantile(error[own], 0.95)),
+                    "with the true gains, rms mm": float(np.sqrt(np.mean(least[own] ** 2))),
+                    "trusted, %": 100 * state[own].count("trusted") / units,
+                    "stated std of the gains, %": _percent(float(np.mean(std[own]))),
+                }
+            )
+    return rows
+
+
+def _percent(part: float) -> float | None:
+    """None before anything is known."""
+    return 100 * part if np.isfinite(part) else None
+
+
+def draw(path: Path, rows: list[dict[str, Any]]) -> None:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
+    for shape in SHAPES:
+        own = [row for row in rows if row["pad"] == shape]
+        at = [row["contacts since"] for row in own]
+        (line,) = left.plot(at, [row["location error, rms mm"] for row in own], "o-", label=shape)
+        left.plot(at, [row["95 % below, mm"] for row in own], "^:", color=line.get_color(), alpha=0.5)
+        least = own[0]["with the true gains, rms mm"]
+        left.axhline(least, color=line.get_color(), ls="--", lw=1, label=f"{shape}, with the true gains")
+        right.plot(at, [row["trusted, %"] for row in own], "o-", label=shape)
+    left.set(xlabel="contacts since the swap", ylabel="location error, mm", yscale="log")
+    left.set_title("rms (solid), 95 % below (dotted)")
+    right.set(xlabel="contacts since the swap", ylabel="units that are trusted, %", ylim=(-3, 103))
+    right.set_title("out of quarantine")
+    left.legend(fontsize=8)
+    right.legend(fontsize=8)
+    figure.savefig(path, dpi=100)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer units and contacts; writes nothing")
+    quick = parser.parse_args().quick
+    units, counts = (3, COUNTS[:6]) if quick else (12, COUNTS)
+    machine = (
+        f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, "
+        f"numpy {np.__version__}, scipy {scipy.__version__}"
+    )
+    rows = run(units, counts)
+    cells = [
+        [f"{v:.3g}" if isinstance(v, float) else "" if v is None else str(v) for v in row.values()]
+        for row in rows
+    ]
+    table = [f"| {' | '.join(line)} |" for line in (list(rows[0]), ["---"] * len(rows[0]), *cells)]
+    print("\n".join(table))
+    if quick:
+        return
+    lines = [
+        "# After a swap",
+        "",
+        f"Made by `make bench ONLY=swap`; {machine}.",
+        "",
+        "The slow half of the supervisor is given blocks of ticks as the daemon gives them, of "
+        f"{units} units of each shape ({' and '.join(f'{x:g} x {WIDTH_MM:g} mm' for x in SHAPES.values())}), "
+        "each in the place of another, nothing of it in the store. Finite elements, noise of 2 counts of "
+        "32767, gains 5 % rms from configured, electrodes that end up to 0.1 mm elsewhere and true sizes of "
+        f"contacts are hidden from it. Contacts of 0.5 to 5 N anywhere, {TICKS} samples each; 100 others a "
+        "pad, single samples, tell the error. A unit is trusted once its least certain log gain is known to "
+        "2 %, after 32 contacts at least.",
+        "",
+        *table,
+        "",
+        "![swap](swap.png)",
+        "",
+    ]
+    out = ROOT / "docs" / "benchmarks"
+    (out / "swap.md").write_text("\n".join(lines))
+    (out / "swap.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
+    draw(out / "swap.png", rows)
+
+
+if __name__ == "__main__":
+    main()
