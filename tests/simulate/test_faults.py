@@ -76,7 +76,8 @@ def currents(
     fine = deployment.model_copy(
         update={"nodes": {"plain": node.model_copy(update={"full_scale_ma": full_ma})}}
     )
-    return VirtualHand(fine, scenario, CALM, faults=faults).counts(0, [t_s])[0].astype(np.float64)
+    counts = VirtualHand(fine, scenario, CALM, faults=faults).counts(0, [t_s])[0]
+    return np.asarray(counts, np.float64)
 
 
 @pytest.mark.parametrize("electrode", range(4))

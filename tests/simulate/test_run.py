@@ -266,3 +266,47 @@ def test_a_mistake_ends_the_run_with_its_status(
     paths = {key: files / value if isinstance(value, str) else value for key, value in arguments.items()}
     assert run(**paths, stop=threading.Event(), seconds=0.05) == status  # type: ignore[arg-type]
     assert words in capsys.readouterr().err
+
+
+def test_a_swapped_node_has_another_serial_number_and_boots_once(deployment: config.Deployment) -> None:
+    swap = '[[swap]]\nlink = "round"\nat_s = 0.0\nserial = 4711\n'
+    with (
+        master(deployment, 0) as near,
+        SimulatedHand.open(deployment, Scenario.parse(SESSION + swap), IDEAL) as hand,
+    ):
+        hand.start()
+        near.send(0, 1, 0)
+        near.sync(1)
+        assert hand.devices["right/round"].serial == 4711
+        assert hand.devices["right/round"].state == "PRE-OPERATIONAL"
+        near.send(0, 1, 0)
+        assert set(near.sync(2)) == {3, 4}
+
+
+def test_a_swap_and_a_fault_on_no_pad_are_named(deployment: config.Deployment) -> None:
+    wrong = '[[swap]]\nlink = "toe"\nat_s = 0.0\nserial = 1\n'
+    wrong += '[[fault]]\nkind = "gum"\nlink = "nose"\nfrom_s = 0.0\n'
+    with pytest.raises(
+        ConfigError, match=r'(?s)\[\[fault\]\] 1: link = "nose".*\[\[swap\]\] 1: link = "toe"'
+    ):
+        SimulatedHand.open(deployment, Scenario.parse(SESSION + wrong + "place = [0.5, 0.5]\n"), IDEAL)
+
+
+def test_excitation_that_is_switched_off_reaches_the_sheet(
+    deployment: config.Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[int, bool]] = []
+    monkeypatch.setattr(VirtualHand, "switch", lambda _, row, __, on: told.append((row, on)))
+    with (
+        master(deployment, 0) as near,
+        SimulatedHand.open(deployment, Scenario.parse(SESSION), IDEAL) as hand,
+    ):
+        hand.start()
+        near.send(0, 1, 0)
+        near.sync(2)
+        assert told == []
+        hand.devices["right/round"].write(0x2100, 0, 0)
+        near.sync(2)
+        hand.devices["right/round"].write(0x2100, 0, 1)
+        near.sync(2)
+    assert told == [(1, False), (1, True)]

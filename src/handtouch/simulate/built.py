@@ -131,8 +131,15 @@ class BuiltPad:
             self._hold(fault, t, read)
         return read
 
+    @property
+    def ideal(self) -> bool:
+        """Whether its sheet makes of a force what the file says."""
+        return self.model is None and self.climate.steady and not self.faults
+
     def yields(self, times_s: FloatArray) -> FloatArray:
         """Apparent over true force (n,): what the sheet makes of what presses on it."""
+        if self.ideal:
+            return np.ones(len(times_s))
         if self.history is None:
             return np.asarray(1 + _GAIN_PER_K * self._warmer_k(times_s))
         return self.history.yields(times_s)
@@ -156,6 +163,14 @@ class BuiltPad:
             np.concatenate([begins, gum]),
             self.round_s,
         )
+
+    def prepare(self) -> None:
+        """Solve what the faults will need, before a live hand must not pause for it."""
+        if not self.plain:
+            begins = [fault.from_s for fault in self.faults]
+            changes = [*self.touches.changes[1], *begins]
+            times = [t + step for t in changes for step in (0.01, 0.1) if t + step < self.round_s]
+            self.counts(np.array(times, np.float64))
 
     def _load(self, since_s: FloatArray) -> FloatArray:
         """Total force (n,) [N] at times of a round."""

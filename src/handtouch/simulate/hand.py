@@ -60,6 +60,7 @@ class VirtualHand:
         self._gains = np.array([row.counts_per_ampere for row in self._rows])
         limits = np.array([row.limits for row in self._rows])
         self._low, self._high = limits[:, :, 0], limits[:, :, 1]
+        self._calls = 0
         self._climate = Climate(world, [(row.hand, row.pad.link) for row in self._rows])
         self._special = [number for number, row in enumerate(self._rows) if not row.plain]
         self._contacts = [
@@ -73,6 +74,9 @@ class VirtualHand:
 
     def sample(self, t_s: float) -> NDArray[np.int64]:
         """Counts (pads, 4) of the electrodes x0, xa, y0, yb, `t_s` after the start of the scenario."""
+        self._calls += 1
+        if history := self._rows[self._calls % len(self._rows)].history:
+            history.prepare(t_s)  # in turn, so that no sample has to wait for all of them
         counts = self._noise[:, None] * noise.normal(self._keys, round(t_s * 1e9))
         gains, at = self._gains, np.array([t_s])
         if not self._climate.steady:
@@ -90,6 +94,11 @@ class VirtualHand:
     def counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:
         """Counts (n, 4) of one pad at times (n,): those that `sample` gives, many at once."""
         return self._rows[pad_row].counts(times_s)
+
+    def prepare(self) -> None:
+        """Solve ahead what a live hand must not pause for."""
+        for row in self._rows:
+            row.prepare()
 
     def switch(self, pad_row: int, t_s: float, on: bool) -> None:
         """A pad's potential goes on or off at `t_s`, later than any switch before: without it, its sheet
@@ -121,7 +130,7 @@ class VirtualHand:
             [(c.pressing.x, c.pressing.y, c.pressing.force_n, c.radius_m) for c in contacts]
         ).T
         at = np.array([t_s])
-        force = force * [self._rows[row].yields(at)[0] for row in rows]
+        force = force * [1.0 if self._rows[row].ideal else self._rows[row].yields(at)[0] for row in rows]
         values, slopes = self._bank.look_up(rows, x, y)
         shares, log_radius = values[:4].T, values[4]
         collected, total = self._electric.solve(rows, shares, log_radius, force, radius)

@@ -20,7 +20,8 @@ from handtouch.simulate import noise
 
 FloatArray = NDArray[np.float64]
 
-_AHEAD_S = 2.0  # no further than needed: a live hand must not pause for it
+_AHEAD_S = 0.5  # no further than needed: a live hand must not pause for it
+_MOST_PIECES = 64
 _LATER_S = np.cumsum(0.02 * 1.35 ** np.arange(21.0))  # knots after the load has changed: 20 ms to 30 s
 _LONGEST_S = 30.0
 _SHORTEST_S = 4e-3
@@ -61,6 +62,8 @@ class History:
         it no longer holds. On from the start."""
         keep = max(int(np.searchsorted([mark for mark, _ in self._marks], t_s, side="right")), 1)
         del self._marks[keep:], self._pieces[keep - 1 :]
+        if t_s < self._marks[0][0]:
+            self._marks, self._pieces = [(0.0, self._model.start(1))], []
         self._power.append((t_s, on))
         self._all = None
 
@@ -68,6 +71,8 @@ class History:
         """Apparent over true force at times (n,) at which something presses."""
         if len(times_s) == 0:
             return np.ones(0)
+        if times_s.min() < self._marks[0][0]:  # long forgotten: all over again
+            self._marks, self._pieces = [(0.0, self._model.start(1))], []
         self._extend(float(times_s.max()))
         if self._all is None:
             whole = (np.concatenate(parts) for parts in zip(*self._pieces, strict=True))
@@ -75,6 +80,11 @@ class History:
         times, ratios = self._all
         smooth = np.interp(times_s, times, ratios) if len(times) else np.ones(len(times_s))
         return smooth * self._chance(times_s, smooth * self._load(self._since(times_s)))
+
+    def prepare(self, t_s: float) -> None:
+        """Go on, if need be, so that times soon after `t_s` cost nothing."""
+        if t_s + _AHEAD_S / 2 > self._marks[-1][0]:
+            self._extend(t_s + _AHEAD_S / 2)
 
     def _extend(self, until_s: float) -> None:
         """Go on to beyond `until_s`."""
@@ -93,6 +103,8 @@ class History:
         pressed = loads > 0
         self._pieces.append((times[pressed], apparent[pressed] / loads[pressed]))
         self._marks.append((end, state))
+        if len(self._pieces) > _MOST_PIECES:
+            del self._marks[: _MOST_PIECES // 2], self._pieces[: _MOST_PIECES // 2]
         self._all = None
 
     def _between(self, start: float, end: float) -> FloatArray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,7 @@ from handtouch.simulate.tear import beyond, torn
 
 FloatArray = NDArray[np.float64]
 _SILENT_N = 1e-6  # less is nothing, and would divide by nothing
+_FEW = 20
 _EVEN_DISC = 0.25  # resistance of a disc that feeds its current evenly, beside ln(R / a), in rho / 2 pi
 
 
@@ -113,6 +114,8 @@ class PadCircuit:
     series_ohm: FloatArray
     drive_v: float
     limit_a: FloatArray
+    _made: dict[tuple[Fault, ...], tuple[Circuit, SheetBank]] = field(default_factory=dict)
+    """By what is wrong with wires and sheet."""
 
     @cached_property
     def healthy(self) -> Circuit:
@@ -149,13 +152,11 @@ class PadCircuit:
         yields: FloatArray,
     ) -> FloatArray:
         """`currents` as long as nothing about wires and sheet changes."""
-        wiring, maps = self._wiring(), self.maps
+        key = tuple(changes)
+        if key not in self._made:
+            self._made[key] = self._make(changes)
+        circuit, bank = self._made[key]
         cuts = [fault.cut for fault in changes if fault.cut]
-        for cut in cuts:
-            maps = torn(self.shape, self.gaps, maps, cut)
-        for fault in changes:
-            fault.rewire(wiring)
-        circuit = Circuit.of(maps.conductance, self.sheet.ohm_per_square, wiring)
         spots = self._spots(times_s, touches, faults, yields)
         for cut in cuts:
             spots = [_without(spot, beyond(self.shape, cut, spot.place)) for spot in spots]
@@ -168,8 +169,16 @@ class PadCircuit:
             if kind.any():
                 at = np.flatnonzero(which.ravel() == number)
                 together = [spot for spot, is_there in zip(spots, kind, strict=True) if is_there]
-                found[at] += self._solve(circuit, SheetBank([maps]), together, at)
+                found[at] += self._solve(circuit, bank, together, at)
         return found
+
+    def _make(self, changes: Sequence[Fault]) -> tuple[Circuit, SheetBank]:
+        wiring, maps = self._wiring(), self.maps
+        for fault in changes:
+            fault.rewire(wiring)
+            if fault.cut:
+                maps = torn(self.shape, self.gaps, maps, fault.cut)
+        return Circuit.of(maps.conductance, self.sheet.ohm_per_square, wiring), SheetBank([maps])
 
     def _solve(
         self, circuit: Circuit, bank: SheetBank, spots: Sequence[_Spot], at: NDArray[np.intp]
@@ -187,9 +196,8 @@ class PadCircuit:
         ohm = phi @ circuit.lift @ phi.transpose(0, 2, 1)
         number = np.arange(len(spots))
         ohm[:, number, number] += np.stack(own, axis=1)
-        for i in range(len(spots)):
-            for j in range(i):
-                ohm[:, [i, j], [j, i]] += sheet_ohm * self._between(spots[i], spots[j], at)[:, None]
+        if len(spots) > 1:
+            ohm += sheet_ohm * self._between(spots, at)
         volt = self.drive_v - phi @ circuit.idle_v
         current = volt / ohm[:, 0] if len(spots) == 1 else np.linalg.solve(ohm, volt[:, :, None])[:, :, 0]
         return np.asarray(np.einsum("nk,nki->ni", current, phi) @ circuit.channels.T)
@@ -197,11 +205,29 @@ class PadCircuit:
     def _wiring(self) -> Wiring:
         return Wiring(self.series_ohm.copy(), self.drive_v, self.limit_a)
 
-    def _between(self, one: _Spot, other: _Spot, at: NDArray[np.intp]) -> FloatArray:
-        """Mutual resistance (n,) or (1,) of two contacts on 1 ohm per square."""
-        at = at[:1] if one.rests and other.rests else at
-        nearest = np.maximum(one.radius_m[at], other.radius_m[at])
-        return mutual(self.shape, self.gaps).ohm(one.place[:, at], other.place[:, at], nearest)
+    def _between(self, spots: Sequence[_Spot], at: NDArray[np.intp]) -> FloatArray:
+        """Mutual resistances (n, k, k) of contacts on 1 ohm per square; 0 on the diagonal."""
+        green = mutual(self.shape, self.gaps)
+        found = np.zeros((len(at), len(spots), len(spots)))
+        moving = []
+        for i, one in enumerate(spots):
+            for j, other in enumerate(spots[:i]):
+                nearest = max(one.radius_m[at[0]], other.radius_m[at[0]])
+                if one.rests and other.rests:
+                    places = (*one.place[:, 0].tolist(), *other.place[:, 0].tolist())
+                    found[:, [i, j], [j, i]] = green.resting(*places, float(nearest))
+                elif len(at) > _FEW:
+                    ohm = green.ohm(one.place[:, at], other.place[:, at], np.full(len(at), nearest))
+                    found[:, [i, j], [j, i]] = ohm[:, None]
+                else:
+                    moving.append((i, j, nearest))
+        if moving:  # few times: all pairs together
+            first, second, nearest_m = zip(*moving, strict=True)
+            one_at = np.concatenate([spots[i].place[:, at] for i in first], axis=1)
+            other_at = np.concatenate([spots[j].place[:, at] for j in second], axis=1)
+            ohm = green.ohm(one_at, other_at, np.repeat(nearest_m, len(at))).reshape(len(moving), -1).T
+            found[:, first, second] = found[:, second, first] = ohm
+        return found
 
     def _spots(
         self, times_s: FloatArray, touches: Played, faults: Sequence[Fault], yields: FloatArray

@@ -65,6 +65,8 @@ class SimulatedHand:
         buses = [bus for bus in deployment.buses if bus.name in used]
         # Before any bus is open: the sheets take a second, and its frames would wait to be answered too late.
         virtuals = [VirtualHand(deployment, scenario, world, bus.name) for bus in buses]
+        for virtual in virtuals:
+            virtual.prepare()
         with contextlib.ExitStack() as opened:
             for bus, virtual in zip(buses, virtuals, strict=True):
                 wire = open_bus(bus)
@@ -180,9 +182,7 @@ class _Stage:
         ]
 
     def truth(self, times_ns: Sequence[int]) -> list[Truth]:
-        return [
-            record for t_ns in times_ns for record in self._virtual.truth(self.start.since_s(t_ns), t_ns)
-        ]
+        return [record for t_ns in times_ns for record in self._virtual.truth(self.start.since_s(t_ns), t_ns)]
 
     def take_times(self) -> list[int]:
         return [self.times_ns.popleft() for _ in range(len(self.times_ns))]

@@ -115,6 +115,12 @@ class Mutual:
         distance = np.maximum(np.hypot(along, across), least)
         return np.asarray(self._regular(one, other) - np.log(distance) / (2 * math.pi))
 
+    @lru_cache(maxsize=4096)  # noqa: B019  as few as there are sheets
+    def resting(self, x: float, y: float, other_x: float, other_y: float, nearest_m: float) -> float:
+        """The same of two places that stay, remembered."""
+        one, other = np.array([[x], [y]]), np.array([[other_x], [other_y]])
+        return float(self.ohm(one, other, np.array([nearest_m]))[0])
+
     def _regular(self, one: FloatArray, other: FloatArray) -> FloatArray:
         if (other == other[:, :1]).all():  # the usual case: one of them stays where it is
             (k, of_k, _), (m, of_m, _) = (_basis(_RADIUS_BREAKS, axis[:1]) for axis in other)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,14 +179,19 @@ class Climate:
         """Counts (n, rows, 4) that channels show without any current."""
         walk = self._walk(self._world.drift_counts_per_s, self._zeros, times_s)
         walk += self._per_k[:, None] * self.warmer_k(times_s)
-        return np.asarray(walk.T.reshape(len(times_s), -1, 4))
+        return np.asarray(walk.T.reshape(len(times_s), len(self._zeros) // 4, 4))
 
     @staticmethod
     def _walk(rate: float, keys: NDArray[np.uint64], times_s: FloatArray) -> FloatArray:
         """Walks (keys, n) from 0, never steeper than the rate."""
         if not rate:
             return np.zeros((len(keys), len(times_s)))
-        return np.asarray(rate * (noise.wander(keys, times_s) - noise.wander(keys, 0.0)))
+        return np.asarray(rate * (noise.wander(keys, times_s) - _at_start(keys.tobytes())))
+
+
+@lru_cache(maxsize=1024)
+def _at_start(keys: bytes) -> FloatArray:
+    return noise.wander(np.frombuffer(keys, np.uint64), 0.0)
 
 
 def _four(values: NDArray[np.float64]) -> Four:
