@@ -219,13 +219,22 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
         left.plot(at, [row["95 % below, mm"] for row in own], "^:", color=line.get_color(), alpha=0.5)
         least = own[0]["with the true gains, rms mm"]
         left.axhline(least, color=line.get_color(), ls="--", lw=1, label=f"{shape}, with the true gains")
-        right.plot(at, [row["trusted, %"] for row in own], "o-", label=shape)
+        known = [row for row in own if row["stated std of the gains, %"] is not None]
+        right.plot(
+            [row["contacts since"] for row in known],
+            [row["stated std of the gains, %"] for row in known],
+            "o-",
+            label=shape,
+        )
     left.set(xlabel="contacts since the swap", ylabel="location error, mm", yscale="log")
-    left.set_title("rms (solid), 95 % below (dotted)")
-    right.set(xlabel="contacts since the swap", ylabel="units that are trusted, %", ylim=(-3, 103))
-    right.set_title("out of quarantine")
+    left.set_yticks([0.01, 0.02, 0.05, 0.1, 0.2, 0.5], ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5"])
+    left.minorticks_off()
+    left.set_title("Location: rms (solid), 95 % below (dotted)")
+    right.axhline(2.0, color="gray", ls="--", lw=1, label="trusted below")
+    right.set(xlabel="contacts since the swap", ylabel="%", xlim=left.get_xlim(), ylim=(0, 2.2))
+    right.set_title("Least certain gain, as stated")
     left.legend(fontsize=8)
-    right.legend(fontsize=8)
+    right.legend(fontsize=8, loc="center right")
     figure.savefig(path, dpi=100)
 
 
