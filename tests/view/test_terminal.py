@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from rich.console import Console
 
 from handtouch import wire
-from handtouch.view.lines import line, location_std_m
+from handtouch.view import status
+from handtouch.view.lines import finding_text, line, location_std_m
 from handtouch.view.terminal import HandView
 from handtouch.view.watch import LineDisplay
 
@@ -163,3 +164,42 @@ def test_where_there_is_no_room_for_all_the_touched_pads_come_first() -> None:
     page = _page(_hand(40, 3), width=100, height=20)
     assert all(f"middle_proximal_{k} " in page for k in (37, 38, 39))
     assert "more" in page
+
+
+GUM = {
+    "kind": "stuck contact", "cause": "chewing gum on thumb_tip", "evidence": "it stands for 60 s",
+    "remedy": "wipe it off", "since_ns": 1, "confidence": 0.99, "pad_m": [0.01, 0.02], "size_m": 0.006,
+}  # fmt: skip
+
+
+def test_what_the_supervisor_found_is_told_once_with_place_and_remedy(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = replace(HEALTH, trust="quarantined", findings=(GUM,))
+    assert "chewing gum on thumb_tip at (10, 20) mm, 6 mm across" in _page(_view(HEALTH, found), width=200)
+    assert "trusted again" in _page(_view(HEALTH, found, replace(HEALTH, trust="trusted")))
+    display = LineDisplay()
+    for message in (HEALTH, found, found):
+        display.take(message)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert "quarantined" in lines[1]
+    assert lines[1].endswith("(it stands for 60 s): wipe it off")
+
+
+def test_a_finding_of_another_version_without_all_its_keys_is_told_too() -> None:
+    assert finding_text({"kind": "new thing"}) == "new thing"
+
+
+def test_status_tells_findings_the_slow_half_and_the_store(capsys: pytest.CaptureFixture[str]) -> None:
+    figures = {
+        "state": "running", "pid": 7, "restarts": 1, "died_of": "killed by signal 9", "lag_s": 0.31,
+        "dropped": 0, "malformed": 0, "late": 0, "word": "3 trusted", "store": "it is damaged",
+    }  # fmt: skip
+    answer = {"service": {"supervisor": figures}, "pads": [asdict(replace(HEALTH, findings=(GUM,)))]}
+    status._show_supervisor(answer, Console(width=200))
+    told = capsys.readouterr().out
+    assert "supervisor running, process 7, 0.3 s behind, 1 restarts (died last: killed by signal 9)" in told
+    assert "calibration store: it is damaged" in told
+    assert "right/thumb_tip: chewing gum on thumb_tip at (10, 20) mm" in told
+    assert not status._is_well({"state": "clear", "trust": "quarantined"})
