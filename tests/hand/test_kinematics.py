@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from pathlib import Path
 
@@ -37,16 +36,6 @@ WITH_MIMIC = """
 """
 
 
-def allegro() -> Path:
-    """The Allegro hand's description, from a package that is installed for the tests."""
-    spec = importlib.util.find_spec("cmeel")
-    assert spec is not None
-    assert spec.origin is not None
-    site = Path(spec.origin).parents[1]
-    folder = site / "cmeel.prefix/share/example-robot-data/robots/allegro_hand_description/urdf"
-    return folder / "allegro_right_hand.urdf"
-
-
 def pose(robot: urdf.Description, link: str, position: dict[str, float]) -> FloatArray:
     """Homogeneous transform (4, 4) from a link to the root."""
     found = np.eye(4)
@@ -66,9 +55,9 @@ def pose(robot: urdf.Description, link: str, position: dict[str, float]) -> Floa
 
 @pytest.fixture(scope="module", params=["shipped", "allegro", "mimic"])
 def hand(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, allegro: Path
 ) -> tuple[urdf.Description, Kinematics]:
-    path = {"shipped": shipped.path("utah_mit.urdf"), "allegro": allegro()}.get(request.param)
+    path = {"shipped": shipped.path("utah_mit.urdf"), "allegro": allegro}.get(request.param)
     if path is None:
         path = tmp_path_factory.mktemp("urdf") / "mimic.urdf"
         path.write_text(WITH_MIMIC)

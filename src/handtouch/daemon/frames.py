@@ -126,11 +126,13 @@ class Frames:
         values = self._values[rows].astype("<f4")
         told = {
             "group": self.group[rows].astype("<u4").tobytes(),
-            "palm": self.palm[rows].tobytes(),
-            "base": self.base[rows].tobytes(),
             "joints_age_s": values[:, _AGE].tobytes(),
         }
-        for frame, state, at in (("palm", self.palm, _PALM), ("base", self.base, _BASE)):
+        asked = (("palm", self.palm, _PALM, self._wants_palm), ("base", self.base, _BASE, self._wants_base))
+        for frame, state, at, wants in asked:
+            if not wants[rows].any():
+                continue
+            told[frame] = state[rows].tobytes()
             part = np.where((state[rows] == _VALID)[:, None], values[:, at], np.float32(np.nan))
             told |= {f"{frame}_{name}": part[:, where].tobytes() for name, where in _TOLD.items()}
         return told

@@ -79,7 +79,7 @@ class Kinematics:
             angle = turned[self._turning_v]
             q[self._turning_q], q[self._turning_q + 1] = np.cos(angle), np.sin(angle)
         self._pin.forwardKinematics(self._model, self._data, q)
-        self._q = q
+        self._q, self._sloped = q, False
         self._here: dict[int, Any] = {}
 
     def in_palm(self, link: int) -> Pose:
@@ -93,7 +93,9 @@ class Kinematics:
     def slope(self, link: int, position_m: FloatArray, in_base: bool = False) -> FloatArray:
         """How a point (3,) of the link moves with each joint, (3, m) [m/rad] in palm or base frame."""
         pin, frame, other = self._pin, self._frames[link], self._base if in_base else self._palm
-        pin.computeJointJacobians(self._model, self._data, self._q)
+        if not self._sloped:
+            pin.computeJointJacobians(self._model, self._data, self._q)
+            self._sloped = True
         seen = self._at(other)
         at = self._at(frame).act(position_m)
         of = [pin.getFrameJacobian(self._model, self._data, f, pin.WORLD) for f in (frame, other)]

@@ -1,0 +1,211 @@
+"""What palm and base frame cost the tick: 15 pads of the shipped hand, at rest under a steady press.
+
+Cases take turns on the same samples, with joint states at 1 kHz beside them; a case is the pipeline of the
+daemon from the last sample to encoded messages. Then the parts by themselves.
+Writes docs/benchmarks/kinematics.{md,json}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from handtouch import shipped, wire
+from handtouch.config import load
+from handtouch.config.tables import Wants
+from handtouch.daemon.inputs import Inputs
+from handtouch.daemon.model import PadModel
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.scene import Demand, Scenes
+from handtouch.daemon.security import Gate
+from handtouch.hand.joints import JointStates
+from handtouch.hand.robot import Robots
+from handtouch.inputs import JointState, decode, encode
+
+OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
+PERIOD_NS = 5_000_000
+JOINTS_EVERY_NS = 1_000_000
+STRENGTH = 20.0  # of the threshold's current
+PLAIN = ("location", "strength")
+CASES: dict[str, tuple[tuple[str, ...], bool, float | None]] = {
+    "no URDF": (PLAIN, False, None),
+    "URDF, palm not asked for": (PLAIN, True, None),
+    "palm": ((*PLAIN, "palm"), True, None),
+    "palm and base": ((*PLAIN, "palm", "base"), True, None),
+    "palm and base, uncertain joints": ((*PLAIN, "palm", "base"), True, 0.01),
+}
+"""Outputs, whether the hand has a URDF, standard deviation of joints [rad]."""
+
+
+class Case:
+    """A pipeline of the shipped hand in one scene, all of whose messages are encoded."""
+
+    subscriptions = frozenset({b""})
+
+    def __init__(
+        self, model: PadModel, robots: Robots, case: tuple[tuple[str, ...], bool, float | None]
+    ) -> None:
+        outputs, described, self._std = case
+        self.pipeline = Pipeline(model, PERIOD_NS, 0.6, self, robots=robots if described else None)
+        self.pipeline.node_state[:] = 0
+        self.spent: list[int] = []
+        self.sent_bytes = 0
+        names = list(zip(model.hands, model.links, strict=True))
+        self._joints = JointStates(robots.joint_names[0])
+        self.pipeline.frames.joints_at = lambda _, t_ns: self._joints.at(t_ns)
+        Demand(Scenes(Wants(outputs=outputs), names), self, 200.0, self._apply).step(0)  # type: ignore[arg-type]
+
+    def wants(self, topic: str) -> bool:
+        return topic.startswith(("contact/", "hand/"))
+
+    def send(self, message: wire.Message) -> None:
+        self.sent_bytes += sum(map(len, wire.encode(message)))
+
+    def _apply(self, wanted: Any, *_: Any) -> None:
+        self.pipeline.want(wanted)
+
+    def tick(self, t_ns: int, counts: Any) -> None:
+        for joints_ns in range(t_ns - PERIOD_NS, t_ns, JOINTS_EVERY_NS):
+            angle = 0.5 + 0.4 * np.sin(joints_ns * 1e-9 + np.arange(16))
+            std = None if self._std is None else np.full(16, self._std)
+            self._joints.take(joints_ns, self._joints.names, angle, None, std)
+        pipeline = self.pipeline
+        pipeline.begin(t_ns, t_ns)
+        for pad, row in enumerate(counts):
+            pipeline.slab.write(pad, row.tobytes(), t_ns + 1000)
+        begin_ns = time.perf_counter_ns()
+        if pipeline.advance(t_ns + 2000) is None:  # before the first tick no pad is expected
+            pipeline.advance(t_ns + PERIOD_NS - 1)
+        self.spent.append(time.perf_counter_ns() - begin_ns)
+
+
+def measure(touched: int, ticks: int) -> list[dict[str, Any]]:
+    """A row a case: median microseconds of a tick, and bytes sent."""
+    deployment = load(shipped.path("utah_mit.toml"))
+    model, robots = PadModel(deployment), Robots(deployment)
+    cases = {name: Case(model, robots, case) for name, case in CASES.items()}
+    pads = np.arange(model.size)
+    x, y = (np.full((model.size, 2), 0.5) * model.locator.sides).T
+    share = model.locator.fractions(pads, x, y).T * (STRENGTH * model.on_a[:, None]) / model.ampere_per_count
+    share[touched:] = 0.0
+    chance, order = np.random.default_rng(1), list(cases.values())
+    for number in range(ticks + 20):
+        counts = np.rint(share + 0.2 * chance.normal(size=share.shape)).astype("<i2")
+        for case in order[number % len(order) :] + order[: number % len(order)]:
+            case.tick(10**9 + number * PERIOD_NS, counts)
+    first = _median_us(cases["no URDF"].spent[20:])
+    return [
+        {
+            "case": name,
+            "touched": touched,
+            "us": (us := _median_us(case.spent[20:])),
+            "more_us": us - first,
+            "of_first": us / first,
+            "bytes": case.sent_bytes / (ticks + 20),
+        }
+        for name, case in cases.items()
+    ]
+
+
+def parts(repeats: int) -> dict[str, float]:
+    """Microseconds of each part by itself."""
+    import zmq
+
+    deployment = load(shipped.path("utah_mit.toml"))
+    robots = Robots(deployment)
+    kinematics, names = robots.kinematics[0], robots.joint_names[0]
+    states = JointStates(names)
+    for number in range(64):
+        states.take(number * JOINTS_EVERY_NS, names, np.full(16, 0.01 * number))
+    message = encode(JointState("right", 1, names, np.full(16, 0.5)))
+    position, point = np.full(16, 0.5), np.array([0.01, 0.0, 0.01])
+    clock = iter(range(10**12, 10**15))
+    with zmq.Context() as context:
+        known = {"right": JointStates(names)}
+        pads = [("right", pad.link) for pad in deployment.hands[0].pads]
+        inputs = Inputs(context, "tcp://127.0.0.1:*", Gate(context), known, pads)
+
+        def take() -> None:
+            now_ns = next(clock)
+            topic, payload = message
+            inputs.take([topic, payload.replace(b"\xa4t_ns\x01", b"\xa4t_ns\xc0")], now_ns)
+
+        def pose() -> None:
+            kinematics.move(position)
+            for link in range(5):
+                kinematics.in_palm(link)
+
+        found = {
+            "take in a joint state of 16 joints": _each_us(take, repeats),
+            "of that, decode it": _each_us(lambda: decode(message), repeats),
+            "look for messages, none there": _each_us(lambda: inputs.poll(0), repeats),
+            "joints at the time of a sample": _each_us(lambda: states.at(60_500_000), repeats),
+            "kinematics of 16 joints": _each_us(lambda: kinematics.move(position), repeats),
+            "kinematics, and the poses of 5 links in the palm": _each_us(pose, repeats),
+            "slope of a point with the joints": _each_us(lambda: kinematics.slope(0, point), repeats),
+        }
+        assert not inputs.dropped, inputs.problem
+        inputs.close()
+    return found
+
+
+def _median_us(spent_ns: list[int]) -> float:
+    return float(np.median(spent_ns)) * 1e-3
+
+
+def _each_us(work: Callable[[], object], repeats: int) -> float:
+    spent = []
+    for _ in range(repeats):
+        begin_ns = time.perf_counter_ns()
+        work()
+        spent.append(time.perf_counter_ns() - begin_ns)
+    return _median_us(spent)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="to try it out: few ticks, nothing is written")
+    quick = parser.parse_args().quick
+    ticks = 100 if quick else 3000
+    rows = [row for touched in (0, 1, 5, 15) for row in measure(touched, ticks)]
+    single = parts(200 if quick else 5000)
+    text = _page(rows, single)
+    print(text)
+    if not quick:
+        (OUT / "kinematics.md").write_text(text)
+        (OUT / "kinematics.json").write_text(json.dumps({"rows": rows, "parts_us": single}, indent=1) + "\n")
+
+
+def _page(rows: list[dict[str, Any]], single: dict[str, float]) -> str:
+    machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+    lines = [
+        "# What palm and base frame cost the tick",
+        "",
+        "From the last sample to encoded contacts and hand frame, 15 pads of the shipped hand, steady",
+        "presses; joint states come at 1 kHz. Cases take turns on the same samples; medians.",
+        f"{machine}.",
+        "",
+        "| pads touched | case | us a tick | more, us | of the first | bytes a tick |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    lines += [
+        f"| {r['touched']} | {r['case']} | {r['us']:.0f} | {r['more_us']:+.0f} | {r['of_first']:.0%} "
+        f"| {r['bytes']:.0f} |"
+        for r in rows
+    ]
+    lines += ["", "The parts by themselves, medians, one after the other with warm caches:", ""]
+    lines += ["| part | us |", "| --- | --- |"]
+    lines += [f"| {name} | {us:.1f} |" for name, us in single.items()]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,18 @@
+"""Where the description of a hand is that nobody here described."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def allegro() -> Path:
+    """The Allegro hand's URDF, from the package example-robot-data."""
+    spec = importlib.util.find_spec("cmeel")
+    assert spec is not None
+    assert spec.origin is not None
+    shared = Path(spec.origin).parents[1] / "cmeel.prefix/share/example-robot-data"
+    return shared / "robots/allegro_hand_description/urdf/allegro_right_hand.urdf"

@@ -1,0 +1,46 @@
+"""The worked example of the documentation: a hand that nobody here described."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from handtouch.check import run
+from handtouch.config import ConfigError, load
+from handtouch.hand.robot import Robots, check, doubts
+
+TEXT = (Path(__file__).parents[2] / "docs" / "hand.md").read_text()
+
+
+def written(folder: Path, allegro: Path) -> Path:
+    """The deployment in docs/hand.md, as a file."""
+    (example,) = re.findall(r"```toml\n(.*?)```", TEXT, flags=re.S)
+    path = folder / "hand.toml"
+    path.write_text(example.replace("allegro_right_hand.urdf", str(allegro)))
+    return path
+
+
+def test_the_example_fits_the_hand(tmp_path: Path, allegro: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, allegro)
+    assert run(path, json=False, schema=False) == 0, capsys.readouterr()
+    deployment = check(load(path), str(path))
+    assert not list(doubts(deployment))
+    (kinematics,) = Robots(deployment).kinematics
+    assert kinematics.joints == ("joint_0.0", "joint_1.0", "joint_2.0", "joint_3.0")
+    kinematics.move(np.zeros(4))
+    straight = kinematics.in_palm(2)
+    # the lengths of the phalanges as its maker tells them, spread by 5 degrees
+    assert straight.translation_m[2] == pytest.approx(0.1355 * math.cos(math.radians(5)) - 0.0015, abs=1e-4)
+    kinematics.move(np.array([0.0, 1.0, 1.0, 1.0]))
+    assert kinematics.in_palm(2).translation_m[0] > 0.04  # it closes towards the palm's side, x
+
+
+def test_a_pad_that_faces_into_this_hand_is_told(tmp_path: Path, allegro: Path) -> None:
+    path = written(tmp_path, allegro)
+    path.write_text(path.read_text().replace("rpy_deg = [180.0, -102.5, 0.0]", "rpy_deg = [0.0, -77.5, 0.0]"))
+    with pytest.raises(ConfigError, match=r"index_tip.*rpy_deg.*faces into the body"):
+        check(load(path), str(path))
