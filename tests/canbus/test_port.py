@@ -16,15 +16,17 @@ from typing import Any
 from unittest import mock
 
 import can
+import msgpack
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message
 
 from handtouch.canbus import receivers
 from handtouch.canbus.bus_state import Condition
 from handtouch.canbus.port import BusError, Port
-from handtouch.canbus.receivers import Retry, ThreadReceiver, monotonic_from_wall
+from handtouch.canbus.receivers import Retry, ThreadReceiver, within
 from handtouch.canbus.router import Router
 from handtouch.canbus.slab import Slab
-from handtouch.canbus.sockets import PolledReceiver
+from handtouch.canbus.sockets import DatagramReceiver
 from handtouch.config import Bus
 
 _channels = itertools.count()
@@ -44,7 +46,7 @@ def eventually(what: Callable[[], bool], seconds: float = 2.0) -> bool:
     return what()
 
 
-def readable(port: Port | ThreadReceiver | PolledReceiver, seconds: float = 0.0) -> bool:
+def readable(port: Port | ThreadReceiver | DatagramReceiver, seconds: float = 0.0) -> bool:
     return bool(select.select([port.fileno()], [], [], seconds)[0])
 
 
@@ -225,7 +227,7 @@ class FakeBus(can.BusABC):
 
     def __init__(self, script: list[Any]) -> None:
         self.script = script
-        self.ends = socket.socketpair()
+        self.ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.ends[1].send(b"x")
         self.closed = False
         self.send_error: Exception = can.CanOperationError("Transmit buffer full")
@@ -268,21 +270,50 @@ class Opener:
         return self.opened[-1]
 
 
+class ScriptedSocket:
+    """A socket that gives a FakeBus's script: frames as datagrams of python-can, other things as garbage."""
+
+    def __init__(self, real: socket.socket, script: list[Any]) -> None:
+        self._real, self._script = real, script
+
+    def recvmsg(self, *_: int) -> tuple[bytes, list[Any], int, None]:
+        if not self._script:
+            raise BlockingIOError
+        item = self._script.pop(0)
+        if isinstance(item, can.Message):
+            return pack_message(item), [], 0, None
+        if item is MALFORMED or isinstance(item, ValueError):
+            return b"no such thing as a frame", [], 0, None
+        raise item
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._real, name)
+
+
+class ScriptedDatagrams(DatagramReceiver):
+    """Reads a FakeBus's script as datagrams."""
+
+    def _use(self, bus: can.BusABC) -> None:
+        assert isinstance(bus, FakeBus)
+        super()._use(bus)
+        self._socket: Any = ScriptedSocket(self._socket, bus.script)
+
+
 GONE = OSError(errno.ENODEV, "No such device")
 DOWN = can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN)
 MALFORMED = can.CanOperationError("could not unpack received message")
 SAMPLE = frame(0x281, bytes(8))
 
 
-@pytest.fixture(params=["polled", "thread"])
+@pytest.fixture(params=["datagram", "thread"])
 def start(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Both receivers, with short pauses."""
     monkeypatch.setattr(receivers, "_RETRY_FIRST_S", 0.002)
-    made: list[ThreadReceiver | PolledReceiver] = []
+    made: list[ThreadReceiver | DatagramReceiver] = []
 
-    def start(opener: Opener) -> ThreadReceiver | PolledReceiver:
-        receiver: ThreadReceiver | PolledReceiver = (
-            PolledReceiver(opener) if request.param == "polled" else ThreadReceiver(opener, "fake")
+    def start(opener: Opener) -> ThreadReceiver | DatagramReceiver:
+        receiver: ThreadReceiver | DatagramReceiver = (
+            ScriptedDatagrams(opener) if request.param == "datagram" else ThreadReceiver(opener, "fake")
         )
         made.append(receiver)
         return receiver
@@ -389,13 +420,55 @@ def test_error_frame_of_an_adapter_that_speaks_the_kernels_language_sets_the_sta
 
 
 @pytest.mark.parametrize("can_id", [0x800, 0xFFF, -1])
-def test_identifier_that_cannot_be_is_dropped(start: Any, router: Router, can_id: int) -> None:
+def test_identifier_that_cannot_be_is_dropped(router: Router, can_id: int) -> None:
     """As a garbled line of slcan has it; in the router it was an index."""
     odd = frame(0, b"")
     odd.arbitration_id = can_id
-    receiver = start(Opener([odd, SAMPLE]))
+    receiver = ThreadReceiver(Opener([odd, SAMPLE]), "fake")
     assert drain_until(receiver, router, lambda: router.counters.samples == 1)
     assert router.counters.foreign == 1
+    receiver.close()
+
+
+def _told(**other: Any) -> bytes:
+    """A datagram of python-can with other fields."""
+    sample = {"arbitration_id": 0x281, "dlc": 8, "data": bytes(8), "timestamp": 0.0, "channel": None}
+    flags = dict.fromkeys(
+        ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch"), False
+    )
+    packed: bytes = msgpack.packb(sample | flags | {"error_state_indicator": False} | other)
+    return packed
+
+
+@pytest.mark.parametrize(
+    ("packet", "count"),
+    [
+        (_told(), "samples"),
+        (_told(dlc=4, data=bytes(4)), "short"),
+        (_told(is_extended_id=True), "foreign"),
+        (_told(is_fd=True, dlc=12, data=bytes(12)), "foreign"),
+        (_told(is_error_frame=True), "errors"),
+        (_told(is_remote_frame=True, arbitration_id=0x701, dlc=1, data=b""), "frames"),
+        (_told(dlc=7), "receive_failures"),
+        (_told(data="text"), "receive_failures"),
+        (_told(arbitration_id="1"), "receive_failures"),
+        (_told(arbitration_id=0x800), "receive_failures"),
+        (_told(more=1), "samples"),
+        (msgpack.packb(5), "receive_failures"),
+        (msgpack.packb({}), "foreign"),
+        (b"", "receive_failures"),
+        (b"\xc1", "receive_failures"),
+    ],
+)
+def test_datagram_is_what_python_can_would_make_of_it(packet: bytes, count: str, router: Router) -> None:
+    opener = Opener()
+    receiver = DatagramReceiver(opener)
+    opener.opened[0].ends[0].recv(1)
+    opener.opened[0].ends[1].send(packet)
+    assert receiver.drain(router) == []
+    assert getattr(router.counters, count) == 1
+    assert router.counters.samples + router.counters.receive_failures <= 1
+    receiver.close()
 
 
 def test_remote_frame_is_sent_as_one(port: Port, other: can.BusABC) -> None:
@@ -415,7 +488,7 @@ def test_adapter_that_cannot_even_be_closed_is_given_back() -> None:
             raise can.CanOperationError("Could not write to serial device")
 
     ThreadReceiver(lambda: Stuck([]), "fake").close()
-    PolledReceiver(lambda: Stuck([])).close()
+    DatagramReceiver(lambda: Stuck([])).close()
 
 
 def test_closing_gives_everything_back() -> None:
@@ -424,7 +497,7 @@ def test_closing_gives_everything_back() -> None:
     for _ in range(5):
         receiver = ThreadReceiver(Opener(), "fake")
         receiver.close()
-        PolledReceiver(Opener()).close()
+        DatagramReceiver(Opener()).close()
     assert len(os.listdir("/proc/self/fd")) == before
 
 
@@ -445,7 +518,7 @@ def test_pauses_between_attempts_grow_to_a_limit() -> None:
 )
 def test_stamps_that_cannot_be_are_replaced_by_now(stamp_s: float, t_ns: int) -> None:
     now_ns, offset_ns = 50 * 10**9, -50 * 10**9  # the wall clock shows 100 s
-    assert monotonic_from_wall(stamp_s, now_ns, offset_ns) == t_ns
+    assert within(round(stamp_s * 1e9) + offset_ns, now_ns) == t_ns
 
 
 OVERFLOW = """

@@ -21,7 +21,7 @@ from .load import frame_bits
 from .receivers import CyclicSender, InProcessReceiver, Receiver, ThreadReceiver
 from .router import Counters, Frame, Router
 from .slab import Slab
-from .sockets import PolledReceiver, SocketcanReceiver
+from .sockets import DatagramReceiver, SocketcanReceiver
 
 _ECHOES = frozenset({"udp_multicast"})  # what we send comes back and is counted there
 _OWN_BIT_RATE = frozenset({"socketcan", "udp_multicast", "virtual"})  # python-can can't set it there
@@ -187,7 +187,7 @@ def _receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
     if bus.interface == "socketcan":
         return SocketcanReceiver(opener, str(bus.channel))
     if bus.interface == "udp_multicast":
-        return PolledReceiver(opener)
+        return DatagramReceiver(opener)
     if bus.interface == "virtual":
         return InProcessReceiver(opener)
     return ThreadReceiver(opener, bus.interface)

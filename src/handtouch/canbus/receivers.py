@@ -109,9 +109,8 @@ class Retry:
         self._due_ns = 0
 
 
-def monotonic_from_wall(stamp_s: float, now_ns: int, offset_ns: int) -> int:
-    """A wall-clock stamp on the monotonic clock; `now_ns` where it can't be a stamp of the last seconds."""
-    t_ns = int(stamp_s * 1e9) + offset_ns
+def within(t_ns: int, now_ns: int) -> int:
+    """A stamp made monotonic; `now_ns` where it can't be one of the last seconds."""
     return t_ns if now_ns - _OLDEST_STAMP_NS < t_ns <= now_ns else now_ns
 
 

@@ -72,6 +72,13 @@ class Daemon(Table):
         (), description="processors that the thread that ticks may use; none given: any"
     )
     lock_memory: bool = Field(False, description="keep all memory of the daemon from being swapped out")
+    busy_poll_us: float = Field(
+        0,
+        ge=0,
+        le=10_000,
+        description="wait for samples without sleeping, so long before and after the last one usually comes; "
+        "0: always sleep",
+    )
 
 
 class Bus(Table):

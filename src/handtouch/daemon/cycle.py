@@ -5,6 +5,9 @@ The same rules serve a live bus and a recorded one: time comes in as an argument
 
 from __future__ import annotations
 
+_FOREVER_NS = 1 << 62
+_SMOOTHING = 8  # cycles
+
 
 class Cycle:
     """One SYNC period after another; `t_ns` is the present one's SYNC, `previous_ns` the one before.
@@ -32,3 +35,25 @@ class Cycle:
     def overdue_ns(self) -> int:
         """When a foreign SYNC is so late that the timer has to take its place."""
         return self.t_ns + self.period_ns + self.period_ns // 2
+
+
+class BusyPoll:
+    """When to wait for samples awake, which spares the wake-up: around the time the last one usually comes.
+
+    `busy_ns`: for how long before that time, and after it where the last one is late; 0: never. Times in ns.
+    """
+
+    def __init__(self, busy_ns: int) -> None:
+        self._busy_ns = busy_ns
+        self._usual_ns = 0  # from SYNC to the tick
+
+    def ticked(self, sync_ns: int, now_ns: int) -> None:
+        """The samples of this SYNC were there, or as many as came in time."""
+        self._usual_ns += (now_ns - sync_ns - self._usual_ns) // _SMOOTHING
+
+    def sleep_ns(self, sync_ns: int, now_ns: int) -> int:
+        """How long to sleep at most while samples of this SYNC are missing."""
+        left_ns = sync_ns + self._usual_ns - now_ns
+        if not self._busy_ns or left_ns <= -self._busy_ns:
+            return _FOREVER_NS
+        return max(0, left_ns - self._busy_ns)

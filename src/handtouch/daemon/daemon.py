@@ -33,6 +33,7 @@ from handtouch.config import ConfigError, Deployment, load, with_bus
 from handtouch.daemon import histogram, logs, realtime
 from handtouch.daemon.commands import Commands
 from handtouch.daemon.control import Control
+from handtouch.daemon.cycle import BusyPoll
 from handtouch.daemon.inputs import Inputs
 from handtouch.daemon.metrics import PATH, Exporter
 from handtouch.daemon.model import PadModel
@@ -185,6 +186,7 @@ class Daemon:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
         by_descriptor = {port.fileno(): port for port in ports}
         descriptors = list(by_descriptor)
+        busy_poll = BusyPoll(round(self.deployment.daemon.busy_poll_us * 1e3))
         sync, pacer, master, stages = self.sync, self.pacer, self.master, self.report.stages
         pipeline.stepped = self._stepped
         sync.start(time.monotonic_ns())
@@ -195,7 +197,8 @@ class Daemon:
                 self._begin(sync_ns, now_ns)
             wake_ns = min(sync.wake_ns, master.wake_ns)  # nodes may not be able to wait for a slow SYNC
             if not cycle.ticked:
-                wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns)
+                sleep_ns = busy_poll.sleep_ns(cycle.t_ns, now_ns)
+                wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns, now_ns + sleep_ns)
             wait_s = max(0, wake_ns - now_ns) * 1e-9
             readable = select.select(descriptors, (), (), wait_s)[0]
             woke_ns = time.monotonic_ns()
@@ -211,6 +214,7 @@ class Daemon:
                 ticked = pipeline.tick_now(now_ns)
             if ticked is not None:
                 self.publisher.release()
+                busy_poll.ticked(cycle.t_ns, now_ns)
                 sent_ns = time.monotonic_ns()
                 stages.lap(histogram.SEND, sent_ns)
                 self.report.ticked(now_ns, sent_ns)
