@@ -90,7 +90,7 @@ class Finding:
 class DiagnosisModel:
     """What is known of the n pads of a hand before any sample.
 
-    networks and surfaces: of each pad, rectangle to metres. ampere_per_count, offset_counts: (n, 4) as
+    networks, surfaces, sheets: of each pad. drive_v: (n,). ampere_per_count, offset_counts: (n, 4) as
     calibrated; offsets are what the store has, not a running baseline. noise_counts: (n,) of a reading.
     limits: (n, 4, 2) least and greatest count.
     """
@@ -98,6 +98,8 @@ class DiagnosisModel:
     links: tuple[str, ...]
     networks: Sequence[ElectrodeNetwork]
     surfaces: Sequence[Surface]
+    sheets: Sequence[config.Sheet]
+    drive_v: FloatArray
     ampere_per_count: FloatArray
     noise_counts: FloatArray
     limits: FloatArray
@@ -127,6 +129,8 @@ class DiagnosisModel:
             links=tuple(pad.link for pad in pads),
             networks=networks,
             surfaces=[surface_of(pad) for pad in pads],
+            sheets=[deployment.sheets[pad.sheet] for pad in pads],
+            drive_v=np.array([node.drive_v for node in nodes]),
             ampere_per_count=scale,
             noise_counts=np.array([node.noise_counts for node in nodes]),
             limits=limits,

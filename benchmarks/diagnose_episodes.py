@@ -1,0 +1,269 @@
+"""Episodes for bench_diagnose: a small hand in use, what happens to one of its pads, and its name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from handtouch import config, shipped
+from handtouch.simulate.faults import FAULTS, INFLUENCES, Fault
+from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.simulate.world import World
+from handtouch.supervise.diagnose import Block, Kind
+
+PADS = ("index_distal", "index_proximal", "palm_thumb")
+RATE_HZ = 100
+BLOCK = 50  # samples
+LENGTH_S = 110.0
+ELECTRODES = ("x0", "xa", "y0", "yb")
+FAULTY = {
+    "gum": Kind.STUCK_CONTACT,
+    "moisture": Kind.MOISTURE,
+    "dead electrode": Kind.DEAD_ELECTRODE,
+    "shorted electrode": Kind.SHORTED_ELECTRODE,
+    "swapped cables": Kind.SWAPPED_ELECTRODES,
+    "saturated channel": Kind.SATURATED_CHANNEL,
+    "stuck channel": Kind.STUCK_CHANNEL,
+    "torn corner": Kind.TORN_CORNER,
+    "offset": Kind.OFFSET,
+    "gain step": Kind.GAIN_STEP,
+    "hysteresis tail": Kind.HYSTERESIS_TAIL,
+}
+"""What happens, and what it should be called."""
+FAULT_FREE = ("plain use", "long grasp", "wet object", "sweeping wipes", "hot cup", "two objects")
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One of them: what happens from begin_s on to the pad `link`, and how big it is."""
+
+    name: str
+    seed: int
+    link: str
+    begin_s: float
+    details: dict[str, Any]
+    hand: VirtualHand
+
+    def blocks(self, length_s: float = LENGTH_S) -> Iterator[Block]:
+        """Its samples, block after block."""
+        ticks = int(length_s * RATE_HZ) // BLOCK * BLOCK
+        times = np.arange(ticks) / RATE_HZ
+        counts = np.stack([self.hand.counts(row, times) for row in range(len(PADS))], axis=1)
+        stamps = np.repeat(np.rint(times * 1e9).astype(np.int64)[:, None], len(PADS), axis=1)
+        fresh = np.ones((BLOCK, len(PADS)), dtype=np.bool_)
+        for first in range(0, ticks, BLOCK):
+            part = slice(first, first + BLOCK)
+            yield Block(stamps[part], counts[part], fresh)
+
+
+@lru_cache(maxsize=1)
+def deployment() -> config.Deployment:
+    """Three pads of the shipped hand: a fingertip, a phalanx, one of the palm."""
+    whole = config.load(shipped.path("utah_mit.toml"))
+    (hand,) = whole.hands
+    pads = tuple(pad for link in PADS for pad in hand.pads if pad.link == link)
+    return whole.model_copy(update={"hands": (hand.model_copy(update={"pads": pads}),)})
+
+
+def episode(name: str, seed: int) -> Episode:
+    """The episode of that name and seed; the same every time."""
+    rng = np.random.default_rng((seed, sum(name.encode())))
+    link = PADS[int(rng.integers(len(PADS)))]
+    begin_s = float(rng.uniform(15, 30))
+    play = _Play(rng)
+    faults: list[Fault] = []
+    details: dict[str, Any] = {}
+    if name in FAULTY and name != "hysteresis tail":
+        details = _fault(name, rng, _size_mm(link))
+        kind = details.pop("kind")
+        faults.append(FAULTS[kind].model_validate({"kind": kind, "link": link, "from_s": begin_s, **details}))
+        for pad in PADS:
+            play.use(pad, 0.5, LENGTH_S)
+    elif name == "hysteresis tail":
+        details = play.tail(link, begin_s)
+    elif name == "long grasp":
+        details = play.grasp(begin_s, 70.0)
+    elif name == "wet object":
+        details = play.wet(link, begin_s)
+    elif name == "hot cup":
+        details = play.grasp(begin_s, 70.0)
+        for pad in PADS:
+            heat = {"kind": "heat", "link": pad, "from_s": begin_s, "until_s": begin_s + 70.0}
+            warmer = float(rng.uniform(10, 30))
+            faults.append(INFLUENCES["heat"].model_validate({**heat, "warmer_by_k": warmer}))
+    elif name == "sweeping wipes":
+        play.wipes(link, begin_s)
+    elif name == "two objects":
+        play.two(link, begin_s)
+    else:
+        for pad in PADS:
+            play.use(pad, 0.5, LENGTH_S)
+    touches = tuple(play.touches)
+    hand = VirtualHand(deployment(), Scenario(touch=touches), World(1 + seed % 10), faults=tuple(faults))
+    return Episode(name, seed, link, begin_s, details, hand)
+
+
+class _Play:
+    """Touches of an episode, as they come to be."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self.touches: list[Touch] = []
+
+    def use(self, link: str, from_s: float, until_s: float) -> None:
+        """Taps, presses and slides one after another, with rests."""
+        rng, at = self._rng, from_s + float(self._rng.uniform(0, 3))
+        while at < until_s - 1:
+            length = float(rng.uniform(0.4, 2.5))
+            path = [self._place()]
+            if rng.uniform() < 0.3:
+                path.append(self._place())
+            force = np.exp(rng.uniform(np.log(0.4), np.log(5.0), int(rng.integers(1, 4))))
+            self._add(link, at, length, path, force.tolist())
+            at += length + float(rng.uniform(0.3, 4.0))
+
+    def held(self, link: str, from_s: float, length_s: float) -> dict[str, Any]:
+        """An object in the hand: trembles by 0.03 to 0.5 mm and 0.5 to 10 % of its force, at about 3 Hz."""
+        rng = self._rng
+        steps = int(3 * length_s)
+        middle, size = np.array(self._place(0.15)), _size_mm(link)
+        wander_mm = float(np.exp(rng.uniform(np.log(0.03), np.log(0.5))))
+        relative = float(np.exp(rng.uniform(np.log(0.005), np.log(0.1))))
+        force = float(np.exp(rng.uniform(np.log(0.4), np.log(5.0))))
+        path = np.clip(middle + rng.normal(size=(steps, 2)) * wander_mm / np.array(size), 0.02, 0.98)
+        forces = force * np.exp(relative * rng.normal(size=steps))
+        self._add(link, from_s, length_s, [(float(x), float(y)) for x, y in path], forces.tolist())
+        return {"wander_mm": wander_mm, "tremble": relative, "force_n": force}
+
+    def grasp(self, from_s: float, length_s: float) -> dict[str, Any]:
+        """Two or more pads hold an object for long."""
+        rng, details = self._rng, {}
+        links = rng.permutation(PADS)[: int(rng.integers(2, len(PADS) + 1))].tolist()
+        for link in links:
+            delay = float(rng.uniform(0, 0.5))
+            details[link] = self.held(link, from_s + delay, length_s - delay)
+        for link in PADS:
+            self.use(link, 0.5, from_s - 1)
+            self.use(link, from_s + length_s + 2 if link in links else from_s, LENGTH_S)
+        return details
+
+    def wet(self, link: str, from_s: float) -> dict[str, Any]:
+        """A wet object is handled: it slips slowly while it is held, again and again."""
+        rng, at = self._rng, from_s
+        for pad in PADS:
+            self.use(pad, 0.5, from_s - 1 if pad == link else LENGTH_S)
+        while at < LENGTH_S - 25:
+            length = float(rng.uniform(8, 25))
+            way = [np.array(self._place(0.15))]
+            for _ in range(int(4 * length)):
+                way.append(np.clip(way[-1] + rng.normal(size=2) * 0.02, 0.06, 0.94))
+            force = np.exp(rng.normal(size=int(3 * length)) * 0.15) * rng.uniform(0.5, 3)
+            self._add(link, at, length, [(float(x), float(y)) for x, y in way], force.tolist())
+            at += length + float(rng.uniform(0.5, 3))
+        return {}
+
+    def wipes(self, link: str, from_s: float) -> None:
+        """Fast strokes across the pad, to and fro."""
+        rng, at = self._rng, from_s
+        for pad in PADS:
+            self.use(pad, 0.5, from_s - 1 if pad == link else LENGTH_S)
+        while at < LENGTH_S - 4:
+            length = float(rng.uniform(1, 4))
+            path = [self._place() for _ in range(int(rng.integers(3, 10)))]
+            self._add(link, at, length, path, rng.uniform(0.4, 4, 4).tolist())
+            at += length + float(rng.uniform(0.2, 1.5))
+
+    def two(self, link: str, from_s: float) -> None:
+        """Two objects press on one pad together, again and again."""
+        rng, at = self._rng, from_s
+        for pad in PADS:
+            self.use(pad, 0.5, from_s - 1 if pad == link else LENGTH_S)
+        while at < LENGTH_S - 8:
+            length = float(rng.uniform(1, 6))
+            for _ in range(2):
+                self._add(link, at, length, [self._place()], rng.uniform(0.5, 4, 2).tolist())
+            at += length + float(rng.uniform(0.5, 2))
+
+    def tail(self, link: str, begin_s: float) -> dict[str, Any]:
+        """A long, hard press whose rest fades over tens of seconds."""
+        rng, place = self._rng, self._place(0.12)
+        for pad in PADS:
+            self.use(pad, 0.5, begin_s - 6 if pad == link else LENGTH_S)
+        press = float(rng.uniform(2, 6))
+        rest, fade_s = press * float(rng.uniform(0.08, 0.2)), float(rng.uniform(15, 60))
+        self._add(link, begin_s - 5, 5.0, [place], [press])
+        left = LENGTH_S - begin_s
+        forces = rest * np.exp(-np.arange(0, left, 0.5) / fade_s)
+        self._add(link, begin_s - 0.1, left, [place], np.maximum(forces, 1e-3).tolist(), 0.05)
+        return {"press_n": press, "rest_n": rest, "fade_s": fade_s}
+
+    def _add(
+        self, link: str, from_s: float, length_s: float, path: list[tuple[float, float]], force: list[float],
+        ramp_s: float = 0.15,
+    ) -> None:  # fmt: skip
+        self.touches.append(
+            Touch(
+                link=link,
+                from_s=from_s,
+                duration_s=length_s,
+                path=tuple(path),
+                force_n=tuple(force),
+                ramp_s=ramp_s,
+            )
+        )
+
+    def _place(self, margin: float = 0.06) -> tuple[float, float]:
+        x, y = self._rng.uniform(margin, 1 - margin, 2).tolist()
+        return x, y
+
+
+@lru_cache(maxsize=8)
+def _size_mm(link: str) -> tuple[float, float]:
+    from handtouch.hand import surface_of
+
+    (pad,) = (pad for pad in deployment().hands[0].pads if pad.link == link)
+    u, v = surface_of(pad).extent_m
+    return 1e3 * u, 1e3 * v
+
+
+def _fault(name: str, rng: np.random.Generator, size_mm: tuple[float, float]) -> dict[str, Any]:
+    """A fault of that name, of a size that somebody would want to hear of."""
+    electrode = ELECTRODES[int(rng.integers(4))]
+    place = tuple(rng.uniform(0.12, 0.88, 2).tolist())
+    if name == "gum":
+        force, radius = float(np.exp(rng.uniform(np.log(0.15), np.log(1.0)))), float(rng.uniform(1.5, 4))
+        return {"kind": "gum", "place": place, "radius_mm": radius, "force_n": force,
+                "press_n": float(rng.uniform(1, 3)), "relax": float(rng.uniform(0, 0.2))}  # fmt: skip
+    if name == "moisture":
+        return {"kind": "moisture", "place": place, "radius_mm": float(rng.uniform(3, 9)),
+                "leak_ohm": float(np.exp(rng.uniform(np.log(2e3), np.log(5e4)))),
+                "grow_s": float(rng.uniform(15, 60))}  # fmt: skip
+    if name == "dead electrode":
+        return {"kind": "dead_electrode", "electrode": electrode}
+    if name == "shorted electrode":
+        return {"kind": "shorted_electrode", "electrode": electrode, "short_ohm": float(rng.uniform(1, 50))}
+    if name == "swapped cables":
+        order = list(ELECTRODES)
+        i, j = int(rng.integers(0, 2)), int(rng.integers(2, 4))  # neighbours; opposite ones leave no trace
+        order[i], order[j] = order[j], order[i]
+        return {"kind": "swapped_cables", "order": tuple(order)}
+    if name == "saturated channel":
+        return {"kind": "saturated_channel", "electrode": electrode, "high": bool(rng.uniform() < 0.7)}
+    if name == "stuck channel":
+        count = None if rng.uniform() < 0.5 else int(rng.integers(-200, 8000))
+        return {"kind": "stuck_channel", "electrode": electrode, "count": count}
+    if name == "torn corner":
+        corner = ("x0y0", "x0yb", "xay0", "xayb")[int(rng.integers(4))]
+        along = rng.uniform(0.35, 0.55, 2) * np.array(size_mm)
+        return {"kind": "torn_corner", "corner": corner, "along_x_mm": float(along[0]),
+                "along_y_mm": float(along[1])}  # fmt: skip
+    if name == "offset":
+        counts = float(np.exp(rng.uniform(np.log(30), np.log(3000)))) * (1 if rng.uniform() < 0.5 else -1)
+        return {"kind": "offset", "electrode": electrode, "counts": counts}
+    factor = float(np.exp(rng.uniform(np.log(1.2), np.log(3)))) ** (1 if rng.uniform() < 0.5 else -1)
+    return {"kind": "gain_step", "electrode": electrode, "factor": factor}

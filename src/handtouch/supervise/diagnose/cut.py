@@ -1,0 +1,101 @@
+"""How a cut across a corner changes the shares of the electrodes: finite differences on the pad's rectangle.
+
+Public: `cut_changes`. The intact and the cut sheet are solved on one coarse grid; only their difference is
+used, in which most of the grid's error cancels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse.linalg import splu
+
+from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.surface import Surface
+from handtouch.supervise.diagnose.findings import FloatArray
+
+_CELLS = 40  # a side
+_NOTHING = 1e-9  # conductivity beyond the cut
+CORNERS = {("x0", "y0"): (0, 0), ("x0", "yb"): (0, 1), ("xa", "y0"): (1, 0), ("xa", "yb"): (1, 1)}
+
+
+def cut_changes(
+    network: ElectrodeNetwork,
+    surface: Surface,
+    cuts: Iterable[tuple[tuple[int, int], float, float]],
+    at: FloatArray,
+) -> list[tuple[FloatArray, NDArray[np.bool_]]]:
+    """Of each cut (corner as 0 or 1 along x and y; lost parts of the sides): changes of the shares.
+
+    A cut is straight in arc length and angle. at: (k,) coordinates as parts of a side of the rectangle. Returns changes (k, k, 4), x first, and which of the places are
+    beyond the cut. Resistors to ground are left out of account.
+    """
+    nodes = np.linspace(0, 1, _CELLS + 1)
+    x, y = np.meshgrid(nodes, nodes, indexing="ij")
+    owner = _owners(network, x, y)
+    intact = _shares(network, owner, x, y, None)
+    along = np.linspace(0, 1, 8 * _CELLS + 1)
+    arc = surface.from_rectangle(along * network.a, 0 * along)[0] / surface.extent_m[0]
+    grid = np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1)
+    found = []
+    for corner, along_x, along_y in cuts:
+        inside = (corner, along_x, along_y)
+        change = _shares(network, owner, np.interp(x, along, arc), y, inside) - intact
+        sampled = RegularGridInterpolator((nodes, nodes), np.moveaxis(change, 0, -1))(grid)
+        found.append(
+            (np.asarray(sampled), _beyond(np.interp(grid[..., 0], along, arc), grid[..., 1], inside))
+        )
+    return found
+
+
+def _beyond(x: FloatArray, y: FloatArray, cut: tuple[tuple[int, int], float, float]) -> NDArray[np.bool_]:
+    (right, top), along_x, along_y = cut
+    return np.asarray((1 - x if right else x) / along_x + (1 - y if top else y) / along_y < 1)
+
+
+def _owners(network: ElectrodeNetwork, x: FloatArray, y: FloatArray) -> NDArray[np.intp]:
+    """Which electrode each node is on, -1 for none."""
+    owner = np.full(x.shape, -1)
+    for number, electrode in enumerate(network.electrodes):
+        along, length = (y, network.b) if electrode.side in ("x0", "xa") else (x, network.a)
+        on_side = {"x0": x == 0, "xa": x == 1, "y0": y == 0, "yb": y == 1}[electrode.side]
+        owner[on_side & (along * length >= electrode.start) & (along * length <= electrode.stop)] = number
+    return owner
+
+
+def _shares(
+    network: ElectrodeNetwork,
+    owner: NDArray[np.intp],
+    x: FloatArray,
+    y: FloatArray,
+    cut: tuple[tuple[int, int], float, float] | None,
+) -> FloatArray:
+    """Potentials (4, nodes, nodes) with one electrode at 1 each: what it collects of a contact there."""
+    n = owner.shape[0]
+    index = np.arange(n * n).reshape(n, n)
+    rows, columns, values = [], [], []
+    for axis, ratio in ((0, network.b / network.a), (1, network.a / network.b)):
+        low = tuple(slice(None, -1) if k == axis else slice(None) for k in range(2))
+        high = tuple(slice(1, None) if k == axis else slice(None) for k in range(2))
+        edge = np.full(index[low].shape, ratio)
+        ends = (slice(None), [0, -1]) if axis == 0 else ([0, -1], slice(None))
+        edge[ends] /= 2  # along the rim there is a sheet on one side only
+        if cut is not None:
+            gone = _beyond((x[low] + x[high]) / 2, (y[low] + y[high]) / 2, cut)
+            edge[gone] *= _NOTHING
+        rows.append(index[low].ravel())
+        columns.append(index[high].ravel())
+        values.append(edge.ravel())
+    i, j, g = (np.concatenate(v) for v in (rows, columns, values))
+    matrix = sparse.coo_matrix((np.r_[g, g], (np.r_[i, j], np.r_[j, i])), shape=(n * n, n * n)).tocsc()
+    laplacian = sparse.diags(np.asarray(matrix.sum(axis=1)).ravel()).tocsc() - matrix
+    held = owner.ravel() >= 0
+    fixed = (owner.ravel()[held][:, None] == np.arange(4)).astype(np.float64)
+    free = splu(laplacian[~held][:, ~held].tocsc()).solve(-(laplacian[~held][:, held] @ fixed))
+    potentials = np.zeros((n * n, 4))
+    potentials[held], potentials[~held] = fixed, free
+    return potentials.T.reshape(4, n, n)
