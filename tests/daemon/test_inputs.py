@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -11,11 +12,13 @@ import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
+from handtouch import keys
 from handtouch.daemon.inputs import Inputs
 from handtouch.daemon.security import Gate
 from handtouch.hand.joints import JointStates
 from handtouch.inputs import InputError, JointState, LinkForces, decode, encode
 from handtouch.robot import Robot
+from handtouch.supervise.strength import ForceReference
 
 NOW = 10**12
 PADS = [("left", "tip"), ("right", "tip"), ("right", "palm")]
@@ -114,12 +117,14 @@ def test_states_of_the_same_time_are_late_and_those_without_a_time_are_of_now(in
     assert inputs.figures(NOW + 10**9)["age_s"]["joints/right"] == pytest.approx(1.0)
 
 
-def test_forces_are_kept_by_pad(inputs: Any) -> None:
-    message = LinkForces("right", NOW, ("palm", "toe"), np.array([2.0, 1.0]), np.array([0.1, 0.1]))
+def test_forces_are_handed_over_by_pad(inputs: Any) -> None:
+    told: list[ForceReference] = []
+    inputs.refer = told.append
+    message = LinkForces("right", NOW, ("toe", "palm"), np.array([1.0, 2.0]), np.array([0.3, 0.1]))
     inputs.take(encode(message), NOW)
-    assert inputs.forces.force_n[2] == 2.0
-    assert inputs.forces.std_n[2] == 0.1
-    assert inputs.forces.t_ns.tolist() == [0, 0, NOW]
+    (reference,) = told
+    assert (reference.pads.tolist(), reference.force_n.tolist()) == ([2], [2.0])
+    assert (reference.std_n.tolist(), reference.t_ns) == ([0.1], NOW)
     assert inputs.dropped == {"unknown_link": 1}
 
 
@@ -144,3 +149,37 @@ def test_the_robots_side_refuses_numbers_that_are_none(inputs: Any) -> None:
             robot.send_joints("right", {"a": 1.0}, velocity_rad_s={"b": 1.0})
         with pytest.raises(ValueError, match="there are none"):
             robot.send_forces("right", {}, 0.1)
+
+
+def test_with_keys_only_those_who_may_control_may_tell(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    keys.make(folder, "daemon")
+    for name, rights in (("viewer", "read"), ("arm", "control")):
+        keys.add_client(folder, name, rights, tmp_path / name)
+    with zmq.Context() as context:
+        gate = Gate(context, folder)
+        made = Inputs(context, "tcp://127.0.0.1:*", gate, {"right": JointStates(("a",))}, PADS)
+        try:
+            for name in ("arm", "viewer", ""):
+                key = str(tmp_path / name) if name else ""
+                with Robot(made.endpoint, key) as robot:
+                    let_in = _knock(robot, gate, made)
+                    assert let_in == (name == "arm")
+            gate.poll(10**12)
+        finally:
+            made.close()
+            gate.close()
+    assert gate.refused["no_right"] >= 1
+    assert sum(gate.refused.values()) >= 2  # without a key it may also look like garbage
+
+
+def _knock(robot: Robot, gate: Gate, inputs: Inputs) -> bool:
+    for number in range(1000):
+        gate.poll(number * 20_000_000)
+        inputs.poll(NOW)
+        try:
+            if robot.connected(0.01):
+                return True
+        except PermissionError:
+            return False
+    raise AssertionError("neither let in nor refused")

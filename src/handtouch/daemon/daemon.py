@@ -100,6 +100,7 @@ class Daemon:
                 robots,
             )
             self.pipeline.frames.joints_at = self.inputs.joints_at
+            self.inputs.refer = self.pipeline.tick.refer
             self.publisher.present.update(self.pipeline.messages.present())
             self.publisher.present.update(self.pipeline.journal.present())
             self.pipeline.journal.serve(deployment, time.monotonic_ns())
@@ -229,9 +230,9 @@ class Daemon:
     def _begin(self, sync_ns: int, now_ns: int) -> None:
         """A SYNC was sent or seen: a new period."""
         self.report.stages.begin(self.sync.overruns, not self.pipeline.cycle.ticked)
+        self.inputs.poll(now_ns)  # before the journal tells what the next tick starts from
         self.pipeline.begin(sync_ns, now_ns)
         self.publisher.release()
-        self.inputs.poll(now_ns)
         if self._rested_ns > _COLD_NS:  # now, while the nodes sample and answer
             self.pipeline.rehearse()
         self.report.stages.lap(histogram.SYNC, time.monotonic_ns())

@@ -1,6 +1,6 @@
 """The inputs endpoint: what the robot tells, joint states and forces from other sensors.
 
-Public names: `Inputs`, `Forces`, `CAUSES`. The daemon binds a SUB socket, robots connect with PUB: they never
+Public names: `Inputs`, `CAUSES`. The daemon binds a SUB socket, robots connect with PUB: they never
 wait for the daemon. What is malformed or belongs to nothing here is counted, told now and then, and dropped.
 """
 
@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import zmq
-from numpy.typing import NDArray
 
 from handtouch.daemon.publisher import bind
 from handtouch.daemon.security import Gate
 from handtouch.hand.joints import Joints, JointStates
 from handtouch.inputs import Input, InputError, JointState, LinkForces, decode
+from handtouch.supervise.strength import ForceReference
 
 CAUSES = {
     "malformed": "that doesn't keep the contract",
@@ -39,21 +39,12 @@ _TOLD_AGAIN_NS = 10_000_000_000
 _log = logging.getLogger("handtouch.inputs")
 
 
-class Forces:
-    """Forces on n pads as another sensor has them; `t_ns` 0 where nobody told one."""
-
-    def __init__(self, n: int) -> None:
-        self.force_n: NDArray[np.float64] = np.full(n, np.nan)
-        self.std_n: NDArray[np.float64] = np.full(n, np.nan)
-        self.t_ns: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
-
-
 class Inputs:
     """Takes what robots tell; `poll` it once a period, before the samples come.
 
-    `joints` (hand -> states) of the hands with a URDF; `pads` (hand, link) of all. `forces` are the latest of
-    each pad; `received` and `dropped` count messages by topic and by cause (`CAUSES`), `problem` is the last
-    one in words. Raises OSError naming the endpoint when it can't be bound.
+    `joints` (hand -> states) of the hands with a URDF; `pads` (hand, link) of all. Forces are handed
+    to `refer`. `received` and `dropped` count messages by topic and by cause (`CAUSES`), `problem` is the
+    last one in words. Raises OSError naming the endpoint when it can't be bound.
     """
 
     def __init__(
@@ -67,7 +58,7 @@ class Inputs:
         self.received: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.problem = ""
-        self.forces = Forces(len(pads))
+        self.refer: Callable[[ForceReference], object] = lambda _: None
         self._joints = joints
         self._pads = {name: pad for pad, name in enumerate(pads)}
         self._hands = {hand for hand, _ in pads}
@@ -158,15 +149,15 @@ class Inputs:
         return kept
 
     def _keep_forces(self, message: LinkForces, t_ns: int, now_ns: int) -> bool:
-        known = 0
-        for link, force_n, std_n in zip(message.links, message.force_n, message.std_n, strict=True):
-            pad = self._pads.get((message.hand, link))
+        pads = [self._pads.get((message.hand, link)) for link in message.links]
+        for link, pad in zip(message.links, pads, strict=True):
             if pad is None:
                 self._drop("unknown_link", f"force/{message.hand}: {link!r:.80}", now_ns)
-                continue
-            known += 1
-            self.forces.force_n[pad], self.forces.std_n[pad], self.forces.t_ns[pad] = force_n, std_n, t_ns
-        return known > 0
+        known = np.array([pad is not None for pad in pads])
+        if known.any():
+            rows = np.array([pad for pad in pads if pad is not None], dtype=np.intp)
+            self.refer(ForceReference(rows, message.force_n[known], message.std_n[known], t_ns))
+        return bool(known.any())
 
     def _drop(self, cause: str, detail: str, now_ns: int) -> None:
         """Count, and tell: the first at once, then from time to time with the number since."""
