@@ -1,0 +1,224 @@
+"""What does recording cost the daemon and the machine, how much disk does it take, how fast is replay?
+
+The daemon's pipeline and its two streams at 500 Hz with 15 pads, fed with the counts of a simulated hand as
+from a bus; the recorder is the real `handtouch record`, a process of its own, and every recording is replayed
+by `handtouch replay`, which must give the same contacts bit for bit. Writes docs/benchmarks/record.{md,json}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zmq
+from bench_latency import OUT, PATHS, ProcessorShare, machine
+from numpy.typing import NDArray
+
+from handtouch import shipped, wire
+from handtouch.config import Deployment, load
+from handtouch.daemon.model import PadModel
+from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.publisher import Publisher
+from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.world import World
+from handtouch.wire import PadState
+
+RATE_HZ = 500
+PERIOD_NS = 1_000_000_000 // RATE_HZ
+FILM_S = 2.0
+MODES: dict[str, list[str] | None] = {"nobody": None, "record": [], "record --hand": ["--hand"]}
+"""Who listens -> options of the recorder, None: no recorder."""
+SERVICE_TICKS = RATE_HZ // 2
+
+
+def film(deployment: Deployment, touched: int) -> NDArray[np.int64]:
+    """Counts (k, pads, 4), a sample each 5 ms: contacts slide on so many pads."""
+    links = [pad.link for hand in deployment.hands for pad in hand.pads]
+    touches = "\n".join(
+        f'[[touch]]\nlink = "{link}"\nfrom_s = 0\nduration_s = {FILM_S + 1}\nramp_s = 0.4\nforce_n = [1.5]\n'
+        f"radius_mm = 2.5\npath = {PATHS['sliding']}"
+        for link in links[:touched]
+    )
+    hand = VirtualHand(deployment, Scenario.parse(touches), World.ideal_parts())
+    there = np.stack([hand.sample(t_s) for t_s in np.arange(0.5, 0.5 + FILM_S, 5e-3)])
+    return np.concatenate([there, there[::-1]])
+
+
+class Loop:
+    """The daemon's loop without a bus: `run` it for so long; what its thread took of a processor."""
+
+    def __init__(self, deployment: Deployment, samples: NDArray[np.int64], folder: Path) -> None:
+        self._context: zmq.Context[Any] = zmq.Context()
+        self.publisher = Publisher(self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
+        self.pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.6, self.publisher, self.publisher.run)
+        self.pipeline.node_state[:] = PadState.CLEAR
+        self.publisher.present.update(self.pipeline.messages.present())
+        self.publisher.present.update(self.pipeline.journal.present())
+        self.pipeline.journal.serve(deployment, time.monotonic_ns())
+        self._hands = {hand.name: [pad.link for pad in hand.pads] for hand in deployment.hands}
+        self._film = [[row.astype("<i2").tobytes() for row in sample] for sample in samples]
+
+    def run(self, seconds: float) -> float:
+        """Tick at RATE_HZ; the thread's share of a processor."""
+        pipeline, publisher = self.pipeline, self.publisher
+        next_ns = began_ns = time.monotonic_ns()
+        busy_s = time.thread_time()
+        while next_ns - began_ns < seconds * 1e9:
+            next_ns += PERIOD_NS
+            time.sleep(max(0.0, (next_ns - time.monotonic_ns()) * 1e-9))
+            now_ns = time.monotonic_ns()
+            pipeline.begin(now_ns, now_ns)
+            for pad, data in enumerate(self._film[pipeline.ticks % len(self._film)]):
+                pipeline.slab.write(pad, data, now_ns + 1)
+            pipeline.advance(now_ns + 2)
+            pipeline.settle()
+            publisher.take_subscriptions(now_ns)
+            if pipeline.ticks % SERVICE_TICKS == 1:
+                publisher.send(self._service(now_ns), lasting=True)
+        return (time.thread_time() - busy_s) / ((time.monotonic_ns() - began_ns) * 1e-9)
+
+    def close(self) -> None:
+        """Give the endpoints back."""
+        self.publisher.close()
+        self._context.term()
+
+    def _service(self, now_ns: int) -> wire.Service:
+        return wire.Service(
+            v=wire.SCHEMA_VERSION, run=self.publisher.run, seq=self.publisher.next_seq("service"),
+            t_ns=now_ns,
+            wall_offset_ns=time.time_ns() - time.monotonic_ns(), version="", pid=0, uptime_s=0.0,
+            period_s=1 / RATE_HZ, hands=self._hands, ticks=self.pipeline.ticks, overruns=0, rate_hz=RATE_HZ,
+            tick_us={}, loop={}, contacts=self.pipeline.tick.contacts.begun, refused={}, process={}, buses={},
+            drops=dict(self.publisher.drops), subscriptions=(), repeat=False,
+        )  # fmt: skip
+
+
+def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> dict[str, Any]:
+    """Record for so long; what it took, what was lost, and how the replay went."""
+    out = folder / f"{time.monotonic_ns()}.mcap"
+    command = [sys.executable, "-m", "handtouch"]
+    endpoint = ["--endpoint", f"ipc://{folder}/complete"]
+    process = subprocess.Popen(
+        [*command, "record", "-o", str(out), *endpoint, *options], stderr=subprocess.PIPE, text=True
+    )
+    while not out.exists():
+        loop.run(0.2)
+    loop.run(1.0)
+    share, size = ProcessorShare(), out.stat().st_size
+    share.start(process.pid)
+    loop_share = loop.run(seconds)
+    recorder_share, size = share.stop(), out.stat().st_size - size
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    report = folder / "report.json"
+    before_s = os.times().children_user + os.times().children_system
+    replayed = subprocess.run(
+        [*command, "replay", str(out), "--report", str(report)], capture_output=True, text=True, check=False
+    )
+    if not report.exists():
+        raise RuntimeError(f"replay: {replayed.stderr}\nrecord: {told}")
+    took_s = os.times().children_user + os.times().children_system - before_s
+    result = json.loads(report.read_text())
+    out.unlink()
+    return {
+        "loop_share": loop_share,
+        "recorder_share": recorder_share,
+        "mb_per_minute": size / seconds * 60 / 1e6,
+        "lost": sum(map(int, re.findall(r"(\d+) messages of \S+ were lost", told))),
+        "drops": loop.publisher.drops["complete"],
+        "status": process.returncode,
+        "compared": result["compared"],
+        "same": result["same"],
+        "replay_times_real": result["seconds"] / took_s,
+    }
+
+
+def measure(touched: list[int], turns: int, seconds: float) -> list[dict[str, Any]]:
+    """All cases, so many times."""
+    deployment = load(shipped.path("utah_mit.toml"))
+    rows = []
+    for count in touched:
+        samples = film(deployment, count)
+        with tempfile.TemporaryDirectory(prefix="ht.") as folder:
+            loop = Loop(deployment, samples, Path(folder))
+            loop.run(1.0)
+            for turn in range(turns):
+                for mode, options in MODES.items():
+                    row: dict[str, Any] = {"touched": count, "listener": mode, "turn": turn}
+                    if options is None:
+                        row["loop_share"] = loop.run(seconds)
+                    else:
+                        row |= recorded(loop, options, seconds, Path(folder))
+                    rows.append(row)
+                    print(row, flush=True)
+            loop.close()
+    return rows
+
+
+def _median(rows: list[dict[str, Any]], key: str) -> float:
+    return float(np.median([row[key] for row in rows]))
+
+
+def write(results: dict[str, Any]) -> str:
+    """The page."""
+    lines = []
+    for count in sorted({row["touched"] for row in results["rows"]}):
+        for mode in MODES:
+            rows = [r for r in results["rows"] if (r["touched"], r["listener"]) == (count, mode)]
+            line = f"| {count} | {mode} | {_median(rows, 'loop_share'):.1%} "
+            if MODES[mode] is None:
+                lines.append(f"{line}| | | | | |")
+                continue
+            lines.append(
+                f"{line}| {_median(rows, 'recorder_share'):.1%} | {_median(rows, 'mb_per_minute'):.1f} "
+                f"| {sum(r['lost'] + r['drops'] for r in rows)} "
+                f"| {sum(r['same'] for r in rows)} of {sum(r['compared'] for r in rows)} "
+                f"| {_median(rows, 'replay_times_real'):.1f} |"
+            )
+    turns = 1 + max(row["turn"] for row in results["rows"])
+    text = f"""# Recording and replay
+
+A hand of 15 pads at {RATE_HZ} Hz, of which some are touched by sliding contacts. The loop is the daemon's
+pipeline and streams fed with counts, without a bus; its share is of one processor, by its thread's own clock,
+with nobody listening and with `handtouch record`, a process of its own. MB (10^6 bytes) are of the file on
+disk, compressed with zstd. Lost are gaps that the recorder saw and messages that the daemon's queue did not
+take. Every recording is replayed: contact messages that came out the same to the last bit, of all; and recorded
+time over the processor time of `handtouch replay`, start and model included, for recordings of
+{results["seconds"] + 1:.0f} s. Medians of {turns} turns.
+{results["machine"]}; load average when it ended {results["load"]:.1f}.
+
+| touched | listener | loop | recorder | MB/min | lost | same contacts | replay, times real |
+| ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |
+{chr(10).join(lines)}
+
+`make bench ONLY=record` measures this again.
+"""
+    (OUT / "record.md").write_text(text)
+    (OUT / "record.json").write_text(json.dumps(results, indent=1) + "\n")
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of a case")
+    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--touched", type=int, nargs="+", default=[1, 5, 15], help="pads that are touched")
+    asked = parser.parse_args()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    rows = measure(asked.touched, asked.turns, asked.seconds)
+    print(write({"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]}))
+
+
+if __name__ == "__main__":
+    main()
