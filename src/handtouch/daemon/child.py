@@ -31,6 +31,7 @@ def main() -> int:
         signal.signal(number, signal.SIG_IGN)
     from handtouch.daemon import logs
     from handtouch.supervise.archive import Archive
+    from handtouch.supervise.diagnoses import Diagnoses
     from handtouch.supervise.link import Start
     from handtouch.supervise.slow import SlowHalf
 
@@ -38,7 +39,7 @@ def main() -> int:
     said = logs.start(start.deployment.daemon.log_level)
     try:
         with socket.socket(fileno=int(sys.argv[1])) as daemon:
-            half = SlowHalf(start, Archive(Path(start.store)))
+            half = SlowHalf(start, Archive(Path(start.store)), Diagnoses(start.deployment))
             try:
                 _serve(daemon, half)
             finally:
