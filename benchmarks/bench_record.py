@@ -193,8 +193,8 @@ A hand of 15 pads at {RATE_HZ} Hz, of which some are touched by sliding contacts
 pipeline and streams fed with counts, without a bus; its share is of one processor, by its thread's own clock,
 with nobody listening and with `handtouch record`, a process of its own. MB (10^6 bytes) are of the file on
 disk, compressed with zstd. Lost are gaps that the recorder saw and messages that the daemon's queue did not
-take. Every recording is replayed: contact messages that came out the same to the last bit, of all; and recorded
-time over the processor time of `handtouch replay`, start and model included, for recordings of
+take. Every recording is replayed: contact messages that came out the same to the last bit, of all; and
+recorded time over the processor time of `handtouch replay`, start and model included, for recordings of
 {results["seconds"] + 1:.0f} s. Medians of {turns} turns.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
