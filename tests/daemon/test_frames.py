@@ -58,7 +58,7 @@ def told(t_ms: float, value: float | NDArray[np.float64] = 0.3, std: float | Non
     return states
 
 
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_place_normal_and_covariance_are_carried_by_the_pose_of_the_link(seed: int) -> None:
     position = np.random.default_rng(seed).uniform(-0.5, 1.5, len(NAMES))

@@ -66,7 +66,7 @@ def hand(
     return robot, Kinematics(robot, list(robot.bodies), palm, robot.root)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_poses_are_the_products_of_the_joints_transforms(
     hand: tuple[urdf.Description, Kinematics], seed: int
