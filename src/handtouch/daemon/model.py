@@ -28,7 +28,8 @@ class PadModel:
 
     `hands`, `links`, `frames` (links of the URDF) and `calibration` (n,) are names; `rows_of_hand`;
     `ampere_per_count` (n, 4) of the electrodes x0, xa, y0, yb, their noise as `noise_counts` (n,) and
-    `noise_a` (n, 4); `gains` (n, 4) are in `ampere_per_count` (what channels read untouched is followed by the tick: `Tick.baseline`),
+    `noise_a` (n, 4); `gains` (n, 4) are in `ampere_per_count` (what channels read untouched is followed by
+    the tick: `Tick.baseline`),
     `gain_covariance` (n, 4, 4) is that of their logarithms, `quarantined` (n,): no force is told;
     `laws` (n,) are those that a calibration has put in the place of the file's, else None;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
