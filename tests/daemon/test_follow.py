@@ -211,3 +211,23 @@ def test_no_force_is_told_of_a_pad_in_quarantine(bench: Any) -> None:
     assert (off <= 1).all()
     assert np.isnan(values[:, FORCE]).tolist() == [False, True, False]
     assert np.isnan(solved.force_std_n).tolist() == [False, True, False]
+
+
+def test_a_force_at_the_end_of_the_range_is_a_value_or_a_bound_and_never_between(bench: Any) -> None:
+    """Contacts that slide to and fro across where the sheet carries no more."""
+    rng, tick, model = np.random.default_rng(8), Tick(bench.model, 5_000_000), bench.model
+    seen = set()
+    for number in range(600):
+        place = 0.5 + 0.3 * np.sin(0.07 * number + np.arange(6).reshape(3, 2))
+        currents = reading(model, place, 8.5e-3 * (1 + 0.15 * np.sin(0.023 * number)), rng)
+        step(tick, currents)
+        tick.settle()
+        found = model.locator.estimate(PADS, currents.T, model.noise_a.T)
+        placed = model.placement.place(PADS, found.x, found.y, found.covariance[:, :2, :2])
+        radius_m = model.locator.conformal_radius(PADS, found.x, found.y) * placed.scale
+        std = np.sqrt(found.covariance[:, 2, 2])
+        own = model.force(PADS, currents.T, found.total, std, radius_m)
+        seen |= set(own.status.tolist())
+        alike = tick.columns.saturated == (own.status == Status.SATURATED)
+        assert (np.abs(tick.columns.force_n / own.force_n - 1) < 0.02)[alike].all()
+    assert seen == {Status.VALID, Status.SATURATED}

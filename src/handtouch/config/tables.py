@@ -15,7 +15,9 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
 Electrode = Literal["x0", "xa", "y0", "yb"]
-Output = Literal["location", "strength", "raw", "palm", "base"]
+Output = Literal[
+    "location", "strength", "raw", "palm", "base", "motion", "hardness", "shape", "texture"
+]
 Four = Annotated[tuple[Positive, Positive, Positive, Positive], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -196,7 +198,7 @@ class Behaviour(Table):
         0.2, description="relative error of these numbers of creep, adaptation and hysteresis (1 sigma)"
     )
     silence_s: Positive = Field(
-        600.0, description="time untouched after which what it got used to may as well be forgotten"
+        150.0, description="time unfelt in which a press too light to be felt may have made it forget (1 - 1/e)"
     )
     history_std_n: NonNegative = Field(
         0.1, description="what it may have got used to before the daemon started (1 sigma)"
@@ -354,7 +356,8 @@ class Wants(Table):
     outputs: Annotated[tuple[Output, ...], Field(strict=False)] = Field(
         ("location", "strength"),
         description="what is used of a contact; raw: its pads are sampled with every SYNC, touched or not; "
-        "palm, base: places in these frames, which need [[hand]] urdf and joint states",
+        "palm, base: places in these frames, which need [[hand]] urdf and joint states; motion, hardness, "
+        "shape, texture: perceived whether anybody listens or not, where a listener alone would do",
     )
     tolerance_mm: NonNegative = Field(
         0.0, le=10, description="error of a location that does no harm; 0: as good as the currents tell it"

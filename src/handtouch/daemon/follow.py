@@ -139,6 +139,13 @@ class Follower:
         row = self._maps[pads, _TRUST + FORCE]
         return np.asarray(row[:, 5] + 2 * row[:, 6])
 
+    def place_noise(self, pads: IntArray, currents: FloatArray) -> FloatArray:
+        """Covariance (k, 2, 2) that the noise of channels (k, 4) gives arc lengths, anew with each sample."""
+        total = (self._per_total.take(pads, axis=0) * currents).sum(axis=1)
+        by_current = self._maps[pads, _TRUST + PAD.start : _TRUST + PAD.stop, :4]
+        by_noise = by_current * (self._model.noise_a[pads] / total[:, None])[:, None]
+        return np.asarray(by_noise @ by_noise.transpose(0, 2, 1))
+
     # Details: each fills its rows of `values` and of `by_place`, their change per reach along x and y -------
 
     def _place(
@@ -193,11 +200,13 @@ class Follower:
         middle, along_x, along_y, less, more = np.where(
             (status[0] == _VALID) | (status[0] == _SATURATED), force, np.nan
         )
-        by_place[:, FORCE, 0], by_place[:, FORCE, 1] = (along_x - middle) / width, (along_y - middle) / width
+        beside = (status[1] == status[0]) & (status[2] == status[0])  # a bound and a value have no slope
+        by_place[:, FORCE, 0] = np.where(beside, along_x - middle, 0.0) / width
+        by_place[:, FORCE, 1] = np.where(beside, along_y - middle, 0.0) / width
         linear, square = (more - less) / (2 * _TOTAL), ((more + less) / 2 - middle) / _TOTAL**2
         value = maps[:, _TRUST + FORCE]
         value[:, 4], value[:, 5], value[:, 6] = middle - linear + square, linear - 2 * square, square
-        alike = (status[3] == status[0]) & (status[4] == status[0])
+        alike = beside & (status[3] == status[0]) & (status[4] == status[0])
         bend = np.abs(square) * (_TOTAL**2 / _FORCE_BEND) / middle
         maps[:, 2, 5] = np.where(alike, np.fmax(bend, 1.0) / _TOTAL, np.nan)
         maps[:, 2, 4] = -maps[:, 2, 5]

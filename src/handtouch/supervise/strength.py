@@ -6,6 +6,7 @@ Public names: `SheetStrength`, `SheetBehaviour`, `behaviour_of`, `StrengthState`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -26,6 +27,7 @@ _LEAST_CONTACTS, _LEAST_S = 3, 5.0  # of evidence
 _LEAST_N = 1e-6
 _VAGUE = 0.5  # of a force: less certain than this, it is none
 _HOUR_S = 3600.0
+_WIPED = 0.3  # of the variance that a wiped back force means; all of it, over many silences, is too much
 _GAIN_WANDERS = 0.05  # of the logarithm, in an hour
 _GAIN_MOVES = 0.02  # a second, at most
 _OUTLIER = 4.0  # standard deviations
@@ -59,6 +61,7 @@ class SheetBehaviour:
     doubt: sheet.Doubt
     gain_std: float
     history_std_n: float
+    silence_s: float
 
 
 class SheetStrength:
@@ -81,6 +84,7 @@ class SheetStrength:
         self.log_gain = np.zeros(n)
         self.log_gain_std = np.array([0.0 if b is None else b.gain_std for b in behaviours])
         self._first_gain_std = self.log_gain_std.copy()
+        self._felt_ns = np.zeros(n, np.int64)  # when each pad was touched last
         self._gain = np.ones(n)
         self._vouched = np.zeros(n, np.bool_)
         self._begin_s = np.zeros(n)  # of evidence when the contact began
@@ -143,7 +147,13 @@ class SheetStrength:
         return back, std
 
     def begin(self, began: IntArray) -> None:
-        """Contacts began on these pads."""
+        """Contacts began on these pads. While nothing was felt, a press too light to be felt may have wiped
+        what a sheet had got used to: it is taken for the mean of both, and as uncertain as they differ."""
+        silent_s = (self._until_ns[0] - self._felt_ns[began]) * 1e-9
+        for group in self.groups.all:
+            rows = np.searchsorted(group.pads, began)
+            here = np.flatnonzero(group.pads[np.minimum(rows, len(group.pads) - 1)] == began)
+            group.forget(rows[here], silent_s[here])
         self.contacts[began] += 1
         self._begin_s[began] = self.touched_s[began]
         self._news[began] = True
@@ -166,6 +176,7 @@ class SheetStrength:
         if not len(pressed):
             self._waited_s[0] = 0.0
             return pressed
+        self._felt_ns[pressed] = self._until_ns
         force = self.force_n.take(pressed) * self._gain.take(pressed)
         if self._waited_s[0] >= SETTLE_S or np.count_nonzero(self._news):
             self._judge(pressed, force, raw_std_n, touching)
@@ -259,9 +270,18 @@ class _Group:
         self.pads = pads
         whole = len(pads) == pads[-1] - pads[0] + 1
         self.rows: slice | IntArray = slice(int(pads[0]), int(pads[-1]) + 1) if whole else pads
+        self._silence_s = behaviour.silence_s
         self.compensator = sheet.Compensator(behaviour.model, len(pads), behaviour.doubt, settle_s=SETTLE_S)
         if behaviour.history_std_n:
             self.compensator.assume(0.0, behaviour.history_std_n)
+
+    def forget(self, rows: IntArray, silent_s: FloatArray) -> None:
+        """Back forces of rows after a silence: wiped with a chance that grows with it, else as they were.
+        That chance is a guess, so doubt is never less for it."""
+        back, std = self.compensator.back_n, self.compensator.back_std_n
+        kept = np.exp(-silent_s / self._silence_s)
+        std[rows] = np.sqrt(np.square(std[rows]) + _WIPED * (1 - kept) * np.square(back[rows]))
+        back[rows] *= kept
 
 
 def behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
@@ -287,5 +307,5 @@ def behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
     if behaviour.loop:
         loop = sheet.PrandtlIshlinskii.of_loop(behaviour.loop, behaviour.loop_full_n)
         model = replace(model, hysteresis=loop)
-    doubt = sheet.Doubt(behaviour.doubt, behaviour.doubt, behaviour.doubt, behaviour.silence_s)
-    return SheetBehaviour(model, doubt, behaviour.gain_std, behaviour.history_std_n)
+    doubt = sheet.Doubt(behaviour.doubt, behaviour.doubt, behaviour.doubt, math.inf)
+    return SheetBehaviour(model, doubt, behaviour.gain_std, behaviour.history_std_n, behaviour.silence_s)
