@@ -3,8 +3,9 @@
 Nodes, daemon and subscriber are three processes on a udp_multicast bus over loopback (in a network namespace
 of their own where that is to be had), or on vcan0 under `tests/socketcan/vcan-run`. The floor is a bare loop
 in place of the daemon: it sends SYNC, receives the same frames with the same library, sends a message of the
-same size when the last has come, and computes nothing. Daemon and floor take turns, with contacts at rest and
-with sliding ones; ratios are of medians over the turns. Writes docs/benchmarks/latency.{md,json}.
+same size when the last has come, and computes nothing. Daemon, daemon with busy_poll_us and floor take turns,
+with contacts at rest and with sliding ones; ratios are of medians over the turns. Writes
+docs/benchmarks/latency.{md,json}.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ CHANNEL, PORT = "239.74.163.9", 43999
 VCAN = Path("/sys/class/net/vcan0")
 TOUCHED = 5
 ROUND_S = 5.0
+BUSY_POLL_US = 300
 PATHS = {"resting": "[[0.4, 0.4]]", "sliding": "[[0.3, 0.3], [0.7, 0.4], [0.3, 0.5], [0.7, 0.6], [0.4, 0.7]]"}
 """Of the contacts, through which they go within ROUND_S, and back."""
 MOST = 400_000
@@ -327,6 +329,7 @@ def where_it_goes(config: Path, samples: NDArray[np.int64], seconds: float) -> d
     return dict(zip(PARTS, np.median(np.array(rows) * 1e-3, axis=0).tolist(), strict=True))
 
 
+AWAKE = f"daemon, busy_poll_us = {BUSY_POLL_US}"
 _WAY = histogram.WAIT, histogram.RECEIVE, histogram.TICK, histogram.SEND
 PARTS = (
     "until the loop turns to the bus",
@@ -382,7 +385,8 @@ def in_own_network() -> None:
 def on_loopback(folder: Path, port: int) -> Path:
     """The shipped hand on a udp_multicast bus, its endpoints in `folder`; path of the deployment."""
     endpoints = "\n".join(f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs"))
-    text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{endpoints}\n")
+    own = f'{endpoints}\nstore = "{folder}/calibrations.db"'
+    text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{own}\n")
     if VCAN.exists():
         text = text.replace('channel = "can0"', f'channel = "{VCAN.name}"')
     else:
@@ -403,12 +407,15 @@ def measure(config: Path, turns: int, seconds: float) -> dict[str, Any]:
     """Turns of daemon and floor, for each way that contacts move."""
     deployment = load(config)
     films = {name: film(deployment, path) for name, path in PATHS.items()}
+    busy = config.with_name("busy.toml")
+    busy.write_text(config.read_text().replace("[daemon]\n", f"[daemon]\nbusy_poll_us = {BUSY_POLL_US}\n"))
     rows: list[dict[str, Any]] = []
     for number in range(turns):
         for motion, samples in films.items():
             daemon = daemon_turn(config, samples, seconds)
             floor = floor_turn(config, samples, seconds, daemon.size)
-            for who, turn in (("daemon", daemon), ("floor", floor)):
+            awake = daemon_turn(busy, samples, seconds)
+            for who, turn in (("daemon", daemon), (AWAKE, awake), ("floor", floor)):
                 late_us = turn.latencies_us()
                 p50, p99, worst = np.percentile(late_us, [50, 99, 100]).tolist()
                 figures = {"n": len(late_us), "p50_us": p50, "p99_us": p99, "max_us": worst, **turn.figures}
@@ -441,18 +448,21 @@ def section(results: dict[str, Any]) -> str:
     rows, ratios = [], []
     for motion in PATHS:
         middle = {}
-        for who in ("daemon", "floor"):
+        for who in ("daemon", AWAKE, "floor"):
             turns = [row for row in results["turns"] if (row["contacts"], row["who"]) == (motion, who)]
+            if not turns:  # an earlier run, on the other bus
+                continue
             middle[who] = [
                 statistics.median(turn[key] for turn in turns)
                 for key in ("p50_us", "p99_us", "max_us", "processor_share")
             ]
             p50, p99, worst, share = middle[who]
             rows.append(f"| {motion} | {who} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {share:.0%} |")
-        ratios.append(
-            f"* {motion}: median {middle['daemon'][0] / middle['floor'][0]:.2f}, "
-            f"p99 {middle['daemon'][1] / middle['floor'][1]:.2f}"
-        )
+        floor = middle.pop("floor")
+        ratios += [
+            f"* {motion}, {who}: median {p50 / floor[0]:.2f}, p99 {p99 / floor[1]:.2f}"
+            for who, (p50, p99, *_) in middle.items()
+        ]
     served = [row for row in results["turns"] if row["who"] == "daemon"]
     lost, missed, overruns = (
         sum(row[key] for row in served) for key in ("messages_lost", "samples_missed", "overruns")
@@ -471,7 +481,8 @@ load average when it ended {results["load"]:.1f}.
 | --- | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
-Ratio to the floor, a bare loop that receives the same frames and sends a message of the same size:
+Ratio to the floor, a bare loop that sleeps in python-can's `recv` for the same frames, sends a message of the
+same size, and computes nothing:
 
 {chr(10).join(ratios)}
 
@@ -489,11 +500,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=10.0, help="of a turn")
     parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--trial", action="store_true", help="two turns of 2 s; writes nothing")
     asked = parser.parse_args()
     if not VCAN.exists():
         in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        found = measure(on_loopback(Path(folder), PORT), asked.turns, asked.seconds)
+        turns, seconds = (2, 2.0) if asked.trial else (asked.turns, asked.seconds)
+        found = measure(on_loopback(Path(folder), PORT), turns, seconds)
+    if asked.trial:
+        print(section(found))
+        return
     path = OUT / "latency.json"
     results = json.loads(path.read_text()) if path.exists() else {}
     results = {bus: results[bus] for bus in ("udp_multicast", "socketcan") if bus in results}

@@ -187,6 +187,7 @@ Made by `make bench ONLY=start`.
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--trial", action="store_true", help="two runs; writes nothing")
     asked = parser.parse_args()
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
@@ -195,9 +196,12 @@ def main() -> int:
         samples = film(load(config), PATHS["resting"])
         worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
         worker.start()
-        results = measure(config, asked.runs)
+        results = measure(config, 2 if asked.trial else asked.runs)
         stop.set()
         worker.join()
+    if asked.trial:
+        print(json.dumps(results, indent=1))
+        return 0
     results |= {"runs": asked.runs, "machine": machine(), "load": os.getloadavg()[0]}
     print(write(results))
     return int(

@@ -215,10 +215,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=6.0, help="of a case")
     parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--trial", action="store_true", help="one turn of 1.5 s a case; writes nothing")
     asked = parser.parse_args()
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        rows = measure(on_loopback(Path(folder), PORT), asked.turns, asked.seconds)
+        turns, seconds = (1, 1.5) if asked.trial else (asked.turns, asked.seconds)
+        rows = measure(on_loopback(Path(folder), PORT), turns, seconds)
+    if asked.trial:
+        print(*rows, sep="\n")
+        return
     print(write({"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]}))
 
 

@@ -63,10 +63,11 @@ def soak(config: Path, minutes: float) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--trial", action="store_true", help="half a minute")
     asked = parser.parse_args()
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        return soak(on_loopback(Path(folder), PORT + 1), asked.minutes)
+        return soak(on_loopback(Path(folder), PORT + 1), 0.5 if asked.trial else asked.minutes)
 
 
 if __name__ == "__main__":
