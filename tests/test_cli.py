@@ -11,7 +11,8 @@ import pytest
 from handtouch.cli import build_parser, main
 
 COMMANDS = [
-    *("demo", "run", "simulate", "replay", "watch", "status", "keys", "scan", "commission"),
+    *("demo", "run", "simulate", "watch", "status", "keys", "scan", "commission"),
+    *("record", "replay", "export", "plot"),
     *("check", "doctor", "figures", "design"),
 ]
 

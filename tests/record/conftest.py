@@ -106,7 +106,7 @@ class Hand:
         at = np.array([pad]), np.array([x * side_a]), np.array([y * side_b])
         fractions = model.locator.fractions(*at)[:, 0]
         counts = fractions * (current_a / model.ampere_per_count[pad])
-        return np.rint(counts).astype("<i2").tobytes()
+        return bytes(np.rint(counts).astype("<i2").tobytes())
 
     def step(self, samples: dict[int, bytes], delay_ns: int = 1000, node_state: int = PadState.CLEAR) -> None:
         """One SYNC, the samples that answer it, the tick."""

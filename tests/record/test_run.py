@@ -28,8 +28,7 @@ class Daemon:
     def __init__(self, hand: Hand, folder: Path) -> None:
         self.hand = hand
         self._context: zmq.Context[Any] = zmq.Context()
-        endpoints = (f"ipc://{folder}/{name}" for name in ("live", "complete"))
-        self.publisher = Publisher(self._context, *endpoints)
+        self.publisher = Publisher(self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
         self.endpoint = self.publisher.endpoints["complete"]
         self._seq = 0
         journal = hand.pipeline.journal
