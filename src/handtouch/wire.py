@@ -1,7 +1,7 @@
 """The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
 
-Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Service`, `TickInputs`, `State`,
-`Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `Placing`, `COLUMNS`, `INPUTS`.
+Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Joints`, `Service`, `TickInputs`,
+`State`, `Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `Placing`, `COLUMNS`, `INPUTS`.
 `docs/wire.md` describes every field for readers in other languages. SI units; `t_ns` is the host's monotonic
 clock; a number that isn't known is nil, never NaN. Fields with a default are left out of a message that has
 none of them.
@@ -255,6 +255,24 @@ class Raw:
 
 
 @dataclass(frozen=True, slots=True)
+class Joints:
+    """`joints/<hand>`: where the joints are, as the robot told; at most 30 a second."""
+
+    v: int
+    run: int
+    seq: int
+    t_ns: int
+    hand: str
+    names: tuple[str, ...]
+    """joints that move its links, as the URDF calls them"""
+    position_rad: tuple[float | None, ...]
+    """as names; metres where a joint slides, None where nobody told"""
+    age_s: tuple[float | None, ...]
+    """of the nearest joint state"""
+    repeat: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Service:
     """`service`: the daemon's own heartbeat, twice a second; three missed ones mean that it is gone."""
 
@@ -365,7 +383,7 @@ class Config:
     repeat: bool
 
 
-Message = Contact | HandFrame | Health | Raw | Service | TickInputs | State | Config
+Message = Contact | HandFrame | Health | Raw | Joints | Service | TickInputs | State | Config
 
 _F4 = ("<f4", 1)
 COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
@@ -426,6 +444,7 @@ TOPICS = (
     Topic("hand", 1, HandFrame, "one per tick"),
     Topic("health", 2, Health, "at every change, and once a second"),
     Topic("raw", 1, Raw, "one per tick"),
+    Topic("joints", 1, Joints, "thirty a second, where the hand has a URDF"),
     Topic("service", 0, Service, "twice a second"),
     Topic("tick", 0, TickInputs, "one per tick"),
     Topic("state", 0, State, "to who subscribes, and when something other than a tick changes it"),
@@ -465,6 +484,8 @@ def topic_of(message: Message) -> str:
         return f"health/{message.hand}/{message.link}"
     if isinstance(message, HandFrame):
         return f"hand/{message.hand}"
+    if isinstance(message, Joints):
+        return f"joints/{message.hand}"
     return f"raw/{message.hand}" if isinstance(message, Raw) else _ALONE[type(message)]
 
 

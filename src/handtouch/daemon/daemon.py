@@ -35,6 +35,7 @@ from handtouch.daemon.commands import Commands
 from handtouch.daemon.control import Control
 from handtouch.daemon.cycle import BusyPoll
 from handtouch.daemon.inputs import Inputs
+from handtouch.daemon.joints import JointTeller
 from handtouch.daemon.metrics import PATH, Exporter
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.notify import Notifier, Pulse
@@ -91,6 +92,7 @@ class Daemon:
             robots = Robots(deployment)
             self.inputs = self._open_inputs(context, robots)
             opened.callback(self.inputs.close)
+            self.joints = JointTeller(robots, self.inputs.joints_at, self.publisher)
             self.pipeline = Pipeline(
                 model or PadModel(deployment),
                 period_ns,
@@ -288,6 +290,7 @@ class Daemon:
         lap(histogram.NODES, time.monotonic_ns())
         self.report.poll(now_ns)
         lap(histogram.REPORT, time.monotonic_ns())
+        self.joints.step(now_ns)
         self.gate.poll(now_ns)
         self.publisher.take_subscriptions(now_ns)
         self.demand.step(now_ns)
