@@ -34,6 +34,8 @@ _FED = (Slab,)
 _OTHERS = {("Pipeline", "_outlet"), ("Pipeline", "journal"), ("Frames", "_robots")}
 """Where messages go is no state of the pipeline's, nor are robots, which there may be none of."""
 _PLAIN = (bool, int, float, str, type(None))
+_CONSTANT = _FIXED + _MADE + _FED
+_SIMPLE = {*_PLAIN, np.ndarray}
 
 
 def save(pipeline: Pipeline) -> dict[str, Any]:
@@ -85,7 +87,12 @@ def _places(root: object) -> Iterator[tuple[str, Any, str]]:
         for name in _attributes(owner):
             value = getattr(owner, name)
             path = f"{prefix}{name}"
-            if isinstance(value, _FIXED + _MADE + _FED) or (type(owner).__name__, name) in _OTHERS:
+            if (type(owner).__name__, name) in _OTHERS:
+                continue
+            if type(value) in _SIMPLE:  # most of them: the hot thread waits for this
+                yield path, owner, name
+                continue
+            if isinstance(value, _CONSTANT):
                 continue
             if isinstance(value, dict) and all(isinstance(item, _FIXED) for item in value.values()):
                 continue
@@ -121,7 +128,7 @@ def _inside(value: Any) -> list[tuple[str, Any]] | None:
 
 def _is_walked(value: object) -> bool:
     """Whether it is an object of ours that changes; named tuples, enumerations, frozen facts are values."""
-    if isinstance(value, (tuple, Enum, *_FIXED, *_MADE, *_FED)) or not _is_ours(value):
+    if isinstance(value, (tuple, Enum, *_CONSTANT)) or not _is_ours(value):
         return False
     facts = is_dataclass(value) and not any(_holds_array(getattr(value, part.name)) for part in fields(value))
     return not (facts and type(value).__setattr__ is not object.__setattr__)
@@ -136,6 +143,10 @@ def _is_ours(value: object) -> bool:
 
 
 def _saved(value: Any, path: str) -> Any:
+    if type(value) is np.ndarray and not value.dtype.hasobject:
+        return [value.dtype.str, value.shape, value.tobytes()]
+    if type(value) in _PLAIN:
+        return value
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, Enum):
@@ -143,7 +154,7 @@ def _saved(value: Any, path: str) -> Any:
     if isinstance(value, _PLAIN):
         return value
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
-        return [value.dtype.str, list(value.shape), value.tobytes()]
+        return [value.dtype.str, value.shape, value.tobytes()]
     if isinstance(value, bytes | bytearray):
         return bytes(value)
     if isinstance(value, list | tuple):
