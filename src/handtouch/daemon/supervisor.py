@@ -104,6 +104,8 @@ class Supervisor:
         swapped = [event for event in events if isinstance(event, SerialChanged)]
         known = [status.serial for status in self._master.status()]
         for event in swapped:
+            if self._serials[event.slot] is None:
+                self._serials[event.slot] = event.before
             if event.after is None:
                 known[event.slot] = 0  # there is one, and it tells no number
         for pad, (before, after) in enumerate(zip(self._serials, known, strict=True)):
