@@ -18,14 +18,19 @@ from typing import Any
 
 import zmq
 
-from handtouch import __version__
+from handtouch import __version__, wire
 from handtouch.client import SILENCE_S, Subscriber
 from handtouch.config import ConfigError, load
 from handtouch.record.file import RecordingFile
 from handtouch.record.recorder import Limits, Recorder
 
 COMPLETE = "tcp://127.0.0.1:5582"
-TOPICS = ("contact/*/*", "health/*/*", "service", "tick", "state", "config")
+TOPICS = tuple(
+    "/".join([topic.prefix, *["*"] * topic.parts])
+    for topic in wire.TOPICS
+    if topic.prefix not in ("hand", "raw")
+)
+"""All but the frames of each tick, which follow from `tick`."""
 _QUEUE = 200_000
 """Messages that wait here while the disk is slow: a quarter of a minute of fifteen touched pads at 500 Hz."""
 _MB = 1_000_000
@@ -162,7 +167,7 @@ def run(options: Options) -> int:
         endpoint = _endpoint(options)
         files = _Files(options, endpoint)
         topics = (*TOPICS, "hand/*") if options.hand else TOPICS
-        wire = _Wire(topics, endpoint, _QUEUE, options.key)
+        source = _Wire(topics, endpoint, _QUEUE, options.key)
     except (ConfigError, ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
@@ -176,9 +181,9 @@ def run(options: Options) -> int:
     recorder = Recorder(files.open, limits)
     progress = _Progress()
     progress.tell(f"recording {endpoint} into {files.folder or '.'}; Ctrl-C ends it")
-    with wire:
+    with source:
         try:
-            ended = _loop(options, wire, recorder, files, progress, stop)
+            ended = _loop(options, source, recorder, files, progress, stop)
             recorder.finish()
         except PermissionError as error:
             progress.tell(str(error))
@@ -192,7 +197,7 @@ def run(options: Options) -> int:
 
 def _loop(
     options: Options,
-    wire: _Wire,
+    source: _Wire,
     recorder: Recorder,
     files: _Files,
     progress: _Progress,
@@ -202,7 +207,7 @@ def _loop(
     end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
     look_s, heard_s = 0.0, time.monotonic()
     while not stop.is_set() and (now_s := time.monotonic()) < end_s:
-        if (parts := wire.parts(100)) is not None:
+        if (parts := source.parts(100)) is not None:
             heard_s = now_s
             recorder.take(parts, time.monotonic_ns())
         if now_s < look_s:
@@ -211,7 +216,7 @@ def _loop(
         recorder.poll(time.monotonic_ns())
         if recorder.asks:
             recorder.asks = False
-            wire.ask_for_state()
+            source.ask_for_state()
         progress.say(recorder, files, now_s - heard_s < SILENCE_S)
         if files.free_bytes() < options.keep_free_mb * _MB:
             return f"less than {options.keep_free_mb:g} MB are free in {files.folder}: recording ends here"

@@ -16,8 +16,13 @@ from typing import Any, Union
 
 from handtouch import wire
 
+_BINARY = {
+    topic.prefix
+    for topic in wire.TOPICS
+    if any(bytes in (hint, *typing.get_args(hint)) for hint in typing.get_type_hints(topic.payload).values())
+}
 ENCODING = {
-    topic.prefix: "msgpack" if topic.prefix in ("tick", "state", "config", "hand", "raw") else "json"
+    topic.prefix: "msgpack" if topic.prefix in _BINARY | {"config"} else "json"  # it has files, as bytes
     for topic in wire.TOPICS
 }
 """First part of a topic -> how its messages are kept."""

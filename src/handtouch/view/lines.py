@@ -94,7 +94,9 @@ def line(message: wire.Message) -> str:
         return f"{head}hand    {message.hand}  tick {message.tick}, {touched} of {len(message.links)} touched"
     if isinstance(message, wire.Raw):
         return f"{head}raw     {message.hand}  tick {message.tick}, {sum(message.fresh)} fresh"
-    return (
-        f"{head}service handtouch {message.version}, up {message.uptime_s:.0f} s, "
-        f"{message.rate_hz:.0f} ticks/s, {message.overruns} overruns"
-    )
+    if isinstance(message, wire.Service):
+        return (
+            f"{head}service handtouch {message.version}, up {message.uptime_s:.0f} s, "
+            f"{message.rate_hz:.0f} ticks/s, {message.overruns} overruns"
+        )
+    return f"{head}{wire.topic_of(message)}"
