@@ -164,6 +164,8 @@ class Messages:
         begin_ns = int(contacts.begin_ns[pad])
         position = columns.position_m[pad].tolist()
         located = all(map(math.isfinite, position))
+        covariance = columns.covariance_m2[pad].ravel().tolist()
+        certain = located and all(map(math.isfinite, covariance))  # at a corner nothing may bound it
         force_n = _finite(columns.force_n[pad])
         strength = "invalid" if force_n is None else "saturated" if columns.saturated[pad] else "valid"
         if strength == "valid" and self._tick.unestimated(pad):
@@ -187,7 +189,7 @@ class Messages:
             age_s=(now_ns - sample_ns) * 1e-9,
             position_m=tuple(position) if located else None,
             normal=tuple(columns.normal[pad].tolist()) if located else None,
-            covariance_m2=tuple(columns.covariance_m2[pad].ravel().tolist()) if located else None,
+            covariance_m2=tuple(covariance) if certain else None,
             pad_m=tuple(columns.pad_m[pad].tolist()) if located else None,
             location="valid" if located else "invalid" if self._tick.wanted[pad] else "skipped",
             force_n=force_n,
