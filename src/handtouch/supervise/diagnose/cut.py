@@ -31,8 +31,9 @@ def cut_changes(
 ) -> list[tuple[FloatArray, NDArray[np.bool_]]]:
     """Of each cut (corner as 0 or 1 along x and y; lost parts of the sides): changes of the shares.
 
-    A cut is straight in arc length and angle. at: (k,) coordinates as parts of a side of the rectangle. Returns changes (k, k, 4), x first, and which of the places are
-    beyond the cut. Resistors to ground are left out of account.
+    A cut is straight in arc length and angle. at: (k,) coordinates as parts of a side of the rectangle.
+    Returns changes (k, k, 4), x first, and which of the places are beyond the cut. Resistors to ground are
+    left out of account.
     """
     nodes = np.linspace(0, 1, _CELLS + 1)
     x, y = np.meshgrid(nodes, nodes, indexing="ij")

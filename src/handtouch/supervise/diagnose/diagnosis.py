@@ -27,19 +27,24 @@ class Diagnosis:
     """State of all pads of a hand; `step` takes block after block.
 
     offset_counts: (n, 4), what the channels read untouched, as stored; those of the model if left out.
+    tables: of alternatives, shared by diagnoses of one model.
     """
 
-    def __init__(self, model: DiagnosisModel, offset_counts: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        model: DiagnosisModel,
+        offset_counts: ArrayLike | None = None,
+        tables: dict[int, Tables] | None = None,
+    ) -> None:
         self._model = model
-        self._offsets = (
-            model.offset_counts if offset_counts is None else np.asarray(offset_counts, np.float64)
-        )
+        offsets = model.offset_counts if offset_counts is None else offset_counts
+        self._offsets = np.asarray(offsets, np.float64)
         n = len(model.links)
         noise = np.hypot(model.noise_counts, 12**-0.5)
         self._channels = ChannelWitness(model)
         self._standing = StandingWitness(noise)
         self._noise = noise / np.sqrt(GROUP)
-        self._tables: dict[int, Tables] = {}
+        self._tables = {} if tables is None else tables
         self._contacts: dict[int, ContactWitness] = {}
         self._released = np.ones(n, dtype=np.bool_)
         self._place = np.full((n, 2), np.nan)

@@ -32,7 +32,7 @@ _LEAST_AGE_S = dict(zip(_CAUSES, (8.0, 15.0, 8.0, 6.0, 15.0, 15.0), strict=True)
 _PRIOR = np.log([0.969, 0.008, 0.012, 0.005, 0.003, 0.003])
 # probability that a feature is there, by cause
 _FEATURES = {
-    "one channel": (0.002, 0.002, 0.002, 0.98, 0.0005, 0.01),
+    "one channel": (0.002, 0.002, 0.002, 0.998, 0.0005, 0.01),
     "negative": (0.0005, 0.0005, 0.0005, 0.45, 0.0005, 0.2),
     "abrupt": (0.99, 0.99, 0.99, 0.99, 0.002, 0.02),
     "decays": (0.15, 0.002, 0.998, 0.002, 0.05, 0.2),
@@ -68,6 +68,8 @@ class Standing:
     later: float = 0.0
     """its total within the first minute"""
     judged_s: float = 0.0
+    channel: int = 0
+    """that reads most, when it was last told"""
 
 
 class StandingWitness:
@@ -166,6 +168,8 @@ class StandingWitness:
             standing.kind = cause
         elif standing.kind is None and age_s > 300:
             standing.kind = Kind.UNEXPLAINED
+        if features["one channel"]:
+            standing.channel = int(np.abs(standing.level).argmax())
         if standing.kind in _CAUSES:
             standing.share = float(share[_CAUSES.index(standing.kind)])
 

@@ -82,7 +82,7 @@ def of_standing(model: DiagnosisModel, pad: int, standing: Standing) -> Finding:
     place: tuple[float, float] | None = None
     size: float | None = None
     if kind == Kind.OFFSET:
-        names = (ELECTRODES[int(np.abs(level).argmax())],)
+        names = (ELECTRODES[standing.channel],)
     elif kind in (Kind.STUCK_CONTACT, Kind.MOISTURE, Kind.HELD_OBJECT, Kind.HYSTERESIS_TAIL):
         place, radius_m = _place(model, pad, level)
         size = 2 * radius_m if kind == Kind.STUCK_CONTACT and radius_m is not None else None

@@ -1,0 +1,134 @@
+"""Each fault has a signature of its own, and what is held is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch import config, shipped
+from handtouch.supervise.diagnose import Block, Diagnosis, DiagnosisModel, Finding, Kind
+from handtouch.supervise.diagnose.contacts import Tables
+
+PAD, SECOND = 13, 1_000_000_000
+Counts = NDArray[np.float64]
+_TABLES: dict[int, Tables] = {}
+
+
+@lru_cache(maxsize=1)
+def model() -> DiagnosisModel:
+    whole = DiagnosisModel.of(config.load(shipped.path("utah_mit.toml")), "right")
+    rows = slice(PAD, PAD + 2)
+    return DiagnosisModel(
+        whole.links[rows], whole.networks[rows], whole.surfaces[rows], whole.sheets[rows], whole.drive_v[rows],
+        whole.ampere_per_count[rows], whole.noise_counts[rows], whole.limits[rows], whole.offset_counts[rows],
+    )  # fmt: skip
+
+
+def play(
+    contacts: Callable[[float, np.random.Generator], Counts], length_s: float, seed: int = 1
+) -> tuple[Diagnosis, list[Finding]]:
+    """Half-second blocks at 100 Hz of two pads; `contacts` gives what the first reads at a time."""
+    rng, diagnosis, changes = np.random.default_rng(seed), Diagnosis(model(), tables=_TABLES), []
+    for first in np.arange(0, length_s, 0.5):
+        times = first + np.arange(50) / 100
+        counts = rng.normal(size=(50, 2, 4))
+        counts[:, 0] += [contacts(t, rng) for t in times]
+        stamps = np.repeat(np.rint((times + 1) * SECOND).astype(np.int64)[:, None], 2, axis=1)
+        read = np.clip(np.rint(counts), -32768, 32767).astype(np.int64)
+        changes += diagnosis.step(Block(stamps, read, np.ones((50, 2), np.bool_)))
+    return diagnosis, changes
+
+
+def fractions(x: float, y: float) -> Counts:
+    network = model().networks[0]
+    return network.fractions(x * network.a, y * network.b)
+
+
+def presses(t: float) -> Counts:
+    """One a second, half a second long, anywhere: the same at the same time."""
+    number, part = divmod(t, 1.0)
+    if part > 0.5:
+        return np.zeros(4)
+    rng = np.random.default_rng(int(number))
+    return fractions(*rng.uniform(0.1, 0.9, 2)) * np.exp(rng.uniform(6, 9))
+
+
+def test_ordinary_presses_are_no_fault() -> None:
+    diagnosis, changes = play(lambda t, _: presses(t), 40)
+    assert diagnosis.findings() == [] and changes == []
+
+
+def test_something_that_stays_and_does_not_tremble_sticks() -> None:
+    diagnosis, _ = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 60)
+    (finding,) = diagnosis.findings()
+    assert finding.kind == Kind.STUCK_CONTACT and finding.fault and finding.link == model().links[0]
+    assert abs(finding.since_ns - 6 * SECOND) <= SECOND
+    assert finding.place_m is not None and finding.size_m is not None
+    assert finding.place_m[0] == pytest.approx(0.3 * 0.042, abs=1e-3)
+    assert finding.place_m[1] == pytest.approx(0.6 * 0.032, abs=1e-3)
+
+
+def test_something_that_trembles_is_held() -> None:
+    def held(t: float, _: np.random.Generator) -> Counts:
+        rng = np.random.default_rng(int(3 * t))
+        x, y = 0.4 + 0.01 * rng.normal(size=2)
+        return fractions(x, y) * 2000 * np.exp(0.05 * rng.normal()) if t > 5 else np.zeros(4)
+
+    diagnosis, _ = play(held, 40)
+    (finding,) = diagnosis.findings()
+    assert finding.kind == Kind.HELD_OBJECT and not finding.fault
+
+
+@pytest.mark.parametrize("size", [-400.0, 400.0])
+def test_a_channel_that_reads_alone_has_an_offset(size: float) -> None:
+    diagnosis, _ = play(lambda t, _: np.array([0, size if t > 5 else 0, 0, 0]), 40)
+    assert [(f.kind, f.electrodes) for f in diagnosis.findings()] == [(Kind.OFFSET, ("xa",))]
+
+
+def test_a_leak_that_grows_for_long_is_moisture() -> None:
+    diagnosis, _ = play(lambda t, _: fractions(0.4, 0.4) * 2000 * max(0.0, -np.expm1(-(t - 5) / 30)), 60)
+    assert [f.kind for f in diagnosis.findings()] == [Kind.MOISTURE]
+
+
+def test_an_open_electrode_is_dead() -> None:
+    network = model().networks[0]
+    broken = network.with_series([0, 0, np.inf, 0])
+
+    def read(t: float, _: np.random.Generator) -> Counts:
+        number, part = divmod(t, 1.0)
+        rng = np.random.default_rng(int(number))
+        x, y = rng.uniform(0.1, 0.9, 2)
+        return broken.fractions(x * network.a, y * network.b) * 3000 * (part < 0.5)
+
+    diagnosis, _ = play(read, 40)
+    assert [(f.kind, f.electrodes) for f in diagnosis.findings()] == [(Kind.DEAD_ELECTRODE, ("y0",))]
+
+
+def test_swapped_neighbours_are_told_by_name() -> None:
+    diagnosis, _ = play(lambda t, _: presses(t)[[0, 3, 2, 1]], 40)
+    assert [(f.kind, f.electrodes) for f in diagnosis.findings()] == [(Kind.SWAPPED_ELECTRODES, ("xa", "yb"))]
+
+
+def test_a_gain_that_jumps_is_told_with_its_factor() -> None:
+    diagnosis, _ = play(lambda t, _: presses(t) * [1, 1, 1.6, 1], 60)
+    (finding,) = diagnosis.findings()
+    assert (finding.kind, finding.electrodes) == (Kind.GAIN_STEP, ("y0",))
+    assert finding.evidence["factor"] == pytest.approx(1.6, rel=0.1)
+
+
+def test_a_channel_at_its_end_is_saturated_and_over_when_it_recovers() -> None:
+    diagnosis, changes = play(lambda t, _: np.array([0, 0, 0, 1e6 if 5 < t < 15 else 0]), 25)
+    assert diagnosis.findings() == []
+    assert [f.kind for f in changes if f.until_ns is None] == [Kind.SATURATED_CHANNEL]
+    assert [f.electrodes for f in changes if f.until_ns is not None] == [("yb",)]
+
+
+def test_a_block_of_another_hand_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"must be \(m, 2, 4\)"):
+        Diagnosis(model()).step(
+            Block(np.zeros((5, 3), np.int64), np.zeros((5, 3, 4), np.int64), np.ones((5, 3), np.bool_))
+        )
