@@ -51,6 +51,8 @@ def connect(pattern: Literal["hand/*"], /, **options: Unpack[_Options]) -> Subsc
 @overload
 def connect(pattern: Literal["health/*/*"], /, **options: Unpack[_Options]) -> Subscriber[wire.Health]: ...
 @overload
+def connect(pattern: Literal["percept/*/*"], /, **options: Unpack[_Options]) -> Subscriber[wire.Percept]: ...
+@overload
 def connect(pattern: Literal["raw/*"], /, **options: Unpack[_Options]) -> Subscriber[wire.Raw]: ...
 @overload
 def connect(pattern: Literal["service"], /, **options: Unpack[_Options]) -> Subscriber[wire.Service]: ...
@@ -62,10 +64,10 @@ def connect(
     """Subscribe to the topics that match any of the patterns.
 
     A pattern is a topic whose parts may hold the wildcards * and ?: "contact/*/*" (the default),
-    "contact/left/thumb_tip", "hand/*", "health/*/index_*", "service". What comes is `wire.Contact`,
-    `HandFrame`, `Health`, `Raw` or `Service`, as a type checker knows for the patterns of a whole topic. On
-    joining, the present state comes first, with `repeat` set: contacts under way as an update, the latest
-    hand frame, health and service. `queue` bounds the messages kept
+    "contact/left/thumb_tip", "hand/*", "health/*/index_*", "percept/left/motion", "service". What comes is
+    `wire.Contact`, `HandFrame`, `Health`, `Percept`, `Raw` or `Service`, as a type checker knows for the
+    patterns of a whole topic. On joining, the present state comes first, with `repeat` set: contacts under
+    way as an update, the latest hand frame, health and service. `queue` bounds the messages kept
     while this side is busy; beyond it the newest are lost, and counted as gaps. The connection comes back
     by itself when a daemon restarts. `key` is the file of this client's key for a daemon that asks for one
     (`handtouch keys`); left out: the file that the environment variable HANDTOUCH_KEY names; "" for none.

@@ -1,7 +1,8 @@
 """The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
 
-Public names: the payloads `Contact`, `HandFrame`, `Health`, `Raw`, `Joints`, `Service`, `TickInputs`,
-`State`, `Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `Placing`, `COLUMNS`, `INPUTS`.
+Public names: the payloads `Contact`, `HandFrame`, `Health`, `Percept`, `Raw`, `Joints`, `Service`,
+`TickInputs`, `State`, `Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `Placing`,
+`COLUMNS`, `INPUTS`.
 `docs/wire.md` describes every field for readers in other languages. SI units; `t_ns` is the host's monotonic
 clock; a number that isn't known is nil, never NaN. Fields with a default are left out of a message that has
 none of them.
@@ -235,6 +236,42 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True)
+class Percept:
+    """`percept/<hand>/<kind>`: what is felt above contacts, or (`ask`) what to do to know more."""
+
+    v: int
+    run: int
+    seq: int
+    t_ns: int
+    hand: str
+    kind: str
+    """motion, hardness, shape, texture or ask"""
+    link: str
+    """whose contact it is of; empty: of the whole hand"""
+    contact: int
+    """id of that contact, 0 for none"""
+    state: str
+    """unestimated (reason says what is missing), estimated or invalid; of an ask: open"""
+    label: str
+    """the most probable class; of an ask: what to do; empty where there are no classes"""
+    confidence: float | None
+    """probability of the label"""
+    probabilities: dict[str, Any]
+    """class -> probability; of an ask: those of the hypotheses it would tell apart"""
+    values: dict[str, Any]
+    """by name with its unit; of an ask: how much of what to do"""
+    evidence: dict[str, Any]
+    """what it rests on, counted"""
+    reason: str
+    """what is missing, or why to ask, in words"""
+    repeat: bool
+    question: str = ""
+    """this and the next of an ask alone: which question it would settle"""
+    expires_ns: int = 0
+    """the request is void from then on"""
+
+
+@dataclass(frozen=True, slots=True)
 class Raw:
     """`raw/<hand>`: the counts as they came, one per tick."""
 
@@ -383,7 +420,7 @@ class Config:
     repeat: bool
 
 
-Message = Contact | HandFrame | Health | Raw | Joints | Service | TickInputs | State | Config
+Message = Contact | HandFrame | Health | Percept | Raw | Joints | Service | TickInputs | State | Config
 
 _F4 = ("<f4", 1)
 COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
@@ -443,6 +480,7 @@ TOPICS = (
     Topic("contact", 2, Contact, "at each tick while touched, and at begin and end"),
     Topic("hand", 1, HandFrame, "one per tick"),
     Topic("health", 2, Health, "at every change, and once a second"),
+    Topic("percept", 2, Percept, "at every change, and while there is something to tell"),
     Topic("raw", 1, Raw, "one per tick"),
     Topic("joints", 1, Joints, "thirty a second, where the hand has a URDF"),
     Topic("service", 0, Service, "twice a second"),
@@ -484,6 +522,8 @@ def topic_of(message: Message) -> str:
         return f"health/{message.hand}/{message.link}"
     if isinstance(message, HandFrame):
         return f"hand/{message.hand}"
+    if isinstance(message, Percept):
+        return f"percept/{message.hand}/{message.kind}"
     if isinstance(message, Joints):
         return f"joints/{message.hand}"
     return f"raw/{message.hand}" if isinstance(message, Raw) else _ALONE[type(message)]

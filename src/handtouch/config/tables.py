@@ -15,9 +15,7 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
 Electrode = Literal["x0", "xa", "y0", "yb"]
-Output = Literal[
-    "location", "strength", "raw", "palm", "base", "motion", "hardness", "shape", "texture"
-]
+Output = Literal["location", "strength", "raw", "palm", "base", "motion", "hardness", "shape", "texture"]
 Four = Annotated[tuple[Positive, Positive, Positive, Positive], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -198,7 +196,8 @@ class Behaviour(Table):
         0.2, description="relative error of these numbers of creep, adaptation and hysteresis (1 sigma)"
     )
     silence_s: Positive = Field(
-        150.0, description="time unfelt in which a press too light to be felt may have made it forget (1 - 1/e)"
+        150.0,
+        description="time unfelt in which a press too light to be felt may have made it forget (1 - 1/e)",
     )
     history_std_n: NonNegative = Field(
         0.1, description="what it may have got used to before the daemon started (1 sigma)"

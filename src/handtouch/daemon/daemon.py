@@ -40,6 +40,7 @@ from handtouch.daemon.metrics import PATH, Exporter
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.notify import Notifier, Pulse
 from handtouch.daemon.pacer import Pacer
+from handtouch.daemon.perceive import Perceiving
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.report import Report
@@ -102,6 +103,7 @@ class Daemon:
                 robots,
             )
             self.pipeline.frames.joints_at = self.inputs.joints_at
+            self.perceiving = Perceiving(self.pipeline, self.publisher, self.publisher.run)
             self.inputs.refer = self.pipeline.tick.refer
             self.publisher.present.update(self.pipeline.messages.present())
             self.publisher.present.update(self.pipeline.journal.present())
@@ -221,6 +223,9 @@ class Daemon:
                 sent_ns = time.monotonic_ns()
                 stages.lap(histogram.SEND, sent_ns)
                 self.report.ticked(now_ns, sent_ns)
+                if self.perceiving.wanted:
+                    self.perceiving.step(ticked)
+                    stages.lap(histogram.PERCEIVE, time.monotonic_ns())
                 self._after_tick(alive)
             elif now_ns >= master.wake_ns:
                 master.poll(now_ns)
@@ -252,6 +257,7 @@ class Daemon:
     def _apply(self, wanted: Wanted, needs: Needs, enabled: NDArray[np.bool_], now_ns: int) -> None:
         """Do what is wanted now, and no more."""
         self.pipeline.want(wanted)
+        self.perceiving.want(wanted)
         self.pipeline.frames_every = self.demand.frames_every
         self._raw = needs.raw
         if self.supervisor is None:

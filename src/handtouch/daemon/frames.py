@@ -49,6 +49,7 @@ class Frames:
         self.palm = np.zeros(n, dtype=np.uint8)
         """Placing"""
         self.base = np.zeros(n, dtype=np.uint8)
+        self._rotation = np.full((n, 3, 3), np.nan)  # of the link in the palm
         self._values = np.full((n, _VALUES), np.nan)  # position, normal, covariance in palm; in base; age
         self._wants_palm, self._wants_base, self._wants = (np.zeros(n, dtype=np.bool_) for _ in range(3))
         self._robots = robots
@@ -101,6 +102,11 @@ class Frames:
             kinematics = self._robots.kinematics[self._robots.hands.index(hand)]
             kinematics.move(position)
             kinematics.in_palm(0)
+
+    def in_palm(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Place, normal and covariance (k, 15) of contacts in the palm, rotations (k, 3, 3) of their links
+        in it, and ages (k,) of joints; NaN where they aren't valid."""
+        return self._values[rows, _PALM], self._rotation[rows], self._values[rows, _AGE]
 
     def tell(self, pad: int) -> dict[str, Any]:
         """Fields of a contact message, none where no scene asks."""
@@ -184,7 +190,9 @@ class Frames:
             (_BASE, self.base, kinematics.base_needs, kinematics.in_base),
         )[: 1 + wants_base]:
             age_s = np.where(needs[links], joints.age_s, 0.0).max(axis=1, initial=0.0)
-            placed = _carry([pose(link) for link in links.tolist()], *on_link)
+            rotation, placed = _carry([pose(link) for link in links.tolist()], *on_link)
+            if at == _PALM:
+                self._rotation[rows] = rotation
             if np.count_nonzero(joints.std_rad):
                 placed[:, _TOLD["covariance_m2"]] += _of_joints(
                     kinematics, links, joints.std_rad, on_link[0], at == _BASE
@@ -201,14 +209,14 @@ class Frames:
 
 def _carry(
     poses: list[Pose], position_m: FloatArray, normal: FloatArray, covariance_m2: FloatArray
-) -> FloatArray:
-    """Places, normals and covariances (k, ...) on links, by the links' poses in another frame: (k, 15)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Rotations (k, 3, 3) of links in another frame, and (k, 15) places, normals and covariances there."""
     rotation = np.array([pose.rotation for pose in poses])
     turned = rotation.transpose(0, 2, 1)
     vectors = np.stack([position_m, normal], axis=1) @ turned  # rows times the transposed rotation
     vectors[:, 0] += np.array([pose.translation_m for pose in poses])
     covariance = rotation @ covariance_m2 @ turned
-    return np.concatenate([vectors.reshape(-1, 6), covariance.reshape(-1, 9)], axis=1)
+    return rotation, np.concatenate([vectors.reshape(-1, 6), covariance.reshape(-1, 9)], axis=1)
 
 
 def _of_joints(

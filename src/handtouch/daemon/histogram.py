@@ -14,11 +14,14 @@ UNIT_NS = 1024
 """Upper end of the first bucket; the k-th ends at UNIT_NS * 2**k."""
 _BUCKETS = 64  # more than an int64 of nanoseconds can need, so that adding never has to look
 
-STAGES = ("sync", "wait", "receive", "tick", "send", "settle", "supervise", "nodes", "report", "requests")
+STAGES = (
+    *("sync", "wait", "receive", "tick", "send", "perceive", "settle", "supervise"),
+    *("nodes", "report", "requests"),
+)
 """Parts of a period, in their order: SYNC is sent; for the bus; frames; samples to contacts; messages; what
-makes the next tick quick; from and for the slow half; nodes and buses; health and service; requests,
-subscriptions and handshakes."""
-SYNC, WAIT, RECEIVE, TICK, SEND, SETTLE, SUPERVISE, NODES, REPORT, REQUESTS = range(len(STAGES))
+is felt above contacts; what makes the next tick quick; from and for the slow half; nodes and buses; health
+and service; requests, subscriptions and handshakes."""
+SYNC, WAIT, RECEIVE, TICK, SEND, PERCEIVE, SETTLE, SUPERVISE, NODES, REPORT, REQUESTS = range(len(STAGES))
 MACHINE = "machine"
 """The name for time that no stage took: the machine let the loop wait longer than it asked to."""
 _PARTS = (*STAGES, MACHINE)

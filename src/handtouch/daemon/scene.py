@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.config.tables import Wants
+from handtouch.percept.stream import KINDS
 
 FILE, CONTROL = "the deployment file", "control"
 MOST_CLIENTS = 32
@@ -36,6 +37,8 @@ class Needs(NamedTuple):
     tolerance_m: NDArray[np.float64]
     rate_hz: NDArray[np.float64]
     """inf: at every SYNC"""
+    percepts: BoolArray
+    """(kinds, n), rows as KINDS"""
 
 
 def select(patterns: Sequence[str], names: Sequence[Name]) -> BoolArray:
@@ -57,12 +60,16 @@ def select(patterns: Sequence[str], names: Sequence[Name]) -> BoolArray:
 def join(scenes: Sequence[Wants], names: Sequence[Name]) -> Needs:
     """The union of scenes over the pads. Raises ValueError for a pattern that names none."""
     n = len(names)
-    needs = Needs(*(np.zeros(n, dtype=np.bool_) for _ in range(6)), np.full(n, np.inf), np.zeros(n))
+    pads, location, strength, raw, palm, base, *percepts = np.zeros((6 + len(KINDS), n), dtype=np.bool_)
+    needs = Needs(
+        pads, location, strength, raw, palm, base, np.full(n, np.inf), np.zeros(n), np.array(percepts)
+    )
     for scene in scenes:
         chosen = select(scene.links, names)
         needs.pads[chosen] = True
         for output in ("location", "strength", "raw", "palm", "base"):
             getattr(needs, output)[chosen] |= output in scene.outputs
+        needs.percepts[np.outer([kind in scene.outputs for kind in KINDS], chosen)] = True
         needs.location[chosen] |= bool(
             {"palm", "base"} & set(scene.outputs)
         )  # they are of a place on the link
@@ -173,6 +180,10 @@ class Wanted(NamedTuple):
     """ticks from one update to the next"""
     palm: BoolArray
     base: BoolArray
+    percepts: BoolArray | None = None
+    """(kinds, n), rows as KINDS; None: nothing is perceived"""
+    asks: BoolArray | None = None
+    """pads that questions may be asked of"""
 
 
 class Demand:
@@ -254,7 +265,12 @@ class Demand:
             "palm": wanted.palm,
             "base": wanted.base,
         }
-        computed = ["touched", *(output for output, pads in on.items() if pads[pad]), *["raw"] * raw]
+        felt = (
+            [kind for kind, pads in zip(KINDS, wanted.percepts, strict=True) if pads[pad]]
+            if (wanted.percepts is not None)
+            else []
+        )
+        computed = ["touched", *(output for output, pads in on.items() if pads[pad]), *["raw"] * raw, *felt]
         skipped = {}
         for output in ("touched", *on):
             if pad in self.disabled_by:
@@ -278,15 +294,22 @@ class Demand:
         enabled = np.ones(len(names), dtype=np.bool_)
         enabled[list(self.disabled_by)] = False
         heard &= enabled
+        held = enabled & needs.pads
+        asks = held & [wants(f"percept/{hand}/ask") for hand, _ in names]
+        percepts = np.array([[wants(f"percept/{hand}/{kind}") for hand, _ in names] for kind in KINDS])
+        percepts = held & (percepts | needs.percepts | asks)
+        felt = percepts.any(axis=0)
         with np.errstate(divide="ignore"):
             every = np.where(needs.pads & ~needs.raw, np.floor(self._tick_hz / needs.rate_hz + 1e-9), 1)
         self.wanted = Wanted(
-            located=heard & (needs.location | needs.strength),  # strength depends on the place
-            weighed=heard & needs.strength,
-            tolerance_m=np.where(needs.location | needs.strength, needs.tolerance_m, 0.0),
-            every=np.maximum(every, 1).astype(np.int64),
-            palm=heard & needs.palm,
+            located=heard & (needs.location | needs.strength) | felt,  # strength depends on the place
+            weighed=heard & needs.strength | felt,
+            tolerance_m=np.where((needs.location | needs.strength) & ~felt, needs.tolerance_m, 0.0),
+            every=np.where(felt, 1, np.maximum(every, 1)).astype(np.int64),  # a slip may come at any tick
+            palm=heard & needs.palm | felt & self.placeable,
             base=heard & needs.base,
+            percepts=percepts if felt.any() else None,
+            asks=asks,
         )
         self.frames_every = int(self.wanted.every[needs.pads].min()) if needs.pads.any() else 1
         self._apply(self.wanted, needs, enabled, now_ns)

@@ -200,6 +200,10 @@ class Tick:
         unsure = self.baseline.unsure[pads] | (self.strength.state[pads] == _UNESTIMATED)
         return np.asarray(unsure & self.contacts.touching[pads])
 
+    def place_noise(self, pads: IntArray) -> FloatArray:
+        """Covariance (k, 2, 2) of arc lengths on the pads (k,) that is new with each of their samples."""
+        return self.follower.place_noise(pads, self._currents.take(pads, axis=0))
+
     def solve_all(self) -> None:
         """Locate and weigh what is touched, wanted or not, as it is now; the next `want` forgets it."""
         everything = ~self._none

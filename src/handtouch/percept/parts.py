@@ -1,0 +1,15 @@
+"""Which parts there are: the one place that a new kind of perception is entered.
+
+Public names: `made`.
+"""
+
+from __future__ import annotations
+
+from handtouch.percept.percept import Perceiver
+from handtouch.percept.stream import Part, Stream
+
+
+def made(stream: Stream, period_ns: int) -> Perceiver:  # noqa: ARG001
+    """Everything that perceives, on a stream of samples that come every `period_ns`."""
+    parts: list[Part] = []
+    return Perceiver(stream, parts)
