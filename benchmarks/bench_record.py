@@ -134,6 +134,7 @@ def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> di
     return {
         "loop_share": loop_share,
         "recorder_share": recorder_share,
+        "ticks_hz": result["ticks"] / result["seconds"],
         "mb_per_minute": size / seconds * 60 / 1e6,
         "lost": sum(map(int, re.findall(r"(\d+) messages of \S+ were lost", told))),
         "drops": loop.publisher.drops["complete"],
