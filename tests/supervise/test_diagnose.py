@@ -45,7 +45,7 @@ def play(
 
 def fractions(x: float, y: float) -> Counts:
     network = model().networks[0]
-    return network.fractions(x * network.a, y * network.b)
+    return np.asarray(network.fractions(x * network.a, y * network.b))
 
 
 def presses(t: float) -> Counts:
@@ -59,15 +59,19 @@ def presses(t: float) -> Counts:
 
 def test_ordinary_presses_are_no_fault() -> None:
     diagnosis, changes = play(lambda t, _: presses(t), 40)
-    assert diagnosis.findings() == [] and changes == []
+    assert diagnosis.findings() == []
+    assert changes == []
 
 
 def test_something_that_stays_and_does_not_tremble_sticks() -> None:
     diagnosis, _ = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 60)
     (finding,) = diagnosis.findings()
-    assert finding.kind == Kind.STUCK_CONTACT and finding.fault and finding.link == model().links[0]
+    assert finding.kind == Kind.STUCK_CONTACT
+    assert finding.fault
+    assert finding.link == model().links[0]
     assert abs(finding.since_ns - 6 * SECOND) <= SECOND
-    assert finding.place_m is not None and finding.size_m is not None
+    assert finding.place_m is not None
+    assert finding.size_m is not None
     assert finding.place_m[0] == pytest.approx(0.3 * 0.042, abs=1e-3)
     assert finding.place_m[1] == pytest.approx(0.6 * 0.032, abs=1e-3)
 
@@ -80,7 +84,8 @@ def test_something_that_trembles_is_held() -> None:
 
     diagnosis, _ = play(held, 40)
     (finding,) = diagnosis.findings()
-    assert finding.kind == Kind.HELD_OBJECT and not finding.fault
+    assert finding.kind == Kind.HELD_OBJECT
+    assert not finding.fault
 
 
 @pytest.mark.parametrize("size", [-400.0, 400.0])
