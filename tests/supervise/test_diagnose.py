@@ -22,10 +22,7 @@ _TABLES: dict[int, Tables] = {}
 def model() -> DiagnosisModel:
     whole = DiagnosisModel.of(config.load(shipped.path("utah_mit.toml")), "right")
     rows = slice(PAD, PAD + 2)
-    return DiagnosisModel(
-        whole.links[rows], whole.networks[rows], whole.surfaces[rows], whole.sheets[rows], whole.drive_v[rows],
-        whole.ampere_per_count[rows], whole.noise_counts[rows], whole.limits[rows], whole.offset_counts[rows],
-    )  # fmt: skip
+    return DiagnosisModel(**{name: value[rows] for name, value in vars(whole).items()})
 
 
 def play(
@@ -54,7 +51,7 @@ def presses(t: float) -> Counts:
     if part > 0.5:
         return np.zeros(4)
     rng = np.random.default_rng(int(number))
-    return fractions(*rng.uniform(0.1, 0.9, 2)) * np.exp(rng.uniform(6, 9))
+    return np.asarray(fractions(*rng.uniform(0.1, 0.9, 2)) * np.exp(rng.uniform(6, 9)))
 
 
 def test_ordinary_presses_are_no_fault() -> None:

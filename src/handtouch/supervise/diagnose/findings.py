@@ -45,14 +45,12 @@ class Block:
     """Samples of all n pads of a hand, as in topic `raw/<hand>`, m one after another.
 
     sample_ns: (m, n) time of each row's sample. counts: (m, n, 4). fresh: (m, n), whether the sample belongs
-    to this tick. speed: (n,), how fast each link moves [any unit], NaN where it isn't known; None: nobody
-    knows. Blocks of 0.2 to 0.5 s serve best; samples of a pad come in the order of time.
+    to this tick. Blocks of 0.2 to 0.5 s serve best; samples of a pad come in the order of time.
     """
 
     sample_ns: NDArray[np.int64]
     counts: NDArray[np.int64]
     fresh: NDArray[np.bool_]
-    speed: FloatArray | None = None
 
 
 @dataclass(frozen=True)
