@@ -233,7 +233,7 @@ def main() -> None:
         f"{len(results)} episodes of {LENGTH_S:g} s on three pads of the shipped hand at 100 Hz, seeds from "
         f"{args.seed}; a fault befalls one pad while all are in use. Thresholds were tuned on seeds below "
         "1000. Finite elements, noise, tolerances of gains, gaps and resistors and sizes of contacts are "
-        "hidden from the diagnosis. Left out as invisible in principle: cables of opposite electrodes swapped, "
+        "hidden from the diagnosis. Left out as invisible: cables of opposite electrodes swapped, "
         "which mirrors the pad, and short circuits between electrodes without series resistors.", "",
     ]  # fmt: skip
     out = ROOT / "docs" / "benchmarks"
