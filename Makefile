@@ -41,10 +41,11 @@ demo: $(VENV)/.run ## a simulated hand, the daemon and a live view; half a minut
 
 # --- test
 
-.PHONY: test lint types unit socketcan
+.PHONY: test lint types unit socketcan docs
 test: ## everything that CI runs
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory types
+	@$(MAKE) --no-print-directory docs
 	@$(MAKE) --no-print-directory unit
 	@$(MAKE) --no-print-directory socketcan
 
@@ -54,6 +55,9 @@ lint: $(VENV)/.dev ## style
 
 types: $(VENV)/.dev ## static types
 	$(BIN)/mypy --strict
+
+docs: $(VENV)/.dev ## the documentation site, in docs/_build; a warning is an error
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
 unit: $(VENV)/.dev ## all tests that need no SocketCAN, with coverage
 	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --cov --cov-report=term:skip-covered $(ARGS)

@@ -1,0 +1,49 @@
+"""How Sphinx builds the documentation: `make docs`, result in docs/_build."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from typing import Any
+
+from handtouch import __version__
+
+project = "handtouch"
+author = "the handtouch authors"
+copyright = author  # the name that Sphinx reads
+version = release = __version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build"]
+myst_enable_extensions = ["colon_fence"]
+myst_heading_anchors = 3
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+add_module_names = False
+
+html_theme = "furo"
+html_title = "handtouch"
+html_theme_options = {"source_edit_link": "", "sidebar_hide_name": False}
+
+
+def as_text(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:  # noqa: ARG001
+    """Docstrings are plain text: nothing in them is markup but `names`, and hanging lines make lists."""
+    made: list[str] = []
+    for blank, group in itertools.groupby(lines, key=lambda line: not line.strip()):
+        block = [re.sub(r"([|*\\]|_\b)", r"\\\1", line) for line in group]
+        hanging = not blank and any(line.startswith(" ") for line in block)
+        if hanging and made and made[-1].strip():
+            made.append("")
+        made += [_in_list(line) for line in block] if hanging else block
+    lines[:] = made
+
+
+def _in_list(line: str) -> str:
+    return f"  {line.strip()}" if line.startswith(" ") else f"* {line}"
+
+
+def setup(app: Any) -> None:
+    """Sphinx calls it."""
+    app.connect("autodoc-process-docstring", as_text)
