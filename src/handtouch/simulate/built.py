@@ -14,13 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
 from handtouch.canbus.channels import ELECTRODES, channels_of, in_order
-from handtouch.hand import mount_of
 from handtouch.sheet import SheetModel
 from handtouch.simulate import noise
 from handtouch.simulate.faults import Fault, Gum, StuckChannel
 from handtouch.simulate.history import History
-from handtouch.simulate.pad import PadCircuit, Played
-from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.pad import PadCircuit
+from handtouch.simulate.play import OnPad, Play
 from handtouch.simulate.shape import Shape, shape_of
 from handtouch.simulate.sheet import Gaps, solve
 from handtouch.simulate.world import Climate, Parts, World
@@ -38,7 +37,7 @@ class BuiltPad:
     pad: config.Pad
     sheet: config.Sheet
     circuit: PadCircuit
-    touches: Played
+    touches: OnPad
     faults: tuple[Fault, ...]
     rotation: FloatArray
     translation: FloatArray
@@ -63,7 +62,7 @@ class BuiltPad:
         deployment: config.Deployment,
         hand: str,
         pad: config.Pad,
-        scenario: Scenario,
+        scenario: Play,
         world: World,
         faults: Sequence[Fault],
     ) -> BuiltPad:
@@ -85,20 +84,15 @@ class BuiltPad:
             node.drive_v,
             limits[:, 1] / per_ampere,
         )
-        touches = [
-            (touch, 1e-3 * (touch.radius_mm or world.radius_mm(sheet, number)))
-            for number, touch in enumerate(scenario.touches)
-            if touch.link == pad.link
-        ]
         keys = [noise.key(world.seed, "noise", hand, pad.link, name) for name in ELECTRODES]
         return cls(
             hand,
             pad,
             sheet,
             circuit,
-            Played(touches),
+            scenario.on(pad.link, lambda number: 1e-3 * world.radius_mm(sheet, number)),
             tuple(fault for fault in faults if fault.link == pad.link),
-            *mount_of(pad),
+            *world.mount(hand, pad),
             node.noise_counts if world.noise_counts is None else world.noise_counts,
             np.array(keys),
             limits,

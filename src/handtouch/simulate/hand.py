@@ -23,7 +23,7 @@ from handtouch.simulate import noise
 from handtouch.simulate.built import BuiltPad
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.pad import layer_ohm
-from handtouch.simulate.scenario import Pressing, Scenario
+from handtouch.simulate.play import Play, Pressing
 from handtouch.simulate.sheet import SheetBank
 from handtouch.simulate.truth import Truth, Vector
 from handtouch.simulate.world import Climate, World
@@ -42,7 +42,7 @@ class VirtualHand:
     def __init__(
         self,
         deployment: config.Deployment,
-        scenario: Scenario,
+        scenario: Play,
         world: World,
         bus: str | None = None,
         faults: Sequence[Fault] = (),
@@ -65,11 +65,11 @@ class VirtualHand:
         self._special = [number for number, row in enumerate(self._rows) if not row.plain]
         self._contacts = [
             [
-                (number, 1e-3 * (touch.radius_mm or world.radius_mm(row.sheet, index)))
+                (number, radius_m or 1e-3 * world.radius_mm(row.sheet, index))
                 for number, row in enumerate(self._rows)
-                if row.pad.link == touch.link
+                if row.pad.link == link
             ]
-            for index, touch in enumerate(scenario.touches)
+            for index, (link, radius_m) in enumerate(scenario.links)
         ]
 
     def sample(self, t_s: float) -> NDArray[np.int64]:
@@ -118,7 +118,7 @@ class VirtualHand:
 
     def _at(self, t_s: float) -> list[_Contact]:
         return [
-            _Contact(row, pressing, radius_m)
+            _Contact(row, pressing, pressing.radius_m or radius_m)
             for pressing in self._scenario.pressing(t_s)
             for row, radius_m in self._contacts[pressing.touch]
         ]

@@ -20,6 +20,7 @@ from handtouch.config import Deployment
 from handtouch.config.tables import Positive, Table
 from handtouch.hand import urdf
 from handtouch.robot import Robot
+from handtouch.simulate.play import Moving
 
 _EVERY_S = 0.01
 
@@ -69,22 +70,23 @@ class Moved:
 class JointFeed:
     """A thread that tells a daemon the joints of every hand with a URDF, until `close`.
 
-    `since_s` is the time in the scenario. A daemon that doesn't let us in is told about once.
+    `moved` says how they move, if they do; `since_s` is the time in the scenario. A daemon that doesn't let
+    us in is told about once.
     """
 
     def __init__(
         self,
         deployment: Deployment,
-        motions: Sequence[Motion],
+        moved: Callable[[urdf.Description], Moving | None],
         since_s: Callable[[], float],
         endpoint: str,
         key: Path | str | None = None,
     ) -> None:
         self._since_s, self._endpoint, self._key = since_s, endpoint, key
         self._hands = [
-            (hand, Moved(urdf.read(Path(hand.urdf)).joints.values(), motions))
+            (hand, moving)
             for hand in deployment.hands
-            if hand.urdf
+            if hand.urdf and (moving := moved(urdf.read(Path(hand.urdf))))
         ]
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="simulated-joints", daemon=True)
@@ -96,6 +98,8 @@ class JointFeed:
         self._thread.join()
 
     def _run(self) -> None:
+        if not self._hands:
+            return
         try:
             with Robot(self._endpoint, self._key) as robot:
                 while not self._stop.wait(_EVERY_S):
@@ -105,6 +109,6 @@ class JointFeed:
 
     def _tell(self, robot: Robot) -> None:
         t_ns, t_s = time.monotonic_ns(), self._since_s()
-        for hand, moved in self._hands:
-            told = {hand.joint_names.get(n, hand.joint_prefix + n): x for n, x in moved.at(t_s).items()}
+        for hand, moving in self._hands:
+            told = {hand.joint_names.get(n, hand.joint_prefix + n): x for n, x in moving.at(t_s).items()}
             robot.send_joints(hand.name, told, t_ns=t_ns)

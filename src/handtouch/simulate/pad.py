@@ -1,6 +1,6 @@
 """One pad over many times at once: what its contacts, its faults and its wiring make of its four currents.
 
-Public names: `PadCircuit` (sheet, contacts and wiring), `Played` (touches of a scenario on it), `layer_ohm`.
+Public names: `PadCircuit` (sheet, contacts and wiring), `layer_ohm`.
 
 The contacts k of a pad share its sheet: V = J_k R_k + sum_l (G_kl + phi_k . lift phi_l) J_l + phi_k . v0, R_k
 being the resistance of a contact with the sheet around it (paper eqs. 9-11), G Green's function between
@@ -21,7 +21,7 @@ from scipy.special import i0e, i1e
 from handtouch import config
 from handtouch.simulate.circuit import Circuit, Wiring
 from handtouch.simulate.faults import Contacts, Fault
-from handtouch.simulate.scenario import Touch
+from handtouch.simulate.play import OnPad
 from handtouch.simulate.shape import Shape
 from handtouch.simulate.sheet import Gaps, SheetBank, SheetMaps, mutual
 from handtouch.simulate.tear import beyond, torn
@@ -59,50 +59,6 @@ class _Spot:
     """Whether its place never changes."""
 
 
-class Played:
-    """Touches on a pad, at most `depth` at a time."""
-
-    def __init__(self, touches: Sequence[tuple[Touch, float]]) -> None:
-        """touches: with the radius [m] of each."""
-        self._lanes: list[list[tuple[Touch, float]]] = []
-        for touch, radius_m in sorted(touches, key=lambda pair: pair[0].from_s):
-            free = (lane for lane in self._lanes if lane[-1][0].until_s <= touch.from_s)
-            lane = next(free, None)
-            if lane is None:
-                self._lanes.append(lane := [])
-            lane.append((touch, radius_m))
-
-    @property
-    def depth(self) -> int:
-        """The most touches at a time."""
-        return len(self._lanes)
-
-    @property
-    def changes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times [s] at which the force is to be looked at; those after which a sheet has to settle, those at
-        which a touch begins."""
-        touches = [touch for lane in self._lanes for touch, _ in lane]
-        looked = [touch.knots() for touch in touches]
-        settles = [t for touch in touches for t in (touch.from_s, touch.from_s + touch.ramp_s, touch.until_s)]
-        begins = np.array([touch.from_s for touch in touches])
-        return np.concatenate([np.zeros(0), *looked]), np.array(settles), begins
-
-    def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Places (depth, 2, n), forces (depth, n) [N], 0 where nothing presses, and radii (depth, n) [m]."""
-        order = np.argsort(times_s, kind="stable")
-        ordered = times_s[order]
-        depth, n = len(self._lanes), len(times_s)
-        place, force, radius = np.full((depth, 2, n), 0.5), np.zeros((depth, n)), np.ones((depth, n))
-        for row, lane in enumerate(self._lanes):
-            for touch, radius_m in lane:
-                first, last = np.searchsorted(ordered, (touch.from_s, touch.until_s))
-                if first < last:
-                    at = order[first:last]
-                    place[row][:, at] = touch.places(times_s[at])
-                    force[row, at], radius[row, at] = touch.forces(times_s[at]), radius_m
-        return place, force, radius
-
-
 @dataclass(frozen=True)
 class PadCircuit:
     """A pad as it was built; `shape` and `gaps` in the coordinates of the shape."""
@@ -125,7 +81,7 @@ class PadCircuit:
     def currents(
         self,
         times_s: FloatArray,
-        touches: Played,
+        touches: OnPad,
         faults: Sequence[Fault],
         yields: FloatArray,
         drive: FloatArray | float = 1.0,
@@ -147,7 +103,7 @@ class PadCircuit:
         self,
         changes: Sequence[Fault],
         times_s: FloatArray,
-        touches: Played,
+        touches: OnPad,
         faults: Sequence[Fault],
         yields: FloatArray,
     ) -> FloatArray:
@@ -230,7 +186,7 @@ class PadCircuit:
         return found
 
     def _spots(
-        self, times_s: FloatArray, touches: Played, faults: Sequence[Fault], yields: FloatArray
+        self, times_s: FloatArray, touches: OnPad, faults: Sequence[Fault], yields: FloatArray
     ) -> list[_Spot]:
         place, force, radius = touches.contacts(times_s)
         spots = [

@@ -28,6 +28,7 @@ from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.joints import JointFeed
+from handtouch.simulate.play import Play
 from handtouch.simulate.scenario import Scenario, Swap
 from handtouch.simulate.truth import Truth
 from handtouch.simulate.world import World
@@ -51,7 +52,7 @@ class SimulatedHand:
 
     @classmethod
     def open(
-        cls, deployment: config.Deployment, scenario: Scenario, world: World, *, record: bool = True
+        cls, deployment: config.Deployment, scenario: Play, world: World, *, record: bool = True
     ) -> Self:
         """Build the hand and open the buses that carry its pads; `record` keeps the truth of every SYNC.
 
@@ -79,16 +80,16 @@ class SimulatedHand:
         for stage in self._stages:
             stage.nodes.start()
 
-    def tell_joints(self, deployment: config.Deployment, scenario: Scenario, endpoint: str) -> None:
+    def tell_joints(self, deployment: config.Deployment, scenario: Play, endpoint: str) -> None:
         """Tell a daemon where the joints are, from now on, if a URDF has some and the scenario moves them."""
-        if scenario.motions and any(hand.urdf for hand in deployment.hands):
+        if any(hand.urdf for hand in deployment.hands):
             start, round_s = self._stages[0].start, scenario.duration_s
 
             def since_s() -> float:
                 t_s = start.peek_s(time.monotonic_ns())
                 return t_s % round_s if scenario.repeat else t_s
 
-            feed = JointFeed(deployment, scenario.motions, since_s, endpoint)
+            feed = JointFeed(deployment, scenario.moved, since_s, endpoint)
             self._opened.callback(feed.close)
 
     def stop(self) -> None:

@@ -1,6 +1,6 @@
 """Scenario file (TOML) -> frozen, checked touches on links: where, when and how hard.
 
-Public names: `Scenario`, `Touch`, `Swap`, `Pressing`. Mistakes are reported as in a deployment file.
+Public names: `Scenario`, `Touch`, `Swap`. Mistakes are reported as in a deployment file.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import itertools
 import math
 import tomllib
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,23 +21,16 @@ from pydantic import Field, ValidationError
 from handtouch.config import Deployment
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.tables import Four, Name, Positive, Table, Unsigned32
+from handtouch.hand.urdf import Description
 from handtouch.simulate.faults import FAULTS, INFLUENCES, Acting
-from handtouch.simulate.joints import Motion
+from handtouch.simulate.joints import Motion, Moved
+from handtouch.simulate.play import Played, Pressing
 
 FloatArray = NDArray[np.float64]
 _Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
 _Point = Annotated[tuple[_Fraction, _Fraction], Field(strict=False)]
 _TOUR_S, _TOUR_STEP_S = 1.6, 1.0
 _KINDS = {**FAULTS, **INFLUENCES}
-
-
-class Pressing(NamedTuple):
-    """A contact at one moment: the touch's number, the place as fractions of the pad, the force."""
-
-    touch: int
-    x: float
-    y: float
-    force_n: float
 
 
 class Touch(Table):
@@ -171,7 +164,7 @@ class Scenario(Table):
         try:
             scenario = cls.model_validate(raw)
         except ValidationError as error:
-            tables = {"": cls, "touch": Touch, "swap": Swap, "joint": Motion}
+            tables: dict[str, type[Table]] = {"": cls, "touch": Touch, "swap": Swap, "joint": Motion}
             raise ConfigError(file, problems_of(raw, error, tables, _KINDS)) from error
         return scenario
 
@@ -195,6 +188,25 @@ class Scenario(Table):
     def duration_s(self) -> float:
         """Time of one round."""
         return max(touch.until_s for touch in self.touches) + self.pause_s
+
+    @property
+    def links(self) -> list[tuple[str, float | None]]:
+        """Of each touch its link, and its radius [m] where it says one."""
+        return [(t.link, None if t.radius_mm is None else 1e-3 * t.radius_mm) for t in self.touches]
+
+    def on(self, link: str, radius_m: Callable[[int], float]) -> Played:
+        """The touches of one pad; `radius_m` of a touch by its number, where it doesn't say one."""
+        return Played(
+            [
+                (touch, 1e-3 * touch.radius_mm if touch.radius_mm else radius_m(number))
+                for number, touch in enumerate(self.touches)
+                if touch.link == link
+            ]
+        )
+
+    def moved(self, robot: Description) -> Moved | None:
+        """How the joints of a hand move; None where nothing moves them."""
+        return Moved(robot.joints.values(), self.motions) if self.motions else None
 
     def pressing(self, t_s: float) -> list[Pressing]:
         """The contacts at `t_s` from the start."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.canbus.channels import ELECTRODES
+from handtouch.hand.pads import mount_of, rotation_of
 from handtouch.sheet import S1, S2, SheetModel
 from handtouch.simulate import noise
 
@@ -63,6 +64,10 @@ class World:
     """Standard deviation of the temperature coefficients of the channels' zeros."""
     gain_per_k: float = 0.0
     """Temperature coefficient of all gains."""
+    mount_mm: float = 0.0
+    """Standard deviation of where a pad sits on its link, along each axis."""
+    mount_deg: float = 0.0
+    """And of how it is turned, about each axis."""
     supply_per_s: float = 0.0
     """How fast the driving potential wanders at most, relative to itself."""
 
@@ -85,6 +90,15 @@ class World:
         gaps = np.maximum(pad.gap_mm + self.gap_tolerance_mm * drawn[8:].reshape(2, 4), 0.0)
         before, after = gaps
         return Parts(_four(gain), _four(series), _four(before), _four(after))
+
+    def mount(self, hand: str, pad: config.Pad) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and translation (3,) [m] of the pad's frame in its link's, as it really is."""
+        rotation, translation = mount_of(pad)
+        if not (self.mount_mm or self.mount_deg):
+            return rotation, translation
+        drawn = np.random.default_rng((self.seed, zlib.crc32(f"mount/{hand}/{pad.link}".encode())))
+        off_m, turned_deg = 1e-3 * self.mount_mm * drawn.normal(size=3), self.mount_deg * drawn.normal(size=3)
+        return rotation @ rotation_of(np.radians(turned_deg)), translation + rotation @ off_m
 
     def gain_of(self, serial: int) -> Four:
         """Gains of the channels of a unit that is put in instead of another."""
