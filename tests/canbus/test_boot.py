@@ -91,6 +91,13 @@ def test_node_without_serial_number_is_not_the_one_with_the_configured_one() -> 
     assert caught.value.stranger
 
 
+def test_another_pads_node_is_refused_though_any_number_is_welcome() -> None:
+    check_identity(Identity(1, 2, 3, 6), Expected(foreign=frozenset({4, 5})))
+    with pytest.raises(StepError, match="serial number 5 is configured for another pad") as caught:
+        check_identity(Identity(1, 2, 3, 5), Expected(foreign=frozenset({4, 5})))
+    assert caught.value.stranger
+
+
 WIDE: Channels = (
     Channel(0x9130, 1, 32),
     Channel(0x9130, 2, 32),

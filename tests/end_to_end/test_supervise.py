@@ -60,6 +60,7 @@ PAD = """
 link = "{link}"
 bus = "can0"
 node_id = {node_id}
+serial = {serial}
 node = "n"
 sheet = "s"
 surface = {{ kind = "plane", length_mm = 24.0, width_mm = 20.0 }}
@@ -149,7 +150,7 @@ class Bench:
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     folder = tmp_path_factory.mktemp("supervised")
-    pads = "".join(PAD.format(link=link, node_id=k + 1) for k, link in enumerate(LINKS))
+    pads = "".join(PAD.format(link=link, node_id=k + 1, serial=1001 + k) for k, link in enumerate(LINKS))
     deployment = in_process(parse(DEPLOYMENT + pads))
     settings = deployment.daemon.model_copy(update={"supervise": True})
     deployment = deployment.model_copy(update={"daemon": settings})

@@ -38,12 +38,13 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What the configuration says of a node; None is not checked."""
+    """What the configuration says of a node; None is not checked. `foreign`: serial numbers of other pads'."""
 
     vendor_id: int | None = None
     product_code: int | None = None
     revision: int | None = None
     serial: int | None = None
+    foreign: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +118,12 @@ def check_identity(identity: Identity, expected: Expected) -> None:
                 f"put the right node there, or correct {key} in the deployment",
                 stranger=True,
             )
+    if identity.serial in expected.foreign:
+        raise StepError(
+            f"another pad's device: serial number {identity.serial} is configured for another pad; "
+            "plug the nodes where they belong, or correct serial in the deployment",
+            stranger=True,
+        )
 
 
 def configure(

@@ -124,7 +124,7 @@ def outcome(node: Member, step: Action, attempt: int, idle: bool) -> tuple[Outco
 
 
 def _expected(spec: NodeSpec) -> boot.Expected:
-    return boot.Expected(spec.vendor_id, spec.product_code, spec.revision, spec.serial)
+    return boot.Expected(spec.vendor_id, spec.product_code, spec.revision, spec.serial, spec.foreign)
 
 
 def _carry_out(node: Member, step: Action, idle: bool) -> Result | None:

@@ -23,7 +23,8 @@ class NodeSpec:
     """A node as the configuration describes it; identity fields left None are not checked.
 
     `channels` are those of the electrodes x0, xa, y0, yb. `remap`: they may be mapped to a TPDO over SDO.
-    `event_timer_ms`: how often it sends if it can't follow SYNC.
+    `event_timer_ms`: how often it sends if it can't follow SYNC. `foreign`: serial numbers that belong to
+    other pads.
     """
 
     slot: int
@@ -34,6 +35,7 @@ class NodeSpec:
     vendor_id: int | None = None
     product_code: int | None = None
     serial: int | None = None
+    foreign: frozenset[int] = frozenset()
     revision: int | None = None
     channels: Channels = STANDARD_CHANNELS
     remap: bool = True

@@ -52,9 +52,10 @@ class Daemon(Table):
         True, description="watch, calibrate and diagnose all pads, in a process of its own beside the daemon"
     )
     another_unit: Literal["refuse", "quarantine"] = Field(
-        "refuse",
-        description="what to do with a node whose serial number isn't the configured one: refuse it, or take "
-        "it as a replacement, in quarantine until it is calibrated",
+        "quarantine",
+        description="what to do with a node whose serial number isn't the configured one: take it as a "
+        "replacement, in quarantine until it is calibrated, or refuse it. Without `supervise`, and where "
+        "the number is configured for another pad, it is refused",
     )
     sync_period_ms: float = Field(5.0, ge=0.5, le=1000, description="period of SYNC and of the tick")
     window: Fraction = Field(0.6, description="part of the period after SYNC that a tick waits for samples")

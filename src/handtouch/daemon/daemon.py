@@ -155,11 +155,12 @@ class Daemon:
         self._opened.close()
 
     def _specs(self) -> list[NodeSpec]:
-        """Of all nodes; where a replacement is welcome, a serial number is nothing that a node must have."""
+        """Of all nodes; where a replacement is welcome, any serial number is that no other pad's node has."""
         specs, settings = node_specs(self.deployment), self.deployment.daemon
         if not settings.supervise or settings.another_unit == "refuse":
             return specs
-        return [replace(spec, serial=None) for spec in specs]
+        known = {spec.serial for spec in specs if spec.serial}
+        return [replace(spec, serial=None, foreign=frozenset(known - {spec.serial})) for spec in specs]
 
     def _open_inputs(self, context: zmq.Context[zmq.Socket[bytes]], robots: Robots) -> Inputs:
         parts = zip(robots.hands, robots.joint_names, robots.kinematics, strict=True)
