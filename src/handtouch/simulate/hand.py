@@ -12,6 +12,7 @@ on the sheet.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -62,7 +63,7 @@ class VirtualHand:
         self._low, self._high = limits[:, :, 0], limits[:, :, 1]
         self._calls = 0
         self._climate = Climate(world, [(row.hand, row.pad.link) for row in self._rows])
-        self._special = [number for number, row in enumerate(self._rows) if not row.plain]
+        self._special = [number for number, row in enumerate(self._rows) if row.faults or row.swapped]
         self._contacts = [
             [
                 (number, radius_m or 1e-3 * world.radius_mm(row.sheet, index))
@@ -82,12 +83,15 @@ class VirtualHand:
         if not self._climate.steady:
             counts += self._climate.zero(at)[0]
             gains = gains * self._climate.gain(at) * self._climate.drive(at)
-        if contacts := [contact for contact in self._at(t_s) if contact.row not in self._special]:
+        found = self._at(t_s)
+        pressed = Counter(contact.row for contact in found)
+        special = {*self._special, *(row for row, number in pressed.items() if number > 1)}
+        if contacts := [contact for contact in found if contact.row not in special]:
             currents, _ = self._currents(contacts, t_s)
             rows = [contact.row for contact in contacts]
             counts[rows] += currents * gains[rows]
         read = np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
-        for number in self._special:
+        for number in special:
             read[number] = self.counts(number, [t_s])[0]
         return read
 
