@@ -4,13 +4,13 @@ A part that can't decide states a `Question`: hypotheses with their probabilitie
 outcome that each hypothesis predicts. The action that is expected to tell most bits for its cost is asked
 for.
 
-Public names: `Question`, `Action`, `Ask`, `Asker`, `expected_bits`.
+Public names: `Question`, `Action`, `Ask`, `Asker`, `expected_bits`, `updated`, `squeeze`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -139,3 +139,48 @@ def _why(question: Question, action: Action, bits: float) -> str:
     )
     what = f" of {action.outcome}" if action.outcome else ""
     return f"{told}{what}: {bits:.2f} of {open_bits:.2f} bits open"
+
+
+def updated(question: Question, action: Action, measured: float) -> dict[str, float]:
+    """Probabilities of the hypotheses once the action was done and gave `measured`."""
+    log_odds = {}
+    for name, prior in question.hypotheses.items():
+        mean, std = action.outcomes[name]
+        log_odds[name] = math.log(max(prior, 1e-300)) - 0.5 * ((measured - mean) / std) ** 2 - math.log(std)
+    most = max(log_odds.values())
+    weights = {name: math.exp(value - most) for name, value in log_odds.items()}
+    total = sum(weights.values())
+    return {name: weight / total for name, weight in weights.items()}
+
+
+def squeeze(
+    curves: Mapping[str, Callable[[float], float]],
+    current_a: float,
+    *,
+    harder: float = 2.0,
+    force_std: float = 0.3,
+    current_std: float = 0.05,
+    between_n: tuple[float, float] = (1e-4, 1e3),
+) -> Action:
+    """Press `harder` times as hard: what the total current then does, under curves of current against force.
+
+    Each hypothesis explains the present current by a force of its own, where its curve, which must rise, has
+    it; the outcome is ln of the current over the present one. force_std: of ln of how much harder it really
+    was, for the controller's measure of force may be crude (paper 4.5, fig. 8); current_std: of ln of the
+    current, as sheets repeat. Raises ValueError where a curve doesn't reach the current between these forces.
+    """
+    outcomes = {}
+    for name, curve in curves.items():
+        low, high = between_n
+        if not curve(low) < current_a < curve(high):
+            raise ValueError(f"{name}: no force from {low} to {high} N gives {current_a:.3g} A")
+        for _ in range(40):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if curve(middle) < current_a else (low, middle)
+        force = math.sqrt(low * high)
+        slope = math.log(curve(force * harder * 1.01) / curve(force * harder / 1.01)) / (2 * math.log(1.01))
+        outcomes[name] = (
+            math.log(curve(force * harder) / current_a),
+            math.hypot(slope * force_std, current_std),
+        )
+    return Action("squeeze", {"force_ratio": harder}, outcomes, outcome="ln of current over current now")

@@ -5,11 +5,12 @@ Public names: `made`.
 
 from __future__ import annotations
 
+from handtouch.percept.motion import Motion
 from handtouch.percept.percept import Perceiver
 from handtouch.percept.stream import Part, Stream
 
 
-def made(stream: Stream, period_ns: int) -> Perceiver:  # noqa: ARG001
+def made(stream: Stream, period_ns: int) -> Perceiver:
     """Everything that perceives, on a stream of samples that come every `period_ns`."""
-    parts: list[Part] = []
+    parts: list[Part] = [Motion(stream, period_ns)]
     return Perceiver(stream, parts)

@@ -72,6 +72,37 @@ def health_line(health: wire.Health) -> str:
     )
 
 
+def percept_line(percept: wire.Percept) -> str:
+    """What is felt of a contact, how sure, by how much evidence; or what to do, and why."""
+    where = f"{percept.hand}/{percept.link}" if percept.link else percept.hand
+    head = f"{percept.t_ns * 1e-9:14.4f}  {percept.kind:8}  {where:<22}  #{percept.contact:<4}"
+    values = ", ".join(
+        f"{name} {_number(value)}{_spread(percept.values, name)}"
+        for name, value in percept.values.items()
+        if not name.endswith("_std") and value is not None
+    )
+    if percept.kind == "ask":
+        left_s = (percept.expires_ns - percept.t_ns) * 1e-9
+        return (
+            f"{head}  {percept.label} ({values}) within {left_s:.1f} s: {percept.question}? {percept.reason}"
+        )
+    sure = "" if percept.confidence is None else f" {percept.confidence:.0%}"
+    said = f"{percept.label}{sure}" if percept.state == "estimated" else f"{percept.state}: {percept.reason}"
+    evidence = ", ".join(f"{_number(count)} {name}" for name, count in percept.evidence.items())
+    return f"{head}  {said:<16}  {values}" + (f"  [{evidence}]" if evidence else "")
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return "(" + ", ".join(map(_number, value)) + ")"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _spread(values: Mapping[str, Any], name: str) -> str:
+    std = values.get(f"{name}_std")
+    return "" if std is None else f" +- {_number(std)}"
+
+
 def finding_text(finding: Mapping[str, Any]) -> str:
     """What a supervisor found, why it thinks so and what helps, in a sentence; whatever keys are missing."""
     where = finding.get("pad_m")
@@ -88,6 +119,8 @@ def line(message: wire.Message) -> str:
         return contact_line(message)
     if isinstance(message, wire.Health):
         return health_line(message)
+    if isinstance(message, wire.Percept):
+        return percept_line(message)
     head = f"{message.t_ns * 1e-9:14.4f}  "
     if isinstance(message, wire.HandFrame):
         touched = sum(state == wire.PadState.TOUCHED for state in message.state)

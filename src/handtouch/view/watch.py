@@ -60,6 +60,7 @@ class LineDisplay:
     def __init__(self, as_json: bool = False) -> None:
         self._as_json = as_json
         self._printed_ns: dict[tuple[str, str], int] = {}
+        self._felt: dict[tuple[str, str], tuple[str, str]] = {}
         self._health: dict[tuple[str, str], tuple[str, ...]] = {}
         self._alive = True
 
@@ -84,6 +85,14 @@ class LineDisplay:
             if message.event == "update" and since_ns < 1e9 / _UPDATE_LINES_PER_S:
                 return False
             self._printed_ns[pad] = message.t_ns
+        if isinstance(message, wire.Percept):
+            what = (f"{message.kind} {message.hand}", message.link)
+            state = (message.state, message.label)
+            since_ns = message.t_ns - self._printed_ns.get(what, 0)
+            known, self._felt[what] = self._felt.get(what), state
+            if message.kind != "ask" and state == known and since_ns < 1e9 / _UPDATE_LINES_PER_S:
+                return False
+            self._printed_ns[what] = message.t_ns
         return True
 
     def frame(self, alive: bool) -> None:
