@@ -27,7 +27,12 @@ $(VENV)/.run: pyproject.toml requirements.lock | $(BIN)/python
 $(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python
 	@echo "installing handtouch and its tools into $(VENV) ..."
 	@$(PIP) install -c requirements.lock -e '.[dev]'
-	@touch $(VENV)/.run $@
+	@touch $(VENV)/.run $(VENV)/.view $@
+
+$(VENV)/.view: pyproject.toml requirements.lock | $(VENV)/.run
+	@echo "installing what the view follows joints and reads meshes with ..."
+	@$(PIP) install --no-compile -c requirements.lock -e '.[view]'
+	@touch $@
 
 .PHONY: install dev
 install: $(VENV)/.run ## install into .venv what a robot needs
@@ -36,8 +41,8 @@ dev: $(VENV)/.dev ## install into .venv what a developer needs
 # --- use
 
 .PHONY: demo
-demo: $(VENV)/.run ## a simulated hand, the daemon and a live view; half a minute, no hardware
-	@$(BIN)/handtouch demo $(ARGS)
+demo: $(VENV)/.run $(if $(VIEW),$(VENV)/.view) ## a simulated hand, the daemon and a live view; VIEW=1: in the browser too
+	@$(BIN)/handtouch demo $(if $(VIEW),--view) $(ARGS)
 
 # --- test
 

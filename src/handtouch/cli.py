@@ -68,6 +68,9 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     demo.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
     demo.add_argument("--config", type=Path, help="deployment to simulate (default: the shipped hand)")
+    demo.add_argument(
+        "--view", action="store_true", help="show it in the browser too, again and again until Ctrl-C"
+    )
 
     run = command(commands, "run", _run, "serve the pads of a deployment until told to stop")
     _add_config(run)
@@ -101,6 +104,13 @@ def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     style.add_argument("--json", dest="style", action="store_const", const="json", help="JSON lines")
     watch.add_argument("--seconds", type=positive, default=0.0, help="end after so long")
+
+    view = command(commands, "view", _view, "show the hand of a running daemon in the browser, live")
+    add_endpoint(view, LIVE, "stream to listen to")
+    view.add_argument("--host", default="127.0.0.1", help="address to serve the page at (default: 127.0.0.1)")
+    view.add_argument("--port", type=_port, default=5588, help="its port, 0 for a free one (default: 5588)")
+    view.add_argument("--open", action="store_true", help="open the page in this machine's browser")
+    view.add_argument("--seconds", type=positive, default=0.0, help="end after so long")
 
     status = command(commands, "status", _status, "how the daemon, its buses and its pads fare")
     add_endpoint(status, CONTROL, "control endpoint")
@@ -288,6 +298,7 @@ def _demo(asked: argparse.Namespace) -> int:
         plain=asked.plain,
         tolerances=asked.tolerances,
         seed=asked.seed,
+        view=asked.view,
     )
 
 
@@ -320,6 +331,19 @@ def _watch(asked: argparse.Namespace) -> int:
         endpoint=asked.endpoint,
         key=asked.key,
         style=asked.style or "auto",
+        seconds=asked.seconds,
+    )
+
+
+def _view(asked: argparse.Namespace) -> int:
+    from handtouch.view import page
+
+    return page.run(
+        endpoint=asked.endpoint,
+        key=asked.key,
+        host=asked.host,
+        port=asked.port,
+        show=asked.open,
         seconds=asked.seconds,
     )
 
@@ -442,6 +466,12 @@ def _node_id(text: str) -> int:
     if not 1 <= value <= 127:
         raise argparse.ArgumentTypeError(f"{text}: must be a node id, 1 to 127 (0x01 to 0x7F)")
     return value
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text}: must be a port, 0 to 65535")
+    return int(text)
 
 
 def _seed(text: str) -> int:

@@ -1,5 +1,7 @@
 """`handtouch demo`: a simulated hand, the daemon and a live view in one process, on a bus inside it.
 
+With `view` the hand is in the browser too, by a process of its own.
+
 Nothing is needed but this machine, and nothing is in the way of a daemon that runs here already: the bus
 is python-can's `virtual` one and the endpoints take free ports.
 """
@@ -9,9 +11,13 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
+import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Self
 
@@ -24,6 +30,7 @@ from handtouch.simulate.run import SimulatedHand
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import score
 from handtouch.simulate.world import World
+from handtouch.view.page import HOST, PORT
 from handtouch.view.watch import Display, LineDisplay, LiveDisplay, follow
 
 DEPLOYMENT = "utah_mit.toml"
@@ -41,10 +48,12 @@ def run(
     plain: bool = False,
     tolerances: bool = False,
     seed: int = 1,
+    view: bool = False,
 ) -> int:
     """Play the scenario to its end, or for `seconds`, or until Ctrl-C; then compare contacts with the truth.
 
-    Exit status 0, 1 when no contact came through, 2 for a configuration that can't be used.
+    With `view` it is played again and again, until `seconds` are over or Ctrl-C comes. Exit status 0, 1 when
+    no contact came through, 2 for a configuration that can't be used.
     """
     logging.basicConfig(level=logging.ERROR)
     try:
@@ -53,25 +62,30 @@ def run(
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
+    endless = view and seconds is None
+    length_s = float("inf") if endless else seconds or scenario.duration_s + _BOOT_S
+    if view:
+        scenario = scenario.model_copy(update={"repeat": True})
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     sys.setswitchinterval(_GIL_SWITCH_S)
     print("building the simulated hand ...", file=sys.stderr)
-    display = (
-        LineDisplay() if plain or not sys.stdout.isatty() else LiveDisplay("handtouch demo: Ctrl-C ends it")
-    )
-    keeper = _Keeper(display)
+    world = World(seed=seed) if tolerances else World.ideal_parts(seed)
     try:
-        hand = SimulatedHand.open(
-            deployment, scenario, World(seed=seed) if tolerances else World.ideal_parts(seed)
-        )
-        with hand, Daemon(deployment) as daemon, _subscribe(daemon) as messages:
+        hand = SimulatedHand.open(deployment, scenario, world, record=not endless)
+        with hand, Daemon(deployment) as daemon, _subscribe(daemon) as messages, ExitStack() as opened:
+            url = opened.enter_context(_page(daemon)) if view else ""
+            lines = plain or not sys.stdout.isatty()
+            title = f"handtouch demo{f', in the browser at {url}' if url else ''}: Ctrl-C ends it"
+            if lines and url:
+                print(f"in the browser at {url}", file=sys.stderr)
+            keeper = _Keeper(LineDisplay() if lines else LiveDisplay(title), keep=not endless)
             hand.tell_joints(deployment, scenario, daemon.inputs.endpoint)
             hand.start()
             served = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
             served.start()
-            end_s = time.monotonic() + (seconds or scenario.duration_s + _BOOT_S)
+            end_s = time.monotonic() + length_s
             try:
                 with keeper:
                     follow(messages, keeper, lambda: stop.is_set() or time.monotonic() > end_s)
@@ -81,20 +95,42 @@ def run(
     except ValueError as error:  # a scenario for another hand, an EDS that can't be simulated
         print(error, file=sys.stderr)
         return 2
-    print(score(keeper.contacts, hand.truth))
-    return 0 if keeper.contacts else 1
+    if not endless:
+        print(score(keeper.contacts, hand.truth))
+    return 0 if keeper.count else 1
+
+
+@contextmanager
+def _page(daemon: Daemon) -> Iterator[str]:
+    """`handtouch view` of this daemon as a process of its own: the URL of its page; empty: none."""
+    with socket.socket() as probe:
+        taken = probe.connect_ex((HOST, PORT)) == 0
+    command = [sys.executable, "-m", "handtouch", "view", "--key", "", "--port", "0" if taken else str(PORT)]
+    endpoint = daemon.publisher.endpoints["live"]
+    with subprocess.Popen(
+        [*command, "--endpoint", endpoint], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            words = process.stdout.readline().split()
+            yield next((word for word in words if word.startswith("http")), "")
+        finally:
+            process.terminate()
 
 
 class _Keeper:
-    """A display that keeps the contacts it is shown, for the comparison with the truth."""
+    """A display that counts the contacts it is shown, and may keep them, to compare them with the truth."""
 
-    def __init__(self, display: Display) -> None:
+    def __init__(self, display: Display, keep: bool) -> None:
         self.contacts: list[wire.Contact] = []
-        self._display = display
+        self.count = 0
+        self._display, self._keep = display, keep
 
     def take(self, message: wire.Message) -> None:
         if isinstance(message, wire.Contact):
-            self.contacts.append(message)
+            self.count += 1
+            if self._keep:
+                self.contacts.append(message)
         if not (isinstance(message, wire.Service) and isinstance(self._display, LineDisplay)):
             self._display.take(message)
 

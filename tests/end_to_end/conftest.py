@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -147,6 +149,42 @@ class Rig:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+def _missing(why: str) -> None:
+    """A test can't run here; CI must have what it needs."""
+    if os.environ.get("CI") == "true":
+        pytest.fail(f"CI needs this test: {why}")
+    pytest.skip(why)
+
+
+@pytest.fixture(scope="session")
+def javascript(pytestconfig: pytest.Config) -> Path:
+    """Folder with the programs of tests/javascript and their packages, installed once for each lock file."""
+    for name in ("node", "npm"):
+        if shutil.which(name) is None:
+            _missing(f"there is no {name}; on Debian: apt-get install nodejs npm")
+    here = Path(__file__).parents[1] / "javascript"
+    digest = hashlib.sha256((here / "package-lock.json").read_bytes()).hexdigest()[:12]
+    folder = Path(pytestconfig.cache.mkdir(f"javascript-{digest}"))
+    for file in here.iterdir():
+        shutil.copy(file, folder)
+    if not (folder / "node_modules/.package-lock.json").exists():  # npm writes it last
+        install = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
+        done = subprocess.run(install, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            _missing(f"npm can't install the packages of tests/javascript: {done.stderr}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    """The program of a browser."""
+    found = shutil.which("chromium") or shutil.which("google-chrome")
+    if found is None:
+        _missing("there is no chromium; on Debian: apt-get install chromium")
+    assert found is not None
+    return found
 
 
 @pytest.fixture

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import os
-import shutil
 import subprocess
 import threading
 import time
@@ -22,34 +19,14 @@ import zmq
 from handtouch import wire
 from handtouch.client import columns, connect
 
-HERE = Path(__file__).parents[1] / "javascript"
 LONGEST_S = 60.0
 PATTERNS = ("contact/*/*", "hand/*", "health/*/*", "raw/*", "service")
 
 
-def _missing(why: str) -> None:
-    if os.environ.get("CI") == "true":
-        pytest.fail(f"CI needs the JavaScript reader: {why}")
-    pytest.skip(why)
-
-
-@pytest.fixture(scope="session")
-def program(pytestconfig: pytest.Config) -> list[str]:
-    """Command that runs the reader, its packages installed once for each package-lock.json."""
-    for name in ("node", "npm"):
-        if shutil.which(name) is None:
-            _missing(f"there is no {name}; on Debian: apt-get install nodejs npm")
-    lock = HERE / "package-lock.json"
-    digest = hashlib.sha256(lock.read_bytes()).hexdigest()[:12]
-    folder = Path(pytestconfig.cache.mkdir(f"javascript-{digest}"))
-    for name in ("package.json", "package-lock.json", "reader.mjs"):
-        shutil.copy(HERE / name, folder)
-    if not (folder / "node_modules/.package-lock.json").exists():  # npm writes it last
-        install = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
-        done = subprocess.run(install, cwd=folder, capture_output=True, text=True, check=False)
-        if done.returncode:
-            _missing(f"npm can't install the reader's packages: {done.stderr}")
-    return ["node", str(folder / "reader.mjs")]
+@pytest.fixture
+def program(javascript: Path) -> list[str]:
+    """Command that runs the reader."""
+    return ["node", str(javascript / "reader.mjs")]
 
 
 class Reader:

@@ -1,6 +1,6 @@
 """How far a point is from the body of a link: negative inside it.
 
-Public names: `distance_m`, `find_mesh`. Meshes are read by Coal, which the extra `handtouch[urdf]` brings.
+Public names: `distance_m`, `find_mesh`, `triangles_of`. Meshes are read by Coal, which the extra `handtouch[urdf]` brings.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _distance(shape: Shape, points: FloatArray, folder: Path) -> FloatArray:
         return _outside(np.abs(points) - np.array(shape.size_m) / 2)
     if shape.kind == "mesh":
         path = find_mesh(shape.file, folder)
-        triangles = _triangles(path, shape.size_m) if path else None
+        triangles = triangles_of(path, shape.size_m) if path else None
         return np.full(len(points), np.inf) if triangles is None else _from_triangles(triangles, points)
     radius, length = shape.size_m
     around, along = np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2]) - length / 2
@@ -66,7 +66,7 @@ def _outside(excess: FloatArray) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def _triangles(path: Path, scale: tuple[float, ...]) -> FloatArray | None:
+def triangles_of(path: Path, scale: tuple[float, ...]) -> FloatArray | None:
     """Corners (k, 3, 3) of a mesh; None where Coal isn't installed or can't read it."""
     try:
         import coal

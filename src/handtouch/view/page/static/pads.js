@@ -1,0 +1,124 @@
+// Every pad unrolled, seen from outside with x0 below, as they lie on the hand: where it is touched and was.
+
+import { CONTACT, colourOf, forceText, lookOf } from "./looks.js";
+
+const TRAIL_S = 4, GAP = 6, LABEL = 26, HEADER = 16;
+
+export class PadsView {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.trails = {};
+    this.boxes = {}; // [left, top, width, height] of each pad in the canvas
+  }
+
+  show(scene) {
+    this.scene = scene;
+    this.trails = {};
+    this.sizes = scene.pads.map(({ outline }) => {
+      const u = outline.map((p) => p[0]), v = outline.map((p) => p[1]);
+      return [Math.max(...u), Math.max(...v) - Math.min(...v)];
+    });
+  }
+
+  // A new place of a contact, or that it ended; `t` in seconds.
+  follow(key, contact, t) {
+    const trail = (this.trails[key] ??= []);
+    if (contact?.pad_m) trail.push({ t, id: contact.id, at: contact.pad_m });
+  }
+
+  draw(state) {
+    if (!this.scene) return;
+    const context = sharp(this.canvas), wide = this.canvas.clientWidth, high = this.canvas.clientHeight;
+    const columns = this.scene.columns, widths = columns.map((c) => Math.max(...c.map((k) => this.sizes[k][1])));
+    const across = widths.reduce((a, b) => a + b, 0);
+    const tall = columns.map((c) => c.reduce((sum, k) => sum + this.sizes[k][0], 0));
+    const most = Math.max(...columns.map((c) => c.length));
+    const k = Math.max(200, Math.min((wide - GAP * (columns.length + 1)) / across, (high - HEADER - most * (LABEL + GAP)) / Math.max(...tall)));
+    let x = (wide - across * k - GAP * (columns.length - 1)) / 2;
+    columns.forEach((column, number) => {
+      const middle = x + (widths[number] * k) / 2;
+      const used = tall[number] * k + column.length * (LABEL + GAP) - GAP;
+      let y = high - used - GAP;
+      if (column.length > 1) this.write(context, digitOf(this.scene.pads[column[0]].link), middle, 11, "#d5dce4", 600);
+      for (const pad of [...column].reverse()) { // the tip on top
+        const size = this.sizes[pad][0] * k;
+        this.drawPad(context, state, pad, middle, y + LABEL + size / 2, k);
+        y += size + LABEL + GAP;
+      }
+      x += widths[number] * k + GAP;
+    });
+  }
+
+  drawPad(context, state, number, middle, centre, k) {
+    const pad = this.scene.pads[number], told = state.pads[pad.key], contact = state.contacts[pad.key];
+    const [long] = this.sizes[number];
+    const place = (u, aside) => [middle - aside * k, centre - (u - long / 2) * k];
+    const half = halfWidth(pad.outline);
+    const onPad = ([u, v]) => place(u, v - half(u)); // seen from outside with x up, y points to the left
+    context.beginPath();
+    pad.outline.forEach(([u, aside]) => context.lineTo(...place(u, aside)));
+    context.closePath();
+    context.fillStyle = "#1a2028";
+    context.fill();
+    context.lineWidth = 1.5;
+    context.strokeStyle = lookOf(told);
+    context.stroke();
+    const trail = (this.trails[pad.key] ?? []).filter((step) => state.t - step.t < TRAIL_S);
+    this.trails[pad.key] = trail;
+    context.lineWidth = 2;
+    for (let j = 1; j < trail.length; j++) {
+      if (trail[j].id !== trail[j - 1].id) continue;
+      context.globalAlpha = 1 - (state.t - trail[j].t) / TRAIL_S;
+      context.strokeStyle = colourOf(number);
+      context.beginPath();
+      context.moveTo(...onPad(trail[j - 1].at));
+      context.lineTo(...onPad(trail[j].at));
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+    const across = this.sizes[number][1];
+    this.boxes[pad.key] = [...place(long, across / 2), across * k, long * k];
+    if (contact?.pad_m) {
+      const [px, py] = onPad(contact.pad_m);
+      context.fillStyle = CONTACT;
+      context.beginPath();
+      context.arc(px, py, 3 + Math.min(6, 2 * Math.sqrt(contact.force_n ?? 0)), 0, 2 * Math.PI);
+      context.fill();
+    }
+    const top = centre - (long / 2) * k - 4, column = this.scene.columns.find((c) => c.includes(number));
+    const name = column.length > 1 ? pad.link.slice(digitOf(pad.link).length + 1) || pad.link : pad.link;
+    this.write(context, name.replaceAll("_", " "), middle, top - (contact ? 12 : 0), "#aeb8c4");
+    if (contact) this.write(context, forceText(contact), middle, top, colourOf(number, 74), 600);
+  }
+
+  write(context, text, x, y, colour, weight = 400) {
+    context.font = `${weight} 11px system-ui, sans-serif`;
+    context.textAlign = "center";
+    context.fillStyle = colour;
+    context.fillText(text, x, y);
+  }
+}
+
+const digitOf = (link) => link.split("_")[0];
+
+// Half the width of an unrolled pad at an arc length.
+function halfWidth(outline) {
+  const upper = outline.slice(0, outline.length / 2);
+  return (u) => {
+    const at = upper.findIndex((p) => p[0] >= u);
+    if (at <= 0) return upper[at === 0 ? 0 : upper.length - 1][1];
+    const [[u0, v0], [u1, v1]] = [upper[at - 1], upper[at]];
+    return v0 + ((v1 - v0) * (u - u0)) / (u1 - u0);
+  };
+}
+
+// A canvas with as many pixels as the screen has there, cleared.
+export function sharp(canvas) {
+  const pixels = window.devicePixelRatio || 1;
+  const wide = Math.round(canvas.clientWidth * pixels), high = Math.round(canvas.clientHeight * pixels);
+  if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
+  const context = canvas.getContext("2d");
+  context.setTransform(pixels, 0, 0, pixels, 0, 0);
+  context.clearRect(0, 0, wide, high);
+  return context;
+}

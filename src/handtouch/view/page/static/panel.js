@@ -1,0 +1,78 @@
+// What is told in words: the daemon, its buses and nodes, messages.
+
+import { LEGEND, LOOK, lookOf, problemOf } from "./looks.js";
+
+const byId = (id) => document.getElementById(id);
+
+function set(id, text) {
+  if (byId(id).textContent !== text) byId(id).textContent = text;
+}
+
+function element(kind, className, text) {
+  const made = document.createElement(kind);
+  made.className = className;
+  made.textContent = text;
+  return made;
+}
+
+export function drawLegend() {
+  for (const [look, text] of LEGEND) {
+    const entry = element("span", "", text), dot = element("i", "dot", "");
+    dot.style.background = LOOK[look];
+    entry.prepend(dot);
+    byId("legend").append(entry);
+  }
+}
+
+export function drawService({ connected, alive, service, scene }) {
+  const waiting = !scene;
+  const trouble = !connected ? "handtouch view has ended: start it again and this page follows"
+    : waiting ? "waiting for the daemon ..."
+    : !alive ? "the daemon is silent: is handtouch run up?" : "";
+  document.body.classList.toggle("silent", Boolean(trouble));
+  set("trouble", trouble);
+  byId("trouble").hidden = !trouble;
+  byId("status").style.background = trouble ? LOOK.lost : LOOK.clear;
+  if (!service) return;
+  const tick = service.tick_us ? `tick ${(service.tick_us / 1000).toFixed(2)} ms` : "";
+  const supervisor = service.supervisor ? `supervisor ${service.supervisor}` : "";
+  set("service", [`handtouch ${service.version}`, `${service.rate_hz} ticks/s`, tick, `${service.drops} dropped`, supervisor].filter(Boolean).join(" · "));
+  byId("buses").replaceChildren(...Object.entries(service.buses).map(([name, bus]) => {
+    const ill = bus.state !== "active" || bus.problem;
+    const line = element("div", ill ? "ill" : "", `${name} ${bus.state}, load ${Math.round(100 * bus.load)} %${bus.problem ? `: ${bus.problem}` : ""}`);
+    const load = element("b", "load", ""), part = element("i", "", "");
+    part.style.width = `${Math.min(100, 100 * bus.load)}%`;
+    load.append(part);
+    line.append(load);
+    return line;
+  }));
+}
+
+export function drawNodes({ scene, pads }) {
+  if (!scene) return;
+  const up = scene.pads.filter((pad) => pads[pad.key]?.node === "operational").length;
+  set("up", `${up} of ${scene.pads.length} operational`);
+  byId("nodes").replaceChildren(...scene.pads.map((pad) => {
+    const told = pads[pad.key], chip = element("span", "", pad.link.replaceAll("_", " "));
+    const dot = element("i", "dot", "");
+    dot.style.background = lookOf(told);
+    chip.prepend(dot);
+    if (told?.node && told.node !== "operational") chip.append(element("em", "", told.node));
+    chip.title = `${pad.link}, ${pad.where}: ${told ? `${told.state}, ${told.node ?? "?"}, ${told.hz ?? 0} samples/s` : "unknown"}${told && problemOf(told) ? `\n${problemOf(told)}` : ""}`;
+    return chip;
+  }));
+}
+
+export function drawMessages({ messages }) {
+  const newest = [...messages].reverse();
+  byId("messages").replaceChildren(...newest.map(({ at_s, text, look }) => {
+    const line = element("li", "", ""), time = at_s ? new Date(1000 * at_s).toLocaleTimeString("en-GB") : "";
+    const [name, ...rest] = text.split(": ");
+    line.style.borderColor = LOOK[look] ?? LOOK.starting;
+    line.append(element("time", "", time));
+    if (rest.length) line.append(element("b", "", name), document.createTextNode(` ${rest.join(": ")}`));
+    else line.append(document.createTextNode(text));
+    return line;
+  }));
+  byId("quiet").hidden = messages.length > 0;
+}
