@@ -49,7 +49,8 @@ class PageServer:
         names = {host, "localhost", "127.0.0.1", "[::1]"}
         self.hosts = {f"{name}:{port}" for name in names} if _is_loopback(host) else None
         """what pages may call us: another name is a page from elsewhere that was led here (DNS rebinding)"""
-        threading.Thread(target=self._http.serve_forever, name="handtouch-page", daemon=True).start()
+        serve = partial(self._http.serve_forever, poll_interval=0.1)
+        threading.Thread(target=serve, name="handtouch-page", daemon=True).start()
 
     def tell(self) -> None:
         """Wake the threads of the pages."""
