@@ -10,6 +10,7 @@ from pathlib import Path
 
 from handtouch import __version__
 
+GRIPPER = "tcp://127.0.0.1:5590"
 LIVE = "tcp://127.0.0.1:5580"
 CONTROL = "tcp://127.0.0.1:5581"
 
@@ -79,8 +80,16 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     simulate = command(commands, "simulate", _simulate, "simulated nodes for a deployment, on its real buses")
     _add_config(simulate)
     _add_bus(simulate)
-    simulate.add_argument(
+    playing = simulate.add_mutually_exclusive_group()
+    playing.add_argument(
         "--scenario", type=Path, help="touches, faults and swaps to play (default: the session, or a tour)"
+    )
+    playing.add_argument(
+        "--gripper",
+        nargs="?",
+        const=GRIPPER,
+        metavar="ENDPOINT",
+        help=f"a gripper that is commanded there, for deployments like two_finger.toml (default: {GRIPPER})",
     )
     simulate.add_argument("--truth", type=Path, help="write what really happened to this file, as JSON lines")
     simulate.add_argument("--seconds", type=positive, help="end after so long (default: on Ctrl-C)")
@@ -317,6 +326,7 @@ def _simulate(asked: argparse.Namespace) -> int:
         asked.config,
         buses=tuple(asked.bus),
         scenario=asked.scenario,
+        gripper=asked.gripper,
         truth=asked.truth,
         world=world,
         seconds=asked.seconds,

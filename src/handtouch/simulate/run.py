@@ -26,6 +26,8 @@ from handtouch.canbus.nodes import checked
 from handtouch.canbus.port import BusError, open_bus
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
+from handtouch.simulate.gripper import GripperPlay
+from handtouch.simulate.gripper_service import GripperService
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.joints import JointFeed
 from handtouch.simulate.play import Play
@@ -91,6 +93,11 @@ class SimulatedHand:
 
             feed = JointFeed(deployment, scenario.moved, since_s, endpoint)
             self._opened.callback(feed.close)
+
+    def obey(self, play: GripperPlay, endpoint: str) -> None:
+        """Take commands for the gripper that is being played, from now on; ValueError as `GripperService`."""
+        service = GripperService(play.world, self._stages[0].start.peek_s, endpoint)
+        self._opened.callback(service.close)
 
     def stop(self) -> None:
         """Silence all nodes and shut the buses down, for good."""
@@ -211,6 +218,7 @@ def run(
     *,
     buses: tuple[str, ...] = (),
     scenario: Path | None = None,
+    gripper: str | None = None,
     truth: Path | None = None,
     world: World | None = None,
     seconds: float | None = None,
@@ -219,7 +227,8 @@ def run(
     """Simulate the nodes of a deployment until `seconds` have passed, `stop` is set, or a signal comes.
 
     Without `stop`, SIGINT and SIGTERM end it. Without a scenario the shipped session is played if the
-    deployment has its links, else a tour over the pads. `buses` put the deployment on other wires, as
+    deployment has its links, else a tour over the pads; with `gripper`, an endpoint, what commands from there
+    do. `buses` put the deployment on other wires, as
     `config.with_bus` has it. Exit status 0, 1 for a bus or file that can't be opened, 2 for a mistake in
     the deployment or scenario.
     """
@@ -228,7 +237,11 @@ def run(
         for other in buses:
             deployment = config.with_bus(deployment, other)
         checked(deployment, str(config_path))
-        played = Scenario.load(scenario) if scenario else _usual(deployment)
+        if gripper and (truth or (world and world.sheet)):
+            raise ValueError(
+                "--gripper can't go with --truth and --sheet: both need to know what will happen"
+            )
+        played = _played(deployment, scenario, gripper, str(config_path))
         hand = SimulatedHand.open(deployment, played, world or World.ideal_parts(), record=truth is not None)
     except BusError as error:
         print(error, file=sys.stderr)
@@ -237,6 +250,12 @@ def run(
         print(error, file=sys.stderr)
         return 2
     with hand, contextlib.ExitStack() as stack:
+        try:
+            if isinstance(played, GripperPlay) and gripper:
+                hand.obey(played, gripper)
+        except ValueError as error:
+            print(error, file=sys.stderr)
+            return 1
         try:
             file = stack.enter_context(truth.open("w", encoding="utf-8")) if truth else None
         except OSError as error:
@@ -290,6 +309,12 @@ def _status(hand: SimulatedHand, deployment: config.Deployment, since_s: float, 
         if names := [bus.name for bus in deployment.buses if bus.name in silent and bus.sync == sync]:
             parts.append(f'no SYNC yet: on {", ".join(names)} {sender} (sync = "{sync}")')
     return "  ".join(parts)
+
+
+def _played(deployment: config.Deployment, scenario: Path | None, gripper: str | None, file: str) -> Play:
+    if gripper:
+        return GripperPlay.of(deployment, file)
+    return Scenario.load(scenario) if scenario else _usual(deployment)
 
 
 def _usual(deployment: config.Deployment) -> Scenario:
