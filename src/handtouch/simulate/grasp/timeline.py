@@ -169,12 +169,13 @@ class _OnPad:
         begins = on[gaps]
         ends = on[np.append(gaps[1:] - 1, len(on) - 1)] + 1 if len(on) else on
         looked = np.unique(np.concatenate([on[::_KNOT_STEPS], begins, ends]))
-        return looked * STEP_S, np.concatenate([begins, ends]) * STEP_S, begins * STEP_S
+        of_s = [np.asarray(steps * STEP_S, np.float64) for steps in (looked, np.append(begins, ends), begins)]
+        return of_s[0], of_s[1], of_s[2]
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Places (depth, 2, n), forces (depth, n) [N], 0 where nothing presses, and radii (depth, n) [m]."""
-        of, steps, lanes = self.timeline.of, self.timeline.steps(times_s), range(self.depth)
+        of, steps, lanes = self.timeline.of, self.timeline.steps(times_s), np.arange(self.depth)
         force = of.force_n[steps, self.row][:, lanes].T * (steps >= 0)
         place = of.place[steps, self.row][:, lanes].transpose(1, 2, 0)
-        radius: FloatArray = of.radius_m[steps, self.row][:, lanes].T.copy()
-        return place, np.asarray(force, np.float64), radius
+        radius = of.radius_m[steps, self.row][:, lanes].T
+        return np.asarray(place), np.asarray(force), np.asarray(radius)
