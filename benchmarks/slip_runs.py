@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,14 +45,16 @@ class Taker:
 
 @dataclass(frozen=True)
 class Record:
-    """Of a run, by tick: times [s] (k,), and (k, pads): ln R, force [N], speed [m/s], and its alarms."""
+    """Of a run, by tick: times [s] (k,) from its begin, and (k, pads): ln R, force [N], who runs."""
 
     t_s: FloatArray
     log_odds: FloatArray
     force_n: FloatArray
     running: npt.NDArray[np.bool_]
+    tick_s: FloatArray
+    """(k,) that samples to contacts took, and the next: what perception added"""
+    perceive_s: FloatArray
     percepts: list[wire.Percept]
-    links: list[str]
 
 
 def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:
@@ -90,16 +93,21 @@ def run(grips: list[Grip], world: World, hz: float, seconds: float, from_s: floa
     motion = next(part for part in perceiving._perceiver.parts if isinstance(part, Motion))  # type: ignore[union-attr]
     shape = len(times), model.size
     log_odds, force, running = np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
+    took = np.empty((2, len(times)))
     payload = counts.astype("<i2")
     for k, t_s in enumerate(times.tolist()):
         t_ns = 10**9 + round(t_s * 1e9)
         pipeline.begin(t_ns, t_ns)
         for pad in range(model.size):
             pipeline.slab.write(pad, payload[k, pad].tobytes(), t_ns + 1000 + pad)
+        began_s = time.perf_counter()
         ticked = pipeline.advance(t_ns + round(0.7 * period_ns))
         assert ticked is not None
+        ticked_s = time.perf_counter()
         perceiving.step(ticked)
+        perceived_s = time.perf_counter()
         pipeline.settle()
+        took[:, k] = ticked_s - began_s, perceived_s - ticked_s
         log_odds[k], running[k] = motion.test.log_odds, motion.running
         force[k] = pipeline.tick.columns.force_n
-    return Record(times, log_odds, force, running, taker.percepts, list(model.links))
+    return Record(times - from_s, log_odds, force, running, took[0], took[1], taker.percepts)

@@ -76,17 +76,20 @@ class Motion:
         variance = np.where(variance > _LEAST_M2, variance, np.maximum(whole, _LEAST_M2))  # too light to tell
         usable = np.isfinite(place).all(axis=1) & np.isfinite(variance).all(axis=1)
         force = np.where(np.isfinite(force), force, self._force[sample.pads])
+        press = np.log(np.maximum(sample["current_a"], 1e-12))
+        usable &= np.isfinite(press)
         new = np.isin(sample.pads, began)
         self._begin(sample.pads[new], place[new], variance[new], force[new], sample.t_ns[new])
+        self.test.begin(sample.pads[new], place[new], press[new])
         dt_s = np.asarray((sample.t_ns - self._last_ns[sample.pads]) * 1e-9, dtype=np.float64)
         go = usable & ~new & (dt_s > 0)
         if np.count_nonzero(go):
             pads = sample.pads[go]
             self._last_ns[pads] = sample.t_ns[go]
             self._follow(pads, dt_s[go], place[go], variance[go], force[go])
-            alarm = self.test.step(pads, dt_s[go], place[go], variance[go], force[go])
+            alarm = self.test.step(pads, dt_s[go], place[go], variance[go], press[go])
             self._start(pads[alarm & ~self.running[pads]], stream)
-            self._settle(pads, dt_s[go], place[go], force[go])
+            self._settle(pads, dt_s[go], place[go], press[go])
         return [
             percept
             for pad, t_ns in zip(sample.pads.tolist(), sample.t_ns.tolist(), strict=True)
@@ -130,7 +133,6 @@ class Motion:
     ) -> None:
         if not len(pads):
             return
-        self.test.begin(pads, place, force)
         self._place[pads, :, 0], self._place[pads, :, 1] = place, 0.0
         self._cov[pads] = 0.0
         self._cov[pads, :, 0, 0], self._cov[pads, :, 1, 1] = variance, 0.01**2
@@ -180,7 +182,7 @@ class Motion:
             self.test.runs(np.array([pad]))
             self._quiet_s[pad] = 0.0
 
-    def _settle(self, pads: IntArray, dt_s: FloatArray, place: FloatArray, force: FloatArray) -> None:
+    def _settle(self, pads: IntArray, dt_s: FloatArray, place: FloatArray, press: FloatArray) -> None:
         """What has run and stands has come to rest: the test begins anew there."""
         if not np.count_nonzero(self.running[pads]):
             return
@@ -191,7 +193,7 @@ class Motion:
         rests = self.running[pads] & (self._quiet_s[pads] > _RUNS_S)
         if np.count_nonzero(rests):
             self.running[pads[rests]] = False
-            self.test.begin(pads[rests], place[rests], force[rests], keep=True)
+            self.test.begin(pads[rests], place[rests], press[rests], keep=True)
 
     def _tell(self, stream: Stream, pad: int, t_ns: int) -> Percept | None:
         """What is to be told of a contact now, if anything."""
@@ -232,7 +234,7 @@ class Motion:
 
     def _leave_probability(self, pad: int) -> float:
         """Of the force being gone in a moment, at the rate at which it falls."""
-        ahead = self._force[pad] + _LEAVES_S * self._rate[pad]
+        ahead = self._force[pad] + (_LEAVES_S + _RATE_S) * self._rate[pad]  # smoothing lags behind
         std = max(_LEAVES_S * 0.3 * abs(self._rate[pad]), 0.03 * self._force[pad], 1e-3)
         return 0.5 * math.erfc(ahead / (std * math.sqrt(2)))
 

@@ -1,7 +1,8 @@
 """When does a contact begin to slide? A sequential test on where it is, with a stated rate of false alarms.
 
 While a contact sticks, its centroid is modelled, along x and along y, as a level that hardly moves, plus a
-part that follows the force (the fingertip rolls and flattens when it presses harder), plus a smooth wander
+part that follows how hard it is pressed (the fingertip rolls and flattens; ln of the total current tells it,
+which neither jumps nor flattens where the force is at the end of its range), plus a smooth wander
 of some hertz (tremor; Matern 3/2), plus the noise of the channels: a Kalman filter, its innovations white.
 Sliding from some sample on adds a ramp. What ramps that began at several past times would have done to the
 innovations is carried along (A. Willsky, H. Jones 1976), which gives the likelihood ratio of each such onset;
@@ -25,7 +26,7 @@ BoolArray = NDArray[np.bool_]
 
 _SPEEDS = np.array([1e-3, 5e-3, 30e-3])  # standard deviations of the prior of each component [m/s]
 _BEGINS_M = 50e-6  # how far a level may be from its first sample
-_FORCE_PART = 0.02  # of a sample, in what is known of the noise of forces
+_PRESS_PART = 0.02  # of a sample, in what is known of the noise of that
 _ONSETS = 96
 _ONSET_S = 0.005
 _LEVEL, _WANDER, _COUPLING, _STATES = 0, slice(1, 3), 3, 4
@@ -45,8 +46,8 @@ class Grip:
     """corner frequency of that"""
     learn_s: float = 1.0
     """time constant of learning it"""
-    coupling_m_per_n: float = 0.15e-3
-    """standard deviation of how far a newton more moves the centroid"""
+    coupling_m: float = 0.7e-3
+    """standard deviation of how far e times the current moves the centroid"""
     coupling_rate: float = 0.3
     """of that, what changes in a second"""
 
@@ -71,11 +72,11 @@ class SlipTest:
         self._stride = max(1, round(_ONSET_S / period_s))
         self._state = np.zeros((pads, 2, _STATES))
         self._cov = np.zeros((pads, 2, _STATES, _STATES))
-        self._force0 = np.zeros(pads)
+        self._press0 = np.zeros(pads)
         self._wander = np.zeros((pads, 2))  # ln of its variance
         self._wander_then = np.zeros((pads, 2))
-        self._forces = np.zeros((pads, 2))  # the last two
-        self._force_noise = np.zeros(pads)  # variance of what is new in a force with every sample
+        self._pressed = np.zeros((pads, 2))  # the last two
+        self._press_noise = np.zeros(pads)  # variance of what is new in it with every sample
         self._steps = np.zeros(pads, dtype=np.int64)
         shape = (pads, 2, _ONSETS)
         self._ramp = np.zeros((pads, _ONSETS))  # s since each onset, 0: none yet
@@ -83,20 +84,20 @@ class SlipTest:
         self._gain = np.zeros(shape)  # sum of f nu / S
         self._information = np.zeros(shape)  # sum of f^2 / S
 
-    def begin(self, pads: IntArray, place: FloatArray, force: FloatArray, keep: bool = False) -> None:
-        """Contacts (k,) begin at places (k, 2) with forces (k,), or stick again (`keep`: what is learnt)."""
+    def begin(self, pads: IntArray, place: FloatArray, press: FloatArray, keep: bool = False) -> None:
+        """Contacts (k,) begin at places (k, 2), pressed so hard (k,), or stick again (`keep` what is learnt)."""
         self._state[pads, :, _LEVEL], self._state[pads, :, _WANDER] = place, 0.0
         cov = np.zeros((len(pads), 2, _STATES, _STATES))
         cov[:, :, _LEVEL, _LEVEL] = _BEGINS_M**2
-        cov[:, :, _COUPLING, _COUPLING] = self.grip.coupling_m_per_n**2
+        cov[:, :, _COUPLING, _COUPLING] = self.grip.coupling_m**2
         self._state[pads, :, _COUPLING] = 0.0
         self._wander[pads] = self._wander_then[pads] if keep else 2 * np.log(self.grip.wander_m)
         if not keep:
-            self._force_noise[pads] = 0.0
-        self._forces[pads] = force[:, None]
+            self._press_noise[pads] = 0.0
+        self._pressed[pads] = press[:, None]
         cov[:, :, _WANDER, _WANDER] = np.exp(self._wander[pads])[:, :, None, None] * self._still
         self._cov[pads] = cov
-        self._force0[pads] = force
+        self._press0[pads] = press
         self._steps[pads] = 0
         self._ramp[pads] = 0.0
         self._bias[:, pads] = 0.0
@@ -108,11 +109,11 @@ class SlipTest:
         self._wander_then[pads] = self._wander[pads]
 
     def step(
-        self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, force: FloatArray
+        self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray
     ) -> BoolArray:
         """Take in samples (k,) that follow those before by dt (k,): places (k, 2), variances of their noise
-        (k, 2), forces (k,). Returns which raise an alarm (k,)."""
-        gain, innovation, variance, forward, row = self._filter(pads, dt_s, place, noise_m2, force)
+        (k, 2), ln of currents (k,). Returns which raise an alarm (k,)."""
+        gain, innovation, variance, forward, row = self._filter(pads, dt_s, place, noise_m2, press)
         ramp = self._open(pads, dt_s)
         level, wander, speed, coupling = self._bias[:, pads]
         stays, comes, slows, keeps = forward.reshape(-1, 4).T[:, :, None, None]
@@ -126,7 +127,7 @@ class SlipTest:
         return self._judge(pads)
 
     def _filter(
-        self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, force: FloatArray
+        self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """One step of the Kalman filter: gains (k, 2, states), innovations and variances (k, 2), what becomes
         of wander (k, 2, 2), and the row (k, states) of the place."""
@@ -139,13 +140,13 @@ class SlipTest:
         cov[:, :, _LEVEL, _LEVEL] += (grip.level_m**2 * dt_s)[:, None]
         renewed = self._still - forward @ self._still @ turned
         cov[:, :, _WANDER, _WANDER] += np.exp(self._wander[pads])[:, :, None, None] * renewed[:, None]
-        coupling = (grip.coupling_m_per_n * grip.coupling_rate) ** 2
+        coupling = (grip.coupling_m * grip.coupling_rate) ** 2
         cov[:, :, _COUPLING, _COUPLING] += (coupling * dt_s)[:, None]
         row = np.zeros((len(pads), _STATES))
-        row[:, :2], row[:, _COUPLING] = 1.0, force - self._force0[pads]
+        row[:, :2], row[:, _COUPLING] = 1.0, press - self._press0[pads]
         across = (cov @ row[:, None, :, None])[..., 0]
         vague = state[:, :, _COUPLING] ** 2 + cov[:, :, _COUPLING, _COUPLING]
-        variance = np.einsum("kai,ki->ka", across, row) + noise_m2 + vague * self._noise(pads, force)[:, None]
+        variance = np.einsum("kai,ki->ka", across, row) + noise_m2 + vague * self._noise(pads, press)[:, None]
         innovation = place - np.einsum("kai,ki->ka", state, row)
         gain = across / variance[:, :, None]
         self._state[pads] = state + gain * innovation[:, :, None]
@@ -156,14 +157,14 @@ class SlipTest:
         self._wander[pads] = np.clip(learnt, least, most)
         return gain, innovation, variance, forward, row
 
-    def _noise(self, pads: IntArray, force: FloatArray) -> FloatArray:
-        """Variance (k,) of the noise of forces, from second differences: tremor is far slower."""
-        before, last = self._forces[pads].T
-        bend = (force - 2 * last + before) ** 2 / 6
-        part = np.maximum(1 / (1 + self._steps[pads]), _FORCE_PART)
-        self._force_noise[pads] += part * (bend - self._force_noise[pads])
-        self._forces[pads, 0], self._forces[pads, 1] = last, force
-        return np.asarray(self._force_noise[pads])
+    def _noise(self, pads: IntArray, press: FloatArray) -> FloatArray:
+        """Variance (k,) of the noise of that, from second differences: tremor is far slower."""
+        before, last = self._pressed[pads].T
+        bend = (press - 2 * last + before) ** 2 / 6
+        part = np.maximum(1 / (1 + self._steps[pads]), _PRESS_PART)
+        self._press_noise[pads] += part * (bend - self._press_noise[pads])
+        self._pressed[pads, 0], self._pressed[pads, 1] = last, press
+        return np.asarray(self._press_noise[pads])
 
     def _forward(self, dt_s: FloatArray) -> FloatArray:
         """What becomes of wander and its speed in dt (k,): (k, 2, 2)."""

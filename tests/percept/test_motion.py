@@ -1,0 +1,224 @@
+"""What a contact does, in words and probabilities: it sticks, slides, rolls, leaves; and what that costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch.percept.ask import Action, Question
+from handtouch.percept.motion import CLASSES, Motion
+from handtouch.percept.percept import Perceiver
+from handtouch.percept.stream import KINDS, Percept, Sample, Stream
+
+FloatArray = NDArray[np.float64]
+PERIOD_NS, NOISE_M = 5_000_000, 8e-6
+Way = Callable[[float], float]
+
+
+class Held:
+    """Contacts at places on pads, moved along x, on links that move in the palm."""
+
+    def __init__(self, pads: int = 1, seed: int = 1) -> None:
+        self.stream = Stream(pads)
+        self.motion = Motion(self.stream, PERIOD_NS)
+        self.perceiver = Perceiver(self.stream, [self.motion])
+        wanted = np.zeros((len(KINDS), pads), dtype=np.bool_)
+        wanted[KINDS.index("motion")] = True
+        self.perceiver.want(wanted, np.ones(pads, dtype=np.bool_))
+        self.asks: list[str] = []
+        self._rng = np.random.default_rng(seed)
+        self._k = 0
+
+    def feel(
+        self, seconds: float, along_m: Way, force: Way = lambda _: 2.0, links_m: Sequence[Way] = ()
+    ) -> list[Percept]:
+        """What is told of it. along_m: the first pad's centroid; links_m: of links, along x in the palm."""
+        told = []
+        pads = np.arange(self.stream.size)
+        for _ in range(round(seconds * 1e9 / PERIOD_NS)):
+            t_s, self._k = self._k * PERIOD_NS * 1e-9, self._k + 1
+            t_ns = np.full(len(pads), 10**9 + self._k * PERIOD_NS)
+            sample = Sample(pads, t_ns, (pads + 1).astype(np.uint32))
+            place = NOISE_M * self._rng.standard_normal((len(pads), 2))
+            place[0, 0] += along_m(t_s)
+            sample["pad_m"] = place
+            sample["pad_noise_m2"] = np.tile(NOISE_M**2 * np.eye(2), (len(pads), 1, 1))
+            sample["covariance_m2"] = np.tile(NOISE_M**2 * np.eye(3), (len(pads), 1, 1))
+            sample["force_n"] = np.full(len(pads), force(t_s))
+            sample["current_a"] = 1e-3 * sample["force_n"]
+            if links_m:
+                on_link = np.hstack([place, np.zeros((len(pads), 1))])
+                sample["position_m"] = on_link
+                link = np.zeros((len(pads), 3))
+                link[:, 0] = [way(t_s) for way in links_m]
+                link[:, 1] = 0.03 * pads
+                sample["palm_position_m"] = on_link + link
+                sample["palm_normal"] = np.tile([0.0, 0.0, 1.0], (len(pads), 1))
+                sample["palm_rotation"] = np.tile(np.eye(3), (len(pads), 1, 1))
+            found, asks = self.perceiver.step(sample, np.zeros(0, np.intp), int(t_ns[0]))
+            told += [percept for percept in found if percept.pad == 0]
+            self.asks += [ask.action.do for ask in asks]
+        return told
+
+
+def still(_: float) -> float:
+    return 0.0
+
+
+def ramp(from_s: float, speed: float) -> Way:
+    return lambda t_s: speed * max(0.0, t_s - from_s)
+
+
+def test_a_firm_contact_sticks_and_says_so_twenty_times_a_second() -> None:
+    told = Held().feel(2.0, still)
+    assert {percept.label for percept in told} == {"sticking"}
+    assert 38 <= len(told) <= 42
+    assert told[-1].probabilities["sticking"] > 0.95
+    assert told[-1].evidence["samples"] == (told[-1].t_ns - 10**9) / PERIOD_NS
+
+
+def test_probabilities_sum_to_one() -> None:
+    for percept in Held().feel(1.5, ramp(1.0, 10e-3)):
+        assert set(percept.probabilities) == set(CLASSES)
+        assert sum(percept.probabilities.values()) == pytest.approx(1.0)
+
+
+def test_a_slip_is_told_at_once_with_its_velocity_and_way() -> None:
+    told = Held().feel(1.2, ramp(1.0, 20e-3))
+    first = next(percept for percept in told if percept.label == "sliding")
+    assert first.at_once
+    assert (first.t_ns - 10**9) * 1e-9 < 1.03
+    last = told[-1]
+    assert last.values["velocity_m_per_s"] == pytest.approx([20e-3, 0.0], abs=4e-3)
+    since_s = last.t_ns * 1e-9 - 2.0
+    assert last.values["slipped_m"] == pytest.approx(since_s * 20e-3, rel=0.2)
+
+
+def test_what_has_slipped_and_rests_sticks_again() -> None:
+    told = Held().feel(2.5, lambda t_s: min(20e-3 * max(0.0, t_s - 1.0), 4e-3))
+    labels = [percept.label for percept in told]
+    assert "sliding" in labels
+    assert labels[-10:] == ["sticking"] * 10
+    assert told[-1].evidence["slips"] == 1
+
+
+def test_a_force_that_falls_away_is_a_lift_off() -> None:
+    told = Held().feel(1.08, still, force=lambda t_s: 2.0 - 20.0 * max(0.0, t_s - 1.0))
+    assert told[-1].label == "lift-off"
+
+
+def test_a_contact_that_ends_has_lifted_off() -> None:
+    held = Held()
+    held.feel(0.5, still)
+    none = Sample(np.zeros(0, np.intp), np.zeros(0, np.int64), np.zeros(0, np.uint32))
+    (last,), _ = held.perceiver.step(none, np.array([0]), 2 * 10**9)
+    assert (last.label, last.contact) == ("lift-off", 1)
+    assert held.stream.contact[0] == 0
+
+
+def test_ripple_and_tremor_are_sticking() -> None:
+    told = Held().feel(
+        3.0,
+        lambda t_s: 5e-5 * np.sin(2 * np.pi * 3 * t_s) + 1e-5 * np.sin(2 * np.pi * 7 * t_s),
+        force=lambda t_s: 2.0 + 0.5 * np.sin(2 * np.pi * 3 * t_s),
+    )
+    assert {percept.label for percept in told} == {"sticking"}
+
+
+def test_joints_tell_rolling_from_sliding() -> None:
+    """A centroid runs over the pad, and two fingers hold the object still: its link stands or moves."""
+    held = [still, still, still]
+    rolls = Held(3).feel(1.3, ramp(1.0, 15e-3), links_m=held)[-1]
+    assert rolls.label == "rolling"
+    assert rolls.values["object"] == "grasp"
+    slides = Held(3).feel(1.3, ramp(1.0, 15e-3), links_m=[ramp(1.0, -15e-3), still, still])[-1]
+    assert slides.label == "sliding"
+    assert slides.probabilities["sliding"] > 0.95
+    relative = slides.values["relative_m_per_s"]
+    assert relative == pytest.approx([-15e-3, 0.0, 0.0], abs=3e-3)
+
+
+def test_a_hand_that_carries_the_object_along_does_not_slide() -> None:
+    carried = Held(3).feel(1.5, still, links_m=[ramp(1.0, 30e-3)] * 3)
+    assert {percept.label for percept in carried} == {"sticking"}
+
+
+def test_a_single_contact_is_against_an_object_that_stands_still() -> None:
+    told = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[ramp(1.0, -15e-3)])[-1]
+    assert told.values["object"] == "static"
+    assert told.label == "sliding"
+
+
+def test_samples_without_place_or_force_are_survived() -> None:
+    held = Held()
+    held.feel(0.5, still)
+    t_ns = 10**9 + round(0.501e9)
+    sample = Sample(np.array([0]), np.array([t_ns]), np.array([1], np.uint32))
+    held.perceiver.step(sample, np.zeros(0, np.intp), t_ns)
+    assert held.feel(0.5, still)[-1].label in CLASSES
+
+
+class Slow:
+    """A part whose fits are always due."""
+
+    # ruff: noqa: ARG002
+
+    kind = "shape"
+
+    def __init__(self) -> None:
+        self.wanted = np.zeros(2, dtype=np.bool_)
+        self.fitted: list[int] = []
+        self.stepped = 0
+
+    def step(self, stream: Stream, sample: Sample, began: NDArray[np.intp]) -> list[Percept]:
+        self.stepped += 1
+        assert self.wanted[sample.pads].all()
+        return []
+
+    def due(self, stream: Stream, t_ns: int) -> int | None:
+        return 1
+
+    def fit(self, stream: Stream, pad: int, t_ns: int) -> list[Percept]:
+        self.fitted.append(t_ns)
+        return []
+
+    def end(self, stream: Stream, pads: NDArray[np.intp], t_ns: int) -> list[Percept]:
+        return []
+
+    def questions(self, t_ns: int) -> list[Question]:
+        tells = Action("squeeze", {"force_ratio": 2.0}, {"flat": (0.0, 1.0), "round": (9.0, 1.0)})
+        return [Question("area", 0, 1, 2, {"flat": 0.5, "round": 0.5}, [tells])]
+
+
+@pytest.mark.parametrize("period_ns", [1_000_000, 5_000_000])
+def test_slow_parts_get_one_fit_at_a_time_and_a_hundred_a_second_at_most(period_ns: int) -> None:
+    stream, first, second = Stream(2), Slow(), Slow()
+    perceiver = Perceiver(stream, [first, second])
+    wanted = np.ones((len(KINDS), 2), dtype=np.bool_)
+    perceiver.want(wanted, np.ones(2, dtype=np.bool_))
+    for k in range(1, 1 + 10**9 // period_ns):
+        sample = Sample(np.array([1]), np.array([k * period_ns]), np.array([2], np.uint32))
+        perceiver.step(sample, np.zeros(0, np.intp), k * period_ns)
+    together = sorted(first.fitted + second.fitted)
+    assert 90 <= len(together) <= 100
+    assert len(set(together)) == len(together)
+    assert abs(len(first.fitted) - len(second.fitted)) <= 1
+
+
+def test_a_part_sees_only_the_pads_that_it_is_wanted_for() -> None:
+    slow = Slow()
+    perceiver = Perceiver(Stream(2), [slow])
+    wanted = np.zeros((len(KINDS), 2), dtype=np.bool_)
+    wanted[KINDS.index("shape"), 1] = True
+    perceiver.want(wanted, np.zeros(2, dtype=np.bool_))
+    both = Sample(np.array([0, 1]), np.array([1, 1]), np.array([1, 2], np.uint32))
+    _, asks = perceiver.step(both, np.zeros(0, np.intp), 1)
+    only = Sample(np.array([0]), np.array([2]), np.array([1], np.uint32))
+    perceiver.step(only, np.zeros(0, np.intp), 2)
+    assert slow.stepped == 1
+    assert asks == []  # nobody listens to questions
+    perceiver.want(wanted, np.ones(2, dtype=np.bool_))
+    assert [ask.action.do for ask in perceiver.step(both, np.zeros(0, np.intp), 10**9)[1]] == ["squeeze"]

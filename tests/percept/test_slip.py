@@ -1,0 +1,121 @@
+"""The slip test: as few false alarms as it says, soon after the onset, and not for what a firm grip does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch.percept.slip import Grip, SlipTest
+
+FloatArray = NDArray[np.float64]
+DT_S, NOISE_M, FORCE_N = 0.005, 10e-6, 2.0
+
+
+def wandering(pads: int, steps: int, rng: np.random.Generator, grip: Grip, dt_s: float = DT_S) -> FloatArray:
+    """Centroids (steps, pads, 2) as the test's own model of a grip has them, without noise and force."""
+    rate = 2 * np.pi * grip.wander_hz
+    passed = rate * dt_s
+    forward = np.exp(-passed) * np.array([[1 + passed, dt_s], [-rate * passed, 1 - passed]])
+    still = grip.wander_m**2 * np.diag([1, rate**2])
+    root = np.linalg.cholesky(still - forward @ still @ forward.T)
+    state = rng.standard_normal((pads, 2, 2)) @ np.sqrt(still)
+    place = np.empty((steps, pads, 2))
+    for k in range(steps):
+        state = state @ forward.T + rng.standard_normal((pads, 2, 2)) @ root.T
+        place[k] = state[:, :, 0]
+    level = rng.standard_normal(place.shape) * (grip.level_m * np.sqrt(dt_s))
+    return place + level.cumsum(axis=0)
+
+
+def alarms(
+    test: SlipTest, place: FloatArray, force: FloatArray, rng: np.random.Generator
+) -> list[tuple[int, int]]:
+    """Step and pad of every alarm; a contact begins anew after each."""
+    found = []
+    pads = np.arange(place.shape[1])
+    noise = np.full((len(pads), 2), NOISE_M**2)
+    seen = place + NOISE_M * rng.standard_normal(place.shape)
+    press = np.log(force)
+    test.begin(pads, seen[0], press[0])
+    for k in range(1, len(seen)):
+        alarm = test.step(pads, np.full(len(pads), DT_S), seen[k], noise, press[k])
+        again = np.flatnonzero(alarm)
+        found += [(k, pad) for pad in again.tolist()]
+        if len(again):
+            test.begin(again, seen[k][again], press[k][again])
+    return found
+
+
+def test_false_alarms_are_as_rare_as_was_asked() -> None:
+    rng, pads, steps, every_s = np.random.default_rng(1), 60, 300, 1.5
+    grip = Grip()
+    force = np.full((steps, pads), FORCE_N)
+    found = alarms(SlipTest(pads, DT_S, every_s), wandering(pads, steps, rng, grip), force, rng)
+    expected = pads * steps * DT_S / every_s
+    assert len(found) < expected + 3 * np.sqrt(expected)
+    assert len(found) > 0  # else it would be no test of that
+
+
+def test_tremor_and_ripple_of_a_firm_grip_raise_no_alarm() -> None:
+    rng, pads, steps = np.random.default_rng(2), 12, 500
+    t = (np.arange(steps) * DT_S)[:, None, None]
+    tones = rng.uniform(1, 10, (3, pads, 6))
+    waves = [np.sin(2 * np.pi * tones[k] * t + 6 * tones[k]).sum(axis=2) / np.sqrt(3) for k in range(3)]
+    force = FORCE_N * (1 + 0.1 * waves[0])
+    place = 1e-4 * (force - FORCE_N)[:, :, None] + 15e-6 * np.stack(waves[1:], axis=2)
+    assert alarms(SlipTest(pads, DT_S, 600.0), place, force, rng) == []
+
+
+def test_pressing_harder_moves_the_centroid_and_is_no_slip() -> None:
+    rng, pads, steps = np.random.default_rng(3), 10, 500
+    force = np.repeat(np.linspace(1.0, 4.0, steps)[:, None], pads, axis=1)
+    angle = rng.uniform(0, 2 * np.pi, pads)
+    moved = 1e-4 * (force - 1)[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert alarms(SlipTest(pads, DT_S, 600.0), moved, force, rng) == []
+
+
+@pytest.mark.parametrize(("speed_mm_per_s", "most_samples"), [(3.0, 25), (10.0, 6), (30.0, 3), (100.0, 2)])
+def test_a_slip_is_found_within_a_few_samples(speed_mm_per_s: float, most_samples: int) -> None:
+    rng, pads, onset, steps = np.random.default_rng(4), 20, 300, 360
+    place = wandering(pads, steps, rng, Grip())
+    ramp = np.maximum(np.arange(steps) - onset, 0) * DT_S * speed_mm_per_s * 1e-3
+    angle = rng.uniform(0, 2 * np.pi, pads)
+    place += ramp[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    first: dict[int, int] = {}
+    test = SlipTest(pads, DT_S, 600.0)
+    for k, pad in alarms(test, place, np.full((steps, pads), FORCE_N), rng):
+        first.setdefault(pad, k)
+    delays = np.array([first.get(pad, steps) - onset for pad in range(pads)])
+    assert (delays > 0).all()
+    assert np.median(delays) <= most_samples
+
+
+def test_missing_samples_neither_alarm_nor_hide_a_slip() -> None:
+    rng, pads, onset = np.random.default_rng(5), np.arange(10), 300
+    place = wandering(10, 340, rng, Grip()) + NOISE_M * rng.standard_normal((340, 10, 2))
+    place[onset:, :, 0] += (np.arange(40) * DT_S * 20e-3)[:, None]
+    test, noise, force = SlipTest(10, DT_S, 600.0), np.full((10, 2), NOISE_M**2), np.full(10, FORCE_N)
+    test.begin(pads, place[0], force)
+    last, found = 0, np.zeros(10, dtype=np.bool_)
+    for k in range(1, 340):
+        if rng.random() < 0.3:
+            continue
+        alarm = test.step(pads, np.full(10, (k - last) * DT_S), place[k], noise, force)
+        last = k
+        assert k > onset or not alarm.any()
+        found |= alarm
+    assert found.all()
+
+
+def test_onset_and_speed_are_those_of_the_slip() -> None:
+    rng, onset = np.random.default_rng(6), 300
+    place = wandering(1, 330, rng, Grip()) + NOISE_M * rng.standard_normal((330, 1, 2))
+    place[onset:, 0, 1] -= np.arange(30) * DT_S * 20e-3
+    test = SlipTest(1, DT_S, 600.0)
+    pads, one = np.array([0]), np.full(1, DT_S)
+    test.begin(pads, place[0], np.ones(1))
+    for k in range(1, 330):
+        test.step(pads, one, place[k], np.full((1, 2), NOISE_M**2), np.ones(1))
+    assert test.onset_s[0] == pytest.approx(29 * DT_S, abs=3 * DT_S)
+    assert test.speed[0] == pytest.approx([0, -20e-3], abs=1.5e-3)
