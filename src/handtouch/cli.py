@@ -69,6 +69,7 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     demo.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
     demo.add_argument("--config", type=Path, help="deployment to simulate (default: the shipped hand)")
+    _add_grasp(demo)
     demo.add_argument(
         "--view", action="store_true", help="show it in the browser too, again and again until Ctrl-C"
     )
@@ -84,6 +85,7 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     playing.add_argument(
         "--scenario", type=Path, help="touches, faults and swaps to play (default: the session, or a tour)"
     )
+    _add_grasp(playing)
     playing.add_argument(
         "--gripper",
         nargs="?",
@@ -298,6 +300,14 @@ def _add_bus(
     )
 
 
+def _add_grasp(parser: argparse._ActionsContainer) -> None:
+    parser.add_argument(
+        "--grasp",
+        metavar="THING",
+        help="let the hand close on a ball, box, pen or cup in MuJoCo (pip install 'handtouch[mujoco]')",
+    )
+
+
 def _demo(asked: argparse.Namespace) -> int:
     from handtouch import demo
 
@@ -308,6 +318,7 @@ def _demo(asked: argparse.Namespace) -> int:
         tolerances=asked.tolerances,
         seed=asked.seed,
         view=asked.view,
+        grasp=asked.grasp,
     )
 
 
@@ -327,6 +338,7 @@ def _simulate(asked: argparse.Namespace) -> int:
         buses=tuple(asked.bus),
         scenario=asked.scenario,
         gripper=asked.gripper,
+        grasp=asked.grasp,
         truth=asked.truth,
         world=world,
         seconds=asked.seconds,

@@ -23,9 +23,11 @@ from typing import Self
 
 from handtouch import shipped, wire
 from handtouch.client import Subscriber, connect
-from handtouch.config import ConfigError, Deployment, load
+from handtouch.config import Deployment, load
 from handtouch.daemon.daemon import Daemon
 from handtouch.hand import kinematics
+from handtouch.simulate.grasp import played as grasped
+from handtouch.simulate.play import Play
 from handtouch.simulate.run import SimulatedHand
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import score
@@ -49,29 +51,29 @@ def run(
     tolerances: bool = False,
     seed: int = 1,
     view: bool = False,
+    grasp: str | None = None,
 ) -> int:
     """Play the scenario to its end, or for `seconds`, or until Ctrl-C; then compare contacts with the truth.
 
-    With `view` it is played again and again, until `seconds` are over or Ctrl-C comes. Exit status 0, 1 when
-    no contact came through, 2 for a configuration that can't be used.
+    With `grasp`, a thing, the hand grasps that instead. With `view` it is played again and again, until
+    `seconds` are over or Ctrl-C comes. Exit status 0, 1 when no contact came through, 2 for a configuration
+    that can't be used.
     """
     logging.basicConfig(level=logging.ERROR)
     try:
         deployment = _placed(in_process(load(config_path or shipped.path(DEPLOYMENT))))
-        scenario = Scenario.tour(deployment) if config_path else Scenario.load(shipped.path(SCENARIO))
-    except ConfigError as error:
+        world = World(seed=seed) if tolerances else World.ideal_parts(seed)
+        scenario = _scenario(deployment, tour=config_path is not None, grasp=grasp, world=world, repeat=view)
+    except ValueError as error:  # of a file, or of a grasp that can't be
         print(error, file=sys.stderr)
         return 2
     endless = view and seconds is None
     length_s = float("inf") if endless else seconds or scenario.duration_s + _BOOT_S
-    if view:
-        scenario = scenario.model_copy(update={"repeat": True})
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     sys.setswitchinterval(_GIL_SWITCH_S)
     print("building the simulated hand ...", file=sys.stderr)
-    world = World(seed=seed) if tolerances else World.ideal_parts(seed)
     try:
         hand = SimulatedHand.open(deployment, scenario, world, record=not endless)
         with hand, Daemon(deployment) as daemon, _subscribe(daemon) as messages, ExitStack() as opened:
@@ -98,6 +100,14 @@ def run(
     if not endless:
         print(score(keeper.contacts, hand.truth))
     return 0 if keeper.count else 1
+
+
+def _scenario(deployment: Deployment, *, tour: bool, grasp: str | None, world: World, repeat: bool) -> Play:
+    """What is played: a grasp, the tour of another hand, or the session; `repeat`: again and again."""
+    if grasp:
+        return grasped(deployment, grasp, world, repeat=repeat)
+    scenario = Scenario.tour(deployment) if tour else Scenario.load(shipped.path(SCENARIO))
+    return scenario.model_copy(update={"repeat": True}) if repeat else scenario
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from handtouch.canbus.nodes import checked
 from handtouch.canbus.port import BusError, open_bus
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
+from handtouch.simulate.grasp import played as grasped
 from handtouch.simulate.gripper import GripperPlay
 from handtouch.simulate.gripper_service import GripperService
 from handtouch.simulate.hand import VirtualHand
@@ -219,6 +220,7 @@ def run(
     buses: tuple[str, ...] = (),
     scenario: Path | None = None,
     gripper: str | None = None,
+    grasp: str | None = None,
     truth: Path | None = None,
     world: World | None = None,
     seconds: float | None = None,
@@ -228,9 +230,9 @@ def run(
 
     Without `stop`, SIGINT and SIGTERM end it. Without a scenario the shipped session is played if the
     deployment has its links, else a tour over the pads; with `gripper`, an endpoint, what commands from there
-    do. `buses` put the deployment on other wires, as
-    `config.with_bus` has it. Exit status 0, 1 for a bus or file that can't be opened, 2 for a mistake in
-    the deployment or scenario.
+    do; with `grasp`, a thing, what grasping it does, again and again. `buses` put the deployment on other
+    wires, as `config.with_bus` has it. Exit status 0, 1 for a bus or file that can't be opened, 2 for a
+    mistake in the deployment or scenario.
     """
     try:
         deployment = config.load(config_path)
@@ -241,8 +243,13 @@ def run(
             raise ValueError(
                 "--gripper can't go with --truth and --sheet: both need to know what will happen"
             )
-        played = _played(deployment, scenario, gripper, str(config_path))
-        hand = SimulatedHand.open(deployment, played, world or World.ideal_parts(), record=truth is not None)
+        world = world or World.ideal_parts()
+        played = (
+            grasped(deployment, grasp, world, repeat=True)
+            if grasp
+            else _played(deployment, scenario, gripper, str(config_path))
+        )
+        hand = SimulatedHand.open(deployment, played, world, record=truth is not None)
     except BusError as error:
         print(error, file=sys.stderr)
         return 1

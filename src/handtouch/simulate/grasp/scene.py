@@ -58,6 +58,10 @@ class Scene:
         spec: Any = mujoco.MjSpec.from_file(str(Path(hand.urdf)))
         spec.compiler.fusestatic = False
         self.joints = tuple(joint.name for joint in spec.joints)
+        if not any(name.endswith(f"_{end}") for name in self.joints for end in thing.closed_deg):
+            ends = ", ".join(f"_{end}" for end in thing.closed_deg)
+            has = ", ".join(self.joints)
+            raise ValueError(f'hand "{hand.name}" can\'t grasp: joints to close end in {ends}; it has {has}')
         for geom in spec.geoms:
             _thin(mujoco, geom)
         mounts = {pad.link: world.mount(hand.name, pad) for pad in hand.pads}
