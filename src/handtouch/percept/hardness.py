@@ -37,7 +37,8 @@ def closing_m(window: Window, others: Sequence[Window] = ()) -> FloatArray:
         there, facing = _along(other)
         if float(facing @ normal) < _OPPOSED:
             t = np.asarray(window.t_ns - window.t_ns[0], np.float64)
-            moved = moved + np.interp(t, np.asarray(other.t_ns - window.t_ns[0], np.float64), there)
+            when, known = np.asarray(other.t_ns - window.t_ns[0], np.float64), np.isfinite(there)
+            moved = moved + np.interp(t, when[known], there[known])
             break
     return moved
 
@@ -45,11 +46,13 @@ def closing_m(window: Window, others: Sequence[Window] = ()) -> FloatArray:
 def _along(window: Window) -> tuple[FloatArray, FloatArray]:
     """Way of a link's point along the mean normal (k,), and that normal."""
     rotation, place, on_link = window["palm_rotation"], window["palm_position_m"], window["position_m"]
-    fixed = on_link.mean(axis=0)
-    point = place - np.einsum("kij,kj->ki", rotation, on_link - fixed)
-    normal = np.nanmean(window["palm_normal"], axis=0) if len(window) else np.full(3, np.nan)
+    known = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(on_link).all(axis=1))
+    if not len(known):
+        return np.full(len(window), np.nan), np.full(3, np.nan)
+    point = place - np.einsum("kij,kj->ki", rotation, on_link - on_link[known].mean(axis=0))
+    normal = window["palm_normal"][known].mean(axis=0)
     normal = normal / np.linalg.norm(normal)
-    return np.asarray((point - point[-1]) @ normal), normal
+    return np.asarray((point - point[known[-1]]) @ normal), normal
 
 
 class Hardness:

@@ -113,8 +113,6 @@ def classify(
 
 def judge(fits: dict[str, Fit], contacts: int, prior: Prior) -> Verdict:
     """Compare fits of the same contacts."""
-    if contacts < _LEAST_CONTACTS or len(fits) < 2:
-        return Verdict("unestimated", "", f"{contacts} of {_LEAST_CONTACTS} contacts", contacts)
     scores = np.array(
         [fits[n].log_evidence + math.log(max(prior.classes[CLASSES.index(n)], 1e-300)) for n in fits]
     )
@@ -122,7 +120,9 @@ def judge(fits: dict[str, Fit], contacts: int, prior: Prior) -> Verdict:
     probabilities = dict(zip(fits, (weights / weights.sum()).tolist(), strict=True))
     best = max(probabilities, key=probabilities.__getitem__)
     state, label, reason = "estimated", best, ""
-    if fits[best].misfit > _MISFIT:
+    if contacts < _LEAST_CONTACTS:
+        state, label, reason = "unestimated", "", f"{contacts} of {_LEAST_CONTACTS} contacts"
+    elif fits[best].misfit > _MISFIT:
         off = fits[best].misfit
         state, label, reason = "invalid", "", f"none of the shapes: even {best} is {off:.0f} sigma off"
     elif probabilities[best] < prior.sure:

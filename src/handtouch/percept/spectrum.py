@@ -1,10 +1,10 @@
 """Period and roughness of a surface: what the total current does while a contact slides, by distance.
 
-The current's logarithm, less a slow trend, is put on an even grid of distance; its periodogram (A. Schuster,
-1898) is compared with a floor, a power law fitted to the periodogram itself, as sheets flicker more slowly
-than white noise. The highest peak is a period if chance hardly makes one as high, and if it holds all along
-the slide. Its deviation is the Cramer-Rao bound of a sine in such noise. Periods below two steps between
-samples can't be seen: `finest_m`; what is finer may look like a coarser one, unless the speed changed.
+The current's logarithm, less a slow trend, is put on an even grid of distance; a peak of its periodogram (A.
+Schuster, 1898) is compared with its neighbours, as neither sheets nor surfaces are white. It is a period if
+chance hardly makes one as high, and if it holds all along the slide. Its deviation is the Cramer-Rao bound of
+a sine in such noise. Periods below two steps between samples can't be seen: `finest_m`; what is finer may
+look like a coarser one, unless the speed changed.
 
 Public names: `texture`, `Found`, `detrended`, `CLASSES`.
 """
@@ -22,9 +22,11 @@ FloatArray = NDArray[np.float64]
 CLASSES = ("periodic", "rough", "smooth")
 
 _LEAST = 48  # samples
-_PERIODS = 3.0  # of the longest that a slide can tell, at least
+_PERIODS = 4.0  # of the longest that a slide can tell, at least
+_SEARCHED = 3.0  # fewer leak into more
 _PERIODIC_ODDS = 0.05  # prior
 _HOLDS = 0.7
+_BESIDE = 12  # independent frequencies to each side that a peak is compared with
 _TREND = 3  # degree
 _SURE = 0.9
 _PADDED = 4  # finer than the independent frequencies
@@ -81,7 +83,7 @@ def texture(
         reason = f"{1e3 * length:.2g} mm in {len(way)} samples: slide further, or more slowly"
         return Found("unestimated", "", reason, finest_m=finest, longest_m=longest, samples=len(way))
     y = detrended(np.log(current), way / length)
-    peak = _peak(y, way, length, 1 / longest, 1 / finest)
+    peak = _peak(y, way, length, _SEARCHED / length, 1 / finest)
     floor = math.sqrt(peak.white * len(y)) if noise is None else noise
     total = float(y @ y) / len(y)
     roughness = math.sqrt(max(total - floor**2, 0.0))
@@ -160,48 +162,60 @@ class _Peak:
 
 
 def _peak(y: FloatArray, way: FloatArray, length: float, lowest: float, highest: float) -> _Peak:
-    """The highest peak above a floor that is a power of the frequency."""
+    """The highest peak above the mean of its neighbours, and the noise once it is taken out."""
     n = len(y)
-    even = np.interp(np.linspace(0, length, n), way, y)
-    size = 1 << (n - 1).bit_length()
-    power = np.abs(np.fft.rfft(even, _PADDED * size)) ** 2 / n**2
-    frequency = np.arange(len(power)) * ((n - 1) / length / (_PADDED * size))
-    band = (frequency >= lowest) & (frequency <= highest)
-    power, frequency = np.asarray(power[band], np.float64), np.asarray(frequency[band], np.float64)
-    floor = _floor(power, frequency)
-    at = int(np.argmax(power / floor))
-    level = float(power[at] / floor[at])
+    even = np.linspace(0, length, n)
+    power, frequency = _periodogram(np.interp(even, way, y), length, lowest, highest)
+    floor, _ = _neighbours(power)
+    best, amplitude2 = _refined(y, way, float(frequency[int(np.argmax(power / floor))]), 1 / length)
+    wave = np.exp(2j * math.pi * best * way)
+    rest = y - 2 * (wave * np.mean(y * wave.conj())).real
+    power, frequency = _periodogram(np.interp(even, way, rest), length, lowest, highest)
+    floor, count = _neighbours(power)
+    at = min(int(np.searchsorted(frequency, best)), len(frequency) - 1)
+    level = amplitude2 / 4 / float(floor[at])
+    single = (1 + level / count[at]) ** -float(count[at])  # F of 2 and 2 `count` degrees of freedom
     independent = max((highest - lowest) * length, 1.0)
-    chance = -math.expm1(independent * math.log1p(-min(math.exp(-level), 1 - 1e-12)))
-    best, amplitude2 = _refined(y, way, float(frequency[at]), 1 / length)
+    chance = -math.expm1(independent * math.log1p(-min(single, 1 - 1e-12)))
     std = math.sqrt(6 * float(floor[at]) / max(amplitude2, 1e-300)) / (math.pi * length)
     white = float(np.mean(floor[-max(len(floor) // 8, 1) :]))
-    at_end = best < lowest + 0.5 / length
+    at_end = best < 0.98 * _PERIODS / length
     holds = _holds(y, way, best)
     return _Peak(best, std, math.sqrt(amplitude2), amplitude2 / 4, white, min(chance, 1.0), at_end, holds)
+
+
+def _periodogram(
+    even: FloatArray, length: float, lowest: float, highest: float
+) -> tuple[FloatArray, FloatArray]:
+    """|Y|^2 / n^2 of an even grid, and its frequencies from lowest to highest."""
+    n = len(even)
+    size = _PADDED << (n - 1).bit_length()
+    power = np.abs(np.fft.rfft(even, size)) ** 2 / n**2
+    step = (n - 1) / length / size
+    first, last = math.ceil(lowest / step), math.floor(highest / step)
+    frequency = step * np.arange(first, last + 1, dtype=np.float64)
+    return np.asarray(power[first : last + 1], np.float64), frequency
+
+
+def _neighbours(power: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean power of the neighbours of each frequency, and how many of them are independent."""
+    width, hole = _BESIDE * _PADDED, 2 * _PADDED
+    sums = np.concatenate([[0.0], np.cumsum(power)])
+    at, n = np.arange(len(power)), len(power)
+
+    def within(reach: int) -> tuple[FloatArray, FloatArray]:
+        low, high = np.maximum(at - reach, 0), np.minimum(at + reach + 1, n)
+        return sums[high] - sums[low], (high - low).astype(np.float64)
+
+    (wide, many), (near, few) = within(width), within(hole)
+    mean = np.maximum((wide - near) / np.maximum(many - few, 1), 1e-300)
+    return mean, np.maximum((many - few) / (2 * _PADDED), 2.0)
 
 
 def _holds(y: FloatArray, way: FloatArray, frequency: float) -> float:
     quarter = len(y) // 4 * 4
     waves = (y * np.exp(-2j * math.pi * frequency * way))[:quarter].reshape(4, -1).mean(axis=1)
     return float(abs(waves.mean()) ** 2 / max(float((np.abs(waves) ** 2).mean()), 1e-300))
-
-
-def _floor(power: FloatArray, frequency: NDArray[np.floating]) -> FloatArray:
-    """Mean power of noise: a straight line through its logarithm, not steeper than sheets are."""
-    x, z = np.log(frequency), np.log(np.maximum(power, 1e-300))
-    use = np.ones(len(x), np.bool_)
-    for _ in range(2):
-        dx, dz = x[use] - x[use].mean(), z[use] - z[use].mean()
-        slope = min(max(float(dx @ dz) / max(float(dx @ dx), 1e-300), -2.5), 0.0)
-        line = z[use].mean() + slope * (x - x[use].mean())
-        use = z - line < 2.0  # peaks are no floor
-    return np.asarray(np.exp(line + _LOG_MEAN))
-
-
-_LOG_MEAN = 0.8
-"""ln of the mean of exponential numbers less the mean of their logarithms, 0.577, and what leaving out the
-highest takes off it."""
 
 
 def _power_at(y: FloatArray, way: FloatArray, frequency: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ def slide_m(window: Window, others: Sequence[Window] = ()) -> tuple[FloatArray, 
     """Way (k,) of a contact along the line that it slid, and by what it is known: joints, place or nothing.
 
     By joint states it is the way of the link's surface against the object, which moves as the hand's other
-    contacts do on average, and else rests in the palm's frame. By place it is that of the centroid on the pad.
+    By joint states it is that of the link's surface against the object, which moves as the hand's other
     """
     known: list[tuple[FloatArray, str]] = []
     palm = window["palm_position_m"]

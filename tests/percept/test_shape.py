@@ -1,0 +1,169 @@
+"""Shapes by their evidence: the right class, sizes with deviations that hold, and "not enough yet"."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch.field import Rectangle
+from handtouch.percept.ask import expected_bits
+from handtouch.percept.percept import Perceiver
+from handtouch.percept.primitives import CLASSES, SIZES, Verdict, classify
+from handtouch.percept.shape import Shape, pair_distance, point_or_more
+from handtouch.percept.stream import KINDS, Percept, Sample, Stream
+
+FloatArray = NDArray[np.float64]
+Touches = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def touches(kind: str, n: int, seed: int, radius: float = 0.02, patch: float = 1.2) -> Touches:
+    """Places, normals of the pads and covariances of n touches of an object that lies anyhow."""
+    chance = np.random.default_rng(seed)
+    along, angle = chance.uniform(-0.03, 0.03, (n, 2)), chance.uniform(-patch, patch, n)
+    if kind == "flat":
+        outward, points = np.tile([0, 0, 1.0], (n, 1)), np.c_[along, np.zeros(n)]
+    elif kind == "sphere":
+        z, turn = chance.uniform(math.cos(patch), 1, n), chance.uniform(0, 2 * np.pi, n)
+        outward = np.c_[np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z]
+        points = radius * outward
+    else:
+        angle = angle if kind == "cylinder" else angle * 0.7 / patch
+        outward = np.c_[np.zeros(n), np.sin(angle), np.cos(angle)]
+        points = (radius if kind == "cylinder" else 0.0) * outward
+        points[:, 0] = along[:, 0]
+    across = np.eye(3) - outward[:, :, None] * outward[:, None]
+    points = points + 0.5e-3 * np.einsum("nij,nj->ni", across, chance.normal(size=(n, 3)))
+    points += 0.3e-3 * chance.normal(size=(n, 1)) * outward
+    normal = outward + 0.07 * chance.normal(size=(n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    turn, _ = np.linalg.qr(chance.normal(size=(3, 3)))
+    away = 0.05 * chance.normal(size=3)
+    return points @ turn.T + away, -normal @ turn.T, 0.5e-3**2 * turn @ across @ turn.T
+
+
+@pytest.mark.parametrize("kind", CLASSES)
+def test_twenty_touches_tell_the_class_and_size(kind: str) -> None:
+    for seed in range(8):
+        found = classify(*touches(kind, 20, seed))
+        assert found.label == kind
+        if SIZES[kind]:
+            fit = found.fits[kind]
+            assert abs(fit.radius_m - 0.02) < 4 * fit.radius_std_m < 0.008
+
+
+@pytest.mark.parametrize("kind", CLASSES)
+def test_few_touches_are_not_enough_yet(kind: str) -> None:
+    for n in (1, 2):
+        found = classify(*touches(kind, n, 3))
+        assert (found.state, found.label, found.contacts) == ("unestimated", "", n)
+    wrong = [classify(*touches(kind, 3, seed)).label not in ("", kind) for seed in range(20)]
+    assert np.mean(wrong) <= 0.25
+
+
+def test_touches_in_a_row_on_a_plane_make_no_edge() -> None:
+    points, normals, covariances = touches("flat", 30, 5)
+    row = points[0] + np.linspace(0, 0.03, 30)[:, None] * np.cross(normals[0], [0.3, 0.5, 0.8])
+    even = np.tile(normals[0], (30, 1)) + 0.02 * np.random.default_rng(1).normal(size=(30, 3))
+    found = classify(row, even, covariances)
+    assert found.probabilities["edge"] < 1e-3
+    assert found.label == "flat"
+
+
+def test_a_shape_that_is_none_of_them_is_none() -> None:
+    chance = np.random.default_rng(4)
+    normals = chance.normal(size=(20, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    found = classify(0.03 * chance.normal(size=(20, 3)), normals, np.tile(1e-7 * np.eye(3), (20, 1, 1)))
+    assert (found.state, found.label) == ("invalid", "")
+
+
+def test_where_the_object_lies_makes_no_difference() -> None:
+    points, normals, covariances = touches("cylinder", 12, 6)
+    turn, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))
+    plain = classify(points, normals, covariances)
+    moved = classify(points @ turn.T + 0.2, normals @ turn.T, turn @ covariances @ turn.T)
+    assert moved.fits["cylinder"].radius_m == pytest.approx(plain.fits["cylinder"].radius_m, rel=1e-3)
+    assert moved.probabilities == pytest.approx(plain.probabilities, abs=0.02)
+    axis = turn @ plain.fits["cylinder"].direction
+    assert abs(axis @ moved.fits["cylinder"].direction) == pytest.approx(1, abs=1e-3)
+
+
+def test_an_uncertain_touch_counts_less() -> None:
+    points, normals, covariances = touches("sphere", 20, 2)
+    points[0] += 0.01
+    loose = covariances.copy()
+    loose[0] = 0.02**2 * np.eye(3)
+    off = abs(classify(points, normals, loose).fits["sphere"].radius_m - 0.02)
+    assert off < 0.5 * abs(classify(points, normals, covariances).fits["sphere"].radius_m - 0.02)
+
+
+def test_what_is_no_contact_is_refused() -> None:
+    points, normals, covariances = touches("flat", 4, 1)
+    with pytest.raises(ValueError, match="must be"):
+        classify(points, normals[:3], covariances)
+    with pytest.raises(ValueError, match="finite"):
+        classify(points * np.nan, normals, covariances)
+
+
+def explored(kind: str, n: int, seed: int, radius: float = 0.02) -> tuple[list[Percept], Shape, Verdict]:
+    """The part on a stream: one pad touches n places, 60 samples each."""
+    stream, part = Stream(1), Shape(1)
+    perceiver = Perceiver(stream, [part])
+    perceiver.want(np.ones((len(KINDS), 1), np.bool_), np.ones(1, np.bool_))
+    points, normals, covariances = touches(kind, n, seed, radius)
+    told: list[Percept] = []
+    t_ns = 0
+    for contact in range(n):
+        for _ in range(60):
+            t_ns += 10_000_000
+            sample = Sample(np.zeros(1, np.intp), np.array([t_ns]), np.array([contact + 1], np.uint32))
+            sample["palm_position_m"], sample["palm_normal"] = points[contact], normals[contact]
+            sample["palm_covariance_m2"] = covariances[contact]
+            sample["residual"], sample["residual_std"] = np.zeros(1), np.full(1, 0.01)
+            told += perceiver.step(sample, np.zeros(0, np.intp), t_ns)[0]
+    return [p for p in told if p.pad < 0], part, classify(points, normals, covariances)
+
+
+def test_the_part_gathers_touches_and_tells_what_the_fit_tells() -> None:
+    told, _, expected = explored("sphere", 12, 3)
+    assert told[0].state == "unestimated"
+    assert (told[-1].state, told[-1].label) == ("estimated", "sphere")
+    assert told[-1].evidence == {"contacts": 12, "pads": 1}
+    assert told[-1].values["radius_m"] == pytest.approx(expected.fits["sphere"].radius_m, rel=0.05)
+    assert told[-1].probabilities["sphere"] == pytest.approx(expected.probabilities["sphere"], abs=0.05)
+
+
+def test_flat_or_a_large_cylinder_is_a_question_that_sliding_answers() -> None:
+    told, part, _ = explored("flat", 2, 1)
+    assert told[-1].state == "unestimated"
+    (question,) = part.questions(10**9)
+    assert question.hypotheses == told[-1].probabilities
+    assert {action.do for action in question.actions} == {"slide"}
+    bits = max(expected_bits(question, action) for action in question.actions)
+    assert 0.0 < bits <= 2.0
+    assert all(action.amount["distance_m"] == 5e-3 for action in question.actions)
+
+
+@pytest.mark.parametrize(("residual", "label"), [(0.0, "point"), (0.1, "along x"), (-0.1, "along y")])
+def test_one_pads_residual_tells_a_point_from_what_is_long(residual: float, label: str) -> None:
+    noise = np.random.default_rng(1).normal(size=64)
+    chances = point_or_more(residual + 0.01 * noise, np.full(64, 0.01))
+    assert chances[label] > 0.9
+    weak = point_or_more(0.02 + 0.05 * noise[:1], np.full(1, 0.05))
+    assert max(weak.values()) < 0.9
+
+
+@pytest.mark.parametrize("along_y", [False, True])
+def test_the_distance_of_two_points_follows_from_the_residual(along_y: bool) -> None:
+    pad = Rectangle(1.0, 1.0)
+    half = np.array([0.0, 0.05] if along_y else [0.05, 0.0])
+    shares = (pad.fractions(np.array(0.5 + s * half[0]), np.array(0.5 + s * half[1])) / 2 for s in (-1, 1))
+    pair = np.sum(list(shares), axis=0)
+    residual = float(pair[0] + pair[1] - 0.5)  # in the middle a point gives a half
+    distance, std = pair_distance(pad, 0.5, 0.5, residual, abs(residual) / 10)
+    assert distance == pytest.approx(0.1, rel=0.02)
+    assert std == pytest.approx(distance / 20)
+    assert math.isinf(pair_distance(pad, 0.5, 0.5, residual, abs(residual))[1])
