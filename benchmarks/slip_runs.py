@@ -43,7 +43,7 @@ class Taker:
             self.percepts.append(message)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Record:
     """Of a run, by tick: times [s] (k,) from its begin, and (k, pads): ln R, force [N], who runs."""
 
@@ -55,6 +55,8 @@ class Record:
     """(k,) that samples to contacts took, and the next: what perception added"""
     perceive_s: FloatArray
     percepts: list[wire.Percept]
+    load: float = 1.0
+    """force while slipping, as a part of that before"""
 
 
 def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:

@@ -85,7 +85,7 @@ class SlipTest:
         self._information = np.zeros(shape)  # sum of f^2 / S
 
     def begin(self, pads: IntArray, place: FloatArray, press: FloatArray, keep: bool = False) -> None:
-        """Contacts (k,) begin at places (k, 2), pressed so hard (k,), or stick again (`keep` what is learnt)."""
+        """Contacts (k,) begin at places (k, 2), so hard pressed (k,), or stick again: `keep` the tremor."""
         self._state[pads, :, _LEVEL], self._state[pads, :, _WANDER] = place, 0.0
         cov = np.zeros((len(pads), 2, _STATES, _STATES))
         cov[:, :, _LEVEL, _LEVEL] = _BEGINS_M**2
