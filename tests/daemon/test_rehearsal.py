@@ -8,6 +8,7 @@ from handtouch import shipped, wire
 from handtouch.config import load
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pipeline import Pipeline
+from handtouch.daemon.rehearsal import Rehearsal
 from handtouch.wire import PadState
 
 PERIOD_NS = 5_000_000
@@ -30,13 +31,15 @@ def messages(model: PadModel, rehearsed: bool) -> list[list[bytes]]:
     """What a hand with a sliding contact says."""
     outlet = Everything()
     pipeline = Pipeline(model, PERIOD_NS, 0.8, outlet)
+    rehearsal = Rehearsal(pipeline, outlet)
     pipeline.node_state[:] = PadState.CLEAR
     noise = np.random.default_rng(5)
     for step in range(1, 40):
         t_ns = step * PERIOD_NS
         pipeline.begin(t_ns, t_ns)
         if rehearsed:
-            pipeline.rehearse()
+            rehearsal.all()
+            rehearsal.tick()
         counts = np.rint(noise.standard_normal((pipeline.slab.size, 4)))
         if 5 < step < 30:
             counts[3] += (900 + 4 * step, 700 - 4 * step, 800, 600)

@@ -51,6 +51,10 @@ class BusyPoll:
         """The samples of this SYNC were there, or as many as came in time."""
         self._usual_ns += (now_ns - sync_ns - self._usual_ns) // _SMOOTHING
 
+    def expected_ns(self, sync_ns: int) -> int:
+        """When the tick of this SYNC is likely to be."""
+        return sync_ns + self._usual_ns
+
     def sleep_ns(self, sync_ns: int, now_ns: int) -> int:
         """How long to sleep at most while samples of this SYNC are missing."""
         left_ns = sync_ns + self._usual_ns - now_ns

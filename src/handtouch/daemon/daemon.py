@@ -43,6 +43,7 @@ from handtouch.daemon.pacer import Pacer
 from handtouch.daemon.perceive import Perceiving
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
+from handtouch.daemon.rehearsal import Rehearsal
 from handtouch.daemon.report import Report
 from handtouch.daemon.scene import Demand, Needs, Scenes, Wanted
 from handtouch.daemon.security import Gate
@@ -57,6 +58,9 @@ _log = logging.getLogger("handtouch.daemon")
 
 _COLD_NS = 1_000_000
 """After a rest of that length others have had the caches: a tick would take several times as long."""
+_BEFORE_SYNC_NS, _BEFORE_TICK_NS = 400_000, 250_000
+"""When all is rehearsed, and the tick once more: the nearer, the more of it is still in the caches."""
+_NEVER_NS = 1 << 62
 _HOUSE_NS = 4_000_000
 """Least time between two looks at nodes, buses, health and requests: a tick every millisecond needn't."""
 _GIL_SWITCH_S = 0.0005  # a thread that boots a node or builds a model lets the hot one in after so long
@@ -78,10 +82,12 @@ class Daemon:
         beside: Path | None = None,
     ) -> None:
         self.deployment = deployment
-        self._rested_ns = 0
+        self._rehearse_ns = _NEVER_NS
+        self._rehearsed = False  # since the last tick
         self._house_ns = 0  # when to look after the rest again
         settings = deployment.daemon
         period_ns = round(settings.sync_period_ms * 1e6)
+        self._busy_poll = BusyPoll(round(settings.busy_poll_us * 1e3))
         with ExitStack() as opened:
             context = opened.enter_context(zmq.Context())
             self.gate = Gate(context, Path(settings.keys) if settings.keys else None)
@@ -103,6 +109,7 @@ class Daemon:
                 robots,
             )
             self.pipeline.frames.joints_at = self.inputs.joints_at
+            self.rehearsal = Rehearsal(self.pipeline, self.publisher)
             self.perceiving = Perceiving(self.pipeline, self.publisher, self.publisher.run)
             self.inputs.refer = self.pipeline.tick.refer
             self.publisher.present.update(self.pipeline.messages.present())
@@ -192,7 +199,7 @@ class Daemon:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
         by_descriptor = {port.fileno(): port for port in ports}
         descriptors = list(by_descriptor)
-        busy_poll = BusyPoll(round(self.deployment.daemon.busy_poll_us * 1e3))
+        busy_poll = self._busy_poll
         sync, pacer, master, stages = self.sync, self.pacer, self.master, self.report.stages
         pipeline.stepped = self._stepped
         sync.start(time.monotonic_ns())
@@ -205,10 +212,9 @@ class Daemon:
             if not cycle.ticked:
                 sleep_ns = busy_poll.sleep_ns(cycle.t_ns, now_ns)
                 wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns, now_ns + sleep_ns)
-            wait_s = max(0, wake_ns - now_ns) * 1e-9
+            wait_s = max(0, min(wake_ns, self._rehearse_ns) - now_ns) * 1e-9
             readable = select.select(descriptors, (), (), wait_s)[0]
             woke_ns = time.monotonic_ns()
-            self._rested_ns = woke_ns - now_ns
             stages.slept(wake_ns, woke_ns)
             # one that is gone shows nothing, and is opened again from `drain`
             every = not readable or woke_ns >= self._house_ns
@@ -230,6 +236,8 @@ class Daemon:
                 self._after_tick(alive)
             elif now_ns >= master.wake_ns:
                 master.poll(now_ns)
+            elif now_ns >= self._rehearse_ns:
+                self._rehearse()
 
     def _stepped(self) -> None:
         self.report.stages.lap(histogram.TICK, time.monotonic_ns())
@@ -241,9 +249,19 @@ class Daemon:
         self.inputs.poll(now_ns)  # before the journal tells what the next tick starts from
         self.pipeline.begin(sync_ns, now_ns)
         self.publisher.release()
-        if self._rested_ns > _COLD_NS:  # now, while the nodes sample and answer
-            self.pipeline.rehearse()
+        if self._rehearsed:
+            self._rehearse_ns = self._busy_poll.expected_ns(sync_ns) - _BEFORE_TICK_NS
         self.report.stages.lap(histogram.SYNC, time.monotonic_ns())
+
+    def _rehearse(self) -> None:
+        """A SYNC is about to come, or the last samples are."""
+        self._rehearse_ns = _NEVER_NS
+        if self.pipeline.cycle.ticked:
+            self.rehearsal.all()
+            self._rehearsed = True
+        else:
+            self.rehearsal.tick()
+        self.report.stages.lap(histogram.REHEARSE, time.monotonic_ns())
 
     def _receive(self, ports: list[Port]) -> None:
         for port in ports:
@@ -275,6 +293,8 @@ class Daemon:
 
     def _after_tick(self, alive: Callable[[int], None]) -> None:
         """What may wait until the contacts are out."""
+        self._rehearsed = False
+        before_sync_ns = self.pipeline.cycle.t_ns + self.sync.period_ns - _BEFORE_SYNC_NS
         lap = self.report.stages.lap
         self.pipeline.settle()
         now_ns = time.monotonic_ns()
@@ -287,7 +307,9 @@ class Daemon:
             self._house_ns = now_ns + _HOUSE_NS
             self._keep_house(now_ns)
         alive(now_ns)
-        lap(histogram.REQUESTS, time.monotonic_ns())
+        now_ns = time.monotonic_ns()
+        lap(histogram.REQUESTS, now_ns)
+        self._rehearse_ns = before_sync_ns if before_sync_ns - now_ns > _COLD_NS else _NEVER_NS
 
     def _keep_house(self, now_ns: int) -> None:
         lap = self.report.stages.lap

@@ -67,6 +67,11 @@ class Follower:
         self._maps, self._per_total = other._maps, other._per_total
         self.weighed, self.tolerance_m = other.weighed, other.tolerance_m
 
+    def imitate(self, other: Follower) -> None:
+        """Have what another one of the same pads has; copied."""
+        self._maps[:], self._per_total[:] = other._maps, other._per_total
+        self.weighed[:], self.tolerance_m[:] = other.weighed, other.tolerance_m
+
     def forget(self, pads: IntArray) -> None:
         """The contacts on these pads are new."""
         self._maps[pads] = np.nan

@@ -16,12 +16,14 @@ _BUCKETS = 64  # more than an int64 of nanoseconds can need, so that adding neve
 
 STAGES = (
     *("sync", "wait", "receive", "tick", "send", "perceive", "settle", "supervise"),
-    *("nodes", "report", "requests"),
+    *("nodes", "report", "requests", "rehearse"),
 )
 """Parts of a period, in their order: SYNC is sent; for the bus; frames; samples to contacts; messages; what
 is felt above contacts; what makes the next tick quick; from and for the slow half; nodes and buses; health
-and service; requests, subscriptions and handshakes."""
-SYNC, WAIT, RECEIVE, TICK, SEND, PERCEIVE, SETTLE, SUPERVISE, NODES, REPORT, REQUESTS = range(len(STAGES))
+and service; requests, subscriptions and handshakes; what has the next tick find its caches warm."""
+(SYNC, WAIT, RECEIVE, TICK, SEND, PERCEIVE, SETTLE, SUPERVISE, NODES, REPORT, REQUESTS, REHEARSE) = range(
+    len(STAGES)
+)
 MACHINE = "machine"
 """The name for time that no stage took: the machine let the loop wait longer than it asked to."""
 _PARTS = (*STAGES, MACHINE)

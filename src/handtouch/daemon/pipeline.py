@@ -101,16 +101,6 @@ class Pipeline:
         """Do what makes the next tick quick and can wait until messages are out; `begin` does it at last."""
         self.tick.settle()
 
-    def rehearse(self) -> None:
-        """Go the way of the next tick with what is there, for nothing but to have it in the caches.
-
-        After milliseconds of sleep a tick takes several times as long as the one that follows at once. Call
-        it when samples are about to come.
-        """
-        self.tick.rehearse()
-        self.frames.rehearse()
-        self.messages.rehearse(self._outlet)
-
     def end(self, now_ns: int) -> None:
         """Send the end of every contact, and of every hand a last frame that says so: the daemon stops."""
         self.settle()

@@ -306,12 +306,6 @@ class Tick:
         updated = np.setdiff1d(telling, began) if len(began) else telling
         return Ticked(cycle.t_ns, began, updated, ended)
 
-    def rehearse(self) -> None:
-        """Read the maps of the contacts under way once more, as the next step will; changes nothing."""
-        touching = np.flatnonzero(self.contacts.touching)
-        if len(touching):
-            self.follower.read(touching, self._currents.take(touching, axis=0))
-
     # Details, for every tick: ufuncs of few elements cost what their calls cost, so what is rare is asked
     # about first, by `count_nonzero`, the quickest of numpy's calls ----------------------------------------
 
