@@ -30,7 +30,7 @@ FALSE_ALARM_S = 600.0
 _HAZARD_HZ = 0.05  # slips of a contact per second, before anything is known
 _UNLOADING = 5.0  # times that, while its force falls as fast as it ever does
 _ROLLS = 0.2  # share of running centroids that roll, where joints don't tell
-_DOUBT = 0.2  # probability of a slip from which on it is worth asking
+_DOUBT = math.log(0.25)  # ln of the odds of a slip from which on it is worth asking
 _HOLD_S = 0.5
 _LEAST_M2 = 1e-14
 _TELL_NS = 50_000_000
@@ -90,10 +90,12 @@ class Motion:
             alarm = self.test.step(pads, dt_s[go], place[go], variance[go], press[go])
             self._start(pads[alarm & ~self.running[pads]], stream)
             self._settle(pads, dt_s[go], place[go], press[go])
+        looks = self._look(sample.pads)
+        news = looks != self._looks[sample.pads]
+        news |= sample.t_ns - self._told_ns[sample.pads] >= _TELL_NS
         return [
-            percept
-            for pad, t_ns in zip(sample.pads.tolist(), sample.t_ns.tolist(), strict=True)
-            if (percept := self._tell(stream, pad, t_ns)) is not None
+            self._tell(stream, int(sample.pads[k]), int(sample.t_ns[k]), int(looks[k]))
+            for k in news.nonzero()[0].tolist()
         ]
 
     def due(self, stream: Stream, t_ns: int) -> int | None:  # noqa: ARG002
@@ -195,21 +197,23 @@ class Motion:
             self.running[pads[rests]] = False
             self.test.begin(pads[rests], place[rests], press[rests], keep=True)
 
-    def _tell(self, stream: Stream, pad: int, t_ns: int) -> Percept | None:
-        """What is to be told of a contact now, if anything."""
-        slips = self._slip_probability(pad)
-        leaves = self._leave_probability(pad)
-        self._in_doubt[pad] = slips * (1 - leaves) > _DOUBT and not self.running[pad]
+    def _look(self, pads: IntArray) -> NDArray[np.intp]:
+        """The most probable class (k,) at a first look: without joints, and quick."""
+        odds, runs = self._slip_odds(pads), self.running[pads]
+        self._in_doubt[pads] = (odds > _DOUBT) & ~runs
+        looks = np.where(runs, 2, np.where(odds > 0, 1, 0))
+        return np.where(self._ahead(pads) < 0, 4, looks)
+
+    def _tell(self, stream: Stream, pad: int, t_ns: int, looks: int) -> Percept:
+        """What is to be told of a contact now."""
+        slips, leaves = self._slip_probability(pad), self._leave_probability(pad)
         self._contact[pad] = stream.hand_of[pad], stream.contact[pad]
-        label = 4 if leaves > 0.5 else 2 if self.running[pad] else 1 if slips > 0.5 else 0
-        known = self._label[pad]
-        if label == self._looks[pad] and t_ns - self._told_ns[pad] < _TELL_NS:
-            return None
         relative = relative_to_object(stream, pad, self.running, t_ns)
         probabilities = self._probabilities(pad, slips, leaves, relative)
         best = max(range(len(CLASSES)), key=lambda k: probabilities[CLASSES[k]])
-        self._label[pad], self._looks[pad], self._told_ns[pad] = best, label, t_ns
-        return self._percept(stream, pad, t_ns, probabilities, at_once=best != known, relative=relative)
+        news = best != self._label[pad]
+        self._label[pad], self._looks[pad], self._told_ns[pad] = best, looks, t_ns
+        return self._percept(stream, pad, t_ns, probabilities, at_once=bool(news), relative=relative)
 
     def _asked(self, pad: int) -> Question:
         slips = self._slip_probability(pad)
@@ -224,17 +228,25 @@ class Motion:
         hand, contact = self._contact[pad].tolist()
         return Question("sliding", hand, pad, contact, {"sticks": 1 - slips, "slides": slips}, [hold])
 
+    def _slip_odds(self, pads: IntArray) -> FloatArray:
+        """ln of the odds (k,) of having begun to run: R, by how often contacts slip at such forces."""
+        falls = np.maximum(-self._rate[pads], 0.0) / np.maximum(3 * self._rate_std[pads], 1e-9)
+        hazard = _HAZARD_HZ * (1 + (_UNLOADING - 1) * np.minimum(falls, 1.0)) * self.test.period_s
+        return np.asarray(self.test.log_odds[pads] + np.log(hazard))
+
     def _slip_probability(self, pad: int) -> float:
-        """Posterior of having begun to run: the test's odds, by how often contacts slip at such forces."""
         if self.running[pad]:
             return 1.0
-        falls = max(0.0, -self._rate[pad]) / max(3 * self._rate_std[pad], 1e-9)
-        hazard = _HAZARD_HZ * (1 + (_UNLOADING - 1) * min(falls, 1.0)) * self.test.period_s
-        return float(1 / (1 + math.exp(-min(self.test.log_odds[pad] + math.log(hazard), 50.0))))
+        odds = float(self._slip_odds(np.array([pad]))[0])
+        return 1 / (1 + math.exp(min(max(-odds, -50.0), 50.0)))
+
+    def _ahead(self, pads: IntArray) -> FloatArray:
+        """Forces (k,) in a moment, at the rate at which they change; smoothing lags behind."""
+        return np.asarray(self._force[pads] + (_LEAVES_S + _RATE_S) * self._rate[pads])
 
     def _leave_probability(self, pad: int) -> float:
-        """Of the force being gone in a moment, at the rate at which it falls."""
-        ahead = self._force[pad] + (_LEAVES_S + _RATE_S) * self._rate[pad]  # smoothing lags behind
+        """Of the force being gone by then."""
+        ahead = float(self._ahead(np.array([pad]))[0])
         std = max(_LEAVES_S * 0.3 * abs(self._rate[pad]), 0.03 * self._force[pad], 1e-3)
         return 0.5 * math.erfc(ahead / (std * math.sqrt(2)))
 
