@@ -87,7 +87,8 @@ def test_percepts_are_whole_on_the_wire_and_readable(bench: Any) -> None:
     for percept in percepts:
         assert wire.decode(wire.encode(percept)) == percept
     assert "lift-off 100%" in line(percepts[-1])
-    assert "velocity_m_per_s (" in line(percepts[0])
+    assert "velocity (" in line(percepts[0])
+    assert " mm/s" in line(percepts[0])
 
 
 def test_for_nobody_nothing_is_perceived(bench: Any) -> None:

@@ -32,6 +32,7 @@ _UNLOADING = 5.0  # times that, while its force falls as fast as it ever does
 _ROLLS = 0.2  # share of running centroids that roll, where joints don't tell
 _DOUBT = math.log(0.25)  # ln of the odds of a slip from which on it is worth asking
 _HOLD_S = 0.5
+_FEW = 4  # samples of a contact that nothing can be said of
 _LEAST_M2 = 1e-14
 _TELL_NS = 50_000_000
 _ACCELERATION = 0.01  # of the centroid, root of its spectral density [m/s^1.5]
@@ -275,7 +276,10 @@ class Motion:
         relative: Relative | None = None,
     ) -> Percept:
         (velocity,), (std,) = self.velocity(np.array([pad]))
-        span_s = float(-stream.window(pad).t_s[0]) if stream.count[pad] else 0.0
+        count = int(stream.count[pad])
+        span_s = abs(float(stream.window(pad).t_s[0])) if count else 0.0
+        label = max(probabilities, key=lambda name: probabilities[name])
+        few = count < _FEW and label == "sticking"
         values: dict[str, float | str | Sequence[float] | None] = {
             "velocity_m_per_s": velocity.tolist(),
             "velocity_m_per_s_std": std.tolist(),
@@ -294,15 +298,16 @@ class Motion:
             pad,
             int(stream.contact[pad]),
             t_ns,
-            "estimated",
-            max(probabilities, key=lambda name: probabilities[name]),
+            "unestimated" if few else "estimated",
+            label,
             probabilities,
             values,
             {
-                "samples": int(stream.count[pad]),
+                "samples": count,
                 "span_s": span_s,
                 "log_odds": odds if math.isfinite(odds) else 0.0,
                 "slips": int(self._slips[pad]),
             },
-            at_once=at_once,
+            f"it has just begun: {_FEW} samples are the least to tell" if few else "",
+            at_once,
         )

@@ -77,7 +77,7 @@ def percept_line(percept: wire.Percept) -> str:
     where = f"{percept.hand}/{percept.link}" if percept.link else percept.hand
     head = f"{percept.t_ns * 1e-9:14.4f}  {percept.kind:8}  {where:<22}  #{percept.contact:<4}"
     values = ", ".join(
-        f"{name} {_number(value)}{_spread(percept.values, name)}"
+        _measure(name, value, percept.values.get(f"{name}_std"))
         for name, value in percept.values.items()
         if not name.endswith("_std") and value is not None
     )
@@ -98,9 +98,30 @@ def _number(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def _spread(values: Mapping[str, Any], name: str) -> str:
-    std = values.get(f"{name}_std")
-    return "" if std is None else f" +- {_number(std)}"
+_UNITS = {
+    "_m_per_s": ("mm/s", 1e3),
+    "_n_per_s": ("N/s", 1.0),
+    "_n_per_m": ("N/mm", 1e-3),
+    "_m": ("mm", 1e3),
+    "_n": ("N", 1.0),
+    "_s": ("s", 1.0),
+}
+"""End of a name -> unit for people, how many of it in the SI unit."""
+
+
+def _measure(name: str, value: Any, std: Any) -> str:
+    """A value by name, with its deviation if there is one, in units that people use."""
+    end = next((end for end in _UNITS if name.endswith(end)), "")
+    unit, scale = _UNITS.get(end, ("", 1.0))
+    words = name.removesuffix(end).replace("_", " ")
+    spread = "" if std is None else f" +- {_number(_scaled(std, scale))}"
+    return f"{words} {_number(_scaled(value, scale))}{spread} {unit}".rstrip()
+
+
+def _scaled(value: Any, scale: float) -> Any:
+    if isinstance(value, list | tuple):
+        return [_scaled(item, scale) for item in value]
+    return value * scale if isinstance(value, float) else value
 
 
 def finding_text(finding: Mapping[str, Any]) -> str:
