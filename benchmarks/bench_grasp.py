@@ -135,7 +135,7 @@ def write(figures: dict[str, Any], seeds: int) -> str:
             row("one patch", figures["one_patch"]),
             row("a line or face, or several patches", figures["wide"]),
             row("joints moving faster than 0.5 rad/s", figures["moving"]),
-            row("all, nothing hidden but noise", figures["ideal"]["place"]),
+            row("seed 1, nothing hidden but noise", figures["ideal"]["place"]),
         ]
     )
     force_rows = "\n".join(force_row(n, of) for n, of in [*things.items(), ("**all**", figures["all"])])
@@ -254,7 +254,7 @@ def draw(runs: dict[str, list[Served]], figures: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--things", nargs="+", default=list(THINGS), choices=list(THINGS))
     asked = parser.parse_args()
     import mujoco
@@ -269,7 +269,8 @@ def main() -> None:
             run = served(deployment, name, seed, setting)
             runs[name].append(run)
             even[name].append(served(deployment, name, seed, setting, assumed_radius=True, done=run.grasp))
-            ideal.append(served(deployment, name, seed, Setting.ideal(seed)))
+            if seed == 1:
+                ideal.append(served(deployment, name, seed, Setting.ideal(seed)))
             print(f"seed {seed}: {name}, {len(run.step)} samples of contacts", flush=True)
     figures = {"mujoco": mujoco.__version__} | gathered(runs, even, ideal)
     print(write(figures, asked.seeds))

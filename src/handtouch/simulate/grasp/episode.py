@@ -59,6 +59,8 @@ class Grasp:
     """(k, 3) in the palm"""
     force_n: FloatArray
     """(k, 3) on the hand, in the palm"""
+    overlap_m: FloatArray
+    """(k,) by which the two bodies give way"""
 
 
 def grasp(
@@ -132,6 +134,7 @@ class _Kept:
         self._held = np.zeros(n, np.bool_)
         self._rows: list[tuple[int, int, int]] = []
         self._points: list[tuple[FloatArray, FloatArray]] = []
+        self._overlaps: list[float] = []
         self._dof = scene.model.body(scene.body).dofadr[0]
 
     def step(self, number: int, held: bool) -> None:
@@ -142,9 +145,10 @@ class _Kept:
         # poses and contacts in `data` are now those of the step's begin, which is what was kept of qpos
         self._rotation[number] = data.xmat[self._bodies].reshape(-1, 3, 3)
         self._link[number], self._thing[number] = data.xpos[self._bodies], data.xpos[scene.body]
-        for body, row, point_m, force_n in contacts(scene):
+        for body, row, point_m, force_n, overlap_m in contacts(scene):
             self._rows.append((number, row, body))
             self._points.append((point_m, force_n))
+            self._overlaps.append(overlap_m)
 
     def grasp(self, hand: str) -> Grasp:
         """What was kept, in the frame of the palm."""
@@ -168,12 +172,13 @@ class _Kept:
             body,
             scene.into_palm(points[:, 0]),
             points[:, 1] @ turn,
+            np.array(self._overlaps),
         )
 
 
-def contacts(scene: Scene) -> list[tuple[int, int, FloatArray, FloatArray]]:
+def contacts(scene: Scene) -> list[tuple[int, int, FloatArray, FloatArray, float]]:
     """Contact points of hand and thing after a step: body, row of the pad or -1, place and force on the hand,
-    both (3,) in the world."""
+    both (3,) in the world, and overlap [m]."""
     import mujoco
 
     model, data = scene.model, scene.data
@@ -187,7 +192,7 @@ def contacts(scene: Scene) -> list[tuple[int, int, FloatArray, FloatArray]]:
         on_other = force[:3] @ contact.frame.reshape(3, 3)  # rows: the normal, from one to other, ...
         geom, on_hand = (other, on_other) if model.geom_bodyid[one] == scene.body else (one, -on_other)
         row = scene.geoms.get(geom, -1)
-        found.append((int(model.geom_bodyid[geom]), row, contact.pos.copy(), on_hand))
+        found.append((int(model.geom_bodyid[geom]), row, contact.pos.copy(), on_hand, -float(contact.dist)))
     return found
 
 

@@ -27,7 +27,7 @@ _PLATE_M = 2e-3  # half the thickness of a flat pad
 _CORNERS = 96  # of a cone's circles
 _HAND, _THING = 1, 2  # bits of who may touch whom
 _STIFFNESS_NM, _DAMPING_NM_S = 1.5, 0.03
-_SKIN_S = 1e-2  # time in which a contact settles: soft, as a skin is
+_SKIN_S = 5e-3  # time in which a contact settles: soft, as a skin is
 _GRAVITY = 9.81
 
 
