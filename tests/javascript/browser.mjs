@@ -10,6 +10,7 @@ import { chromium } from "playwright-core";
 const PATIENCE_MS = 60_000;
 const browser = await chromium.launch({
   executablePath: process.argv[2],
+  timeout: PATIENCE_MS,
   args: [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",

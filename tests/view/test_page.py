@@ -67,7 +67,8 @@ def deployed(deployment: config.Deployment = DEPLOYMENT, run: int = 1) -> wire.C
 
 
 def said(picture: Picture) -> list[str]:
-    return [line["text"] for line in picture.board.since(0).get("messages", ())]
+    lines = picture.board.since(0).get("messages", ())
+    return [f"{', '.join(line['links'])}: {line['text']}" for line in lines]
 
 
 # geometry ---------------------------------------------------------------------------------------------------
@@ -217,6 +218,15 @@ def test_health_colours_the_pad_and_is_told_in_words() -> None:
     ]
 
 
+def test_what_befalls_many_pads_at_once_is_one_line() -> None:
+    picture = Picture()
+    for link in LINKS[:3]:
+        picture.take(health("lost", link=link, reason="unplugged"))
+    assert said(picture) == [f"{', '.join(LINKS[:3])}: lost: unplugged"]
+    picture.take(health("lost", link=LINKS[3], reason="unplugged", t_ns=2 * 10**9))
+    assert said(picture)[1:] == [f"{LINKS[3]}: lost: unplugged"]
+
+
 def test_a_daemon_that_is_silent_or_another_takes_its_contacts_along() -> None:
     picture = Picture()
     for message in (deployed(), frame({DISTAL: 7})):
@@ -228,7 +238,7 @@ def test_a_daemon_that_is_silent_or_another_takes_its_contacts_along() -> None:
     for message in (deployed(run=2), frame({}, run=2)):
         picture.take(message)
     picture.step(True)
-    assert "the daemon was started anew" in said(picture)
+    assert ": the daemon was started anew" in said(picture)
     assert "scene" not in picture.board.since(seen)  # the same hand needn't be built again
     hand = DEPLOYMENT.hands[0]
     fewer = DEPLOYMENT.model_copy(update={"hands": (hand.model_copy(update={"pads": hand.pads[:4]}),)})

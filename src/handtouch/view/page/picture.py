@@ -23,6 +23,7 @@ _MESSAGES = 60
 _STATES = tuple(state.name.lower() for state in wire.PadState)
 _WELL = ("clear", "touched")
 _ILL = ("stale", "lost", "faulted")
+_AT_ONCE_NS = 1_000_000_000
 _SURE = 2.4477
 """Half axes of the ellipse that holds a Gaussian of two dimensions with 95 %, in standard deviations."""
 
@@ -67,7 +68,7 @@ class Picture:
         self._ill: dict[str, tuple[str, str]] = {}
         self._told: deque[dict[str, Any]] = deque(maxlen=_MESSAGES)
         self._wall_offset_ns = 0
-        self._count = 0
+        self._told_ns = 0
 
     def take(self, message: wire.Message) -> None:
         """Take in a message of any topic."""
@@ -137,16 +138,16 @@ class Picture:
         if health.state in _ILL and self._ill.get(key) != (health.state, health.reason):
             self._ill[key] = health.state, health.reason
             why = f": {health.reason}" if health.reason else f", node {health.node}"
-            self._tell(health.t_ns, f"{health.link}: {health.state}{why}", health.state)
+            self._tell(health.t_ns, f"{health.state}{why}", health.state, health.link)
         elif health.state in _WELL and key in self._ill:
             del self._ill[key]
-            self._tell(health.t_ns, f"{health.link}: well again", "clear")
+            self._tell(health.t_ns, "well again", "clear", health.link)
         known = {finding.get("kind") for finding in before.findings} if before else set()
         for finding in health.findings:
             if finding.get("kind") not in known:
-                self._tell(health.t_ns, f"{health.link}: {finding_text(finding)}", "doubted")
+                self._tell(health.t_ns, finding_text(finding), "doubted", health.link)
         if before and before.trust in DOUBTED and health.trust not in DOUBTED:
-            self._tell(health.t_ns, f"{health.link}: {health.trust} again", "clear")
+            self._tell(health.t_ns, f"{health.trust} again", "clear", health.link)
         self._put_pad(key, health.state)
 
     def _put_pad(self, key: str, state: str) -> None:
@@ -176,10 +177,21 @@ class Picture:
         self.board.drop("contact/")
         self._tell(t_ns, "the daemon was started anew", "starting")
 
-    def _tell(self, t_ns: int, text: str, look: str) -> None:
-        self._count += 1
+    def _tell(self, t_ns: int, text: str, look: str, link: str = "") -> None:
+        """A line for people; what befalls several pads at once is one."""
+        last = self._told[-1] if self._told else None
+        links = [link] if link else []
+        if (
+            last
+            and link
+            and (last["text"], last["look"]) == (text, look)
+            and t_ns - self._told_ns < _AT_ONCE_NS
+        ):
+            self._told.pop()
+            links = [*last["links"], *(links if link not in last["links"] else [])]
+        self._told_ns = t_ns
         at_s = round((t_ns + self._wall_offset_ns) * 1e-9, 2) if self._wall_offset_ns else None
-        self._told.append({"number": self._count, "at_s": at_s, "text": text, "look": look})
+        self._told.append({"at_s": at_s, "links": links, "text": text, "look": look})
         self.board.put("messages", list(self._told))
 
 

@@ -8,6 +8,7 @@ const FIELD_OF_VIEW = (32 * Math.PI) / 180;
 const M_PER_N = 0.012, LONGEST_M = 0.06, SHORTEST_M = 0.004;
 const HEAD_M = 0.006, PLACE_M = 0.0017;
 const PAD_NEARER_M = 0.002, CONTACT_NEARER_M = 0.004;
+const LABEL_WIDE = 50, LABEL_HIGH = 18; // of a force, pixels
 const MOST_PIXELS = 1.5; // of the canvas to one of the page
 
 const numbers = (text) => new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
@@ -154,11 +155,14 @@ export class HandView {
       }
     }
     while (this.labels.children.length < wanted.length) this.labels.append(document.createElement("span"));
-    const corner = this.canvas.getBoundingClientRect();
+    const corner = this.canvas.getBoundingClientRect(), taken = [];
     [...this.labels.children].forEach((label, number) => {
       label.hidden = number >= wanted.length;
       if (label.hidden) return;
-      const [at, kind, text] = wanted[number], [x, y] = this.pixels(at);
+      const [at, kind, text] = wanted[number];
+      let [x, y] = this.pixels(at);
+      while (taken.some(([x1, y1]) => Math.abs(x - x1) < LABEL_WIDE && Math.abs(y - y1) < LABEL_HIGH)) y += LABEL_HIGH / 4;
+      taken.push([x, y]);
       label.className = kind;
       if (label.textContent !== text) label.textContent = text;
       label.style.transform = `translate(${(x - corner.left).toFixed(1)}px, ${(y - corner.top).toFixed(1)}px) translate(-50%, -50%)`;

@@ -65,13 +65,13 @@ export function drawNodes({ scene, pads }) {
 
 export function drawMessages({ messages }) {
   const newest = [...messages].reverse();
-  byId("messages").replaceChildren(...newest.map(({ at_s, text, look }) => {
+  byId("messages").replaceChildren(...newest.map(({ at_s, links, text, look }) => {
     const line = element("li", "", ""), time = at_s ? new Date(1000 * at_s).toLocaleTimeString("en-GB") : "";
-    const [name, ...rest] = text.split(": ");
     line.style.borderColor = LOOK[look] ?? LOOK.starting;
     line.append(element("time", "", time));
-    if (rest.length) line.append(element("b", "", name), document.createTextNode(` ${rest.join(": ")}`));
-    else line.append(document.createTextNode(text));
+    if (links.length) line.append(element("b", "", links.length > 3 ? `${links.length} pads` : links.join(", ")), " ");
+    line.append(text);
+    line.title = links.length > 3 ? links.join(", ") : "";
     return line;
   }));
   byId("quiet").hidden = messages.length > 0;

@@ -1,0 +1,292 @@
+"""What the page in the browser costs, and what it shows: updates delivered, frames drawn, processor shares.
+
+The real daemon and simulated nodes, as in bench_latency, but with all 15 pads touched by sliding contacts,
+and joints told at 100 Hz. Cases take turns: nobody listens; somebody reads hand frames, as a controller does;
+the view without a page; with one that only reads; with one in Chromium, drawing in software where there is no
+graphics processor. Chromium is left out where it isn't installed. Writes docs/benchmarks/view.{md,json}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import bench_latency
+import zmq
+from bench_latency import (
+    MOST,
+    OUT,
+    PATHS,
+    PORT,
+    ProcessorShare,
+    film,
+    in_own_network,
+    machine,
+    nodes,
+    on_loopback,
+    wait_for_touch,
+)
+from bench_subscribers import bystanders
+
+from handtouch import Robot
+from handtouch.client import request
+from handtouch.config import load
+
+HERE = Path(__file__).parents[1] / "tests" / "javascript"
+NOBODY, READER, VIEW, PAGE, BROWSER = (
+    "nobody listens",
+    "a reader of hand frames",
+    "the view, no page open",
+    "the view, a page that only reads",
+    "the view, a page in Chromium",
+)
+JOINING_S = 2.0
+JOINTS = ("index_mcp", "index_pip", "index_dip", "middle_mcp", "ring_mcp", "thumb_cmc")
+
+
+@contextmanager
+def view(endpoint: str) -> Iterator[tuple[int, str]]:
+    """`handtouch view`: its process and URL."""
+    command = [sys.executable, "-m", "handtouch", "view", "--key", "", "--port", "0", "--endpoint", endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process.pid, next(word for word in process.stdout.readline().split() if "http" in word)
+        process.terminate()
+
+
+class Reader:
+    """A page that only reads: `updates` so far, and the times between them."""
+
+    def __init__(self, url: str) -> None:
+        self.updates = 0
+        self.bytes = 0
+        self._stream = urllib.request.urlopen(f"{url}changes")
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in self._stream:
+            self.bytes += len(line)
+            self.updates += line.startswith(b"data: ")
+
+
+class Chromium:
+    """The page in a browser, driven by tests/javascript/browser.mjs."""
+
+    def __init__(self, folder: Path, url: str) -> None:
+        self._process = subprocess.Popen(
+            ["node", str(folder / "browser.mjs"), shutil.which("chromium") or ""],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.ask(open=url)
+        self.ask(wait="handtouch.counts.frames > 3")
+
+    def ask(self, **command: Any) -> Any:
+        """The answer to a command."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(command) + "\n")
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline()).get("value")
+
+    def counts(self) -> dict[str, int]:
+        """Updates taken and frames drawn."""
+        return dict(self.ask(evaluate="handtouch.counts"))
+
+    def close(self) -> None:
+        """End the browser."""
+        self._process.communicate()
+
+
+def case(config: Path, pid: int, seconds: float, name: str, packages: Path | None) -> dict[str, Any]:
+    """Shares and rates over a time."""
+    daemon = load(config).daemon
+    row: dict[str, Any] = {"case": name}
+    stop = multiprocessing.Event()
+    reader = multiprocessing.Process(target=bystanders, args=(daemon.live, 1, stop))
+    if name == READER:
+        reader.start()
+    if name in (NOBODY, READER):
+        time.sleep(JOINING_S)
+        row |= shares(daemon.control, pid, None, seconds)
+    else:
+        with view(daemon.live) as (view_pid, url):
+            page = Reader(url) if name == PAGE else None
+            browser = Chromium(packages, url) if name == BROWSER and packages else None
+            time.sleep(JOINING_S)
+            start_s, before = time.monotonic(), browser.counts() if browser else {}
+            read = (page.updates, page.bytes) if page else (0, 0)
+            row |= shares(daemon.control, pid, view_pid, seconds)
+            took_s = time.monotonic() - start_s
+            if page:
+                row["updates_hz"] = (page.updates - read[0]) / took_s
+                row["kilobytes_s"] = (page.bytes - read[1]) / took_s / 1e3
+            if browser:
+                after = browser.counts()
+                row["updates_hz"] = (after["updates"] - before["updates"]) / took_s
+                row["frames_hz"] = (after["frames"] - before["frames"]) / took_s
+                browser.close()
+    stop.set()
+    if name == READER:
+        reader.join()
+    return row
+
+
+def shares(control: str, pid: int, view_pid: int | None, seconds: float) -> dict[str, Any]:
+    """Of a core, that the daemon's loop, the daemon and the view take; how the ticks fare meanwhile."""
+    cpu, of_view = ProcessorShare(), ProcessorShare()
+    before = request("status", endpoint=control, timeout_s=30)["service"]
+    cpu.start(pid)
+    if view_pid:
+        of_view.start(view_pid)
+    time.sleep(seconds)
+    row = {"daemon": cpu.stop(), "view": of_view.stop() if view_pid else None}
+    after = request("status", endpoint=control, timeout_s=30)["service"]
+    took_s = (after["t_ns"] - before["t_ns"]) * 1e-9
+    loop_s, ticks = (
+        after["process"]["loop_cpu_s"] - before["process"]["loop_cpu_s"],
+        after["ticks"] - before["ticks"],
+    )
+    return row | {
+        "loop": loop_s / took_s,
+        "tick_ms": 1e3 * loop_s / max(1, ticks),
+        "ticks_hz": ticks / took_s,
+        "overruns": after["overruns"] - before["overruns"],
+        "drops": sum(after["drops"].values()) - sum(before["drops"].values()),
+    }
+
+
+def tell_joints(endpoint: str, stop: threading.Event) -> None:
+    """A robot that moves."""
+    with Robot(endpoint, key="") as robot:
+        while not stop.wait(0.01):
+            now_s = time.monotonic()
+            robot.send_joints("right", {name: 0.4 + 0.3 * math.sin(now_s) for name in JOINTS})
+
+
+def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> list[dict[str, Any]]:
+    """All cases, so many times, with one daemon."""
+    bench_latency.TOUCHED = 15  # of the film: the most that there is to show
+    deployment = load(config)
+    stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
+    worker = multiprocessing.Process(
+        target=nodes, args=(config, film(deployment, PATHS["sliding"]), stamps, stop)
+    )
+    worker.start()
+    daemon = subprocess.Popen(
+        [sys.executable, "-m", "handtouch", "run", str(config)], stderr=subprocess.DEVNULL
+    )
+    still = threading.Event()
+    robot = threading.Thread(target=tell_joints, args=(deployment.daemon.inputs, still))
+    robot.start()
+    rows = []
+    try:
+        with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.subscribe("hand/")
+            socket.connect(deployment.daemon.live)
+            wait_for_touch(socket)
+        for turn in range(turns):
+            for name in (NOBODY, READER, VIEW, PAGE, *([BROWSER] if packages else [])):
+                rows.append({"turn": turn, **case(config, daemon.pid, seconds, name, packages)})
+                print(rows[-1], flush=True)
+    finally:
+        still.set()
+        robot.join()
+        daemon.terminate()
+        daemon.wait()
+        stop.set()
+        worker.join()
+    return rows
+
+
+def browser_packages(folder: Path) -> Path | None:
+    """What drives Chromium; None without Chromium. Before the program enters a network of its own."""
+    if not (shutil.which("chromium") and shutil.which("npm")):
+        return None
+    shutil.copytree(HERE, folder)
+    install = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"]
+    subprocess.run(install, cwd=folder, check=True)
+    return folder
+
+
+def write(results: dict[str, Any]) -> str:
+    """The page."""
+    lines = []
+    for name in dict.fromkeys(row["case"] for row in results["rows"]):
+        rows = [row for row in results["rows"] if row["case"] == name]
+
+        def middle(key: str, form: str, rows: list[dict[str, Any]] = rows) -> str:
+            values = [row[key] for row in rows if row.get(key) is not None]
+            return format(statistics.median(values), form) if values else ""
+
+        shares = f"{middle('loop', '.1%')} | {middle('tick_ms', '.2f')} | {middle('daemon', '.1%')}"
+        rates = (
+            f"{middle('updates_hz', '.1f')} | {middle('frames_hz', '.1f')} | {middle('kilobytes_s', '.0f')}"
+        )
+        ticks = f"{middle('ticks_hz', '.0f')} | {middle('overruns', '.0f')}"
+        lines.append(f"| {name} | {shares} | {middle('view', '.1%')} | {rates} | {ticks} |")
+    turns = 1 + max(row["turn"] for row in results["rows"])
+    text = f"""# The view
+
+A hand of 15 pads at 200 Hz, all touched by sliding contacts, its joints told at 100 Hz. Medians of
+{turns} turns through all cases, {results["seconds"]:.0f} s each. Shares are of one core: of the daemon's
+loop (and its time per tick), of the daemon with its other threads, of `handtouch view`. Where nobody listens,
+the daemon computes no places and forces: what a view costs is what it takes beyond a reader of hand frames,
+which any controller is. Chromium draws the page of 1280 x 800 in software here, on the same two cores. Where
+ticks stay below 200/s, others had the machine.
+{results["machine"]}; load average when it ended {results["load"]:.1f}.
+
+| who listens | loop | ms a tick | daemon | view | updates/s | frames/s drawn | kB/s | ticks/s | overruns |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
+{chr(10).join(lines)}
+
+Made by `make bench ONLY=view`.
+"""
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / "view.md").write_text(text)
+    (OUT / "view.json").write_text(json.dumps(results, indent=1) + "\n")
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=8.0, help="of a case")
+    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--trial", action="store_true", help="one turn of 2 s a case; writes nothing")
+    asked = parser.parse_args()
+    if "HANDTOUCH_BENCH_PACKAGES" not in os.environ:
+        with tempfile.TemporaryDirectory(prefix="ht.") as folder:
+            os.environ["HANDTOUCH_BENCH_PACKAGES"] = str(browser_packages(Path(folder) / "js") or "")
+            subprocess.run([sys.executable, *sys.argv], check=True)
+        return
+    in_own_network()
+    packages = os.environ["HANDTOUCH_BENCH_PACKAGES"]
+    with tempfile.TemporaryDirectory(prefix="ht.") as folder:
+        turns, seconds = (1, 2.0) if asked.trial else (asked.turns, asked.seconds)
+        config = on_loopback(Path(folder), PORT)
+        rows = measure(config, turns, seconds, Path(packages) if packages else None)
+    if not asked.trial:
+        print(
+            write({"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]})
+        )
+
+
+if __name__ == "__main__":
+    main()
