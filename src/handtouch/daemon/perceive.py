@@ -35,6 +35,7 @@ class Perceiving:
         self._pipeline, self._outlet, self._run = pipeline, outlet, run
         self._perceiver: Perceiver | None = None
         self._hands = list(pipeline.model.rows_of_hand)
+        self._felt = np.zeros(pipeline.model.size, dtype=np.bool_)
         self._seq: Counter[str] = Counter()
         self._told: dict[tuple[str, int, int], tuple[int, str, str]] = {}  # kind, hand, pad -> time, state
 
@@ -48,6 +49,7 @@ class Perceiving:
         if self._perceiver is None:
             self._perceiver = self._made()
         none = np.zeros(self._pipeline.model.size, dtype=np.bool_)
+        self._felt = wanted.percepts.any(axis=0)
         self._perceiver.want(wanted.percepts, none if wanted.asks is None else wanted.asks)
 
     def step(self, ticked: Ticked) -> None:
@@ -73,6 +75,7 @@ class Perceiving:
         tick, frames = self._pipeline.tick, self._pipeline.frames
         columns = tick.columns
         rows = np.concatenate([ticked.began, ticked.updated])
+        rows = rows[self._felt[rows]]
         sample = Sample(rows, columns.sample_ns[rows], tick.contacts.id[rows])
         if not len(rows):
             return sample
