@@ -32,6 +32,7 @@ EXPONENTS = (1.0, 1.5, 2.0)
 _LEAST_SAMPLES = 16
 _LEAST_RISE = 8.0  # of force, in standard deviations of a sample's noise
 _LEAST_SHARE = 0.3  # of the force, that has to be rise: less tells nothing that drift wouldn't
+_PARTS = 6
 _LOW = 0.08  # of the greatest force: below, roots are mostly noise
 _VAGUE = math.log(4.0)  # from one end of the 95 % interval to the other: wider is no estimate
 _Z = 1.96
@@ -295,11 +296,20 @@ def _correlation(residual: FloatArray) -> float:
 
 
 def _common(force: FloatArray, spread: FloatArray) -> float:
-    """Relative deviation that all forces share: variances a^2 + b^2 F^2, by least squares; b."""
-    square, variance = force * force, np.where(np.isfinite(spread), spread, force) ** 2
+    """Relative deviation that slopes have from what all forces share, as a wrong gain or contact radius.
+
+    Independent causes add their variances, a^2 + b^2 F^2, of which b tilts; one alone, as a radius, tilts by
+    how its deviation changes with the force, here and there. The greater of the two.
+    """
+    std = np.where(np.isfinite(spread), spread, force)
+    square = force * force
     away = square - square.mean()
-    slope = float(away @ variance) / max(float(away @ away), 1e-300)
-    return math.sqrt(min(max(slope, 0.0), 1.0))
+    of_gain = float(away @ (std * std)) / max(float(away @ away), 1e-300)
+    parts = np.array_split(np.argsort(force), _PARTS)
+    mean = np.array([(force[part].mean(), std[part].mean()) for part in parts])
+    steps = np.diff(mean, axis=0)
+    of_one = float(np.max(np.abs(steps[:, 1]) / np.maximum(steps[:, 0], 1e-9 * force.max())))
+    return min(max(math.sqrt(max(of_gain, 0.0)), of_one), 1.0)
 
 
 def _of_logs(
