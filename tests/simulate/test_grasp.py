@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from handtouch import config, shipped
+from handtouch import config, demo, shipped
 from handtouch.hand.pads import mount_of
 from handtouch.hand.robot import Robots
 from handtouch.simulate import grasp as grasping
@@ -26,6 +26,7 @@ from handtouch.simulate.grasp.scene import STEP_S, Scene
 from handtouch.simulate.grasp.shapes import foot
 from handtouch.simulate.grasp.timeline import Encoders, Timeline
 from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.run import run as simulate
 from handtouch.simulate.shape import shape_of
 from handtouch.simulate.world import World
 
@@ -237,3 +238,11 @@ def test_what_cannot_be_grasped_is_told_with_the_remedy(monkeypatch: pytest.Monk
     monkeypatch.setattr(grasping, "available", lambda: False)
     with pytest.raises(ValueError, match=r"pip install 'handtouch\[mujoco\]'"):
         grasping.played(HAND, "ball", world)
+
+
+def test_a_thing_that_is_not_there_ends_commands_with_status_2(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert demo.run(grasp="bottle") == 2
+    assert simulate(shipped.path("utah_mit.toml"), buses=("can0=virtual:grasp",), grasp="bottle") == 2
+    assert capsys.readouterr().err.count("--grasp bottle: there is no such thing") == 2
