@@ -119,6 +119,15 @@ def test_a_contact_that_ends_has_lifted_off() -> None:
     assert held.stream.contact[0] == 0
 
 
+def test_what_may_be_a_slow_slip_is_asked_to_be_held_still() -> None:
+    held = Held()
+    held.feel(2.0, ramp(1.0, 0.4e-3))
+    assert "hold" in held.asks
+    firm = Held()
+    firm.feel(1.0, still)
+    assert firm.asks == []
+
+
 def test_ripple_and_tremor_are_sticking() -> None:
     told = Held().feel(
         3.0,

@@ -9,6 +9,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.percept.stream import Sample, Stream
@@ -35,7 +36,7 @@ class Perceiving:
         self._pipeline, self._outlet, self._run = pipeline, outlet, run
         self._perceiver: Perceiver | None = None
         self._hands = list(pipeline.model.rows_of_hand)
-        self._felt = np.zeros(pipeline.model.size, dtype=np.bool_)
+        self._felt: NDArray[np.bool_] = np.zeros(pipeline.model.size, dtype=np.bool_)
         self._seq: Counter[str] = Counter()
         self._told: dict[tuple[str, int, int], tuple[int, str, str]] = {}  # kind, hand, pad -> time, state
 
@@ -49,7 +50,7 @@ class Perceiving:
         if self._perceiver is None:
             self._perceiver = self._made()
         none = np.zeros(self._pipeline.model.size, dtype=np.bool_)
-        self._felt = wanted.percepts.any(axis=0)
+        self._felt = np.asarray(wanted.percepts.any(axis=0))
         self._perceiver.want(wanted.percepts, none if wanted.asks is None else wanted.asks)
 
     def step(self, ticked: Ticked) -> None:
