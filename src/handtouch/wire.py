@@ -1,8 +1,8 @@
 """The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
 
 Public names: the payloads `Contact`, `HandFrame`, `Health`, `Percept`, `Raw`, `Joints`, `Service`,
-`TickInputs`, `State`, `Config`; `encode`, `decode`, `topic_of`, `WireError`, `PadState`, `Placing`,
-`COLUMNS`, `INPUTS`.
+`TickInputs`, `State`, `Config`; `Message`, one of these, and `Outgoing`, or one that is `Packed`; `encode`,
+`decode`, `plain`, `topic_of`, `WireError`, `PadState`, `Placing`, `COLUMNS`, `INPUTS`.
 `docs/wire.md` describes every field for readers in other languages. SI units; `t_ns` is the host's monotonic
 clock; a number that isn't known is nil, never NaN. Fields with a default are left out of a message that has
 none of them.
@@ -420,7 +420,16 @@ class Config:
     repeat: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """A message whose payload is encoded already; `decode(encode(it))` tells what it is."""
+
+    topic: str
+    payload: bytes
+
+
 Message = Contact | HandFrame | Health | Percept | Raw | Joints | Service | TickInputs | State | Config
+Outgoing = Message | Packed
 
 _F4 = ("<f4", 1)
 COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
@@ -514,8 +523,10 @@ _OPTIONAL = {
 _PACKER = msgpack.Packer()
 
 
-def topic_of(message: Message) -> str:
+def topic_of(message: Outgoing) -> str:
     """Topic that a message belongs to."""
+    if isinstance(message, Packed):
+        return message.topic
     if isinstance(message, Contact):
         return f"contact/{message.hand}/{message.link}"
     if isinstance(message, Health):
@@ -529,13 +540,17 @@ def topic_of(message: Message) -> str:
     return f"raw/{message.hand}" if isinstance(message, Raw) else _ALONE[type(message)]
 
 
-def encode(message: Message) -> list[bytes]:
+def encode(message: Outgoing) -> list[bytes]:
     """The two parts of a message, ready for a ZeroMQ multipart send."""
+    if isinstance(message, Packed):
+        return [message.topic.encode(), message.payload]
     return [topic_of(message).encode(), _PACKER.pack(plain(message))]
 
 
-def plain(message: Message) -> dict[str, Any]:
+def plain(message: Outgoing) -> dict[str, Any]:
     """The map that a message is sent as."""
+    if isinstance(message, Packed):
+        return dict(msgpack.unpackb(message.payload))
     kind = type(message)
     names, values = _FIELDS[kind]
     told = dict(zip(names, values(message), strict=True))

@@ -38,7 +38,7 @@ class Rig:
     def wants(self, topic: str) -> bool:
         return any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         self.sent.append(message)
 
     def _apply(self, wanted: Wanted, needs: Needs, enabled: Any, now_ns: int) -> None:  # noqa: ARG002

@@ -26,8 +26,8 @@ class Taker:
     def next_seq(self, _: str) -> int:
         return len(self.messages) + 1
 
-    def send(self, message: wire.Message) -> None:
-        self.messages.append(message)
+    def send(self, message: wire.Outgoing) -> None:
+        self.messages.append(wire.decode(wire.encode(message)))
 
     def contacts(self) -> list[wire.Contact]:
         return [message for message in self.messages if isinstance(message, wire.Contact)]

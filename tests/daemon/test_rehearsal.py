@@ -18,12 +18,12 @@ class Everything:
     """Wants all and keeps it."""
 
     def __init__(self) -> None:
-        self.sent: list[wire.Message] = []
+        self.sent: list[wire.Outgoing] = []
 
     def wants(self, topic: str) -> bool:  # noqa: ARG002
         return True
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         self.sent.append(message)
 
 

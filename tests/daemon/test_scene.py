@@ -122,8 +122,8 @@ class Served:
     def wants(self, topic: str) -> bool:
         return any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
 
-    def send(self, message: wire.Message) -> None:
-        self.messages.append(message)
+    def send(self, message: wire.Outgoing) -> None:
+        self.messages.append(wire.decode(wire.encode(message)))
 
     def run(self, ticks: int) -> list[Any]:
         """What was sent meanwhile."""

@@ -82,9 +82,10 @@ class Taker:
     def wants(self, topic: str) -> bool:
         return not topic.startswith("raw/")
 
-    def send(self, message: wire.Message) -> None:
-        self.messages.append(message)
-        self._take(wire.encode(message))
+    def send(self, message: wire.Outgoing) -> None:
+        sent = wire.encode(message)
+        self.messages.append(wire.decode(sent))
+        self._take(sent)
 
     def contacts(self) -> list[wire.Contact]:
         return [message for message in self.messages if isinstance(message, wire.Contact)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from handtouch import wire
 from handtouch.canbus.slab import Slab
 from handtouch.daemon.frames import Frames
+from handtouch.daemon.handframe import HandWriter
 from handtouch.daemon.model import PadModel
-from handtouch.daemon.tick import Tick, Ticked
+from handtouch.daemon.tick import LOCATED, Tick, Ticked
 from handtouch.wire import PadState
 
 REASONS = {
@@ -35,7 +36,7 @@ class Outlet(Protocol):
     def wants(self, topic: str) -> bool:
         """Whether a message of this topic is of use to anybody."""
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         """Take a message."""
 
 
@@ -54,6 +55,7 @@ class Messages:
         self._frames = 0
         self._frame_of = 0, 0  # number and time of the tick that the last frames were of
         self._reason = ""  # why all contacts end, once the daemon stops
+        self._writers = {hand: self._writer(hand, rows) for hand, rows in model.rows_of_hand.items()}
         self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
 
     def send_contacts(self, ticked: Ticked, now_ns: int, outlet: Outlet) -> None:
@@ -97,7 +99,7 @@ class Messages:
             if outlet.wants(f"hand/{hand}"):
                 wire.encode(self._hand(hand))
 
-    def present(self) -> dict[str, Callable[[int], wire.Message | None]]:
+    def present(self) -> dict[str, Callable[[int], wire.Outgoing | None]]:
         """Topic -> what there is to repeat of it, at a time [ns]: contacts under way, and hands."""
         return {
             **{topic: partial(self._under_way, pad) for pad, topic in enumerate(self._topics)},
@@ -109,38 +111,29 @@ class Messages:
             return None
         return self._contact(pad, "update", 0, now_ns, repeat=True)
 
-    def _last_hand(self, hand: str, _: int) -> wire.HandFrame | None:
+    def _last_hand(self, hand: str, _: int) -> wire.Packed | None:
         return self._hand(hand, repeat=True) if self._frames else None
 
-    def _hand(self, hand: str, repeat: bool = False) -> wire.HandFrame:
-        columns, rows = self._tick.columns, self._model.rows_of_hand[hand]
-        located = columns.located[rows]
+    def _hand(self, hand: str, repeat: bool = False) -> wire.Packed:
+        rows = self._model.rows_of_hand[hand]
+        optional = self._placing.columns(rows)
         unestimated = self._tick.unestimated(rows)
-        return wire.HandFrame(
-            v=wire.SCHEMA_VERSION,
-            run=self._run,
-            seq=self._frames,
-            t_ns=self._frame_of[1],
-            tick=self._frame_of[0],
-            hand=hand,
-            links=tuple(self._model.links[rows]),
-            state=columns.state[rows].tobytes(),
-            contact=self._tick.contacts.id[rows].astype("<u4").tobytes(),
-            sample_ns=columns.sample_ns[rows].astype("<i8").tobytes(),
-            current_a=columns.current_a[rows].astype("<f4").tobytes(),
-            position_m=located["position_m"].tobytes(),
-            normal=located["normal"].tobytes(),
-            covariance_m2=located["covariance_m2"].tobytes(),
-            pad_m=located["pad_m"].tobytes(),
-            force_n=located["force_n"].tobytes(),
-            force_std_n=located["force_std_n"].tobytes(),
-            saturated=columns.saturated[rows].tobytes(),
-            residual=located["residual"].tobytes(),
-            residual_std=located["residual_std"].tobytes(),
-            repeat=repeat,
-            unestimated=unestimated.tobytes() if np.count_nonzero(unestimated) else b"",
-            **self._placing.columns(rows),
-        )
+        if np.count_nonzero(unestimated):
+            optional["unestimated"] = unestimated.tobytes()
+        tick_number, t_ns = self._frame_of
+        return self._writers[hand].write(self._frames, t_ns, tick_number, repeat, optional)
+
+    def _writer(self, hand: str, rows: slice) -> HandWriter:
+        columns = self._tick.columns
+        sources: dict[str, NDArray[Any]] = {
+            "state": columns.state[rows],
+            "contact": self._tick.contacts.id[rows],
+            "sample_ns": columns.sample_ns[rows],
+            "current_a": columns.current_a[rows],
+            "saturated": columns.saturated[rows],
+            **{name: columns.located[name][rows] for name in LOCATED.names or ()},
+        }
+        return HandWriter(self._run, hand, tuple(self._model.links[rows]), sources)
 
     def _raw(self, hand: str, slab: Slab) -> wire.Raw:
         rows = self._model.rows_of_hand[hand]

@@ -39,7 +39,7 @@ class Publisher:
     ) -> None:
         gate = gate or Gate(context)
         self.run = int(time.time())
-        self.present: dict[str, Callable[[int], wire.Message | None]] = {}
+        self.present: dict[str, Callable[[int], wire.Outgoing | None]] = {}
         self.drops: Counter[str] = Counter(live=0, complete=0)
         self.subscriptions: frozenset[bytes] = frozenset()
         self.endpoints: dict[str, str] = {}
@@ -104,10 +104,11 @@ class Publisher:
         self._seq[topic] += 1
         return self._seq[topic]
 
-    def send(self, message: wire.Message, lasting: bool = False) -> None:
+    def send(self, message: wire.Outgoing, lasting: bool = False) -> None:
         """Send to those who subscribed; a `lasting` message is repeated for those who subscribe later."""
         topic = wire.topic_of(message)
         if lasting:
+            assert not isinstance(message, wire.Packed)
             self.present[topic] = lambda _: replace(message, repeat=True)
         if not self.wants(topic):
             return

@@ -70,7 +70,7 @@ class _Outlet:
     def wants(self, topic: str) -> bool:
         return topic.startswith("contact/") or (self._publisher is not None and self._publisher.wants(topic))
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         if isinstance(message, wire.Contact):
             self.contacts += message.event == "begin"
             self._take(message)

@@ -278,7 +278,7 @@ class _Outlet:
     def wants(self, topic: str) -> bool:
         return topic.startswith("contact/") or (self._publisher is not None and self._publisher.wants(topic))
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         if isinstance(message, wire.Contact):
             self.made.append(message)
             self._take(message)

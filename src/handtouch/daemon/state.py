@@ -31,8 +31,11 @@ _MADE = (LocatorBank, Placement, ContactLaw, Robots)
 """Follow from the deployment alone."""
 _FED = (Slab,)
 """Filled anew for every tick."""
-_OTHERS = {("Pipeline", "_outlet"), ("Pipeline", "journal"), ("Frames", "_robots")}
-"""Where messages go is no state of the pipeline's, nor are robots, which there may be none of."""
+_OTHERS = {
+    ("Pipeline", "_outlet"), ("Pipeline", "journal"), ("Frames", "_robots"), ("Messages", "_writers")
+}  # fmt: skip
+"""Where messages go and how they are written is no state of the pipeline's, nor are robots, which there may
+be none of."""
 _PLAIN = (bool, int, float, str, type(None))
 _CONSTANT = _FIXED + _MADE + _FED
 _SIMPLE = {*_PLAIN, np.ndarray}
