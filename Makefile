@@ -44,6 +44,10 @@ dev: $(VENV)/.dev ## install into .venv what a developer needs
 demo: $(VENV)/.run $(if $(VIEW),$(VENV)/.view) ## a simulated hand, the daemon and a live view; VIEW=1: in the browser too
 	@$(BIN)/handtouch demo $(if $(VIEW),--view) $(ARGS)
 
+.PHONY: examples
+examples: $(VENV)/.dev ## the programs of examples/, each closing a loop with a simulated gripper; a minute
+	@$(BIN)/python examples/run_all.py
+
 # --- test
 
 .PHONY: test lint types unit socketcan docs

@@ -44,9 +44,10 @@ class ForceControl:
         return max(-FASTEST_M_S, min(speed, FASTEST_M_S))
 
 
-async def keep_force(gripper: Gripper, live: str, force_n: float, seconds: float) -> Contact:
+async def keep_force(gripper: Gripper, live: str, control: ForceControl, seconds: float) -> Contact:
     """Hold on for so long; the last contact. Raises RuntimeError, all stopped, when it can't go on."""
-    control, begin_ns = ForceControl(force_n), None
+    begin_ns: int | None = None
+    contact: Contact | None
     async for contact in touches(live, "index_tip"):
         if contact is None:
             gripper.move()
@@ -68,7 +69,7 @@ async def main(asked: Options) -> None:
             await fresh(gripper, "block", asked.live)
             for finger in ("thumb", "index"):
                 await stop_on_touch(gripper, asked.live, finger)
-            contact = await keep_force(gripper, asked.live, force_n, 3.0)
+            contact = await keep_force(gripper, asked.live, ForceControl(force_n), 3.0)
             truth = gripper.look().truth["index_force_n"]
             felt = f"{contact.force_n:.2f} +- {contact.force_std_n:.2f} N"
             print(f"wanted {force_n:.2f} N: felt {felt}, really {truth:.2f} N")

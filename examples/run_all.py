@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -19,17 +20,19 @@ import handtouch
 HERE = Path(__file__).parent
 PROGRAMS = ("stop_on_touch", "keep_force", "follow_edge", "stop_slip")
 NOTEBOOK = HERE / "log_contacts.ipynb"
-_START_S = 60.0
+FIGURE = Path(tempfile.gettempdir()) / "contacts.png"
+_START_S, _LOG_S = 60.0, 9.0
 
 
 @contextlib.contextmanager
-def rig(folder: Path, prefix: Sequence[str] = ()) -> Iterator[Options]:
+def rig(folder: Path, prefix: Sequence[str] = (), period_ms: float = 10.0) -> Iterator[Options]:
     """The gripper and its daemon, on a bus and with endpoints of their own; `prefix` of their commands."""
     bus = f"udp_multicast:239.74.163.2,port={free_port()}"
     endpoints = {name: f"ipc://{folder}/{name}" for name in ("live", "complete", "control", "inputs")}
     told = "".join(f'{name} = "{endpoint}"\n' for name, endpoint in endpoints.items())
     deployment = (HERE.parent / "config/two_finger.toml").read_text()
     config = folder / "two_finger.toml"
+    deployment = deployment.replace("sync_period_ms = 10.0", f"sync_period_ms = {period_ms}")
     config.write_text(deployment.replace("[daemon]\n", f"[daemon]\nsupervise = false\n{told}", 1))
     asked = Options(endpoints["live"], endpoints["control"], f"ipc://{folder}/gripper")
     simulate, run = (
@@ -70,17 +73,26 @@ def cells(notebook: Path) -> str:
     return "\n\n".join("".join(cell["source"]) for cell in found if cell["cell_type"] == "code")
 
 
+def log(live: str, figure: Path, seconds: float) -> subprocess.Popen[bytes]:
+    """Run the notebook's code, without Jupyter, so that it logs while something else goes on."""
+    told = {"HANDTOUCH_LIVE": live, "SECONDS": str(seconds), "FIGURE": str(figure), "MPLBACKEND": "agg"}
+    return subprocess.Popen([sys.executable, "-c", cells(NOTEBOOK)], env={**os.environ, **told})
+
+
 def main() -> int:
-    """Run them one after the other; the number that failed."""
+    """Run them one after the other, the notebook beside the last; how many failed."""
     failed = 0
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, rig(Path(folder)) as asked:
-        options = ["--live", asked.live, "--control", asked.control, "--robot", asked.robot]
+        where = ["--live", asked.live, "--control", asked.control, "--robot", asked.robot]
         for name in PROGRAMS:
             print(f"== examples/{name}.py", flush=True)
+            notebook = log(asked.live, FIGURE, _LOG_S) if name == PROGRAMS[-1] else None
             failed += (
-                subprocess.run([sys.executable, str(HERE / f"{name}.py"), *options], check=False).returncode
-                != 0
+                subprocess.run([sys.executable, HERE / f"{name}.py", *where], check=False).returncode != 0
             )
+        print(f"== {NOTEBOOK.relative_to(HERE.parent)}", flush=True)
+        failed += notebook is None or notebook.wait() != 0
+        print(f"the figure is {FIGURE}")
     return failed
 
 
