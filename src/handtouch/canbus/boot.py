@@ -38,7 +38,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What the configuration says of a node; None is not checked. `foreign`: serial numbers of other pads'."""
+    """What the configuration says of a node; None is not checked. `foreign`: of other pads."""
 
     vendor_id: int | None = None
     product_code: int | None = None

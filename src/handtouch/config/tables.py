@@ -163,7 +163,7 @@ class Node(Table):
 
 
 class Behaviour(Table):
-    """`[sheet.NAME.behaviour]`: how a sheet creeps, adapts and remembers, to be undone; left out: it doesn't."""
+    """`[sheet.NAME.behaviour]`: how a sheet creeps, adapts and remembers, to be undone."""
 
     preset: Literal["S1", "S2"] = Field(
         "S1", description="sheet of the paper that it is like; keys below that are left out are that one's"
@@ -197,8 +197,9 @@ class Behaviour(Table):
         0.2, description="relative error of these numbers of creep, adaptation and hysteresis (1 sigma)"
     )
     silence_s: Positive = Field(
-        150.0,
-        description="time unfelt in which a press too light to be felt may have made it forget (1 - 1/e)",
+        45.0,
+        description="time unfelt in which a press too light to be felt may have made it forget (1 - 1/e), if "
+        "it has got used to 1 N; as much longer as that is less",
     )
     history_std_n: NonNegative = Field(
         0.1, description="what it may have got used to before the daemon started (1 sigma)"
@@ -375,8 +376,8 @@ class Scene(Wants):
     )
     rest_after_s: Positive | None = Field(
         None,
-        description="a hand untouched for so long rests the sheets that fade, half of them at a time, without "
-        "potential: they recover, and feel nothing until something touches another pad; left out: never",
+        description="a hand untouched for so long rests the sheets that fade, half of them at a time, "
+        "without potential: they recover, and feel nothing until another pad is touched; left out: never",
     )
     idle_sync_period_ms: float = Field(
         50.0,

@@ -57,13 +57,21 @@ def _serve(daemon: socket.socket, half: SlowHalf) -> None:
 
     from handtouch.supervise.link import write_word
 
-    while data := daemon.recv(_LARGEST_MESSAGE):
+    while data := _received(daemon):
         words = half.take(msgpack.unpackb(data), datetime.now(UTC))
         try:
             for word in words:
                 daemon.send(write_word(word))
         except (BrokenPipeError, ConnectionResetError):
             return
+
+
+def _received(daemon: socket.socket) -> bytes:
+    """The next message; empty when the daemon is gone, even if it left words of ours unread."""
+    try:
+        return daemon.recv(_LARGEST_MESSAGE)
+    except ConnectionResetError:
+        return b""
 
 
 def _be_modest(cpus: set[int]) -> None:

@@ -27,7 +27,6 @@ _LEAST_CONTACTS, _LEAST_S = 3, 5.0  # of evidence
 _LEAST_N = 1e-6
 _VAGUE = 0.5  # of a force: less certain than this, it is none
 _HOUR_S = 3600.0
-_WIPED = 0.3  # of the variance that a wiped back force means; all of it, over many silences, is too much
 _GAIN_WANDERS = 0.05  # of the logarithm, in an hour
 _GAIN_MOVES = 0.02  # a second, at most
 _OUTLIER = 4.0  # standard deviations
@@ -276,11 +275,12 @@ class _Group:
             self.compensator.assume(0.0, behaviour.history_std_n)
 
     def forget(self, rows: IntArray, silent_s: FloatArray) -> None:
-        """Back forces of rows after a silence: wiped with a chance that grows with it, else as they were.
-        That chance is a guess, so doubt is never less for it."""
+        """Back forces of rows after a silence: wiped with a chance that grows with it and the back force, as
+        more presses are lighter than that; else as they were. Mean and variance are those of both.
+        How often such presses come isn't known (exponential prior): no chance is soon a certainty."""
         back, std = self.compensator.back_n, self.compensator.back_std_n
-        kept = np.exp(-silent_s / self._silence_s)
-        std[rows] = np.sqrt(np.square(std[rows]) + _WIPED * (1 - kept) * np.square(back[rows]))
+        kept = 1 / (1 + silent_s / self._silence_s * back[rows])
+        std[rows] = np.sqrt(kept * (np.square(std[rows]) + (1 - kept) * np.square(back[rows])))
         back[rows] *= kept
 
 
