@@ -103,7 +103,7 @@ def false_per_minute(value: FloatArray, threshold: float, t_s: FloatArray) -> fl
     count = 0
     for pad in range(above.shape[1]):
         last = -1e9
-        for at in t_s[held][above[:, pad]]:
+        for at in t_s[held][above[:, pad]].tolist():
             count += at - last > DEAD_S
             last = at
     return count / minutes

@@ -38,7 +38,7 @@ class Taker:
     def wants(self, topic: str) -> bool:
         return topic.startswith("percept/")
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         if isinstance(message, wire.Percept):
             self.percepts.append(message)
 
