@@ -106,7 +106,7 @@ def false_per_minute(value: FloatArray, threshold: float, t_s: FloatArray) -> fl
         for at in t_s[held][above[:, pad]].tolist():
             count += at - last > DEAD_S
             last = at
-    return count / minutes
+    return float(count / minutes)
 
 
 def latency_s(value: FloatArray, threshold: float, t_s: FloatArray) -> float:
