@@ -78,6 +78,8 @@ def _be_modest(cpus: set[int]) -> None:
     """Everything else on this machine goes first, and when memory runs out this process goes first."""
     with contextlib.suppress(OSError):
         os.sched_setaffinity(0, cpus)
+    with contextlib.suppress(OSError):  # nice means nothing to a real-time one, as its daemon may be
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(_NICE)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE))
