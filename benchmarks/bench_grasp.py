@@ -177,7 +177,8 @@ knows of noise and joints, not of mounts.
 {force_rows}
 
 Forces assume patches of 2.5 mm radius. *With the radius assumed*: the same grasps as if that were so, which
-leaves out what the assumption costs.
+leaves out what the assumption costs; a
+few samples still err much (its rms, beside its median), and why hasn't been looked into.
 
 ## When
 
