@@ -156,10 +156,23 @@ def test_a_part_of_perception_tells_stiffness_and_its_label(k: float, label: str
     assert np.ptp(closing_m(stream.window(0), others)) == pytest.approx(3 / k, abs=8 * NOISE_M)
 
 
-def test_without_joints_it_says_so_and_asks_for_a_squeeze_that_tells_much() -> None:
+def test_without_joints_it_says_so_and_asks_for_nothing_that_would_not_help() -> None:
     told, part, _ = played(1e3, False, joints=False)
     assert told[-1].state == "unestimated"
     assert "joint" in told[-1].reason
+    assert part.questions(0) == []
+
+
+def test_a_contact_that_is_only_held_is_asked_to_be_squeezed() -> None:
+    stream, part = Stream(1), Hardness(1)
+    part.wanted[:] = True
+    for i in range(60):
+        sample = Sample(np.zeros(1, np.intp), np.array([i * 5_000_000]), np.array([4], np.uint32))
+        sample["force_n"], sample["force_std_n"] = np.ones(1) + 1e-3 * (i % 3), np.full(1, 0.1)
+        sample["palm_position_m"] = sample["position_m"] = np.zeros((1, 3))
+        sample["palm_normal"], sample["palm_rotation"] = np.array([[0, 0, 1.0]]), np.eye(3)[None]
+        stream.add(sample)
+    part.fit(stream, 0, 0)
     (question,) = part.questions(0)
     assert question.actions[0].do == "squeeze"
     assert expected_bits(question, question.actions[0]) > 0.5

@@ -63,6 +63,7 @@ class Hardness:
     def __init__(self, pads: int, skin_m_per_n: float = 0.0, skin_std_m_per_n: float = 0.0) -> None:
         self.wanted = np.zeros(pads, dtype=np.bool_)
         self._fitted_ns = np.full(pads, -(10**18), dtype=np.int64)
+        self._blind = np.zeros(pads, dtype=np.bool_)  # without joints a squeeze tells nothing
         self._best: dict[int, tuple[int, int, Stiffness]] = {}  # pad -> contact, hand, what is known
         self._skin = {"skin_m_per_n": skin_m_per_n, "skin_std_m_per_n": skin_std_m_per_n}
 
@@ -85,7 +86,8 @@ class Hardness:
         window = stream.window(pad)
         near = np.flatnonzero((stream.hand_of == hand) & (stream.contact > 0))
         depth = closing_m(window, [stream.window(other) for other in near.tolist() if other != pad])
-        if not np.isfinite(depth).any():
+        self._blind[pad] = not np.isfinite(depth).any()
+        if self._blind[pad]:
             found = Stiffness("unestimated", "no joint states, and one sheet can't tell area from force")
         else:
             found = stiffness(window["force_n"], depth, window["force_std_n"], **self._skin)
@@ -110,7 +112,7 @@ class Hardness:
         return [
             _question(hand, pad, contact, found)
             for pad, (contact, hand, found) in self._best.items()
-            if found.state == "unestimated" and self.wanted[pad]
+            if found.state == "unestimated" and self.wanted[pad] and not self._blind[pad]
         ]
 
 

@@ -37,6 +37,7 @@ _SPOT_SAMPLES = 64
 _LONG = 0.05  # residuals of contacts that aren't points (1 sigma, prior)
 _TOLERANCE = 3e-3  # residual of a point on a pad whose parts are a little off
 _SLIDE_M = 5e-3
+_COST = 2.0  # sliding disturbs a grasp more than squeezing
 
 
 def point_or_more(residual: FloatArray, residual_std: FloatArray) -> dict[str, float]:
@@ -131,9 +132,8 @@ class Shape:
             touched.add(pad, place[row], normal[row], sample["palm_covariance_m2"][row])
             self._kept_m[pad], self._kept_normal[pad] = place[row], normal[row]
             self._kept_of[pad] = sample.contact[row]
-        for hand in np.unique(stream.hand_of[pads]).tolist():
-            if hand in self._objects:
-                self._objects[hand].seen_ns = int(sample.t_ns.max())
+        for hand in set(stream.hand_of[pads].tolist()) & self._objects.keys():
+            self._objects[hand].seen_ns = int(sample.t_ns.max())
         return ()
 
     def due(self, stream: Stream, t_ns: int) -> int | None:
@@ -235,7 +235,7 @@ def question(verdict: Verdict, hand: int, pad: int, contact: int, prior: Prior) 
             outcomes[name] = turn, (own if name != "edge" else math.hypot(noise, 0.5))
         direction = "across the axis" if way == "slide around" else "along the axis"
         amount: dict[str, float | str] = {"distance_m": _SLIDE_M, "direction": direction}
-        actions.append(Action("slide", amount, outcomes, outcome="turn of the normal in rad"))
+        actions.append(Action("slide", amount, outcomes, _COST, "turn of the normal in rad"))
     return Question("which shape", hand, pad, contact, verdict.probabilities, actions)
 
 

@@ -21,6 +21,7 @@ _LEAST = 48  # samples
 _AGAIN_NS = 250_000_000
 _LEAST_M = 1e-3
 _ASK_S = 1.0
+_COST = 3.0  # a held object may fall
 
 
 def slide_m(window: Window, others: Sequence[Window] = ()) -> tuple[FloatArray, str]:
@@ -132,8 +133,8 @@ class Texture:
         """Of contacts that slid too fast, too little, or not at all: how does it feel?"""
         return [
             _question(hand, pad, contact, found, float(self._rate_hz[pad]))
-            for pad, (contact, hand, found, _) in self._best.items()
-            if found.state == "unestimated" and self.wanted[pad]
+            for pad, (contact, hand, found, by) in self._best.items()
+            if found.state == "unestimated" and by and self.wanted[pad]
         ]
 
 
@@ -182,5 +183,5 @@ def _question(hand: int, pad: int, contact: int, found: Found, rate_hz: float) -
     distance = min(max(_ASK_S * speed, 5e-3), 20e-3)
     outcomes = {"periodic": (3.5, 0.7), "rough": (1.6, 0.4), "smooth": (1.4, 0.4)}
     amount: dict[str, float | str] = {"distance_m": distance, "speed_m_per_s": min(speed, 0.05)}
-    slide = Action("slide", amount, outcomes, outcome="ln of the peak over the floor")
+    slide = Action("slide", amount, outcomes, _COST, "ln of the peak over the floor")
     return Question("which texture", hand, pad, contact, hypotheses, [slide])
