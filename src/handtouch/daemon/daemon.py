@@ -309,7 +309,8 @@ class Daemon:
         alive(now_ns)
         now_ns = time.monotonic_ns()
         lap(histogram.REQUESTS, now_ns)
-        self._rehearse_ns = before_sync_ns if before_sync_ns - now_ns > _COLD_NS else _NEVER_NS
+        waited_for = self.publisher.subscriptions and before_sync_ns - now_ns > _COLD_NS
+        self._rehearse_ns = before_sync_ns if waited_for else _NEVER_NS
 
     def _keep_house(self, now_ns: int) -> None:
         lap = self.report.stages.lap
