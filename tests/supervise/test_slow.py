@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from handtouch.supervise.archive import Archive
-from handtouch.supervise.calibration import Calibration, Gains, Provenance
+from handtouch.supervise.calibration import Calibration, Gains, Law, Provenance, matrix
 from handtouch.supervise.link import Calibrate, Judged, Word
 from handtouch.supervise.slow import SlowHalf
 from handtouch.supervise.store import Store
@@ -181,3 +181,18 @@ def test_a_store_that_cannot_be_used_stops_nothing(bench: Bench, session: Sessio
     words = slow.take(bench.introduce([11, 2, 3], [1, None, None]), NOW) + play(slow, bench, session)
     assert judged(words, 0).trust == "trusted"
     assert path.read_text() == "not a store"
+
+
+def test_what_is_kept_later_drops_nothing_that_was_stored_before(bench: Bench, tmp_path: Path) -> None:
+    """A law of a guided session, stored by another process while the slow half runs, outlives new gains."""
+    archive, place = Archive(tmp_path / "c.db"), half(bench, tmp_path / "c.db")._rows[0].place
+    law = Law(21_000.0, 1.4, 2400.0, matrix(np.diag([1e-4, 1e-4, 1e-6])))
+    gains = Gains((1.1, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
+    assert archive.keep(11, place, Provenance("gains from contacts"), NOW, gains=gains)
+    with Store(tmp_path / "c.db") as store:
+        store.write(11, place.config, Calibration(gains=gains, law=law), Provenance("weights"), NOW)
+    later = Gains((1.2, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
+    kept = archive.keep(11, place, Provenance("gains from contacts"), NOW, gains=later)
+    assert kept is not None
+    assert (kept.calibration.gains, kept.calibration.law) == (later, law)
+    archive.close()
