@@ -249,7 +249,7 @@ A hand of 15 pads at 200 Hz, all touched by sliding contacts, its joints told at
 {turns} turns through all cases, {results["seconds"]:.0f} s each. Shares are of one core: of the daemon's
 loop (and its time per tick), of the daemon with its other threads, of `handtouch view`. Where nobody listens,
 the daemon computes no places and forces: what a view costs is what it takes beyond a reader of hand frames,
-which any controller is. Chromium draws the page of 1280 x 800 in software here, on the same two cores. Where
+which any controller is. Chromium draws the page of 1024 x 640 in software here, on the same two cores. Where
 ticks stay below 200/s, others had the machine.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 

@@ -137,6 +137,7 @@ def hue_of(picture: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(colour / np.linalg.norm(colour))
 
 
+@pytest.mark.timeout(300)  # a browser that draws in software, on a machine that does other things too
 def test_touches_are_seen_where_they_are_and_the_page_outlives_its_daemon(
     rig: Any, browser: Browser, free_port: int, tmp_path: Path
 ) -> None:

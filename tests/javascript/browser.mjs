@@ -17,7 +17,7 @@ const browser = await chromium.launch({
     "--enable-unsafe-swiftshader",
   ],
 });
-const page = await browser.newPage({ viewport: { width: 1280, height: 800 }, bypassCSP: true });
+const page = await browser.newPage({ viewport: { width: 1024, height: 640 }, bypassCSP: true });
 page.setDefaultTimeout(PATIENCE_MS);
 const errors = [];
 page.on("pageerror", (error) => errors.push(String(error)));

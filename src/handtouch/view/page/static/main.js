@@ -9,6 +9,7 @@ const state = {
   connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, messages: [], t: 0,
 };
 const counts = { updates: 0, frames: 0 };
+const SLOW_MS = 40;
 const byId = (id) => document.getElementById(id);
 const hand = new HandView(byId("hand"), byId("labels"));
 const pads = new PadsView(byId("pads"));
@@ -40,10 +41,18 @@ function take(changes) {
   dirty = true;
 }
 
-function draw() {
+// Where drawing takes long, as in software, half of the time is left to others: a controller has better to do.
+let drawnAt = 0, restUntil = 0;
+
+function draw(now) {
   requestAnimationFrame(draw);
-  if (!dirty) return;
+  if (drawnAt) {
+    if (now - drawnAt > SLOW_MS) restUntil = 2 * now - drawnAt;
+    drawnAt = 0;
+  }
+  if (!dirty || now < restUntil) return;
   dirty = false;
+  drawnAt = now;
   hand.draw(state);
   pads.draw(state);
   history.draw(state.t);
@@ -110,4 +119,4 @@ drawService(state);
 listen(byId("hand"));
 reportRates();
 follow();
-draw();
+requestAnimationFrame(draw);
