@@ -2,7 +2,8 @@
 
 Prints its tables and writes docs/benchmarks/diagnose.md, diagnose.json and diagnose.png. `--quick` plays four
 episodes of each name and writes nothing; `--episodes N` says how many of each; `--seed S` where seeds begin.
-Thresholds were tuned on seeds below 1000; those reported begin at 1000.
+Thresholds were tuned on seeds below 1000; those reported begin at 2000, and are of other hands: each 25 seeds
+have one of their own.
 """
 
 from __future__ import annotations
@@ -11,6 +12,9 @@ import argparse
 import json
 import multiprocessing
 import os
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
+
 import platform
 import sys
 import time
@@ -21,7 +25,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from diagnose_episodes import FAULT_FREE, FAULTY, LENGTH_S, PADS, deployment, episode
+from diagnose_episodes import FAULT_FREE, FAULTY, LENGTH_S, PADS, deployment, episode, hand_of
 
 from handtouch import config, shipped
 from handtouch.supervise.diagnose import Block, Diagnosis, DiagnosisModel, Kind
@@ -32,51 +36,71 @@ from matplotlib import pyplot as plt
 ROOT = Path(__file__).parent.parent
 NAMES = (*FAULTY, *FAULT_FREE)
 NOTHING = "nothing"
+SETTLED_S = 15.0
+"""An episode is over so long after its fault was named, if nothing wrong was told."""
 _TABLES: dict[int, Any] = {}
 _MODEL: list[DiagnosisModel] = []
 
 
 def play(task: tuple[str, int]) -> dict[str, Any]:
-    """One episode: the first fault told of its pad once it began, when, and what was told wrongly."""
+    """One episode: what was told of its pad, when, and what was told wrongly."""
     name, seed = task
     if not _MODEL:
         _MODEL.append(DiagnosisModel.of(deployment(), "right"))
     it = episode(name, seed)
     diagnosis = Diagnosis(_MODEL[0], tables=_TABLES)
-    told: list[tuple[float, str, str]] = []
-    spent = 0.0
-    for block in it.blocks():
-        start = time.process_time()
-        changes = diagnosis.step(block)
-        spent += time.process_time() - start
-        t_s = float(block.sample_ns.max()) * 1e-9
-        told += [(t_s, f.link, f.kind.value) for f in changes if f.fault and f.until_ns is None]
     truth = FAULTY[name].value if name in FAULTY else NOTHING
-    mine = [(t, kind) for t, link, kind in told if link == it.link and t >= it.begin_s]
-    others = [kind for t, link, kind in told if link != it.link or t < it.begin_s]
-    kinds = [kind for _, kind in mine] if truth != NOTHING else [kind for _, _, kind in told]
-    named = next((t for t, kind in mine if kind == truth), None)
-    wrong = [kind for kind in kinds if kind != truth] + (others if truth != NOTHING else [])
-    last = kinds[-1] if kinds else NOTHING
+    mine: list[str] = []
+    alarms: list[str] = []
+    named_s, t_s = None, 0.0
+    for block in it.blocks():
+        t_s = float(block.sample_ns.max()) * 1e-9
+        for f in diagnosis.step(block):
+            if not f.fault or f.until_ns is not None:
+                continue
+            if truth == NOTHING or f.link != it.link or t_s < it.begin_s:
+                alarms.append(f.kind.value)
+                continue
+            mine.append(f.kind.value)
+            if f.kind == truth and named_s is None:
+                named_s = t_s
+        wrong = [kind for kind in mine if kind not in (truth, Kind.UNEXPLAINED)]
+        if named_s is not None and t_s > named_s + SETTLED_S and not wrong and not alarms:
+            break
+    told = mine if truth != NOTHING else alarms
     return {
-        "name": name, "seed": seed, "truth": truth, "first": kinds[0] if kinds else NOTHING, "last": last,
-        "after_s": None if named is None else named - it.begin_s, "wrong": wrong, "spent_s": spent,
+        "name": name, "seed": seed, "truth": truth, "last": told[-1] if told else NOTHING,
+        "after_s": None if named_s is None else named_s - it.begin_s, "wrong": wrong + alarms,
+        "alarms": len(alarms), "doubt": Kind.UNEXPLAINED in mine,
         "details": it.details if name in FAULTY else {},
+        "pad_s": t_s * len(PADS) - (t_s - it.begin_s if truth != NOTHING else 0.0),
     }  # fmt: skip
 
 
-def run(count: int, first: int, workers: int) -> list[dict[str, Any]]:
-    """Play them all, telling how far it is."""
+def run(count: int, first: int, workers: int, journal: Path | None) -> list[dict[str, Any]]:
+    """Play them all, seed after seed, telling how far it is; what a journal holds isn't played again."""
+    lines = journal.read_text().splitlines() if journal and journal.exists() else []
     tasks = [(name, seed) for seed in range(first, first + count) for name in NAMES]
-    found, began = [], time.monotonic()
+    wanted = {*tasks}
+    found = [r for r in map(json.loads, lines) if (r["name"], r["seed"]) in wanted]
+    done = {(r["name"], r["seed"]) for r in found}
+    tasks = [task for task in tasks if task not in done]
+    before, began = len(found), time.monotonic()
     with multiprocessing.get_context("fork").Pool(workers) as pool:
         for result in pool.imap_unordered(play, tasks, chunksize=1):
             found.append(result)
-            if len(found) % (2 * len(NAMES)) == 0 or len(found) == len(tasks):
+            if journal:
+                with journal.open("a") as file:
+                    file.write(json.dumps(result) + "\n")
+            played = len(found) - before
+            if played % (2 * len(NAMES)) == 0 or played == len(tasks):
                 gone = time.monotonic() - began
-                left = gone / len(found) * (len(tasks) - len(found))
+                left = gone / played * (len(tasks) - played)
+                wrong = sum(bool(r["wrong"]) for r in found)
                 print(
-                    f"{len(found)} of {len(tasks)} episodes, {left:.0f} s left", file=sys.stderr, flush=True
+                    f"{played} of {len(tasks)} episodes, {wrong} wrong so far, {left:.0f} s left",
+                    file=sys.stderr,
+                    flush=True,
                 )
     return sorted(found, key=lambda r: (NAMES.index(r["name"]), r["seed"]))
 
@@ -97,6 +121,7 @@ def by_name(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 "at the end right, %": 100 * np.mean([r["last"] == r["truth"] for r in mine]),
                 "median s to name": float(np.median(times)) if times else "",
                 "95 % within, s": float(np.quantile(times, 0.95)) if times else "",
+                "told in doubt, %": 100 * np.mean([r["doubt"] for r in mine]),
                 "with something wrong told, %": 100 * np.mean([bool(r["wrong"]) for r in mine]),
                 "what": ", ".join(f"{kind} {n}" for kind, n in wrong.most_common(3)),
             }
@@ -127,14 +152,19 @@ def by_kind(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def false_alarms(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Per hand of 15 pads and week, from the fault-free episodes, with Poisson's 95 % limits."""
+    """Per hand of 15 pads and week, with Poisson's 95 % limits, from pads without a fault."""
     from scipy.stats import chi2
 
     rows = []
-    for label, names in (("plain use", ("plain use",)), ("all fault-free episodes", FAULT_FREE)):
+    for label, names in (
+        ("plain use", ("plain use",)),
+        ("all fault-free episodes", FAULT_FREE),
+        ("healthy pads beside faulty ones, and before the fault", tuple(FAULTY)),
+        ("all of these", NAMES),
+    ):
         mine = [r for r in results if r["name"] in names]
-        alarms = sum(len(r["wrong"]) for r in mine)
-        pad_hours = len(mine) * len(PADS) * LENGTH_S / 3600
+        alarms = sum(r["alarms"] for r in mine)
+        pad_hours = sum(r["pad_s"] for r in mine) / 3600
         scale = 15 * 168 / pad_hours
         rows.append(
             {
@@ -143,7 +173,7 @@ def false_alarms(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 "false alarms": alarms,
                 "per hand and week": alarms * scale,
                 "at least": (chi2.ppf(0.025, 2 * alarms) / 2 if alarms else 0.0) * scale,
-                "at most": chi2.ppf(0.975, 2 * alarms + 2) / 2 * scale,
+                "at most": (chi2.ppf(0.975, 2 * alarms + 2) / 2 if alarms else chi2.ppf(0.95, 2) / 2) * scale,
             }
         )
     return rows
@@ -204,19 +234,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="how well faults of pads are named")
     parser.add_argument("--quick", action="store_true", help="four episodes of each, nothing written")
     parser.add_argument("--episodes", type=int, default=300, help="of each name")
-    parser.add_argument("--seed", type=int, default=1000, help="where seeds begin")
+    parser.add_argument("--seed", type=int, default=2000, help="where seeds begin")
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
+    parser.add_argument(
+        "--journal", type=Path, help="file to keep results in; a run that was stopped goes on from it"
+    )
     args = parser.parse_args()
-    results = run(4 if args.quick else args.episodes, args.seed, args.workers)
+    results = run(4 if args.quick else args.episodes, args.seed, args.workers, args.journal)
     tables = {
         "By what happens": (
             "Named: the right kind was told of the right pad; at the end right: it is what was told last. "
-            "Something wrong: any other kind, or any other pad, at any time.",
+            "Something wrong: any other kind, or any other pad, at any time. In doubt: the fault is told as "
+            "one that can't be explained, or with two candidates; that is neither named nor wrong.",
             by_name(results),
         ),
         "By what is told": ("Recall counts faults named at any time.", by_kind(results)),
         "False alarms": (
-            "Each fault told in a fault-free episode counts; limits are Poisson's, 95 %.",
+            "Each fault told of a pad that has none counts. Limits are Poisson's, 95 %; where none was "
+            "seen, the upper one alone. Most of these hours are hard cases on end, as no hand's week is.",
             false_alarms(results),
         ),
         "Cost": ("15 pads at 200 Hz, all in use; tables are made in the first round.", cost()),
@@ -230,9 +265,11 @@ def main() -> None:
     head = [
         "# Naming of faults", "",
         f"Made by `make bench ONLY=diagnose`; {machine}.", "",
-        f"{len(results)} episodes of {LENGTH_S:g} s on three pads of the shipped hand at 100 Hz, seeds from "
-        f"{args.seed}; a fault befalls one pad while all are in use. Thresholds were tuned on seeds below "
-        "1000. Finite elements, noise, tolerances of gains, gaps and resistors and sizes of contacts are "
+        f"{len(results)} episodes of {LENGTH_S:g} s on three pads of the shipped hand at 100 Hz, seeds "
+        f"from {args.seed}; a fault befalls one pad while all are in use. An episode ends {SETTLED_S:g} s "
+        "after its fault was named, if nothing wrong was told. Thresholds were tuned on seeds below 1000, on "
+        f"other hands: these are {len({hand_of(r['seed']) for r in results})}, built from tolerances. "
+        "Finite elements, noise, tolerances of gains, gaps and resistors and sizes of contacts are "
         "hidden from the diagnosis. Left out as invisible: cables of opposite electrodes swapped, "
         "which mirrors the pad, and short circuits between electrodes without series resistors.", "",
     ]  # fmt: skip

@@ -10,10 +10,16 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch import config, shipped
+from handtouch.simulate.faults import FAULTS
+from handtouch.simulate.hand import VirtualHand
+from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.simulate.world import World
 from handtouch.supervise.diagnose import Block, Diagnosis, DiagnosisModel, Finding, Kind
-from handtouch.supervise.diagnose.contacts import Tables
+from handtouch.supervise.diagnose.contacts import Hypothesis, Tables, Verdict
+from handtouch.supervise.diagnose.words import of_contacts
 
 PAD, SECOND = 13, 1_000_000_000
+LINK = "palm_thumb"
 Counts = NDArray[np.float64]
 _TABLES: dict[int, Tables] = {}
 
@@ -38,6 +44,36 @@ def play(
         read = np.clip(np.rint(counts), -32768, 32767).astype(np.int64)
         changes += diagnosis.step(Block(stamps, read, np.ones((50, 2), np.bool_)))
     return diagnosis, changes
+
+
+def run(diagnosis: Diagnosis, counts: Callable[[Counts], NDArray[np.int64]], length_s: float) -> None:
+    """Half-second blocks at 100 Hz of counts (50, n, 4) by times (50,)."""
+    for first in np.arange(0, length_s, 0.5):
+        times = first + np.arange(50) / 100
+        read = counts(times)
+        stamps = np.repeat(np.rint((times + 1) * SECOND).astype(np.int64)[:, None], read.shape[1], axis=1)
+        diagnosis.step(Block(stamps, read, np.ones(stamps.shape, np.bool_)))
+
+
+def simulate(
+    fault: dict[str, object], length_s: float, series_ohm: tuple[float, ...] = (0.0,) * 4
+) -> list[Finding]:
+    """What is found of one pad of the virtual hand, pressed all over while it has a fault."""
+    whole = config.load(shipped.path("utah_mit.toml"))
+    (hand,) = whole.hands
+    (pad,) = (pad for pad in hand.pads if pad.link == LINK)
+    pad = pad.model_copy(update={"series_ohm": series_ohm})
+    alone = whole.model_copy(update={"hands": (hand.model_copy(update={"pads": (pad,)}),)})
+    rng = np.random.default_rng(1)
+    touches = tuple(
+        Touch(link=LINK, from_s=at, duration_s=0.7, path=(tuple(rng.uniform(0.08, 0.92, 2)),), force_n=(2.0,))
+        for at in np.arange(0.5, length_s - 1, 1.0).tolist()
+    )
+    acting = FAULTS[str(fault["kind"])].model_validate(fault)
+    virtual = VirtualHand(alone, Scenario(touch=touches), World(3), faults=(acting,))
+    diagnosis = Diagnosis(DiagnosisModel.of(alone, "right"))
+    run(diagnosis, lambda times: virtual.counts(0, times)[:, None], length_s)
+    return diagnosis.findings()
 
 
 def fractions(x: float, y: float) -> Counts:
@@ -134,3 +170,51 @@ def test_a_block_of_another_hand_is_refused() -> None:
         Diagnosis(model()).step(
             Block(np.zeros((5, 3), np.int64), np.zeros((5, 3, 4), np.int64), np.ones((5, 3), np.bool_))
         )
+
+
+def test_a_torn_corner_is_told_with_its_size() -> None:
+    fault = {"kind": "torn_corner", "link": LINK, "from_s": 0.0, "corner": "x0yb"}
+    fault |= {"along_x_mm": 17.0, "along_y_mm": 14.0}
+    (finding,) = simulate(fault, 60)
+    assert (finding.kind, finding.electrodes) == (Kind.TORN_CORNER, ("x0", "yb"))
+    assert finding.evidence["along_x_mm"] == pytest.approx(17, abs=5)
+    assert finding.evidence["along_y_mm"] == pytest.approx(14, abs=5)
+
+
+def test_electrodes_that_touch_one_another_show_through_their_resistors() -> None:
+    fault = {"kind": "shorted_electrode", "link": LINK, "from_s": 0.0, "electrode": "x0", "to": "y0"}
+    (finding,) = simulate(fault, 60, series_ohm=(500.0,) * 4)
+    assert (finding.kind, finding.electrodes) == (Kind.SHORTED_ELECTRODE, ("x0", "y0"))
+
+
+def test_zeros_that_walk_together_are_common_drift_and_no_contact() -> None:
+    whole = config.load(shipped.path("utah_mit.toml"))
+    (hand,) = whole.hands
+    few = whole.model_copy(update={"hands": (hand.model_copy(update={"pads": hand.pads[-5:]}),)})
+    late = Touch(link=LINK, from_s=1000.0, duration_s=1.0, path=((0.5, 0.5),), force_n=(1.0,))
+    world = World(3, warmth_k_per_s=0.4, offset_counts_per_k=8.0)
+    virtual = VirtualHand(few, Scenario(touch=(late,)), world)
+    diagnosis = Diagnosis(DiagnosisModel.of(few, "right"))
+    run(diagnosis, lambda times: np.stack([virtual.counts(row, times) for row in range(5)], axis=1), 60)
+    faults = [finding.kind for finding in diagnosis.findings() if finding.fault]
+    assert len(faults) >= 2
+    assert set(faults) == {Kind.COMMON_DRIFT}
+
+
+def test_contacts_that_no_fault_explains_are_told_as_such() -> None:
+    def nowhere(t: float, _: np.random.Generator) -> Counts:
+        rng = np.random.default_rng(int(t))
+        return rng.dirichlet(np.ones(4)) * 5000 * (t % 1 < 0.5)
+
+    diagnosis, _ = play(nowhere, 120)
+    assert [(f.kind, f.electrodes) for f in diagnosis.findings()] == [(Kind.UNEXPLAINED, ())]
+
+
+def test_what_may_be_a_gain_or_a_cut_is_told_as_both() -> None:
+    gain = Hypothesis(Kind.GAIN_STEP, ("x0",), 0.7)
+    cut = Hypothesis(Kind.TORN_CORNER, ("x0", "yb"), 1.0, (0.5, 0.5))
+    verdict = Verdict(cut, (), 41.0, 0.6, SECOND, 20, gain)
+    finding = of_contacts(model(), 0, verdict)
+    assert finding.kind == Kind.UNEXPLAINED
+    assert "channel x0 collects too little" in finding.cause
+    assert "torn at the corner of x0 and yb" in finding.cause

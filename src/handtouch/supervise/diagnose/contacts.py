@@ -8,6 +8,7 @@ alternative to the nominal pad is tested by how well *its* pad explains the same
     swapped   the channels are permuted; permutations that mirror the pad leave no trace and are left out
     gain      a channel is multiplied by a factor
     torn      a cut across a corner takes a part of both its sides
+    (none)    no contact is a point: something that isn't in this list
 
 Each contact adds the logarithm of its likelihood ratio to a sum kept above zero (Page's CUSUM). Gains within
 tolerance enter as noise in proportion to the currents. A contact may be no point at all, with a probability
@@ -35,6 +36,8 @@ ALARM = 20.0
 """Nats. A hand of 15 pads has some 3 million contacts a week at most: 3e6 x 225 x e^-20 = 1.4 a week is the
 bound; sums of a healthy pad fall much faster than the bound supposes."""
 CLEAR = 12.0
+DOUBT = 7.0
+"""Nats by which a torn corner and a gain step must differ; far from the corner they look alike."""
 _MOST = 4 * ALARM
 GAIN_TOLERANCE = 0.02
 """Standard deviation of a channel's gain, relative; twice what parts have, as it is the same in all contacts
@@ -43,9 +46,12 @@ and counts anew in each."""
 _SIDE = 25
 _AT = np.linspace(0.02, 0.98, _SIDE)
 _FLOOR = 1e-3  # of the total: what the model leaves out
+_TORN_FLOOR = 0.01  # of the total: sizes of cuts are few, and their sheets coarse
 _NO_POINT = np.array([0.03, 0.5])  # of all contacts: as it is mostly, and while two objects are handled
+_NEVER = -1e3  # nats
 _SPREAD = np.log(40.0)  # log of how much wider contacts that are no points scatter
-_CUTS = (0.2, 0.3, 0.4, 0.5)  # parts of a side
+_CUTS = (0.2, 0.35, 0.5, 0.65, 0.8, 0.92)  # parts of a side; the short side of a fingertip may be gone
+_ALIKE = (Kind.GAIN_STEP, Kind.TORN_CORNER)
 _SOME = 40  # contacts among which those at one place share
 _FACTORS = np.exp(np.append(np.arange(-19.5, -1), np.arange(1.5, 20)) * 0.07)
 
@@ -99,14 +105,17 @@ class Tables:
                 merged[:, [i, j]] = nominal[:, [i, j]].mean(axis=1, keepdims=True)
                 self.hypotheses.append(Hypothesis(Kind.SHORTED_ELECTRODE, (ELECTRODES[i], ELECTRODES[j])))
                 others.append(merged)
+        self._others, torn_ones = _Table(np.stack(others)), []
         cuts = list(itertools.product(CORNERS, _CUTS, _CUTS))
         changes = cut_changes(network, surface, [(CORNERS[corner], p, q) for corner, p, q in cuts], _AT)
         for (corner, p, q), (change, beyond) in zip(cuts, changes, strict=True):
             self.hypotheses.append(Hypothesis(Kind.TORN_CORNER, corner, 1.0, (p, q)))
             torn = nominal + change.reshape(-1, 4)
             torn[beyond.ravel()] = 0.0
-            others.append(torn)
-        self._others = _Table(np.stack(others))
+            torn_ones.append(torn)
+        self._torn = _Table(np.stack(torn_ones))
+        self.hypotheses.append(Hypothesis(Kind.UNEXPLAINED, ()))
+        self.kinds = np.array([h.kind for h in self.hypotheses])
 
     def log_ratios(self, contact: Contact, left_out: NDArray[np.bool_]) -> FloatArray:
         """Log likelihood ratios (2, hypotheses) to a nominal pad with few contacts that are no points, and
@@ -118,7 +127,11 @@ class Tables:
         rescaled = data[self._orders] * self._factors, sigma[self._orders] * self._factors
         level, volume = self._nominal.fit(*rescaled)
         level = level + np.log(self._factors).sum(axis=0)
-        level = np.append(level, self._others.fit(data[:, None], sigma[:, None])[0]) - volume[0]
+        vaguer = np.hypot(sigma, _TORN_FLOOR * total)
+        torn = self._torn.fit(data[:, None], vaguer[:, None])[0] - np.log(vaguer / sigma).sum()
+        others = self._others.fit(data[:, None], sigma[:, None])[0]
+        level = np.concatenate([level, others, torn]) - volume[0]
+        level = np.append(level, -_SPREAD)
         few, many = (np.logaddexp(np.log1p(-part) + level, np.log(part) - _SPREAD) for part in _NO_POINT)
         return np.stack([few[1:] - few[0], few[1:] - many[0]])
 
@@ -148,7 +161,9 @@ class _Table:
         for reach in (2, 1):  # not beyond the next node
             jacobian, misfit = self._linear(table, node, data, sigma)
             gram = np.einsum("pck,qck->kpq", jacobian, jacobian)
-            gram += 1e-9 * np.eye(3) * np.trace(gram, axis1=1, axis2=2)[:, None, None]
+            size = np.trace(gram, axis1=1, axis2=2)
+            nowhere = size <= 0  # no node collects anything of such currents
+            gram += np.eye(3) * np.where(nowhere, 1.0, 1e-9 * size)[:, None, None]
             step = np.linalg.solve(gram, np.einsum("pck,ck->kp", jacobian, misfit)[:, :, None])[:, :, 0]
             step[:, 1:] = np.clip(step[:, 1:], -reach, reach)
             if reach > 1:
@@ -156,7 +171,7 @@ class _Table:
                 there = self._f[table, moved[0] * _SIDE + moved[1], 0] > 0  # and not cut off
                 node = np.where(there, moved, node)
         misfit = misfit - np.einsum("kp,pck->ck", step, jacobian)
-        volume = -0.5 * np.linalg.slogdet(gram)[1]
+        volume = np.where(nowhere, _NEVER, -0.5 * np.linalg.slogdet(gram)[1])
         return np.asarray(volume - 0.5 * (misfit**2).sum(axis=0)), np.asarray(volume)
 
     def _linear(
@@ -192,6 +207,13 @@ class Verdict:
     share: float
     since_ns: int
     contacts: int
+    rival: Hypothesis | None = None
+    """of another kind, about as likely"""
+
+    @property
+    def kind(self) -> Kind:
+        """What to call it."""
+        return Kind.UNEXPLAINED if self.rival else self.hypothesis.kind
 
 
 class ContactWitness:
@@ -204,7 +226,9 @@ class ContactWitness:
         self._since = np.zeros(n, dtype=np.int64)
         self._count = np.zeros(n, dtype=np.int64)
         self._places: deque[tuple[int, int]] = deque(maxlen=_SOME)
-        self._prior = -np.log([sum(h.kind == k.kind for h in tables.hypotheses) for k in tables.hypotheses])
+        self._prior = -np.log([(tables.kinds == kind).sum() for kind in tables.kinds])
+        self._needed = np.where(tables.kinds == Kind.UNEXPLAINED, 2 * ALARM, ALARM)
+        self._prior[tables.kinds == Kind.UNEXPLAINED] = -ALARM  # the last resort
         self._settled: Verdict | None = None
 
     def take(self, contact: Contact, left_out: NDArray[np.bool_]) -> None:
@@ -220,9 +244,8 @@ class ContactWitness:
         np.maximum(self._sums, 0.0, out=self._sums)
         self._count += 1
         if self._settled is not None:
-            kind = self._settled.hypothesis.kind
-            best = max(r for r, h in zip(ratios[0], self._tables.hypotheses, strict=True) if h.kind == kind)
-            self._back = min(max(self._back - weight * float(best), 0.0), _MOST)
+            same = self._tables.kinds == self._settled.hypothesis.kind
+            self._back = min(max(self._back - weight * float(ratios[0, same].max()), 0.0), _MOST)
         self._judge()
 
     @property
@@ -248,19 +271,26 @@ class ContactWitness:
         if self._settled is not None and self._back > CLEAR:
             self.forget()
             return
-        if sums[best] < ALARM:
+        if sums[best] < self._needed[best]:
             return
+        hypothesis, kinds = self._tables.hypotheses[best], self._tables.kinds
         odds = np.exp(score - score[best])
-        kind = self._tables.hypotheses[best].kind
-        same = np.array([h.kind == kind for h in self._tables.hypotheses])
+        same = kinds == hypothesis.kind
         share = float(odds[same].sum() / odds.sum())
         also = tuple(self._tables.hypotheses[i] for i in np.flatnonzero(same & (odds > 0.05)) if i != best)
-        one = all(h.electrodes == self._tables.hypotheses[best].electrodes for h in also)
+        one = all(h.electrodes == hypothesis.electrodes for h in also)
         if (share < 0.95 or not one) and sums[best] < 2 * ALARM:
             return
-        if self._settled is None or self._settled.hypothesis.kind != kind:
+        rival = None
+        if hypothesis.kind in _ALIKE:
+            other = np.isin(kinds, _ALIKE) & ~same
+            second = int(np.argmax(np.where(other, score, -np.inf)))
+            if score[second] > score[best] - DOUBT:
+                rival = self._tables.hypotheses[second]
+        if rival and (sums[best] < 2 * ALARM or self._settled is not None):
+            return  # more contacts may decide it
+        if self._settled is None or self._settled.hypothesis.kind != hypothesis.kind:
             self._back = 0.0
         self._settled = Verdict(
-            self._tables.hypotheses[best], also, float(sums[best]), share,
-            int(self._since[best]), int(self._count[best]),
-        )  # fmt: skip
+            hypothesis, also, float(sums[best]), share, int(self._since[best]), int(self._count[best]), rival
+        )

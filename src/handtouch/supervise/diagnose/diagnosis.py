@@ -16,7 +16,7 @@ from handtouch.supervise.diagnose.contacts import Contact, ContactWitness, Table
 from handtouch.supervise.diagnose.features import GROUP, Reduced, reduce
 from handtouch.supervise.diagnose.findings import Block, DiagnosisModel, Finding, FloatArray, Kind
 from handtouch.supervise.diagnose.standing import StandingWitness
-from handtouch.supervise.diagnose.words import of_channels, of_contacts, of_standing
+from handtouch.supervise.diagnose.words import electrodes_of, of_channels, of_contacts, of_standing
 
 BoolArray = NDArray[np.bool_]
 _OBSERVED_COUNTS, _RELEASED_COUNTS = 250.0, 60.0
@@ -123,11 +123,14 @@ class Diagnosis:
                 found[pad, finding.kind] = finding
         for pad, standing in self._standing.now.items():
             if pad not in bad and standing.kind is not None:
-                found[pad, standing.kind] = of_standing(self._model, pad, standing)
+                before = self._found.get((pad, standing.kind))
+                if before is None or before.electrodes != electrodes_of(standing):  # to find a place is dear
+                    before = of_standing(self._model, pad, standing)
+                found[pad, standing.kind] = before
         for pad, witness in self._contacts.items():
             verdict = witness.verdict
             if pad not in bad and verdict is not None:
-                found[pad, verdict.hypothesis.kind] = of_contacts(self._model, pad, verdict)
+                found[pad, verdict.kind] = of_contacts(self._model, pad, verdict)
         return found
 
     def _compare(self, found: dict[tuple[int, Kind], Finding], t_ns: int) -> list[Finding]:

@@ -74,16 +74,19 @@ def of_channels(link: str, faults: Mapping[int, ChannelFault]) -> list[Finding]:
     return found
 
 
+def electrodes_of(standing: Standing) -> tuple[str, ...]:
+    """Those that a finding of what stands on a pad names."""
+    return (ELECTRODES[standing.channel],) if standing.kind == Kind.OFFSET else ()
+
+
 def of_standing(model: DiagnosisModel, pad: int, standing: Standing) -> Finding:
     """A finding of what stands on a pad."""
     assert standing.kind is not None
     kind, level = standing.kind, standing.level
-    names: tuple[str, ...] = ()
+    names = electrodes_of(standing)
     place: tuple[float, float] | None = None
     size: float | None = None
-    if kind == Kind.OFFSET:
-        names = (ELECTRODES[standing.channel],)
-    elif kind in (Kind.STUCK_CONTACT, Kind.MOISTURE, Kind.HELD_OBJECT, Kind.HYSTERESIS_TAIL):
+    if kind in (Kind.STUCK_CONTACT, Kind.MOISTURE, Kind.HELD_OBJECT, Kind.HYSTERESIS_TAIL):
         place, radius_m = _place(model, pad, level)
         size = 2 * radius_m if kind == Kind.STUCK_CONTACT and radius_m is not None else None
     cause, remedy = _STANDING[kind]
@@ -106,7 +109,23 @@ def of_contacts(model: DiagnosisModel, pad: int, verdict: Verdict) -> Finding:
     names = hypothesis.electrodes
     evidence = {"nats": verdict.nats, "contacts": float(verdict.contacts)}
     strength = False
-    if hypothesis.kind == Kind.DEAD_ELECTRODE:
+    if verdict.rival is not None:
+        gain, cut = sorted((hypothesis, verdict.rival), key=lambda h: h.kind != Kind.GAIN_STEP)
+        names = gain.electrodes
+        cause = (
+            f"channel {names[0]} collects too {'little' if gain.factor < 1 else 'much'}: its gain is about "
+            f"{gain.factor:.2f} times what it was, or the sheet is torn at the corner of "
+            f"{' and '.join(cut.electrodes)}"
+        )
+        remedy = (
+            "touch the pad near that corner, which tells one from the other; look whether the sheet is torn"
+        )
+    elif hypothesis.kind == Kind.UNEXPLAINED:
+        cause = (
+            "what touches the pad never looks like a touch at one place, and no fault that I know explains it"
+        )
+        remedy = "look at the pad; if many things touch it at a time, that is the reason"
+    elif hypothesis.kind == Kind.DEAD_ELECTRODE:
         cause = f"electrode {names[0]} takes no current: its wire is broken or out of its socket"
         remedy = "look at the wire and the socket of that electrode"
     elif hypothesis.kind == Kind.SHORTED_ELECTRODE:
@@ -132,7 +151,7 @@ def of_contacts(model: DiagnosisModel, pad: int, verdict: Verdict) -> Finding:
         remedy = "change the sheet; until then don't rely on places near that corner"
         evidence.update(along_x_mm=mm[0], along_y_mm=mm[1])
     return Finding(
-        hypothesis.kind, model.links[pad], verdict.since_ns, cause, remedy, evidence, verdict.share,
+        verdict.kind, model.links[pad], verdict.since_ns, cause, remedy, evidence, verdict.share,
         False, strength, names,
     )  # fmt: skip
 
