@@ -5,6 +5,7 @@ Public names: `Frames`. Pure but for what it keeps; joint states come through `j
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -123,6 +124,8 @@ class Frames:
             if state[pad] == _VALID:
                 part = values[at : at + 15]
                 told |= {f"{frame}_{name}": tuple(part[where]) for name, where in _TOLD.items()}
+                if not math.isfinite(sum(part)):  # at a corner nothing may bound the covariance
+                    told[f"{frame}_covariance_m2"] = None
         return told
 
     def columns(self, rows: slice) -> dict[str, bytes]:

@@ -155,8 +155,10 @@ class Messages:
         model, columns, contacts = self._model, self._tick.columns, self._tick.contacts
         sample_ns = int(columns.sample_ns[pad])
         begin_ns = int(contacts.begin_ns[pad])
-        position = columns.position_m[pad].tolist()
-        located = all(map(math.isfinite, position))
+        position, normal, on_pad = (
+            column[pad].tolist() for column in (columns.position_m, columns.normal, columns.pad_m)
+        )
+        located = all(map(math.isfinite, (*position, *normal, *on_pad)))
         covariance = columns.covariance_m2[pad].ravel().tolist()
         certain = located and all(map(math.isfinite, covariance))  # at a corner nothing may bound it
         force_n = _finite(columns.force_n[pad])
@@ -181,9 +183,9 @@ class Messages:
             duration_s=((sample_ns if event != "end" else t_ns) - begin_ns) * 1e-9,
             age_s=(now_ns - sample_ns) * 1e-9,
             position_m=tuple(position) if located else None,
-            normal=tuple(columns.normal[pad].tolist()) if located else None,
+            normal=tuple(normal) if located else None,
             covariance_m2=tuple(covariance) if certain else None,
-            pad_m=tuple(columns.pad_m[pad].tolist()) if located else None,
+            pad_m=tuple(on_pad) if located else None,
             location="valid" if located else "invalid" if self._tick.wanted[pad] else "skipped",
             force_n=force_n,
             force_std_n=_finite(columns.force_std_n[pad]) if strength in _WITH_STD else None,
