@@ -32,6 +32,7 @@ _UNLOADING = 5.0  # times that, while its force falls as fast as it ever does
 _ROLLS = 0.2  # share of running centroids that roll, where joints don't tell
 _DOUBT = math.log(0.25)  # ln of the odds of a slip from which on it is worth asking
 _HOLD_S = 0.5
+_FIRM = 10.0  # times the current at which a contact begins
 _FEW = 4  # samples of a contact that nothing can be said of
 _LEAST_M2 = 1e-14
 _TELL_NS = 50_000_000
@@ -66,6 +67,7 @@ class Motion:
         self._began_at = np.zeros((n, 2))  # where it began to run
         self._quiet_s = np.zeros(n)
         self._slips = np.zeros(n, dtype=np.int64)  # of the contact so far
+        self._scale_a, self._peak_a = np.zeros((2, n))
         self._in_doubt = np.zeros(n, dtype=np.bool_)
         self._contact = np.zeros((n, 2), dtype=np.int64)  # hand and id
 
@@ -77,9 +79,9 @@ class Motion:
         variance = np.where(variance > _LEAST_M2, variance, np.maximum(whole, _LEAST_M2))  # too light to tell
         usable = np.isfinite(place).all(axis=1) & np.isfinite(variance).all(axis=1)
         force = np.where(np.isfinite(force), force, self._force[sample.pads])
-        press = np.log(np.maximum(sample["current_a"], 1e-12))
-        usable &= np.isfinite(press)
         new = np.isin(sample.pads, began)
+        press = self._press(sample.pads, sample["current_a"], new)
+        usable &= np.isfinite(press)
         self._begin(sample.pads[new], place[new], variance[new], force[new], sample.t_ns[new])
         self.test.begin(sample.pads[new], place[new], press[new])
         dt_s = np.asarray((sample.t_ns - self._last_ns[sample.pads]) * 1e-9, dtype=np.float64)
@@ -125,6 +127,12 @@ class Motion:
         return self._place[pads, :, 1], np.sqrt(self._cov[pads, :, 1, 1])
 
     # Details ----------------------------------------------------------------------------------------------
+
+    def _press(self, pads: IntArray, current_a: FloatArray, new: NDArray[np.bool_]) -> FloatArray:
+        """Currents (k,) over that of a firm contact on each pad: the greatest ever, or as it begins."""
+        self._scale_a[pads[new]] = np.fmax(self._peak_a[pads[new]], _FIRM * current_a[new])
+        self._peak_a[pads] = np.fmax(self._peak_a[pads], current_a)
+        return np.asarray(current_a / np.maximum(self._scale_a[pads], 1e-12))
 
     def _begin(
         self,

@@ -1,7 +1,7 @@
 """When does a contact begin to slide? A sequential test on where it is, with a stated rate of false alarms.
 
 While a contact sticks, its centroid is modelled, along x and along y, as a level that hardly moves, plus a
-part that follows how hard it is pressed (the fingertip rolls and flattens; ln of the total current tells it,
+part that follows how hard it is pressed (the fingertip rolls and flattens; the total current tells it,
 which neither jumps nor flattens where the force is at the end of its range), plus a smooth wander
 of some hertz (tremor; Matern 3/2), plus the noise of the channels: a Kalman filter, its innovations white.
 Sliding from some sample on adds a ramp. What ramps that began at several past times would have done to the
@@ -46,9 +46,9 @@ class Grip:
     """corner frequency of that"""
     learn_s: float = 1.0
     """time constant of learning it"""
-    coupling_m: float = 0.7e-3
-    """standard deviation of how far e times the current moves the centroid"""
-    coupling_rate: float = 0.3
+    coupling_m: float = 1e-3
+    """standard deviation of how far the current of a firm contact moves the centroid"""
+    coupling_rate: float = 0.05
     """of that, what changes in a second"""
 
 
@@ -112,7 +112,7 @@ class SlipTest:
         self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray
     ) -> BoolArray:
         """Take in samples (k,) that follow those before by dt (k,): places (k, 2), variances of their noise
-        (k, 2), ln of currents (k,). Returns which raise an alarm (k,)."""
+        (k, 2), relative currents (k,). Returns which raise an alarm (k,)."""
         gain, innovation, variance, forward, row = self._filter(pads, dt_s, place, noise_m2, press)
         ramp = self._open(pads, dt_s)
         level, wander, speed, coupling = self._bias[:, pads]
