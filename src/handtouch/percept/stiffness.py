@@ -246,7 +246,9 @@ def _fit(
         best = int(np.argmin([line.least for line in lines]))
         correlation = _correlation(lines[best].residual)
         excess = lines[best].excess_n2 * (1 - 1 / correlation)  # white excess is chance
-        variance = max(variance + excess, noise**2)
+        last, variance = variance, max(variance + excess, noise**2)
+        if variance < 1.05 * last:
+            break
     logs, weights = _posterior(lines, best, correlation, at_n)
     independent = len(force) / correlation
     scale = math.hypot(_common(force, spread), skin_std * math.exp(float(weights @ logs)))
