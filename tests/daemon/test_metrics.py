@@ -66,6 +66,21 @@ def one(values: dict[tuple[str, frozenset[tuple[str, str]]], float], name: str, 
     return values[name, frozenset(labels.items())]
 
 
+def test_what_the_supervisor_finds_is_there_by_pad_and_kind() -> None:
+    figures = {"pid": 8, "restarts": 2, "dropped": 3, "malformed": 4}
+    gum = {"kind": "stuck contact", "cause": "gum"}
+    pads = [pad("thumb_tip", findings=(gum,)), pad("palm", trust="quarantined")]
+    values = parsed(render(service(supervisor=figures), pads, 0.1))
+    assert one(values, "supervisor_up") == 1
+    assert one(values, "supervisor_restarts_total") == 2
+    assert one(values, "supervisor_dropped_total") == 3
+    assert one(values, "supervisor_malformed_total") == 4
+    assert one(values, "pad_finding", hand="left", link="thumb_tip", kind="stuck contact") == 1
+    assert one(values, "pad_trust", hand="left", link="palm", trust="quarantined") == 1
+    assert one(values, "pad_trust", hand="left", link="palm", trust="trusted") == 0
+    assert not any(name.startswith("supervisor") for name, _ in parsed(render(service(), [], 0.1)))
+
+
 def test_every_figure_of_the_daemon_is_there_under_its_cause() -> None:
     values = parsed(render(service(), [pad("thumb_tip"), pad("palm", "lost")], 0.1))
     assert one(values, "up") == 1

@@ -30,6 +30,7 @@ _SILENCE_S = 1.5
 _RESTART_S = 2.0
 _LARGEST_BYTES = 1 << 20
 _CLIENT_S = 5.0
+_TRUST = ("nominal", "trusted", "quarantined", "person")
 _PAD_STATES = tuple(state.name.lower() for state in wire.PadState)
 _NODE_STATES = (
     *("absent", "booting", "identified", "configuring", "settling"),
@@ -108,6 +109,7 @@ def render(service: wire.Service | None, pads: Iterable[wire.Health], age_s: flo
         _buses(page, service.buses)
         _causes(page, service)
         _process(page, service.process)
+        _supervisor(page, service.supervisor)
     _pads(page, list(pads))
     return page.text()
 
@@ -217,6 +219,28 @@ def _pads(page: _Page, pads: list[wire.Health]) -> None:
     page.states("pad_state", "what to believe of the pad", "state", _PAD_STATES, states)
     states = [(name, pad.node) for name, pad in zip(names, pads, strict=True)]
     page.states("node_state", "state of the pad's node", "state", _NODE_STATES, states)
+    _findings(page, pads, names)
+
+
+def _findings(page: _Page, pads: list[wire.Health], names: list[Labels]) -> None:
+    states = [(name, pad.trust) for name, pad in zip(names, pads, strict=True)]
+    page.states("pad_trust", "how far the unit is relied upon", "trust", _TRUST, states)
+    found = [
+        ({**name, "kind": kind}, 1.0)
+        for name, pad in zip(names, pads, strict=True)
+        for kind in sorted({finding["kind"] for finding in pad.findings})
+    ]
+    page.many("pad_finding", "gauge", "1 while the supervisor finds this the matter with the pad", found)
+
+
+def _supervisor(page: _Page, figures: Mapping[str, Any] | None) -> None:
+    if figures is None:
+        return
+    running = int(figures["pid"] is not None)
+    page.one("supervisor_up", "gauge", "1 while the supervisor's process runs", running)
+    page.one("supervisor_restarts_total", "counter", "times that it was started again", figures["restarts"])
+    page.one("supervisor_dropped_total", "counter", "blocks that it was too slow for", figures["dropped"])
+    page.one("supervisor_malformed_total", "counter", "words of it that made no sense", figures["malformed"])
 
 
 def _told(buses: Mapping[str, Any], key: str) -> list[tuple[Labels, str]]:
