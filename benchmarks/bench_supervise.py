@@ -49,7 +49,7 @@ FULL_N = 5.0
 DT_S, PADS = 0.1, 120
 PART_H = 0.5  # of a day, for what is compared with it
 SPREAD = 0.2
-DAY = "A day on real sheets"
+DAY = "Mixed use of real sheets"
 INK, FAINT, ACCENT, RED = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c23b22"
 
 
@@ -378,9 +378,7 @@ def draw(found: list[dict[str, Any]], presses: Rows, path: Path) -> None:
         axis.plot(hour, raw, color=FAINT, label="uncompensated")
         axis.plot(hour, off, color=ACCENT, label="compensated")
         axis.plot(hour, std, color=RED, ls="--", label="stated")
-        axis.set(
-            title=f"{row['sheets']}: a day of mixed use", xlabel="hour", ylabel="force error, rms, % of 5 N"
-        )
+        axis.set(title=f"{row['sheets']}: mixed use", xlabel="hour", ylabel="force error, rms, % of 5 N")
         axis.set_ylim(0, None)
         axis.legend(frameon=False)
     speed = [row["speed, N/s"] for row in presses]
@@ -414,7 +412,8 @@ def page(parts: dict[str, Rows], held_s: float) -> str:
 simulator's: each zero wanders by {DRIFT.drift_counts_per_s:g} counts a second at most, and the hand's
 temperature by {DRIFT.warmth_k_per_s:g} K a second, for {DRIFT.offset_counts_per_k:g} counts/K. The
 error is that of the force at the end against the same grip at its start; below, parts of the fast half
-are taken out.""",
+are taken out. In so slow a drift of either sign, following and common mode are worth nothing to a held
+object; what counts is that it isn't followed in contact.""",
         "Slow presses": "On a pad of the shipped hand, on_n 0.06 N, slow_touch_s 20.",
         DAY: f"""{PADS} sheets each; grips of 2 to 40 s and 0.1 to 5 N.
 Adaptation, fatigue and creep are spread by 20 % about the preset that the estimator is told, gains by
@@ -428,7 +427,7 @@ estimator is told.""",
     lines = [
         "# The fast half of the supervisor",
         "",
-        "![a day on two sheets, slow presses](supervise.png)",
+        "![mixed use of two sheets, slow presses](supervise.png)",
         "",
     ]
     for title, rows in parts.items():
