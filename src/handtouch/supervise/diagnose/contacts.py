@@ -35,8 +35,10 @@ from handtouch.supervise.diagnose.findings import FloatArray, Kind
 ALARM = 20.0
 """Nats. A hand of 15 pads has some 3 million contacts a week at most: 3e6 x 225 x e^-20 = 1.4 a week is the
 bound; sums of a healthy pad fall much faster than the bound supposes."""
+FLEXIBLE_ALARM = 28.0
+"""That of torn corners and gain steps: of so many sizes one fits two objects now and then, up to 20 nats."""
 CLEAR = 12.0
-DOUBT = 7.0
+DOUBT = 10.0
 """Nats by which a torn corner and a gain step must differ; far from the corner they look alike."""
 _MOST = 4 * ALARM
 GAIN_TOLERANCE = 0.02
@@ -46,7 +48,7 @@ and counts anew in each."""
 _SIDE = 25
 _AT = np.linspace(0.02, 0.98, _SIDE)
 _FLOOR = 1e-3  # of the total: what the model leaves out
-_TORN_FLOOR = 0.01  # of the total: sizes of cuts are few, and their sheets coarse
+_TORN_FLOOR = 5e-3  # of the total: sizes of cuts are few, and their sheets coarse
 _NO_POINT = np.array([0.03, 0.5])  # of all contacts: as it is mostly, and while two objects are handled
 _NEVER = -1e3  # nats
 _SPREAD = np.log(40.0)  # log of how much wider contacts that are no points scatter
@@ -227,7 +229,8 @@ class ContactWitness:
         self._count = np.zeros(n, dtype=np.int64)
         self._places: deque[tuple[int, int]] = deque(maxlen=_SOME)
         self._prior = -np.log([(tables.kinds == kind).sum() for kind in tables.kinds])
-        self._needed = np.where(tables.kinds == Kind.UNEXPLAINED, 2 * ALARM, ALARM)
+        self._needed = np.where(np.isin(tables.kinds, _ALIKE), FLEXIBLE_ALARM, ALARM)
+        self._needed[tables.kinds == Kind.UNEXPLAINED] = 2 * ALARM
         self._prior[tables.kinds == Kind.UNEXPLAINED] = -ALARM  # the last resort
         self._settled: Verdict | None = None
 
