@@ -66,7 +66,7 @@ class Case:
     def wants(self, topic: str) -> bool:
         return topic.startswith(("contact/", "hand/"))
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         self.sent_bytes += sum(map(len, wire.encode(message)))
 
     def _apply(self, wanted: Any, *_: Any) -> None:

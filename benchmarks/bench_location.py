@@ -47,7 +47,7 @@ class Collector:
     def next_seq(self, topic: str) -> int:
         return len(topic)
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         if isinstance(message, wire.Contact):
             self.contacts.append(message)
 

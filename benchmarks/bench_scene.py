@@ -78,7 +78,7 @@ class Case:
             self._wanted[topic] = any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
         return self._wanted[topic]
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         self.sent_bytes += sum(map(len, wire.encode(message)))
 
     def _apply(self, wanted: Any, needs: Any, *_: Any) -> None:

@@ -147,7 +147,7 @@ class _Run:
     def wants(self, topic: str) -> bool:
         return topic.startswith("contact/")
 
-    def send(self, message: wire.Message) -> None:
+    def send(self, message: wire.Outgoing) -> None:
         if isinstance(message, wire.Contact):
             self.contacts.append(message)
 

@@ -25,7 +25,7 @@ def wandering(pads: int, steps: int, rng: np.random.Generator, grip: Grip, dt_s:
         state = state @ forward.T + rng.standard_normal((pads, 2, 2)) @ root.T
         place[k] = state[:, :, 0]
     level = rng.standard_normal(place.shape) * (grip.level_m * np.sqrt(dt_s))
-    return place + level.cumsum(axis=0)
+    return np.asarray(place + level.cumsum(axis=0))
 
 
 def alarms(

@@ -139,7 +139,7 @@ class Slab:
 
     @property
     def limits(self) -> NDArray[np.int64]:
-        """Counts (size, 8) from which on the four channels are at the bottom, and at the top, of their range."""
+        """Counts (size, 8) from which on the four channels are at the bottom and top of their range."""
         return np.hstack([self._bottom, self._top])
 
     def begin_cycle(self, t_ns: int) -> None:

@@ -1,6 +1,7 @@
 """How far a point is from the body of a link: negative inside it.
 
-Public names: `distance_m`, `find_mesh`, `triangles_of`. Meshes are read by Coal, which the extra `handtouch[urdf]` brings.
+Public names: `distance_m`, `find_mesh`, `triangles_of`. Meshes are read by Coal, which the extra
+`handtouch[urdf]` brings.
 """
 
 from __future__ import annotations
