@@ -196,7 +196,7 @@ def latencies(name: str, hz: float, made: list[tuple[float, float, Record, int]]
 
 
 def curves(made: list[tuple[float, float, Record, int]], firm: Record) -> dict[str, Rows]:
-    """Ours, and the derivative of force, smoothed over several times; of forces at which no sheet saturates."""
+    """Ours, and the rate of force, smoothed over several times; of forces that saturate no sheet."""
     made = [slip for slip in made if slip[1] < FORCES[-1]]
     light = [pad for pad in range(len(PADS)) if FORCES[pad % 3] < FORCES[-1]]
     ours = [(record.log_odds[:, pad], record.t_s) for _, _, record, pad in made]
