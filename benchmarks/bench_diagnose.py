@@ -2,7 +2,7 @@
 
 Prints its tables and writes docs/benchmarks/diagnose.md, diagnose.json and diagnose.png. `--quick` plays four
 episodes of each name and writes nothing; `--episodes N` says how many of each; `--seed S` where seeds begin.
-Thresholds were tuned on seeds below 1000; those reported begin at 2000, and are of other hands: each 25 seeds
+Thresholds were tuned on seeds below 1100; those reported begin at 2000, and are of other hands: each 25 seeds
 have one of their own.
 """
 
@@ -267,7 +267,7 @@ def main() -> None:
         f"Made by `make bench ONLY=diagnose`; {machine}.", "",
         f"{len(results)} episodes of {LENGTH_S:g} s on three pads of the shipped hand at 100 Hz, seeds "
         f"from {args.seed}; a fault befalls one pad while all are in use. An episode ends {SETTLED_S:g} s "
-        "after its fault was named, if nothing wrong was told. Thresholds were tuned on seeds below 1000, on "
+        "after its fault was named, if nothing wrong was told. Thresholds were tuned on seeds below 1100, on "
         f"other hands: these are {len({hand_of(r['seed']) for r in results})}, built from tolerances. "
         "Finite elements, noise, tolerances of gains, gaps and resistors and sizes of contacts are "
         "hidden from the diagnosis. Left out as invisible: cables of opposite electrodes swapped, "
