@@ -265,7 +265,11 @@ def _once(fault: Fault, failure: str) -> None:
 def measure(folder: Path, asked: Any) -> dict[str, Any]:
     config = on_loopback(folder, PORT)
     config.write_text(
-        re.sub(r"sync_period_ms = [\d.]+", f"sync_period_ms = {asked.period_ms}", config.read_text())
+        re.sub(
+            r"sync_period_ms = [\d.]+",
+            f'sync_period_ms = {asked.period_ms}\nanother_unit = "refuse"',  # so that it shows as a fault
+            config.read_text(),
+        )
     )
     deployment = load(config)
     pads = [pad for hand in deployment.hands for pad in hand.pads]

@@ -557,7 +557,8 @@ def plain(message: Outgoing) -> dict[str, Any]:
     if kind in _OPTIONAL:
         names, get, defaults = _OPTIONAL[kind]
         if (optional := get(message)) != defaults:
-            told.update(zip(names, optional, strict=True))
+            pairs = zip(names, optional, defaults, strict=True)
+            told.update((name, value) for name, value, default in pairs if value != default)
     return told
 
 

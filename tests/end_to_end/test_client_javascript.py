@@ -142,6 +142,7 @@ def _service(seq: int, run: int = 1, repeat: bool = False) -> wire.Service:
     values |= {name: {} for name in ("hands", "tick_us", "loop", "refused", "process", "buses", "drops")}
     values |= {"v": 1, "run": run, "seq": seq, "t_ns": 2**62 + seq, "wall_offset_ns": -(2**60)}
     values |= {"version": "x", "uptime_s": 1.0, "period_s": 0.1, "rate_hz": 0.0, "subscriptions": ()}
+    values |= {"inputs": {}, "supervisor": None}
     return wire.Service(**{**values, "repeat": repeat})
 
 

@@ -37,6 +37,23 @@ const COLUMNS = {
   raw: { counts: [int64, 4], sample_ns: [int64, 1], fresh: [uint8, 1] },
 };
 
+// columns that are there only where there is something to tell
+const OPTIONAL = {
+  hand: {
+    group: [uint32, 1],
+    palm: [uint8, 1],
+    palm_position_m: [float32, 3],
+    palm_normal: [float32, 3],
+    palm_covariance_m2: [float32, 9],
+    base: [uint8, 1],
+    base_position_m: [float32, 3],
+    base_normal: [float32, 3],
+    base_covariance_m2: [float32, 9],
+    joints_age_s: [float32, 1],
+    unestimated: [uint8, 1],
+  },
+};
+
 function columnOf(bytes, [type, elements], rows) {
   if (!(bytes instanceof Uint8Array) || bytes.length !== rows * elements * type.bytes) {
     throw new Error("a column doesn't fit its links");
@@ -62,6 +79,9 @@ function read(parts) {
   }
   for (const [name, shape] of Object.entries(COLUMNS[kind] ?? {})) {
     payload[name] = columnOf(payload[name], shape, payload.links.length);
+  }
+  for (const [name, shape] of Object.entries(OPTIONAL[kind] ?? {})) {
+    if (name in payload) payload[name] = columnOf(payload[name], shape, payload.links.length);
   }
   return { topic, payload };
 }

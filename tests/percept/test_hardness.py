@@ -50,7 +50,7 @@ def test_the_95_percent_interval_holds_the_truth_and_the_exponent_is_found(k: fl
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.floats(-1.5, 1.5), st.floats(-1.0, 1.0), st.floats(-1, 1))
+@given(st.floats(-1.0, 1.5), st.floats(-1.0, 0.7), st.floats(-1, 1))  # within the range of stiffness
 def test_units_and_the_zero_of_depth_make_no_difference(log_f: float, log_d: float, zero_m: float) -> None:
     force, depth, _ = squeeze(1e3, 1.5, 3)
     plain = stiffness(force, depth)

@@ -261,7 +261,7 @@ def _posterior(
     """Ln stiffness and weights, over all exponents."""
     least = lines[best].least
     inflate = correlation * max(least / max(len(lines[best].residual) - 2, 1), 1.0)
-    logs, weights = [], []
+    logs, scores, widths = [], [], []
     for line, exponent in zip(lines, EXPONENTS, strict=True):
         factor = exponent * at_n ** (1 - 1 / exponent)
         low, high = (math.log(edge / factor) for edge in RANGE_N_PER_M)
@@ -270,10 +270,11 @@ def _posterior(
         ends = max(centre - width, low), min(centre + width, high)
         log_kappa = ends[0] + (ends[1] - ends[0]) * (_GRID + 1) / 2
         logs.append(log_kappa + math.log(factor))
-        score = (line.chi2(np.exp(log_kappa)) - least) / (2 * inflate)
-        weights.append(np.exp(-score) * (ends[1] - ends[0]))
-    together = np.concatenate(weights)
-    return np.concatenate(logs), together / together.sum()
+        scores.append((line.chi2(np.exp(log_kappa)) - least) / (2 * inflate))
+        widths.append(np.full(len(log_kappa), ends[1] - ends[0]))
+    score = np.concatenate(scores)  # the least of them is far from `least` where that lies beyond the range
+    weights = np.exp(score.min() - score) * np.concatenate(widths)
+    return np.concatenate(logs), weights / weights.sum()
 
 
 def _width(line: _Line, inflate: float) -> float:
