@@ -50,7 +50,7 @@ examples: $(VENV)/.dev ## the programs of examples/, each closing a loop with a 
 
 # --- test
 
-.PHONY: test lint types unit socketcan docs
+.PHONY: test lint types unit coverage socketcan docs
 test: ## everything that CI runs
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory types
@@ -68,8 +68,11 @@ types: $(VENV)/.dev ## static types
 docs: $(VENV)/.dev ## the documentation site, in docs/_build; a warning is an error
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
-unit: $(VENV)/.dev ## all tests that need no SocketCAN, with coverage
-	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --cov --cov-report=term:skip-covered $(ARGS)
+unit: $(VENV)/.dev ## all tests that need no SocketCAN
+	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile $(ARGS)
+
+coverage: $(VENV)/.dev ## the same, telling which lines they don't reach; slower
+	@$(MAKE) --no-print-directory unit ARGS="--cov --cov-report=term:skip-covered $(ARGS)"
 
 socketcan: $(VENV)/.dev ## the tests on real SocketCAN; skipped with the reason where there is none, which fails CI
 	@tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $(ARGS); status=$$?; \
