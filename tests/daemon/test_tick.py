@@ -204,6 +204,21 @@ def test_a_channel_that_gives_current_is_a_fault_and_not_a_touch(driver: Driver)
     assert driver.state(PLANE) == PadState.CLEAR
 
 
+def test_a_start_during_a_light_touch_is_no_fault_once_that_is_over(driver: Driver) -> None:
+    touch = driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)
+    light = driver.bench.counts(PLANE, 0.2, 0.5, 0.8 * driver.bench.model.on_a[PLANE])
+    for _ in range(60):
+        assert not len(driver.step({PLANE: light}).began)
+        driver.tick.settle()
+    for _ in range(60):
+        driver.step({})
+        assert driver.state(PLANE) == PadState.CLEAR
+        driver.tick.settle()
+    assert abs(driver.tick.baseline.expected[PLANE]).sum() < 1
+    driver.step({PLANE: touch})
+    assert driver.step({PLANE: touch}).began.tolist() == [PLANE]
+
+
 def test_samples_that_came_with_their_sync_in_one_batch_belong_to_it(driver: Driver) -> None:
     touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
     driver.step(touch)

@@ -59,7 +59,9 @@ class Served:
         with (rig.folder / "nodes.txt").open("w") as output:
             rig.processes["nodes"] = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         rig.start("run")
-        rig.wait_operational()
+        ticks = rig.wait_operational()["service"]["ticks"]
+        # what is pressed at once has no baseline yet: its strength would be unestimated until it is released
+        rig.wait("baselines learned", lambda status: status["service"]["ticks"] > ticks + 15)
 
     def load(self, counts: Mapping[str, list[int]]) -> None:
         """What the channels of pads read, besides noise; the others read nothing."""

@@ -331,12 +331,19 @@ class Tick:
         return sampled
 
     def _absurd(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
-        """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take."""
+        """Pads (n,) with a channel at the end of its range, or one that gives current: it can only take.
+
+        Where all channels give, by no more than what begins a contact, the baseline is wrong and not the pad:
+        it was learned during a light touch."""
         railed, least, read = slab.railed(counts), self._least_counts, self._excess
         if not np.count_nonzero(railed) and not np.count_nonzero(read < least):
             return self._none
         source = _SOURCE_PART * np.abs(read).sum(axis=1) - least[:, 0]
-        return np.asarray(railed.any(axis=1) | (read.min(axis=1) < -source))
+        gives = read.min(axis=1) < -source
+        if np.count_nonzero(gives):
+            amount_a = -(read * self.model.ampere_per_count).sum(axis=1)
+            gives &= (read.max(axis=1) > -self._least_counts[:, 0]) | (amount_a > self.model.on_a)
+        return np.asarray(railed.any(axis=1) | gives)
 
     def _stale(self, now_ns: int, sampled: BoolArray) -> BoolArray:
         """Pads (n,) that have been quiet for too long."""

@@ -9,6 +9,8 @@ time that they stand for, so that rates of ticks and missing samples make no dif
   creeps back neither triggers anew nor becomes the baseline.
 * What untouched pads of a hand drift by together (temperature, supply), touched ones are taken to drift too.
 * The baseline at the start, and how sure it is, decide whether a first reading is a touch.
+* A sheet only takes current. What reads less than its baseline was touched when that was learned, too lightly
+  to be told from an offset: the baseline is learned anew.
 """
 
 from __future__ import annotations
@@ -169,8 +171,7 @@ class Baseline:
         seen = self._count > 0
         mean = self._sum / np.maximum(self._count, 1.0)[:, None]
         total = mean @ _ONES
-        if np.count_nonzero(self.fresh) or np.count_nonzero(self.waiting):
-            self._release(seen & ~touching, total)
+        self._release(seen & ~touching, total)
         free = seen & ~self.waiting
         dt_s = np.asarray((t_ns - self._known_ns) * 1e-9, np.float64)
         np.copyto(self._known_ns, t_ns, where=free | self.waiting)
@@ -191,8 +192,18 @@ class Baseline:
 
     def _release(self, read: BoolArray, total: FloatArray) -> None:
         """Pads that read what their baseline explains are no longer kept."""
-        near = np.where(self.fresh, 0.0, _NEAR * self._off) + _SURE * np.hypot(self.std, 2 * self._noise)
-        near = np.where(self.fresh, np.minimum(near, np.maximum(self._on, _SURE * self.std)), near)
+        near = _NEAR * self._off + _SURE * np.hypot(self.std, 2 * self._noise)
+        less = read & (total < -near) & (total >= -self._on)
+        if np.count_nonzero(less):
+            self.fresh |= less
+            self.waiting |= less  # for the next block: only a part of this may be without the touch
+            self.std[less] = self._on[less] / _SURE
+            read = read & ~less
+        elif not np.count_nonzero(self.fresh) and not np.count_nonzero(self.waiting):
+            return
+        first_near = _SURE * np.hypot(self.std, 2 * self._noise)
+        first_near = np.minimum(first_near, np.maximum(self._on, _SURE * self.std))
+        near = np.where(self.fresh, first_near, near)
         back = read & (np.abs(total) <= near)
         first = np.flatnonzero(back & self.fresh)
         if len(first):
