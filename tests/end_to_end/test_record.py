@@ -12,7 +12,7 @@ import pytest
 
 from handtouch import Robot
 from handtouch.client import request
-from handtouch.record import Recording
+from handtouch.record.read import Recording
 
 LONGEST_S = 90.0
 

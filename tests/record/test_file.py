@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handtouch.record import Recording
 from handtouch.record.file import RecordingFile
+from handtouch.record.read import Recording
 
 
 @given(st.floats(0, 1))

@@ -14,7 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from handtouch import wire
-from handtouch.record import Recording
+from handtouch.record.read import Recording
 from handtouch.record.recorder import Limits, Recorder
 from handtouch.record.schemas import FOXGLOVE, schema_of
 

@@ -14,7 +14,7 @@ from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.daemon import replay
 from handtouch.daemon.rerun import Again, recorded_deployment
-from handtouch.record import Recording
+from handtouch.record.read import Recording
 
 from .conftest import DEPLOYMENT, Hand, Session
 

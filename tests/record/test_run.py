@@ -15,7 +15,7 @@ import zmq
 
 from handtouch import wire
 from handtouch.daemon.publisher import Publisher
-from handtouch.record import Recording
+from handtouch.record.read import Recording
 
 from .conftest import Hand, service
 

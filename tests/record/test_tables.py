@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from handtouch.record import Recording, export, plot
+from handtouch.record import export, plot
+from handtouch.record.read import Recording
 from handtouch.record.tables import split
 
 pyarrow = pytest.importorskip("pyarrow")

@@ -246,7 +246,8 @@ class Settling:
         if not sample.alive:
             return None
         if not sample.touched:
-            self.__init__()  # type: ignore[misc]
+            self.begun_ns, self.drift = None, math.nan
+            self._kept.clear()
             return None
         if self.begun_ns is None:
             self.begun_ns = sample.t_ns

@@ -19,7 +19,7 @@ from handtouch import wire
 
 if TYPE_CHECKING:
     from handtouch.daemon.rerun import Rerun
-    from handtouch.record import Recording
+    from handtouch.record.read import Recording
 
 
 @dataclass

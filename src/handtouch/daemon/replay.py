@@ -268,7 +268,7 @@ def _rerun(
 ) -> int:
     from handtouch.daemon import rerun
     from handtouch.daemon.compare import Comparison, tell_anew, tell_same
-    from handtouch.record import Recording
+    from handtouch.record.read import Recording
 
     recording = Recording(path)
     if deployment is None and (nominal or publish):

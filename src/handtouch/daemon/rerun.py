@@ -29,7 +29,6 @@ from handtouch.daemon.messages import Outlet
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.scene import Scenes, Wanted
-from handtouch.hand.joints import Joints
 from handtouch.hand.robot import Robots
 from handtouch.record.read import Entry
 
@@ -328,17 +327,12 @@ def fill(
     """Put what a tick was made from where the tick looks for it."""
     assert isinstance(pipeline.slab, FedSlab)
     pipeline.slab.feed(columns, limits)
-    told = {(hand, t_ns): _joints(t_ns, parts) for hand, t_ns, *parts in payload["others"].get("joints", ())}
-    pipeline.frames.joints_at = lambda hand, t_ns: told.get((hand, t_ns))
+    pipeline.frames.recall(payload["others"].get("joints", ()))
     pipeline.node_state[:] = columns["node_state"]
     pipeline.cycle.t_ns, pipeline.cycle.previous_ns = payload["t_ns"], payload["previous_ns"]
     tick = pipeline.tick
     tick.synchronous[:] = columns["synchronous"].astype(np.bool_)
     tick.period_ns[:], tick.paced_ns[:] = columns["period_ns"], columns["paced_ns"]
-
-
-def _joints(t_ns: int, parts: list[bytes]) -> Joints:
-    return Joints(t_ns, *(np.frombuffer(part) for part in parts))
 
 
 def _limits(data: bytes) -> NDArray[np.int64]:

@@ -1,8 +1,4 @@
 """Touches kept: record what a daemon publishes as MCAP, read it back, export it, draw it.
 
-Public names: `Recording`. Making contacts again from a recording is `daemon/rerun.py`.
+`Recording` (in `read.py`) reads a recording. Making contacts again from one is `daemon/rerun.py`.
 """
-
-from handtouch.record.read import Recording
-
-__all__ = ["Recording"]
