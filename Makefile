@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 ONLY ?= *
 ARGS ?=
+# tests start hundreds of processes; without bytecode each would compile the source anew
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help
 help: ## what can be made (the default)
@@ -75,7 +77,8 @@ coverage: $(VENV)/.dev ## the same, telling which lines they don't reach; slower
 	@$(MAKE) --no-print-directory unit ARGS="--cov --cov-report=term:skip-covered $(ARGS)"
 
 socketcan: $(VENV)/.dev ## the tests on real SocketCAN; skipped with the reason where there is none, which fails CI
-	@tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $(ARGS); status=$$?; \
+	@marked=$$(grep -rl --include='*.py' 'mark\.socketcan' tests); \
+	tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $$marked $(ARGS); status=$$?; \
 	if [ $$status -eq 77 ] && [ "$(CI)" != true ]; then echo "SocketCAN tests SKIPPED, see the reason above"; exit 0; \
 	elif [ $$status -eq 77 ]; then echo "SocketCAN tests were skipped, and CI needs them"; exit 1; fi; exit $$status
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import random
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,12 +18,15 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from handtouch import cli, commission, config, shipped
+from handtouch.canbus.boot import Identity
 from handtouch.canbus.channels import ELECTRODES
 from handtouch.canbus.device import Device, DeviceBus
-from handtouch.commission.bench import Bench
+from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes import NodeStatus
+from handtouch.commission.bench import Bench, Sample
 from handtouch.commission.edit import applied
 from handtouch.commission.order import ASKED, Near
-from handtouch.commission.outcome import Outcome, Result
+from handtouch.commission.outcome import Hand, Outcome, Result
 from handtouch.commission.report import table
 from handtouch.commission.session import Session
 from handtouch.dialogue import Key
@@ -30,6 +34,8 @@ from handtouch.hand import network_of, surface_of
 
 PROMPT = re.compile(r"\[\d+/\d+\] right/(\w+): press (?:it anywhere|near electrode (\w+))")
 TOTAL = 4000.0
+PERIOD_NS = 20_000_000
+START = 1  # NMT
 _numbers = itertools.count()
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -76,6 +82,55 @@ class Pads:
     def _sample(self, _: int) -> NDArray[np.int64]:
         noise = self.noise * self._rng.standard_normal(self._currents.shape)
         return np.rint(self.offset + self._currents + noise).astype(np.int64)
+
+
+class Stepped:
+    """The nodes of `pads` as a Hand that nobody waits for: each sample is the answer to the next SYNC."""
+
+    def __init__(self, pads: Pads, deployment: config.Deployment) -> None:
+        self._pads, self._t_ns = pads, 0
+        configured = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
+        self._devices = [pads.nodes.devices[pad.node_id] for _, pad in configured]
+        for device in self._devices:
+            device.plug()
+            self._send(0x000, bytes((START, device.node_id)))
+        self.nodes = [
+            NodeStatus(
+                slot=slot,
+                name=f"{hand}/{pad.link}",
+                bus=pad.bus,
+                node_id=pad.node_id,
+                state=NodeState.OPERATIONAL,
+                since_ns=0,
+                reason="started",
+                identity=Identity(0, serial=device.serial),
+                cob_ids=(),
+                guarded=False,
+                idle=False,
+                heartbeats=0,
+                heartbeats_missed=0,
+                reboots=0,
+                emergencies=(),
+            )
+            for slot, ((hand, pad), device) in enumerate(zip(configured, self._devices, strict=True))
+        ]
+
+    def __enter__(self) -> Stepped:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def samples(self) -> Iterator[Sample]:
+        while True:
+            self._t_ns += PERIOD_NS
+            self._send(0x080)
+            counts = np.array([device.sample() for device in self._devices])
+            yield Sample(self._t_ns, counts, np.array([bool(device.tpdos) for device in self._devices]))
+
+    def _send(self, can_id: int, data: bytes = b"") -> None:
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        self._pads.nodes.handle(message, self._t_ns)
 
 
 @dataclass
@@ -142,16 +197,15 @@ def told(
     deployment: config.Deployment | None = None,
     *,
     yes: bool = False,
-    patience_s: float = 20.0,
+    hand: Hand | None = None,
 ) -> tuple[dict[str, Outcome], Session]:
     """Commission all pads, the file saying `deployment` of them; outcomes by link."""
     deployment = deployment or pads.truth
-    pads.nodes.start()
-    with Bench(deployment) as bench:
-        rows = range(sum(len(hand.pads) for hand in deployment.hands))
-        session = Session(deployment, bench, person, lambda _: None, rows, yes=yes, patience_s=patience_s)
-        session.run()
-        text = table(session)
+    rows = range(sum(len(hand.pads) for hand in deployment.hands))
+    hand = hand or Stepped(pads, deployment)
+    session = Session(deployment, hand, person, lambda _: None, rows, yes=yes, patience_s=20.0)
+    session.run()
+    text = table(session)
     assert all(outcome.name in text for outcome in session.outcomes)
     return {outcome.pad.link: outcome for outcome in session.outcomes}, session
 
@@ -202,6 +256,7 @@ def test_three_nodes_in_a_ring_go_each_to_its_pad(made: Callable[..., Pads]) -> 
 
 def test_nodes_swapped_between_two_buses_and_of_two_kinds_go_to_their_pads(made: Callable[..., Pads]) -> None:
     near_thumb, near_palm = made("thumb_middle"), made("palm_heel", noise_counts=3.0)
+    near_thumb.nodes.start()
     near_palm.nodes.start()
     (thumb,), (palm,) = (pads.truth.hands[0].pads for pads in (near_thumb, near_palm))
     palm = palm.model_copy(update={"bus": "can1", "node": "noisy"})
@@ -217,9 +272,27 @@ def test_nodes_swapped_between_two_buses_and_of_two_kinds_go_to_their_pads(made:
     thumbs, palms = ({key: getattr(pad, key) for key in keys} for pad in (thumb, palm))
     person = Person(near_thumb, also=near_palm)
     person.instead = {"palm_heel": lambda near: near_palm.press("palm_heel", near)}
-    _, session = told(near_thumb, person, with_pads(truth, thumb_middle=palms, palm_heel=thumbs), yes=True)
+    file = with_pads(truth, thumb_middle=palms, palm_heel=thumbs)
+    with Bench(file) as bench:
+        _, session = told(near_thumb, person, file, yes=True, hand=bench)
     assert applied(truth, session.ledger.edits()) == truth
     assert {link for _, link in session.ledger.edits()} == {"thumb_middle", "palm_heel"}
+
+
+def test_every_pad_of_a_whole_hand_wired_at_random_is_found(made: Callable[..., Pads]) -> None:
+    (hand,) = config.parse(shipped.path("utah_mit.toml").read_text()).hands
+    pads = made(*(pad.link for pad in hand.pads))
+    chance = random.Random(1)
+    right: dict[str, dict[str, Any]] = {}
+    wrong: dict[str, dict[str, Any]] = {}
+    others = chance.sample(hand.pads, len(hand.pads))
+    for pad, other in zip(hand.pads, others, strict=True):
+        right[pad.link] = {"electrodes": tuple(chance.sample(ELECTRODES, 4))}
+        pads.devices[pad.link].wired = tuple(map(ELECTRODES.index, right[pad.link]["electrodes"]))
+        wrong[pad.link] = {"node_id": other.node_id, "serial": other.serial}
+    outcomes, session = told(pads, Person(pads), with_pads(pads.truth, **wrong), yes=True)
+    assert all(outcome.well for outcome in outcomes.values())
+    assert applied(pads.truth, session.ledger.edits()) == with_pads(pads.truth, **right)
 
 
 def test_a_swap_is_taken_over_only_when_somebody_says_so(made: Callable[..., Pads]) -> None:
@@ -228,11 +301,9 @@ def test_a_swap_is_taken_over_only_when_somebody_says_so(made: Callable[..., Pad
     file = with_pads(pads.truth, index_proximal={"node_id": second}, index_middle={"node_id": first})
     outcomes, session = told(pads, Person(pads))
     assert session.ledger.edits()["right", "index_proximal"].node_id == first
-    pads.nodes.stop()
     outcomes, session = told(pads, Person(pads), file)  # nobody there to ask
     assert outcomes["index_proximal"].result is Result.SKIPPED
     assert not session.ledger.edits()
-    pads.nodes.stop()
     outcomes, session = told(pads, Person(pads, keys=[Key.ENTER]), file)
     assert session.ledger.edits()["right", "index_proximal"].node_id == first
     assert all(outcome.well for outcome in outcomes.values())
@@ -272,7 +343,7 @@ def test_a_pad_whose_node_is_silent_is_told_with_likely_causes_and_the_others_ar
 ) -> None:
     pads = made("index_proximal", "index_distal")
     pads.devices["index_proximal"].send_data = False
-    outcomes, _ = told(pads, Person(pads), patience_s=3.0)
+    outcomes, _ = told(pads, Person(pads))
     assert outcomes["index_proximal"].result is Result.NO_ANSWER
     assert "isn't on the bus" in outcomes["index_proximal"].problems[0]
     assert outcomes["index_distal"].result is Result.WELL
@@ -381,7 +452,6 @@ class Written:
     person: Person
 
     def run(self, **options: Any) -> int:
-        self.pads.nodes.start()
         return commission.run(self.path, [self.pads.option], **options)
 
 
@@ -395,6 +465,7 @@ def written(
     pads = made("thumb_proximal", "thumb_middle")
     person = Person(pads)
     monkeypatch.setattr(commission, "open_dialogue", lambda: contextlib.nullcontext(person))
+    monkeypatch.setattr(commission, "Bench", lambda file: Stepped(pads, file))
     text = "".join(re.split(r"(?m)^(?=\[\[hand\.pad\]\])", shipped.path("utah_mit.toml").read_text())[:3])
     text = text.replace("[daemon]\n", f'[daemon]\ncontrol = "{endpoints["control"]}"\n')
     pads.devices["thumb_middle"].wired = (1, 0, 2, 3)
@@ -444,10 +515,8 @@ def test_a_file_that_cannot_say_what_was_found_is_left_alone(
 def test_one_pad_can_be_done_again_when_all_others_are_left(written: Written) -> None:
     assert written.run(links=["thumb_proximal"]) == 0
     assert (written.path.parent / "hand.toml.commissioned").read_text() == "right/thumb_proximal\n"
-    written.pads.nodes.stop()
     assert written.run(links=["right/thumb_proximal"]) == 0
     assert sum("press it anywhere" in line for line in written.person.said) == 2
-    written.pads.nodes.stop()
     assert written.run() == 0
     assert not (written.path.parent / "hand.toml.commissioned").exists()
 

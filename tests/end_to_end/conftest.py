@@ -198,7 +198,6 @@ def rig(tmp_path: Path, endpoints: dict[str, str], network: list[str], free_port
 @pytest.fixture
 def vcan_rig(tmp_path: Path, endpoints: dict[str, str]) -> Iterator[Rig]:
     """A deployment on SocketCAN; only inside vcan-run."""
-    os.environ.setdefault("PYTHONDONTWRITEBYTECODE", "1")
     made = Rig(tmp_path, endpoints, [], ["can0=socketcan:vcan0"])
     yield made
     made.end_all()

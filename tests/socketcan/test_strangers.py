@@ -44,6 +44,7 @@ class Hand:
         endpoints = "\n".join(
             f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs")
         )
+        endpoints += "\nsupervise = false"  # its process takes seconds to start in the guest
         text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{endpoints}\n")
         text = text.replace("sync_period_ms = 5.0", f"sync_period_ms = {PERIOD_MS}")
         config = folder / "hand.toml"
