@@ -23,9 +23,6 @@ class Taker:
     def wants(self, _: str) -> bool:
         return True
 
-    def next_seq(self, _: str) -> int:
-        return len(self.messages) + 1
-
     def send(self, message: wire.Outgoing) -> None:
         self.messages.append(wire.decode(wire.encode(message)))
 

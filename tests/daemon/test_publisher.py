@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,9 @@ def publisher() -> Iterator[Publisher]:
         made.close()
 
 
-def _health(publisher: Publisher, link: str, text: str = "") -> wire.Health:
-    topic = f"health/h/{link}"
+def _health(publisher: Publisher, link: str, text: str = "", seq: int = 1) -> wire.Health:
     return wire.Health(
-        wire.SCHEMA_VERSION, publisher.run, publisher.next_seq(topic), 1, "h", link, "can0", 1, "clear",
+        wire.SCHEMA_VERSION, publisher.run, seq, 1, "h", link, "can0", 1, "clear",
         "operational", 0, "sync", text, None, 0.0, 0, 0, None, 0, 0, (), False,
     )  # fmt: skip
 
@@ -83,13 +83,15 @@ def test_a_late_joiner_gets_the_lasting_state_as_a_repeat_and_others_do_not_see_
 ) -> None:
     with connect("health/*/*", endpoint=publisher.endpoints["live"]) as early:
         _until(publisher, "health/h/thumb")
-        publisher.send(_health(publisher, "thumb", "first"), lasting=True)
+        told = _health(publisher, "thumb", "first")
+        publisher.present["health/h/thumb"] = lambda _: replace(told, repeat=True)
+        publisher.send(told)
         first = early.recv()
         assert (first.reason, first.repeat) == ("first", False)
         with connect("health/*/*", endpoint=publisher.endpoints["live"]) as late:  # the very same prefix
             (repeat,) = _all_that_comes(publisher, late, 1)
             assert (repeat.reason, repeat.repeat, repeat.seq) == ("first", True, first.seq)
-        publisher.send(_health(publisher, "thumb", "second"), lasting=True)
+        publisher.send(_health(publisher, "thumb", "second", 2))
         assert early.recv().reason == "second"
         assert early.gaps == 0
 
@@ -174,7 +176,8 @@ def test_late_joiners_cost_a_tick_no_more_than_a_few_messages(
     publisher: Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for number in range(100):
-        publisher.send(_health(publisher, f"link_{number}"), lasting=True)
+        health = replace(_health(publisher, f"link_{number}"), repeat=True)
+        publisher.present[wire.topic_of(health)] = lambda _, health=health: health  # type: ignore[misc]
     encoded = 0
     encode = wire.encode
 
@@ -209,8 +212,8 @@ def test_a_subscriber_that_stalls_loses_messages_and_nobody_else_does(publisher:
             publisher.take_subscriptions(NOW_NS)
             publisher._sockets["live"].poll(1)
         got = []
-        for _ in range(count):
-            publisher.send(_health(publisher, "thumb", text))
+        for number in range(count):
+            publisher.send(_health(publisher, "thumb", text, 1 + number))
             got.append(awake.recv().seq)
         assert got == list(range(1, count + 1))
     assert publisher.drops["live"] > 0

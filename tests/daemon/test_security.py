@@ -65,7 +65,7 @@ class Served:
         self.control = Control(self.context, "tcp://127.0.0.1:*", self.gate)
         self.control.commands["status"] = lambda _, __: {"answer": 42}
         self.live = self.publisher.endpoints["live"]
-        self.skipped_ns = 0
+        self.skipped_ns = self.sent = 0
         self.now_ns = _SECOND_NS
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve)
@@ -79,7 +79,8 @@ class Served:
             self.gate.poll(self.now_ns)
             self.publisher.take_subscriptions(self.now_ns)
             self.control.poll(self.now_ns)
-            self.publisher.send(_health(self.publisher.next_seq("health/h/thumb")))
+            self.sent += 1
+            self.publisher.send(_health(self.sent))
 
     def until(self, met: Callable[[], bool]) -> None:
         for _ in range(2000):

@@ -48,6 +48,8 @@ __all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus", "Serial
 
 STALE_PERIODS = 3
 """Periods without a sample after which an operational node is stale."""
+_LEAST_SILENCE_NS = 15_000_000
+"""And as long at least: at 1 kHz three periods are a pause of our own, in which nobody was asked."""
 BEATS_WATCHED = 10
 """Heartbeat periods over which it is judged whether they come twice as often as they should."""
 CROWDED = 2
@@ -87,8 +89,8 @@ class Master:
     ) -> None:
         """Read the nodes' EDS files; nothing is sent before `start`.
 
-        With `sync_period_ns` an operational node without samples for three periods becomes STALE. Raises
-        EdsError for an EDS that can't be used, ValueError for nodes that contradict each other.
+        With `sync_period_ns` an operational node without samples for three periods, and 15 ms, becomes STALE.
+        Raises EdsError for an EDS that can't be used, ValueError for nodes that contradict each other.
         """
         slabs = {id(port.slab): port.slab for port in ports.values()}
         if len(slabs) != 1:
@@ -194,6 +196,10 @@ class Master:
         """Every node as it is now, in the order given."""
         return [node.status() for node in self._nodes]
 
+    def status_of(self, slot: int) -> NodeStatus:
+        """The node of a slot as it is now."""
+        return self._by_slot[slot].status()
+
     def take_events(self) -> list[NodeEvent | SerialChanged]:
         """What has happened since the last call, oldest first; the latest thousand if nobody asked."""
         events = list(self._events)
@@ -258,7 +264,8 @@ class Master:
                 self._advance(self._by_slot[slot], Sample(), t_ns)
         if self._sync_period_ns:
             ages = t_ns - np.maximum(stamps, self.paced_ns)
-            silent = (self.states == NodeState.OPERATIONAL) & (ages > STALE_PERIODS * self.period_ns)
+            patience_ns = np.maximum(STALE_PERIODS * self.period_ns, _LEAST_SILENCE_NS)
+            silent = (self.states == NodeState.OPERATIONAL) & (ages > patience_ns)
             if silent.any():
                 for slot in np.flatnonzero(silent).tolist():
                     self._advance(self._by_slot[slot], Silence(int(ages[slot])), t_ns)

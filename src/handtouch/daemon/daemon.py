@@ -133,6 +133,7 @@ class Daemon:
             self.control,
         )
         self.report.inputs = self.inputs.figures
+        self.publisher.present.update(self.report.present())
         self.supervisor: Supervisor | None = None
         if settings.supervise:
             store = str(store_path(settings.store, beside))

@@ -6,7 +6,6 @@ import socket as stdlib_socket
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import zmq
@@ -45,7 +44,6 @@ class Publisher:
         self.endpoints: dict[str, str] = {}
         self._sockets: dict[str, zmq.Socket[bytes]] = {}
         self._asked: dict[str, set[bytes]] = {}
-        self._seq: Counter[str] = Counter()
         self._repeats: dict[tuple[str, str], None] = {}  # (stream, topic) that somebody waits for, in order
         self._wanted: dict[str, bool] = {}
         self._held: list[list[bytes]] | None = None
@@ -99,18 +97,9 @@ class Publisher:
             self._wanted[topic] = wanted
         return wanted
 
-    def next_seq(self, topic: str) -> int:
-        """Number of the topic's next message."""
-        self._seq[topic] += 1
-        return self._seq[topic]
-
-    def send(self, message: wire.Outgoing, lasting: bool = False) -> None:
-        """Send to those who subscribed; a `lasting` message is repeated for those who subscribe later."""
-        topic = wire.topic_of(message)
-        if lasting:
-            assert not isinstance(message, wire.Packed)
-            self.present[topic] = lambda _: replace(message, repeat=True)
-        if not self.wants(topic):
+    def send(self, message: wire.Outgoing) -> None:
+        """Send to those who subscribed."""
+        if not self.wants(wire.topic_of(message)):
             return
         parts = wire.encode(message)
         if self._held is None:

@@ -7,7 +7,8 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 
 from handtouch import __version__, wire
 from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master, NodeStatus
+from handtouch.canbus.master import Master
 from handtouch.canbus.port import Port
-from handtouch.canbus.sync import Sync
+from handtouch.canbus.sync import Sync, summary_us
 from handtouch.config import Deployment
 from handtouch.daemon.control import Control
 from handtouch.daemon.histogram import StageClock
@@ -68,13 +69,14 @@ class Report:
         self._sync = sync
         self._publisher = publisher
         self._gate, self._control = gate, control
-        self.listener: Callable[[wire.Health | wire.Service], None] = lambda _: None
+        self.listener: Callable[[wire.Health | wire.Service], None] | None = None
         """is given every health and service message, subscribed or not"""
         self.inputs: Callable[[int], dict[str, Any]] = lambda _: {}
         """what came to the inputs endpoint until a time [ns]"""
         self.supervisor: Supervisor | None = None
         self._pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
         self._names = [(hand, pad.link) for hand, pad in self._pads]
+        self._topics = [f"health/{hand}/{link}" for hand, link in self._names]
         self._disabled_by: dict[int, str] = {}
         self._events_before: set[int] = set()
         self._told = np.full(n, PadState.STARTING, dtype=np.uint8)
@@ -82,6 +84,9 @@ class Report:
         self._started_ns = time.monotonic_ns()
         self.stages = StageClock(self._started_ns)
         self._second = _Window(self._started_ns, np.zeros(n, dtype=np.int64))
+        self._told_this_second = 0  # of all pads, in turn: told together, they would make a tick late
+        self._seq: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
+        self._services = 0
         self._half_second = _Window(self._started_ns, self._totals())
         self._rate_hz = np.zeros(n)
         self._speeds: dict[str, float] = {}
@@ -117,35 +122,33 @@ class Report:
         if self.supervisor is not None and self.supervisor.changed:
             changed |= self.supervisor.changed
             self.supervisor.changed.clear()
-        if now_ns - self._second.since_ns >= _SECOND_NS:
-            self._rate_hz = self._second.per_second(now_ns, self._pipeline.tick.samples)
-            changed = set(range(len(self._pads)))
-        if changed:
-            statuses = self._master.status()
-            for pad in sorted(changed):
-                self._tell(self._health(pad, now_ns, statuses[pad]))
+        for pad in sorted(changed.union(self._due(now_ns))):
+            self._seq[pad] += 1
+            self._tell(self._topics[pad], partial(self._health, pad, now_ns))
         if now_ns - self._half_second.since_ns >= _SERVICE_NS:
             rates = self._half_second.per_second(now_ns, self._totals())
             self._speeds = dict(zip(["ticks", *_of_buses(self._ports)], rates.tolist(), strict=True))
-            self._tick_us = _summary(self._durations_ns)
+            self._tick_us = summary_us(np.array(self._durations_ns, dtype=np.int64))
             if late := self.stages.take_late():
                 parts = (f"{name} {count} (up to {most_ns * 1e-6:.1f} ms)" for name, count, most_ns in late)
                 about = {"fields": {"part": late[0][0]}}
                 _loop_log.warning("late ticks, by what took the time: %s", ", ".join(parts), extra=about)
             self._durations_ns.clear()
-            self._tell(self._service(now_ns, self._publisher.next_seq("service")))
+            self._services += 1
+            self._tell("service", partial(self._service, now_ns))
 
-    def _tell(self, message: wire.Health | wire.Service) -> None:
-        self._publisher.send(message, lasting=True)
-        self.listener(message)
+    def present(self) -> dict[str, Callable[[int], wire.Outgoing | None]]:
+        """Topic -> what there is to repeat of it, at a time [ns]."""
+        pads = {topic: partial(self._last_health, pad) for pad, topic in enumerate(self._topics)}
+        return {**pads, "service": self._last_service}
 
     def status(self) -> dict[str, Any]:
         """Everything about the daemon and every pad, for the control endpoint."""
         now_ns = time.monotonic_ns()
-        statuses = self._master.status()
+        pads = (replace(self._health(pad, now_ns), seq=0) for pad in range(len(self._pads)))
         return {
-            "service": _plain(self._service(now_ns, 0)),
-            "pads": [_plain(self._health(pad, now_ns, status, 0)) for pad, status in enumerate(statuses)],
+            "service": _plain(replace(self._service(now_ns), seq=0)),
+            "pads": [_plain(health) for health in pads],
         }
 
     def summary(self) -> str:
@@ -154,6 +157,32 @@ class Report:
         up = int(np.count_nonzero((states == NodeState.OPERATIONAL) | (states == NodeState.STOPPED)))
         hands = ", ".join(hand.name for hand in self._deployment.hands)
         return f"{hands}: {up} of {len(self._pads)} nodes up, {self._speeds.get('ticks', 0.0):.0f} ticks/s"
+
+    def _due(self, now_ns: int) -> range:
+        """Pads whose turn it is to be told: each once a second."""
+        passed_ns, first = now_ns - self._second.since_ns, self._told_this_second
+        self._told_this_second = min(len(self._pads), len(self._pads) * passed_ns // _SECOND_NS)
+        due = range(first, self._told_this_second)
+        if passed_ns >= _SECOND_NS:
+            self._rate_hz = self._second.per_second(now_ns, self._pipeline.tick.samples)
+            self._told_this_second = 0
+        return due
+
+    def _tell(self, topic: str, make: Callable[[], wire.Health | wire.Service]) -> None:
+        """Make a message only if it is of use to anybody."""
+        wanted = self._publisher.wants(topic)
+        if wanted or self.listener is not None:
+            message = make()
+            if self.listener is not None:
+                self.listener(message)
+            if wanted:
+                self._publisher.send(message)
+
+    def _last_health(self, pad: int, now_ns: int) -> wire.Health | None:
+        return replace(self._health(pad, now_ns), repeat=True) if self._seq[pad] else None
+
+    def _last_service(self, now_ns: int) -> wire.Service | None:
+        return replace(self._service(now_ns), repeat=True) if self._services else None
 
     def _translate(self) -> None:
         """From node states to what the tick makes of them; a node that was up and is absent is lost."""
@@ -165,18 +194,18 @@ class Report:
             )
         self._pipeline.node_state[list(self._disabled_by)] = PadState.OFF
 
-    def _health(self, pad: int, now_ns: int, status: NodeStatus, seq: int | None = None) -> wire.Health:
+    def _health(self, pad: int, now_ns: int) -> wire.Health:
         hand, settings = self._pads[pad]
+        status = self._master.status_of(pad)
         columns = self._pipeline.tick.columns
         sample_ns = int(columns.sample_ns[pad])
         state = PadState(int(columns.state[pad]))
         counts = self._pipeline.tick.counts[pad]
         railed = self._pipeline.slab.railed(self._pipeline.tick.counts)[pad]
-        topic = f"health/{hand}/{settings.link}"
         return wire.Health(
             v=wire.SCHEMA_VERSION,
             run=self._publisher.run,
-            seq=self._publisher.next_seq(topic) if seq is None else seq,
+            seq=int(self._seq[pad]),
             t_ns=now_ns,
             hand=hand,
             link=settings.link,
@@ -203,12 +232,12 @@ class Report:
         by = self._disabled_by.get(pad)
         return f"disabled by {by}; `handtouch enable` switches it on" if by else ""
 
-    def _service(self, now_ns: int, seq: int) -> wire.Service:
+    def _service(self, now_ns: int) -> wire.Service:
         bit_rates = {bus.name: bus.bitrate_bit_s for bus in self._deployment.buses}
         return wire.Service(
             v=wire.SCHEMA_VERSION,
             run=self._publisher.run,
-            seq=seq,
+            seq=self._services,
             t_ns=now_ns,
             wall_offset_ns=time.time_ns() - time.monotonic_ns(),
             version=__version__,
@@ -285,11 +314,3 @@ def _process() -> dict[str, Any]:
         "log_dropped": logs.dropped if logs else 0,
         "log_silenced": logs.silenced if logs else 0,
     }
-
-
-def _summary(durations_ns: Iterable[int]) -> dict[str, float]:
-    microseconds = np.fromiter(durations_ns, dtype=np.float64) * 1e-3
-    if not len(microseconds):
-        return {}
-    median, p99, worst = np.percentile(microseconds, [50, 99, 100]).tolist()
-    return {"p50": median, "p99": p99, "max": worst}
