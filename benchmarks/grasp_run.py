@@ -77,12 +77,16 @@ class Served:
     error_m: dict[str, FloatArray]
     """(k, 3) by PARTS; they add up to palm_m - true_m"""
     force_n: FloatArray
+    force_std_n: FloatArray
+    """(k,) as told; NaN where the force is a lower bound"""
     true_n: FloatArray
     moving_rad_s: FloatArray
     """(k,) the fastest joint"""
     railed: int
     """samples of a pad at the end of a channel's range"""
     events: Events
+    spans: list[list[Span]]
+    """of each pad, when contacts were told"""
 
 
 def served(
@@ -212,10 +216,12 @@ def _compared(deployment: Deployment, went: Grasp, pressed: Patches, run: _Run, 
         np.array([true_m for true_m, _ in places]).reshape(-1, 3),
         {part: np.array([of[part] for _, of in places]).reshape(-1, 3) for part in PARTS},
         np.array([np.nan if c.force_n is None else c.force_n for c, *_ in kept]),
+        np.array([np.nan if c.force_std_n is None else c.force_std_n for c, *_ in kept]),
         pressed.total_n[steps, rows],
         speed[steps],
         railed,
         events,
+        spans,
     )
 
 
