@@ -122,6 +122,11 @@ def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     view.add_argument("--port", type=_port, default=5588, help="its port, 0 for a free one (default: 5588)")
     view.add_argument("--open", action="store_true", help="open the page in this machine's browser")
     view.add_argument("--seconds", type=positive, default=0.0, help="end after so long")
+    view.add_argument(
+        "--no-percepts",
+        action="store_true",
+        help="contacts alone: don't let the daemon compute slip, hardness, shape and texture for the page",
+    )
 
     status = command(commands, "status", _status, "how the daemon, its buses and its pads fare")
     add_endpoint(status, CONTROL, "control endpoint")
@@ -367,6 +372,7 @@ def _view(asked: argparse.Namespace) -> int:
         port=asked.port,
         show=asked.open,
         seconds=asked.seconds,
+        percepts=not asked.no_percepts,
     )
 
 

@@ -11,6 +11,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -244,6 +245,50 @@ def test_a_daemon_that_is_silent_or_another_takes_its_contacts_along() -> None:
     fewer = DEPLOYMENT.model_copy(update={"hands": (hand.model_copy(update={"pads": hand.pads[:4]}),)})
     picture.take(deployed(fewer, run=2))
     assert len(picture.board.since(seen)["scene"]["pads"]) == 4
+
+
+def percept(kind: str, label: str, **changed: Any) -> wire.Percept:
+    values: dict[str, Any] = {"v": 1, "run": 1, "seq": 1, "t_ns": 10**9, "hand": "right", "kind": kind}
+    values |= {"link": "index_distal", "contact": 7, "state": "estimated", "label": label, "confidence": 0.93}
+    values |= {"probabilities": {}, "values": {}, "evidence": {}, "reason": "", "repeat": False}
+    return wire.Percept(**{**values, **changed})
+
+
+def test_what_is_felt_is_told_in_words_beside_its_pad_as_long_as_the_contact_lasts() -> None:
+    picture = Picture()
+    picture.take(frame({DISTAL: 7}))
+    picture.take(percept("motion", "sliding", values={"slipped_m": 4e-4}))
+    picture.take(percept("hardness", "medium", values={"stiffness_n_per_m": 2100.0}))
+    picture.take(percept("texture", "", state="unestimated", reason="it has to slide"))
+    picture.take(percept("shape", "sphere", link="", contact=0, values={"radius_m": 0.012}))
+    question = {"values": {"force_ratio": 1.5, "bits": 0.8}, "question": "hardness", "expires_ns": 2 * 10**9}
+    picture.take(percept("ask", "squeeze", state="open", confidence=None, **question))
+    picture.step(True)
+    told = picture.board.since(0)
+    assert told["felt/right/index_distal"] == {
+        "short": ["sliding", "medium"],
+        "lines": ["sliding 95%, slipped 0.4 mm", "medium 95%, stiffness 2.1 N/mm"],
+        "asks": ["hardness? squeeze (force ratio 1.5)"],
+        "missing": ["texture: it has to slide"],
+    }
+    assert told["felt/right/"]["lines"] == ["shape sphere 95%, radius 12 mm"]
+    later = replace(frame({DISTAL: 7}), t_ns=2 * 10**9)
+    picture.take(later)
+    picture.step(True)
+    assert picture.board.since(0)["felt/right/index_distal"]["asks"] == []  # expired
+    picture.take(replace(frame({DISTAL: 8}), t_ns=2 * 10**9))
+    picture.step(True)
+    assert picture.board.since(0)["felt/right/index_distal"] is None  # another contact
+
+
+def test_a_silent_daemon_takes_what_was_felt_along() -> None:
+    picture = Picture()
+    picture.take(frame({DISTAL: 7}))
+    picture.take(percept("motion", "sliding"))
+    picture.step(True)
+    assert picture.board.since(0)["felt/right/index_distal"]
+    picture.step(False)
+    assert picture.board.since(0)["felt/right/index_distal"] is None
 
 
 def test_a_urdf_that_cannot_be_read_is_told_and_pads_are_shown_all_the_same() -> None:

@@ -92,6 +92,35 @@ def percept_line(percept: wire.Percept) -> str:
     return f"{head}  {said:<16}  {values}" + (f"  [{evidence}]" if evidence else "")
 
 
+_MAIN = {"motion": "slipped_m", "hardness": "stiffness_n_per_m", "shape": "radius_m", "texture": "period_m"}
+"""Kind of a percept -> the number that says most."""
+_SURE_STEP = 0.05
+"""Steps of a probability told live: finer ones would only flicker."""
+
+
+def percept_words(percept: wire.Percept) -> str:
+    """A percept in a few words: class, how sure, the number that says most; "" while nothing is known."""
+    values = percept.values
+    if percept.kind == "ask":
+        amounts = ", ".join(
+            _measure(name, value, None)
+            for name, value in values.items()
+            if name != "bits" and not name.endswith("_std") and value is not None
+        )
+        return f"{percept.question}? {percept.label}" + (f" ({amounts})" if amounts else "")
+    if percept.state == "invalid":
+        return f"{percept.kind}: {percept.reason}"
+    if percept.state != "estimated" or not percept.label:
+        return ""
+    words = percept.label if percept.kind in ("motion", "hardness") else f"{percept.kind} {percept.label}"
+    if percept.confidence is not None:
+        words += f" {_SURE_STEP * round(percept.confidence / _SURE_STEP):.0%}"
+    name = _MAIN.get(percept.kind, "")
+    if isinstance(value := values.get(name), float):
+        words += f", {_measure(name, value, None)}"
+    return words
+
+
 def _number(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "(" + ", ".join(map(_number, value)) + ")"

@@ -17,6 +17,7 @@ from handtouch.view.page.picture import Picture
 from handtouch.view.page.serve import PageServer
 
 TOPICS = ("hand/*", "health/*/*", "joints/*", "service", "config")
+PERCEPTS = "percept/*/*"
 HOST, PORT = "127.0.0.1", 5588
 _UPDATES_PER_S = 30
 _QUEUE = 2000
@@ -30,8 +31,11 @@ def run(
     port: int = PORT,
     show: bool = False,
     seconds: float = 0.0,
+    percepts: bool = True,
 ) -> int:
     """Serve the page until Ctrl-C, or for `seconds`; `show` opens it in this machine's browser.
+
+    `percepts`: what is felt above contacts, too, which the daemon computes only for who asks.
 
     Exit status 0, 1 when the daemon doesn't let us in, 2 for an endpoint, key or port that can't be used.
     """
@@ -40,7 +44,8 @@ def run(
         signal.signal(number, lambda *_: stop.set())
     picture = Picture()
     try:
-        messages = connect(*TOPICS, endpoint=endpoint, key=key, queue=_QUEUE)
+        topics = (*TOPICS, PERCEPTS) if percepts else TOPICS
+        messages = connect(*topics, endpoint=endpoint, key=key, queue=_QUEUE)
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2

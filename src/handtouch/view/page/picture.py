@@ -16,6 +16,7 @@ from handtouch import wire
 from handtouch.client import columns
 from handtouch.config import Deployment
 from handtouch.view.lines import DOUBTED, finding_text
+from handtouch.view.page.felt import Felt
 from handtouch.view.page.layout import describe
 
 FloatArray = NDArray[np.float64]
@@ -55,7 +56,8 @@ class Picture:
     """Takes messages by `take`; `step` puts what they come to on `board`, for the pages.
 
     Keys of the board: `scene` (as `layout.describe`), `joints/<hand>`, `pad/<hand>/<link>`,
-    `contact/<hand>/<link>` (None: not touched), `service`, `alive`, `messages`, `t` (seconds).
+    `contact/<hand>/<link>` (None: not touched), `felt/<hand>/<link>` (as `Felt.told`), `service`, `alive`,
+    `messages`, `t` (seconds).
     """
 
     def __init__(self) -> None:
@@ -65,6 +67,7 @@ class Picture:
         self._frames: dict[str, wire.HandFrame] = {}
         self._passing: dict[str, tuple[wire.HandFrame, int]] = {}
         self._health: dict[str, wire.Health] = {}
+        self._felt = Felt()
         self._ill: dict[str, tuple[str, str]] = {}
         self._told: deque[dict[str, Any]] = deque(maxlen=_MESSAGES)
         self._wall_offset_ns = 0
@@ -81,6 +84,8 @@ class Picture:
             angles = zip(message.names, message.position_rad, strict=False)
             known = {name: round(angle, 4) for name, angle in angles if angle is not None}
             self.board.put(f"joints/{message.hand}", known)
+        elif isinstance(message, wire.Percept):
+            self._felt.take(message)
         elif isinstance(message, wire.Health):
             self._take_health(message)
         elif isinstance(message, wire.Service):
@@ -95,16 +100,24 @@ class Picture:
         if not alive:
             self._frames.clear()
             self._passing.clear()
+            self._felt.clear()
             self.board.drop("contact/")
+            self.board.drop("felt/")
             return
+        touched: dict[str, int] = {}
         for hand, frame in self._frames.items():
             told = columns(frame)
             for row, link in enumerate(frame.links):
                 key = f"{hand}/{link}"
                 self._put_pad(key, _STATES[told["state"][row]] if told["state"][row] < 7 else "faulted")
-                last = (frame, row) if told["contact"][row] else self._passing.get(key)
+                touched[key] = int(told["contact"][row])
+                last = (frame, row) if touched[key] else self._passing.get(key)
                 self.board.put(f"contact/{key}", _contact(*last) if last else None)
             self.board.put("t", round(frame.t_ns * 1e-9, 3))
+        if self._frames:
+            now_ns = max(frame.t_ns for frame in self._frames.values())
+            for key, felt in self._felt.told(touched, now_ns).items():
+                self.board.put(f"felt/{key}", felt)
         self._frames.clear()
         self._passing.clear()
 
@@ -174,7 +187,9 @@ class Picture:
         self._passing.clear()
         self._health.clear()
         self._ill.clear()
+        self._felt.clear()
         self.board.drop("contact/")
+        self.board.drop("felt/")
         self._tell(t_ns, "the daemon was started anew", "starting")
 
     def _tell(self, t_ns: int, text: str, look: str, link: str = "") -> None:

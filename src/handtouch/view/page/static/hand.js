@@ -8,7 +8,8 @@ const FIELD_OF_VIEW = (32 * Math.PI) / 180;
 const M_PER_N = 0.012, LONGEST_M = 0.06, SHORTEST_M = 0.004;
 const HEAD_M = 0.006, PLACE_M = 0.0017;
 const PAD_NEARER_M = 0.002, CONTACT_NEARER_M = 0.004;
-const LABEL_WIDE = 50, LABEL_HIGH = 18; // of a force, pixels
+const LETTER = 6.4, LINE = 17, ASIDE = 12; // of a label, pixels
+const MOST_WORDS = 6; // pads beside which all that is felt stands; of more, only the motion
 const MOST_PIXELS = 1.5; // of the canvas to one of the page
 
 const numbers = (text) => new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
@@ -140,11 +141,13 @@ export class HandView {
   }
 
   label(state, touched) {
-    const wanted = [];
+    const wanted = [], few = touched.length <= MOST_WORDS;
     for (const [pad, contact] of touched) {
       const link = this.placed[pad.node], z = m.unit(m.direction(link, contact.normal));
       const end = m.add(m.point(link, contact.at), m.scale(z, arrowM(contact.force_n ?? 0) + 0.004));
-      wanted.push([end, "force", forceText(contact)]);
+      const felt = state.felt[pad.key], words = felt?.short ?? [];
+      wanted.push([end, "force", [forceText(contact), ...(few ? words : words.slice(0, 1))].join("\n")]);
+      if (few) for (const ask of felt?.asks ?? []) wanted.push([end, "open", ask]);
     }
     for (const pad of this.pads) {
       const told = state.pads[pad.key], ill = told && ["stale", "lost", "faulted", "doubted"].includes(told.look);
@@ -160,9 +163,7 @@ export class HandView {
       label.hidden = number >= wanted.length;
       if (label.hidden) return;
       const [at, kind, text] = wanted[number];
-      let [x, y] = this.pixels(at);
-      while (taken.some(([x1, y1]) => Math.abs(x - x1) < LABEL_WIDE && Math.abs(y - y1) < LABEL_HIGH)) y += LABEL_HIGH / 4;
-      taken.push([x, y]);
+      const [x, y] = free(this.pixels(at), text, taken);
       label.className = kind;
       if (label.textContent !== text) label.textContent = text;
       label.style.transform = `translate(${(x - corner.left).toFixed(1)}px, ${(y - corner.top).toFixed(1)}px) translate(-50%, -50%)`;
@@ -172,6 +173,16 @@ export class HandView {
   ill(state) {
     return this.pads.filter((pad) => ["stale", "lost", "faulted", "doubted"].includes(state.pads[pad.key]?.look)).length;
   }
+}
+
+// The nearest place below, or else above, where a label covers none of those that are there; it is added to them.
+function free([x, y], text, taken) {
+  const lines = text.split("\n"), wide = LETTER * Math.max(...lines.map((line) => line.length)) + ASIDE, high = LINE * lines.length + 2;
+  const clear = (at) => taken.every((one) => Math.abs(x - one.x) >= (wide + one.wide) / 2 || Math.abs(at - one.y) >= (high + one.high) / 2);
+  const steps = Array.from({ length: 60 }, (_, k) => y + 4 * Math.ceil(k / 2) * (k % 2 ? 1 : -1));
+  const found = steps.find(clear) ?? y;
+  taken.push({ x, y: found, wide, high });
+  return [x, found];
 }
 
 const m2 = (a, b) => [a[0] - b[0], a[1] - b[1]];

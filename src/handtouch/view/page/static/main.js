@@ -3,10 +3,10 @@
 import { HandView } from "./hand.js";
 import { HistoryView } from "./history.js";
 import { PadsView } from "./pads.js";
-import { drawLegend, drawMessages, drawNodes, drawService } from "./panel.js";
+import { drawFelt, drawLegend, drawMessages, drawNodes, drawService } from "./panel.js";
 
 const state = {
-  connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, messages: [], t: 0,
+  connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, felt: {}, messages: [], t: 0,
 };
 const counts = { updates: 0, frames: 0 };
 const SLOW_MS = 40;
@@ -20,7 +20,7 @@ let dirty = true;
 function take(changes) {
   if (changes.t !== undefined) state.t = changes.t;
   if (changes.scene) {
-    Object.assign(state, { scene: changes.scene, pads: {}, contacts: {} });
+    Object.assign(state, { scene: changes.scene, pads: {}, contacts: {}, felt: {} });
     numbers = new Map(changes.scene.pads.map((pad, number) => [pad.key, number]));
     for (const view of [hand, pads]) view.show(changes.scene);
     history.clear();
@@ -29,6 +29,7 @@ function take(changes) {
     const [kind, name] = [key.slice(0, key.indexOf("/")), key.slice(key.indexOf("/") + 1)];
     if (kind === "joints") state.joints[name] = value ?? {};
     else if (kind === "pad") state.pads[name] = value;
+    else if (kind === "felt") state.felt[name] = value;
     else if (kind === "contact") {
       state.contacts[name] = value;
       pads.follow(name, value, state.t);
@@ -37,6 +38,7 @@ function take(changes) {
   }
   if ("alive" in changes || "service" in changes || changes.scene) drawService(state);
   if (changes.scene || Object.keys(changes).some((key) => key.startsWith("pad/"))) drawNodes(state);
+  if (changes.scene || Object.keys(changes).some((key) => key.startsWith("felt/"))) drawFelt(state);
   if (changes.messages) drawMessages(state);
   dirty = true;
 }

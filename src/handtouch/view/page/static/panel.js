@@ -63,6 +63,27 @@ export function drawNodes({ scene, pads }) {
   }));
 }
 
+// What is felt of each touch and of the whole hand, and what is open, in words.
+export function drawFelt({ scene, felt }) {
+  if (!scene) return;
+  const order = new Map(scene.pads.map((pad, number) => [pad.key, number]));
+  const entries = Object.entries(felt).filter(([, told]) => told);
+  entries.sort(([a], [b]) => (order.get(a) ?? -1) - (order.get(b) ?? -1)); // whole hands first
+  const nameOf = (key) => (key.endsWith("/") ? `${key.slice(0, -1)} hand` : key.slice(key.indexOf("/") + 1).replaceAll("_", " "));
+  const known = ([, told]) => told.lines.length || told.asks.length, lines = [];
+  for (const [key, told] of entries.filter(known)) {
+    const line = element("li", "", "");
+    line.append(element("b", "", nameOf(key)), ` ${told.lines.join(" · ")}`);
+    for (const ask of told.asks) line.append(element("em", "", ask));
+    line.title = told.missing.join("\n");
+    lines.push(line);
+  }
+  const open = entries.filter((entry) => !known(entry)), line = element("li", "dim", "");
+  line.textContent = open.length ? `too little is known yet of ${lines.length ? `${open.length} more` : open.length === 1 ? "one touch" : `${open.length} touches`}` : "nothing beyond contacts";
+  line.title = open.map(([key, told]) => `${nameOf(key)}: ${told.missing.join("; ")}`).join("\n");
+  byId("felt").replaceChildren(...lines, ...(open.length || !lines.length ? [line] : []));
+}
+
 export function drawMessages({ messages }) {
   const newest = [...messages].reverse();
   byId("messages").replaceChildren(...newest.map(({ at_s, links, text, look }) => {
