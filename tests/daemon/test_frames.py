@@ -17,8 +17,9 @@ from handtouch.hand.robot import Robots
 
 MS = 1_000_000
 NONE = np.zeros(0, dtype=np.intp)
-ROBOTS = Robots(load(shipped.path("utah_mit.toml")))
-PADS = [pad.link for pad in load(shipped.path("utah_mit.toml")).hands[0].pads]
+DEPLOYMENT = load(shipped.path("utah_mit.toml"))
+ROBOTS = Robots(DEPLOYMENT)
+PADS = [pad.link for pad in DEPLOYMENT.hands[0].pads]
 NAMES = ROBOTS.joint_names[0]
 TIP, MIDDLE, PROXIMAL = (PADS.index(f"index_{phalanx}") for phalanx in ("distal", "middle", "proximal"))
 HEEL = PADS.index("palm_heel")
@@ -27,7 +28,7 @@ HEEL = PADS.index("palm_heel")
 class Touched:
     """The shipped hand with contacts on some pads, at 100 ms."""
 
-    def __init__(self, *pads: int, joints: JointStates | None = None) -> None:
+    def __init__(self, *pads: int, joints: JointStates | None = None, robots: Robots = ROBOTS) -> None:
         n = len(PADS)
         self.columns, self.ids = Columns.of(n), np.zeros(n, dtype=np.uint32)
         rng = np.random.default_rng(1)
@@ -40,7 +41,7 @@ class Touched:
             self.columns.covariance_m2[pad] = root @ root.T
         self.columns.sample_ns[:] = 100 * MS
         self.pads = np.array(pads, dtype=np.intp)
-        self.frames = Frames(["right"] * n, ROBOTS)
+        self.frames = Frames(["right"] * n, robots)
         if joints is not None:
             self.frames.joints_at = lambda _, t_ns: joints.at(t_ns)
         everything = np.ones(n, dtype=np.bool_)
@@ -109,6 +110,50 @@ def test_uncertain_joints_widen_the_covariance_as_samples_of_them_do() -> None:
     touched.frames.joints_at = joints_at
     places = [touched.step().tell(TIP)["palm_position_m"] for _ in range(2000)]
     np.testing.assert_allclose(added, np.cov(np.array(places).T), atol=0.1 * added.max())
+
+
+def stating(**tolerances: float) -> Robots:
+    """The shipped hand, whose file tells these tolerances."""
+    hand = DEPLOYMENT.hands[0].model_copy(update=tolerances)
+    return Robots(DEPLOYMENT.model_copy(update={"hands": (hand,)}))
+
+
+def test_stated_tolerances_of_mounts_widen_covariances_as_pads_that_sit_a_little_off_do() -> None:
+    place_mm, turn_deg = 0.2, 2.0
+    position = np.full(len(NAMES), 0.5)
+    stated, unstated = (
+        Touched(TIP, joints=told(100, position), robots=robots)
+        for robots in (stating(mount_std_mm=place_mm, mount_std_deg=turn_deg), ROBOTS)
+    )
+    on_link = np.array([0.0, 0.01, 0.01])  # 1 cm or so from the middle of the pad
+    middle_m = np.array(DEPLOYMENT.hands[0].pads[TIP].mount.position_mm) * 1e-3
+    for touched in (stated, unstated):
+        touched.columns.position_m[TIP] = middle_m + on_link
+        touched.step()
+    kinematics = ROBOTS.kinematics[0]
+    kinematics.move(position)
+    rng = np.random.default_rng(4)
+    moved = 1e-3 * place_mm * rng.normal(size=(20_000, 3))
+    moved += np.cross(np.radians(turn_deg) * rng.normal(size=(20_000, 3)), on_link)
+    for frame, pose in (("palm", kinematics.in_palm(TIP)), ("base", kinematics.in_base(TIP))):
+        wide, narrow = (
+            np.reshape(touched.frames.tell(TIP)[f"{frame}_covariance_m2"], (3, 3))
+            for touched in (stated, unstated)
+        )
+        drawn = np.cov(moved @ pose.rotation.T, rowvar=False)
+        np.testing.assert_allclose(wide - narrow, drawn, atol=0.03 * drawn.max())
+
+
+def test_the_stated_error_of_joints_counts_where_joint_states_tell_none() -> None:
+    std = 0.01
+    robots = stating(joint_std_deg=np.degrees(std), joint_std_mm=1e3)  # none of them slides
+    by_file = Touched(TIP, HEEL, joints=told(100), robots=robots).step()
+    by_states = Touched(TIP, HEEL, joints=told(100, std=std)).step()
+    surer = Touched(TIP, HEEL, joints=told(100, std=std / 2), robots=robots).step()
+    for pad in (TIP, HEEL):
+        assert by_file.tell(pad) == by_states.tell(pad)
+    trace = [sum(of.tell(TIP)["palm_covariance_m2"][::4]) for of in (by_states, surer)]
+    assert trace[1] < 0.5 * trace[0]
 
 
 def test_old_joints_give_no_place_but_their_age_and_what_no_joint_moves_stays_valid() -> None:

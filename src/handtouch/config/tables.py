@@ -338,9 +338,28 @@ class Hand(Table):
     joint_prefix: str = Field(
         "", description="what joint states put before the names of joints, e.g. left_; not before joint_names"
     )
+    mount_std_mm: NonNegative = Field(
+        0.0,
+        description="how far a pad may sit from where its mount says, along each axis (1 sigma): it enters "
+        "the covariances in palm and base; 0: not stated, and not in them",
+    )
+    mount_std_deg: NonNegative = Field(
+        0.0, description="and how far it may be turned, about each axis (1 sigma)"
+    )
+    joint_std_deg: NonNegative = Field(
+        0.0,
+        description="error of the joint angles (1 sigma) where joint states tell no position_std_rad, as of "
+        "their zeros: it enters these covariances too; 0: not stated",
+    )
+    joint_std_mm: NonNegative = Field(0.0, description="the same of joints that slide")
     joints_stale_ms: Positive = Field(
         100.0,
         description="a contact farther in time from the nearest joint state has no place in palm and base",
+    )
+    gravity: Three = Field(
+        (0.0, 0.0, -1.0),
+        description="which way gravity points in the base's frame, for links whose pads feel it; joint states "
+        "may tell another, of a base that moves",
     )
     group_mm: NonNegative = Field(
         25.0, description="contacts that lie this close may be of one object, and are told as a group"

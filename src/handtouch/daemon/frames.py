@@ -185,7 +185,11 @@ class Frames:
             joints = Joints.unknown(t_ns, len(kinematics.joints))
         self.used.append((hand, t_ns, joints.position_rad, joints.age_s, joints.std_rad))
         kinematics.move(joints.position_rad)
-        on_link = columns.position_m[rows], columns.normal[rows], columns.covariance_m2[rows]
+        covariance_m2, mounts = columns.covariance_m2[rows], self._robots.mounts[number]
+        if mounts is not None:
+            covariance_m2 = covariance_m2 + mounts.covariance(links, columns.position_m[rows])
+        on_link = columns.position_m[rows], columns.normal[rows], covariance_m2
+        joint_std = np.where(joints.std_rad > 0, joints.std_rad, self._robots.joint_std[number])
         ages = []
         wants_base = np.count_nonzero(self._wants_base[rows]) > 0
         for at, state, needs, pose in (
@@ -196,9 +200,9 @@ class Frames:
             rotation, placed = _carry([pose(link) for link in links.tolist()], *on_link)
             if at == _PALM:
                 self._rotation[rows] = rotation
-            if np.count_nonzero(joints.std_rad):
+            if np.count_nonzero(joint_std):
                 placed[:, _TOLD["covariance_m2"]] += _of_joints(
-                    kinematics, links, joints.std_rad, on_link[0], at == _BASE
+                    kinematics, links, joint_std, on_link[0], at == _BASE
                 )
             stale = age_s > self._robots.stale_s[number]
             lost = ~np.isfinite(placed[:, 0]) | ~np.isfinite(age_s)

@@ -90,6 +90,11 @@ class Kinematics:
         """Where the link of that number is in the frame of the base."""
         return self._pose(self._base, self._frames[link])
 
+    def down(self, in_base: FloatArray) -> FloatArray:
+        """A direction (3,) of the base's frame in the frame of each link, (n, 3)."""
+        seen = self._at(self._base).rotation @ in_base
+        return np.array([seen @ self._at(frame).rotation for frame in self._frames])
+
     def slope(self, link: int, position_m: FloatArray, in_base: bool = False) -> FloatArray:
         """How a point (3,) of the link moves with each joint, (3, m) [m/rad] in palm or base frame."""
         pin, frame, other = self._pin, self._frames[link], self._base if in_base else self._palm

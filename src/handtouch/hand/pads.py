@@ -32,6 +32,26 @@ def mount_of(pad: config.Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     return rotation_of(np.radians(pad.mount.rpy_deg)), np.array(pad.mount.position_mm) * _MM
 
 
+class Mounts:
+    """How sure it is where the pads of a hand sit on their links: `covariance` of places on them."""
+
+    def __init__(self, hand: config.Hand) -> None:
+        self._origin_m = np.array([pad.mount.position_mm for pad in hand.pads]) * _MM
+        self._place_m2 = (hand.mount_std_mm * _MM) ** 2
+        self._turn_rad2 = math.radians(hand.mount_std_deg) ** 2
+
+    def covariance(self, pads: NDArray[np.intp], position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What that adds to places (k, 3) on pads (k,), both in the links' frames: (k, 3, 3) [m^2].
+
+        A turn of s about each axis through the pad's origin moves what is r away by s^2 (r.r 1 - r r').
+        """
+        arm = position_m - self._origin_m[pads]
+        even = self._place_m2 + self._turn_rad2 * np.einsum("ki,ki->k", arm, arm)
+        return np.asarray(
+            even[:, None, None] * np.eye(3) - self._turn_rad2 * (arm[:, :, None] * arm[:, None])
+        )
+
+
 def rotation_of(rpy_rad: ArrayLike) -> NDArray[np.float64]:
     """Matrix (3, 3) of roll, pitch and yaw [rad] about the fixed axes x, y and z, in turn, as in URDF."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(rpy_rad), np.cos(rpy_rad)

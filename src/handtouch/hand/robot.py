@@ -18,12 +18,17 @@ from handtouch.config import ConfigError, Deployment, Hand, Problem
 from handtouch.hand import kinematics, urdf
 from handtouch.hand.body import distance_m, find_mesh
 from handtouch.hand.kinematics import Kinematics
-from handtouch.hand.pads import mount_of
+from handtouch.hand.pads import Mounts, mount_of
 from handtouch.hand.urdf import Description, UrdfError
 
+FloatArray = NDArray[np.float64]
 _DEEPEST_M, _FARTHEST_M = 0.003, 0.010
 """How far below its link's body, and how far off it, the middle of a pad may be."""
 _OUTWARD_M = 0.003
+_OF_URDF = (
+    *("palm_link", "base_link", "joint_names", "joint_prefix"),
+    *("mount_std_mm", "mount_std_deg", "joint_std_deg", "joint_std_mm"),
+)
 INSTALL = "pip install 'handtouch[urdf]'"
 
 
@@ -32,7 +37,9 @@ class Robots:
 
     `hands` their names; `kinematics` of each; `rows` (of each) numbers of its pads among those of the
     deployment, in the order of the kinematics' links; `joint_names` (of each) what joint states call the
-    kinematics' joints; `stale_s` and `group_m` of each. Raises UrdfError, KeyError or OSError for what
+    kinematics' joints; `stale_s`, `group_m` and `gravity` (3,), unit, in the base, of each; `mounts` of each,
+    how sure it is where its pads sit, None where that isn't stated; `joint_std` (m,) of each, for joints that
+    tell no deviation of their own [rad, m where they slide]. Raises UrdfError, KeyError or OSError for what
     `check` would have told.
     """
 
@@ -43,6 +50,9 @@ class Robots:
         self.joint_names: list[tuple[str, ...]] = []
         self.stale_s: list[float] = []
         self.group_m: list[float] = []
+        self.mounts: list[Mounts | None] = []
+        self.joint_std: list[FloatArray] = []
+        self.gravity: list[NDArray[np.float64]] = []
         first = 0
         for hand in deployment.hands:
             if hand.urdf and kinematics.available():
@@ -55,6 +65,11 @@ class Robots:
                 self.joint_names.append(tuple(_told_name(hand, joint) for joint in made.joints))
                 self.stale_s.append(hand.joints_stale_ms * 1e-3)
                 self.group_m.append(hand.group_mm * 1e-3)
+                self.mounts.append(Mounts(hand) if hand.mount_std_mm or hand.mount_std_deg else None)
+                slides = np.array([robot.joints[name].kind == "prismatic" for name in made.joints], np.bool_)
+                std = np.where(slides, hand.joint_std_mm * 1e-3, np.radians(hand.joint_std_deg))
+                self.joint_std.append(std)
+                self.gravity.append(np.array(hand.gravity) / np.linalg.norm(hand.gravity))
             first += len(hand.pads)
 
 
@@ -97,10 +112,14 @@ def doubts(deployment: Deployment) -> Iterator[str]:
 
 def _problems(number: int, hand: Hand) -> Iterator[Problem]:
     place = f'[[hand]] {number} "{hand.name}": '
+    if not any(hand.gravity):
+        yield Problem(f"{place}gravity", _is(hand.gravity), "must point somewhere, e.g. [0.0, 0.0, -1.0]")
     if not hand.urdf:
-        for key in ("palm_link", "base_link", "joint_names", "joint_prefix"):
+        for key in _OF_URDF:
             if value := getattr(hand, key):
-                yield Problem(f"{place}{key}", _is(value), "names something of a URDF, and urdf is left out")
+                yield Problem(
+                    f"{place}{key}", _is(value), "is of no use without a URDF, and urdf is left out"
+                )
         return
     try:
         robot = urdf.read(Path(hand.urdf))
