@@ -41,6 +41,8 @@ class JointState:
     effort_nm: FloatArray | None = None
     position_std_rad: FloatArray | None = None
     """standard deviations of position_rad: they enter the covariances in palm and base frame"""
+    gravity: FloatArray | None = None
+    """(3,) unit: which way gravity points in the frame of the hand's base, where the base itself moves"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +70,8 @@ def encode(message: Input) -> list[bytes]:
     prefix = "joints" if isinstance(message, JointState) else "force"
     _, names, required, optional = _KEYS[prefix]
     payload: dict[str, Any] = {"v": SCHEMA_VERSION, "t_ns": message.t_ns, names: getattr(message, names)}
-    for key in (*required, *optional):
-        if (column := getattr(message, key)) is not None:
+    for key in (*required, *optional, "gravity"):
+        if (column := getattr(message, key, None)) is not None:
             payload[key] = np.asarray(column, np.float64).tolist()
     return [f"{prefix}/{message.hand}".encode(), bytes(msgpack.packb(payload))]
 
@@ -99,8 +101,19 @@ def decode(parts: Sequence[bytes]) -> Input:
     columns = {
         name: _column(payload.get(name), len(names), f"{prefix}: {name}") for name in (*required, *given)
     }
+    if kind is JointState and payload.get("gravity") is not None:
+        columns["gravity"] = _direction(payload["gravity"], f"{prefix}: gravity")
     found: Input = kind(hand, t_ns, names, **columns)
     return found
+
+
+def _direction(given: Any, place: str) -> FloatArray:
+    way = _column(given, 3, place)
+    largest = np.abs(way).max()
+    if largest == 0:
+        raise InputError(f"{place} must point somewhere")
+    way /= largest  # so that no square is beyond what floats hold
+    return np.asarray(way / np.linalg.norm(way))
 
 
 def _names(given: Any, place: str) -> tuple[str, ...]:
@@ -115,7 +128,7 @@ def _names(given: Any, place: str) -> tuple[str, ...]:
 
 def _column(given: Any, size: int, place: str) -> FloatArray:
     if not isinstance(given, list) or len(given) != size:
-        raise InputError(f"{place} must be a list of {size} numbers, one a name")
+        raise InputError(f"{place} must be a list of {size} numbers")
     if not all(type(value) is float or type(value) is int for value in given):
         raise InputError(f"{place} must hold numbers")
     try:

@@ -9,7 +9,7 @@ Public names: `Robot`.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -53,11 +53,14 @@ class Robot:
         t_ns: int | None = None,
         velocity_rad_s: Mapping[str, float] | None = None,
         position_std_rad: Mapping[str, float] | float | None = None,
+        gravity: Sequence[float] | None = None,
     ) -> None:
         """Where joints of a hand, by name, were at `t_ns` of time.monotonic_ns(), None: now.
 
         Metres for joints that slide. Velocities and standard deviations are of the same joints; one deviation
-        may stand for all. Raises ValueError for joints that only one of them has, and for NaN and infinity.
+        may stand for all. gravity: (3,) which way it points in the frame of the hand's base, of any length,
+        where that isn't what the deployment says, as of a hand on an arm that its URDF lacks. Raises
+        ValueError for joints that only one of them has, and for NaN and infinity.
         """
         names = tuple(position_rad)
         std = position_std_rad
@@ -66,7 +69,9 @@ class Robot:
         std_rad = None if std is None else _column(std, names)
         velocity = None if velocity_rad_s is None else _column(velocity_rad_s, names)
         t_ns = time.monotonic_ns() if t_ns is None else t_ns
-        self._send(JointState(hand, t_ns, names, _column(position_rad, names), velocity, None, std_rad))
+        down = None if gravity is None else _direction(gravity)
+        angles = _column(position_rad, names)
+        self._send(JointState(hand, t_ns, names, angles, velocity, None, std_rad, down))
 
     def send_forces(
         self,
@@ -115,6 +120,13 @@ class Robot:
             except zmq.Again:
                 return
             (self._subscribed.add if request[:1] == b"\x01" else self._subscribed.discard)(request[1:])
+
+
+def _direction(gravity: Sequence[float]) -> NDArray[np.float64]:
+    way = np.asarray(gravity, np.float64)
+    if way.shape != (3,) or not np.isfinite(way).all() or not way.any():
+        raise ValueError(f"gravity must be three finite numbers that point somewhere, got {gravity}")
+    return way
 
 
 def _column(values: Mapping[str, float], names: tuple[str, ...]) -> NDArray[np.float64]:

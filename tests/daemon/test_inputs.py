@@ -34,7 +34,8 @@ def _inputs(draw: st.DrawFn) -> JointState | LinkForces:
     if draw(st.booleans()):
         return LinkForces("right", t_ns, names, draw(column), draw(positive))
     others = (draw(st.none() | column), draw(st.none() | column), draw(st.none() | positive))
-    return JointState("right", t_ns, names, draw(column), *others)
+    down = draw(st.none() | st.sampled_from([np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])]))
+    return JointState("right", t_ns, names, draw(column), *others, down)
 
 
 def _same(one: Any, two: Any) -> bool:
@@ -63,6 +64,23 @@ def test_a_missing_or_wrong_key_is_refused_by_name(
         del content[key]
         with pytest.raises(InputError, match=key):
             decode([topic, msgpack.packb(content)])
+
+
+@pytest.mark.parametrize("given", [[0.0, 0.0, 0.0], [1.0, 0.0], [1e400, 0.0, 1.0], "down"])
+def test_gravity_that_points_nowhere_is_refused_by_name(given: object) -> None:
+    payload = {"v": 1, "t_ns": None, "names": ["a"], "position_rad": [0.1], "gravity": given}
+    with pytest.raises(InputError, match="gravity"):
+        decode([b"joints/right", msgpack.packb(payload)])
+
+
+def test_gravity_of_any_length_is_a_direction_and_the_last_that_was_told_holds(inputs: Inputs) -> None:
+    assert inputs.down_at("right") is None
+    for number, gravity in enumerate([[0.0, 0.0, -9.81], None, [1e300, 0.0, 0.0], None]):
+        payload = {"v": 1, "t_ns": NOW + number, "names": ["a"], "position_rad": [0.1], "gravity": gravity}
+        inputs.take([b"joints/right", msgpack.packb(payload)], NOW + number)
+        down = inputs.down_at("right")
+        assert down is not None
+        assert down.tolist() == ([0.0, 0.0, -1.0] if number < 2 else [1.0, 0.0, 0.0])
 
 
 @given(st.sampled_from([b"joints/right", b"force/right", b"joints", b"x/y", b"\xff"]), st.binary(max_size=50))

@@ -358,8 +358,8 @@ class Hand(Table):
     )
     gravity: Three = Field(
         (0.0, 0.0, -1.0),
-        description="which way gravity points in the base's frame, for links whose pads feel it; joint states "
-        "may tell another, of a base that moves",
+        description="which way gravity points in the base's frame, for pads that feel it; joint states may "
+        "tell another, of a base that moves",
     )
     group_mm: NonNegative = Field(
         25.0, description="contacts that lie this close may be of one object, and are told as a group"

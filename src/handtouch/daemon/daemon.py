@@ -34,6 +34,7 @@ from handtouch.daemon import histogram, logs, realtime
 from handtouch.daemon.commands import Commands
 from handtouch.daemon.control import Control
 from handtouch.daemon.cycle import BusyPoll
+from handtouch.daemon.gravity import Gravity
 from handtouch.daemon.inputs import Inputs
 from handtouch.daemon.joints import JointTeller
 from handtouch.daemon.metrics import PATH, Exporter
@@ -111,7 +112,9 @@ class Daemon:
             self.pipeline.frames.joints_at = self.inputs.joints_at
             self.rehearsal = Rehearsal(self.pipeline, self.publisher)
             self.perceiving = Perceiving(self.pipeline, self.publisher, self.publisher.run)
-            self.inputs.refer = self.pipeline.tick.refer
+            self.inputs.refer = self.pipeline.told.refer
+            pads = self.pipeline.model.size
+            self.gravity = Gravity(robots, pads, self.inputs.joints_at, self.inputs.down_at)
             self.publisher.present.update(self.pipeline.messages.present())
             self.publisher.present.update(self.pipeline.journal.present())
             self.pipeline.journal.serve(deployment, time.monotonic_ns())
@@ -248,6 +251,8 @@ class Daemon:
         """A SYNC was sent or seen: a new period."""
         self.report.stages.begin(self.sync.overruns, not self.pipeline.cycle.ticked)
         self.inputs.poll(now_ns)  # before the journal tells what the next tick starts from
+        if (gravity := self.gravity.step(now_ns)) is not None:
+            self.pipeline.told.turn(gravity)
         self.pipeline.begin(sync_ns, now_ns)
         self.publisher.release()
         if self._rehearsed:

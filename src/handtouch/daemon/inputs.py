@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from handtouch.daemon.publisher import bind
 from handtouch.daemon.security import Gate
@@ -60,6 +61,7 @@ class Inputs:
         self.problem = ""
         self.refer: Callable[[ForceReference], object] = lambda _: None
         self._joints = joints
+        self._down: dict[str, NDArray[np.float64]] = {}  # by hand, as last told
         self._pads = {name: pad for pad, name in enumerate(pads)}
         self._hands = {hand for hand, _ in pads}
         self._told: dict[str, tuple[int, int]] = {}
@@ -112,6 +114,10 @@ class Inputs:
         states = self._joints.get(hand)
         return None if states is None else states.at(t_ns)
 
+    def down_at(self, hand: str) -> NDArray[np.float64] | None:
+        """Which way gravity points in the base of a hand (3,), as joint states told last, None: never."""
+        return self._down.get(hand)
+
     def figures(self, now_ns: int) -> dict[str, Any]:
         """For `service`."""
         return {
@@ -139,6 +145,8 @@ class Inputs:
         kept = states.take(
             t_ns, message.names, message.position_rad, message.velocity_rad_s, message.position_std_rad
         )
+        if kept and message.gravity is not None:
+            self._down[message.hand] = message.gravity
         if not kept and states.late > late:
             self._drop("late", f"joints/{message.hand}", now_ns)
         elif not kept:

@@ -38,7 +38,7 @@ class Journal:
         self._limits = b""  # as last told
         self._deployment: Deployment | None = None
         self.others: dict[str, Callable[[], Any]] = {}
-        """what else a tick is made from: name -> a function that returns it as msgpack takes it"""
+        """what else ticks are made from: name -> what tells it as msgpack takes it, empty if nothing"""
 
     def present(self) -> dict[str, Callable[[int], wire.Message | None]]:
         """Topic -> what there is to repeat of it."""
@@ -88,7 +88,7 @@ class Journal:
                 period_ns=tick.period_ns.astype("<i8", copy=False).tobytes(),
                 paced_ns=tick.paced_ns.astype("<i8", copy=False).tobytes(),
                 limits=limits if changed else None,
-                others={name: tell() for name, tell in self.others.items()},
+                others={name: told for name, tell in self.others.items() if (told := tell())},
                 repeat=False,
             )
         )

@@ -15,6 +15,7 @@ from handtouch.daemon.messages import Messages, Outlet
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.scene import Wanted
 from handtouch.daemon.tick import Tick, Ticked
+from handtouch.daemon.told import Told
 from handtouch.hand.robot import Robots
 from handtouch.wire import PadState
 
@@ -50,9 +51,11 @@ class Pipeline:
         """ticks from one frame of a hand to the next"""
         self.stepped: Callable[[], None] = lambda: None
         """called between the step of a tick and its messages, for who watches the time"""
+        self.told = Told()
+        """what robots tell of forces and gravity; the next cycle takes it in"""
         self._outlet = outlet
         self.journal = Journal(self, run, outlet)
-        self.journal.others["joints"] = self.frames.journal
+        self.journal.others.update(joints=self.frames.journal, told=self.told.journal)
         self._expected = self.tick.expected()
         self._expected_count = 0
 
@@ -70,6 +73,7 @@ class Pipeline:
             self._tick(now_ns, t_ns)
         self.settle()
         self.journal.between(now_ns)
+        self.told.apply(self.tick)  # what the state holds already would be given twice
         self.slab.begin_cycle(t_ns)
         self.cycle.begin(t_ns)
         self._expected = self.tick.expected()
@@ -89,6 +93,7 @@ class Pipeline:
     def tick_again(self, now_ns: int, until_ns: int | None) -> Ticked:
         """A recorded tick; slab, cycle and `node_state` hold what it was made from."""
         self.settle()
+        self.told.apply(self.tick)
         return self._tick(now_ns, _FOREVER_NS if until_ns is None else until_ns)
 
     def adopt(self, model: PadModel, changed: NDArray[np.intp]) -> None:

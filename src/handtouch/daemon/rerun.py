@@ -328,6 +328,7 @@ def fill(
     assert isinstance(pipeline.slab, FedSlab)
     pipeline.slab.feed(columns, limits)
     pipeline.frames.recall(payload["others"].get("joints", ()))
+    pipeline.told.recall(payload["others"].get("told", {}))
     pipeline.node_state[:] = columns["node_state"]
     pipeline.cycle.t_ns, pipeline.cycle.previous_ns = payload["t_ns"], payload["previous_ns"]
     tick = pipeline.tick

@@ -32,10 +32,11 @@ _MADE = (LocatorBank, Placement, ContactLaw, Robots)
 _FED = (Slab,)
 """Filled anew for every tick."""
 _OTHERS = {
-    ("Pipeline", "_outlet"), ("Pipeline", "journal"), ("Frames", "_robots"), ("Messages", "_writers")
+    ("Pipeline", "_outlet"), ("Pipeline", "journal"), ("Pipeline", "told"),
+    ("Frames", "_robots"), ("Messages", "_writers"),
 }  # fmt: skip
-"""Where messages go and how they are written is no state of the pipeline's, nor are robots, which there may
-be none of."""
+"""Where messages go and how they are written is no state of the pipeline's, nor what it is yet to be given,
+nor are robots, which there may be none of."""
 _PLAIN = (bool, int, float, str, type(None))
 _CONSTANT = _FIXED + _MADE + _FED
 _SIMPLE = {*_PLAIN, np.ndarray}

@@ -224,14 +224,12 @@ class Tick:
         self.strength.recalibrated(pad, new_sheet=True)
         self.disturbed = True
 
-    def turn(self, gravity: FloatArray | None) -> None:
-        """Direction of gravity in each link's frame (n, 3), from joint states; None: not known any more."""
+    def turn(self, gravity: FloatArray) -> None:
+        """Direction of gravity in each link's frame (n, 3), NaN where nobody knows; see `Told`."""
         self.baseline.turn(gravity)
-        self.disturbed = True
 
     def refer(self, reference: ForceReference) -> int:
-        """Compare forces with what something else measured; the number of pads that it tells anything of."""
-        self.disturbed = True
+        """Compare forces with what something else measured, see `Told`; how many pads it tells of."""
         return self.strength.refer(reference, self.columns.sample_ns, self.contacts.touching)
 
     def adopt(self, model: PadModel, changed: IntArray) -> None:

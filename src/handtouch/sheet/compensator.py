@@ -70,7 +70,7 @@ class Compensator:
             (swelling.preload_n_per_k * warmth_k) ** 2,
         )
         """Variance that goes as the square of what is felt, as what is felt, and that is always there."""
-        self._last = (self._flow_s,) * 4
+        self._last = tuple(np.zeros(pads) for _ in range(4))  # four: a state is put into each
         self._resumed = False  # what presses then has pressed since ever, as far as creep is concerned
         self._prepare(0.0)
 

@@ -73,8 +73,8 @@ class Baseline:
         self.drift = _FIRST_SPEED * noise_counts
         self.by_gravity = np.zeros((n, 4, 3))
         self.gravity: FloatArray | None = None
-        """(n, 3) in each link's frame, unit of `by_gravity`, as last given to `turn`"""
-        self.turned = np.full((n, 3), np.nan)  # gravity, smoothed as the offset is
+        """(n, 3) in each link's frame, unit of `by_gravity`, as last given to `turn`; 0: never known"""
+        self.turned = np.zeros((n, 3))  # gravity, smoothed as the offset is
         self.expected = np.zeros((n, 4))
         """(n, 4) what is to be taken off a reading"""
         self._member = np.zeros((len(hands := list(hands)), n))
@@ -120,14 +120,15 @@ class Baseline:
         self.assume(pad, np.zeros(4), self._on[pad] / (2 * _SURE))
         self.known[pad] = False
 
-    def turn(self, gravity: FloatArray | None) -> None:
-        """Direction of gravity in each link's frame, (n, 3) of unit length, from joint states; None: not
-        known, and the last is taken to hold."""
-        if gravity is None:
-            return
-        self.gravity = gravity
-        if np.isnan(self.turned[0, 0]):
-            self.turned[:] = gravity
+    def turn(self, gravity: FloatArray) -> None:
+        """Direction of gravity in each link's frame, (n, 3) of unit length, from joint states; where it is
+        NaN nobody knows, and the last is taken to hold."""
+        if self.gravity is None:
+            self.gravity = np.zeros_like(gravity)
+        known = ~np.isnan(gravity[:, 0])
+        first = known & ~self.gravity.any(axis=1)
+        self.gravity[known] = gravity[known]
+        self.turned[first] = gravity[first]
         self._expect()
 
     @property
