@@ -190,3 +190,43 @@ def test_a_recording_without_a_tick_is_status_1(tmp_path: Path, capsys: pytest.C
     empty.write_bytes(b"")
     assert replay.run(empty) == 1
     assert "holds no tick" in capsys.readouterr().err
+
+
+def _links(report: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(report.read_text())["links"]
+    return found
+
+
+def test_another_locator_finds_the_same_touches_elsewhere_by_what_it_leaves_out(
+    recorded: Path, tmp_path: Path
+) -> None:
+    report = tmp_path / "report.json"
+    shifts = {}
+    for name in ("likelihood", "likelihood-tabulated", "exact", "log-ratio"):
+        assert replay.run(recorded, locator=name, report=report) == 0
+        links = _links(report)
+        assert all(link["only_recorded"] == link["only_replayed"] == 0 for link in links.values())
+        shifts[name] = max(link["shift_mm"]["median"] for link in links.values())
+    assert shifts["likelihood"] < 2e-3  # what the live maps and tables do to a place
+    assert shifts["likelihood-tabulated"] < 2e-3
+    assert shifts["likelihood"] < shifts["exact"] < shifts["log-ratio"]  # gaps; the geometry
+
+
+def test_a_tolerance_moves_places_by_less_than_itself(recorded: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    assert replay.run(recorded, tolerance_mm=0.5, report=report) == 0
+    shifts = [link["shift_mm"]["max"] for link in _links(report).values()]
+    assert 0 < max(shifts) < 0.5
+
+
+def test_a_locator_that_is_none_is_status_2_and_all_are_in_the_help(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from handtouch.cli import main
+
+    assert replay.run(recorded, locator="guess") == 2
+    assert "log-ratio" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["replay", "--help"])
+    told = " ".join(capsys.readouterr().out.split()).replace("- ", "-")
+    assert all(name in told for name in replay.locator_names())

@@ -93,6 +93,8 @@ class Follower:
     def solve(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> Solved:
         """Find the contacts (k,) anew, beginning at xy (k, 2), NaN for new ones, and draw their maps."""
         noise = self._model.noise_a[pads].T
+        if self._model.locate is not None:
+            return self.draw(pads, currents, self._model.locate(pads, currents.T, noise), solved=True)
         found = self._model.locator.estimate(pads, currents.T, noise, xy.T)
         return self.draw(pads, currents, np.stack([found.x, found.y], axis=1), solved=True)
 
@@ -103,7 +105,7 @@ class Follower:
         spread = np.sqrt(np.diagonal(at.covariance, axis1=1, axis2=2)[:, :2])
         vague = spread.max(axis=1)
         trust = np.maximum(np.sqrt(_BEND * spread.min(axis=1)), _NOISE * vague)
-        firm = vague <= _VAGUE
+        firm = (vague <= _VAGUE) & (self._model.locate is None)  # a map is a step of maximum likelihood
         if self._model.doubted:  # wider, but a map is trusted no farther for it
             at.doubt(currents, self._model.gain_covariance[pads])
         tolerated = self.tolerance_m.take(pads)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from handtouch.supervise.calibration import Calibration, Law
 from handtouch.supervise.strength import SheetBehaviour, behaviour_of
 
 FloatArray = NDArray[np.float64]
+Locate = Callable[[NDArray[np.intp], FloatArray, FloatArray], FloatArray]
+"""Pads (k,), currents (4, k) and their noise (4, k) to places (k, 2) on their rectangles, NaN for none."""
 
 
 class PadModel:
@@ -71,10 +73,12 @@ class PadModel:
         self.slow_touch_s = np.array([touch.slow_touch_s for touch in touches])
         kinds_of_sheet = {name: _behaviour(sheet) for name, sheet in deployment.sheets.items()}
         self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]
-        networks = _networks(pads, sheets)
+        networks = networks_of(deployment)
         full_scale_a = np.array([node.full_scale_ma * 1e-3 for node in nodes])
         finest = float((self.noise_a.min(axis=1) / full_scale_a).min())  # noise of the strongest contact
         self.locator = LocatorBank(networks, tolerance=finest / 10)
+        self.locate: Locate | None = None
+        """another way to find contacts, at every sample; `daemon.locators`"""
         self.placement = Placement([(surface_of(pad), *mount_of(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
         self.laws: list[Law | None] = [None] * self.size
@@ -213,11 +217,12 @@ def _rows(hands: list[str]) -> dict[str, slice]:
     return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
 
 
-def _networks(pads: list[config.Pad], sheets: list[config.Sheet]) -> list[ElectrodeNetwork]:
+def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
     """Electrodes of every pad; pads of one make share one object, and with it one table."""
     made: dict[tuple[object, ...], ElectrodeNetwork] = {}
     networks = []
-    for pad, sheet in zip(pads, sheets, strict=True):
+    for pad in (pad for hand in deployment.hands for pad in hand.pads):
+        sheet = deployment.sheets[pad.sheet]
         make = (pad.surface, pad.gap_mm, pad.series_ohm, sheet.ohm_per_square)
         if make not in made:
             made[make] = network_of(pad, sheet)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import can
 import zmq
@@ -226,6 +227,8 @@ def run(
     as_json: bool = False,
     report: Path | None = None,
     publish: bool = False,
+    locator: str | None = None,
+    tolerance_mm: float | None = None,
 ) -> int:
     """`handtouch replay`: print contacts, or publish them too, and tell how they compare with recorded ones.
 
@@ -235,15 +238,21 @@ def run(
     take = _print_json if as_json else _print_line
     try:
         deployment = load(config_path) if config_path else None
+        if locator and locator not in (known := locator_names()):
+            print(f"--locator {locator}: there are {', '.join(known)}", file=sys.stderr)
+            return 2
         if is_recording(path):
-            return _rerun(path, deployment, nominal, speed, take, report, publish)
+            other = _Other(nominal, locator, tolerance_mm)
+            return _rerun(path, deployment, other, speed, take, report, publish)
         if deployment is None:
             print(
                 f"{path}: a CAN log needs the deployment file of its hand: replay LOG CONFIG", file=sys.stderr
             )
             return 2
-        if nominal or report:
-            print("--nominal and --report are for MCAP recordings", file=sys.stderr)
+        if nominal or report or locator or tolerance_mm is not None:
+            print(
+                "--nominal, --locator, --tolerance-mm and --report are for MCAP recordings", file=sys.stderr
+            )
             return 2
         with ExitStack() as stack:
             publisher, pace = _served(deployment, publish, speed, stack)
@@ -257,25 +266,45 @@ def run(
     return _tell(summary, path, config_path)
 
 
+class _Other(NamedTuple):
+    """What is to be otherwise than it was recorded."""
+
+    nominal: bool
+    locator: str | None
+    tolerance_mm: float | None
+
+    @property
+    def any(self) -> bool:
+        return self.nominal or self.locator is not None or self.tolerance_mm is not None
+
+    def of(self, deployment: Deployment) -> Deployment:
+        """With the tolerance that is asked for."""
+        if self.tolerance_mm is None:
+            return deployment
+        scene = deployment.scene.model_copy(update={"tolerance_mm": self.tolerance_mm})
+        return deployment.model_copy(update={"scene": scene})
+
+
 def _rerun(
     path: Path,
     deployment: Deployment | None,
-    nominal: bool,
+    other: _Other,
     speed: float,
     take: Callable[[wire.Contact], None],
     report: Path | None,
     publish: bool,
 ) -> int:
-    from handtouch.daemon import rerun
+    from handtouch.daemon import locators, rerun
     from handtouch.daemon.compare import Comparison, tell_anew, tell_same
     from handtouch.record.read import Recording
 
     recording = Recording(path)
-    if deployment is None and (nominal or publish):
+    again = deployment is None and not other.any
+    if deployment is None and (other.any or publish):
         deployment = rerun.first_deployment(recording)
-        again = not nominal
-    else:
-        again = deployment is None
+    if deployment is not None:
+        deployment = other.of(deployment)
+    locate = locators.locator(deployment, other.locator) if deployment and other.locator else None
     comparison = Comparison()
 
     def both(contact: wire.Contact) -> None:
@@ -288,7 +317,14 @@ def _rerun(
         feeder = (
             rerun.Again(take, publisher)
             if again or deployment is None
-            else rerun.Anew(deployment, both, publisher, nominal=nominal, recorded=comparison.add_recorded)
+            else locators.Otherwise(
+                deployment,
+                both,
+                publisher,
+                nominal=other.nominal,
+                locate=locate,
+                recorded=comparison.add_recorded,
+            )
         )
         for entry in recording.read("config", "state", "contact", "tick"):
             if entry.topic == "tick":
@@ -298,6 +334,13 @@ def _rerun(
     if again:
         return tell_same(recording, feeder.found, seconds, report)
     return tell_anew(recording, feeder.found, comparison, seconds, report)
+
+
+def locator_names() -> list[str]:
+    """What `--locator` takes."""
+    from handtouch.daemon.locators import NAMES
+
+    return list(NAMES)
 
 
 def is_recording(path: Path) -> bool:

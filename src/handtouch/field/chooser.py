@@ -1,8 +1,8 @@
 """Chooser: the cheapest method that locates well enough on this pad and noise, by its measured error map.
 
-Public: `choose`, `Choice`, `ErrorMap`, `Cost`, `methods_for`. Each method is tried on currents of the pad's
-own forward model with noise drawn on a grid of contacts, so that what a method leaves out (corner gaps,
-resistors, the other two currents) counts as much as its arithmetic.
+Public: `choose`, `Choice`, `ErrorMap`, `Cost`, `methods_for`, `method_for`. Each method is tried on currents
+of the pad's own forward model with noise drawn on a grid of contacts, so that what a method leaves out (corner
+gaps, resistors, the other two currents) counts as much as its arithmetic.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike
 
 from handtouch.field.bank import LocatorBank
 from handtouch.field.classic import LogRatioTable, log_ratio
-from handtouch.field.estimate import estimate
+from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.model import FloatArray, ForwardModel
 from handtouch.field.ratio_table import RatioTable
-from handtouch.field.rectangle import Rectangle
+from handtouch.field.rectangle import Location, Rectangle
 
 Locator = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
+_RATIOS = "ratio table"
 _DRAWS = 48  # of the noise at each place
 _PLACES = 19  # a side
 _AS_GOOD = 1.05  # times the least error of any method counts as reaching it
@@ -118,32 +119,40 @@ def choose(
 
 def methods_for(model: ForwardModel) -> dict[str, Locator]:
     """The methods that a pad of this shape allows, by name; all but the likelihoods take it for ideal."""
+    return {name: method_for(model, name) for name in COSTS if name != _RATIOS or _has_ratios(model)}
+
+
+def method_for(model: ForwardModel, name: str) -> Locator:
+    """One of the methods in `COSTS`. Raises ValueError where there is none, or none for a pad so long."""
     pad = Rectangle(model.a, model.b)
+    if name == "log-ratio":
+        return _without_noise(lambda currents: log_ratio(pad, currents))
+    if name == "log-ratio, adjusted":
+        return _without_noise(LogRatioTable(pad, cells=0).locate)
+    if name == "log-ratio, corrected":
+        return _without_noise(LogRatioTable(pad).locate)
+    if name == _RATIOS and _has_ratios(model):
+        return _without_noise(RatioTable(pad).locate)
+    if name == "exact":
+        return _without_noise(lambda currents: _place(pad.locate(currents)))
+    if name == "likelihood":
+        return lambda currents, noise: _place(estimate(model, currents, noise))
+    if name != "likelihood, tabulated":
+        raise ValueError(
+            f'no method "{name}" for a pad of {model.a:.4g} x {model.b:.4g}; there are {[*COSTS]}'
+        )
     bank = LocatorBank([model])
+    return lambda currents, noise: _place(
+        bank.estimate(np.zeros(currents.shape[1], dtype=np.intp), currents, noise)
+    )
 
-    def exact(currents: FloatArray) -> tuple[FloatArray, FloatArray]:
-        found = pad.locate(currents)
-        return found.x, found.y
 
-    def tabulated(currents: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        found = bank.estimate(np.zeros(currents.shape[1], dtype=np.intp), currents, noise)
-        return found.x, found.y
+def _has_ratios(model: ForwardModel) -> bool:
+    return max(model.a / model.b, model.b / model.a) <= RatioTable.LONGEST_ASPECT
 
-    def likelihood(currents: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        found = estimate(model, currents, noise)
-        return found.x, found.y
 
-    methods: dict[str, Locator] = {
-        "log-ratio": _without_noise(lambda currents: log_ratio(pad, currents)),
-        "log-ratio, adjusted": _without_noise(LogRatioTable(pad, cells=0).locate),
-        "log-ratio, corrected": _without_noise(LogRatioTable(pad).locate),
-        "exact": _without_noise(exact),
-        "likelihood, tabulated": tabulated,
-        "likelihood": likelihood,
-    }
-    if max(pad.a / pad.b, pad.b / pad.a) <= RatioTable.LONGEST_ASPECT:
-        methods["ratio table"] = _without_noise(RatioTable(pad).locate)
-    return methods
+def _place(found: Location | PointEstimate) -> tuple[FloatArray, FloatArray]:
+    return found.x, found.y
 
 
 def _without_noise(locate: Callable[[FloatArray], tuple[FloatArray, FloatArray]]) -> Locator:

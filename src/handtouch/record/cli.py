@@ -72,6 +72,18 @@ def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         action="store_true",
         help="without the calibrations of the recording, as the deployment file alone has it",
     )
+    replay.add_argument(
+        "--locator",
+        metavar="NAME",
+        help="find contacts another way, to compare: log-ratio, log-ratio-adjusted, ratio-table, "
+        "log-ratio-corrected, exact, likelihood-tabulated (as live, but at every sample) or likelihood",
+    )
+    replay.add_argument(
+        "--tolerance-mm",
+        type=positive,
+        metavar="MM",
+        help="with this error of a location allowed, as [scene] tolerance_mm does",
+    )
     replay.add_argument("--json", action="store_true", help="every contact message as a JSON line")
     replay.add_argument("--report", type=Path, metavar="FILE", help="write the comparison as JSON")
     replay.add_argument("--publish", action="store_true", help="publish on the deployment's endpoints too")
@@ -122,6 +134,8 @@ def _replay(asked: argparse.Namespace) -> int:
         as_json=asked.json,
         report=asked.report,
         publish=asked.publish,
+        locator=asked.locator,
+        tolerance_mm=asked.tolerance_mm,
     )
 
 
