@@ -29,7 +29,7 @@ XY, PAD, RESIDUAL, POSITION, NORMAL, FORCE = slice(0, 2), slice(2, 4), 4, slice(
 _PLACED = np.delete(np.arange(FORCE), RESIDUAL)
 _TRUST = 3  # rows of a map before the values: how far off x, y and the total are, 1 at the end of trust
 _TERMS = 7  # four currents over the relative total v, 1, v and v^2
-_BEND = 0.3  # standard deviations that the bend of the model may add to a place where trust ends, at most
+_BEND = 0.6  # standard deviations that the bend of the model may add to a place where trust ends, at most
 _NOISE = 6.0  # standard deviations of a place that trust spans at least
 _VAGUE = 0.1  # of `reach`: a place less certain than this has no tangent worth the name
 _TOTAL = 0.05  # relative change of the total that a parabola of the force spans
@@ -93,8 +93,6 @@ class Follower:
     def solve(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> Solved:
         """Find the contacts (k,) anew, beginning at xy (k, 2), NaN for new ones, and draw their maps."""
         noise = self._model.noise_a[pads].T
-        if self._model.locate is not None:
-            return self.draw(pads, currents, self._model.locate(pads, currents.T, noise), solved=True)
         found = self._model.locator.estimate(pads, currents.T, noise, xy.T)
         return self.draw(pads, currents, np.stack([found.x, found.y], axis=1), solved=True)
 
@@ -105,7 +103,7 @@ class Follower:
         spread = np.sqrt(np.diagonal(at.covariance, axis1=1, axis2=2)[:, :2])
         vague = spread.max(axis=1)
         trust = np.maximum(np.sqrt(_BEND * spread.min(axis=1)), _NOISE * vague)
-        firm = (vague <= _VAGUE) & (self._model.locate is None)  # a map is a step of maximum likelihood
+        firm = vague <= _VAGUE
         if self._model.doubted:  # wider, but a map is trusted no farther for it
             at.doubt(currents, self._model.gain_covariance[pads])
         tolerated = self.tolerance_m.take(pads)
@@ -217,7 +215,9 @@ class Follower:
         bend = np.abs(square) * (_TOTAL**2 / _FORCE_BEND) / middle
         maps[:, 2, 5] = np.where(alike, np.fmax(bend, 1.0) / _TOTAL, np.nan)
         maps[:, 2, 4] = -maps[:, 2, 5]
-        return strength.std_n.reshape(5, -1)[0], status[0] == _SATURATED
+        radius_m = np.exp(log_radius[0])
+        by_law = self._model.law_std(pads, currents.T, at.total, radius_m, force[0])
+        return np.hypot(strength.std_n.reshape(5, -1)[0], by_law), status[0] == _SATURATED
 
 
 class _Linear(NamedTuple):
