@@ -1,8 +1,8 @@
 """Chooser: the cheapest method that locates well enough on this pad and noise, by its measured error map.
 
 Public: `choose`, `Choice`, `ErrorMap`, `Cost`, `methods_for`, `method_for`. Each method is tried on currents
-of the pad's own forward model with noise drawn on a grid of contacts, so that what a method leaves out (corner
-gaps, resistors, the other two currents) counts as much as its arithmetic.
+of the pad's own forward model with noise drawn on a grid of contacts, so that what a method leaves out
+(corner gaps, resistors, the other two currents) counts as much as its arithmetic.
 """
 
 from __future__ import annotations
