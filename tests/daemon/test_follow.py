@@ -48,7 +48,7 @@ class Reference(NamedTuple):
             placed.position_m,
             placed.normal,
             placed.pad_m,
-            placed.covariance_m2,
+            placed.covariance_m2 * (1 + np.fmax(found.chi_squared - 9, 0))[:, None, None],
             strength.force_n,
             strength.std_n,
             found.residual,
@@ -231,3 +231,38 @@ def test_a_force_at_the_end_of_the_range_is_a_value_or_a_bound_and_never_between
         alike = tick.columns.saturated == (own.status == Status.SATURATED)
         assert (np.abs(tick.columns.force_n / own.force_n - 1) < 0.02)[alike].all()
     assert seen == {Status.VALID, Status.SATURATED}
+
+
+def test_where_a_contact_is_no_point_its_covariance_holds_the_centre_of_force(bench: Any) -> None:
+    rng, inside, as_a_point = np.random.default_rng(6), [], []
+    model = bench.model
+    for _ in range(60):
+        middle, apart = rng.uniform(0.3, 0.7, (3, 2)), rng.uniform(0.05, 0.2, (3, 1))
+        angle = rng.uniform(0, np.pi, (3, 1))
+        way = apart * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        currents = reading(model, middle - way, 1e-3, rng) + reading(model, middle + way, 1e-3, rng)
+        tick = Tick(model, 5_000_000)
+        step(tick, currents)
+        nowhere = np.zeros((3, 2, 2))
+        true = model.placement.place(PADS, *(middle * model.locator.sides).T, nowhere).position_m
+        point = model.locator.estimate(PADS, currents.T, model.noise_a.T).covariance[:, :2, :2]
+        narrow = model.placement.place(PADS, *tick.columns.xy.T, point).covariance_m2
+        for covariances, found in ((tick.columns.covariance_m2, inside), (narrow, as_a_point)):
+            values, axes = np.linalg.eigh(covariances)
+            along = np.einsum("kji,kj->ki", axes, tick.columns.position_m - true)[:, 1:]
+            found.extend((along**2 / values[:, 1:]).sum(axis=1) < 5.991)  # 95 % of chi squared of two
+    assert np.mean(inside) > 0.8
+    assert np.mean(as_a_point) < 0.1
+
+
+def test_a_point_keeps_the_covariance_of_its_noise(bench: Any) -> None:
+    rng, kept = np.random.default_rng(7), []
+    for _ in range(100):
+        tick = Tick(bench.model, 5_000_000)
+        currents = reading(bench.model, rng.uniform(0.2, 0.8, (3, 2)), 1e-3, rng)
+        step(tick, currents)
+        found = bench.model.locator.estimate(PADS, currents.T, bench.model.noise_a.T)
+        placed = bench.model.placement.place(PADS, found.x, found.y, found.covariance[:, :2, :2])
+        sizes = [np.trace(of, axis1=1, axis2=2) for of in (tick.columns.covariance_m2, placed.covariance_m2)]
+        kept.extend(sizes[0] < 1.05 * sizes[1])
+    assert 0.98 < np.mean(kept) <= 1.0

@@ -29,7 +29,7 @@ XY, PAD, RESIDUAL, POSITION, NORMAL, FORCE = slice(0, 2), slice(2, 4), 4, slice(
 _PLACED = np.delete(np.arange(FORCE), RESIDUAL)
 _TRUST = 3  # rows of a map before the values: how far off x, y and the total are, 1 at the end of trust
 _TERMS = 7  # four currents over the relative total v, 1, v and v^2
-_BEND = 0.6  # standard deviations that the bend of the model may add to a place where trust ends, at most
+_BEND = 0.3  # standard deviations that the bend of the model may add to a place where trust ends, at most
 _NOISE = 6.0  # standard deviations of a place that trust spans at least
 _VAGUE = 0.1  # of `reach`: a place less certain than this has no tangent worth the name
 _TOTAL = 0.05  # relative change of the total that a parabola of the force spans
@@ -37,6 +37,10 @@ NEAR = 8.0  # ends of trust from which one Gauss-Newton step leads back into it
 _FORCE_BEND = 0.01  # of the force: where the parabola bends more, trust spans less
 _TOLERATED = 0.4  # of a tolerance: the bend as a rule where trust ends; off the middle it is up to twice that
 _WIDEST = 0.35  # of `reach`: what a tolerance lets a map span at most
+_FITS = 9.0
+"""Squared misfit of a point, of one degree of freedom, that noise explains. What goes beyond widens the
+covariance by as much (Birge, Phys. Rev. 40, 1932): where a contact is no point, or gains are off, currents err
+along the directions that move its place as they do along the one that shows."""
 _LEAST_INFORMATION = 1e-6  # of a place, per squared `reach`
 _VALID, _SATURATED = int(Status.VALID), int(Status.SATURATED)
 
@@ -136,8 +140,14 @@ class Follower:
         self._per_total[pads] = at.per_total
         pair = currents[:, 0] + currents[:, 1]
         by_current = values[:, RESIDUAL, :4] - (pair / at.total)[:, None] * at.per_total
-        residual_std = np.sqrt(((by_current * self._model.noise_a[pads]) ** 2).sum(axis=1))
-        return Solved(covariance_m2, *strength, residual_std)
+        variance = ((by_current * self._model.noise_a[pads]) ** 2).sum(axis=1)
+        residual_std = np.sqrt(variance)
+        if self._model.doubted:
+            by_log_gain = by_current * currents
+            variance += np.einsum("ki,kij,kj->k", by_log_gain, self._model.gain_covariance[pads], by_log_gain)
+        left_over = (values[:, RESIDUAL, :4] * currents).sum(axis=1) + values[:, RESIDUAL, 4]
+        widened = 1 + np.fmax(left_over**2 / variance - _FITS, 0.0)
+        return Solved(covariance_m2 * widened[:, None, None], *strength, residual_std)
 
     def force_slopes(self, pads: IntArray) -> FloatArray:
         """Change of the force (k,) with the relative change of the total, where the maps were drawn [N]."""
@@ -215,9 +225,7 @@ class Follower:
         bend = np.abs(square) * (_TOTAL**2 / _FORCE_BEND) / middle
         maps[:, 2, 5] = np.where(alike, np.fmax(bend, 1.0) / _TOTAL, np.nan)
         maps[:, 2, 4] = -maps[:, 2, 5]
-        radius_m = np.exp(log_radius[0])
-        by_law = self._model.law_std(pads, currents.T, at.total, radius_m, force[0])
-        return np.hypot(strength.std_n.reshape(5, -1)[0], by_law), status[0] == _SATURATED
+        return strength.std_n.reshape(5, -1)[0], status[0] == _SATURATED
 
 
 class _Linear(NamedTuple):
