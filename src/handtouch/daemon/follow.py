@@ -225,7 +225,9 @@ class Follower:
         bend = np.abs(square) * (_TOTAL**2 / _FORCE_BEND) / middle
         maps[:, 2, 5] = np.where(alike, np.fmax(bend, 1.0) / _TOTAL, np.nan)
         maps[:, 2, 4] = -maps[:, 2, 5]
-        return strength.std_n.reshape(5, -1)[0], status[0] == _SATURATED
+        radius_m = np.exp(log_radius[0])
+        by_law = self._model.law_std(pads, currents.T, at.total, radius_m, force[0])
+        return np.hypot(strength.std_n.reshape(5, -1)[0], by_law), status[0] == _SATURATED
 
 
 class _Linear(NamedTuple):

@@ -23,6 +23,7 @@ from handtouch.supervise.strength import SheetBehaviour, behaviour_of
 FloatArray = NDArray[np.float64]
 Locate = Callable[[NDArray[np.intp], FloatArray, FloatArray], FloatArray]
 """Pads (k,), currents (4, k) and their noise (4, k) to places (k, 2) on their rectangles, NaN for none."""
+_LEAST_ALPHA = 0.1
 
 
 class PadModel:
@@ -93,6 +94,9 @@ class PadModel:
             np.array([sheet.contact_radius_std_mm * 1e-3 for sheet in sheets]),
             np.array([sheet.reference_kpa * 1e3 for sheet in sheets]),
         )
+        self._law_axes = np.zeros((3, 3, self.size))
+        """parameters of `Law.covariance` by its axes by pads: a standard deviation along each axis"""
+        self._axis_laws: tuple[ContactLaw, FloatArray] | None = None
         self._middle = self._middles(networks)
         self.on_a, self.off_a = (self._threshold(force) for force in (self.on_n, self.off_n))
 
@@ -165,6 +169,30 @@ class PadModel:
             current_std_a=total_std_a,
         )
 
+    def law_std(
+        self,
+        index: NDArray[np.intp],
+        currents: FloatArray,
+        total_a: FloatArray,
+        radius_m: FloatArray,
+        force_n: FloatArray,
+    ) -> FloatArray:
+        """Standard deviation [N] of forces (n,) because laws of calibrations are known only so well;
+        arguments as of `force`. Delta method along the axes of the covariance; 0 for the file's law, which
+        has none."""
+        if self._axis_laws is None:
+            return np.zeros(len(index))
+        law, sheet_ohm = self._axis_laws
+        rows = (index + self.size * np.arange(3)[:, None]).ravel()
+        along = law.take(rows).force(
+            np.tile(total_a, 3),
+            np.tile(self._drive_v[index], 3),
+            sheet_ohm[rows],
+            np.tile(radius_m, 3),
+            np.tile(self._resistors(index, currents), 3) if self._has_series.any() else 0.0,
+        )
+        return np.asarray(np.sqrt(np.square(along.force_n.reshape(3, -1) - force_n).sum(axis=0)))
+
     def _resistors(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray | float:
         """What series resistors add to the way from contact to ground [ohm] (n,): sum of phi_i V_i / I."""
         if not self._has_series[index].any():
@@ -181,8 +209,22 @@ class PadModel:
         contact[pad], alpha[pad] = taken.contact_ohm_mm2 * 1e-6, taken.alpha
         self._sheet_ohm[pad] = taken.ohm_per_square
         self._law = replace(old, contact_ohm_m2=contact, alpha=alpha)
+        spread, ways = np.linalg.eigh(np.array(taken.covariance))
+        self._law_axes[:, :, pad] = ways * np.sqrt(np.maximum(spread, 0.0))
+        self._axis_laws = self._laws_along() if self._law_axes.any() else None
         self.on_a[pad] = self._threshold(self.on_n)[pad]
         self.off_a[pad] = self._threshold(self.off_n)[pad]
+
+    def _laws_along(self) -> tuple[ContactLaw, FloatArray]:
+        """Laws a standard deviation along each axis of all pads, and their sheet resistances: (3 n,), axis by
+        axis."""
+        law, (log_layer, alpha, log_sheet) = self._law, self._law_axes
+        along = ContactLaw(
+            (law.contact_ohm_m2 * np.exp(log_layer)).ravel(),
+            np.maximum(law.alpha + alpha, _LEAST_ALPHA).ravel(),
+            *(np.tile(column, 3) for column in (law.radius_m, law.radius_std_m, law.reference_pa)),
+        )
+        return along, (self._sheet_ohm * np.exp(log_sheet)).ravel()
 
     def _middles(self, networks: Sequence[ElectrodeNetwork]) -> tuple[FloatArray, FloatArray | float]:
         """Spreading radius [m] in the middle of each pad, and what resistors add there [ohm]."""
