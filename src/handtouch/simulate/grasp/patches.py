@@ -3,8 +3,9 @@
 Public names: `Patches` (discs on all pads, and the resultant on each), `patches`. A skin that gives spreads a
 point's force over a disc as Hertz has it for two round bodies. Two convex bodies that touch in several
 points touch in all between them: the points move towards their centre of force until their second moment is
-that of an even load. Discs that overlap are one, with their moments of force. What presses beside the pads'
-sensing surfaces isn't sensed, and counted.
+that of an even load. Discs that overlap are one, with their moments of force. At an edge of a pad its skin
+ends: all the force of a disc is on the part of it that lies on the pad. What presses beside the pads' sensing
+surfaces isn't sensed, and counted.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ _SKIN_PA = 1.0e6  # effective modulus of a rubber skin on something hard
 _LEAST_M, _LARGEST_M = 0.5e-3, 5e-3
 _FAINT_N = 1e-4
 _RIM_M = 0.5e-3  # so far beyond the edge of a pad it is still pressed, at the edge
-_EDGE = 0.02  # of a side: no disc is nearer to it
 _EVEN = 3**-0.5  # an even line or rectangle has a third of the second moment of its ends or corners
 
 
@@ -56,7 +56,8 @@ def patches(grasp: Grasp) -> Patches:
     n, p = len(grasp.times_s), len(grasp.pads)
     sensed = [_sensed(grasp, row) for row in range(p)]
     found = [_even(steps, place, force, radius) for _, steps, place, force, radius in sensed]
-    discs = [_merged(grasp.pads[row], *of) for row, of in enumerate(found)]
+    whole = [_merged(grasp.pads[row], *of) for row, of in enumerate(found)]
+    discs = [_cut(grasp.pads[row], *of) for row, of in enumerate(whole)]
     depth = max((int(np.bincount(steps).max()) for steps, *_ in discs if len(steps)), default=1)
     made = Patches(
         np.full((n, p, depth, 2), 0.5),
@@ -87,7 +88,7 @@ def _sensed(grasp: Grasp, row: int) -> tuple[IntArray, IntArray, FloatArray, Flo
     force = -np.einsum("ki,ki->k", pushed, at.normal)
     rim = 0.5 + _RIM_M / _sides_m(pad, 0.5)
     on = (np.abs(at.fraction - 0.5) <= rim).all(axis=1) & (force > _FAINT_N)
-    place = np.clip(at.fraction[on], _EDGE, 1 - _EDGE)
+    place = np.clip(at.fraction[on], 0.0, 1.0)
     return mine[on], steps[on], place, force[on], _hertz_m(grasp, pad, place, force[on])
 
 
@@ -132,6 +133,23 @@ def _merged(
         return steps, place, force, radius
     numbers, places, forces, radii = zip(*kept, strict=True)
     return np.array(numbers, np.intp), np.array(places), np.array(forces), np.array(radii)
+
+
+def _cut(
+    pad: Pad, steps: IntArray, place: FloatArray, force: FloatArray, radius: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """What of even discs (k,) lies on the pad, as discs: each is cut by the nearest edges along x and y."""
+    if not len(steps):
+        return steps, place, force, radius
+    sides = np.stack([_sides_m(pad, x) for x in place[:, 0].tolist()])
+    inward = np.where(place < 0.5, 1.0, -1.0)
+    depth = np.clip(
+        (0.5 - np.abs(place - 0.5)) * sides / radius[:, None], 0.0, 1.0
+    )  # of the centre, in radii
+    part = 1 - (np.arccos(depth) - depth * np.sqrt(1 - depth**2)) / np.pi  # of a disc cut by a chord
+    shift = 2 / (3 * np.pi) * (1 - depth**2) ** 1.5 / part  # of its centroid, in radii
+    radii = np.maximum(radius * np.sqrt(part.prod(axis=1)), _LEAST_M)
+    return steps, place + inward * shift * radius[:, None] / sides, force, radii
 
 
 Disc = tuple[FloatArray, float, float]
