@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,8 +21,6 @@ from handtouch.supervise.calibration import Calibration, Law
 from handtouch.supervise.strength import SheetBehaviour, behaviour_of
 
 FloatArray = NDArray[np.float64]
-Locate = Callable[[NDArray[np.intp], FloatArray, FloatArray], FloatArray]
-"""Pads (k,), currents (4, k) and their noise (4, k) to places (k, 2) on their rectangles, NaN for none."""
 _LEAST_ALPHA = 0.1
 
 
@@ -78,8 +76,6 @@ class PadModel:
         full_scale_a = np.array([node.full_scale_ma * 1e-3 for node in nodes])
         finest = float((self.noise_a.min(axis=1) / full_scale_a).min())  # noise of the strongest contact
         self.locator = LocatorBank(networks, tolerance=finest / 10)
-        self.locate: Locate | None = None
-        """another way to find contacts, at every sample; `daemon.locators`"""
         self.placement = Placement([(surface_of(pad), *mount_of(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
         self.laws: list[Law | None] = [None] * self.size

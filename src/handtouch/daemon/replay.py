@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import can
 import zmq
@@ -31,6 +31,9 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.security import Gate
 from handtouch.keys import KeysError
 from handtouch.wire import PadState
+
+if TYPE_CHECKING:
+    from handtouch.record.read import Recording
 
 _SERVICES = (0x080, 0x580, 0x600, 0x700)
 """EMCY, SDO and heartbeat of our nodes are no strangers."""
@@ -299,12 +302,6 @@ def _rerun(
     from handtouch.record.read import Recording
 
     recording = Recording(path)
-    again = deployment is None and not other.any
-    if deployment is None and (other.any or publish):
-        deployment = rerun.first_deployment(recording)
-    if deployment is not None:
-        deployment = other.of(deployment)
-    locate = locators.locator(deployment, other.locator) if deployment and other.locator else None
     comparison = Comparison()
 
     def both(contact: wire.Contact) -> None:
@@ -313,19 +310,23 @@ def _rerun(
 
     began_s = time.monotonic()
     with ExitStack() as stack:
+        again = deployment is None and not other.any
+        if deployment is None and (other.any or publish):
+            deployment = stack.enter_context(rerun.recorded_deployment(_first_config(recording)))
         publisher, pace = _served(deployment, publish, speed, stack) if deployment else (None, pacer(speed))
-        feeder = (
-            rerun.Again(take, publisher)
-            if again or deployment is None
-            else locators.Otherwise(
+        if again or deployment is None:
+            feeder = rerun.Again(take, publisher)
+        else:
+            deployment = other.of(deployment)
+            locate = locators.locator(deployment, other.locator) if other.locator else None
+            feeder = locators.Otherwise(
                 deployment,
                 both,
                 publisher,
                 nominal=other.nominal,
-                locate=locate,
                 recorded=comparison.add_recorded,
+                locate=locate,
             )
-        )
         for entry in recording.read("config", "state", "contact", "tick"):
             if entry.topic == "tick":
                 pace(entry.payload["now_ns"])
@@ -334,6 +335,15 @@ def _rerun(
     if again:
         return tell_same(recording, feeder.found, seconds, report)
     return tell_anew(recording, feeder.found, comparison, seconds, report)
+
+
+def _first_config(recording: Recording) -> dict[str, Any]:
+    """What a recording begins with. Raises ValueError where there is none."""
+    for entry in recording.read("config"):
+        return entry.payload
+    raise ValueError(
+        f"{recording.path}: has no deployment: the daemon was not reached, or is of an older version"
+    )
 
 
 def locator_names() -> list[str]:
