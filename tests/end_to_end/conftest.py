@@ -21,6 +21,8 @@ import pytest
 from handtouch import shipped
 from handtouch.client import Subscriber, connect, request
 
+from .starter import Started, Starter
+
 START_S = 90.0
 """Longest that anything may take on a busy machine; nothing waits so long when all is well."""
 
@@ -59,12 +61,13 @@ class Rig:
         prefix: list[str],
         bus: list[str],
         supervise: bool = False,
+        starter: Starter | None = None,
     ) -> None:
         self.folder = folder
         self.endpoints = endpoints
         self.bus = bus
-        self.processes: dict[str, subprocess.Popen[str]] = {}
-        self._prefix = prefix
+        self.processes: dict[str, subprocess.Popen[str] | Started] = {}
+        self._prefix, self._starter = prefix, starter
         self.config = folder / "hand.toml"
         settings = "\n".join(f'{stream} = "{endpoint}"' for stream, endpoint in endpoints.items())
         text = shipped.path("utah_mit.toml").read_text()
@@ -85,16 +88,18 @@ class Rig:
         """Start the nodes, with touches that come quickly and again and again."""
         self.start("simulate", "--scenario", str(self.scenario), *arguments)
 
-    def start(self, name: str, *arguments: str) -> subprocess.Popen[str]:
+    def start(self, name: str, *arguments: str) -> subprocess.Popen[str] | Started:
         """Start `handtouch NAME hand.toml --bus ... ARGUMENTS`, printing to a file beside the deployment."""
         buses = [word for bus in self.bus for word in ("--bus", bus)]
+        words = [name, str(self.config), *buses, *arguments]
+        process: subprocess.Popen[str] | Started
         with (self.folder / f"{name}.txt").open("a") as output:
-            process = subprocess.Popen(
-                self.command(name, str(self.config), *buses, *arguments),
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
+            if self._starter is not None:
+                process = self._starter.start(words, output)
+            else:
+                process = subprocess.Popen(
+                    self.command(*words), stdout=output, stderr=subprocess.STDOUT, text=True
+                )
         self.processes[name] = process
         return process
 
@@ -187,17 +192,36 @@ def chromium() -> str:
     return found
 
 
+@pytest.fixture(scope="session")
+def starter(network: list[str]) -> Iterator[Starter]:
+    """Starts processes in the tests' network."""
+    made = Starter(network)
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def rig(tmp_path: Path, endpoints: dict[str, str], network: list[str], free_port: int) -> Iterator[Rig]:
+def rig(
+    tmp_path: Path, endpoints: dict[str, str], network: list[str], free_port: int, starter: Starter
+) -> Iterator[Rig]:
     """A deployment on a udp_multicast bus in a network of its own."""
-    made = Rig(tmp_path, endpoints, network, [f"can0=udp_multicast:239.74.163.2,port={free_port}"])
+    bus = f"can0=udp_multicast:239.74.163.2,port={free_port}"
+    made = Rig(tmp_path, endpoints, network, [bus], starter=starter)
     yield made
     made.end_all()
 
 
+@pytest.fixture(scope="session")
+def vcan_starter() -> Iterator[Starter]:
+    """Starts processes where SocketCAN is."""
+    made = Starter([])
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def vcan_rig(tmp_path: Path, endpoints: dict[str, str]) -> Iterator[Rig]:
+def vcan_rig(tmp_path: Path, endpoints: dict[str, str], vcan_starter: Starter) -> Iterator[Rig]:
     """A deployment on SocketCAN; only inside vcan-run."""
-    made = Rig(tmp_path, endpoints, [], ["can0=socketcan:vcan0"])
+    made = Rig(tmp_path, endpoints, [], ["can0=socketcan:vcan0"], starter=vcan_starter)
     yield made
     made.end_all()
