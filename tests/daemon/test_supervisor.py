@@ -8,9 +8,11 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
+from handtouch import wire
 from handtouch.canbus.master import SerialChanged
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.process import Process
@@ -53,22 +55,32 @@ class Nodes:
         return [type("Status", (), {"serial": serial}) for serial in self.serials]
 
 
-class Nobody:
-    def wants(self, topic: str) -> bool:  # noqa: ARG002
-        return False
+class Listener:
+    """Keeps the last message of each topic."""
+
+    def __init__(self) -> None:
+        self.last: dict[str, Any] = {}
+
+    def wants(self, topic: str) -> bool:
+        return topic.startswith(("contact/", "hand/"))
 
     def send(self, message: Any) -> None:
-        """Nobody listens."""
+        sent = wire.decode(wire.encode(message))
+        self.last[wire.topic_of(sent)] = sent
 
 
 class Rig:
     def __init__(self, bench: Any) -> None:
-        self.pipeline = Pipeline(type(bench.model)(bench.deployment), PERIOD_NS, 0.6, Nobody())
+        self.heard = Listener()
+        self.pipeline = Pipeline(type(bench.model)(bench.deployment), PERIOD_NS, 0.6, self.heard)
         self.pipeline.node_state[:] = PadState.CLEAR
         self.nodes, self.process = Nodes([11, 12, 13]), Said()
         arguments: tuple[Any, ...] = (bench.deployment, self.pipeline, self.nodes, "", self.process)
         self.supervisor = Supervisor(*arguments)
         self.t_ns = SECOND_NS
+        self.touched = False
+        """whether somebody touches the first pad"""
+        self._counts = bench.counts(0, 0.4, 0.6, 1e-3).astype("<i2").tobytes()
         self.swap(0, None, 11)  # the first time that anybody is known
 
     def swap(self, pad: int, before: int | None, after: int | None) -> None:
@@ -79,10 +91,24 @@ class Rig:
         """Until the next words are taken."""
         self.process.waiting = [word if isinstance(word, bytes) else write_word(word) for word in words]
         while self.process.waiting:
-            self.t_ns += PERIOD_NS
-            self.pipeline.begin(self.t_ns, self.t_ns)
-            self.pipeline.advance(self.t_ns + PERIOD_NS)
-            self.supervisor.step(self.t_ns)
+            self.step()
+        for _ in range(10):
+            self.step()
+
+    def step(self) -> None:
+        self.t_ns += PERIOD_NS
+        self.pipeline.begin(self.t_ns, self.t_ns)
+        for pad in range(3):
+            counts = self._counts if self.touched and pad == 0 else b"\0" * 8
+            self.pipeline.slab.write(pad, counts, self.t_ns + 1000)
+        self.pipeline.advance(self.t_ns + PERIOD_NS)
+        self.supervisor.step(self.t_ns)
+
+    def contact(self) -> Any:
+        return self.heard.last["contact/h/plane"]
+
+    def frame(self) -> Any:
+        return self.heard.last["hand/h"]
 
 
 @pytest.fixture
@@ -103,6 +129,24 @@ def test_a_calibration_is_applied_whole(rig: Rig) -> None:
     assert np.diag(model.gain_covariance[1]).tolist() == [1e-4] * 4
     assert rig.pipeline.tick.baseline.expected[1].tolist() == [3.0, 4.0, 5.0, 6.0]
     assert rig.supervisor.changed >= {1}
+
+
+def test_what_a_person_gave_is_told_to_the_slow_half_until_it_knows_better(rig: Rig) -> None:
+    def told() -> list[dict[str, Any]]:
+        return [m for m in map(msgpack.unpackb, rig.process.sent) if m["kind"] == "put"]
+
+    rig.pipeline.model.calibrate(1, np.array([1.1, 1.0, 1.0, 0.9]), "bench-1")
+    rig.supervisor.put(1, {"gains"})
+    assert told()[-1]["given"] == ["gains"]
+    word = Calibrate.model_validate(told()[-1]["word"])
+    assert (word.serial, word.name, word.gains) == (12, "bench-1", (1.1, 1.0, 1.0, 0.9))
+    assert np.diag(rig.pipeline.model.gain_covariance[1]) == pytest.approx([0.01**2 * 0.75] * 4)
+    rig.swap(0, 11, 11)  # as after a new start of the slow half, which applies what is stored first
+    rig.hear(calibrate(1, 12), word)
+    assert (len(told()), rig.pipeline.model.calibration[1]) == (2, "bench-1")
+    rig.hear(calibrate(1, 12))  # contacts have told more
+    rig.swap(0, 11, 11)
+    assert len(told()) == 2
 
 
 @pytest.mark.parametrize(
@@ -167,6 +211,30 @@ def test_a_fault_takes_force_and_certainty_and_gives_them_back(rig: Rig) -> None
     rig.hear(Judged(pad=2, serial=13, trust="trusted"))
     assert not rig.pipeline.model.quarantined[2]
     assert (rig.pipeline.model.gain_covariance[2] == before).all()
+
+
+def test_contacts_say_of_what_findings_make_of_them_while_those_last(rig: Rig) -> None:
+    spoiled = {"location": False, "strength": False}
+    rig.hear(calibrate(0, 11), Judged(pad=0, serial=11, trust="trusted"))
+    rig.touched = True
+    rig.hear(Judged(pad=0, serial=11, trust="trusted", findings=(GUM,)))
+    assert rig.contact().location == rig.contact().strength == "valid"
+    assert (rig.contact().findings, rig.frame().doubtful) == ((), b"")
+    torn = GUM.model_copy(update={"kind": "torn corner", **spoiled})
+    rig.hear(Judged(pad=0, serial=11, trust="trusted", findings=(GUM, torn)))
+    contact = rig.contact()
+    assert (contact.location, contact.strength, contact.force_n) == ("doubtful", "invalid", None)
+    assert contact.position_m is not None
+    assert contact.findings == ("torn corner",)
+    assert rig.frame().doubtful == b"\1\0\0"
+    rig.hear(Judged(pad=0, serial=11, trust="trusted"))
+    contact = rig.contact()
+    assert (contact.location, contact.strength, contact.findings) == ("valid", "valid", ())
+    rig.swap(0, 11, 21)
+    rig.hear()
+    rig.step()
+    contact = rig.contact()
+    assert (contact.location, contact.strength, contact.findings) == ("valid", "invalid", ("swapped unit",))
 
 
 def test_its_state_is_told(rig: Rig) -> None:

@@ -6,12 +6,13 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
 from handtouch.supervise.archive import Archive
 from handtouch.supervise.calibration import Calibration, Gains, Law, Provenance, matrix
-from handtouch.supervise.link import Calibrate, Judged, Word
+from handtouch.supervise.link import Alive, Calibrate, Judged, Word, put
 from handtouch.supervise.slow import SlowHalf
 from handtouch.supervise.store import Store
 
@@ -128,6 +129,82 @@ def test_a_calibration_under_other_tables_is_not_applied_and_told(bench: Bench, 
     assert calibrations(words, 0) == []
     assert judged(words, 0).trust == "nominal"
     assert "it was made under nominal-other" in judged(words, 0).calibrating
+
+
+def later(bench: Bench, slow: SlowHalf, seconds: float) -> list[Word]:
+    """What is said when so long has gone by without a touch."""
+    nothing = np.zeros((13, 3, 4)), np.zeros((13, 3), np.uint32)
+    return slow.take(bench.block(*nothing, round(seconds * 1e9)), NOW)
+
+
+def test_what_others_store_while_it_runs_is_taken_within_seconds(bench: Bench, swapped: Swapped) -> None:
+    """By a rollback, say: its gains are applied, and contacts go on from them."""
+    slow = half(bench, swapped[1])
+    slow.take(bench.introduce([11, 12, 5]), NOW)
+    assert all(isinstance(word, Alive) for word in later(bench, slow, 3.0))
+    gains = Gains((1.2, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
+    with Store(swapped[1]) as store:
+        newest = store.newest(11)
+        assert newest is not None
+        made = store.write(11, newest.config, Calibration(gains), Provenance("by hand"), NOW)
+    (applied,) = calibrations(later(bench, slow, 6.0), 0)
+    assert (applied.name, applied.gains) == (made.name, pytest.approx(gains.factors))
+    with Store(swapped[1]) as store:  # for the tests after this one
+        store.roll_back(11, newest.number, Provenance(""), NOW)
+    (applied,) = calibrations(later(bench, slow, 9.0), 0)
+    assert newest.calibration.gains is not None
+    assert applied.gains == pytest.approx(newest.calibration.gains.factors)
+
+
+def test_gains_that_a_person_gave_end_a_quarantine_and_are_gone_on_from(
+    bench: Bench, session: Session, tmp_path: Path
+) -> None:
+    slow = half(bench, tmp_path / "c.db")
+    slow.take(bench.introduce([11, 12, 13], [1, 2, 3]), NOW)
+    gains, wide = (1.5, 1.0, 1.0, 1.0), tuple((1e-4 * (np.eye(4) - 0.25)).ravel().tolist())
+    word = Calibrate(pad=2, serial=13, name="bench.1", gains=gains, covariance=wide)
+    words = slow.take(msgpack.unpackb(put(word, ["gains"])), NOW)
+    assert calibrations(words, 2) == [word]  # told again, as what is stored may have undone it
+    assert (judged(words, 2).trust, judged(words, 2).findings) == ("trusted", ())
+    assert "gains given or stored, known to 0.87 %" in judged(words, 2).calibrating
+    near = Calibrate(pad=0, serial=11, name="bench", gains=tuple(1.1 * bench.gains[0]), covariance=wide)
+    slow.take(msgpack.unpackb(put(near, ["gains"])), NOW)
+    last = calibrations(play(slow, bench, session), 0)[-1]
+    assert np.log(last.gains) == pytest.approx(np.log(near.gains), abs=0.01)  # with the factor they share
+    assert slow.take(msgpack.unpackb(put(near.model_copy(update={"serial": 99}), ["gains"])), NOW) == []
+
+
+def test_a_guided_session_ends_the_quarantine_of_a_pad_that_hides_its_gains(
+    bench: Bench, tmp_path: Path
+) -> None:
+    slow = half(bench, tmp_path / "c.db")
+    assert judged(slow.take(bench.introduce([11, 12, 13], [1, 2, 3]), NOW), 2).trust == "person"
+    law = Law(21_000.0, 1.4, 2400.0, matrix(np.diag([1e-4, 1e-4, 1e-6])))
+    with Store(tmp_path / "c.db") as store:
+        store.write(13, "nominal-strip", Calibration(law=law), Provenance("guided session"), NOW)
+    words = later(bench, slow, 3.0)
+    (applied,) = calibrations(words, 2)
+    assert applied.law is not None
+    assert applied.law.alpha == 1.4
+    assert np.diag(np.reshape(applied.covariance, (4, 4))) == pytest.approx([0.05**2 * 0.75] * 4)
+    assert judged(words, 2).trust == "trusted"
+
+
+def test_another_units_calibration_is_applied_where_a_person_took_it_over_and_says_so(
+    bench: Bench, tmp_path: Path
+) -> None:
+    gains = Gains((1.1, 1.0, 1.0, 1.0), matrix(1e-6 * np.eye(4)))
+    taken = Provenance("gains from contacts", foreign="it was made for serial 9, not for 11")
+    with Store(tmp_path / "c.db") as store:
+        store.write(11, "nominal-square", Calibration(gains), taken, NOW)
+    slow = half(bench, tmp_path / "c.db")
+    words = slow.take(bench.introduce([11, 12, 13], [1, None, None]), NOW)
+    (applied,) = calibrations(words, 0)
+    assert applied.covariance[0] > 0.04**2 * 0.75
+    (finding,) = judged(words, 0).findings
+    assert judged(words, 0).trust == "nominal"
+    assert (finding.kind, finding.evidence) == ("foreign calibration", taken.foreign)
+    assert "rollback" in finding.remedy
 
 
 def test_units_that_share_a_number_or_have_none_learn_nothing(

@@ -130,7 +130,7 @@ def _again(job: _Job, file: Path) -> int:
     stored = ""
     if job.options.yes and job.options.store and not outcome.fit.problems:
         stored = store_law(job.options.config, job.deployment, (job.hand, job.pad), head, outcome)
-        words.append(f"stored as {stored}; the daemon takes it when it starts")
+        words.append(f"stored as {stored}; a daemon that uses this store takes it within seconds")
     if job.options.as_json:
         print(json.dumps(report.as_json(outcome, calibration=stored or None), indent=2))
     else:

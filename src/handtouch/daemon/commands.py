@@ -167,7 +167,11 @@ class Commands:
 
     def _tare(self, arguments: dict[str, Any], now_ns: int) -> Job:
         chosen = self._chosen(_checked(_Pads, arguments).pads)
-        return Tare(self._names, chosen, self._pipeline.tick, self._pacer, now_ns)
+        return Tare(self._names, chosen, self._pipeline.tick, self._pacer, now_ns, self._tared)
+
+    def _tared(self, pad: int) -> None:
+        if self._report.supervisor is not None:
+            self._report.supervisor.put(pad, {"offset_counts"})
 
     def _calibrate(self, arguments: dict[str, Any], now_ns: int) -> Reply:  # noqa: ARG002
         """Change what is given of a pad's calibration, and tell all of it."""
@@ -208,6 +212,9 @@ class Commands:
         self._pipeline.adopt(model, np.array([pad]))
         if offsets is not None:
             self._pipeline.tick.assume(pad, offsets)
+        if self._report.supervisor is not None:
+            parts = ("gains", "law", "offset_counts")
+            self._report.supervisor.put(pad, {part for part in parts if getattr(asked, part) is not None})
 
     def _disable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
         asked = _checked(_Switch, arguments)

@@ -7,7 +7,8 @@ took another's place is put into quarantine here, at once, whether the slow half
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -19,22 +20,26 @@ from handtouch.daemon.blocks import Blocks
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.process import Process
 from handtouch.daemon.rest import Turns
-from handtouch.supervise.calibration import Law
+from handtouch.supervise.calibration import Law, four
 from handtouch.supervise.link import (
     Alive,
     Calibrate,
+    ContactLaw,
     Finding,
     Judged,
     Start,
     Word,
     WordError,
     plain,
+    put,
     read_word,
     serials,
 )
 
 _UNKNOWN_GAINS = 0.05**2 * (np.eye(4) - 0.25)
 """Covariance of log gains of a unit that nobody knows; their sum can't be seen."""
+_GIVEN_GAINS = 0.01**2 * (np.eye(4) - 0.25)
+"""The same of gains that a person gave: what measuring them by known currents leaves."""
 _RESTS = (
     "rests without potential, for its sheet has got used to load and hides light touches; it feels nothing "
     "until another pad of the hand is touched, or its turn is over"
@@ -81,6 +86,10 @@ class Supervisor:
         self._blocks = Blocks(pipeline.model.size)
         self._serials: list[int | None] = [None] * pipeline.model.size
         self._before: list[int | None] = [pad.serial for _, pad in self._pads]
+        self._given: dict[int, set[str]] = {}
+        """of pads whose calibration a person put in force: what of it"""
+        self._awaited: dict[int, str] = {}
+        """names of those that the slow half was told of and hasn't taken yet"""
         self._sent_ns = 0
         self._alive: Alive | None = None
 
@@ -118,6 +127,19 @@ class Supervisor:
             if self._before[pad] is not None and self._before[pad] != after:
                 self._quarantine(pad)
         self._introduce(now_ns)
+
+    def put(self, pad: int, given: Collection[str]) -> None:
+        """A person put gains, a law or offset_counts in force: the slow half goes on from them.
+
+        It is told of gains and law again when it begins anew; they hold as long as the daemon lives and the
+        unit is there, or until contacts tell the gains better.
+        """
+        if "gains" in given:
+            self._covariance[pad] = _GIVEN_GAINS
+            self._doubt(pad, bool(self._pipeline.model.quarantined[pad]))
+        self._given[pad] = self._given.get(pad, set()) | set(given)
+        self._tell_given(pad)
+        self._given[pad].discard("offset_counts")  # the baseline goes on from there
 
     def step(self, now_ns: int) -> None:
         """After a tick: gather it; now and then send what was gathered and do what was said."""
@@ -193,12 +215,34 @@ class Supervisor:
 
     def _introduce(self, now_ns: int) -> None:
         self.process.send(serials(self._serials, self._before, now_ns))
+        for pad in self._given:
+            self._tell_given(pad)
+
+    def _tell_given(self, pad: int) -> None:
+        model, serial, given = self._pipeline.model, self._serials[pad], self._given[pad]
+        if serial is None or not given:
+            return
+        law, offsets = model.laws[pad], self._pipeline.tick.baseline.expected[pad]
+        word = Calibrate(
+            pad=pad,
+            serial=serial,
+            name=model.calibration[pad],
+            gains=four(model.gains[pad]),
+            covariance=tuple(self._covariance[pad].ravel().tolist()),
+            offset_counts=four(offsets) if "offset_counts" in given else None,
+            law=ContactLaw(**asdict(law)) if law is not None and "law" in given else None,
+        )
+        if {"gains", "law"} & given:  # it says those again
+            self._awaited[pad] = word.name
+        self.process.send(put(word, sorted(given)))
 
     def _quarantine(self, pad: int) -> None:
         """Another unit: nothing that was known of the one before holds."""
         model = self._pipeline.model
         model.calibrate(pad, np.ones(4), model.nominal[pad])
         self._covariance[pad] = _UNKNOWN_GAINS
+        self._given.pop(pad, None)
+        self._awaited.pop(pad, None)
         self._doubt(pad, quarantined=True)
         self._pipeline.adopt(model, np.array([pad]))
         self._pipeline.tick.renew(pad)
@@ -241,6 +285,10 @@ class Supervisor:
         if offsets is not None and max(map(abs, offsets)) > model.largest_counts[pad] / 2:
             self.malformed += 1
             return
+        if self._awaited.get(pad) == word.name:
+            del self._awaited[pad]
+        elif pad not in self._awaited:  # what is known by now goes before what was given
+            self._given.pop(pad, None)
         law = model.laws[pad] if word.law is None else Law(**word.law.model_dump())
         reweighed = law != model.laws[pad]
         model.calibrate(pad, word.gains, word.name, law)

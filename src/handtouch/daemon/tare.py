@@ -5,6 +5,7 @@ Public names: `Tare`. A job of the control endpoint: it looks at every tick, and
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,17 @@ class Tare:
     """Measures the pads `chosen` (n,) and tares those that prove to be unloaded."""
 
     def __init__(
-        self, names: list[tuple[str, str]], chosen: NDArray[np.bool_], tick: Tick, pacer: Pacer, now_ns: int
+        self,
+        names: list[tuple[str, str]],
+        chosen: NDArray[np.bool_],
+        tick: Tick,
+        pacer: Pacer,
+        now_ns: int,
+        tared: Callable[[int], None] = lambda _: None,
     ) -> None:
+        """tared: is called with the row of each pad that was tared."""
         self._names, self._chosen, self._tick, self._pacer = names, chosen, tick, pacer
+        self._tared = tared
         self._end_ns = now_ns + max(_SECOND_NS, 10 * int(tick.period_ns.max()))
         self._samples = tick.samples.copy()
         self._count = np.zeros(len(names), dtype=np.int64)
@@ -77,6 +86,7 @@ class Tare:
             return {**told, "tared": False, "reason": why}
         self._tick.assume(pad, mean, std / np.sqrt(count))
         self._tick.forget(np.array([pad]))
+        self._tared(pad)
         return {**told, "tared": True, "reason": "", "offset_counts": mean.tolist()}
 
     def _trouble(self, pad: int, model: PadModel, mean: NDArray[np.float64], std: NDArray[np.float64]) -> str:

@@ -28,6 +28,8 @@ _log = logging.getLogger("handtouch.supervise")
 _AGAIN = timedelta(seconds=60)
 _DRIFT_PER_DAY = 1e-3
 """Standard deviation of a log gain's random walk, after a day."""
+_FROM_UNIT_TO_UNIT = 0.05
+"""Standard deviation of a log gain, from one unit to another."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class Archive:
         self._store: Store | None = None
         self._again: datetime | None = None
         self._damage = ""
+        self._news = False
 
     def close(self) -> None:
         """Close the store."""
@@ -55,14 +58,33 @@ class Archive:
             self._store.close()
         self._store = None
 
+    def changed(self, now: datetime) -> bool:
+        """Whether others may have stored anything since the last call: by a guided session, say."""
+        store = self._opened(now)
+        if store is None:
+            return False
+        news, self._news = self._news, False
+        try:
+            return store.changed() or news
+        except StoreError as error:
+            self._fail(error, now)
+            return False
+
     def own(self, serial: int, place: Place, now: datetime) -> tuple[Version | None, str]:
-        """The newest calibration of a unit that may be applied in this place, and why one is refused."""
+        """The newest calibration of a unit that may be applied in this place, and why one is refused.
+
+        Another unit's that a person took over expressly may be; its provenance says so.
+        """
         store = self._opened(now)
         if store is None:
             return None, ""
         try:
             version = store.newest(serial, place.config)
-            return (fit(version, serial, place.config).version, "") if version else (None, "")
+            if version is None:
+                return None, ""
+            taken_over = replace(version, provenance=replace(version.provenance, foreign=""))
+            fit(taken_over, serial, place.config)
+            return version, ""
         except MismatchError as error:
             return None, str(error)
         except StoreError as error:
@@ -95,6 +117,7 @@ class Archive:
             return None
         before, _ = self.own(serial, place, now)
         known = before.calibration if before else Calibration()
+        lasts = known.law or (known.gains and gains is None)
         changed = replace(
             known, gains=gains or known.gains, offsets=offsets or known.offsets, sheet=sheet or known.sheet
         )
@@ -104,6 +127,7 @@ class Archive:
             link=place.link,
             host=platform.node(),
             program=f"handtouch {handtouch.__version__}",
+            foreign=before.provenance.foreign if before and lasts else "",
         )
         try:
             return store.write(serial, place.config, changed, origin, now)
@@ -115,7 +139,7 @@ class Archive:
         if self._store is not None or (self._again is not None and now < self._again):
             return self._store
         try:
-            self._store = self._open()
+            self._store, self._news = self._open(), True
             self.trouble = self._damage
         except (StoreError, OSError) as error:
             self._fail(error, now)
@@ -143,11 +167,13 @@ def age_s(version: Version, now: datetime) -> float:
 
 
 def grown_old(version: Version, now: datetime) -> Gains | None:
-    """The gains of a version, less certain by what they may have drifted since."""
+    """The gains of a version, less certain by what they may have drifted since, or if another unit's."""
     gains = version.calibration.gains
     if gains is None:
         return None
     drift = _DRIFT_PER_DAY**2 * age_s(version, now) / 86400
+    if version.provenance.foreign:
+        drift += _FROM_UNIT_TO_UNIT**2
     # a walk of four gains that leaves their product alone
     covariance = tuple(
         tuple(value + drift * ((i == j) - 0.25) for j, value in enumerate(row))

@@ -20,6 +20,7 @@ from handtouch.supervise.store import Store, StoreError, Unit, store_path
 
 FORMAT = "handtouch-calibrations"
 _FORMAT_VERSION = 1
+_TAKEN = "a daemon that uses this store takes it within seconds; `handtouch status` tells what it applies"
 
 
 def run_list(store: Path | None, deployment: Path | None, as_json: bool) -> int:
@@ -94,6 +95,7 @@ def run_roll_back(store: Path | None, deployment: Path | None, unit: str, number
         serial = _find(opened, unit, number).serial
         made = opened.roll_back(serial, number, _here(f"rolled back to version {number}"), _now())
         print(f"serial {serial}: version {made.number} is what version {number} was; none is lost")
+        print(_TAKEN)
         return 0
 
     return _run(store, deployment, work)
@@ -134,10 +136,13 @@ def run_import(
         if serial is not None and len(found) != 1:
             raise StoreError(f"{file}: holds {len(found)} calibrations: --serial takes a file of one")
         # all are looked at before any is written
-        fitting = [
-            fit(v, v.serial if serial is None else serial, v.config, accept_mismatch=other_unit)
-            for v in found
-        ]
+        try:
+            fitting = [
+                fit(v, v.serial if serial is None else serial, v.config, accept_mismatch=other_unit)
+                for v in found
+            ]
+        except MismatchError as error:
+            raise StoreError(f"{file}: {error}, by --other-unit") from error
         for one in fitting:
             version, target = one.version, one.version.serial if serial is None else serial
             note = _here(f"imported from {file.name}")
@@ -146,6 +151,7 @@ def run_import(
             )
             made = opened.write(target, version.config, version.calibration, origin, _now())
             print(f"serial {target}: version {made.number}" + (f", {one.mismatch}" if one.mismatch else ""))
+        print(_TAKEN)
         return 0
 
     return _run(store, deployment, work, create=True)

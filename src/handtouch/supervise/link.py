@@ -1,13 +1,14 @@
 """What the daemon and the slow half tell each other over their socket pair: msgpack maps, one a message.
 
-Public: to the slow half `Start` (JSON on its standard input), `Block` (ticks of all pads), `serials`; from it
-`Alive`, `Calibrate`, `Judged` with `Finding`s. `read_word` takes any bytes and raises WordError.
+Public: to the slow half `Start` (JSON on its standard input), `Block` (ticks of all pads), `serials`, `put`
+(what a person gave); from it `Alive`, `Calibrate`, `Judged` with `Finding`s. `read_word` takes any bytes and
+raises WordError.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -178,7 +179,7 @@ class Calibrate(Table):
     kind: Literal["calibrate"] = "calibrate"
     pad: PadNumber
     serial: Serial
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*$", max_length=64)]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
     gains: Annotated[tuple[Factor, Factor, Factor, Factor], Field(strict=False)]
     covariance: Annotated[tuple[float, ...], Field(strict=False, min_length=16, max_length=16)]
     offset_counts: Four | None = None
@@ -197,6 +198,12 @@ class Judged(Table):
     trust: Literal["nominal", "trusted", "quarantined", "person"]
     calibrating: Text = ""
     findings: Annotated[tuple[Finding, ...], Field(strict=False, max_length=8)] = ()
+
+
+def put(word: Calibrate, given: Collection[str]) -> bytes:
+    """What a person put in force, and which of its fields that person gave."""
+    packed: bytes = msgpack.packb({"kind": "put", "given": list(given), "word": word.model_dump()})
+    return packed
 
 
 Word = Alive | Calibrate | Judged

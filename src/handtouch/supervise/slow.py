@@ -38,6 +38,8 @@ from handtouch.supervise.upkeep import Upkeep, back_force
 
 _log = logging.getLogger("handtouch.supervise")
 _ALIVE_NS = 500_000_000
+_LOOK_NS = 2_000_000_000
+"""Time between two looks whether others have stored anything."""
 _MOST_FINDINGS = 8
 
 
@@ -61,8 +63,12 @@ class _Row:
     place: archives.Place
     unit: Unit
     places: Places
+    version: int = 0
+    """number of the newest that is stored of the unit, 0 for none"""
     refused: str = ""
     """why a stored calibration isn't applied"""
+    foreign: str = ""
+    """whose calibration it has, if another unit's"""
     told: Judged | None = None
 
 
@@ -86,7 +92,7 @@ class SlowHalf:
         self._upkeep = Upkeep(len(entries))
         self._found: dict[int, list[Finding]] = {}
         self._block: Block | None = None
-        self._t_ns = self._alive_ns = 0
+        self._t_ns = self._alive_ns = self._looked_ns = 0
 
     def take(self, message: dict[str, Any], now: datetime) -> list[Word]:
         """What follows from a message of the daemon's."""
@@ -96,6 +102,9 @@ class SlowHalf:
             self._enter(message["serials"], message["before"], now, words)
         elif message["kind"] == "block":
             self._work(read_block(message, len(self._rows)), now, words)
+        elif message["kind"] == "put":
+            self._put(Calibrate.model_validate(message["word"]), message["given"], words)
+        self._look(now, words)
         for pad in range(len(self._rows)):
             self._tell(pad, words)
         if self._t_ns - self._alive_ns >= _ALIVE_NS:
@@ -129,7 +138,8 @@ class SlowHalf:
             if not obstacle:
                 version, row.refused = self._archive.own(serial, row.place, now)
             own = archives.grown_old(version, now) if version else None
-            row.unit.enter(serial, last, own, obstacle, self._t_ns)
+            row.version, row.foreign = 0, version.provenance.foreign if version else ""
+            row.unit.enter(serial, last, own, obstacle, self._t_ns, foreign=bool(row.foreign))
             self._upkeep.forget(pad)
             if self._diagnoses is not None:
                 self._diagnoses.calibrate(pad, row.unit.gains.factors)
@@ -140,7 +150,49 @@ class SlowHalf:
             )  # fmt: skip
             if version is not None:
                 words.append(self._recall(pad, version, now))
-                self._tare(pad, version)
+
+    def _look(self, now: datetime, words: list[Word]) -> None:
+        """Take over what others have stored meanwhile: a guided session, a rollback, an import."""
+        if self._t_ns - self._looked_ns < _LOOK_NS:
+            return
+        self._looked_ns = self._t_ns
+        if not self._archive.changed(now):
+            return
+        for pad, row in enumerate(self._rows):
+            if row.unit.serial is None or not row.unit.learns:
+                continue
+            version, row.refused = self._archive.own(row.unit.serial, row.place, now)
+            if version is None or version.number == row.version:
+                continue
+            row.foreign = version.provenance.foreign
+            if own := archives.grown_old(version, now):
+                row.unit.adopt(own, foreign=bool(row.foreign))
+            elif version.calibration.law and row.unit.doubted:
+                row.unit.weigh()
+            else:
+                row.unit.forget()
+            if self._diagnoses is not None:
+                self._diagnoses.calibrate(pad, row.unit.gains.factors)
+            words.append(self._recall(pad, version, now))
+            _log.info("%s/%s: %s was stored by others: taken", row.place.hand, row.place.link, version.name)
+
+    def _put(self, word: Calibrate, given: Sequence[str], words: list[Word]) -> None:
+        """Go on from what a person put in force; and say it again, as what is stored may have undone it."""
+        row = self._rows[word.pad]
+        if word.serial != row.unit.serial:
+            return
+        if "gains" in given:
+            row.foreign = ""
+            row.unit.adopt(Gains(word.gains, matrix(np.reshape(word.covariance, (4, 4)))))
+        if "law" in given:
+            row.unit.weigh()
+        if self._diagnoses is not None:
+            if "gains" in given:
+                self._diagnoses.calibrate(word.pad, word.gains)
+            if word.offset_counts is not None:
+                self._diagnoses.tare(word.pad, word.offset_counts)
+        if {"gains", "law"} & {*given}:
+            words.append(word)
 
     def _work(self, block: Block, now: datetime, words: list[Word]) -> None:
         self._t_ns = int(block.t_ns[-1])
@@ -179,7 +231,7 @@ class SlowHalf:
         assert serial is not None
         residual = estimate.misfit
         origin = Provenance("gains from contacts", contacts=estimate.contacts, residual=residual)
-        version = self._archive.keep(serial, row.place, origin, now, gains=row.unit.gains)
+        version = self._kept(row, self._archive.keep(serial, row.place, origin, now, gains=row.unit.gains))
         where = f"{row.place.hand}/{row.place.link}"
         kept = f"kept as {version.name}" if version else "not kept"
         _log.info("%s: gains of unit %d from contacts, %s: %s", where, serial, kept, estimate.reason)
@@ -193,9 +245,17 @@ class SlowHalf:
         if offsets is not None or sheet is not None:
             origin = Provenance("baseline and sheet followed")
             first = self._archive.own(serial, row.place, now)[0] is None
-            version = self._archive.keep(serial, row.place, origin, now, offsets=offsets, sheet=sheet)
+            version = self._kept(
+                row, self._archive.keep(serial, row.place, origin, now, offsets=offsets, sheet=sheet)
+            )
             if version is not None and first:
                 self._tare(pad, version)
+
+    @staticmethod
+    def _kept(row: _Row, version: Version | None) -> Version | None:
+        if version is not None:
+            row.version, row.foreign = version.number, version.provenance.foreign
+        return version
 
     def _tare(self, pad: int, version: Version) -> None:
         """From now on, what stands off the baseline of a version is something to explain."""
@@ -204,9 +264,12 @@ class SlowHalf:
 
     def _recall(self, pad: int, version: Version, now: datetime) -> Calibrate:
         """All that is stored of the unit in a place."""
-        known = version.calibration
-        # as in the file, if none are stored; nobody knows how sure those are
-        gains = self._rows[pad].unit.gains if known.gains else Gains((1.0,) * 4, matrix(np.zeros((4, 4))))
+        known, row = version.calibration, self._rows[pad]
+        row.version = version.number
+        self._tare(pad, version)
+        gains = row.unit.gains
+        if not known.gains and row.unit.trust is Trust.NOMINAL:  # as in the file; nobody knows how sure
+            gains = Gains((1.0,) * 4, matrix(np.zeros((4, 4))))
         word = _calibrate(pad, version.serial, version.name, gains)
         found: dict[str, Any] = {}
         if known.offsets:
@@ -243,7 +306,17 @@ class SlowHalf:
             words.append(judged)
 
     def _of_store(self, row: _Row) -> tuple[Finding, ...]:
-        """What a pad lacks while the store is in trouble."""
+        """That its calibration is another unit's; what a pad lacks while the store is in trouble."""
+        if row.foreign:
+            return (
+                Finding(
+                    kind="foreign calibration",
+                    cause="a calibration is applied that isn't this unit's own, as somebody took it over",
+                    evidence=row.foreign[:1000],
+                    remedy="`handtouch calibrations rollback` goes back, `handtouch calibrate` measures it",
+                    since_ns=row.unit.since_ns,
+                ),
+            )
         if not self._archive.trouble or row.unit.trust is Trust.TRUSTED or not row.unit.learns:
             return ()
         return (

@@ -63,6 +63,7 @@ class Store:
             store_file.create(self.path)
         self._connection, self.writable = store_file.connect(self.path)
         self._inode = self.path.stat().st_ino
+        self._seen = self._data_version()
 
     def __enter__(self) -> Self:
         return self
@@ -80,6 +81,11 @@ class Store:
     def damaged(self) -> list[Path]:
         """Damaged stores that were moved aside here, oldest first: what this one lacks may be in them."""
         return store_file.damaged_beside(self.path)
+
+    def changed(self) -> bool:
+        """Whether anybody else has written into it since the last call, or since it was opened."""
+        before, self._seen = self._seen, self._data_version()
+        return self._seen != before
 
     def write(
         self,
@@ -157,6 +163,10 @@ class Store:
                 "SELECT serial, count(*), max(number) FROM calibration GROUP BY serial ORDER BY serial"
             ).fetchall()
         return [Unit(serial, count, self.get(serial, newest)) for serial, count, newest in counts]
+
+    def _data_version(self) -> int:
+        with self._errors_told("read"):
+            return int(self._connection.execute("PRAGMA data_version").fetchone()[0])
 
     def _select(self, where: str, *values: object) -> list[Version]:
         order = "" if "ORDER BY" in where else "ORDER BY number"

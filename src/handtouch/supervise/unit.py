@@ -6,6 +6,7 @@ there: from the store, from ordinary contacts, or from a person. Pure; time is a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -65,14 +66,25 @@ class Unit:
         self._swap: tuple[str, str] = ("", "")  # kind and cause of the quarantine
         self._waiting: list[Place] = []
         self.since_ns, self._attempt, self._store_at = 0, 0, 0
+        self._known = False  # the estimate began from gains of its own
+        self._common = 1.0  # their geometric mean, which contacts can't tell
         self._estimator = GainEstimator(model)
         self.estimate = self._estimator.estimate
 
-    def enter(self, serial: int, before: int | None, own: Gains | None, obstacle: str, t_ns: int) -> None:
+    def enter(
+        self,
+        serial: int,
+        before: int | None,
+        own: Gains | None,
+        obstacle: str,
+        t_ns: int,
+        *,
+        foreign: bool = False,
+    ) -> None:
         """A unit is in this place from now on.
 
-        before: serial number of the one that was here, None if nobody knows. own: its stored gains.
-        obstacle: why nothing can be kept for it; empty if it can.
+        before: serial number of the one that was here, None if nobody knows. own: its stored gains. obstacle:
+        why nothing can be kept for it; empty if it can. foreign: what is stored was taken over from another.
         """
         self.serial, self.learns, self._why = serial, not obstacle, obstacle
         self.since_ns = t_ns
@@ -80,7 +92,25 @@ class Unit:
         self._swap = "swapped unit", f"another unit: serial {before} was here, {serial} is"
         self._begin(0, own)
         self.trust = Trust.TRUSTED if own else Trust.QUARANTINED if swapped else Trust.NOMINAL
+        if foreign:
+            self.trust = Trust.NOMINAL
         self._ask_a_person_where_hopeless()
+
+    def adopt(self, own: Gains, *, foreign: bool = False) -> None:
+        """Go on from these gains: a person gave them, or went back to them."""
+        self._begin(0, own)
+        self.trust = Trust.NOMINAL if foreign else Trust.TRUSTED
+
+    def weigh(self) -> None:
+        """Its contact law was measured: that is what forces need, whatever isn't known of the gains."""
+        if self.doubted:
+            self.trust = Trust.TRUSTED
+
+    def forget(self) -> None:
+        """Go on from the deployment file's word; one that is doubted goes on learning."""
+        if not self.doubted:
+            self._begin(0)
+            self.trust = Trust.NOMINAL
 
     def add(self, place: Place) -> Outcome:
         """Take a place that was touched; what follows."""
@@ -99,21 +129,30 @@ class Unit:
         return self._judge(place.t_ns)
 
     @property
+    def doubted(self) -> bool:
+        """Whether its forces can't be relied upon."""
+        return self.trust in (Trust.QUARANTINED, Trust.PERSON)
+
+    @property
     def gains(self) -> Gains:
         """The gains as contacts, and what was stored, tell them."""
-        return Gains(four(self.estimate.gains), matrix(self.estimate.covariance))
+        return Gains(four(self._common * self.estimate.gains), matrix(self.estimate.covariance))
 
     @property
     def calibrating(self) -> str:
         """How far its calibration by itself is, in words."""
         if self._why:
             return self._why
-        return "" if self.serial is None else f"gains {self.estimate.status}: {self.estimate.reason}"
+        if self.serial is None:
+            return ""
+        if self.trust is Trust.TRUSTED and self._known and not self.estimate.contacts:
+            return f"gains given or stored, known to {100 * self.estimate.std:.2g} %; contacts refine them"
+        return f"gains {self.estimate.status}: {self.estimate.reason}"
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What there is to say of it: why it is not trusted, and what helps."""
-        if self.trust not in (Trust.QUARANTINED, Trust.PERSON):
+        if not self.doubted:
             return ()
         kind, cause = self._swap
         if self.trust is Trust.PERSON:
@@ -126,7 +165,12 @@ class Unit:
                 "until then its forces are invalid, and its places less certain"
             )
         evidence = f"no calibration of its own is stored; {reason}"
-        return (Finding(kind=kind, cause=cause, evidence=evidence, remedy=remedy, since_ns=self.since_ns),)
+        since_ns = self.since_ns
+        return (
+            Finding(
+                kind=kind, cause=cause, evidence=evidence, remedy=remedy, since_ns=since_ns, strength=False
+            ),
+        )
 
     def _judge(self, t_ns: int) -> Outcome:
         """A batch of contacts was taken."""
@@ -162,8 +206,9 @@ class Unit:
             self.trust = Trust.PERSON
 
     def _begin(self, attempt: int, own: Gains | None = None) -> None:
-        self._attempt, self._waiting = attempt, []
+        self._attempt, self._waiting, self._known = attempt, [], own is not None
         start, covariance = (own.factors, own.covariance) if own else (None, None)
+        self._common = math.exp(np.log(own.factors).mean()) if own else 1.0
         self._estimator = GainEstimator(
             self._model,
             tolerance=_TOLERANCES[attempt],
