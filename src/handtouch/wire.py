@@ -91,7 +91,7 @@ class Contact:
     pad_m: tuple[float, float] | None
     """arc lengths on the pad from the electrodes x0 and y0"""
     location: str
-    """valid or invalid"""
+    """valid, doubtful (told, and not to be relied on), invalid or skipped"""
     force_n: float | None
     force_std_n: float | None
     peak_force_n: float | None
@@ -124,6 +124,9 @@ class Contact:
     """from the sample to the nearest joint state, the worst of the joints in between"""
     raw_force_n: float | None = None
     """before the behaviour of the sheet was undone; None where that isn't modelled"""
+    findings: tuple[str, ...] = ()
+    """kinds of what the supervisor has found, see `Health`, and because of which place or force isn't told or
+    isn't to be relied on"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +189,8 @@ class HandFrame:
     """float32"""
     unestimated: bytes = b""
     """uint8, 1 where force_n isn't to be relied on yet; no bytes where there is none"""
+    doubtful: bytes = b""
+    """uint8, 1 where position_m isn't to be relied on, for what the supervisor has found; as above"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -458,6 +463,7 @@ COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
         "base_covariance_m2": ("<f4", 9),
         "joints_age_s": _F4,
         "unestimated": ("<u1", 1),
+        "doubtful": ("<u1", 1),
     },
     Raw: {"counts": ("<i8", 4), "sample_ns": ("<i8", 1), "fresh": ("<u1", 1)},
 }

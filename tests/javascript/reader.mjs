@@ -51,6 +51,7 @@ const OPTIONAL = {
     base_covariance_m2: [float32, 9],
     joints_age_s: [float32, 1],
     unestimated: [uint8, 1],
+    doubtful: [uint8, 1],
   },
 };
 

@@ -120,6 +120,8 @@ class Messages:
         unestimated = self._tick.unestimated(rows)
         if np.count_nonzero(unestimated):
             optional["unestimated"] = unestimated.tobytes()
+        if np.count_nonzero(vague := self._model.vague[rows]):
+            optional["doubtful"] = vague.tobytes()
         tick_number, t_ns = self._frame_of
         return self._writers[hand].write(self._frames, t_ns, tick_number, repeat, optional)
 
@@ -159,6 +161,7 @@ class Messages:
             column[pad].tolist() for column in (columns.position_m, columns.normal, columns.pad_m)
         )
         located = all(map(math.isfinite, (*position, *normal, *on_pad)))
+        location = "doubtful" if model.vague[pad] else "valid"
         covariance = columns.covariance_m2[pad].ravel().tolist()
         certain = located and all(map(math.isfinite, covariance))  # at a corner nothing may bound it
         force_n = _finite(columns.force_n[pad])
@@ -186,7 +189,7 @@ class Messages:
             normal=tuple(normal) if located else None,
             covariance_m2=tuple(covariance) if certain else None,
             pad_m=tuple(on_pad) if located else None,
-            location="valid" if located else "invalid" if self._tick.wanted[pad] else "skipped",
+            location=location if located else "invalid" if self._tick.wanted[pad] else "skipped",
             force_n=force_n,
             force_std_n=_finite(columns.force_std_n[pad]) if strength in _WITH_STD else None,
             peak_force_n=_finite(contacts.peak_n[pad]),
@@ -200,6 +203,7 @@ class Messages:
             reason=self._reason or REASONS.get(state, "released") if event == "end" else "",
             repeat=repeat,
             raw_force_n=_finite(columns.raw_force_n[pad]) if modelled else None,
+            findings=model.findings[pad],
             **self._placing.tell(pad),
         )
 

@@ -32,6 +32,7 @@ class PadModel:
     `noise_a` (n, 4); `gains` (n, 4) are in `ampere_per_count` (what channels read untouched is followed by
     the tick: `Tick.baseline`),
     `gain_covariance` (n, 4, 4) is that of their logarithms, `quarantined` (n,): no force is told;
+    `vague` (n,): no place is to be relied on; `findings` (n,): names of what says either;
     `laws` (n,) are those that a calibration has put in the place of the file's, else None;
     thresholds `on_n`, `off_n` [N] and the total currents `on_a`, `off_a` [A] that stand for them in the
     middle of the pad; `begin_samples`, `end_samples`; `slow_touch_s`: what takes longer to reach `off_n` is
@@ -64,6 +65,8 @@ class PadModel:
         self.gains = np.ones((self.size, 4))
         self.gain_covariance = np.zeros((self.size, 4, 4))
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
+        self.vague = np.zeros(self.size, dtype=np.bool_)
+        self.findings: list[tuple[str, ...]] = [()] * self.size
         self.doubted = False
         self.on_n = np.array([touch.on_n for touch in touches])
         self.off_n = np.array([touch.off_n for touch in touches])
@@ -131,10 +134,19 @@ class PadModel:
         """What weighs the contacts of a pad: the law of its calibration, or the file's."""
         return self.laws[pad] or self._file_laws[pad]
 
-    def doubt(self, pad: int, log_gain_covariance: ArrayLike, quarantined: bool) -> None:
-        """Gains of a pad are that uncertain, (4, 4) of their logarithms; `quarantined`: tell no force."""
+    def doubt(
+        self,
+        pad: int,
+        log_gain_covariance: ArrayLike,
+        quarantined: bool,
+        vague: bool = False,
+        findings: tuple[str, ...] = (),
+    ) -> None:
+        """Gains of a pad are that uncertain, (4, 4) of their logarithms; `quarantined`: tell no force;
+        `vague`: tell places as not to be relied on; because of `findings`."""
         self.gain_covariance[pad] = log_gain_covariance
-        self.quarantined[pad] = quarantined
+        self.quarantined[pad], self.vague[pad] = quarantined, vague
+        self.findings[pad] = findings
         self.doubted = bool(self.gain_covariance.any() or self.quarantined.any())
 
     def take_over(self, other: PadModel) -> None:
@@ -143,6 +155,13 @@ class PadModel:
             corrected = bool((other.gains[pad] != 1).any()) or other.calibration[pad] != other.nominal[pad]
             name = other.calibration[pad] if corrected else self.calibration[pad]
             self.calibrate(pad, other.gains[pad], name, other.laws[pad])
+            self.doubt(
+                pad,
+                other.gain_covariance[pad],
+                bool(other.quarantined[pad]),
+                bool(other.vague[pad]),
+                other.findings[pad],
+            )
 
     def force(
         self,

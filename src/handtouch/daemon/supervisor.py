@@ -82,6 +82,8 @@ class Supervisor:
         rows = pipeline.model.rows_of_hand.values()
         self.turns = Turns(rows, pipeline.model.size, deployment.scene.rest_after_s)
         self._vague = np.zeros(pipeline.model.size, dtype=np.bool_)
+        self._spoiling: list[tuple[str, ...]] = [()] * pipeline.model.size
+        """of each pad, kinds of the findings that take something from its contacts"""
         self._covariance = np.zeros((pipeline.model.size, 4, 4))
         self._blocks = Blocks(pipeline.model.size)
         self._serials: list[int | None] = [None] * pipeline.model.size
@@ -243,6 +245,7 @@ class Supervisor:
         self._covariance[pad] = _UNKNOWN_GAINS
         self._given.pop(pad, None)
         self._awaited.pop(pad, None)
+        self._vague[pad], self._spoiling[pad] = False, ("swapped unit",)
         self._doubt(pad, quarantined=True)
         self._pipeline.adopt(model, np.array([pad]))
         self._pipeline.tick.renew(pad)
@@ -254,7 +257,8 @@ class Supervisor:
 
     def _doubt(self, pad: int, quarantined: bool) -> None:
         covariance = _NO_PLACE if self._vague[pad] else self._covariance[pad]
-        self._pipeline.model.doubt(pad, covariance, quarantined)
+        vague, spoiling = bool(self._vague[pad]), self._spoiling[pad]
+        self._pipeline.model.doubt(pad, covariance, quarantined, vague, spoiling)
 
     def _take(self, said: bytes) -> None:
         """Do what a word says: all of it or nothing."""
@@ -311,8 +315,9 @@ class Supervisor:
             finding.strength for finding in word.findings
         )
         vague = not all(finding.location for finding in word.findings)
-        if (mute, vague) != (model.quarantined[pad], self._vague[pad]):
-            self._vague[pad] = vague
+        spoiling = tuple(f.kind for f in word.findings if not (f.location and f.strength))
+        if (mute, vague, spoiling) != (model.quarantined[pad], self._vague[pad], self._spoiling[pad]):
+            self._vague[pad], self._spoiling[pad] = vague, spoiling
             self._doubt(pad, mute)
             self._pipeline.tick.forget(np.array([pad]))
         known = {finding.kind for finding in before.findings} if before else set()
