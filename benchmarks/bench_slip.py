@@ -28,7 +28,7 @@ from matplotlib import pyplot as plt
 FloatArray = npt.NDArray[np.float64]
 PADS = pads_of(DEPLOYMENT)
 SPEEDS, FORCES = (1.0, 3.0, 10.0, 30.0, 100.0), (0.5, 2.0, 5.0)
-WORLDS = {name: replace(World(3), sheet=sheet) for name, sheet in (("ideal", None), ("S1", S1), ("S2", S2))}
+WORLDS = {name: replace(World(21), sheet=sheet) for name, sheet in (("ideal", None), ("S1", S1), ("S2", S2))}
 LOADS = {0: 1.0, 1: 0.7}
 GRIPPED_S, SLIPS_S, RUN_S, LATEST_S = 0.3, 1.8, 2.3, 0.5
 SMOOTH_S = (0.0, 0.01, 0.03)
@@ -64,7 +64,7 @@ def slip_all(world: World, hz: float, repeats: int) -> list[tuple[float, float, 
 
 def hold(world: World, hz: float, seconds: float) -> Record:
     """A firm grip that doesn't slip."""
-    grips = [grip(k, 0.0, seconds + 1, FORCES[k % 3], 7000) for k in range(len(PADS))]
+    grips = [grip(k, 0.0, seconds + 1, FORCES[k % 3], 9000) for k in range(len(PADS))]
     return run(grips, world, hz, seconds)
 
 
@@ -136,9 +136,9 @@ def curve(made: list[tuple[FloatArray, FloatArray]], held: FloatArray, t_s: Floa
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    repeats, seconds = (2, 10.0) if quick else (6, 40.0)
+    repeats, seconds = (2, 10.0) if quick else (4, 40.0)
     results: dict[str, Any] = {"latency": [], "false": [], "curves": {}, "cost": []}
-    cases = [("ideal", 200.0), ("S1", 200.0), ("S2", 200.0), ("ideal", 500.0)]
+    cases = [("ideal", 200.0), ("S1", 200.0), ("S2", 200.0), ("ideal", 500.0), ("S2", 500.0)]
     for name, hz in cases[: 1 if quick else None]:
         made, firm = slip_all(WORLDS[name], hz, repeats), hold(WORLDS[name], hz, seconds)
         told = firm.running & ~np.vstack([firm.running[:1], firm.running[:-1]])
@@ -314,7 +314,8 @@ def report(results: dict[str, Any]) -> str:
 Simulated Utah/MIT hand, 15 pads at once, through the daemon's own pipeline and perception; channel noise of
 1 count, tolerances of all parts, sheets (`ideal`, `S1`, `S2`) that the daemon isn't told. A grip trembles:
 10 % ripple of force and 15 um of sway, both of eight tones from 1 to 10 Hz, and the centroid rolls 0.1 mm a
-newton. In half of the slips the force stays as it was, in half it falls to 70 % within 20 ms. Made by
+newton. In half of the slips the force stays as it was, in half it falls to 70 % within 20 ms. The test was
+tuned on other hands, with other grips, than those measured here. Made by
 `benchmarks/bench_slip.py` on {platform.machine()}, Python {platform.python_version()}, {os.cpu_count()}
 shared cores.
 

@@ -121,7 +121,7 @@ def test_a_contact_that_ends_has_lifted_off() -> None:
 
 def test_what_may_be_a_slow_slip_is_asked_to_be_held_still() -> None:
     held = Held()
-    held.feel(2.0, ramp(1.0, 0.4e-3))
+    held.feel(2.0, ramp(1.0, 0.8e-3))
     assert "hold" in held.asks
     firm = Held()
     firm.feel(1.0, still)

@@ -1,17 +1,18 @@
 """How the surface of a link moves against the object that it touches, from joint states and other contacts.
 
-Public names: `relative_to_object`, `Relative`.
+Public names: `Materials`, `relative_to_object`, `Relative`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.percept.stream import Stream
+from handtouch.percept.stream import IntArray, Stream
 
 FloatArray = NDArray[np.float64]
 _OVER_S = 0.05  # that velocities are taken over
@@ -46,22 +47,50 @@ class Relative:
         }
 
 
-def relative_to_object(stream: Stream, pad: int, running: NDArray[np.bool_], t_ns: int) -> Relative | None:
+class Materials(NamedTuple):
+    """Of the links under all contacts of which the palm and joints tell: `pads` (k,), and in the palm's frame
+    places, outward normals, and velocities of the links' material (k, 3)."""
+
+    pads: IntArray
+    place: FloatArray
+    normal: FloatArray
+    velocity: FloatArray
+
+    @classmethod
+    def of(cls, stream: Stream, t_ns: int, period_s: float) -> Materials:
+        """Over the last 50 ms of samples that come every `period_s`."""
+        pads = np.flatnonzero(stream.count > 1)
+        back = np.minimum(max(round(_OVER_S / period_s), 1), stream.count[pads] - 1)
+        now_ns, then_ns = stream.latest_ns(pads), stream.latest_ns(pads, back)
+        palm, link, normal = (
+            stream.latest(pads, name) for name in ("palm_position_m", "position_m", "palm_normal")
+        )
+        was, was_on_link, rotation = (
+            stream.latest(pads, name, back) for name in ("palm_position_m", "position_m", "palm_rotation")
+        )
+        moved = palm - was - (rotation @ (link - was_on_link)[:, :, None])[:, :, 0]
+        known = np.isfinite(moved).all(axis=1) & (t_ns - now_ns <= _OVER_S * 1e9) & (now_ns > then_ns)
+        velocity = moved[known] / ((now_ns - then_ns)[known, None] * 1e-9)
+        return cls(pads[known], palm[known], normal[known], velocity)
+
+
+def relative_to_object(
+    materials: Materials, pad: int, hand_of: IntArray, running: NDArray[np.bool_]
+) -> Relative | None:
     """Of the contact on a pad; None where joint states don't tell the places of its link.
 
     `running` (n,) are contacts that aren't to be relied on to stick.
     """
-    mine = _material(stream, pad, t_ns)
-    if mine is None:
+    own = np.flatnonzero(materials.pads == pad)
+    if not len(own):
         return None
-    place, normal, velocity = mine
-    sticks = (stream.contact > 0) & (stream.hand_of == stream.hand_of[pad]) & ~running
-    sticks[pad] = False
-    all_held = [_material(stream, other, t_ns) for other in np.flatnonzero(sticks).tolist()]
-    others = [held for held in all_held if held is not None]
+    place, normal, velocity = (column[own[0]] for column in materials[1:])
+    pads = materials.pads
+    holds = (hand_of[pads] == hand_of[pad]) & ~running[pads] & (pads != pad)
+    others = int(np.count_nonzero(holds))
     moves, variance = np.zeros(3), 0.0
     if others:
-        moves, covariance = _rigid(place, [(p - place, v) for p, _, v in others])
+        moves, covariance = _rigid(materials.place[holds] - place, materials.velocity[holds])
         variance = float(np.trace(covariance) - normal @ covariance @ normal) / 2
     against = velocity - moves
     against -= normal * (normal @ against)
@@ -72,37 +101,23 @@ def relative_to_object(stream: Stream, pad: int, running: NDArray[np.bool_], t_n
         tuple(against.tolist()),
         std,
         "grasp" if others else "static",
-        len(others),
+        others,
         _sigmoid(log_ratio),
         _sigmoid(log_ratio + _SURE_ODDS) if others else 0.0,
     )
 
 
-def _material(stream: Stream, pad: int, t_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Place, normal and velocity of the link's material under a contact, in the palm; None if not known."""
-    window = stream.window(pad, 64)
-    if len(window) < 2 or t_ns - window.t_ns[-1] > _OVER_S * 1e9:
-        return None
-    then = int(np.searchsorted(window.t_s, -_OVER_S))
-    then = min(then, len(window) - 2)
-    palm, link, rotation = window["palm_position_m"], window["position_m"], window["palm_rotation"]
-    moved = palm[-1] - palm[then] - rotation[then] @ (link[-1] - link[then])
-    if not np.isfinite(moved).all():
-        return None
-    return palm[-1].copy(), window["palm_normal"][-1].copy(), moved / -window.t_s[then]
-
-
-def _rigid(place: FloatArray, held: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """Velocity (3,) and covariance (3, 3) at a place of the body that moves as material at offsets does."""
-    precision = np.diag([1 / _MOVES**2] * 3 + [1 / _TURNS**2] * 3)
-    right = np.zeros(6)
-    for offset, velocity in held:
-        x, y, z = offset
-        row = np.hstack([np.eye(3), np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])])  # v + omega x offset
-        precision += row.T @ row / _LINK_STD**2
-        right += row.T @ velocity / _LINK_STD**2
-    covariance = np.linalg.inv(precision)
-    return (covariance @ right)[: len(place)], covariance[:3, :3]
+def _rigid(offset: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Velocity (3,) and covariance (3, 3) at a place of the body that moves as material (k, 3) at offsets."""
+    x, y, z = offset.T
+    rows = np.zeros((len(offset), 3, 6))
+    rows[:, [0, 1, 2], [0, 1, 2]] = 1.0  # v + omega x offset
+    rows[:, 0, 4], rows[:, 0, 5], rows[:, 1, 3] = z, -y, -z
+    rows[:, 1, 5], rows[:, 2, 3], rows[:, 2, 4] = x, y, -x
+    flat = rows.reshape(-1, 6)
+    precision = np.diag([1 / _MOVES**2] * 3 + [1 / _TURNS**2] * 3) + flat.T @ flat / _LINK_STD**2
+    covariance = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+    return (covariance @ (flat.T @ velocity.ravel() / _LINK_STD**2))[:3], covariance[:3, :3]
 
 
 def _sigmoid(log_odds: float) -> float:

@@ -10,11 +10,16 @@ the speed is integrated out over scales from 1 to 100 mm/s. Their sum over the o
 statistic R: under the model R less the number of samples is a martingale of mean 0, so the mean time to a
 false alarm is at least as many samples as the threshold on R says.
 
+No hand trembles as modelled: innovations are white from one sample to the next, but not over a tenth of a
+second, the less so the more samples that is. So it is learnt, for every age of an onset, by how much ramps of
+that age have met more than their variance while it stuck, and ramps count for so much less.
+
 Public names: `SlipTest`, `Grip`.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,12 +29,18 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-_SPEEDS = np.array([1e-3, 5e-3, 30e-3])  # standard deviations of the prior of each component [m/s]
+_SPEEDS = np.array([1e-3, 5e-3, 30e-3])[:, None]  # standard deviations of the prior of each component [m/s]
 _BEGINS_M = 50e-6  # how far a level may be from its first sample
 _PRESS_PART = 0.02  # of a sample, in what is known of the noise of that
-_ONSETS = 96
 _ONSET_S = 0.005
-_LEVEL, _WANDER, _COUPLING, _STATES = 0, slice(1, 3), 3, 4
+_FRESH, _OLD, _THIN = 12, 21, 4  # onsets: the last ones, and of those before every fourth
+_ONSETS = _FRESH + _OLD
+_STANDS = np.repeat([1.0, _THIN], [_FRESH, _OLD])  # for so many
+_LEVEL, _COUPLING, _STATES = 0, 3, 4  # between them the wander and its speed
+_GAIN, _INFORMATION, _RAMPS = 4, 5, 6  # rows of a ramp, after the states
+_LEAST_HEARD_S = 0.3
+_FORGETS = 0.4  # times as fast as it learns: the calm between two swells of a tremor isn't its end
+_MARGIN = 1.25  # times ln of the excess: what isn't as modelled has tails that aren't, either
 _CLIP = 6.0  # of an innovation squared: a slip must not pass for a new tremor
 
 
@@ -46,6 +57,8 @@ class Grip:
     """corner frequency of that"""
     learn_s: float = 1.0
     """time constant of learning it"""
+    remember_s: float = 2.0
+    """the same of what tremor does beyond the model; sooner at the start"""
     coupling_m: float = 1e-3
     """standard deviation of how far the current of a firm contact moves the centroid"""
     coupling_rate: float = 0.05
@@ -68,7 +81,9 @@ class SlipTest:
         self.speed = np.zeros((pads, 2))
         """of the ramp from then on, most likely [m/s]"""
         rate = 2 * np.pi * self.grip.wander_hz
-        self._still = np.diag([1.0, rate**2])  # covariance of wander and its speed, relative
+        self._still = np.diag([0.0, 1.0, rate**2, 0.0])  # covariance of wander and its speed, relative
+        coupling = (self.grip.coupling_m * self.grip.coupling_rate) ** 2
+        self._drift = np.diag([self.grip.level_m**2, 0.0, 0.0, coupling])  # that comes in a second
         self._stride = max(1, round(_ONSET_S / period_s))
         self._state = np.zeros((pads, 2, _STATES))
         self._cov = np.zeros((pads, 2, _STATES, _STATES))
@@ -78,84 +93,84 @@ class SlipTest:
         self._pressed = np.zeros((pads, 2))  # the last two
         self._press_noise = np.zeros(pads)  # variance of what is new in it with every sample
         self._steps = np.zeros(pads, dtype=np.int64)
-        shape = (pads, 2, _ONSETS)
         self._ramp = np.zeros((pads, _ONSETS))  # s since each onset, 0: none yet
-        self._bias = np.zeros((_STATES, *shape))  # what a ramp of 1 m/s has done to the states
-        self._gain = np.zeros(shape)  # sum of f nu / S
-        self._information = np.zeros(shape)  # sum of f^2 / S
+        self._ramps = np.zeros((pads, _RAMPS, 2, _ONSETS))
+        """what a ramp of 1 m/s has done to the states; sums of f nu / S and of f^2 / S"""
+        self._heard_s = np.zeros(pads)  # of the contact, as long as it doesn't slip
+        self._over = np.zeros((2, pads, _ONSETS, 2))  # ln of how much more than S, by age; and kept from then
 
     def begin(self, pads: IntArray, place: FloatArray, press: FloatArray, keep: bool = False) -> None:
         """Contacts (k,) begin at places (k, 2), so hard pressed (k,), or stick again: `keep` the tremor."""
-        self._state[pads, :, _LEVEL], self._state[pads, :, _WANDER] = place, 0.0
+        self._state[pads], self._state[pads, :, _LEVEL] = 0.0, place
         cov = np.zeros((len(pads), 2, _STATES, _STATES))
         cov[:, :, _LEVEL, _LEVEL] = _BEGINS_M**2
         cov[:, :, _COUPLING, _COUPLING] = self.grip.coupling_m**2
-        self._state[pads, :, _COUPLING] = 0.0
         self._wander[pads] = self._wander_then[pads] if keep else 2 * np.log(self.grip.wander_m)
+        self._over[0, pads] = self._over[1, pads] if keep else 0.0
         if not keep:
-            self._press_noise[pads] = 0.0
+            self._press_noise[pads] = self._heard_s[pads] = 0.0
         self._pressed[pads] = press[:, None]
-        cov[:, :, _WANDER, _WANDER] = np.exp(self._wander[pads])[:, :, None, None] * self._still
+        cov += np.exp(self._wander[pads])[:, :, None, None] * self._still
         self._cov[pads] = cov
         self._press0[pads] = press
         self._steps[pads] = 0
         self._ramp[pads] = 0.0
-        self._bias[:, pads] = 0.0
-        self._gain[pads] = self._information[pads] = 0.0
+        self._ramps[pads] = 0.0
         self.log_odds[pads] = -np.inf
 
     def runs(self, pads: IntArray) -> None:
         """They slip: what is learnt from now on is none of a grip's."""
-        self._wander_then[pads] = self._wander[pads]
+        self._wander_then[pads], self._over[1, pads] = self._wander[pads], self._over[0, pads]
 
     def step(
         self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray
     ) -> BoolArray:
         """Take in samples (k,) that follow those before by dt (k,): places (k, 2), variances of their noise
         (k, 2), relative currents (k,). Returns which raise an alarm (k,)."""
-        gain, innovation, variance, forward, row = self._filter(pads, dt_s, place, noise_m2, press)
-        ramp = self._open(pads, dt_s)
-        level, wander, speed, coupling = self._bias[:, pads]
-        stays, comes, slows, keeps = forward.reshape(-1, 4).T[:, :, None, None]
-        wander, speed = stays * wander + comes * speed, slows * wander + keeps * speed
-        f = ramp[:, None] - level - wander - row[:, _COUPLING, None, None] * coupling
-        gains = gain.transpose(2, 0, 1)[:, :, :, None]
-        self._bias[:, pads] = np.stack([level, wander, speed, coupling]) + gains * f
+        if (dt_s == dt_s[0]).all():
+            dt_s = dt_s[:1]
+        forward = self._forward(dt_s)
+        gain, innovation, variance, row = self._filter(pads, dt_s, forward, place, noise_m2, press)
+        ramp, ramps = self._open(pads, dt_s), self._ramps[pads]
+        flat = ramps.reshape(len(pads), _RAMPS, -1)  # a view
+        flat[:, :_STATES] = forward @ flat[:, :_STATES]
+        f = ramp[:, None] - (row[:, None] @ flat[:, :_STATES]).reshape(len(pads), 2, _ONSETS)
+        ramps[:, :_STATES] += gain.transpose(0, 2, 1)[..., None] * f[:, None]
         weighted = f / variance[:, :, None]
-        self._information[pads] += weighted * f
-        self._gain[pads] += weighted * innovation[:, :, None]
-        return self._judge(pads)
+        ramps[:, _GAIN] += weighted * innovation[:, :, None]
+        ramps[:, _INFORMATION] += weighted * f
+        self._ramps[pads] = ramps
+        return self._judge(pads, ramp, ramps, self._learn(pads, dt_s, ramps))
 
     def _filter(
-        self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """One step of the Kalman filter: gains (k, 2, states), innovations and variances (k, 2), what becomes
-        of wander (k, 2, 2), and the row (k, states) of the place."""
-        grip, state, cov = self.grip, self._state[pads], self._cov[pads]
-        forward = self._forward(dt_s)
-        turned = forward.transpose(0, 2, 1)
-        state[:, :, _WANDER] = state[:, :, _WANDER] @ turned
-        cov[:, :, _WANDER, :] = forward[:, None] @ cov[:, :, _WANDER, :]
-        cov[:, :, :, _WANDER] = cov[:, :, :, _WANDER] @ turned[:, None]
-        cov[:, :, _LEVEL, _LEVEL] += (grip.level_m**2 * dt_s)[:, None]
-        renewed = self._still - forward @ self._still @ turned
-        cov[:, :, _WANDER, _WANDER] += np.exp(self._wander[pads])[:, :, None, None] * renewed[:, None]
-        coupling = (grip.coupling_m * grip.coupling_rate) ** 2
-        cov[:, :, _COUPLING, _COUPLING] += (coupling * dt_s)[:, None]
-        row = np.zeros((len(pads), _STATES))
-        row[:, :2], row[:, _COUPLING] = 1.0, press - self._press0[pads]
+        self,
+        pads: IntArray,
+        dt_s: FloatArray,
+        forward: FloatArray,
+        place: FloatArray,
+        noise_m2: FloatArray,
+        press: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """One step of the Kalman filter: gains (k, 2, states), innovations and variances (k, 2), and the row
+        (k, states) of the place. dt_s and forward may be one for all."""
+        turned, wander = forward.transpose(0, 2, 1), self._wander[pads]
+        state, cov = self._state[pads] @ turned, forward[:, None] @ self._cov[pads] @ turned[:, None]
+        cov += (self._drift * dt_s[:, None, None])[:, None]
+        cov += np.exp(wander)[:, :, None, None] * (self._still - forward @ self._still @ turned)[:, None]
+        row = np.ones((len(pads), _STATES))
+        row[:, 2], row[:, _COUPLING] = 0.0, press - self._press0[pads]
         across = (cov @ row[:, None, :, None])[..., 0]
         vague = state[:, :, _COUPLING] ** 2 + cov[:, :, _COUPLING, _COUPLING]
-        variance = np.einsum("kai,ki->ka", across, row) + noise_m2 + vague * self._noise(pads, press)[:, None]
-        innovation = place - np.einsum("kai,ki->ka", state, row)
+        variance = (across * row[:, None]).sum(axis=2) + noise_m2 + vague * self._noise(pads, press)[:, None]
+        innovation = place - (state * row[:, None]).sum(axis=2)
         gain = across / variance[:, :, None]
         self._state[pads] = state + gain * innovation[:, :, None]
         self._cov[pads] = cov - gain[..., None] * across[:, :, None]
-        excess = np.minimum(innovation**2 / variance, _CLIP) - 1
-        least, most = (2 * np.log(edge) for edge in grip.wander_range_m)
-        learnt = self._wander[pads] + excess * (dt_s / grip.learn_s)[:, None]
-        self._wander[pads] = np.clip(learnt, least, most)
-        return gain, innovation, variance, forward, row
+        excess = np.minimum(innovation * innovation / variance, _CLIP) - 1
+        wander += excess * (dt_s / self.grip.learn_s)[:, None]
+        least, most = self.grip.wander_range_m
+        self._wander[pads] = np.minimum(np.maximum(wander, 2 * math.log(least)), 2 * math.log(most))
+        return gain, innovation, variance, row
 
     def _noise(self, pads: IntArray, press: FloatArray) -> FloatArray:
         """Variance (k,) of the noise of that, from second differences: tremor is far slower."""
@@ -167,44 +182,79 @@ class SlipTest:
         return np.asarray(self._press_noise[pads])
 
     def _forward(self, dt_s: FloatArray) -> FloatArray:
-        """What becomes of wander and its speed in dt (k,): (k, 2, 2)."""
+        """What becomes of the states in dt (k,): (k, states, states)."""
         rate = 2 * np.pi * self.grip.wander_hz
         passed = rate * dt_s
-        rows = [[1 + passed, dt_s], [-rate * passed, 1 - passed]]
-        return np.asarray(np.exp(-passed) * np.array(rows)).transpose(2, 0, 1)
+        decay, forward = np.exp(-passed), np.zeros((len(dt_s), _STATES, _STATES))
+        forward[:, _LEVEL, _LEVEL] = forward[:, _COUPLING, _COUPLING] = 1.0
+        forward[:, 1, 1], forward[:, 1, 2] = decay * (1 + passed), decay * dt_s
+        forward[:, 2, 1], forward[:, 2, 2] = -decay * rate * passed, decay * (1 - passed)
+        return forward
 
     def _open(self, pads: IntArray, dt_s: FloatArray) -> FloatArray:
         """Let ramps grow (k, onsets), and a new one begin now and then, in the place of the oldest."""
         ramp = self._ramp[pads]
         ramp += np.where(ramp > 0, dt_s[:, None], 0.0)
-        due = self._steps[pads] % self._stride == 0
-        fresh, slot = pads[due], (self._steps[pads][due] // self._stride) % _ONSETS
-        ramp[due, slot] = dt_s[due]  # it began with the sample before
-        self._bias[:, fresh, :, slot] = 0.0
-        self._gain[fresh, :, slot] = self._information[fresh, :, slot] = 0.0
+        steps = self._steps[pads]
+        number, rest = np.divmod(steps, self._stride)
+        due = rest == 0
+        if np.count_nonzero(due):
+            fresh, slot, old = pads[due], number[due] % _FRESH, number[due] // _THIN % _OLD + _FRESH
+            last = number[due] % _THIN == _THIN - 1  # the others of its like have left before
+            self._ramps[fresh[last], :, :, old[last]] = self._ramps[fresh[last], :, :, slot[last]]
+            row = np.flatnonzero(due)
+            ramp[row[last], old[last]] = ramp[row[last], slot[last]]
+            ramp[row, slot] = np.broadcast_to(dt_s, due.shape)[due]  # it began with the sample before
+            self._ramps[fresh, :, :, slot] = 0.0
         self._ramp[pads] = ramp
-        self._steps[pads] += 1
+        self._steps[pads] = steps + 1
         return ramp
 
-    def _judge(self, pads: IntArray) -> BoolArray:
+    def _learn(self, pads: IntArray, dt_s: FloatArray, ramps: FloatArray) -> FloatArray:
+        """Which part (k, 2, onsets) of what ramps have met counts, by what those of such an age met before.
+
+        Tremor isn't as modelled: innovations that are white from one sample to the next need not be so over a
+        tenth of a second, and the more samples there are in that, the less.
+        """
+        number = (self._steps[pads] - 1) // self._stride
+        age = _age(number)
+        over = self._over[0, pads[:, None], age]
+        part = np.exp(-_MARGIN * over).transpose(0, 2, 1)
+        information = ramps[:, _INFORMATION]
+        met = ramps[:, _GAIN] ** 2 / np.maximum(information, 1e-300) * np.exp(-over).transpose(0, 2, 1)
+        excess = np.where(information > 0, np.minimum(met, _CLIP) - 1, 0.0).transpose(0, 2, 1)
+        self._heard_s[pads] += dt_s
+        lasts = np.minimum(np.maximum(self._heard_s[pads], _LEAST_HEARD_S), self.grip.remember_s)
+        excess *= np.where(excess < 0, _FORGETS, 1.0)
+        learnt = over + excess * (dt_s / lasts)[:, None, None]
+        self._over[0, pads[:, None], age] = np.maximum(learnt, 0.0)
+        return np.asarray(part)
+
+    def _judge(self, pads: IntArray, ramp: FloatArray, ramps: FloatArray, part: FloatArray) -> BoolArray:
         """ln R from the onsets' likelihood ratios, each standing for `stride` samples."""
-        d, information = self._gain[pads][:, None], self._information[pads][:, None]
-        more = information + (1 / _SPEEDS**2)[:, None, None]  # (k, speeds, 2, onsets)
-        quotient = (d * d / more).sum(axis=2)
-        relative = more[:, :, 0] * more[:, :, 1] * (_SPEEDS**4)[:, None]
-        ratios = 0.5 * (quotient - np.log(relative))
+        information = part * ramps[:, _INFORMATION]
+        square = (part * ramps[:, _GAIN]) ** 2
+        x, y = (information[:, axis, None] * _SPEEDS**2 + 1 for axis in (0, 1))  # (k, speeds, onsets)
+        quotient = (square[:, 0, None] / x + square[:, 1, None] / y) * _SPEEDS**2
+        ratios = 0.5 * (quotient - np.log(x * y))
         most = ratios.max(axis=(1, 2))
-        total = np.exp(ratios - most[:, None, None]).sum(axis=1) / len(_SPEEDS)
-        total *= self._ramp[pads] > 0  # slots that no onset has yet
+        total = np.exp(ratios - most[:, None, None]).sum(axis=1) * (_STANDS / len(_SPEEDS))
+        total *= ramp > 0  # slots that no onset has yet
         log_odds = most + np.log(total.sum(axis=1) * self._stride)
         self.log_odds[pads] = log_odds
-        best = total.argmax(axis=1)
-        rows = np.arange(len(pads))
-        self.onset_s[pads] = self._ramp[pads, best]
-        information = self._information[pads][rows, :, best]
-        self.speed[pads] = self._gain[pads][rows, :, best] / np.maximum(information, 1e-12)
+        best, rows = total.argmax(axis=1), np.arange(len(pads))
+        self.onset_s[pads] = ramp[rows, best]
+        known = np.maximum(ramps[rows, _INFORMATION, :, best], 1e-12)
+        self.speed[pads] = ramps[rows, _GAIN, :, best] / known
         return np.asarray(log_odds > np.log(self.per_alarm))
 
     def tremor_m(self, pads: IntArray) -> FloatArray:
         """Standard deviation (k, 2) of the wander as learnt."""
         return np.asarray(np.exp(0.5 * self._wander[pads]))
+
+
+def _age(number: NDArray[np.int64]) -> IntArray:
+    """Which of all onsets (k, onsets) is in each slot, the last is 0, after so many (k,) have begun."""
+    fresh = (number[:, None] - np.arange(_FRESH)) % _FRESH
+    old = ((number[:, None] + 1) // _THIN - 1 - np.arange(_OLD)) % _OLD + _FRESH
+    return np.concatenate([fresh, old], axis=1)

@@ -133,14 +133,14 @@ class Stream:
         stop = int((self.count[pad] - 1) % self.length) + self.length + 1
         return Window(self._t_ns[pad, stop - k : stop], self._values[pad, stop - k : stop])
 
-    def latest(self, pads: IntArray, name: str, back: int = 0) -> FloatArray:
+    def latest(self, pads: IntArray, name: str, back: IntArray | int = 0) -> FloatArray:
         """A field of the last sample of each pad (k, ...), or of that `back` samples before; NaN without."""
         at = (self.count[pads] - 1 - back) % self.length
         values = self._values[pads, at, _SLICES[name]]
         values[self.count[pads] <= back] = np.nan
         return np.asarray(values.reshape(len(pads), *FIELDS[name]))
 
-    def latest_ns(self, pads: IntArray, back: int = 0) -> NDArray[np.int64]:
+    def latest_ns(self, pads: IntArray, back: IntArray | int = 0) -> NDArray[np.int64]:
         """Times (k,) of these samples."""
         return np.asarray(self._t_ns[pads, (self.count[pads] - 1 - back) % self.length])
 
