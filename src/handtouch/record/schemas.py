@@ -95,6 +95,15 @@ _ARROW = _object(
     color=_COLOR,
 )
 _SPHERE = _object("foxglove.SpherePrimitive", pose=_POSE, size=_VECTOR, color=_COLOR)
+_CUBE = _object("foxglove.CubePrimitive", pose=_POSE, size=_VECTOR, color=_COLOR)
+_CYLINDER = _object(
+    "foxglove.CylinderPrimitive",
+    pose=_POSE,
+    size=_VECTOR,
+    bottom_scale=_NUMBER,
+    top_scale=_NUMBER,
+    color=_COLOR,
+)
 _WORDS = _object(
     "foxglove.TextPrimitive",
     pose=_POSE,
@@ -113,9 +122,9 @@ _ENTITY = _object(
     frame_locked=_TRUTH,
     metadata=_list(_object("foxglove.KeyValuePair", key=_TEXT, value=_TEXT)),
     arrows=_list(_ARROW),
-    cubes=_list(_object()),
+    cubes=_list(_CUBE),
     spheres=_list(_SPHERE),
-    cylinders=_list(_object()),
+    cylinders=_list(_CYLINDER),
     lines=_list(_object()),
     triangles=_list(_object()),
     texts=_list(_WORDS),
