@@ -71,7 +71,7 @@ docs: $(VENV)/.dev ## the documentation site, in docs/_build; a warning is an er
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
 unit: $(VENV)/.dev ## all tests that need no SocketCAN
-	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 coverage: $(VENV)/.dev ## the same, telling which lines they don't reach; slower
 	@$(MAKE) --no-print-directory unit ARGS="--cov --cov-report=term:skip-covered $(ARGS)"

@@ -14,6 +14,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+from tests.starter import Starter
+
+# how long an example takes says nothing on shared cores; CI tries the same ones every time
+settings.register_profile(
+    "shared cores",
+    max_examples=50,
+    deadline=None,
+    derandomize="CI" in os.environ,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("shared cores")
 
 # as `handtouch` sets it, before anything loads numpy: on busy cores those threads cost 20 times the time
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -23,7 +36,8 @@ _STREAMS = ("live", "complete", "control", "inputs")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests that need SocketCAN where there is none; inside vcan-run there must be, so they run."""
+    """Long files first, so that workers end together. Without SocketCAN skip its tests; in vcan-run it is."""
+    items.sort(key=lambda item: "end_to_end" not in item.path.parts)
     if "VCAN_RUN" in os.environ or Path("/sys/class/net/vcan0").exists():
         return
     skip = pytest.mark.skip(reason="no vcan0 here; `make socketcan` runs these tests where there is one")
@@ -93,6 +107,22 @@ def network() -> Iterator[list[str]]:
         user = ["--user", "--preserve-credentials"] if rootless else []
         yield ["nsenter", "--target", str(keeper.pid), *user, "--net", "--"]
         keeper.stdin.close()
+
+
+@pytest.fixture(scope="session")
+def starter(network: list[str]) -> Iterator[Starter]:
+    """Starts processes in the tests' network."""
+    made = Starter(network)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="session")
+def vcan_starter() -> Iterator[Starter]:
+    """Starts processes where SocketCAN is."""
+    made = Starter([])
+    yield made
+    made.close()
 
 
 @dataclass(frozen=True)

@@ -391,7 +391,7 @@ class Answering:
                 self.jobs.append((self.now + patience * MS, action, self.life.attempt))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(HISTORIES, st.sampled_from([4, 5, 127]), st.booleans())
 def test_node_that_is_there_and_right_is_operational_soon_whatever_was_before(
     history: list[tuple[Event, int]], nmt: int, beats: bool

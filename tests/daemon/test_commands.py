@@ -86,7 +86,7 @@ def served(bench: Any, endpoints: dict[str, str]) -> Iterator[Bench]:
     logging.getLogger("handtouch").setLevel(logging.NOTSET)
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(COMMANDS), st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=5))
 def test_any_arguments_are_answered_and_the_tick_goes_on(
     served: Bench, command: str, arguments: dict[str, Any]

@@ -129,7 +129,7 @@ def test_what_is_wrong_with_a_request_is_answered_and_counted(
     assert bench.control.refused == before + 1
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=200) | VALUES.map(msgpack.packb))
 @example(b"\xc7\x0c\xff" + b"\xff" * 12)  # a timestamp that is none
 @example(b"\xd6\xff\x00\x00\x00\x00")

@@ -150,7 +150,7 @@ def test_a_missing_sample_is_counted_and_its_contact_goes_on(driver: Driver) -> 
     assert driver.step(touch).updated.tolist() == [PLANE]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.lists(st.integers(-32768, 32767), min_size=12, max_size=12), min_size=3, max_size=6))
 def test_no_reading_whatever_is_fatal_or_spoils_a_neighbour(bench: Any, readings: list[list[int]]) -> None:
     driver = Driver(bench)

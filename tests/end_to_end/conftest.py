@@ -20,8 +20,7 @@ import pytest
 
 from handtouch import shipped
 from handtouch.client import Subscriber, connect, request
-
-from .starter import Started, Starter
+from tests.starter import Started, Starter
 
 START_S = 90.0
 """Longest that anything may take on a busy machine; nothing waits so long when all is well."""
@@ -192,14 +191,6 @@ def chromium() -> str:
     return found
 
 
-@pytest.fixture(scope="session")
-def starter(network: list[str]) -> Iterator[Starter]:
-    """Starts processes in the tests' network."""
-    made = Starter(network)
-    yield made
-    made.close()
-
-
 @pytest.fixture
 def rig(
     tmp_path: Path, endpoints: dict[str, str], network: list[str], free_port: int, starter: Starter
@@ -209,14 +200,6 @@ def rig(
     made = Rig(tmp_path, endpoints, network, [bus], starter=starter)
     yield made
     made.end_all()
-
-
-@pytest.fixture(scope="session")
-def vcan_starter() -> Iterator[Starter]:
-    """Starts processes where SocketCAN is."""
-    made = Starter([])
-    yield made
-    made.close()
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import contextlib
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -23,6 +22,7 @@ from handtouch.canbus.device import DeviceBus
 from handtouch.canbus.receivers import grow_receive_buffer
 from handtouch.client import request
 from handtouch.config import load
+from tests.starter import Starter
 
 pytestmark = [pytest.mark.socketcan, pytest.mark.timeout(280)]
 
@@ -40,7 +40,7 @@ HEARD_BY_NODES = [  # as a node's controller is set: NMT, SYNC, SDO requests, no
 class Hand:
     """Fifteen nodes in this process, a daemon of its own, and candump as the witness of every TPDO."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, starter: Starter) -> None:
         endpoints = "\n".join(
             f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs")
         )
@@ -63,9 +63,8 @@ class Hand:
             for pad in hand.pads:
                 self._devices.add(pad.node_id, serial=pad.serial)
         self._devices.start()
-        command = [sys.executable, "-m", "handtouch", "run", str(config), "--bus", "can0=socketcan:vcan0"]
         with self.printed.open("w") as file:
-            self._daemon = subprocess.Popen(command, stdout=file, stderr=file)
+            self._daemon = starter.start(["run", str(config), "--bus", "can0=socketcan:vcan0"], file)
 
     def status(self) -> dict[str, Any]:
         return request("status", endpoint=self.deployment.daemon.control, timeout_s=LONGEST_S)
@@ -117,9 +116,9 @@ class Hand:
 
 
 @pytest.fixture
-def hand() -> Iterator[Hand]:
+def hand(vcan_starter: Starter) -> Iterator[Hand]:
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        made = Hand(Path(folder))
+        made = Hand(Path(folder), vcan_starter)
         yield made
         status = made.end()
         printed = made.printed.read_text()
@@ -161,11 +160,13 @@ def bare_rate() -> int:
     return best
 
 
-def test_flood_of_unused_identifiers_costs_no_sample_and_is_counted_to_the_frame() -> None:
+def test_flood_of_unused_identifiers_costs_no_sample_and_is_counted_to_the_frame(
+    vcan_starter: Starter,
+) -> None:
     rate = bare_rate()
     assert rate >= RATES[0]
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        hand = Hand(Path(folder))
+        hand = Hand(Path(folder), vcan_starter)
         try:
             before = hand.wait_operational()
             foreign = hand.counters()["foreign"]
