@@ -1,7 +1,8 @@
 """One grasp of MuJoCo's through the daemon's own pipeline, and what became of it beside MuJoCo's truth.
 
-Public names: `Setting`, `served` -> `Served`. Samples go in at 200 Hz, joint states through the decoder of
-the inputs endpoint at 100 Hz, in the order of their arrival; no clock is waited for.
+Public names: `Setting`, `served` -> `Served`; `against` and `at_best` compare its contacts. Samples go in at
+200 Hz, joint states through the decoder of the inputs endpoint at 100 Hz, in the order of their arrival; no
+clock is waited for.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import zmq
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.config import Deployment
+from handtouch.config import Deployment, Touch
 from handtouch.daemon.inputs import Inputs
 from handtouch.daemon.model import PadModel
+from handtouch.daemon.perceive import Perceiving
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.scene import Wanted
 from handtouch.daemon.security import Gate
@@ -24,8 +26,9 @@ from handtouch.hand.joints import JointStates
 from handtouch.hand.pads import mount_of
 from handtouch.hand.robot import Robots
 from handtouch.inputs import JointState, encode
+from handtouch.percept.stream import KINDS
 from handtouch.simulate.grasp.episode import DURATION_S, Grasp, grasp
-from handtouch.simulate.grasp.events import Events, Span, compare, touches
+from handtouch.simulate.grasp.events import Events, Span, compare, joined, sampled, touches
 from handtouch.simulate.grasp.patches import Patches, patches
 from handtouch.simulate.grasp.scene import STEP_S
 from handtouch.simulate.grasp.timeline import Encoders, Timeline
@@ -84,9 +87,10 @@ class Served:
     """(k,) the fastest joint"""
     railed: int
     """samples of a pad at the end of a channel's range"""
-    events: Events
     spans: list[list[Span]]
     """of each pad, when contacts were told"""
+    percepts: list[wire.Percept]
+    """what was perceived, if that was asked for"""
 
 
 def served(
@@ -96,11 +100,13 @@ def served(
     setting: Setting,
     *,
     assumed_radius: bool = False,
+    perceive: bool = False,
     duration_s: float = DURATION_S,
     done: Grasp | None = None,
 ) -> Served:
     """Let the first hand grasp, and serve it; `assumed_radius`: as if every pad were pressed by one disc of
-    the radius that forces assume. `done` is the grasp, if it has been made."""
+    the radius that forces assume; `perceive`: all that there is to perceive. `done` is the grasp, if it has
+    been made."""
     hand = deployment.hands[0]
     went = done or grasp(hand, name, seed, setting.world, duration_s=duration_s)
     pressed = patches(went)
@@ -112,7 +118,7 @@ def served(
     steps = np.arange(0, len(went.times_s), _PER_TICK)
     counts = np.stack([virtual.counts(row, steps * STEP_S) for row in range(len(hand.pads))], axis=1)
     with zmq.Context() as context:
-        run = _Run(deployment, context, went, setting)
+        run = _Run(deployment, context, went, setting, perceive)
         for step, now in zip(steps.tolist(), counts, strict=True):
             run.tick(step, now)
         run.inputs.close()
@@ -124,7 +130,12 @@ class _Run:
     """The pipeline, fed tick by tick."""
 
     def __init__(
-        self, deployment: Deployment, context: zmq.Context[Any], went: Grasp, setting: Setting
+        self,
+        deployment: Deployment,
+        context: zmq.Context[Any],
+        went: Grasp,
+        setting: Setting,
+        perceive: bool = False,
     ) -> None:
         model, robots = PadModel(deployment), Robots(deployment)
         self.kinematics = robots.kinematics[0]
@@ -140,20 +151,25 @@ class _Run:
         self.pipeline.node_state[:] = PadState.CLEAR
         self.pipeline.frames.joints_at = self.inputs.joints_at
         every = np.ones(model.size, np.bool_)
-        self.pipeline.want(
-            Wanted(every, every, np.zeros(model.size), np.ones(model.size, np.int64), every, ~every)
-        )
+        wanted = Wanted(every, every, np.zeros(model.size), np.ones(model.size, np.int64), every, ~every)
+        self.pipeline.want(wanted)
+        self._perceiving = Perceiving(self.pipeline, self)
+        if perceive:
+            self._perceiving.want(wanted._replace(percepts=np.ones((len(KINDS), model.size), np.bool_)))
         self.contacts: list[wire.Contact] = []
+        self.percepts: list[wire.Percept] = []
         self.used: dict[int, tuple[FloatArray, FloatArray]] = {}
         """by step: the joints that the daemon took, and what it would have taken from faultless encoders"""
         self._next_ns = 3_000_000  # the robot's clock and ours don't go together
 
     def wants(self, topic: str) -> bool:
-        return topic.startswith("contact/")
+        return topic.startswith(("contact/", "percept/"))
 
     def send(self, message: wire.Outgoing) -> None:
         if isinstance(message, wire.Contact):
             self.contacts.append(message)
+        elif isinstance(message, wire.Percept):
+            self.percepts.append(message)
 
     def tick(self, step: int, counts: NDArray[np.int64]) -> None:
         since_ns = round(step * STEP_S * 1e9)
@@ -164,7 +180,10 @@ class _Run:
         self.pipeline.begin(t_ns, t_ns)
         for pad, now in enumerate(counts):
             self.pipeline.slab.write(pad, now.astype("<i2").tobytes(), t_ns + 1)
-        self.pipeline.advance(t_ns + _PERIOD_NS // 2)
+        ticked = self.pipeline.advance(t_ns + 7 * _PERIOD_NS // 10)
+        assert ticked is not None
+        self._perceiving.step(ticked)
+        self.pipeline.settle()
         if self.pipeline.frames.used:
             self.used[step] = (
                 self.pipeline.frames.used[-1][2].copy(),
@@ -180,8 +199,28 @@ class _Run:
         self._timely.take(t_ns, self._names, clean, None, std)
 
 
+def against(run: Served, touch: Touch, apart_s: float) -> Events:
+    """Contacts beside MuJoCo's touches at 1 kHz; breaks of either shorter than `apart_s` are none."""
+    events = Events()
+    for pad, told in enumerate(run.spans):
+        total = run.patches.total_n[:, pad]
+        true = touches(total, STEP_S, touch.on_n, touch.off_n, apart_s)
+        compare(events, true, touches(total, STEP_S, 0.0, 1e-9, 0.0), joined(told, apart_s))
+    return events
+
+
+def at_best(run: Served, touch: Touch) -> Events:
+    """Contacts beside those of pads that feel MuJoCo's forces exactly, whenever they are sampled."""
+    events, period_s = Events(), _PER_TICK * STEP_S
+    for pad, told in enumerate(run.spans):
+        total = run.patches.total_n[::_PER_TICK, pad]
+        true = sampled(total, period_s, touch.on_n, touch.off_n, touch.begin_samples)
+        compare(events, true, touches(total, period_s, 0.0, 1e-9, 0.0), told, least_s=0.0)
+    return events
+
+
 def _compared(deployment: Deployment, went: Grasp, pressed: Patches, run: _Run, railed: int) -> Served:
-    pads, period_s = deployment.hands[0].pads, _PERIOD_NS * 1e-9
+    pads = deployment.hands[0].pads
     row = {pad.link: number for number, pad in enumerate(pads)}
     spans: list[list[Span]] = [[] for _ in pads]
     begun: dict[int, float] = {}
@@ -197,11 +236,6 @@ def _compared(deployment: Deployment, went: Grasp, pressed: Patches, run: _Run, 
             kept.append((contact, step, pad))
     for pad, t_s in begun.items():
         spans[pad].append((t_s, len(went.times_s) * STEP_S))
-    events, touch = Events(), deployment.touch
-    for pad, told in enumerate(spans):
-        total = pressed.total_n[:, pad]
-        true = touches(total, STEP_S, touch.on_n, touch.off_n, 2 * period_s)
-        compare(events, true, touches(total, STEP_S, 0.0, 1e-9, 0.0), told)
     places = [_split(run, went, pressed, deployment, *of) for of in kept]
     steps = np.array([step for _, step, _ in kept], np.intp)
     rows = np.array([pad for *_, pad in kept], np.intp)
@@ -220,8 +254,8 @@ def _compared(deployment: Deployment, went: Grasp, pressed: Patches, run: _Run, 
         pressed.total_n[steps, rows],
         speed[steps],
         railed,
-        events,
         spans,
+        run.percepts,
     )
 
 

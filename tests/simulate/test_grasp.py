@@ -20,9 +20,9 @@ from handtouch.hand.pads import mount_of
 from handtouch.hand.robot import Robots
 from handtouch.simulate import grasp as grasping
 from handtouch.simulate.grasp.episode import Grasp, contacts, grasp
-from handtouch.simulate.grasp.events import Events, compare, touches
-from handtouch.simulate.grasp.patches import Patches, patches
-from handtouch.simulate.grasp.scene import STEP_S, Scene
+from handtouch.simulate.grasp.events import Events, compare, joined, sampled, touches
+from handtouch.simulate.grasp.patches import Patches, _cut, patches
+from handtouch.simulate.grasp.scene import STEP_S, Pad, Scene
 from handtouch.simulate.grasp.shapes import foot
 from handtouch.simulate.grasp.timeline import Encoders, Timeline
 from handtouch.simulate.hand import VirtualHand
@@ -175,7 +175,10 @@ def test_a_served_ball_is_touched_where_it_is_within_the_told_covariance(run: An
     assert np.median(squared) < 3.0  # 1.39 for two dimensions of noise
     assert np.median(np.linalg.norm(error, axis=1)) < 20e-6
     np.testing.assert_allclose(sum(served.error_m.values()), error, atol=1e-12)
-    assert served.events.missed == served.events.invented == 0
+    events = run.at_best(served, HAND.touch)
+    assert events.touches >= 5
+    assert events.missed == events.invented == 0
+    assert events.f1(0.011) > 0.9
 
 
 def test_causes_of_an_error_show_where_they_are(run: Any) -> None:
@@ -215,6 +218,35 @@ def test_touches_begin_above_one_force_and_end_below_another() -> None:
     force = np.array([0, 0.05, 0.1, 0.04, 0.1, 0.01, 0.1, 0.0, 0.0, 0.0, 0.2, 0.2])
     assert touches(force, 1.0, 0.06, 0.03, 0.0) == [(2.0, 5.0), (6.0, 7.0), (10.0, 12.0)]
     assert touches(force, 1.0, 0.06, 0.03, 2.0) == [(2.0, 7.0), (10.0, 12.0)]
+
+
+def test_what_a_pad_could_tell_at_best_takes_samples_in_a_row() -> None:
+    force = np.array([0, 0.1, 0, 0.1, 0.1, 0.04, 0, 0.1, 0, 0, 0.1, 0.1])
+    assert sampled(force, 1.0, 0.06, 0.03, 2) == [(3.0, 9.0), (10.0, 12.0)]
+    assert sampled(force, 1.0, 0.06, 0.03, 1)[:2] == [(1.0, 2.0), (3.0, 6.0)]
+    assert joined(sampled(force, 1.0, 0.06, 0.03, 1), 1.5) == [(1.0, 8.0), (10.0, 12.0)]
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.floats(0, 1), st.floats(0, 1), st.floats(0.5e-3, 5e-3))
+def test_at_an_edge_a_disc_is_the_part_of_it_that_lies_on_the_pad(x: float, y: float, radius: float) -> None:
+    pad = grasp_pad()
+    sides = np.array([pad.shape.length_m, pad.shape.arc])
+    *_, place, force, found = _cut(pad, np.array([0]), np.array([[x, y]]), np.ones(1), np.array([radius]))
+    points = np.random.default_rng(1).uniform(-1, 1, (20_000, 2))
+    points = np.array([x, y]) + points[(points**2).sum(1) < 1] * radius / sides
+    on = points[((points > 0) & (points < 1)).all(1)]
+    assert force[0] == 1
+    if min(x, 1 - x) * sides[0] > radius or min(y, 1 - y) * sides[1] > radius:  # not cut by a corner
+        np.testing.assert_allclose(place[0] * sides, on.mean(0) * sides, atol=0.03 * radius)
+        np.testing.assert_allclose(found[0], max(radius * np.sqrt(len(on) / len(points)), 0.5e-3), rtol=0.03)
+    assert ((place >= 0) & (place <= 1)).all()
+
+
+def grasp_pad() -> Pad:
+    """A flat pad, as it is in a scene."""
+    (pad,) = [pad for pad in PADS if pad.link == "palm_heel"]
+    return Pad(pad.link, 1, *mount_of(pad), shape_of(pad.surface))
 
 
 def test_events_are_late_missed_or_invented_by_what_really_touched() -> None:

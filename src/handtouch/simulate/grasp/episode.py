@@ -47,6 +47,8 @@ class Grasp:
     """(n, 3) its middle, in the palm"""
     thing_m_s: FloatArray
     """(n, 3) its velocity, in the palm"""
+    thing_rad_s: FloatArray
+    """(n, 3) how it turns, in the palm"""
     held: NDArray[np.bool_]
     """(n,) whether somebody besides the hand holds it"""
     step: IntArray
@@ -130,7 +132,7 @@ class _Kept:
         self._bodies = np.array([pad.body for pad in scene.pads])
         self._q = np.empty((n, len(scene.q)))
         self._rotation, self._link = np.empty((n, p, 3, 3)), np.empty((n, p, 3))
-        self._thing, self._speed = np.empty((n, 3)), np.empty((n, 3))
+        self._thing, self._speed, self._turn = (np.empty((n, 3)) for _ in range(3))
         self._held = np.zeros(n, np.bool_)
         self._rows: list[tuple[int, int, int]] = []
         self._points: list[tuple[FloatArray, FloatArray]] = []
@@ -141,6 +143,8 @@ class _Kept:
         scene, data = self._scene, self._scene.data
         self._q[number], self._held[number] = data.qpos[scene.q], held
         self._speed[number] = data.qvel[self._dof : self._dof + 3]
+        turned = data.xmat[scene.body].reshape(3, 3)  # MuJoCo has how it turns in its own frame
+        self._turn[number] = turned @ data.qvel[self._dof + 3 : self._dof + 6]
         self._mujoco.mj_step(scene.model, data)
         # poses and contacts in `data` are now those of the step's begin, which is what was kept of qpos
         self._rotation[number] = data.xmat[self._bodies].reshape(-1, 3, 3)
@@ -166,6 +170,7 @@ class _Kept:
             scene.into_palm(self._link),
             scene.into_palm(self._thing),
             self._speed @ turn,
+            self._turn @ turn,
             self._held,
             step,
             pad,

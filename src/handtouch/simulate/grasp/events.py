@@ -1,6 +1,6 @@
 """Contacts that begin and end, against those of a grasp: how late, how many missed, invented.
 
-Public names: `touches`, `compare`, `Events`.
+Public names: `touches`, `sampled`, `joined`, `compare`, `Events`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ class Events:
     """that last long enough to be told"""
     short: int = 0
     """the others"""
+    faint: int = 0
+    """what pressed and never became a touch: below `on_n`"""
     missed: int = 0
     """touches during which no contact was told"""
     invented: int = 0
@@ -70,23 +72,54 @@ def touches(total_n: FloatArray, step_s: float, on_n: float, off_n: float, apart
             begun = None
     if begun is not None:
         spans.append((begun * step_s, len(total_n) * step_s))
-    return _joined(spans, apart_s)
+    return joined(spans, apart_s)
 
 
-def _joined(spans: list[Span], apart_s: float) -> list[Span]:
-    joined: list[Span] = []
+def sampled(total_n: FloatArray, period_s: float, on_n: float, off_n: float, in_a_row: int) -> list[Span]:
+    """What a pad could tell at best that feels total_n (n,) exactly, a period apart: `in_a_row` samples above
+    `on_n` begin a contact, from the first of them on, as many below `off_n` end it, at the last of them."""
+    spans: list[Span] = []
+    begun: int | None = None
+    against = 0
+    for number, force in enumerate(total_n.tolist()):
+        against = against + 1 if (force > on_n if begun is None else force < off_n) else 0
+        if against == in_a_row:
+            against = 0
+            if begun is None:
+                begun = number + 1 - in_a_row
+            else:
+                spans.append((begun * period_s, number * period_s))
+                begun = None
+    if begun is not None:
+        spans.append((begun * period_s, len(total_n) * period_s))
+    return spans
+
+
+def joined(spans: Sequence[Span], apart_s: float) -> list[Span]:
+    """Spans, those closer together than `apart_s` made one."""
+    found: list[Span] = []
     for begin, end in spans:
-        if joined and begin - joined[-1][1] < apart_s:
-            joined[-1] = joined[-1][0], end
+        if found and begin - found[-1][1] < apart_s:
+            found[-1] = found[-1][0], end
         else:
-            joined.append((begin, end))
-    return joined
+            found.append((begin, end))
+    return found
 
 
-def compare(events: Events, every: Sequence[Span], any_force: Sequence[Span], told: Sequence[Span]) -> None:
-    """Add a pad: its touches, the times at which anything pressed at all, and the contacts told."""
-    true = [span for span in every if span[1] - span[0] >= SHORT_S]
-    short = [span for span in every if span[1] - span[0] < SHORT_S]
+def compare(
+    events: Events,
+    every: Sequence[Span],
+    any_force: Sequence[Span],
+    told: Sequence[Span],
+    least_s: float = SHORT_S,
+) -> None:
+    """Add a pad: its touches, the times at which anything pressed at all, and the contacts told.
+
+    Touches shorter than `least_s` count as short; what never was one, as faint."""
+    true = [span for span in every if span[1] - span[0] >= least_s]
+    short = [span for span in every if span[1] - span[0] < least_s]
+    pressed = joined(any_force, SHORT_S)
+    events.faint += sum(not any(_overlap(span, other) for other in every) for span in pressed)
     for end, moments in enumerate((events.begins, events.ends)):
         moments.append(tuple([span[end] for span in spans] for spans in (true, short, told)))  # type: ignore[arg-type]
     events.touches, events.short = events.touches + len(true), events.short + len(short)
