@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,13 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from handtouch import wire
+from handtouch import connect, wire
 from handtouch.config import Deployment
 from handtouch.daemon import replay
 from handtouch.daemon.rerun import Again, recorded_deployment
 from handtouch.record.read import Recording
 
-from .conftest import DEPLOYMENT, Hand, Session
+from .conftest import DEPLOYMENT, RUN, Hand, Session
+
+LONGEST_S = 60.0
 
 
 def _again(entries: Any) -> tuple[Again, list[wire.Contact]]:
@@ -229,3 +233,26 @@ def test_a_locator_that_is_none_is_status_2_and_all_are_in_the_help(
         main(["replay", "--help"])
     told = " ".join(capsys.readouterr().out.split()).replace("- ", "-")
     assert all(name in told for name in replay.locator_names())
+
+
+def test_a_recording_is_published_with_all_that_a_view_needs(
+    recorded: Path, tmp_path: Path, endpoints: dict[str, str]
+) -> None:
+    config = tmp_path / "hand.toml"
+    told = "".join(f'{name} = "{endpoint}"\n' for name, endpoint in endpoints.items())
+    config.write_text(DEPLOYMENT.replace("[daemon]\n", f"[daemon]\n{told}"))
+    command = [sys.executable, "-m", "handtouch", "replay", str(recorded), str(config)]
+    topics = ("config", "service", "contact/*/*", "hand/*", "health/*/*")
+    with (
+        connect(*topics, endpoint=endpoints["live"], key="") as messages,
+        subprocess.Popen([*command, "--publish", "--speed", "0.2"], stdout=subprocess.DEVNULL) as process,
+    ):
+        got: dict[str, Any] = {}
+        while len(got) < len(topics):
+            message = messages.recv(LONGEST_S)
+            assert message is not None, sorted(got)
+            got[type(message).__name__] = message
+        process.terminate()
+    assert got["HandFrame"].links == ("plane", "round")
+    assert json.loads(got["Config"].deployment)["hand"][0]["name"] == "h"
+    assert {message.run for message in got.values()} == {RUN}

@@ -1,8 +1,9 @@
 """`handtouch replay`: what was recorded through the same pipeline as live: identical contacts each time.
 
-A CAN log drives the pipeline as a bus does (`replay`); a recording has every tick's own input (`rerun`).
+A CAN log drives the pipeline as a bus does (`replay`); a recording has every tick's own input
+(`replay_recording`).
 
-Public names: `replay`, `Summary`, `run`.
+Public names: `replay`, `Summary`, `run`, `served`, `pacer`.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
 
 import can
 import zmq
@@ -31,9 +32,6 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.security import Gate
 from handtouch.keys import KeysError
 from handtouch.wire import PadState
-
-if TYPE_CHECKING:
-    from handtouch.record.read import Recording
 
 _SERVICES = (0x080, 0x580, 0x600, 0x700)
 """EMCY, SDO and heartbeat of our nodes are no strangers."""
@@ -225,7 +223,7 @@ def run(
     path: Path,
     config_path: Path | None = None,
     *,
-    speed: float = 0,
+    speed: float | None = None,
     nominal: bool = False,
     as_json: bool = False,
     report: Path | None = None,
@@ -235,18 +233,26 @@ def run(
 ) -> int:
     """`handtouch replay`: print contacts, or publish them too, and tell how they compare with recorded ones.
 
+    `speed` times as fast as recorded, 0: as fast as it goes, None: that, or as recorded if it is published.
+
     Exit status 0, 1 (it can't be read, holds no sample of the deployment, or contacts come out otherwise than
     recorded by the same deployment), 2 (usage or config).
     """
     take = _print_json if as_json else _print_line
+    if speed is None:
+        speed = 1.0 if publish else 0.0
     try:
         deployment = load(config_path) if config_path else None
         if locator and locator not in (known := locator_names()):
             print(f"--locator {locator}: there are {', '.join(known)}", file=sys.stderr)
             return 2
         if is_recording(path):
-            other = _Other(nominal, locator, tolerance_mm)
-            return _rerun(path, deployment, other, speed, take, report, publish)
+            from handtouch.daemon import replay_recording
+
+            other = replay_recording.Other(nominal, locator, tolerance_mm)
+            with ExitStack() as stack:
+                serve = partial(served, publish=publish, speed=speed, stack=stack)
+                return replay_recording.replay(path, deployment, other, serve, take, report, stack)
         if deployment is None:
             print(
                 f"{path}: a CAN log needs the deployment file of its hand: replay LOG CONFIG", file=sys.stderr
@@ -258,7 +264,7 @@ def run(
             )
             return 2
         with ExitStack() as stack:
-            publisher, pace = _served(deployment, publish, speed, stack)
+            publisher, pace = served(deployment, publish, speed, stack)
             summary = replay(path, deployment, take, pace=pace, publisher=publisher)
     except (ConfigError, KeysError) as error:
         print(error, file=sys.stderr)
@@ -267,83 +273,6 @@ def run(
         print(error, file=sys.stderr)
         return 1
     return _tell(summary, path, config_path)
-
-
-class _Other(NamedTuple):
-    """What is to be otherwise than it was recorded."""
-
-    nominal: bool
-    locator: str | None
-    tolerance_mm: float | None
-
-    @property
-    def any(self) -> bool:
-        return self.nominal or self.locator is not None or self.tolerance_mm is not None
-
-    def of(self, deployment: Deployment) -> Deployment:
-        """With the tolerance that is asked for."""
-        if self.tolerance_mm is None:
-            return deployment
-        scene = deployment.scene.model_copy(update={"tolerance_mm": self.tolerance_mm})
-        return deployment.model_copy(update={"scene": scene})
-
-
-def _rerun(
-    path: Path,
-    deployment: Deployment | None,
-    other: _Other,
-    speed: float,
-    take: Callable[[wire.Contact], None],
-    report: Path | None,
-    publish: bool,
-) -> int:
-    from handtouch.daemon import locators, rerun
-    from handtouch.daemon.compare import Comparison, tell_anew, tell_same
-    from handtouch.record.read import Recording
-
-    recording = Recording(path)
-    comparison = Comparison()
-
-    def both(contact: wire.Contact) -> None:
-        take(contact)
-        comparison.add_replayed(contact)
-
-    began_s = time.monotonic()
-    with ExitStack() as stack:
-        again = deployment is None and not other.any
-        if deployment is None and (other.any or publish):
-            deployment = stack.enter_context(rerun.recorded_deployment(_first_config(recording)))
-        publisher, pace = _served(deployment, publish, speed, stack) if deployment else (None, pacer(speed))
-        if again or deployment is None:
-            feeder = rerun.Again(take, publisher)
-        else:
-            deployment = other.of(deployment)
-            locate = locators.locator(deployment, other.locator) if other.locator else None
-            feeder = locators.Otherwise(
-                deployment,
-                both,
-                publisher,
-                nominal=other.nominal,
-                recorded=comparison.add_recorded,
-                locate=locate,
-            )
-        for entry in recording.read("config", "state", "contact", "tick"):
-            if entry.topic == "tick":
-                pace(entry.payload["now_ns"])
-            feeder.feed(entry)
-    seconds = time.monotonic() - began_s
-    if again:
-        return tell_same(recording, feeder.found, seconds, report)
-    return tell_anew(recording, feeder.found, comparison, seconds, report)
-
-
-def _first_config(recording: Recording) -> dict[str, Any]:
-    """What a recording begins with. Raises ValueError where there is none."""
-    for entry in recording.read("config"):
-        return entry.payload
-    raise ValueError(
-        f"{recording.path}: has no deployment: the daemon was not reached, or is of an older version"
-    )
 
 
 def locator_names() -> list[str]:
@@ -363,12 +292,12 @@ def is_recording(path: Path) -> bool:
         return file.read(len(MAGIC)) == MAGIC
 
 
-def _served(
-    deployment: Deployment, publish: bool, speed: float, stack: ExitStack
+def served(
+    deployment: Deployment | None, publish: bool, speed: float, stack: ExitStack
 ) -> tuple[Publisher | None, Callable[[int], None]]:
     """A publisher if there is to be one, and what keeps the pace."""
     pace = pacer(speed)
-    if not publish:
+    if not publish or deployment is None:
         return None, pace
     context = stack.enter_context(zmq.Context())
     settings = deployment.daemon

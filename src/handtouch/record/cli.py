@@ -31,6 +31,11 @@ def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--hand", action="store_true", help="frames of the whole hand too (replay can make them again)"
     )
     record.add_argument(
+        "--percepts",
+        action="store_true",
+        help="slip, hardness, shape and texture too, which the daemon then computes",
+    )
+    record.add_argument(
         "--rotate-mb", type=positive, default=0.0, metavar="MB", help="go on in a new file after so many MB"
     )
     record.add_argument(
@@ -65,7 +70,9 @@ def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "and every contact must be the same to the last bit)",
     )
     replay.add_argument(
-        "--speed", type=_speed, default=0.0, help="1 as recorded, 2 twice as fast, max (default)"
+        "--speed",
+        type=_speed,
+        help="1 as recorded, 2 twice as fast, max (default: max, with --publish 1)",
     )
     replay.add_argument(
         "--nominal",
@@ -116,6 +123,7 @@ def _record(asked: argparse.Namespace) -> int:
             key=asked.key,
             seconds=asked.seconds,
             hand=asked.hand,
+            percepts=asked.percepts,
             rotate_mb=asked.rotate_mb,
             rotate_minutes=asked.rotate_minutes,
             keep_free_mb=asked.keep_free_mb,

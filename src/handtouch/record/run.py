@@ -28,9 +28,9 @@ COMPLETE = "tcp://127.0.0.1:5582"
 TOPICS = tuple(
     "/".join([topic.prefix, *["*"] * topic.parts])
     for topic in wire.TOPICS
-    if topic.prefix not in ("hand", "raw")
+    if topic.prefix not in ("hand", "raw", "percept")
 )
-"""All but the frames of each tick, which follow from `tick`."""
+"""All but frames of each tick, which follow from `tick`, and percepts, which are computed for who asks."""
 _QUEUE = 200_000
 """Messages that wait here while the disk is slow: a quarter of a minute of fifteen touched pads at 500 Hz."""
 _MB = 1_000_000
@@ -50,6 +50,7 @@ class Options:
     """0: until told to stop"""
     hand: bool = False
     """frames of the whole hand too"""
+    percepts: bool = False
     rotate_mb: float = 0.0
     rotate_minutes: float = 0.0
     keep_free_mb: float = 200.0
@@ -166,7 +167,7 @@ def run(options: Options) -> int:
     try:
         endpoint = _endpoint(options)
         files = _Files(options, endpoint)
-        topics = (*TOPICS, "hand/*") if options.hand else TOPICS
+        topics = (*TOPICS, *["hand/*"] * options.hand, *["percept/*/*"] * options.percepts)
         source = _Wire(topics, endpoint, _QUEUE, options.key)
     except (ConfigError, ValueError, OSError) as error:
         print(error, file=sys.stderr)
