@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from handtouch.field import Sandwich
 from handtouch.percept.ask import expected_bits
-from handtouch.percept.hardness import Hardness, closing_m
+from handtouch.percept.closing import Commanded, closing_m, opposite
+from handtouch.percept.hardness import Hardness
 from handtouch.percept.percept import Perceiver
 from handtouch.percept.stiffness import stiffness, stiffness_from_area
 from handtouch.percept.stream import KINDS, Percept, Sample, Stream
@@ -121,7 +122,9 @@ def test_an_area_that_does_not_grow_as_hertz_has_it_says_nothing() -> None:
     assert "0.00 +- " in found.reason
 
 
-def played(k: float, partner: bool, joints: bool = True) -> tuple[list[Percept], Hardness, Stream]:
+def played(
+    k: float, partner: bool, joints: bool = True, commanded: bool = False
+) -> tuple[list[Percept], Hardness, Stream]:
     """A part on a stream: one pad presses along z, while a second gives way or closes as well."""
     stream, part = Stream(2), Hardness(2)
     perceiver = Perceiver(stream, [part])
@@ -133,6 +136,9 @@ def played(k: float, partner: bool, joints: bool = True) -> tuple[list[Percept],
         sample = Sample(pads, np.full(len(pads), i * 5_000_000), np.full(len(pads), 7, np.uint32))
         sample["force_n"] = np.full(len(pads), force[i])
         sample["force_std_n"] = np.full(len(pads), 0.02 * force[i])
+        if commanded:
+            sample["commanded_m"] = np.full(len(pads), depth[i] / len(pads))
+            sample["commanded_normal"] = np.array([[0, 0, 1.0], [0, 0, -1.0]])[: len(pads)]
         if joints:
             z = np.array([0.5, -0.5])[: len(pads)] * depth[i] if partner else np.array([depth[i]])
             sample["palm_position_m"] = np.stack([0 * z, 0 * z, z], axis=1)
@@ -152,8 +158,10 @@ def test_a_part_of_perception_tells_stiffness_and_its_label(k: float, label: str
     assert last.values["stiffness_n_per_m"] == pytest.approx(k, rel=0.1)
     assert last.values["sheet"] == "taken as ideal"
     assert part.questions(0) == []
-    others = [stream.window(1)] if partner else []
-    assert np.ptp(closing_m(stream.window(0), others)) == pytest.approx(3 / k, abs=8 * NOISE_M)
+    depth, by = closing_m(stream.window(0), opposite(stream, 0))
+    assert by == "joints"
+    assert np.ptp(depth) == pytest.approx(3 / k, abs=8 * NOISE_M)
+    assert last.values["depth_by"] == "joints"
 
 
 def test_without_joints_it_says_so_and_asks_for_nothing_that_would_not_help() -> None:
@@ -161,6 +169,29 @@ def test_without_joints_it_says_so_and_asks_for_nothing_that_would_not_help() ->
     assert told[-1].state == "unestimated"
     assert "joint" in told[-1].reason
     assert part.questions(0) == []
+
+
+@pytest.mark.parametrize("partner", [False, True])
+def test_without_joint_states_commands_tell_how_far_the_hand_closes(partner: bool) -> None:
+    told, _, _ = played(3e3, partner, joints=False, commanded=True)
+    assert (told[-1].state, told[-1].values["depth_by"]) == ("estimated", "command")
+    assert told[-1].values["stiffness_n_per_m"] == pytest.approx(3e3, rel=0.1)
+
+
+def test_commanded_ways_add_up_along_the_normal_and_begin_anew_with_a_contact() -> None:
+    """A link that turns by 0.1 rad about an axis 40 mm off its contact closes by 4 mm, however it slides."""
+    made, pads, on_link = Commanded(2), np.array([1]), np.array([[0.04, 0.0, 0.0]])
+    normal = np.array([[0.0, 1.0, 0.0]])
+    for k in range(51):
+        angle = 0.1 * k / 50
+        c, s = math.cos(angle), math.sin(angle)
+        pose = np.array([[[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0.01 * k]]])
+        way, facing = made.step(pads, np.array([7], np.uint32), pose, on_link, normal)
+    assert way[0] == pytest.approx(4e-3, rel=1e-3)
+    assert facing[0] == pytest.approx([-math.sin(0.1), math.cos(0.1), 0.0])
+    assert made.step(pads, np.array([8], np.uint32), pose, on_link, normal)[0][0] == 0.0
+    unknown = np.full((1, 3, 4), np.nan)
+    assert np.isnan(made.step(pads, np.array([8], np.uint32), unknown, on_link, normal)[0][0])
 
 
 def test_a_contact_that_is_only_held_is_asked_to_be_squeezed() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from handtouch.percept.stream import LENGTH, Sample, Stream
+from handtouch.percept.stream import LENGTH, Sample, Stream, Turns
 
 
 def sample(pads: list[int], t_ns: int, contact: int, force_n: float) -> Sample:
@@ -45,3 +45,13 @@ def test_what_is_not_known_of_a_sample_is_nan() -> None:
     stream = Stream(1)
     stream.add(sample([0], 1, 1, 1.0))
     assert np.isnan(stream.window(0)["palm_position_m"]).all()
+
+
+def test_the_pad_that_has_waited_longest_has_its_turn_and_none_too_soon() -> None:
+    turns, ready = Turns(3, 100), np.array([True, True, False])
+    taken = []
+    for t_ns in range(0, 200, 20):
+        if (pad := turns.due(ready, t_ns)) is not None:
+            turns.took(pad, t_ns)
+            taken.append((t_ns, pad))
+    assert taken == [(0, 0), (20, 1), (100, 0), (120, 1)]

@@ -20,7 +20,7 @@ from handtouch.field.model import ForwardModel
 from handtouch.field.residual import point_test
 from handtouch.percept.ask import Action, Question
 from handtouch.percept.primitives import CLASSES, SIZES, Fit, Prior, Verdict, fitting, judge
-from handtouch.percept.stream import IntArray, Percept, Sample, Stream
+from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns
 
 FloatArray = NDArray[np.float64]
 
@@ -115,7 +115,7 @@ class Shape:
         self._objects: dict[int, _Object] = {}
         self._kept_m, self._kept_normal = np.full((pads, 3), np.inf), np.zeros((pads, 3))
         self._kept_of = np.zeros(pads, dtype=np.uint32)
-        self._spot_ns = np.full(pads, -(10**18), dtype=np.int64)
+        self._spots = Turns(pads, _SPOT_NS)
 
     def step(self, stream: Stream, sample: Sample, began: IntArray) -> Sequence[Percept]:  # noqa: ARG002
         """Keep what is a new place."""
@@ -142,15 +142,15 @@ class Shape:
             mine = self.wanted & (stream.hand_of == hand)
             if (touched.news or touched.at_work is not None) and mine.any():
                 return int(np.argmax(mine))
-        ready = self.wanted & (stream.count >= _SETTLED) & (t_ns - self._spot_ns >= _SPOT_NS)
-        return int(np.argmax(ready)) if ready.any() else None
+        return self._spots.due(self.wanted & (stream.count >= _SETTLED), t_ns)
 
     def fit(self, stream: Stream, pad: int, t_ns: int) -> Sequence[Percept]:
         """A few steps for the hand of a pad, and the pad's own spot."""
         hand = int(stream.hand_of[pad])
         found: list[Percept] = []
-        if stream.count[pad] >= _SETTLED and t_ns - self._spot_ns[pad] >= _SPOT_NS:
-            self._spot_ns[pad] = t_ns
+        this = (np.arange(stream.size) == pad) & (stream.count >= _SETTLED)
+        if self._spots.due(this, t_ns) is not None:
+            self._spots.took(pad, t_ns)
             found += self._spot(stream, pad, t_ns)
         touched = self._objects.get(hand)
         if touched is None or not (touched.news or touched.at_work is not None):

@@ -36,7 +36,10 @@ _PARTS = 6
 _LOW = 0.08  # of the greatest force: below, roots are mostly noise
 _VAGUE = math.log(4.0)  # from one end of the 95 % interval to the other: wider is no estimate
 _Z = 1.96
-_GRID = np.linspace(-1.0, 1.0, 81)
+_GRID = np.linspace(-1.0, 1.0, 41)
+_REACH = np.geomspace(1e-5, math.log(RANGE_N_PER_M[1] / RANGE_N_PER_M[0]), 48)
+_Z_OF = np.linspace(-6.0, 6.0, 1201)
+_BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2)) for z in _Z_OF.tolist()])  # of a normal number
 
 
 @dataclass(frozen=True)
@@ -110,13 +113,15 @@ def stiffness_from_area(
     log_std: ArrayLike,
     object_radius_m: float = 0.015,
     object_radius_log_std: float = 0.7,
+    sheet_log_std: float = 0.1,
 ) -> Stiffness:
     """Stiffness of a round object pressed by a flat pad, from forces and contact radii (n,); no joints.
 
     Both as two sheets in one sandwich tell them (`field.Sandwich`). log_std: (2,) noise of ln force and of ln
     radius of a sample. By Hertz d = a^2 / R, so dF/dd = 3/2 F R / a^2: the radius R of the object must come
-    from elsewhere. The default is a prior for things in a hand, 15 mm within a factor of 2, and then most of
-    the deviation. invalid where the radius doesn't grow as force^(1/3): then it isn't Hertz.
+    from elsewhere. sheet_log_std: of ln F / a^2, by what isn't known of the sheets; two that are known within
+    2 % leave so much. The default of the radius is a prior for things in a hand, 15 mm within a factor of 2,
+    and then most of the deviation. invalid where the radius doesn't grow as force^(1/3): then it isn't Hertz.
     """
     force, radius = np.asarray(force_n, np.float64), np.asarray(radius_m, np.float64)
     force_std, radius_std = np.asarray(log_std, np.float64)
@@ -134,7 +139,7 @@ def stiffness_from_area(
         return Stiffness("invalid", f"{grows}, a round elastic body's as force^0.33", samples=len(x))
     at = float(x.mean())
     log_k = math.log(1.5 * object_radius_m) + at - 2 * float(y.mean())
-    std = math.hypot(2 * math.sqrt(variance / len(x)), object_radius_log_std)
+    std = math.hypot(2 * math.sqrt(variance / len(x)), object_radius_log_std, sheet_log_std)
     return _of_logs(np.array([log_k]), np.ones(1), std, math.exp(at), 1.5, len(x), math.inf)
 
 
@@ -143,7 +148,7 @@ def label_probabilities(log_stiffness: FloatArray, weights: FloatArray, std: flo
     below = [0.0]
     for bound in BOUNDS_N_PER_M:
         z = (math.log(bound) - log_stiffness) / max(std, 1e-6)
-        below.append(float(weights @ [0.5 * math.erfc(-v / math.sqrt(2)) for v in z.tolist()]))
+        below.append(float(weights @ np.interp(z, _Z_OF, _BELOW)))
     below.append(1.0)
     return {name: max(below[k + 1] - below[k], 0.0) for k, name in enumerate(CLASSES)}
 
@@ -279,10 +284,9 @@ def _posterior(
 
 def _width(line: _Line, inflate: float) -> float:
     """How far from the best ln kappa the posterior has fallen to nothing."""
-    reach = np.geomspace(1e-5, math.log(RANGE_N_PER_M[1] / RANGE_N_PER_M[0]), 48)
-    both = np.exp(np.stack([-reach, reach])) * line.kappa
+    both = np.exp(np.stack([-_REACH, _REACH])) * line.kappa
     over = ((line.chi2(both) - line.least) > 30 * inflate).all(axis=0)
-    return float(reach[int(np.argmax(over))]) if over.any() else float(reach[-1])
+    return float(_REACH[int(np.argmax(over))]) if over.any() else float(_REACH[-1])
 
 
 def _correlation(residual: FloatArray) -> float:

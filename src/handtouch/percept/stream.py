@@ -1,6 +1,6 @@
 """The latest samples of the contact on each pad, as arrays, and what parts make of them.
 
-Public names: `Stream`, `Window`, `Sample`, `Percept`, `Part`, `KINDS`.
+Public names: `Stream`, `Window`, `Sample`, `Turns`, `Percept`, `Part`, `KINDS`.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ FIELDS: dict[str, tuple[int, ...]] = {
     "palm_covariance_m2": (3, 3),
     "palm_rotation": (3, 3),  # of the link's frame in the palm's
     "joints_age_s": (),
+    "commanded_m": (),  # how far the link was told to close since the contact began, along the normal
+    "commanded_normal": (3,),  # in the palm, where joints are as they were told to be
 }
 """What is known of a sample -> its shape; SI units, NaN where it isn't known."""
 
@@ -143,6 +145,23 @@ class Stream:
     def latest_ns(self, pads: IntArray, back: IntArray | int = 0) -> NDArray[np.int64]:
         """Times (k,) of these samples."""
         return np.asarray(self._t_ns[pads, (self.count[pads] - 1 - back) % self.length])
+
+
+class Turns:
+    """Whose turn it is to be fitted: of n pads the one that waited longest, none again within `again_ns`."""
+
+    def __init__(self, pads: int, again_ns: int) -> None:
+        self._again_ns = again_ns
+        self._last_ns = np.full(pads, -(10**18), dtype=np.int64)
+
+    def due(self, ready: NDArray[np.bool_], t_ns: int) -> int | None:
+        """The next of the pads that are `ready` (n,), None if each had its turn a moment ago."""
+        pads = np.flatnonzero(ready & (t_ns - self._last_ns >= self._again_ns))
+        return int(pads[np.argmin(self._last_ns[pads])]) if len(pads) else None
+
+    def took(self, pad: int, t_ns: int) -> None:
+        """It had its turn."""
+        self._last_ns[pad] = t_ns
 
 
 @dataclass(frozen=True, slots=True)

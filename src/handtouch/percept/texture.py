@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from handtouch.percept.ask import Action, Question
 from handtouch.percept.spectrum import CLASSES, Found, detrended, texture
-from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Window
+from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns, Window
 
 FloatArray = NDArray[np.float64]
 
@@ -21,14 +21,15 @@ _LEAST = 48  # samples
 _AGAIN_NS = 250_000_000
 _LEAST_M = 1e-3
 _ASK_S = 1.0
+_OTHERS = 3  # contacts that tell how the object moves
 _COST = 3.0  # a held object may fall
 
 
 def slide_m(window: Window, others: Sequence[Window] = ()) -> tuple[FloatArray, str]:
     """Way (k,) of a contact along the line that it slid, and by what it is known: joints, place or nothing.
 
-    By joint states it is the way of the link's surface against the object, which moves as the hand's other
     By joint states it is that of the link's surface against the object, which moves as the hand's other
+    contacts (`others`) do on average, or stands still where there are none.
     """
     known: list[tuple[FloatArray, str]] = []
     palm = window["palm_position_m"]
@@ -78,7 +79,7 @@ class Texture:
 
     def __init__(self, pads: int) -> None:
         self.wanted = np.zeros(pads, dtype=np.bool_)
-        self._fitted_ns = np.full(pads, -(10**18), dtype=np.int64)
+        self._turns = Turns(pads, _AGAIN_NS)
         self._best: dict[int, tuple[int, int, Found, str]] = {}
         self._noise: dict[int, float] = {}
         self._rate_hz = np.full(pads, np.nan)
@@ -92,17 +93,16 @@ class Texture:
 
     def due(self, stream: Stream, t_ns: int) -> int | None:
         """The pad that has waited longest."""
-        ready = self.wanted & (stream.contact > 0) & (stream.count >= _LEAST)
-        pads = np.flatnonzero(ready & (t_ns - self._fitted_ns >= _AGAIN_NS))
-        return int(pads[np.argmin(self._fitted_ns[pads])]) if len(pads) else None
+        return self._turns.due(self.wanted & (stream.contact > 0) & (stream.count >= _LEAST), t_ns)
 
     def fit(self, stream: Stream, pad: int, t_ns: int) -> Sequence[Percept]:
         """Look at the pad's window: while it rests for its noise, while it slides for texture."""
-        self._fitted_ns[pad] = t_ns
+        self._turns.took(pad, t_ns)
         contact, hand = int(stream.contact[pad]), int(stream.hand_of[pad])
         window = stream.window(pad)
         others = np.flatnonzero((stream.hand_of == hand) & (stream.contact > 0))
-        way, by = slide_m(window, [stream.window(other) for other in others.tolist() if other != pad])
+        few = others[others != pad][:_OTHERS].tolist()
+        way, by = slide_m(window, [stream.window(other) for other in few])
         self._rate_hz[pad] = (len(window) - 1) / max(-float(window.t_s[0]), 1e-9)
         current = window["current_a"]
         if not by:
