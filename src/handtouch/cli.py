@@ -69,7 +69,10 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     demo.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
     demo.add_argument("--config", type=Path, help="deployment to simulate (default: the shipped hand)")
-    _add_grasp(demo)
+    acting = demo.add_mutually_exclusive_group()
+    _add_scenario(acting, "its faults and swaps are told in words")
+    _add_grasp(acting)
+    _add_sheets(demo)
     demo.add_argument(
         "--view", action="store_true", help="show it in the browser too, again and again until Ctrl-C"
     )
@@ -82,9 +85,7 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_config(simulate)
     _add_bus(simulate)
     playing = simulate.add_mutually_exclusive_group()
-    playing.add_argument(
-        "--scenario", type=Path, help="touches, faults and swaps to play (default: the session, or a tour)"
-    )
+    _add_scenario(playing, "touches, faults and swaps (default: the session, or a tour)")
     _add_grasp(playing)
     playing.add_argument(
         "--gripper",
@@ -96,12 +97,7 @@ def _add_serving(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     simulate.add_argument("--truth", type=Path, help="write what really happened to this file, as JSON lines")
     simulate.add_argument("--seconds", type=positive, help="end after so long (default: on Ctrl-C)")
     simulate.add_argument("--tolerances", action="store_true", help="tolerances of parts besides the noise")
-    simulate.add_argument(
-        "--sheet", choices=("S1", "S2"), help="sheets that creep and fade as this one of the paper"
-    )
-    simulate.add_argument(
-        "--drift", action="store_true", help="zeros, temperature and supply that wander slowly"
-    )
+    _add_sheets(simulate)
     simulate.add_argument("--seed", type=_seed, default=1, help="seed of noise and tolerances (default: 1)")
 
 
@@ -305,6 +301,28 @@ def _add_bus(
     )
 
 
+def _add_scenario(parser: argparse._ActionsContainer, text: str) -> None:
+    from handtouch import shipped
+
+    names = ", ".join(shipped.SCENARIOS)
+
+    def known(text: str) -> Path:
+        if not (path := shipped.scenario(text)).is_file():
+            raise argparse.ArgumentTypeError(f"{text}: is neither a file nor one of {names}")
+        return path
+
+    parser.add_argument("--scenario", type=known, metavar="NAME", help=f"play {names}, or a file: {text}")
+
+
+def _add_sheets(parser: argparse._ActionsContainer) -> None:
+    parser.add_argument(
+        "--sheet", choices=("S1", "S2"), help="sheets that creep and fade as this one of the paper"
+    )
+    parser.add_argument(
+        "--drift", action="store_true", help="zeros, temperature and supply that wander slowly"
+    )
+
+
 def _add_grasp(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--grasp",
@@ -324,6 +342,9 @@ def _demo(asked: argparse.Namespace) -> int:
         seed=asked.seed,
         view=asked.view,
         grasp=asked.grasp,
+        scenario_path=asked.scenario,
+        sheet=asked.sheet,
+        drift=asked.drift,
     )
 
 

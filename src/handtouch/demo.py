@@ -19,11 +19,13 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Self
+from tempfile import TemporaryDirectory
+from typing import Literal, Self
 
 from handtouch import shipped, wire
 from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load
+from handtouch.config.tables import Behaviour
 from handtouch.daemon.daemon import Daemon
 from handtouch.hand import kinematics
 from handtouch.simulate.grasp import played as grasped
@@ -32,6 +34,7 @@ from handtouch.simulate.run import SimulatedHand
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import score
 from handtouch.simulate.world import World
+from handtouch.view.lines import finding_text
 from handtouch.view.page import HOST, PORT
 from handtouch.view.watch import Display, LineDisplay, LiveDisplay, follow
 
@@ -52,18 +55,25 @@ def run(
     seed: int = 1,
     view: bool = False,
     grasp: str | None = None,
+    scenario_path: Path | None = None,
+    sheet: Literal["S1", "S2"] | None = None,
+    drift: bool = False,
 ) -> int:
     """Play the scenario to its end, or for `seconds`, or until Ctrl-C; then compare contacts with the truth.
 
-    With `grasp`, a thing, the hand grasps that instead. With `view` it is played again and again, until
-    `seconds` are over or Ctrl-C comes. Exit status 0, 1 when no contact came through, 2 for a configuration
-    that can't be used.
+    With `grasp`, a thing, the hand grasps that instead. With `scenario_path`, sheets that behave as `sheet`
+    or electronics that `drift`, the supervisor is at work, with a store that is gone afterwards. With `view`
+    it is played again and again, until `seconds` are over or Ctrl-C comes. Exit status 0, 1 when no contact
+    came through, 2 for a configuration that can't be used.
     """
     logging.basicConfig(level=logging.ERROR)
     try:
         deployment = _placed(in_process(load(config_path or shipped.path(DEPLOYMENT))))
-        world = World(seed=seed) if tolerances else World.ideal_parts(seed)
-        scenario = _scenario(deployment, tour=config_path is not None, grasp=grasp, world=world, repeat=view)
+        if scenario_path or sheet or drift:
+            deployment = _supervised(deployment, sheet)
+        world = World.named(seed, tolerances=tolerances, sheet=sheet, drift=drift)
+        file = scenario_path or (None if config_path else shipped.path(SCENARIO))
+        scenario = _scenario(deployment, file, grasp=grasp, world=world, repeat=view)
     except ValueError as error:  # of a file, or of a grasp that can't be
         print(error, file=sys.stderr)
         return 2
@@ -76,7 +86,13 @@ def run(
     print("building the simulated hand ...", file=sys.stderr)
     try:
         hand = SimulatedHand.open(deployment, scenario, world, record=not endless)
-        with hand, Daemon(deployment) as daemon, _subscribe(daemon) as messages, ExitStack() as opened:
+        with (
+            hand,
+            TemporaryDirectory(prefix="handtouch-demo-") as folder,
+            Daemon(deployment, beside=Path(folder)) as daemon,
+            _subscribe(daemon) as messages,
+            ExitStack() as opened,
+        ):
             url = opened.enter_context(_page(daemon)) if view else ""
             lines = plain or not sys.stdout.isatty()
             title = f"handtouch demo{f', in the browser at {url}' if url else ''}: Ctrl-C ends it"
@@ -97,16 +113,20 @@ def run(
     except ValueError as error:  # a scenario for another hand, an EDS that can't be simulated
         print(error, file=sys.stderr)
         return 2
+    for told in keeper.findings.values():
+        print(f"found {told}")
     if not endless:
         print(score(keeper.contacts, hand.truth))
     return 0 if keeper.count else 1
 
 
-def _scenario(deployment: Deployment, *, tour: bool, grasp: str | None, world: World, repeat: bool) -> Play:
-    """What is played: a grasp, the tour of another hand, or the session; `repeat`: again and again."""
+def _scenario(
+    deployment: Deployment, file: Path | None, *, grasp: str | None, world: World, repeat: bool
+) -> Play:
+    """What is played: a grasp, a file, or a tour of the hand without one; `repeat`: again and again."""
     if grasp:
         return grasped(deployment, grasp, world, repeat=repeat)
-    scenario = Scenario.tour(deployment) if tour else Scenario.load(shipped.path(SCENARIO))
+    scenario = Scenario.load(file) if file else Scenario.tour(deployment)
     return scenario.model_copy(update={"repeat": True}) if repeat else scenario
 
 
@@ -133,6 +153,7 @@ class _Keeper:
 
     def __init__(self, display: Display, keep: bool) -> None:
         self.contacts: list[wire.Contact] = []
+        self.findings: dict[tuple[str, str], str] = {}
         self.count = 0
         self._display, self._keep = display, keep
 
@@ -141,6 +162,10 @@ class _Keeper:
             self.count += 1
             if self._keep:
                 self.contacts.append(message)
+        if isinstance(message, wire.Health):
+            for finding in message.findings:
+                told = f"{message.hand}/{message.link}: {finding_text(finding)}"
+                self.findings.setdefault((message.link, finding["kind"]), told)
         if not (isinstance(message, wire.Service) and isinstance(self._display, LineDisplay)):
             self._display.take(message)
 
@@ -161,6 +186,23 @@ def _placed(deployment: Deployment) -> Deployment:
         return deployment
     scene = deployment.scene.model_copy(update={"outputs": (*deployment.scene.outputs, "palm")})
     return deployment.model_copy(update={"scene": scene})
+
+
+def _supervised(deployment: Deployment, sheet: Literal["S1", "S2"] | None) -> Deployment:
+    """The deployment with its supervisor at work, which needs to know one unit from another; and with sheets
+    that the daemon knows to behave as those of a preset."""
+    first = 1001
+    hands = []
+    for hand in deployment.hands:
+        pads = tuple(pad.model_copy(update={"serial": first + k}) for k, pad in enumerate(hand.pads))
+        hands.append(hand.model_copy(update={"pads": pads}))
+        first += len(pads)
+    daemon = deployment.daemon.model_copy(update={"supervise": True, "store": "calibrations.db"})
+    sheets = deployment.sheets
+    if sheet:
+        behaviour = Behaviour(preset=sheet)
+        sheets = {name: it.model_copy(update={"behaviour": behaviour}) for name, it in sheets.items()}
+    return deployment.model_copy(update={"hands": tuple(hands), "daemon": daemon, "sheets": sheets})
 
 
 def in_process(deployment: Deployment) -> Deployment:

@@ -8,6 +8,15 @@ _PACKAGE = Path(__file__).parent
 _PLACES = (_PACKAGE / "shipped_files", _PACKAGE.parents[1] / "config")  # a wheel's; a checkout's
 
 
+SCENARIOS = ("session", "gum", "swap", "faults")
+"""Those of the shipped hand that have a name of their own."""
+
+
+def scenario(name: str) -> Path:
+    """Path of the scenario of that name, such as "gum"; else `name` is a path itself."""
+    return path(f"utah_mit_{name}.toml") if name in SCENARIOS else Path(name)
+
+
 def path(name: str) -> Path:
     """Path of a shipped file by its name in `config/`, e.g. "handtouch-node.eds".
 

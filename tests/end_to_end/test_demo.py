@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 
 def test_the_demo_finds_touches_within_the_noise_bound_and_ends_by_itself() -> None:
@@ -24,6 +26,51 @@ def test_the_demo_finds_touches_within_the_noise_bound_and_ends_by_itself() -> N
     ratio, invented = float(total[4]), int(total[-1])
     assert ratio < 2.5  # a few weak samples carry it in so short a time; the whole session stays below 1.5
     assert invented == 0
+
+
+STUCK = """
+
+[[fault]]
+kind = "stuck_channel"
+link = "ring_distal"
+from_s = 0.5
+electrode = "xa"
+
+[[touch]]
+link = "index_distal"
+from_s = 0.1
+duration_s = 10.0
+path = [[0.2, 0.3], [0.8, 0.5]]
+force_n = [0.8]
+"""
+
+
+def test_a_scenario_with_a_fault_has_it_told_in_words_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "stuck.toml").write_text(STUCK)
+    home = {**os.environ, "HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path / "state")}
+    demo = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "handtouch", "demo", "--plain", "--seconds", "150"),
+            *("--scenario", str(tmp_path / "stuck.toml")),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=home,
+    )
+    assert demo.stdout is not None
+    try:
+        for text in demo.stdout:
+            if "right/ring_distal" in text and "channel xa" in text:
+                break
+        demo.send_signal(signal.SIGINT)
+        rest = demo.stdout.read()
+        assert demo.wait(30) == 0
+    finally:
+        demo.kill()
+        demo.stdout.close()
+        demo.wait()
+    assert re.search(r"^found right/ring_distal: channel xa", rest, re.MULTILINE)
+    assert not (tmp_path / "state").exists()
 
 
 def test_ctrl_c_ends_the_demo_with_its_summary() -> None:
@@ -46,7 +93,7 @@ def test_ctrl_c_ends_the_demo_with_its_summary() -> None:
 
 
 def test_two_demos_run_side_by_side() -> None:
-    command = [sys.executable, "-m", "handtouch", "demo", "--plain", "--seconds", "5"]
+    command = [sys.executable, "-m", "handtouch", "demo", "--plain", "--seconds", "2"]
     demos = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
     end_s = time.monotonic() + 100
     assert [demo.wait(end_s - time.monotonic()) for demo in demos] == [0, 0]
