@@ -714,8 +714,9 @@ or within a factor of 2), pressed from 0.5 to 4 N; the sheets' layers, alphas an
 currents; harder objects make contacts too small for these sheets, softer ones too large. A daemon has one
 sheet a pad: this is for who reads two."""
 TICKS = """\
-One part at a time, 15 contacts at 200 Hz with joint states: wall time of a tick's perception, with a slow fit and
-without; 10 % quantiles, for the cores were shared and full. What nobody wants isn't called and costs nothing: a test."""
+One part at a time, 15 contacts at 200 Hz with joint states: wall time of a tick's perception, with a slow
+fit and without; 10 % quantiles, for the cores were shared and full. What nobody wants isn't called and costs
+nothing: a test."""
 COST = """\
 Processor time, median of calls by themselves. Perception does one of these in 10 ms at most, and of a
 shape's fit two steps at a time (a class takes 6 to 26); none of it while nobody wants it."""

@@ -1,7 +1,8 @@
 """What a robot tells the daemon: joint states and forces, as two-part messages [topic, msgpack map].
 
-Public names: `JointState`, `LinkForces`, `encode`, `decode`, `InputError`. `docs/wire.md`, "Inputs", has
-every key, for writers in other languages. SI units; `t_ns` is of the host's monotonic clock, as of samples.
+Public names: `JointState`, `JointCommand`, `LinkForces`, `encode`, `decode`, `InputError`. `docs/wire.md`,
+"Inputs", has every key, for writers in other languages. SI units; `t_ns` is of the host's monotonic clock, as
+of samples.
 """
 
 from __future__ import annotations
@@ -46,6 +47,18 @@ class JointState:
 
 
 @dataclass(frozen=True, slots=True)
+class JointCommand:
+    """`command/<hand>`: where joints were told to go, for hands that don't know where they are."""
+
+    hand: str
+    t_ns: int | None
+    """from when on"""
+    names: tuple[str, ...]
+    position_rad: FloatArray
+    """(m,) as `names`; metres for a joint that slides"""
+
+
+@dataclass(frozen=True, slots=True)
 class LinkForces:
     """`force/<hand>`: forces on links as another sensor has them, a wrist's or those of the joint torques."""
 
@@ -57,9 +70,10 @@ class LinkForces:
     std_n: FloatArray
 
 
-Input = JointState | LinkForces
+Input = JointState | JointCommand | LinkForces
 _KEYS: dict[str, tuple[type[Any], str, tuple[str, ...], tuple[str, ...]]] = {
     "joints": (JointState, "names", ("position_rad",), ("velocity_rad_s", "effort_nm", "position_std_rad")),
+    "command": (JointCommand, "names", ("position_rad",), ()),
     "force": (LinkForces, "links", ("force_n", "std_n"), ()),
 }
 """Topic -> payload, key of the names, keys that must be there, keys that may be."""
@@ -67,7 +81,7 @@ _KEYS: dict[str, tuple[type[Any], str, tuple[str, ...], tuple[str, ...]]] = {
 
 def encode(message: Input) -> list[bytes]:
     """The two parts of a message, ready for a ZeroMQ multipart send."""
-    prefix = "joints" if isinstance(message, JointState) else "force"
+    prefix = next(prefix for prefix, (kind, *_) in _KEYS.items() if isinstance(message, kind))
     _, names, required, optional = _KEYS[prefix]
     payload: dict[str, Any] = {"v": SCHEMA_VERSION, "t_ns": message.t_ns, names: getattr(message, names)}
     for key in (*required, *optional, "gravity"):
@@ -83,7 +97,7 @@ def decode(parts: Sequence[bytes]) -> Input:
     topic = parts[0].decode("utf-8", "replace")
     prefix, _, hand = topic.partition("/")
     if prefix not in _KEYS or not hand or "/" in hand:
-        raise InputError(f"unknown topic {topic[:80]!r}; there are joints/HAND and force/HAND")
+        raise InputError(f"unknown topic {topic[:80]!r}; there are joints/HAND, command/HAND and force/HAND")
     try:
         payload = msgpack.unpackb(parts[1])
     except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:

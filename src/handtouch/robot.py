@@ -18,7 +18,7 @@ import zmq
 from numpy.typing import NDArray
 
 from handtouch.client import _Door
-from handtouch.inputs import Input, JointState, LinkForces, encode
+from handtouch.inputs import Input, JointCommand, JointState, LinkForces, encode
 
 INPUTS = "tcp://127.0.0.1:5583"
 _QUEUE = 16
@@ -72,6 +72,16 @@ class Robot:
         down = None if gravity is None else _direction(gravity)
         angles = _column(position_rad, names)
         self._send(JointState(hand, t_ns, names, angles, velocity, None, std_rad, down))
+
+    def send_commands(self, hand: str, position_rad: Mapping[str, float], *, t_ns: int | None = None) -> None:
+        """Where joints of a hand, by name, were told to be from `t_ns` on; as `send_joints`.
+
+        For hands that don't know where their joints are: how far they close on an object tells how hard it
+        is.
+        """
+        names = tuple(position_rad)
+        t_ns = time.monotonic_ns() if t_ns is None else t_ns
+        self._send(JointCommand(hand, t_ns, names, _column(position_rad, names)))
 
     def send_forces(
         self,

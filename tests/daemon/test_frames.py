@@ -176,6 +176,19 @@ def test_joints_that_nobody_told_and_places_that_are_not_known_are_invalid() -> 
     assert touched.step().tell(TIP)["palm"] == "invalid"
 
 
+def test_poses_by_commands_are_those_of_joint_states_that_are_alike() -> None:
+    touched = Touched(TIP, HEEL, joints=told(100, 0.2))
+    frames, rows = touched.step(), np.array([TIP, HEEL])
+    placed, rotation, _ = frames.in_palm(rows)
+    poses = frames.told_poses(rows, 100 * MS, lambda _, t_ns: told(100, 0.2).at(t_ns))
+    np.testing.assert_allclose(poses[:, :, :3], rotation, atol=1e-12)
+    carried = (poses[:, :, :3] @ touched.columns.position_m[rows][:, :, None])[:, :, 0] + poses[:, :, 3]
+    np.testing.assert_allclose(carried, placed[:, :3], atol=1e-12)
+    nobody = frames.told_poses(rows, 100 * MS, lambda _, t_ns: JointStates(NAMES).at(t_ns))
+    assert np.isnan(nobody[0]).all()  # a finger's needs joints, the palm's heel none
+    assert np.isfinite(nobody[1]).all()
+
+
 def test_nothing_is_computed_that_no_scene_asks_for() -> None:
     touched = Touched(TIP, HEEL, joints=told(100))
     asked: list[str] = []

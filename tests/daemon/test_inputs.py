@@ -16,7 +16,7 @@ from handtouch import keys
 from handtouch.daemon.inputs import Inputs
 from handtouch.daemon.security import Gate
 from handtouch.hand.joints import JointStates
-from handtouch.inputs import InputError, JointState, LinkForces, decode, encode
+from handtouch.inputs import InputError, JointCommand, JointState, LinkForces, decode, encode
 from handtouch.robot import Robot
 from handtouch.supervise.strength import ForceReference
 
@@ -112,6 +112,7 @@ def joints(hand: str = "right", t_ns: int | None = NOW, names: tuple[str, ...] =
         (joints(names=("x", "y")), "unknown_joints", "tells x, y; the URDF has a, b"),
         (joints(t_ns=NOW + 10**15), "clock", "s off; leave it nil"),
         (joints(t_ns=5), "clock", "s off"),
+        (encode(JointCommand("right", NOW, ("x",), np.ones(1))), "unknown_joints", "command/right tells x"),
         (encode(LinkForces("right", NOW, ("toe",), np.ones(1), np.ones(1))), "unknown_link", "'toe'"),
     ],
 )
@@ -133,6 +134,17 @@ def test_states_of_the_same_time_are_late_and_those_without_a_time_are_of_now(in
     assert inputs.joints_at("right", NOW + 5).age_s.tolist() == [0.0, 0.0]
     assert inputs.joints_at("left", NOW) is None
     assert inputs.figures(NOW + 10**9)["age_s"]["joints/right"] == pytest.approx(1.0)
+
+
+def test_commands_are_kept_apart_from_joint_states_and_hold(inputs: Any) -> None:
+    assert inputs.commands_at("right", NOW) is None
+    inputs.take(encode(JointCommand("right", NOW, ("b",), np.array([0.7]))), NOW)
+    told = inputs.commands_at("right", NOW + 10**9)
+    assert told.position_rad.tolist() == pytest.approx([np.nan, 0.7], nan_ok=True)
+    assert np.isnan(inputs.joints_at("right", NOW).position_rad).all()
+    assert inputs.received == {"command/right": 1}
+    inputs.take(encode(JointCommand("left", NOW, ("b",), np.array([0.7]))), NOW)
+    assert inputs.dropped == {"no_urdf": 1}
 
 
 def test_forces_are_handed_over_by_pad(inputs: Any) -> None:

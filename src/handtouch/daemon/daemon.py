@@ -89,35 +89,10 @@ class Daemon:
         settings = deployment.daemon
         period_ns = round(settings.sync_period_ms * 1e6)
         self._busy_poll = BusyPoll(round(settings.busy_poll_us * 1e3))
+        robots = Robots(deployment)
         with ExitStack() as opened:
-            context = opened.enter_context(zmq.Context())
-            self.gate = Gate(context, Path(settings.keys) if settings.keys else None)
-            opened.callback(self.gate.close)
-            self.publisher = Publisher(context, settings.live, settings.complete, self.gate)
-            opened.callback(self.publisher.close)
-            self.control = Control(context, settings.control, self.gate)
-            opened.callback(self.control.close)
-            robots = Robots(deployment)
-            self.inputs = self._open_inputs(context, robots)
-            opened.callback(self.inputs.close)
-            self.joints = JointTeller(robots, self.inputs.joints_at, self.publisher)
-            self.pipeline = Pipeline(
-                model or PadModel(deployment),
-                period_ns,
-                settings.window,
-                self.publisher,
-                self.publisher.run,
-                robots,
-            )
-            self.pipeline.frames.joints_at = self.inputs.joints_at
-            self.rehearsal = Rehearsal(self.pipeline, self.publisher)
-            self.perceiving = Perceiving(self.pipeline, self.publisher, self.publisher.run)
-            self.inputs.refer = self.pipeline.told.refer
-            pads = self.pipeline.model.size
-            self.gravity = Gravity(robots, pads, self.inputs.joints_at, self.inputs.down_at)
-            self.publisher.present.update(self.pipeline.messages.present())
-            self.publisher.present.update(self.pipeline.journal.present())
-            self.pipeline.journal.serve(deployment, time.monotonic_ns())
+            self._open_endpoints(opened, robots)
+            self._connect(model or PadModel(deployment), period_ns, robots)
             self.ports: dict[str, Port] = {}
             for bus in deployment.buses:
                 self.ports[bus.name] = port = Port.open(bus, self.pipeline.slab)
@@ -125,8 +100,41 @@ class Daemon:
             self._opened = opened.pop_all()
         self.master = Master(self.ports, self._specs(), period_ns)
         self.sync = Sync(list(self.ports.values()), period_ns)
+        self._watch_over(beside)
+        self._serve(read, period_ns, robots)
+
+    def _open_endpoints(self, opened: ExitStack, robots: Robots) -> None:
+        settings = self.deployment.daemon
+        context = opened.enter_context(zmq.Context())
+        self.gate = Gate(context, Path(settings.keys) if settings.keys else None)
+        opened.callback(self.gate.close)
+        self.publisher = Publisher(context, settings.live, settings.complete, self.gate)
+        opened.callback(self.publisher.close)
+        self.control = Control(context, settings.control, self.gate)
+        opened.callback(self.control.close)
+        self.inputs = self._open_inputs(context, robots)
+        opened.callback(self.inputs.close)
+
+    def _connect(self, model: PadModel, period_ns: int, robots: Robots) -> None:
+        """From samples and what robots tell to messages."""
+        publisher, inputs, window = self.publisher, self.inputs, self.deployment.daemon.window
+        self.pipeline = pipeline = Pipeline(model, period_ns, window, publisher, publisher.run, robots)
+        pipeline.frames.joints_at = inputs.joints_at
+        inputs.refer = pipeline.told.refer
+        self.joints = JointTeller(robots, inputs.joints_at, publisher)
+        self.gravity = Gravity(robots, model.size, inputs.joints_at, inputs.down_at)
+        self.rehearsal = Rehearsal(pipeline, publisher)
+        self.perceiving = Perceiving(pipeline, publisher, publisher.run)
+        self.perceiving.commands_at = inputs.commands_at
+        publisher.present.update(pipeline.messages.present())
+        publisher.present.update(pipeline.journal.present())
+        pipeline.journal.serve(self.deployment, time.monotonic_ns())
+
+    def _watch_over(self, beside: Path | None) -> None:
+        """Nodes, buses and pads."""
+        settings = self.deployment.daemon
         self.report = Report(
-            deployment,
+            self.deployment,
             self.pipeline,
             self.master,
             self.ports,
@@ -140,19 +148,21 @@ class Daemon:
         self.supervisor: Supervisor | None = None
         if settings.supervise:
             store = str(store_path(settings.store, beside))
-            self.supervisor = Supervisor(deployment, self.pipeline, self.master, store)
+            self.supervisor = Supervisor(self.deployment, self.pipeline, self.master, store)
             self.supervisor.rested = self._rest
             self._opened.callback(self.supervisor.close)
         self.report.supervisor = self.supervisor
-        names = pad_names(deployment)
-        scenes = Scenes(deployment.scene, names)
-        self.pacer = Pacer(deployment, scenes.needs.pads, self.pipeline, self.master, self.sync)
+
+    def _serve(self, read: Callable[[], Deployment] | None, period_ns: int, robots: Robots) -> None:
+        """What scenes want, and control."""
+        scenes = Scenes(self.deployment.scene, pad_names(self.deployment))
+        self.pacer = Pacer(self.deployment, scenes.needs.pads, self.pipeline, self.master, self.sync)
         self.demand = Demand(scenes, self.publisher, 1e9 / period_ns, self._apply)
         self.demand.placeable[:] = False
         for rows in robots.rows:
             self.demand.placeable[rows] = True
         self.demand.step(time.monotonic_ns())
-        commands = Commands(deployment, read, self.pipeline, self.report, self.demand, self.pacer)
+        commands = Commands(self.deployment, read, self.pipeline, self.report, self.demand, self.pacer)
         self.control.commands.update(commands.by_name)
 
     def __enter__(self) -> Daemon:

@@ -109,6 +109,26 @@ class Frames:
         in it, and ages (k,) of joints; NaN where they aren't valid."""
         return self._values[rows, _PALM], self._rotation[rows], self._values[rows, _AGE]
 
+    def told_poses(
+        self, rows: IntArray, t_ns: int, joints_at: Callable[[str, int], Joints | None]
+    ) -> FloatArray:
+        """Rotations and translations (k, 3, 4) of links in the palm, joints being as somebody else tells; NaN
+        where that isn't enough."""
+        poses = np.full((len(rows), 3, 4), np.nan)
+        robots = self._robots
+        for number, of in enumerate(robots.rows if robots else ()):
+            mine = np.flatnonzero((rows >= of[0]) & (rows <= of[-1]))
+            joints = joints_at(robots.hands[number], t_ns) if robots and len(mine) else None
+            if robots is None or joints is None:
+                continue
+            kinematics, links = robots.kinematics[number], rows[mine] - of[0]
+            kinematics.move(joints.position_rad)
+            for row, link in zip(mine.tolist(), links.tolist(), strict=True):
+                if np.isfinite(joints.position_rad[kinematics.palm_needs[link]]).all():
+                    pose = kinematics.in_palm(link)
+                    poses[row, :, :3], poses[row, :, 3] = pose.rotation, pose.translation_m
+        return poses
+
     def tell(self, pad: int) -> dict[str, Any]:
         """Fields of a contact message, none where no scene asks."""
         if not self._wants[pad]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from handtouch.daemon.publisher import bind
 from handtouch.daemon.security import Gate
 from handtouch.hand.joints import Joints, JointStates
-from handtouch.inputs import Input, InputError, JointState, LinkForces, decode
+from handtouch.inputs import Input, InputError, JointCommand, JointState, LinkForces, decode
 from handtouch.supervise.strength import ForceReference
 
 CAUSES = {
@@ -61,6 +61,7 @@ class Inputs:
         self.problem = ""
         self.refer: Callable[[ForceReference], object] = lambda _: None
         self._joints = joints
+        self._commands = {hand: states.like() for hand, states in joints.items()}
         self._down: dict[str, NDArray[np.float64]] = {}  # by hand, as last told
         self._pads = {name: pad for pad, name in enumerate(pads)}
         self._hands = {hand for hand, _ in pads}
@@ -70,6 +71,7 @@ class Inputs:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
         self._socket.subscribe("joints/")
+        self._socket.subscribe("command/")
         self._socket.subscribe("force/")
         try:
             self.endpoint = bind(self._socket, endpoint, "the inputs endpoint", gate, "inputs")
@@ -114,6 +116,11 @@ class Inputs:
         states = self._joints.get(hand)
         return None if states is None else states.at(t_ns)
 
+    def commands_at(self, hand: str, t_ns: int) -> Joints | None:
+        """Where the joints of a hand were told to be at a time, None where nobody ever told."""
+        states = self._commands.get(hand)
+        return states.at(t_ns) if states is not None and f"command/{hand}" in self._newest_ns else None
+
     def down_at(self, hand: str) -> NDArray[np.float64] | None:
         """Which way gravity points in the base of a hand (3,), as joint states told last, None: never."""
         return self._down.get(hand)
@@ -134,25 +141,28 @@ class Inputs:
     def _keep(self, message: Input, t_ns: int, now_ns: int) -> bool:
         if isinstance(message, LinkForces):
             return self._keep_forces(message, t_ns, now_ns)
-        states = self._joints.get(message.hand)
+        told = isinstance(message, JointState)
+        topic = f"{'joints' if told else 'command'}/{message.hand}"
+        states = (self._joints if told else self._commands).get(message.hand)
         if states is None:
-            self._drop("no_urdf", f"joints/{message.hand}", now_ns)
+            self._drop("no_urdf", topic, now_ns)
             return False
-        return self._keep_joints(message, states, t_ns, now_ns)
+        return self._keep_joints(message, states, topic, t_ns, now_ns)
 
-    def _keep_joints(self, message: JointState, states: JointStates, t_ns: int, now_ns: int) -> bool:
-        late = states.late
-        kept = states.take(
-            t_ns, message.names, message.position_rad, message.velocity_rad_s, message.position_std_rad
-        )
-        if kept and message.gravity is not None:
-            self._down[message.hand] = message.gravity
+    def _keep_joints(
+        self, message: JointState | JointCommand, states: JointStates, topic: str, t_ns: int, now_ns: int
+    ) -> bool:
+        late, names, position = states.late, message.names, message.position_rad
+        if isinstance(message, JointState):
+            kept = states.take(t_ns, names, position, message.velocity_rad_s, message.position_std_rad)
+            if kept and message.gravity is not None:
+                self._down[message.hand] = message.gravity
+        else:
+            kept = states.take(t_ns, names, position)
         if not kept and states.late > late:
-            self._drop("late", f"joints/{message.hand}", now_ns)
+            self._drop("late", topic, now_ns)
         elif not kept:
-            said = f"joints/{message.hand} tells {', '.join(message.names[:4])}; the URDF has " + ", ".join(
-                states.names
-            )
+            said = f"{topic} tells {', '.join(message.names[:4])}; the URDF has " + ", ".join(states.names)
             self._drop("unknown_joints", said, now_ns)
         return kept
 

@@ -6,19 +6,22 @@ Public names: `Perceiving`.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.percept.stream import Sample, Stream
+from handtouch.percept.closing import Commanded
+from handtouch.percept.stream import KINDS, Sample, Stream
 
 if TYPE_CHECKING:
     from handtouch.daemon.messages import Outlet
     from handtouch.daemon.pipeline import Pipeline
     from handtouch.daemon.scene import Wanted
     from handtouch.daemon.tick import Ticked
+    from handtouch.hand.joints import Joints
     from handtouch.percept.ask import Ask
     from handtouch.percept.percept import Perceiver
     from handtouch.percept.stream import Percept
@@ -37,7 +40,11 @@ class Perceiving:
         self._perceiver: Perceiver | None = None
         self._hands = list(pipeline.model.rows_of_hand)
         self._felt: NDArray[np.bool_] = np.zeros(pipeline.model.size, dtype=np.bool_)
+        self._squeezed = self._felt
         self._seq: Counter[str] = Counter()
+        self.commands_at: Callable[[str, int], Joints | None] = lambda _, __: None
+        """a hand's joints as they were told to be at a time, None where nobody tells; the daemon sets it"""
+        self._commanded = Commanded(pipeline.model.size)
         self._told: dict[tuple[str, int, int], tuple[int, str, str]] = {}  # kind, hand, pad -> time, state
 
     def want(self, wanted: Wanted) -> None:
@@ -51,6 +58,7 @@ class Perceiving:
             self._perceiver = self._made()
         none = np.zeros(self._pipeline.model.size, dtype=np.bool_)
         self._felt = np.asarray(wanted.percepts.any(axis=0))
+        self._squeezed = wanted.percepts[KINDS.index("hardness")]
         self._perceiver.want(wanted.percepts, none if wanted.asks is None else wanted.asks)
 
     def step(self, ticked: Ticked) -> None:
@@ -91,7 +99,18 @@ class Perceiving:
             sample["palm_position_m"], sample["palm_normal"] = placed[:, :3], placed[:, 3:6]
             sample["palm_covariance_m2"], sample["palm_rotation"] = placed[:, 6:], rotation
             sample["joints_age_s"] = age_s
+        self._follow_commands(sample, ticked.t_ns)
         return sample
+
+    def _follow_commands(self, sample: Sample, t_ns: int) -> None:
+        """Where joint states don't tell how far a hand closes, commands may."""
+        blind = np.flatnonzero(np.isnan(sample["palm_position_m"][:, 0]) & self._squeezed[sample.pads])
+        if not len(blind):
+            return
+        poses = self._pipeline.frames.told_poses(sample.pads[blind], t_ns, self.commands_at)
+        on_link, normal = sample["position_m"][blind], sample["normal"][blind]
+        way, facing = self._commanded.step(sample.pads[blind], sample.contact[blind], poses, on_link, normal)
+        sample["commanded_m"][blind], sample["commanded_normal"][blind] = way, facing
 
     def _tell(self, percept: Percept) -> None:
         what = percept.kind, percept.hand, percept.pad

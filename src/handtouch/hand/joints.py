@@ -59,6 +59,10 @@ class JointStates:
         self._continuous = np.zeros(len(self.names), dtype=np.bool_) if continuous is None else continuous
         self._sources: dict[tuple[str, ...], tuple[IntArray, IntArray, deque[_State]]] = {}
 
+    def like(self) -> JointStates:
+        """Another one of the same joints, of which nothing is told yet."""
+        return JointStates(self.names, self._continuous)
+
     def take(
         self,
         t_ns: int,
