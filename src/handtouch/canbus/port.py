@@ -18,7 +18,7 @@ from handtouch.config import Bus
 
 from .bus_state import BusState, Condition, code_of, is_queue_full, trouble_of
 from .load import frame_bits
-from .receivers import CyclicSender, InProcessReceiver, Receiver, ThreadReceiver
+from .receivers import CyclicSender, InProcessReceiver, QueuedReceiver, Receiver, ThreadReceiver
 from .router import Counters, Frame, Router
 from .slab import Slab
 from .sockets import DatagramReceiver, SocketcanReceiver
@@ -62,6 +62,11 @@ class Port:
         except Exception as error:  # as in `open_bus`: it is there, but can't be received from
             raise _unopened(bus, error) from error
         return cls(bus, receiver, slab)
+
+    @property
+    def is_queue(self) -> bool:
+        """Whether frames wait in this process, so that to `drain` asks nobody else."""
+        return isinstance(self._receiver, QueuedReceiver)
 
     @property
     def slab(self) -> Slab:

@@ -4,7 +4,7 @@ A receiver has a file descriptor that becomes readable when frames wait and stay
 opened anew, and `drain`, which hands all that waits to a router. None ever raises for what the bus does:
 errors are counted, told in `trouble`, and the bus is opened again with growing pauses. Two more: `sockets`.
 
-Public names: `Receiver`, `CyclicSender`, `ThreadReceiver`, `InProcessReceiver`, `Retry`,
+Public names: `Receiver`, `CyclicSender`, `QueuedReceiver`, `ThreadReceiver`, `InProcessReceiver`, `Retry`,
 `RECEIVE_BUFFER_BYTES`, `DRAIN_LIMIT`, `QUEUE_FRAMES`.
 """
 
@@ -123,7 +123,7 @@ def clock_offset_ns() -> int:
     return (before + after) // 2 - wall
 
 
-class _QueuedReceiver:
+class QueuedReceiver:
     """Frames wait in a bounded queue that other threads fill; the first of a burst signals an eventfd."""
 
     def __init__(self, opener: Opener) -> None:
@@ -188,7 +188,7 @@ class _QueuedReceiver:
             self._raise_signal()
 
 
-class ThreadReceiver(_QueuedReceiver):
+class ThreadReceiver(QueuedReceiver):
     """Any python-can bus: a thread waits in its `recv`."""
 
     def __init__(self, opener: Opener, interface: str) -> None:
@@ -274,7 +274,7 @@ class ThreadReceiver(_QueuedReceiver):
             self.trouble = None
 
 
-class InProcessReceiver(_QueuedReceiver):
+class InProcessReceiver(QueuedReceiver):
     """python-can's virtual bus: who sends a frame puts it into our queue; there is no thread."""
 
     def __init__(self, opener: Opener) -> None:

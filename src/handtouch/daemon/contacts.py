@@ -59,10 +59,12 @@ class Contacts:
         """
         touching = self.touching
         above = level > self._threshold
-        against = (above != touching) & sampled & trusted
-        lost = touching & ~trusted
+        against = above != touching
+        lost = touching > trusted
         began = ended = _NONE
         if self._unsettled or np.count_nonzero(against) or np.count_nonzero(lost):
+            against &= sampled
+            against &= trusted
             began, ended = self._count(against, sampled | ~trusted, lost, sample_ns)
             above = level > self._threshold
         # a sample below the threshold tells no place: until it is known whether more follow, the last holds
@@ -92,7 +94,8 @@ class Contacts:
 
     def forget(self, ended: IntArray) -> None:
         """Clear the ids of ended contacts, once their last message is made."""
-        self.id[ended] = 0
+        if len(ended):
+            self.id[ended] = 0
 
     def _count(
         self, against: BoolArray, known: BoolArray, lost: BoolArray, sample_ns: NDArray[np.int64]

@@ -213,6 +213,7 @@ class Daemon:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
         by_descriptor = {port.fileno(): port for port in ports}
         descriptors = list(by_descriptor)
+        queues = all(port.is_queue for port in ports)  # to look into all costs less than to wake once more
         busy_poll = self._busy_poll
         sync, pacer, master, stages = self.sync, self.pacer, self.master, self.report.stages
         pipeline.stepped = self._stepped
@@ -231,7 +232,7 @@ class Daemon:
             woke_ns = time.monotonic_ns()
             stages.slept(wake_ns, woke_ns)
             # one that is gone shows nothing, and is opened again from `drain`
-            every = not readable or woke_ns >= self._house_ns
+            every = queues or not readable or woke_ns >= self._house_ns
             self._receive(ports if every else [by_descriptor[ready] for ready in readable])
             now_ns = time.monotonic_ns()
             stages.lap(histogram.RECEIVE, now_ns)
@@ -265,8 +266,9 @@ class Daemon:
             self.pipeline.told.turn(gravity)
         self.pipeline.begin(sync_ns, now_ns)
         self.publisher.release()
-        if self._rehearsed:
-            self._rehearse_ns = self._busy_poll.expected_ns(sync_ns) - _BEFORE_TICK_NS
+        tick_ns = self._busy_poll.expected_ns(sync_ns)
+        if self._rehearsed and tick_ns - sync_ns > _COLD_NS:
+            self._rehearse_ns = tick_ns - _BEFORE_TICK_NS
         self.report.stages.lap(histogram.SYNC, time.monotonic_ns())
 
     def _rehearse(self) -> None:

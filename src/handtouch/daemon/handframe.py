@@ -1,4 +1,4 @@
-"""Hand frames, written straight into their bytes: what doesn't change from tick to tick is encoded once.
+"""Hand frames, put together from their bytes: what doesn't change from tick to tick is encoded once.
 
 Public names: `HandWriter`.
 """
@@ -6,7 +6,7 @@ Public names: `HandWriter`.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import msgpack
 import numpy as np
@@ -16,8 +16,9 @@ from handtouch import wire
 
 _SHORT = 1 << 32
 _NUMBERS = "seq", "t_ns", "tick"
+_CHANGING = *_NUMBERS, "repeat"
 _INT, _LONG = struct.Struct(">I"), struct.Struct(">Q")
-_TRUE, _FALSE = 0xC3, 0xC2  # of msgpack
+_TRUE, _FALSE = b"\xc3", b"\xc2"  # of msgpack
 
 
 class HandWriter:
@@ -42,21 +43,19 @@ class HandWriter:
         if layout != self._layout:
             self._lay_out(*layout)
             self._layout = layout
-        for column, source in self._pairs:
-            np.copyto(column, source, casting="same_kind")
-        buffer, at = self._buffer, self._at
+        parts, at = self._parts, self._at
+        for column, tell in self._columns:
+            parts[column] = tell()
         for name, data in optional.items():
-            buffer[at[name] : at[name] + len(data)] = data
+            parts[at[name]] = data
         number = self._number
-        number.pack_into(buffer, at["seq"], seq)
-        number.pack_into(buffer, at["tick"], tick)
-        _LONG.pack_into(buffer, at["t_ns"], t_ns)
-        buffer[at["repeat"]] = _TRUE if repeat else _FALSE
-        return wire.Packed(self._topic, bytes(buffer))
+        parts[at["seq"]], parts[at["tick"]], parts[at["t_ns"]] = number(seq), number(tick), _LONG.pack(t_ns)
+        parts[at["repeat"]] = _TRUE if repeat else _FALSE
+        return wire.Packed(self._topic, b"".join(parts))
 
     def _lay_out(self, short: bool, optional: tuple[str, ...]) -> None:
-        """Encode a frame with empty columns, and note where everything is."""
-        self._number = _INT if short else _LONG
+        """Encode a frame with empty columns, in parts: what stays, and by name what changes."""
+        self._number = (_INT if short else _LONG).pack
         some = 1 << 31 if short else 1 << 62
         rows, kinds = len(self._links), wire.COLUMNS[wire.HandFrame]
         columns = {
@@ -70,15 +69,28 @@ class HandWriter:
         )  # fmt: skip
         told = wire.plain(frame)
         packer = msgpack.Packer()
-        self._buffer, self._at = bytearray(packer.pack_map_header(len(told))), {}
+        self._parts: list[bytes] = []
+        self._at: dict[str, int] = {}
+        fixed = bytearray(packer.pack_map_header(len(told)))
         for name, value in told.items():
-            self._buffer += packer.pack(name)
+            fixed += packer.pack(name)
             packed = packer.pack(value)
-            size = len(value) if isinstance(value, bytes) else len(packed) - (name in _NUMBERS)
-            self._at[name] = len(self._buffer) + len(packed) - size
-            self._buffer += packed
-        self._pairs = []
-        for name, source in self._sources.items():
-            kind, elements = kinds[name]
-            column = np.frombuffer(self._buffer, kind, rows * elements, self._at[name])
-            self._pairs.append((column.reshape(source.shape), source))
+            if name not in columns and name not in _CHANGING:
+                fixed += packed
+                continue
+            size = len(value) if name in columns else len(packed) - (name in _NUMBERS)
+            fixed += packed[: len(packed) - size]
+            self._at[name] = len(self._parts) + 1
+            self._parts += [bytes(fixed), b""]
+            fixed = bytearray()
+        self._parts.append(bytes(fixed))
+        self._columns = [
+            (self._at[name], _teller(source, kinds[name][0])) for name, source in self._sources.items()
+        ]
+
+
+def _teller(source: NDArray[np.generic], kind: str) -> Callable[[], bytes]:
+    """What tells the bytes of an array as it is at each call."""
+    if source.dtype == np.dtype(kind):
+        return source.tobytes
+    return lambda: source.astype(kind).tobytes()

@@ -27,6 +27,7 @@ REASONS = {
 }
 """Why a contact ended, by what became of its pad; any other is released."""
 _STOPPED = "stopped"
+_ALL = slice(None)
 _WITH_STD = ("valid", "unestimated")
 
 
@@ -56,6 +57,7 @@ class Messages:
         self._frame_of = 0, 0  # number and time of the tick that the last frames were of
         self._reason = ""  # why all contacts end, once the daemon stops
         self._writers = {hand: self._writer(hand, rows) for hand, rows in model.rows_of_hand.items()}
+        self._hand_topics = [(hand, f"hand/{hand}", f"raw/{hand}") for hand in model.rows_of_hand]
         self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
 
     def send_contacts(self, ticked: Ticked, now_ns: int, outlet: Outlet) -> None:
@@ -87,17 +89,18 @@ class Messages:
         """Send the columns of every hand, and their raw counts, where somebody wants them."""
         self._frames += 1
         self._frame_of = tick_number, t_ns
-        for hand in self._model.rows_of_hand:
-            if outlet.wants(f"hand/{hand}"):
-                outlet.send(self._hand(hand))
-            if outlet.wants(f"raw/{hand}"):
+        unestimated = self._tick.unestimated(_ALL)
+        for hand, topic, raw in self._hand_topics:
+            if outlet.wants(topic):
+                outlet.send(self._hand(hand, unestimated))
+            if outlet.wants(raw):
                 outlet.send(self._raw(hand, slab))
 
     def rehearse(self, outlet: Outlet) -> None:
         """Encode the frames of the hands that somebody wants, and throw them away."""
-        for hand in self._model.rows_of_hand:
-            if outlet.wants(f"hand/{hand}"):
-                wire.encode(self._hand(hand))
+        for hand, topic, _ in self._hand_topics:
+            if outlet.wants(topic):
+                wire.encode(self._hand(hand, self._tick.unestimated(_ALL)))
 
     def present(self) -> dict[str, Callable[[int], wire.Outgoing | None]]:
         """Topic -> what there is to repeat of it, at a time [ns]: contacts under way, and hands."""
@@ -112,14 +115,13 @@ class Messages:
         return self._contact(pad, "update", 0, now_ns, repeat=True)
 
     def _last_hand(self, hand: str, _: int) -> wire.Packed | None:
-        return self._hand(hand, repeat=True) if self._frames else None
+        return self._hand(hand, self._tick.unestimated(_ALL), repeat=True) if self._frames else None
 
-    def _hand(self, hand: str, repeat: bool = False) -> wire.Packed:
+    def _hand(self, hand: str, unestimated: NDArray[np.bool_], repeat: bool = False) -> wire.Packed:
         rows = self._model.rows_of_hand[hand]
         optional = self._placing.columns(rows)
-        unestimated = self._tick.unestimated(rows)
-        if np.count_nonzero(unestimated):
-            optional["unestimated"] = unestimated.tobytes()
+        if np.count_nonzero(unestimated) and np.count_nonzero(unestimated[rows]):
+            optional["unestimated"] = unestimated[rows].tobytes()
         if np.count_nonzero(vague := self._model.vague[rows]):
             optional["doubtful"] = vague.tobytes()
         tick_number, t_ns = self._frame_of

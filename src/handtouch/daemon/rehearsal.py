@@ -23,12 +23,12 @@ class Rehearsal:
     def all(self) -> None:
         """Samples are about to come."""
         self._pipeline.frames.rehearse()
-        self._pipeline.messages.rehearse(self._outlet)
         self.tick()
 
     def tick(self) -> None:
-        """From samples to contacts alone."""
+        """From samples to contacts, and their messages."""
         pipeline = self._pipeline
+        pipeline.messages.rehearse(self._outlet)
         if self._tick.model is not pipeline.tick.model:
             self._tick = _Double(pipeline.tick)
         self._tick.follow(pipeline.tick)

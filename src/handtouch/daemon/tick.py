@@ -163,6 +163,8 @@ class Tick:
         self._behind = np.full((model.size, 4), np.nan)  # their currents, smoothed: as they were a while ago
         self._located = self.columns.located.view("<f4").reshape(model.size, -1)
         self._none = np.zeros(model.size, dtype=np.bool_)
+        self._sampled, self._trusted = self._none.copy(), self._none.copy()  # of the last step
+        self._gathered = True  # whether they are counted, and the baseline has seen them
         self._steps = 0
         self._every = np.ones(model.size, dtype=np.int64)  # steps from one update to the next
         self._sparse = False  # whether anything is not wanted at every step
@@ -267,12 +269,15 @@ class Tick:
         `node_state` (n,): PadState.CLEAR where the node is up, else what its pad is instead.
         """
         model, columns, contacts = self.model, self.columns, self.contacts
+        self._gather()
         operational = np.logical_not(node_state)  # CLEAR is 0
         sampled = self._take_in(slab, operational, cycle, until_ns)
         self.counts = counts = slab.read()
         excess = np.subtract(counts, self.baseline.expected, out=self._excess)
         absurd, stale = self._absurd(counts, slab), self._stale(now_ns, sampled)
-        trusted = operational & ~(absurd | stale)
+        trusted = operational
+        if not (absurd is self._none is stale):
+            trusted = operational & ~(absurd | stale)
         np.multiply(excess, model.ampere_per_count, out=self._currents)
         np.copyto(columns.current_a, self._currents @ _ALL_CHANNELS, where=sampled)
         began, ended, telling = contacts.step(columns.current_a, sampled, trusted, columns.sample_ns)
@@ -283,7 +288,7 @@ class Tick:
             self._behind[began] = np.nan
             self.baseline.begin(began)
             self.strength.begin(began)
-        self._gather(sampled & trusted)
+        self._sampled, self._trusted, self._gathered = sampled, trusted, False
         self._cycle_ns = cycle.t_ns
         self._steps += 1
         solved = telling
@@ -297,8 +302,7 @@ class Tick:
             raw = self.columns.raw_force_n
             self._tell_forces(self.strength.step(raw, self._raw_std, contacts.touching, cycle.t_ns))
         if len(solved):
-            peak = contacts.peak_n
-            peak[solved] = np.fmax(peak.take(solved), columns.force_n.take(solved))
+            np.fmax(contacts.peak_n, columns.force_n, out=contacts.peak_n, where=contacts.touching)
         if len(ended):
             self._located[ended] = np.nan
         updated = np.setdiff1d(telling, began) if len(began) else telling
@@ -319,7 +323,6 @@ class Tick:
             sampled &= here
             in_time = in_time & here
             np.copyto(self._taken_ns, slab.t_ns, where=here)
-        self.samples += sampled
         np.copyto(columns.sample_ns, cycle.t_ns, where=sampled)
         if np.count_nonzero(in_time) < size:
             self.missed += self.expected() & operational & ~in_time
@@ -360,7 +363,7 @@ class Tick:
         state = self.columns.state
         np.copyto(state, node_state)
         np.copyto(state, _TOUCHED, where=operational & self.contacts.touching)
-        if np.count_nonzero(absurd) or np.count_nonzero(stale):
+        if not (absurd is self._none is stale):
             np.copyto(state, _FAULTED, where=operational & absurd)
             np.copyto(state, _STALE, where=operational & stale)
 
@@ -373,11 +376,18 @@ class Tick:
         self._read = touched, currents
         self.columns.values[touched] = values
         self._located[touched, :10] = values[:, PAD.start :]
-        self.columns.raw_force_n[touched] = values[:, FORCE]
+        if self.strength.any:
+            self.columns.raw_force_n[touched] = values[:, FORCE]
 
-    def _gather(self, trusted: BoolArray) -> None:
-        """Samples of untouched pads, for the baseline; what may be a contact in a moment is none of these."""
-        free = trusted & (self.columns.current_a <= self.model.on_a)
+    def _gather(self) -> None:
+        """Count samples, and keep those of untouched pads for the baseline; what may be a contact in a moment
+        is none of these. Nobody waits for that: it is done after the messages of a step have left."""
+        if self._gathered:
+            return
+        self._gathered = True
+        self.samples += self._sampled
+        free = self._sampled & self._trusted
+        free &= self.columns.current_a <= self.model.on_a
         free &= ~self.contacts.touching
         self.baseline.gather(self._excess, free)
 
@@ -422,6 +432,7 @@ class Tick:
 
         Call it between two steps, when nobody waits: it makes the next step cheap, and changes no contact.
         """
+        self._gather()
         if self._cycle_ns and self.baseline.learn(self._cycle_ns, self.contacts.touching):
             touching = np.flatnonzero(self.contacts.touching)
             if len(touching):
