@@ -35,14 +35,16 @@ PERIOD_NS = 5_000_000
 JOINTS_EVERY_NS = 1_000_000
 STRENGTH = 20.0  # of the threshold's current
 PLAIN = ("location", "strength")
-CASES: dict[str, tuple[tuple[str, ...], bool, float | None]] = {
-    "no URDF": (PLAIN, False, None),
-    "URDF, palm not asked for": (PLAIN, True, None),
-    "palm": ((*PLAIN, "palm"), True, None),
-    "palm and base": ((*PLAIN, "palm", "base"), True, None),
-    "palm and base, uncertain joints": ((*PLAIN, "palm", "base"), True, 0.01),
+STATED = {"mount_std_mm": 0.3, "mount_std_deg": 1.0, "joint_std_deg": 0.3}
+CASES: dict[str, tuple[tuple[str, ...], dict[str, float] | None]] = {
+    "no URDF": (PLAIN, None),
+    "URDF, palm not asked for": (PLAIN, STATED),
+    "palm": ((*PLAIN, "palm"), {}),
+    "palm, uncertain mounts and joints": ((*PLAIN, "palm"), STATED),
+    "palm and base": ((*PLAIN, "palm", "base"), {}),
+    "palm and base, uncertain mounts and joints": ((*PLAIN, "palm", "base"), STATED),
 }
-"""Outputs, whether the hand has a URDF, standard deviation of joints [rad]."""
+"""Outputs, and what the file states of the hand; None: no URDF."""
 
 
 class Case:
@@ -50,10 +52,7 @@ class Case:
 
     subscriptions = frozenset({b""})
 
-    def __init__(
-        self, model: PadModel, robots: Robots, case: tuple[tuple[str, ...], bool, float | None]
-    ) -> None:
-        outputs, described, self._std = case
+    def __init__(self, model: PadModel, robots: Robots, described: bool, outputs: tuple[str, ...]) -> None:
         self.pipeline = Pipeline(model, PERIOD_NS, 0.6, self, robots=robots if described else None)
         self.pipeline.node_state[:] = 0
         self.spent: list[int] = []
@@ -75,8 +74,7 @@ class Case:
     def tick(self, t_ns: int, counts: Any) -> None:
         for joints_ns in range(t_ns - PERIOD_NS, t_ns, JOINTS_EVERY_NS):
             angle = 0.5 + 0.4 * np.sin(joints_ns * 1e-9 + np.arange(16))
-            std = None if self._std is None else np.full(16, self._std)
-            self._joints.take(joints_ns, self._joints.names, angle, None, std)
+            self._joints.take(joints_ns, self._joints.names, angle)
         pipeline = self.pipeline
         pipeline.begin(t_ns, t_ns)
         for pad, row in enumerate(counts):
@@ -90,8 +88,12 @@ class Case:
 def measure(touched: int, ticks: int) -> list[dict[str, Any]]:
     """A row a case: median microseconds of a tick, and bytes sent."""
     deployment = load(shipped.path("utah_mit.toml"))
-    model, robots = PadModel(deployment), Robots(deployment)
-    cases = {name: Case(model, robots, case) for name, case in CASES.items()}
+    model = PadModel(deployment)
+    cases = {}
+    for name, (outputs, stated) in CASES.items():
+        hand = deployment.hands[0].model_copy(update=stated or {})
+        robots = Robots(deployment.model_copy(update={"hands": (hand,)}))
+        cases[name] = Case(model, robots, stated is not None, outputs)
     pads = np.arange(model.size)
     x, y = (np.full((model.size, 2), 0.5) * model.locator.sides).T
     share = model.locator.fractions(pads, x, y).T * (STRENGTH * model.on_a[:, None]) / model.ampere_per_count
@@ -150,7 +152,9 @@ def parts(repeats: int) -> dict[str, float]:
             "joints at the time of a sample": _each_us(lambda: states.at(60_500_000), repeats),
             "kinematics of 16 joints": _each_us(lambda: kinematics.move(position), repeats),
             "kinematics, and the poses of 5 links in the palm": _each_us(pose, repeats),
-            "slope of a point with the joints": _each_us(lambda: kinematics.slope(0, point), repeats),
+            "slope of a point with the joints, of one pose": _each_us(
+                lambda: kinematics.slope(0, point), repeats
+            ),
         }
         assert not inputs.dropped, inputs.problem
         inputs.close()

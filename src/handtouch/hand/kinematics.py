@@ -79,7 +79,8 @@ class Kinematics:
             angle = turned[self._turning_v]
             q[self._turning_q], q[self._turning_q + 1] = np.cos(angle), np.sin(angle)
         self._pin.forwardKinematics(self._model, self._data, q)
-        self._q, self._sloped = q, False
+        self._q = q
+        self._jacobians: dict[int, Any] = {}
         self._here: dict[int, Any] = {}
 
     def in_palm(self, link: int) -> Pose:
@@ -97,16 +98,23 @@ class Kinematics:
 
     def slope(self, link: int, position_m: FloatArray, in_base: bool = False) -> FloatArray:
         """How a point (3,) of the link moves with each joint, (3, m) [m/rad] in palm or base frame."""
-        pin, frame, other = self._pin, self._frames[link], self._base if in_base else self._palm
-        if not self._sloped:
-            pin.computeJointJacobians(self._model, self._data, self._q)
-            self._sloped = True
+        frame, other = self._frames[link], self._base if in_base else self._palm
         seen = self._at(other)
-        at = self._at(frame).act(position_m)
-        of = [pin.getFrameJacobian(self._model, self._data, f, pin.WORLD) for f in (frame, other)]
-        twist = (of[0] - of[1]) @ self._matrix
-        moved = twist[:3] + np.cross(twist[3:].T, at).T
-        return np.asarray(seen.rotation.T @ moved, np.float64)
+        x, y, z = self._at(frame).act(position_m)
+        twist = self._jacobian(frame) - self._jacobian(other)
+        lever = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # a turn's cross product with the place
+        moved = twist[:3] + lever @ twist[3:]
+        return np.asarray(seen.rotation.T @ moved @ self._matrix, np.float64)
+
+    def _jacobian(self, frame: int) -> Any:
+        """How a frame moves with Pinocchio's coordinates, (6, nv), about the world's origin."""
+        found = self._jacobians.get(frame)
+        if found is None:
+            if not self._jacobians:
+                self._pin.computeJointJacobians(self._model, self._data, self._q)
+            found = self._pin.getFrameJacobian(self._model, self._data, frame, self._pin.WORLD)
+            self._jacobians[frame] = found
+        return found
 
     def _pose(self, seen_from: int, frame: int) -> Pose:
         pose = self._at(seen_from).actInv(self._at(frame))
