@@ -138,6 +138,37 @@ def test_deviations_cover_sheets_that_are_off_by_what_is_doubted() -> None:
     assert 0.9 < inside / counted < 0.99
 
 
+def test_deviations_cover_a_long_hold_whose_end_the_preset_does_not_know() -> None:
+    """What an S2 keeps at last, off by a fifth: its error goes into the load, and so into what is learned."""
+    pads, rng = 100, np.random.default_rng(8)
+    left = (1 - np.asarray(sheet.S2.adaptation.share)) * np.exp(rng.normal(0, 0.2, pads))
+    model = replace(sheet.S2, adaptation=replace(sheet.S2.adaptation, share=1 - left, time_s=60.0))
+    told = Behaviour(
+        preset="S2", adaptation_time_s=60.0, gain_std=0.0, history_std_n=0.0, slow_creep=0.0, press_std=0.05
+    )
+    rig = Rig(pads, replace(model, fluctuation=sheet.Fluctuation(press_std=0.05)), behaviour_of(told))
+    load = rng.uniform(1.0, 4.0, pads)
+    rig.cycle(4, load)
+    rig.run(240.0, load)
+    off = np.abs(rig.strength.force_n - load)
+    assert 0.9 < (off < 1.96 * rig.strength.std_n).mean() <= 1
+    assert np.sqrt(np.mean(off**2)) > 0.33 * np.sqrt(np.mean(rig.strength.std_n**2))
+
+
+def test_doubt_of_slow_creep_grows_with_the_logarithm_of_how_long_a_touch_lasts() -> None:
+    stds = []
+    for slow_creep in (0.0, 0.03):
+        behaviour = behaviour_of(Behaviour(gain_std=0.0, history_std_n=0.0, doubt=0.0, slow_creep=slow_creep))
+        rig, load = Rig(1, calm(sheet.S1), behaviour), np.array([2.0])
+        std = []
+        for seconds in (5.0, 95.0):
+            rig.run(seconds, load)
+            std.append(rig.strength.std_n[0] / rig.strength.force_n[0])
+        stds.append(np.array(std))
+    added = np.sqrt(stds[1] ** 2 - stds[0] ** 2)
+    np.testing.assert_allclose(added, 0.03 * np.log1p([5.0, 100.0]), rtol=0.05)
+
+
 def test_a_reference_finds_the_gain_while_working_and_no_faster_than_is_sane() -> None:
     behaviour = behaviour_of(Behaviour(gain_std=0.2, history_std_n=0.0))
     rig, rng, load = Rig(2, calm(sheet.S1), behaviour), np.random.default_rng(6), np.array([2.0, 2.0])

@@ -196,6 +196,11 @@ class Behaviour(Table):
     doubt: Annotated[float, Field(ge=0, le=1)] = Field(
         0.2, description="relative error of these numbers of creep, adaptation and hysteresis (1 sigma)"
     )
+    slow_creep: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.02,
+        description="part by which a reading may go on growing each time that a touch lasts e times longer "
+        "(1 sigma): creep by a power law, which isn't undone",
+    )
     silence_s: Positive = Field(
         45.0,
         description="time unfelt in which a press too light to be felt may have made it forget (1 - 1/e), if "

@@ -50,8 +50,7 @@ from handtouch.daemon.scene import Demand, Needs, Scenes, Wanted
 from handtouch.daemon.security import Gate
 from handtouch.daemon.supervisor import Supervisor
 from handtouch.hand.joints import JointStates
-from handtouch.hand.robot import Robots
-from handtouch.hand.robot import check as check_robots
+from handtouch.hand.robot import Robots, served
 from handtouch.keys import KeysError
 from handtouch.supervise.store import store_path
 
@@ -369,12 +368,16 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
 
 
 def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
-    """The deployment in a file, with other buses. Raises ConfigError."""
+    """The deployment in a file, with other buses; hands that don't fit their URDFs go without. Raises
+    ConfigError."""
     deployment = load(config_path)
     for bus in buses:
         deployment = with_bus(deployment, bus)
     deployment = checked(deployment, str(config_path))  # a mistake must show before a bus is touched
-    return check_robots(deployment, str(config_path))
+    deployment, problems = served(deployment, str(config_path))
+    for problem in problems:
+        _log.error("%s: %s; until then that hand has no palm and base frame", config_path, problem)
+    return deployment
 
 
 def _serve(

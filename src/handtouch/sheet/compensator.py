@@ -57,7 +57,8 @@ class Compensator:
         self._adaptation = model.adaptation.start(pads)
         self._elements = model.creep.start(pads)
         self.back_std_n = np.zeros(pads)
-        """Standard deviation of the back force (n,) [N]."""
+        """Standard deviation of the back force (n,) [N], but for what the press in progress adds."""
+        self._press_n = np.zeros(pads)  # that: error of the back force if this press reads a deviation more
         self._on, self._warmer_k = np.ones(pads, np.bool_), 0.0
         self._settle_s, self._waited_s = settle_s, 0.0
         self._flow_s, self._impulse = np.zeros(pads), np.zeros(pads)  # of load, since the back force settled
@@ -96,7 +97,8 @@ class Compensator:
         """Fresh sheets on some pads."""
         self._settle()
         state = self._adaptation
-        rows = (state.back_n, state.peak_n, state.flowed_s, self.back_std_n, *self._plays, *self._elements)
+        doubts = self.back_std_n, self._press_n
+        rows = (state.back_n, state.peak_n, state.flowed_s, *doubts, *self._plays, *self._elements)
         for row in rows:
             row[pads] = 0.0
 
@@ -127,7 +129,7 @@ class Compensator:
         load that may be anything which wouldn't be felt."""
         load, before, felt, reading = (column[pads] for column in self._last)
         press, flicker, fixed = self._unknowable
-        variance = (press * felt + flicker) * felt
+        variance = np.square(math.sqrt(press) * felt + self._press_n[pads]) + flicker * felt
         variance += np.square(self.back_std_n[pads])
         variance += np.square(self.doubt.creep * (felt - reading))
         if len(self._plays):
@@ -190,10 +192,21 @@ class Compensator:
         flow[:] = self._impulse[:] = 0.0
 
     def _carry_doubt(self, load: FloatArray, kept: FloatArray, silent_s: FloatArray) -> None:
-        """What adaptation forgets, doubt forgets; what it learns is doubted; silence may hide anything."""
-        spread, back = self.back_std_n, self._adaptation.back_n
-        spread *= kept
-        spread += self.doubt.adaptation * self._back.share * load * (1 - kept)
+        """What is learned is doubted, in part because its press may read too much; silence may hide anything.
+
+        An error of the back force goes into the load, and with that into what is learned next: so it isn't
+        forgotten as the back force is, d(error)/dt = -(1 - share) error / time. Errors of one press add up;
+        those of several presses are independent."""
+        spread, back, share = self.back_std_n, self._adaptation.back_n, self._back.share
+        learned = 1 - kept
+        lasts = 1 - learned * (1 - share)
+        felt = np.maximum(load - back, 0.0)
+        spread *= lasts
+        spread += self.doubt.adaptation * learned * (share * felt + (1 - share) * load)
+        if press := math.sqrt(self._unknowable[0]):
+            np.hypot(spread, self._press_n, out=spread, where=load <= 0)
+            self._press_n *= lasts * (load > 0)
+            self._press_n += press * learned * share * felt
         spread += np.maximum(back - spread, 0.0) * -np.expm1(-silent_s / self.doubt.silence_s)
         if not self._on.all():
             np.minimum(spread, back, out=spread, where=~self._on)

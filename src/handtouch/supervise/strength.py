@@ -25,6 +25,7 @@ IntArray = npt.NDArray[np.intp]
 SETTLE_S = 0.1
 _LEAST_CONTACTS, _LEAST_S = 3, 5.0  # of evidence
 _LEAST_N = 1e-6
+_UNLIKELY, _WITHIN = 0.05, 1.96  # chance of what is beyond a 95 % interval, and how wide that is
 _VAGUE = 0.5  # of a force: less certain than this, it is none
 _HOUR_S = 3600.0
 _GAIN_WANDERS = 0.05  # of the logarithm, in an hour
@@ -61,6 +62,7 @@ class SheetBehaviour:
     gain_std: float
     history_std_n: float
     silence_s: float
+    slow_creep: float
 
 
 class SheetStrength:
@@ -83,6 +85,7 @@ class SheetStrength:
         self.log_gain = np.zeros(n)
         self.log_gain_std = np.array([0.0 if b is None else b.gain_std for b in behaviours])
         self._first_gain_std = self.log_gain_std.copy()
+        self._slow_creep = np.array([0.0 if b is None else b.slow_creep for b in behaviours])
         self._felt_ns = np.zeros(n, np.int64)  # when each pad was touched last
         self._gain = np.ones(n)
         self._vouched = np.zeros(n, np.bool_)
@@ -226,7 +229,9 @@ class SheetStrength:
         for group in self.groups.all:
             self.std_n[group.rows] = group.compensator.std_n()
         variance = np.square(self.std_n[pressed]) + np.square(raw_std_n[pressed])
-        variance += np.square(force * self.log_gain_std[pressed])
+        held_s = self.touched_s[pressed] - self._begin_s[pressed]
+        wander = self._slow_creep[pressed] * np.log1p(held_s / _STEADY_S)
+        variance += np.square(force) * (np.square(self.log_gain_std[pressed]) + np.square(wander))
         std = np.sqrt(variance)
         self._doubt[pressed] = std / np.maximum(force, _LEAST_N)
         enough = (self.contacts[pressed] >= _LEAST_CONTACTS) & (self.touched_s[pressed] >= _LEAST_S)
@@ -277,10 +282,13 @@ class _Group:
     def forget(self, rows: IntArray, silent_s: FloatArray) -> None:
         """Back forces of rows after a silence: wiped with a chance that grows with it and the back force, as
         more presses are lighter than that; else as they were. Mean and variance are those of both.
-        How often such presses come isn't known (exponential prior): no chance is soon a certainty."""
+        How often such presses come isn't known (exponential prior): no chance is soon a certainty. Where it
+        was most likely wiped, the deviation is such that 1.96 of it reach what wasn't, unless that is all but
+        impossible: of two possibilities a normal interval would leave out the second."""
         back, std = self.compensator.back_n, self.compensator.back_std_n
         kept = 1 / (1 + silent_s / self._silence_s * back[rows])
-        std[rows] = np.sqrt(kept * (np.square(std[rows]) + (1 - kept) * np.square(back[rows])))
+        apart = np.where(kept > _UNLIKELY, np.maximum(kept, (1 - kept) / _WITHIN**2), kept) * (1 - kept)
+        std[rows] = np.sqrt(kept * np.square(std[rows]) + apart * np.square(back[rows]))
         back[rows] *= kept
 
 
@@ -308,4 +316,11 @@ def behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
         loop = sheet.PrandtlIshlinskii.of_loop(behaviour.loop, behaviour.loop_full_n)
         model = replace(model, hysteresis=loop)
     doubt = sheet.Doubt(behaviour.doubt, behaviour.doubt, behaviour.doubt, math.inf)
-    return SheetBehaviour(model, doubt, behaviour.gain_std, behaviour.history_std_n, behaviour.silence_s)
+    return SheetBehaviour(
+        model,
+        doubt,
+        behaviour.gain_std,
+        behaviour.history_std_n,
+        behaviour.silence_s,
+        behaviour.slow_creep,
+    )
