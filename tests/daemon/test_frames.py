@@ -189,6 +189,15 @@ def test_poses_by_commands_are_those_of_joint_states_that_are_alike() -> None:
     assert np.isfinite(nobody[1]).all()
 
 
+def test_a_hand_whose_description_is_no_use_has_no_place_but_its_links() -> None:
+    hand = DEPLOYMENT.hands[0].model_copy(update={"urdf": None})
+    nobody = Robots(DEPLOYMENT.model_copy(update={"hands": (hand,)}))
+    touched = Touched(TIP, joints=told(100), robots=nobody)
+    told_of = touched.step().tell(TIP)
+    assert (told_of["palm"], told_of["base"]) == ("invalid", "invalid")
+    assert told_of["group"] == TIP + 1
+
+
 def test_nothing_is_computed_that_no_scene_asks_for() -> None:
     touched = Touched(TIP, HEEL, joints=told(100))
     asked: list[str] = []

@@ -12,7 +12,7 @@ from handtouch import shipped
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.hand import kinematics, urdf
 from handtouch.hand.body import distance_m
-from handtouch.hand.robot import Robots, check, doubts
+from handtouch.hand.robot import Robots, check, doubts, served
 from handtouch.hand.urdf import Shape, UrdfError
 
 LINK = '<link name="{}"/>'
@@ -111,6 +111,17 @@ def test_what_does_not_fit_is_told_with_key_value_and_remedy(
 ) -> None:
     with pytest.raises(ConfigError, match=said):
         check(changed(tmp_path, change), "hand.toml")
+
+
+def test_a_hand_that_does_not_fit_is_served_on_its_links_alone(tmp_path: Path) -> None:
+    scene = ("[touch]", '[scene]\noutputs = ["location", "palm"]\n\n[touch]')
+    wrong = changed(tmp_path, scene, ('palm_link = "palm"', 'palm_link = "plam"'))
+    deployment, (problem,) = served(wrong, "hand.toml")
+    assert 'did you mean "palm"' in str(problem)
+    assert Robots(deployment).hands == []
+    assert deployment.hands[0].pads == wrong.hands[0].pads
+    right = changed(tmp_path, scene)
+    assert served(right, "hand.toml") == (right, ())
 
 
 def test_palm_output_needs_a_description_and_the_package_that_reads_it(

@@ -1,6 +1,6 @@
 """The robots of a deployment: what its hands' URDFs say, checked against the pads that are mounted on them.
 
-Public names: `Robots`, `check`, `doubts`.
+Public names: `Robots`, `check`, `served`, `doubts`.
 """
 
 from __future__ import annotations
@@ -79,19 +79,34 @@ def _told_name(hand: Hand, joint: str) -> str:
 
 def check(deployment: Deployment, file: str) -> Deployment:
     """The deployment, if its hands fit their URDFs. Raises ConfigError naming every mistake."""
-    asked = sorted({"palm", "base"} & set(deployment.scene.outputs))
-    problems = [
-        problem for number, hand in enumerate(deployment.hands, 1) for problem in _problems(number, hand)
-    ]
-    if asked and not any(hand.urdf for hand in deployment.hands):
-        problems.append(Problem("[scene]: outputs", _is(asked), "needs a hand with a URDF: [[hand]] urdf"))
-    elif asked and not kinematics.available():
-        problems.append(
-            Problem("[scene]: outputs", _is(asked), f"needs a package that isn't here: {INSTALL}")
-        )
+    problems = [*_unserved(deployment)]
+    for number, hand in enumerate(deployment.hands, 1):
+        problems += _problems(number, hand)
     if problems:
         raise ConfigError(file, tuple(problems))
     return deployment
+
+
+def served(deployment: Deployment, file: str) -> tuple[Deployment, tuple[Problem, ...]]:
+    """The deployment to serve, and what is wrong with its URDFs: a hand that doesn't fit its own is served on
+    its links alone. Raises ConfigError where palm or base is asked for and no hand could ever have it."""
+    if unserved := tuple(_unserved(deployment)):
+        raise ConfigError(file, unserved)
+    hands, problems = [], []
+    for number, hand in enumerate(deployment.hands, 1):
+        found = list(_problems(number, hand))
+        problems += found
+        hands.append(hand.model_copy(update={"urdf": None}) if found else hand)
+    return deployment.model_copy(update={"hands": tuple(hands)}), tuple(problems)
+
+
+def _unserved(deployment: Deployment) -> Iterator[Problem]:
+    """Frames that the file's scene asks for and nobody could tell."""
+    asked = sorted({"palm", "base"} & set(deployment.scene.outputs))
+    if asked and not any(hand.urdf for hand in deployment.hands):
+        yield Problem("[scene]: outputs", _is(asked), "needs a hand with a URDF: [[hand]] urdf")
+    elif asked and not kinematics.available():
+        yield Problem("[scene]: outputs", _is(asked), f"needs a package that isn't here: {INSTALL}")
 
 
 def doubts(deployment: Deployment) -> Iterator[str]:
