@@ -13,7 +13,7 @@ import msgpack
 import zmq
 
 from handtouch.daemon.publisher import bind
-from handtouch.daemon.security import Gate
+from handtouch.daemon.security import Gate, ready
 from handtouch.wire import SCHEMA_VERSION
 
 LARGEST_BYTES = 65_536
@@ -66,10 +66,9 @@ class Control:
     def poll(self, now_ns: int) -> None:
         """Answer what waits, and go on with what takes longer."""
         for _ in range(_REQUESTS_PER_POLL):
-            try:
-                client, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
+            if not ready(self._socket):
                 break
+            client, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
             # a REP socket would do this by itself, but malformed parts make it send answers astray for ever
             if parts[:1] != [b""]:
                 self.refused += 1  # not from a REQ socket: no answer would be understood

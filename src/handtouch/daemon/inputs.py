@@ -16,7 +16,7 @@ import zmq
 from numpy.typing import NDArray
 
 from handtouch.daemon.publisher import bind
-from handtouch.daemon.security import Gate
+from handtouch.daemon.security import Gate, ready
 from handtouch.hand.joints import Joints, JointStates
 from handtouch.inputs import Input, InputError, JointCommand, JointState, LinkForces, decode
 from handtouch.supervise.strength import ForceReference
@@ -82,11 +82,9 @@ class Inputs:
     def poll(self, now_ns: int) -> None:
         """Take what has come, a bounded number of messages."""
         for _ in range(_PER_POLL):
-            try:
-                parts = self._socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
+            if not ready(self._socket):
                 return
-            self.take(parts, now_ns)
+            self.take(self._socket.recv_multipart(zmq.NOBLOCK), now_ns)
         self._drop("flood", "", now_ns)
 
     def take(self, parts: Sequence[bytes], now_ns: int) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import zmq
 
 from handtouch import wire
-from handtouch.daemon.security import Gate
+from handtouch.daemon.security import Gate, ready
 
 LIVE_QUEUE = 64
 """Messages kept for a slow subscriber of the live stream: a few ticks, the newest matter."""
@@ -69,10 +69,9 @@ class Publisher:
             self._repeat(now_ns)
         for stream, socket in self._sockets.items():
             for _ in range(_SUBSCRIPTIONS_PER_POLL):  # who asks without end must not stop the tick
-                try:
-                    request = socket.recv(zmq.NOBLOCK)
-                except zmq.Again:
+                if not ready(socket):
                     break
+                request = socket.recv(zmq.NOBLOCK)
                 if request[:1] == b"\x01":
                     self._asked[stream].add(request[1:])
                     self._repeats.update(

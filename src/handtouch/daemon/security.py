@@ -1,6 +1,6 @@
 """Who may connect: CURVE on every TCP endpoint of a daemon that has keys; bounds on what anybody may send.
 
-Public names: `Gate`, `CAUSES`.
+Public names: `Gate`, `ready`, `CAUSES`.
 
 The hot thread answers the handshakes itself, a few at a time. They are rare, and a flood of them waits in
 line; a thread for them would fight the tick for the interpreter, and under a flood win too often.
@@ -42,6 +42,7 @@ _FAILURES = (
 )  # those by key are counted where they are decided
 _MECHANISM_MISMATCH = 0x11000002
 _CRYPTOGRAPHIC = 0x11000001
+_EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)  # to look up members of an enumeration costs more
 
 _log = logging.getLogger("handtouch.security")
 
@@ -95,12 +96,12 @@ class Gate:
             return
         self._polled_ns = now_ns
         for _ in range(_HANDSHAKES_PER_POLL):
-            if not _ready(self._zap):
+            if not ready(self._zap):
                 break
             self._answer(self._zap.recv_multipart(zmq.NOBLOCK), now_ns)
         for monitor in self._monitors:
             for _ in range(_EVENTS_PER_POLL):
-                if not _ready(monitor):
+                if not ready(monitor):
                     break
                 value = recv_monitor_message(monitor, zmq.NOBLOCK)["value"]
                 cause = {_MECHANISM_MISMATCH: "no_key", _CRYPTOGRAPHIC: "wrong_server_key"}
@@ -156,8 +157,9 @@ class Gate:
             _log.warning("nobody is let in: handtouch keys client %s NAME makes a client's key", self._folder)
 
 
-def _ready(socket: zmq.Socket[bytes]) -> bool:
-    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+def ready(socket: zmq.Socket[bytes]) -> bool:
+    """Whether a message waits: a third of a `recv` in vain, and it keeps the interpreter's lock."""
+    return bool(int(socket.getsockopt(_EVENTS)) & _POLLIN)
 
 
 def _state(folder: Path) -> object:
