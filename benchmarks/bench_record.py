@@ -2,7 +2,8 @@
 
 The daemon's pipeline and its two streams at 500 Hz with 15 pads, fed with the counts of a simulated hand as
 from a bus; the recorder is the real `handtouch record`, a process of its own, and every recording is replayed
-by `handtouch replay`, which must give the same contacts bit for bit. Writes docs/benchmarks/record.{md,json}.
+by `handtouch replay`, which must give the same contacts bit for bit. All is told per tick, in processor time
+and bytes, which others on the machine hardly change. Writes docs/benchmarks/record.{md,json}.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import zmq
-from bench_latency import OUT, PATHS, ProcessorShare, machine
+from bench_latency import OUT, PATHS, machine
 from numpy.typing import NDArray
 
 from handtouch import shipped, wire
@@ -40,6 +41,7 @@ FILM_S = 2.0
 MODES: dict[str, list[str] | None] = {"nobody": None, "record": [], "record --hand": ["--hand"]}
 """Who listens -> options of the recorder, None: no recorder."""
 SERVICE_TICKS = RATE_HZ // 2
+_START_S = 2.0
 
 
 def film(deployment: Deployment, touched: int) -> NDArray[np.int64]:
@@ -67,15 +69,16 @@ class Loop:
         self.publisher.present.update(self.pipeline.journal.present())
         self.pipeline.journal.serve(deployment, time.monotonic_ns())
         self._hands = {hand.name: [pad.link for pad in hand.pads] for hand in deployment.hands}
+        self._told = 0
         self._film = [[row.astype("<i2").tobytes() for row in sample] for sample in samples]
 
     def run(self, seconds: float) -> float:
-        """Tick at RATE_HZ; the thread's share of a processor."""
+        """Tick at RATE_HZ for so many seconds' worth of ticks; processor seconds of the thread per tick."""
         pipeline, publisher = self.pipeline, self.publisher
-        next_ns = began_ns = time.monotonic_ns()
-        busy_s = time.thread_time()
-        while next_ns - began_ns < seconds * 1e9:
-            next_ns += PERIOD_NS
+        next_ns = time.monotonic_ns()
+        busy_s, ticks = time.thread_time(), round(seconds * RATE_HZ)
+        for _ in range(ticks):
+            next_ns = max(next_ns + PERIOD_NS, time.monotonic_ns() - PERIOD_NS)
             time.sleep(max(0.0, (next_ns - time.monotonic_ns()) * 1e-9))
             now_ns = time.monotonic_ns()
             pipeline.begin(now_ns, now_ns)
@@ -85,8 +88,8 @@ class Loop:
             pipeline.settle()
             publisher.take_subscriptions(now_ns)
             if pipeline.ticks % SERVICE_TICKS == 1:
-                publisher.send(self._service(now_ns), lasting=True)
-        return (time.thread_time() - busy_s) / ((time.monotonic_ns() - began_ns) * 1e-9)
+                publisher.send(self._service(now_ns))
+        return (time.thread_time() - busy_s) / ticks
 
     def close(self) -> None:
         """Give the endpoints back."""
@@ -94,9 +97,9 @@ class Loop:
         self._context.term()
 
     def _service(self, now_ns: int) -> wire.Service:
+        self._told += 1
         return wire.Service(
-            v=wire.SCHEMA_VERSION, run=self.publisher.run, seq=self.publisher.next_seq("service"),
-            t_ns=now_ns,
+            v=wire.SCHEMA_VERSION, run=self.publisher.run, seq=self._told, t_ns=now_ns,
             wall_offset_ns=time.time_ns() - time.monotonic_ns(), version="", pid=0, uptime_s=0.0,
             period_s=1 / RATE_HZ, hands=self._hands, ticks=self.pipeline.ticks, overruns=0, rate_hz=RATE_HZ,
             tick_us={}, loop={}, contacts=self.pipeline.tick.contacts.begun, refused={}, process={}, buses={},
@@ -115,10 +118,10 @@ def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> di
     while not out.exists():
         loop.run(0.2)
     loop.run(1.0)
-    share, size = ProcessorShare(), out.stat().st_size
-    share.start(process.pid)
-    loop_share = loop.run(seconds)
-    recorder_share, size = share.stop(), out.stat().st_size - size
+    size, busy_s = out.stat().st_size, processor_s(process.pid)
+    loop_s = loop.run(seconds)
+    time.sleep(1.2)  # what waits is written once a second
+    size, busy_s = out.stat().st_size - size, processor_s(process.pid) - busy_s
     process.send_signal(signal.SIGINT)
     _, told = process.communicate(timeout=60)
     report = folder / "report.json"
@@ -132,8 +135,8 @@ def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> di
     result = json.loads(report.read_text())
     out.unlink()
     return {
-        "loop_share": loop_share,
-        "recorder_share": recorder_share,
+        "loop_us": 1e6 * loop_s,
+        "recorder_us": 1e6 * busy_s / (seconds * RATE_HZ),
         "ticks_hz": result["ticks"] / result["seconds"],
         "mb_per_minute": size / seconds * 60 / 1e6,
         "lost": sum(map(int, re.findall(r"(\d+) messages of \S+ were lost", told))),
@@ -141,8 +144,14 @@ def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> di
         "status": process.returncode,
         "compared": result["compared"],
         "same": result["same"],
-        "replay_times_real": result["seconds"] / took_s,
+        "replay_times_real": result["ticks"] / RATE_HZ / took_s,
     }
+
+
+def processor_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measure(touched: list[int], turns: int, seconds: float) -> list[dict[str, Any]]:
@@ -158,7 +167,7 @@ def measure(touched: list[int], turns: int, seconds: float) -> list[dict[str, An
                 for mode, options in MODES.items():
                     row: dict[str, Any] = {"touched": count, "listener": mode, "turn": turn}
                     if options is None:
-                        row["loop_share"] = loop.run(seconds)
+                        row["loop_us"] = 1e6 * loop.run(seconds)
                     else:
                         row |= recorded(loop, options, seconds, Path(folder))
                     rows.append(row)
@@ -173,35 +182,44 @@ def _median(rows: list[dict[str, Any]], key: str) -> float:
 
 def write(results: dict[str, Any]) -> str:
     """The page."""
+    rows = results["rows"]
+    alone = {(row["touched"], row["turn"]): row["loop_us"] for row in rows if row["listener"] == "nobody"}
+    for row in rows:
+        row["to_alone"] = row["loop_us"] / alone[row["touched"], row["turn"]]
     lines = []
     for count in sorted({row["touched"] for row in results["rows"]}):
         for mode in MODES:
-            rows = [r for r in results["rows"] if (r["touched"], r["listener"]) == (count, mode)]
-            line = f"| {count} | {mode} | {_median(rows, 'loop_share'):.1%} "
+            of_case = [r for r in rows if (r["touched"], r["listener"]) == (count, mode)]
+            line = f"| {count} | {mode} | {_median(of_case, 'loop_us'):.0f} | {_median(of_case, 'to_alone'):.2f} "
             if MODES[mode] is None:
-                lines.append(f"{line}| | | | | |")
+                lines.append(f"{line}| | | | | | |")
                 continue
+            recorder_us = _median(of_case, "recorder_us")
             lines.append(
-                f"{line}| {_median(rows, 'recorder_share'):.1%} | {_median(rows, 'mb_per_minute'):.1f} "
-                f"| {sum(r['lost'] + r['drops'] for r in rows)} "
-                f"| {sum(r['same'] for r in rows)} of {sum(r['compared'] for r in rows)} "
-                f"| {_median(rows, 'replay_times_real'):.1f} |"
+                f"{line}| {recorder_us:.0f} | {recorder_us * RATE_HZ / 1e6:.0%} "
+                f"| {_median(of_case, 'mb_per_minute'):.1f} | {sum(r['lost'] + r['drops'] for r in of_case)} "
+                f"| {sum(r['same'] for r in of_case)} of {sum(r['compared'] for r in of_case)} "
+                f"| {_median(of_case, 'replay_times_real'):.1f} |"
             )
-    turns = 1 + max(row["turn"] for row in results["rows"])
+    turns = 1 + max(row["turn"] for row in rows)
     text = f"""# Recording and replay
 
-A hand of 15 pads at {RATE_HZ} Hz, of which some are touched by sliding contacts. The loop is the daemon's
-pipeline and streams fed with counts, without a bus; its share is of one processor, by its thread's own clock,
-with nobody listening and with `handtouch record`, a process of its own. MB (10^6 bytes) are of the file on
-disk, compressed with zstd. Lost are gaps that the recorder saw and messages that the daemon's queue did not
-take. Every recording is replayed: contact messages that came out the same to the last bit, of all; and
-recorded time over the processor time of `handtouch replay`, start and model included, for recordings of
-{results["seconds"] + 1:.0f} s. Medians of {turns} turns.
+A hand of 15 pads at {RATE_HZ} Hz, of which some are touched by sliding contacts. Medians of {turns} turns of
+{results["seconds"]:.0f} s each.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
-| touched | listener | loop | recorder | MB/min | lost | same contacts | replay, times real |
-| ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |
+| touched | listener | loop, us a tick | of nobody's | recorder, us a tick | its share | MB/min | lost \
+| same | replay, times real |
+| ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
 {chr(10).join(lines)}
+
+* *loop* is the daemon's pipeline and streams fed with counts, without a bus: processor time of its thread.
+  Where nobody listens it computes no places and forces and encodes nothing, most of the difference.
+* *recorder* is `handtouch record`, a process of its own: its processor time for each tick of the daemon, and
+  what that is of a core at {RATE_HZ} Hz. MB (10^6 bytes) are of the file on disk, compressed with zstd.
+* *lost* are gaps that the recorder saw and messages that the daemon's queue did not take.
+* Every recording is replayed: contact messages that came out the *same* to the last bit, of all; and recorded
+  time over the processor time of `handtouch replay`, start and model included (some {_START_S:.0f} s).
 
 `make bench ONLY=record` measures this again.
 """
@@ -212,11 +230,15 @@ recorded time over the processor time of `handtouch replay`, start and model inc
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of a case")
-    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=6.0, help="of a case")
+    parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--touched", type=int, nargs="+", default=[1, 5, 15], help="pads that are touched")
+    parser.add_argument("--trial", action="store_true", help="a turn of 2 s, 5 touched; writes nothing")
     asked = parser.parse_args()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if asked.trial:
+        measure([5], 1, 2.0)
+        return
     rows = measure(asked.touched, asked.turns, asked.seconds)
     print(write({"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]}))
 

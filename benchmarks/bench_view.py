@@ -3,7 +3,9 @@
 The real daemon and simulated nodes, as in bench_latency, but with all 15 pads touched by sliding contacts,
 and joints told at 100 Hz. Cases take turns: nobody listens; somebody reads hand frames, as a controller does;
 the view without a page; with one that only reads; with one in Chromium, drawing in software where there is no
-graphics processor. Chromium is left out where it isn't installed. Writes docs/benchmarks/view.{md,json}.
+graphics processor. Chromium is left out where it isn't installed. What the daemon takes is told as processor
+time of its loop per tick, which others on the machine hardly change, and as ratios within a turn. Writes
+docs/benchmarks/view.{md,json}.
 """
 
 from __future__ import annotations
@@ -48,21 +50,24 @@ from handtouch.client import request
 from handtouch.config import load
 
 HERE = Path(__file__).parents[1] / "tests" / "javascript"
-NOBODY, READER, VIEW, PAGE, BROWSER = (
+NOBODY, READER, VIEW, PLAIN, PAGE, BROWSER = (
     "nobody listens",
     "a reader of hand frames",
     "the view, no page open",
+    "the view --no-percepts, a page that only reads",
     "the view, a page that only reads",
     "the view, a page in Chromium",
 )
+RATE_HZ = 200
 JOINING_S = 2.0
 JOINTS = ("index_mcp", "index_pip", "index_dip", "middle_mcp", "ring_mcp", "thumb_cmc")
 
 
 @contextmanager
-def view(endpoint: str) -> Iterator[tuple[int, str]]:
+def view(endpoint: str, *options: str) -> Iterator[tuple[int, str]]:
     """`handtouch view`: its process and URL."""
     command = [sys.executable, "-m", "handtouch", "view", "--key", "", "--port", "0", "--endpoint", endpoint]
+    command += options
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         yield process.pid, next(word for word in process.stdout.readline().split() if "http" in word)
@@ -126,8 +131,8 @@ def case(config: Path, pid: int, seconds: float, name: str, packages: Path | Non
         time.sleep(JOINING_S)
         row |= shares(daemon.control, pid, None, seconds)
     else:
-        with view(daemon.live) as (view_pid, url):
-            page = Reader(url) if name == PAGE else None
+        with view(daemon.live, *["--no-percepts"] * (name == PLAIN)) as (view_pid, url):
+            page = Reader(url) if name in (PLAIN, PAGE) else None
             browser = Chromium(packages, url) if name == BROWSER and packages else None
             time.sleep(JOINING_S)
             start_s, before = time.monotonic(), browser.counts() if browser else {}
@@ -163,13 +168,29 @@ def shares(control: str, pid: int, view_pid: int | None, seconds: float) -> dict
         after["process"]["loop_cpu_s"] - before["process"]["loop_cpu_s"],
         after["ticks"] - before["ticks"],
     )
+    stages = after["loop"]["stages"]
+    perceive_s = stages["perceive"]["sum_s"] - before["loop"]["stages"]["perceive"]["sum_s"]
+    counts = [late["loop"]["latency"]["counts"] for late in (before, after)]
     return row | {
-        "loop": loop_s / took_s,
         "tick_ms": 1e3 * loop_s / max(1, ticks),
+        "perceive_ms": 1e3 * perceive_s / max(1, ticks),
+        "latency_ms": median_ms(counts[0], counts[1]),
         "ticks_hz": ticks / took_s,
         "overruns": after["overruns"] - before["overruns"],
         "drops": sum(after["drops"].values()) - sum(before["drops"].values()),
     }
+
+
+def median_ms(before: list[int], after: list[int]) -> float:
+    """Of what a histogram of the wire counted in between; within its bin as if spread evenly."""
+    counts = [now - then for then, now in zip([*before, *[0] * len(after)], after, strict=False)]
+    half, below = sum(counts) / 2, 0.0
+    for number, count in enumerate(counts):
+        if below + count >= half and count:
+            low = 0.0 if number == 0 else 1.024e-3 * 2 ** (number - 1)
+            return float(low + (1.024e-3 * 2**number - low) * (half - below) / count)
+        below += count
+    return math.nan
 
 
 def tell_joints(endpoint: str, stop: threading.Event) -> None:
@@ -203,7 +224,7 @@ def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> 
             socket.connect(deployment.daemon.live)
             wait_for_touch(socket)
         for turn in range(turns):
-            for name in (NOBODY, READER, VIEW, PAGE, *([BROWSER] if packages else [])):
+            for name in (NOBODY, READER, VIEW, PLAIN, PAGE, *([BROWSER] if packages else [])):
                 rows.append({"turn": turn, **case(config, daemon.pid, seconds, name, packages)})
                 print(rows[-1], flush=True)
     finally:
@@ -226,36 +247,64 @@ def browser_packages(folder: Path) -> Path | None:
     return folder
 
 
+_TOLD = (
+    *(
+        ("to_reader", ".2f"),
+        ("latency_ms", ".2f"),
+        ("ticks_hz", ".0f"),
+        ("view", ".1%"),
+        ("update_ms", ".1f"),
+    ),
+    *(("updates_hz", ".1f"), ("frames_hz", ".1f"), ("kilobytes_s", ".0f")),
+)
+
+
 def write(results: dict[str, Any]) -> str:
     """The page."""
+    rows = results["rows"]
+    reader = {row["turn"]: row["tick_ms"] for row in rows if row["case"] == READER}
+    for row in rows:
+        row["to_reader"] = row["tick_ms"] / reader[row["turn"]]
+        if row["view"] is not None and row.get("updates_hz"):
+            row["update_ms"] = 1e3 * row["view"] / row["updates_hz"]
     lines = []
-    for name in dict.fromkeys(row["case"] for row in results["rows"]):
-        rows = [row for row in results["rows"] if row["case"] == name]
+    for name in dict.fromkeys(row["case"] for row in rows):
+        of_case = [row for row in rows if row["case"] == name]
 
-        def middle(key: str, form: str, rows: list[dict[str, Any]] = rows) -> str:
-            values = [row[key] for row in rows if row.get(key) is not None]
+        def middle(key: str, form: str, of_case: list[dict[str, Any]] = of_case) -> str:
+            values = [row[key] for row in of_case if row.get(key) is not None]
             return format(statistics.median(values), form) if values else ""
 
-        shares = f"{middle('loop', '.1%')} | {middle('tick_ms', '.2f')} | {middle('daemon', '.1%')}"
-        rates = (
+        loop = f"{middle('tick_ms', '.2f')} | {RATE_HZ / 1e3 * float(middle('tick_ms', '.4f')):.0%}"
+        of_loop = (
+            f"{middle('to_reader', '.2f')} | {middle('latency_ms', '.2f')} | {middle('ticks_hz', '.0f')}"
+        )
+        page = (
             f"{middle('updates_hz', '.1f')} | {middle('frames_hz', '.1f')} | {middle('kilobytes_s', '.0f')}"
         )
-        ticks = f"{middle('ticks_hz', '.0f')} | {middle('overruns', '.0f')}"
-        lines.append(f"| {name} | {shares} | {middle('view', '.1%')} | {rates} | {ticks} |")
-    turns = 1 + max(row["turn"] for row in results["rows"])
+        of_view = f"{middle('view', '.1%')} | {middle('update_ms', '.1f')}"
+        lines.append(f"| {name} | {loop} | {of_loop} | {of_view} | {page} |")
+    turns = 1 + max(row["turn"] for row in rows)
     text = f"""# The view
 
-A hand of 15 pads at 200 Hz, all touched by sliding contacts, its joints told at 100 Hz. Medians of
-{turns} turns through all cases, {results["seconds"]:.0f} s each. Shares are of one core: of the daemon's
-loop (and its time per tick), of the daemon with its other threads, of `handtouch view`. Where nobody listens,
-the daemon computes no places and forces: what a view costs is what it takes beyond a reader of hand frames,
-which any controller is. Chromium draws the page of 1024 x 640 in software here, on the same two cores. Where
-ticks stay below 200/s, others had the machine.
+A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, its joints told at 100 Hz. Medians of
+{turns} turns through all cases, {results["seconds"]:.0f} s each.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
-| who listens | loop | ms a tick | daemon | view | updates/s | frames/s drawn | kB/s | ticks/s | overruns |
-| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
+| who listens | loop, ms a tick | its share | of the reader's | latency, ms | ticks/s | view | ms an update \
+| updates/s | frames/s drawn | kB/s |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(lines)}
+
+* *loop* is processor time of the daemon's loop per tick, and what that is of a core at {RATE_HZ} ticks/s; *of
+  the reader's* the ratio to a reader of hand frames in the same turn. Where nobody listens, the daemon
+  computes no places and forces: what a view costs is what it takes beyond that reader, which any controller is:
+  joints, health, and what is felt above contacts (percepts), computed after these were sent.
+* *latency* is from the last sample to the last message of a tick, median, by the daemon's own clock.
+* *view* is the share of a core that `handtouch view` takes. *updates* are delivered to the page, of 30 that
+  are due; *frames* are drawn: Chromium draws 1024 x 640 pixels in software here, on the same cores, and the
+  page then leaves half of the time to others.
+* Where ticks/s stay below {RATE_HZ}, others had the machine: then rates are lower limits.
 
 Made by `make bench ONLY=view`.
 """
@@ -267,7 +316,7 @@ Made by `make bench ONLY=view`.
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of a case")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of a case")
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--trial", action="store_true", help="one turn of 2 s a case; writes nothing")
     asked = parser.parse_args()
