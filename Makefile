@@ -28,7 +28,7 @@ $(VENV)/.run: pyproject.toml requirements.lock | $(BIN)/python
 
 $(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python
 	@echo "installing handtouch and its tools into $(VENV) ..."
-	@$(PIP) install -c requirements.lock -e '.[dev]'
+	@$(PIP) install --no-compile -c requirements.lock -e '.[dev]'
 	@touch $(VENV)/.run $(VENV)/.view $@
 
 $(VENV)/.view: pyproject.toml requirements.lock | $(VENV)/.run
@@ -54,9 +54,7 @@ examples: $(VENV)/.dev ## the programs of examples/, each closing a loop with a 
 
 .PHONY: test lint types unit coverage socketcan docs
 test: ## everything that CI runs
-	@$(MAKE) --no-print-directory lint
-	@$(MAKE) --no-print-directory types
-	@$(MAKE) --no-print-directory docs
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types docs
 	@$(MAKE) --no-print-directory unit
 	@$(MAKE) --no-print-directory socketcan
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import sysconfig
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.starter import Starter
+from tests.starter import Starter, find_port, own_endpoints
 
 # how long an example takes says nothing on shared cores; CI tries the same ones every time
 settings.register_profile(
@@ -32,7 +31,6 @@ settings.load_profile("shared cores")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 ROOT = Path(__file__).parents[1]
-_STREAMS = ("live", "complete", "control", "inputs")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -59,23 +57,15 @@ def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture
 def endpoints() -> Iterator[dict[str, str]]:
-    """ZeroMQ endpoints for a `[daemon]` table, nobody else's; seen from every network namespace."""
-    with tempfile.TemporaryDirectory(prefix="ht.") as folder:  # tmp_path is longer than ipc paths may be
-        yield {stream: f"ipc://{folder}/{stream}" for stream in _STREAMS}
+    """ZeroMQ endpoints for a `[daemon]` table, nobody else's."""
+    with own_endpoints() as made:
+        yield made
 
 
 @pytest.fixture
 def free_port() -> int:
     """A TCP and UDP port that is free on loopback (until somebody takes it)."""
-    while True:
-        with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
-            tcp.bind(("127.0.0.1", 0))
-            port = int(tcp.getsockname()[1])
-            try:
-                udp.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
+    return find_port()
 
 
 @pytest.fixture(scope="session")
@@ -164,13 +154,32 @@ class Installation:
 
 
 @pytest.fixture(scope="session")
-def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """Makes a folder by its name and what fills it, once for all of xdist's workers."""
+    base = tmp_path_factory.getbasetemp()
+    parent = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def made(name: str, fill: Callable[[Path], None]) -> Path:
+        with (parent / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (parent / name).exists():
+                fill(parent / f"{name}.part")
+                (parent / f"{name}.part").rename(parent / name)
+        return parent / name
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def archives(shared: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """Folder with the source archive, and the wheel built from it."""
-    folder = tmp_path_factory.mktemp("dist")
-    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
-    done = subprocess.run(build, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder
+
+    def build(folder: Path) -> None:
+        command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    return shared("dist", build)
 
 
 @pytest.fixture(scope="session")
@@ -181,10 +190,12 @@ def wheel(archives: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def installation(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installation:
+def installation(wheel: Path, shared: Callable[[str, Callable[[Path], None]], Path]) -> Installation:
     """handtouch installed, by way of a staging folder as a package is built. Read only: tests share it."""
-    folder = tmp_path_factory.mktemp("installed")
-    installed, stage = Installation(folder / "root"), folder / "stage"
-    installed.install(wheel, DESTDIR=str(stage))
-    Path(f"{stage}{installed.root}").rename(installed.root)
-    return installed
+
+    def install(folder: Path) -> None:
+        installed = Installation(folder.with_name("installed") / "root")
+        installed.install(wheel, DESTDIR=str(folder / "stage"))
+        Path(f"{folder}/stage{installed.root}").rename(folder / "root")
+
+    return Installation(shared("installed", install) / "root")

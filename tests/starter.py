@@ -4,7 +4,7 @@ To load it costs each process more than a second of a processor, a fork a hundre
 is the same: a process with arguments, environment, output, signals and an exit status of its own. Run as a
 program, this file is the process that gets forked; it ends with its socket.
 
-Public names: `Starter`, `Started`.
+Public names: `Starter`, `Started`; where processes meet: `own_endpoints`, `find_port`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from typing import IO, Any
 
 LOADED = (
@@ -33,6 +35,27 @@ LOADED = (
     "pinocchio",
 )
 _REQUEST_BYTES = 1 << 20
+_STREAMS = ("live", "complete", "control", "inputs")
+
+
+@contextlib.contextmanager
+def own_endpoints() -> Iterator[dict[str, str]]:
+    """ZeroMQ endpoints for a `[daemon]` table, nobody else's; seen from every network namespace."""
+    with tempfile.TemporaryDirectory(prefix="ht.") as folder:  # tmp_path is longer than ipc paths may be
+        yield {stream: f"ipc://{folder}/{stream}" for stream in _STREAMS}
+
+
+def find_port() -> int:
+    """A TCP and UDP port that is free on loopback (until somebody takes it)."""
+    while True:
+        with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+            tcp.bind(("127.0.0.1", 0))
+            port = int(tcp.getsockname()[1])
+            try:
+                udp.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
 
 
 class Started:

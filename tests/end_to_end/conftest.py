@@ -20,13 +20,15 @@ import pytest
 
 from handtouch import shipped
 from handtouch.client import Subscriber, connect, request
-from tests.starter import Started, Starter
+from tests.starter import Started, Starter, find_port, own_endpoints
 
 START_S = 90.0
 """Longest that anything may take on a busy machine; nothing waits so long when all is well."""
 
 
 PERIOD_MS = 20.0
+PATIENCE_MS = 1000
+"""For a node's heartbeat: a machine that pauses for half a second loses none."""
 SCENARIO = """
 repeat = true
 pause_s = 0.1
@@ -76,6 +78,8 @@ class Rig:
         # slower than on a robot: a machine that tests other things too may not get round to it in 5 ms
         text, changed = re.subn(r"sync_period_ms = [\d.]+", f"sync_period_ms = {PERIOD_MS}", text)
         assert changed == 1
+        text, changed = re.subn(r"heartbeat_timeout_ms = \d+", f"heartbeat_timeout_ms = {PATIENCE_MS}", text)
+        assert changed == 1
         self.config.write_text(text)
         self.scenario = folder / "scenario.toml"
         self.scenario.write_text(SCENARIO)
@@ -90,7 +94,11 @@ class Rig:
     def start(self, name: str, *arguments: str) -> subprocess.Popen[str] | Started:
         """Start `handtouch NAME hand.toml --bus ... ARGUMENTS`, printing to a file beside the deployment."""
         buses = [word for bus in self.bus for word in ("--bus", bus)]
-        words = [name, str(self.config), *buses, *arguments]
+        return self.start_command(name, str(self.config), *buses, *arguments)
+
+    def start_command(self, name: str, *arguments: str) -> subprocess.Popen[str] | Started:
+        """Start `handtouch NAME ARGUMENTS`."""
+        words = [name, *arguments]
         process: subprocess.Popen[str] | Started
         with (self.folder / f"{name}.txt").open("a") as output:
             if self._starter is not None:
@@ -101,6 +109,14 @@ class Rig:
                 )
         self.processes[name] = process
         return process
+
+    def call(self, *arguments: str) -> tuple[int, str]:
+        """Exit status and output of a handtouch command."""
+        assert self._starter is not None
+        with (self.folder / "call.txt").open("w+") as output:
+            status = self._starter.start([*arguments], output).wait(START_S)
+            output.seek(0)
+            return status, output.read()
 
     def printed(self, name: str) -> str:
         return (self.folder / f"{name}.txt").read_text()
@@ -191,20 +207,39 @@ def chromium() -> str:
     return found
 
 
-@pytest.fixture
-def rig(
-    tmp_path: Path, endpoints: dict[str, str], network: list[str], free_port: int, starter: Starter
-) -> Iterator[Rig]:
+@contextlib.contextmanager
+def own_rig(folder: Path, network: list[str], starter: Starter) -> Iterator[Rig]:
     """A deployment on a udp_multicast bus in a network of its own."""
-    bus = f"can0=udp_multicast:239.74.163.2,port={free_port}"
-    made = Rig(tmp_path, endpoints, network, [bus], starter=starter)
-    yield made
-    made.end_all()
+    with own_endpoints() as endpoints:
+        bus = f"can0=udp_multicast:239.74.163.2,port={find_port()}"
+        made = Rig(folder, endpoints, network, [bus], starter=starter)
+        yield made
+        made.end_all()
+
+
+@pytest.fixture
+def rig(tmp_path: Path, network: list[str], starter: Starter) -> Iterator[Rig]:
+    """A deployment that a test may do with as it likes."""
+    with own_rig(tmp_path, network, starter) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def working(tmp_path_factory: pytest.TempPathFactory, network: list[str], starter: Starter) -> Iterator[Rig]:
+    """A hand at work, touched all the time, for tests that leave it as it is."""
+    with own_rig(tmp_path_factory.mktemp("working"), network, starter) as made:
+        made.simulate()
+        made.start("run")
+        made.wait_operational()
+        yield made
 
 
 @pytest.fixture
 def vcan_rig(tmp_path: Path, endpoints: dict[str, str], vcan_starter: Starter) -> Iterator[Rig]:
     """A deployment on SocketCAN; only inside vcan-run."""
     made = Rig(tmp_path, endpoints, [], ["can0=socketcan:vcan0"], starter=vcan_starter)
+    # all processes share the guest's one processor
+    text = made.config.read_text()
+    made.config.write_text(text.replace(f"sync_period_ms = {PERIOD_MS}", "sync_period_ms = 50.0"))
     yield made
     made.end_all()

@@ -95,11 +95,8 @@ def test_no_contact_a_silent_sensor_and_a_dead_daemon_are_told_apart(rig: Any) -
 
 
 @pytest.mark.parametrize("stream", ["live", "complete"])
-def test_a_late_joiner_is_told_the_present_at_once_and_nobody_else_twice(rig: Any, stream: str) -> None:
-    rig.simulate()
-    rig.start("run")
-    rig.wait_operational()
-    endpoint = rig.endpoints[stream]
+def test_a_late_joiner_is_told_the_present_at_once_and_nobody_else_twice(working: Any, stream: str) -> None:
+    endpoint = working.endpoints[stream]
     told, repeated = set[type[Any]](), set[type[Any]]()
     with connect(*EVERYTHING, endpoint=endpoint, queue=100_000) as early:
         seen: dict[str, list[int]] = defaultdict(list)
@@ -111,19 +108,19 @@ def test_a_late_joiner_is_told_the_present_at_once_and_nobody_else_twice(rig: An
         # of a topic with a message at every tick, the next one mostly comes before the repeat is made
         while not (told >= {wire.Contact, wire.HandFrame} and repeated >= {wire.Health, wire.Service}):
             assert time.monotonic() < end_s, (told, repeated)
-            _until(rig, early, lambda m: isinstance(m, wire.Contact) and m.event != "end", note)
+            _until(working, early, lambda m: isinstance(m, wire.Contact) and m.event != "end", note)
             with connect(*EVERYTHING, endpoint=endpoint) as late:  # the same prefixes
                 first: dict[str, Any] = {}
                 while len([topic for topic in first if topic.startswith("health/")]) < 15:
                     message = late.recv(LONGEST_S)
-                    assert message is not None, rig.all_printed()
+                    assert message is not None, working.all_printed()
                     first.setdefault(wire.topic_of(message), message)
                     told.add(type(message))
                     if message.repeat:
                         assert not isinstance(message, wire.Contact) or message.event == "update"
                         repeated.add(type(message))
                 assert late.gaps == 0
-        _until(rig, early, _is(wire.Service), note)
+        _until(working, early, _is(wire.Service), note)
         assert early.gaps == 0
     for topic, seqs in seen.items():
         assert seqs == list(range(seqs[0], seqs[0] + len(seqs))), topic

@@ -230,15 +230,11 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_follows_their_res
         for number, robot in enumerate(robots, 1):
             robot.simulate()
             robot.start("run")
-            with (robot.folder / "bridge.txt").open("w") as printed:  # before there is anybody to connect to
-                robot.processes["bridge"] = subprocess.Popen(
-                    robot.command(
-                        *("bridge", str(robot.config), "--prefix", f"lab/robot{number}", "--control"),
-                        *("--connect", listen[number - 1]),
-                    ),
-                    stderr=printed,
-                    text=True,
-                )
+            # before there is anybody to connect to
+            robot.start_command(
+                *("bridge", str(robot.config), "--prefix", f"lab/robot{number}", "--control"),
+                *("--connect", listen[number - 1]),
+            )
         for robot in robots:
             robot.wait_operational()
         remote = Remote(middle, *listen)
@@ -287,9 +283,7 @@ def test_commands_stay_away_from_the_network_unless_asked_for(rig: Rig, free_por
     listen = f"tcp/127.0.0.1:{free_port}"
     remote = Remote(rig.command()[:-3], listen)
     try:
-        rig.processes["bridge"] = subprocess.Popen(
-            rig.command("bridge", str(rig.config), "--prefix", "lab", "--connect", listen), text=True
-        )
+        rig.start_command("bridge", str(rig.config), "--prefix", "lab", "--connect", listen)
         remote.next("sample", "lab/hand/service")
         assert remote.get("lab/hand/control", msgpack.packb({"v": 1, "command": "status"})) == {}
     finally:
