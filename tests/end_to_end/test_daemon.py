@@ -305,7 +305,7 @@ def test_status_tells_people_and_programs_how_the_hand_fares(rig: Any) -> None:
     assert "right/thumb_distal" in told.stdout
     assert told.stdout.count("operational") == 15
     answer = json.loads(subprocess.run([*ask, "--json"], capture_output=True, timeout=LONGEST_S).stdout)
-    assert {pad["state"] for pad in answer["pads"]} <= {"clear", "touched", "stale"}  # stale: the machine paused
+    assert {pad["state"] for pad in answer["pads"]} <= {"clear", "touched", "stale"}  # paused
     rig.end("simulate")
     rig.wait("lost", lambda status: _row(status, "palm_heel")["state"] == "lost")
     told = subprocess.run(ask, capture_output=True, text=True, timeout=LONGEST_S)
