@@ -13,6 +13,7 @@ from handtouch.daemon import realtime
 
 CHECK = """
 import os, threading
+import zmq
 from handtouch.config import Daemon
 from handtouch.daemon import realtime
 cpu = min(os.sched_getaffinity(0))
@@ -24,6 +25,8 @@ def look():
     seen.append((os.sched_getscheduler(0), os.sched_getaffinity(0)))
 thread = threading.Thread(target=look)
 thread.start()
+context = zmq.Context()
+socket = context.socket(zmq.PUB)
 refused = realtime.apply(Daemon(realtime_priority=12, cpus=(cpu,), lock_memory=True))
 other.set()
 thread.join()
@@ -32,6 +35,9 @@ assert os.sched_getaffinity(0) == {cpu}
 if not any("realtime_priority" in text for text in refused):
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
     assert os.sched_getparam(0).sched_priority == 12
+    carriers = realtime._carriers()
+    assert carriers
+    assert {os.sched_getparam(carrier).sched_priority for carrier in carriers} == {11}
     pid = os.fork()
     if pid == 0:
         os._exit(os.sched_getscheduler(0))
@@ -40,6 +46,7 @@ if not any("lock_memory" in text for text in refused):
     locked = next(line for line in open("/proc/self/status") if line.startswith("VmLck"))
     assert int(locked.split()[1]) > 10_000, locked
 print("\\n".join(refused))
+context.destroy()
 """
 
 

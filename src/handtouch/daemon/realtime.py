@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
+from pathlib import Path
 
 from handtouch.config.tables import Daemon
 
@@ -17,7 +18,8 @@ _MCL_CURRENT, _MCL_FUTURE = 1, 2
 def apply(settings: Daemon) -> list[str]:
     """Do for the calling thread what `[daemon]` asks for; what was refused, in words with a remedy.
 
-    SCHED_FIFO and processors are the calling thread's alone (sched(7)); children begin as ordinary ones.
+    Processors are the calling thread's alone (sched(7)), SCHED_FIFO is also that of ZeroMQ's threads, which
+    carry its messages on, but for one step of priority; children begin as ordinary ones.
     """
     refused = []
     if settings.cpus:
@@ -29,6 +31,8 @@ def apply(settings: Daemon) -> list[str]:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         try:
             os.sched_setscheduler(0, policy, os.sched_param(settings.realtime_priority))
+            for thread in _carriers():
+                os.sched_setscheduler(thread, policy, os.sched_param(max(1, settings.realtime_priority - 1)))
         except OSError as error:
             refused.append(_no_priority(settings.realtime_priority, error.strerror))
     if settings.lock_memory and ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE):
@@ -55,6 +59,12 @@ def troubles(settings: Daemon) -> list[str]:
     if settings.lock_memory and locked != resource.RLIM_INFINITY:
         found.append(_no_lock(f"the limit of this user is {locked >> 10} KiB"))
     return found
+
+
+def _carriers() -> list[int]:
+    """ZeroMQ's threads in this process that read and write sockets, by their names (zmq 4.2 and later)."""
+    threads = Path("/proc/self/task").iterdir()
+    return [int(thread.name) for thread in threads if (thread / "comm").read_text().startswith("ZMQbg/IO/")]
 
 
 def _no_cpus(cpus: tuple[int, ...], why: str | None) -> str:
