@@ -96,7 +96,7 @@ def onsets(speed: FloatArray) -> list[int]:
     for step, now in enumerate(speed.tolist()):
         if now > SLIPS_M_S and firm >= _FIRM_STEPS:
             still = np.flatnonzero(speed[:step] < REST_M_S)
-            found.append(int(still[-1]) + 1)
+            found.append(int(still[-1]) + 1 if len(still) else step)
         firm = firm + 1 if now < SLIPS_M_S else 0
     return found
 
