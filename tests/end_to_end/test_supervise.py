@@ -256,3 +256,28 @@ def test_killing_the_slow_half_costs_no_contact_and_no_tick(bench: Bench) -> Non
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), link
     bench.wait("contacts go on", lambda: bench.contacts[-1].t_ns > since_ns + 1_000_000_000)
     assert bench.daemon.report.status()["pads"][0]["trust"] == "trusted"
+
+
+def test_another_unit_is_refused_where_the_deployment_says_so(tmp_path: Path) -> None:
+    made_of = "".join(PAD.format(link=link, node_id=k + 1, serial=1001 + k) for k, link in enumerate(LINKS))
+    deployment = in_process(parse(DEPLOYMENT + made_of))
+    settings = deployment.daemon.model_copy(update={"supervise": True, "another_unit": "refuse"})
+    deployment = deployment.model_copy(update={"daemon": settings})
+    stop = threading.Event()
+    hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), World.ideal_parts())
+    with hand, Daemon(deployment, beside=tmp_path) as daemon:
+        next(iter(hand.devices.values())).swap(2002)
+        hand.start()
+        made = Bench(daemon, hand, tmp_path / "calibrations.db")
+        thread = threading.Thread(target=daemon.run, args=(stop,))
+        thread.start()
+        try:
+            pads = daemon.report.status
+            made.wait("refused", lambda: pads()["pads"][0]["node"] == "faulted")
+            pad = pads()["pads"][0]
+        finally:
+            stop.set()
+            thread.join()
+    assert (pad["link"], pad["trust"]) == ("swapped", "nominal")
+    assert "1001" in pad["reason"]
+    assert "2002" in pad["reason"]
