@@ -190,7 +190,8 @@ def write(results: dict[str, Any]) -> str:
     for count in sorted({row["touched"] for row in results["rows"]}):
         for mode in MODES:
             of_case = [r for r in rows if (r["touched"], r["listener"]) == (count, mode)]
-            line = f"| {count} | {mode} | {_median(of_case, 'loop_us'):.0f} | {_median(of_case, 'to_alone'):.2f} "
+            ratio = _median(of_case, "to_alone")
+            line = f"| {count} | {mode} | {_median(of_case, 'loop_us'):.0f} | {ratio:.2f} "
             if MODES[mode] is None:
                 lines.append(f"{line}| | | | | | |")
                 continue

@@ -50,13 +50,13 @@ from handtouch.client import request
 from handtouch.config import load
 
 HERE = Path(__file__).parents[1] / "tests" / "javascript"
-NOBODY, READER, VIEW, PLAIN, PAGE, BROWSER = (
+NOBODY, READER, VIEW, PAGE, BROWSER, FELT = (
     "nobody listens",
     "a reader of hand frames",
     "the view, no page open",
-    "the view --no-percepts, a page that only reads",
     "the view, a page that only reads",
     "the view, a page in Chromium",
+    "the view --percepts, a page that only reads",
 )
 RATE_HZ = 200
 JOINING_S = 2.0
@@ -131,8 +131,8 @@ def case(config: Path, pid: int, seconds: float, name: str, packages: Path | Non
         time.sleep(JOINING_S)
         row |= shares(daemon.control, pid, None, seconds)
     else:
-        with view(daemon.live, *["--no-percepts"] * (name == PLAIN)) as (view_pid, url):
-            page = Reader(url) if name in (PLAIN, PAGE) else None
+        with view(daemon.live, *["--percepts"] * (name == FELT)) as (view_pid, url):
+            page = Reader(url) if name in (FELT, PAGE) else None
             browser = Chromium(packages, url) if name == BROWSER and packages else None
             time.sleep(JOINING_S)
             start_s, before = time.monotonic(), browser.counts() if browser else {}
@@ -224,7 +224,7 @@ def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> 
             socket.connect(deployment.daemon.live)
             wait_for_touch(socket)
         for turn in range(turns):
-            for name in (NOBODY, READER, VIEW, PLAIN, PAGE, *([BROWSER] if packages else [])):
+            for name in (NOBODY, READER, VIEW, PAGE, *([BROWSER] if packages else []), FELT):
                 rows.append({"turn": turn, **case(config, daemon.pid, seconds, name, packages)})
                 print(rows[-1], flush=True)
     finally:
@@ -298,8 +298,8 @@ A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, its joints t
 
 * *loop* is processor time of the daemon's loop per tick, and what that is of a core at {RATE_HZ} ticks/s; *of
   the reader's* the ratio to a reader of hand frames in the same turn. Where nobody listens, the daemon
-  computes no places and forces: what a view costs is what it takes beyond that reader, which any controller is:
-  joints, health, and what is felt above contacts (percepts), computed after these were sent.
+  computes no places and forces: what a view costs is what it takes beyond that reader, which any controller
+  is: joints and health; with --percepts what is felt above contacts, computed after these were sent.
 * *latency* is from the last sample to the last message of a tick, median, by the daemon's own clock.
 * *view* is the share of a core that `handtouch view` takes. *updates* are delivered to the page, of 30 that
   are due; *frames* are drawn: Chromium draws 1024 x 640 pixels in software here, on the same cores, and the

@@ -24,6 +24,8 @@ autodoc_typehints_description_target = "documented"
 add_module_names = False
 
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_title = "handtouch"
 html_theme_options = {"source_edit_link": "", "sidebar_hide_name": False}
 

@@ -119,9 +119,9 @@ def _add_looking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     view.add_argument("--open", action="store_true", help="open the page in this machine's browser")
     view.add_argument("--seconds", type=positive, default=0.0, help="end after so long")
     view.add_argument(
-        "--no-percepts",
+        "--percepts",
         action="store_true",
-        help="contacts alone: don't let the daemon compute slip, hardness, shape and texture for the page",
+        help="slip, hardness, shape and texture too, which the daemon then computes",
     )
 
     status = command(commands, "status", _status, "how the daemon, its buses and its pads fare")
@@ -393,7 +393,7 @@ def _view(asked: argparse.Namespace) -> int:
         port=asked.port,
         show=asked.open,
         seconds=asked.seconds,
-        percepts=not asked.no_percepts,
+        percepts=asked.percepts,
     )
 
 

@@ -31,7 +31,7 @@ def run(
     port: int = PORT,
     show: bool = False,
     seconds: float = 0.0,
-    percepts: bool = True,
+    percepts: bool = False,
 ) -> int:
     """Serve the page until Ctrl-C, or for `seconds`; `show` opens it in this machine's browser.
 
@@ -42,7 +42,7 @@ def run(
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    picture = Picture()
+    picture = Picture(percepts)
     try:
         topics = (*TOPICS, PERCEPTS) if percepts else TOPICS
         messages = connect(*topics, endpoint=endpoint, key=key, queue=_QUEUE)

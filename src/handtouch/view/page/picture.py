@@ -55,13 +55,16 @@ class Board:
 class Picture:
     """Takes messages by `take`; `step` puts what they come to on `board`, for the pages.
 
+    `percepts`: whether they were subscribed to; without, the page says how to have them.
+
     Keys of the board: `scene` (as `layout.describe`), `joints/<hand>`, `pad/<hand>/<link>`,
-    `contact/<hand>/<link>` (None: not touched), `felt/<hand>/<link>` (as `Felt.told`), `service`, `alive`,
-    `messages`, `t` (seconds).
+    `contact/<hand>/<link>` (None: not touched), `felt/<hand>/<link>` (as `Felt.told`), `percepts`, `service`,
+    `alive`, `messages`, `t` (seconds).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, percepts: bool = False) -> None:
         self.board = Board()
+        self.board.put("percepts", percepts)
         self._run: int | None = None
         self._deployment = ""
         self._frames: dict[str, wire.HandFrame] = {}

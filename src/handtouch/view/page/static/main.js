@@ -6,7 +6,7 @@ import { PadsView } from "./pads.js";
 import { drawFelt, drawLegend, drawMessages, drawNodes, drawService } from "./panel.js";
 
 const state = {
-  connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, felt: {}, messages: [], t: 0,
+  connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, felt: {}, percepts: false, messages: [], t: 0,
 };
 const counts = { updates: 0, frames: 0 };
 const SLOW_MS = 40;
@@ -34,7 +34,7 @@ function take(changes) {
       state.contacts[name] = value;
       pads.follow(name, value, state.t);
       if (numbers.has(name)) history.follow(numbers.get(name), value, state.t);
-    } else if (["alive", "service", "messages"].includes(key)) state[key] = value;
+    } else if (["alive", "service", "messages", "percepts"].includes(key)) state[key] = value;
   }
   if ("alive" in changes || "service" in changes || changes.scene) drawService(state);
   if (changes.scene || Object.keys(changes).some((key) => key.startsWith("pad/"))) drawNodes(state);

@@ -64,8 +64,9 @@ export function drawNodes({ scene, pads }) {
 }
 
 // What is felt of each touch and of the whole hand, and what is open, in words.
-export function drawFelt({ scene, felt }) {
+export function drawFelt({ scene, felt, percepts }) {
   if (!scene) return;
+  if (!percepts) return byId("felt").replaceChildren(element("li", "dim", "handtouch view --percepts tells slip, hardness, shape, texture"));
   const order = new Map(scene.pads.map((pad, number) => [pad.key, number]));
   const entries = Object.entries(felt).filter(([, told]) => told);
   entries.sort(([a], [b]) => (order.get(a) ?? -1) - (order.get(b) ?? -1)); // whole hands first
