@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -14,6 +15,7 @@ import pytest
 
 from handtouch import wire
 from handtouch.canbus.master import SerialChanged
+from handtouch.config import Behaviour
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.process import Process
 from handtouch.daemon.supervisor import Supervisor
@@ -235,6 +237,33 @@ def test_contacts_say_of_what_findings_make_of_them_while_those_last(rig: Rig) -
     rig.step()
     contact = rig.contact()
     assert (contact.location, contact.strength, contact.findings) == ("valid", "invalid", ("swapped unit",))
+
+
+def test_a_fading_sheet_rests_tells_so_and_wakes_when_the_hand_is_touched(bench: Any, caplog: Any) -> None:
+    caplog.set_level("INFO", "handtouch.supervise")
+    sheet = bench.deployment.sheets["s"].model_copy(update={"behaviour": Behaviour()})
+    scene = bench.deployment.scene.model_copy(update={"rest_after_s": 1.0})
+    fading = bench.deployment.model_copy(update={"sheets": {"s": sheet}, "scene": scene})
+    rig = Rig(replace(bench, deployment=fading))
+    rested: list[int] = []
+    rig.supervisor.rested = rested.append
+    rig.pipeline.tick.strength.assume(1, 2.0, 0.1)
+    for _ in range(450):
+        rig.step()
+    assert rig.supervisor.turns.resting.tolist() == [False, True, False]
+    (finding,) = rig.supervisor.told(1)["findings"]
+    assert finding["kind"] == "fading sheet"
+    assert "2.00 N" in finding["evidence"]
+    assert "touch another pad" in finding["remedy"]
+    assert 1 in rig.supervisor.changed
+    assert "h/round: rests without potential" in caplog.text
+    rig.touched = True
+    rig.hear()
+    rig.step()
+    assert not rig.supervisor.turns.resting.any()
+    assert rig.supervisor.told(1)["findings"] == ()
+    assert "h/round: is awake again" in caplog.text
+    assert len(rested) == 2
 
 
 def test_its_state_is_told(rig: Rig) -> None:
