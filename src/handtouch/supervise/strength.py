@@ -25,7 +25,7 @@ IntArray = npt.NDArray[np.intp]
 SETTLE_S = 0.1
 _LEAST_CONTACTS, _LEAST_S = 3, 5.0  # of evidence
 _LEAST_N = 1e-6
-_UNLIKELY, _WITHIN = 0.05, 1.96  # chance of what is beyond a 95 % interval, and how wide that is
+_LEFT_ALONE = 0.3  # chance that nobody pressed at all in a silence, however long
 _VAGUE = 0.5  # of a force: less certain than this, it is none
 _HOUR_S = 3600.0
 _GAIN_WANDERS = 0.05  # of the logarithm, in an hour
@@ -282,13 +282,11 @@ class _Group:
     def forget(self, rows: IntArray, silent_s: FloatArray) -> None:
         """Back forces of rows after a silence: wiped with a chance that grows with it and the back force, as
         more presses are lighter than that; else as they were. Mean and variance are those of both.
-        How often such presses come isn't known (exponential prior): no chance is soon a certainty. Where it
-        was most likely wiped, the deviation is such that 1.96 of it reach what wasn't, unless that is all but
-        impossible: of two possibilities a normal interval would leave out the second."""
+        How often such presses come isn't known (exponential prior), and in a break there are none: no
+        chance is ever a certainty, and both possibilities stay within 1.96 deviations."""
         back, std = self.compensator.back_n, self.compensator.back_std_n
-        kept = 1 / (1 + silent_s / self._silence_s * back[rows])
-        apart = np.where(kept > _UNLIKELY, np.maximum(kept, (1 - kept) / _WITHIN**2), kept) * (1 - kept)
-        std[rows] = np.sqrt(kept * np.square(std[rows]) + apart * np.square(back[rows]))
+        kept = _LEFT_ALONE + (1 - _LEFT_ALONE) / (1 + silent_s / self._silence_s * back[rows])
+        std[rows] = np.sqrt(kept * (np.square(std[rows]) + (1 - kept) * np.square(back[rows])))
         back[rows] *= kept
 
 
