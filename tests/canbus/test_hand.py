@@ -32,7 +32,7 @@ def eventually(what: Callable[[], bool], seconds: float = 5.0) -> bool:
     ("interface", "channel"),
     [("virtual", "hand"), pytest.param("socketcan", "vcan0", marks=pytest.mark.socketcan)],
 )
-def test_a_hand_boots_within_two_seconds_and_survives_a_reboot(interface: str, channel: str) -> None:
+def test_a_hand_boots_in_two_seconds_of_work_and_survives_a_reboot(interface: str, channel: str) -> None:
     slab = Slab(NODES)
     port = Port.open(Bus(name="palm", interface=interface, channel=channel), slab)
     counts = np.arange(4 * NODES, dtype=np.int16).reshape(NODES, 4)
