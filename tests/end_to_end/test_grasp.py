@@ -32,7 +32,7 @@ def test_a_grasp_is_told_as_mujoco_has_it_on_the_links_and_on_one_ball_in_the_pa
     told: list[wire.Contact] = []
     with grasping.subscribe("contact/*/*") as messages:
         while sum(contact.palm == "valid" for contact in told) < LEAST:
-            message = messages.recv(60)
+            message = messages.recv(120)
             assert message is not None, grasping.all_printed()
             told.append(message)
     assert grasping.end("simulate") == 0, grasping.all_printed()
