@@ -127,3 +127,10 @@ def test_derivatives_are_those_of_the_values() -> None:
     by_x = bank.look_up(sheet, x + step, y)[0] - bank.look_up(sheet, x - step, y)[0]
     by_y = bank.look_up(sheet, x, y + step)[0] - bank.look_up(sheet, x, y - step)[0]
     np.testing.assert_allclose(slopes, np.stack([by_x, by_y], axis=1) / (2 * step), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("off", [1e-7, 1e-6, -2e-6])
+def test_electrodes_that_end_nearly_alike_across_the_sheet_make_no_odd_one(off: float) -> None:
+    """A sliver of an element between two such ends once threw the shares off by a third."""
+    exact, near = Gaps(*[(0.07, 0.069)] * 4), Gaps((0.07, 0.069 + off), *[(0.07, 0.069)] * 3)
+    assert solve(SQUARE, near, 5).conductance == pytest.approx(solve(SQUARE, exact, 5).conductance, rel=1e-4)

@@ -36,6 +36,7 @@ INSET: Final = 0.02
 """Maps are looked up no nearer to a side than this fraction of the pad."""
 
 _LEAST_GAP = 1e-3  # as a fraction of the side: electrodes that met would short the corner
+_SAME_GAP = 1e-5  # electrodes of opposite sides that end so near end alike: no element may be a sliver
 _NEAR_A_SIDE = np.array([INSET, 0.03, 0.045, 0.065, 0.1, 0.16, 0.25, 0.37])
 _BREAKS = np.concatenate([_NEAR_A_SIDE, [0.5], 1 - _NEAR_A_SIDE[::-1]])  # of the tables' elements
 _RADIUS_BREAKS = np.array([INSET, 0.08, 0.35, 0.65, 0.92, 1 - INSET])  # enough for a logarithm
@@ -58,11 +59,11 @@ class Gaps(NamedTuple):
     y0: tuple[float, float]
     yb: tuple[float, float]
 
-    def at_least(self, shape: Shape) -> Gaps:
-        """The same, no gap so small that electrodes would short a corner."""
-        sides = (shape.arc, shape.arc, shape.length_m, shape.length_m)
-        least = [_LEAST_GAP * side for side in sides]
-        return Gaps(*((max(a, d), max(b, d)) for (a, b), d in zip(self, least, strict=True)))
+    def solvable(self, shape: Shape) -> Gaps:
+        """The same, no gap so small that electrodes would short a corner, and no two nearly the same."""
+        x0, xa = _apart(self.x0, self.xa, shape.arc)
+        y0, yb = _apart(self.y0, self.yb, shape.length_m)
+        return Gaps(x0, xa, y0, yb)
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ class _Sheet:
 
     def __init__(self, shape: Shape, gaps: Gaps, degree: int) -> None:
         self._shape = shape
-        bare = gaps.at_least(shape)
+        bare = gaps.solvable(shape)
         s, phi = _axis(shape.length_m, bare[2:], degree), _axis(shape.arc, bare[:2], degree)
         self._s, self._phi = s, phi
         radius = shape.radius(s.at)
@@ -318,6 +319,15 @@ class _Side:
         """Which quadrature points are in the gaps."""
         at = self.line.at
         return np.asarray((at < self.gap[0]) | (at > self.line.nodes[-1] - self.gap[1]))
+
+
+def _apart(
+    one: tuple[float, float], other: tuple[float, float], length: float
+) -> Sequence[tuple[float, float]]:
+    """Gaps along two opposite sides."""
+    first, second = np.maximum([one, other], _LEAST_GAP * length)
+    second = np.where(np.abs(second - first) < _SAME_GAP * length, first, second)
+    return [(float(before), float(after)) for before, after in (first, second)]
 
 
 def _axis(length: float, gaps: Sequence[tuple[float, float]], degree: int) -> Axis:

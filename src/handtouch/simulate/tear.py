@@ -35,7 +35,7 @@ class _Coarse(NamedTuple):
 @lru_cache(maxsize=256)
 def _solve(shape: Shape, gaps: Gaps, cut: Cut | None) -> _Coarse:
     """Conductances (4, 4) [S] and shares (4, n, n) on the table's nodes, for 1 ohm per square."""
-    gaps = gaps.at_least(shape)
+    gaps = gaps.solvable(shape)
     ends_s = [end for a, b in (gaps.y0, gaps.yb) for end in (a, shape.length_m - b)]
     ends_phi = [end for a, b in (gaps.x0, gaps.xa) for end in (a, shape.arc - b)]
     s = Axis.graded(shape.length_m, ends_s, _DEGREE)
