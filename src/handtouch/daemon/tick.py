@@ -446,8 +446,7 @@ class Tick:
         self._behind[pads] = behind
         ahead = currents + (currents - behind) / (_TREND - 1)
         values, off = self.follower.read(pads, ahead)
-        far = off.max(axis=1)
-        if np.count_nonzero(far > _LEAVING):
+        if np.count_nonzero(off > _LEAVING) and np.count_nonzero((far := off.max(axis=1)) > _LEAVING):
             leaving = np.flatnonzero(far > _ALONG)
             self._draw(pads[leaving], ahead[leaving], values[leaving, XY])
 
