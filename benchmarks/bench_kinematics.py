@@ -190,6 +190,7 @@ def main() -> None:
 
 def _page(rows: list[dict[str, Any]], single: dict[str, float]) -> str:
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+    machine += f", load {os.getloadavg()[0]:.0f}"  # others' work cools the caches
     lines = [
         "# What palm and base frame cost the tick",
         "",
