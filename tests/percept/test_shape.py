@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.field import Rectangle
+from handtouch.field import LocatorBank, Rectangle
 from handtouch.percept.ask import expected_bits
 from handtouch.percept.percept import Perceiver
 from handtouch.percept.primitives import CLASSES, SIZES, Verdict, classify
@@ -159,11 +159,12 @@ def test_one_pads_residual_tells_a_point_from_what_is_long(residual: float, labe
 @pytest.mark.parametrize("along_y", [False, True])
 def test_the_distance_of_two_points_follows_from_the_residual(along_y: bool) -> None:
     pad = Rectangle(1.0, 1.0)
+    bank = LocatorBank([pad])
     half = np.array([0.0, 0.05] if along_y else [0.05, 0.0])
     shares = (pad.fractions(np.array(0.5 + s * half[0]), np.array(0.5 + s * half[1])) / 2 for s in (-1, 1))
     pair = np.sum(list(shares), axis=0)
     residual = float(pair[0] + pair[1] - 0.5)  # in the middle a point gives a half
-    distance, std = pair_distance(pad, 0.5, 0.5, residual, abs(residual) / 10)
+    distance, std = pair_distance(bank, 0, 0.5, 0.5, residual, abs(residual) / 10)
     assert distance == pytest.approx(0.1, rel=0.02)
     assert std == pytest.approx(distance / 20)
-    assert math.isinf(pair_distance(pad, 0.5, 0.5, residual, abs(residual))[1])
+    assert math.isinf(pair_distance(bank, 0, 0.5, 0.5, residual, abs(residual))[1])

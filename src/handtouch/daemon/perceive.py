@@ -5,6 +5,7 @@ Public names: `Perceiving`.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -78,7 +79,22 @@ class Perceiving:
         hand_of = np.zeros(self._pipeline.model.size, dtype=np.intp)
         for hand, pads in enumerate(rows):
             hand_of[pads] = hand
-        return made(Stream(len(hand_of), hand_of.tolist()), self._pipeline.cycle.period_ns)
+        return made(Stream(len(hand_of), hand_of.tolist()), self._pipeline.cycle.period_ns, self._pair_m)
+
+    def _pair_m(self, pad: int, residual: float, residual_std: float) -> tuple[float, float]:
+        """`pair_distance` in metres."""
+        from handtouch.percept.shape import pair_distance
+
+        model, (x, y) = self._pipeline.model, self._pipeline.tick.columns.xy[pad].tolist()
+        if not math.isfinite(x + y):
+            return math.nan, math.inf
+        distance, std = pair_distance(model.locator, pad, x, y, residual, residual_std)
+        step = 0.02 * float(model.locator.sides[pad].min())
+        way = step * np.array([0.0, 1.0])
+        xs, ys = x + way * (residual >= 0), y + way * (residual < 0)
+        placed = model.placement.place(np.full(2, pad), xs, ys, np.zeros((2, 2, 2))).position_m
+        scale = float(np.linalg.norm(placed[1] - placed[0])) / step
+        return scale * distance, scale * std
 
     def _sample(self, ticked: Ticked) -> Sample:
         tick, frames = self._pipeline.tick, self._pipeline.frames

@@ -9,21 +9,20 @@ Public names: `Shape`, `point_or_more`, `pair_distance`.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.field.estimate import estimate
-from handtouch.field.model import ForwardModel
-from handtouch.field.residual import point_test
+from handtouch.field.bank import LocatorBank
 from handtouch.percept.ask import Action, Question
 from handtouch.percept.primitives import CLASSES, SIZES, Fit, Prior, Verdict, fitting, judge
 from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns
 
 FloatArray = NDArray[np.float64]
 
+PairDistance = Callable[[int, float, float], tuple[float, float]]
 SPOTS = ("point", "along x", "along y")
 """What one pad's residual tells apart: no more than how far it is longer one way than the other."""
 
@@ -59,26 +58,22 @@ def point_or_more(residual: FloatArray, residual_std: FloatArray) -> dict[str, f
 
 
 def pair_distance(
-    model: ForwardModel, x: float, y: float, residual: float, residual_std: float
+    bank: LocatorBank, pad: int, x: float, y: float, residual: float, residual_std: float
 ) -> tuple[float, float]:
-    """How far apart two equal points about (x, y) would be that leave this residual, and its deviation.
+    """How far apart two equal points about (x, y) on a pad would be that leave this residual; its deviation.
 
-    In the unit of the pad; along x where the residual is above 0, else along y. The least size that explains
-    it. The deviation is infinite where the residual isn't told from 0.
+    In the unit of the pad's rectangle; along x where the residual is above 0, else along y. The least size
+    that explains it. The deviation is infinite where the residual isn't told from 0.
     """
-    angle = 0.0 if residual >= 0 else math.pi / 2
-    half = 0.02 * min(model.a, model.b)
-    dx, dy = half * math.cos(angle), half * math.sin(angle)
-    pair = (
-        model.fractions(np.array(x - dx), np.array(y - dy))
-        + model.fractions(np.array(x + dx), np.array(y + dy))
-    ) / 2
-    noise = np.full(4, 1e-6)
-    test = point_test(
-        model, pair, noise, found=estimate(model, pair, noise, start=(np.array(x), np.array(y)))
-    )
-    known = abs(float(test.score) * float(test.deviation))  # goes as the square of the distance
-    distance = 2 * half * math.sqrt(abs(residual) / known)
+    at, side = np.array([x, y]), bank.sides[pad]
+    axis = 0 if residual >= 0 else 1
+    half = 0.05 * float(min(side.min(), 2 * at[axis], 2 * (side - at)[axis]))
+    xs, ys = at[:, None] + half * np.eye(2)[axis][:, None] * [-1.0, 1.0]
+    pair = bank.fractions(np.full(2, pad), xs, ys).mean(axis=1, keepdims=True)
+    found = bank.estimate(np.array([pad]), pair, 1e-6, start=at[:, None])
+    point = bank.fractions(np.array([pad]), found.x, found.y)
+    known = abs(float((pair - point)[:2].sum()))  # goes as the square of the distance
+    distance = 2 * half * math.sqrt(abs(residual) / max(known, 1e-12))
     sure = abs(residual) > 2 * residual_std
     return distance, distance / 2 * residual_std / abs(residual) if sure else math.inf
 
@@ -109,9 +104,12 @@ class Shape:
 
     kind = "shape"
 
-    def __init__(self, pads: int, prior: Prior | None = None) -> None:
+    def __init__(self, pads: int, prior: Prior | None = None, pair_m: PairDistance | None = None) -> None:
+        """pair_m: of a pad, a residual and its deviation: how far apart two points would be, as
+        `pair_distance`, in metres; left out, no size is told of a spot."""
         self.wanted = np.zeros(pads, dtype=np.bool_)
         self.prior = Prior() if prior is None else prior
+        self._pair_m = pair_m
         self._objects: dict[int, _Object] = {}
         self._kept_m, self._kept_normal = np.full((pads, 3), np.inf), np.zeros((pads, 3))
         self._kept_of = np.zeros(pads, dtype=np.uint32)
@@ -201,10 +199,14 @@ class Shape:
         label = max(chances, key=chances.__getitem__)
         sure = chances[label] >= self.prior.sure
         count = int(known.sum())
-        values = {
+        values: dict[str, float] = {
             "residual": float(residual[known].mean()),
             "residual_std": math.hypot(float(std[known].mean()) / math.sqrt(count), _TOLERANCE),
         }
+        if sure and label != "point" and self._pair_m is not None:
+            distance_m, std_m = self._pair_m(pad, *values.values())
+            if math.isfinite(distance_m + std_m):
+                values |= {"pair_distance_m": distance_m, "pair_distance_m_std": std_m}
         reason = "" if sure else "press for longer, or harder: the residual is within its noise"
         state = "estimated" if sure else "unestimated"
         evidence = {"samples": count}
