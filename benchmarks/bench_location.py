@@ -44,9 +44,6 @@ class Collector:
     def wants(self, topic: str) -> bool:
         return topic.startswith("contact/")
 
-    def next_seq(self, topic: str) -> int:
-        return len(topic)
-
     def send(self, message: wire.Outgoing) -> None:
         if isinstance(message, wire.Contact):
             self.contacts.append(message)
