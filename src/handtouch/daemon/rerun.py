@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -299,15 +299,6 @@ def recorded_deployment(payload: dict[str, Any]) -> Iterator[Deployment]:
                 if table.get(key) == name:
                     table[key] = str(path)
         yield Deployment.model_validate_json(json.dumps(told))
-
-
-def first_deployment(recording: Iterable[Entry]) -> Deployment:
-    """The deployment that a recording begins with. Raises ValueError where there is none."""
-    for entry in recording:
-        if entry.topic == "config":
-            with recorded_deployment(entry.payload) as deployment:
-                return deployment
-    raise ValueError("the recording has no deployment: the daemon was not reached, or is of an older version")
 
 
 def columns_of(payload: dict[str, Any]) -> dict[str, NDArray[Any]]:
