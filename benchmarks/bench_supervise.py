@@ -449,7 +449,7 @@ Errors are against the grip's first seconds, and against the touch before.""",
 with the same grip for ten. Each channel reads 4 counts (rms) more for a unit of gravity along each axis of
 its link.""",
         "Slow presses": "On a pad of the shipped hand, on_n 0.06 N, slow_touch_s 20.",
-        DAY: f"""{supervise_day.PADS} sheets of each kind, {hours:g} h each (seed {", ".join(map(str, SEEDS))}): grips
+        DAY: f"""{supervise_day.PADS} sheets of each kind, {hours:g} h each, seeds {SEEDS}: grips
 of 2 to 40 s, some of minutes, 0.1 to 5 N, half of them waxing and waning; breaks, and a night from hour 16.
 The estimator is told the preset and no more. Truths: the preset with its numbers off by 20 or 50 % (1 sigma);
 or, besides 20 %, creep by a power law (t / 1 s)^{supervise_day.POWER:g} for hours, a Preisach operator with a
