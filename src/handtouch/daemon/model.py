@@ -235,9 +235,11 @@ class PadModel:
         axis."""
         law, (log_layer, alpha, log_sheet) = self._law, self._law_axes
         along = ContactLaw(
-            (law.contact_ohm_m2 * np.exp(log_layer)).ravel(),
-            np.maximum(law.alpha + alpha, _LEAST_ALPHA).ravel(),
-            *(np.tile(column, 3) for column in (law.radius_m, law.radius_std_m, law.reference_pa)),
+            (np.asarray(law.contact_ohm_m2) * np.exp(log_layer)).ravel(),
+            np.maximum(np.asarray(law.alpha) + alpha, _LEAST_ALPHA).ravel(),
+            np.tile(np.asarray(law.radius_m), 3),
+            np.tile(np.asarray(law.radius_std_m), 3),
+            np.tile(np.asarray(law.reference_pa), 3),
         )
         return along, (self._sheet_ohm * np.exp(log_sheet)).ravel()
 
