@@ -295,7 +295,15 @@ def law_of(sheet: config.Sheet) -> Law:
 
 
 def nominal_of(pad: config.Pad, deployment: Deployment) -> str:
-    """Name of the calibration that the deployment file itself is; it changes with the pad's tables."""
-    parts = (pad, deployment.nodes[pad.node], deployment.sheets[pad.sheet])
+    """Name of the calibration that the deployment file itself is; it changes with the pad's tables.
+
+    Not with `serial`: calibrations are bound to that besides, and a unit that took another's place keeps its
+    own when the file is told of it.
+    """
+    parts = (
+        pad.model_copy(update={"serial": None}),
+        deployment.nodes[pad.node],
+        deployment.sheets[pad.sheet],
+    )
     text = "".join(part.model_dump_json() for part in parts)
     return "nominal-" + hashlib.sha256(text.encode()).hexdigest()[:12]
