@@ -43,10 +43,13 @@ from matplotlib import pyplot as plt
 
 ROOT = Path(__file__).parent.parent
 KILLS = 500
-LONGEST_S = 0.25
+MOST_COMMITS = 4
+"""That a process makes before it is killed, at most."""
 SERIALS = (1001, 1002, 1003)
 CONFIG = "nominal-0123456789ab"
-_RECORD = struct.Struct("<II")
+_RECORD = struct.Struct("<BII")
+OPENING, CALIBRATING, STORING, COMMITTED = range(4)
+PHASES = ("opening", "calibrating", "storing", "between")
 
 
 def calibration(serial: int, number: int, estimator: GainEstimator) -> Calibration:
@@ -71,26 +74,55 @@ def mark(serial: int, number: int) -> bytes:
 
 
 def calibrate_and_store(path: Path, pipe: int) -> None:
-    """For ever; every commit is told on the pipe before going on."""
+    """For ever; what is begun and every commit is told on the pipe before going on."""
     with Store(path) as store:
-        os.write(pipe, _RECORD.pack(0, 0))
         estimators = {serial: GainEstimator(Rectangle(1.4, 1.0)) for serial in SERIALS}
         while True:
             for serial, estimator in estimators.items():
                 newest = store.newest(serial)
                 number = 1 if newest is None else newest.number + 1
-                made = store.write(
-                    serial,
-                    CONFIG,
-                    calibration(serial, number, estimator),
-                    Provenance("stress", 32 * number),
-                    datetime.now(UTC),
-                )
-                os.write(pipe, _RECORD.pack(serial, made.number))
+                os.write(pipe, _RECORD.pack(CALIBRATING, serial, number))
+                found = calibration(serial, number, estimator)
+                os.write(pipe, _RECORD.pack(STORING, serial, number))
+                provenance = Provenance("stress", 32 * number)
+                made = store.write(serial, CONFIG, found, provenance, datetime.now(UTC))
+                os.write(pipe, _RECORD.pack(COMMITTED, serial, made.number))
 
 
-def kill_once(path: Path, after_s: float, opened: bool) -> list[tuple[int, int]]:
-    """Start a process, kill it so long after its start, or after it opened the store; what it committed."""
+class Killer:
+    """Chooses instants: after so many steps of the process, and then a part of what such a step takes."""
+
+    def __init__(self) -> None:
+        self._generator = np.random.default_rng(1)
+        self._usual_s = dict.fromkeys(range(4), 0.05)  # of each phase, on this machine, under its load
+        self.phases = dict.fromkeys(PHASES, 0)
+
+    def kill(self, path: Path) -> list[tuple[int, int]]:
+        """Start a process and kill it; what it committed."""
+        steps = 3 * int(self._generator.integers(MOST_COMMITS)) + int(self._generator.integers(3))
+        child, reading = _start(path)
+        told = []
+        for _ in range(steps):
+            begin = time.monotonic()
+            told.append(_RECORD.unpack(os.read(reading, _RECORD.size)))
+            self._saw(told[-2][0] if len(told) > 1 else OPENING, time.monotonic() - begin)
+        last = told[-1][0] if told else OPENING
+        time.sleep(float(self._generator.uniform(0, 1.2 * self._usual_s[last])))
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        if not os.WIFSIGNALED(status):
+            raise RuntimeError(f"the writer ended by itself with status {status}")
+        with os.fdopen(reading, "rb") as pipe:
+            told += _RECORD.iter_unpack(pipe.read())
+        self.phases[PHASES[told[-1][0] if told else OPENING]] += 1
+        return [(serial, number) for phase, serial, number in told if phase == COMMITTED]
+
+    def _saw(self, phase: int, took_s: float) -> None:
+        self._usual_s[phase] += 0.1 * (took_s - self._usual_s[phase])
+
+
+def _start(path: Path) -> tuple[int, int]:
+    """Process number, and where what it tells can be read."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -100,26 +132,19 @@ def kill_once(path: Path, after_s: float, opened: bool) -> list[tuple[int, int]]
         finally:
             os._exit(1)
     os.close(writing)
-    if opened and os.read(reading, _RECORD.size) != _RECORD.pack(0, 0):
-        raise RuntimeError("the writer could not open the store")
-    time.sleep(after_s)
-    os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    if not os.WIFSIGNALED(status):
-        raise RuntimeError(f"the writer ended by itself with status {status}")
-    with os.fdopen(reading, "rb") as pipe:
-        return [record for record in _RECORD.iter_unpack(pipe.read()) if record != (0, 0)]
+    return child, reading
 
 
 def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
     """KILLS times: kill, open, compare all that is there with all that was told."""
-    path, generator = folder / "store.db", np.random.default_rng(1)
+    path, killer = folder / "store.db", Killer()
     told: dict[int, int] = dict.fromkeys(SERIALS, 0)
     counts = dict.fromkeys(("undone", "untold", "lost", "wrong", "unopened"), 0)
     openings = []
     for kill in range(KILLS):
-        after_s = float(generator.uniform(0, LONGEST_S))
-        for serial, number in kill_once(path, after_s, opened=kill % 2 == 1):
+        if kill % 50 == 0:
+            print(f"kill {kill} of {KILLS}", file=sys.stderr)
+        for serial, number in killer.kill(path):
             told[serial] = max(told[serial], number)
         journal = path.with_name("store.db-journal")
         counts["undone"] += journal.exists() and journal.stat().st_size > 0
@@ -145,6 +170,7 @@ def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
                 told[serial] = len(versions)
     row = {
         "kills": KILLS,
+        **{f"while {phase}": count for phase, count in killer.phases.items()},
         "commits": sum(told.values()),
         "interrupted writes undone": counts["undone"],
         "committed but not told yet": counts["untold"],
@@ -248,10 +274,10 @@ def main() -> None:
         killed, openings = kills(folder)
         tables = {
             "Kill -9 while calibrating and storing": (
-                f"A process estimates gains and writes versions of three units without a pause; half "
-                f"of them are killed 0 to {1e3 * LONGEST_S:.0f} ms after their start, half so long after "
-                "they had opened the store. They tell every commit on a pipe. A kill doesn't lose what the "
-                "kernel has; for power loss see `docs/calibrations.md`.",
+                "A process opens the store, estimates gains by contacts and writes versions of three "
+                "units without a pause, and is killed at a random instant of any of that. It tells what it "
+                "begins and every commit on a pipe. A kill doesn't lose what the kernel has; for power loss "
+                "see `docs/calibrations.md`.",
                 [killed],
             ),
             "Journal modes of SQLite": ("500 transactions each, a row of 2 kB.", modes(folder)),
