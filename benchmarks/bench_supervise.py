@@ -293,7 +293,9 @@ CUTS: dict[str, dict[str, Any]] = {
 
 
 def day(preset: str, hours: float, seed: int, changes: dict[str, Any]) -> dict[str, Any]:
-    return supervise_day.day(preset, Behaviour(preset=preset, **changes), hours, seed)  # type: ignore[arg-type]
+    behaviour = Behaviour.model_validate({"preset": preset, **changes})
+    told: dict[str, Any] = supervise_day.day(preset, behaviour, hours, seed)
+    return told
 
 
 def pooled(days: list[dict[str, Any]], part: Callable[[dict[str, Any]], dict[str, float]]) -> dict[str, Any]:

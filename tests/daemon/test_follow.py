@@ -234,7 +234,9 @@ def test_a_force_at_the_end_of_the_range_is_a_value_or_a_bound_and_never_between
 
 
 def test_where_a_contact_is_no_point_its_covariance_holds_the_centre_of_force(bench: Any) -> None:
-    rng, inside, as_a_point = np.random.default_rng(6), [], []
+    rng = np.random.default_rng(6)
+    inside: list[bool] = []
+    as_a_point: list[bool] = []
     model = bench.model
     for _ in range(60):
         middle, apart = rng.uniform(0.3, 0.7, (3, 2)), rng.uniform(0.05, 0.2, (3, 1))

@@ -39,8 +39,8 @@ _TOLERATED = 0.4  # of a tolerance: the bend as a rule where trust ends; off the
 _WIDEST = 0.35  # of `reach`: what a tolerance lets a map span at most
 _FITS = 9.0
 """Squared misfit of a point, of one degree of freedom, that noise explains. What goes beyond widens the
-covariance by as much (Birge, Phys. Rev. 40, 1932): where a contact is no point, or gains are off, currents err
-along the directions that move its place as they do along the one that shows."""
+covariance by as much (Birge, Phys. Rev. 40, 1932): where a contact is no point, or gains are off, currents
+err along the directions that move its place as they do along the one that shows."""
 _LEAST_INFORMATION = 1e-6  # of a place, per squared `reach`
 _VALID, _SATURATED = int(Status.VALID), int(Status.SATURATED)
 
