@@ -176,10 +176,20 @@ def test_joints_that_nobody_told_and_places_that_are_not_known_are_invalid() -> 
     assert touched.step().tell(TIP)["palm"] == "invalid"
 
 
+def test_what_joints_put_into_a_place_is_told_apart_from_the_rest_of_its_covariance() -> None:
+    sure = Touched(TIP, joints=told(100, 0.2)).step()
+    shaky = Touched(TIP, joints=told(100, 0.2, std=2e-3)).step()
+    (_, _, _, none), (placed, _, _, some) = (frames.in_palm(np.array([TIP])) for frames in (sure, shaky))
+    more = np.trace((placed - sure.in_palm(np.array([TIP]))[0])[0, 6:].reshape(3, 3)) / 3
+    assert none[0] == 0.0
+    assert some[0] == pytest.approx(more, rel=1e-6)
+    assert 1e-5 < some[0] ** 0.5 < 1e-3
+
+
 def test_poses_by_commands_are_those_of_joint_states_that_are_alike() -> None:
     touched = Touched(TIP, HEEL, joints=told(100, 0.2))
     frames, rows = touched.step(), np.array([TIP, HEEL])
-    placed, rotation, _ = frames.in_palm(rows)
+    placed, rotation, *_ = frames.in_palm(rows)
     poses = frames.told_poses(rows, 100 * MS, lambda _, t_ns: told(100, 0.2).at(t_ns))
     np.testing.assert_allclose(poses[:, :, :3], rotation, atol=1e-12)
     carried = (poses[:, :, :3] @ touched.columns.position_m[rows][:, :, None])[:, :, 0] + poses[:, :, 3]

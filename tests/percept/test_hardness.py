@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from handtouch.field import Sandwich
 from handtouch.percept.ask import expected_bits
-from handtouch.percept.closing import Commanded, closing_m, opposite
+from handtouch.percept.closing import Commanded, closing_m, held, opposite, sways_m
 from handtouch.percept.hardness import Hardness
 from handtouch.percept.percept import Perceiver
 from handtouch.percept.stiffness import stiffness, stiffness_from_area
@@ -162,6 +162,60 @@ def test_a_part_of_perception_tells_stiffness_and_its_label(k: float, label: str
     assert by == "joints"
     assert np.ptp(depth) == pytest.approx(3 / k, abs=8 * NOISE_M)
     assert last.values["depth_by"] == "joints"
+
+
+def test_a_force_that_all_samples_have_wrong_alike_is_no_estimate() -> None:
+    """An interval over decades is none, whatever makes it so wide."""
+    force, depth, _ = squeeze(3e3, 1.0, 3)
+    known = stiffness(force, depth, 0.1 * force)
+    vague = stiffness(force, depth, 1.0 * force)
+    assert known.state == "estimated"
+    assert vague.state == "unestimated"
+    assert "isn't known well enough" in vague.reason
+    assert vague.low_n_per_m < 3e3 < vague.high_n_per_m
+
+
+def pressed_by_three(third: str, seed: int = 1) -> tuple[Percept, float]:
+    """Two pads squeeze 2 kN/m between them, the second one a little aslant, a third pad touches: what is told
+    of the first pad last, and how far the thing may have swayed [m]. third: rests, pushes, or alone (the
+    second isn't there)."""
+    pads = np.array([0, 2]) if third == "alone" else np.arange(3)
+    stream, part = Stream(3), Hardness(3)
+    perceiver = Perceiver(stream, [part])
+    perceiver.want(np.ones((len(KINDS), 3), np.bool_), np.zeros(3, np.bool_))
+    force, depth, _ = squeeze(2e3, 1.0, seed)
+    slope = np.array([math.sin(0.2), 0.0, -math.cos(0.2)])
+    normals, places = (
+        np.array([[0, 0, 1.0], slope, [1.0, 0, 0]]),
+        0.03 * np.array([[0, 0, -1], [0, 0, 1], [-1, 0, 0]]),
+    )
+    told: list[Percept] = []
+    for i in range(N):
+        ways = np.array([depth[i] / 2, depth[i] / 2, 4e-3 * i / N if third == "pushes" else 0.0])
+        sample = Sample(pads, np.full(len(pads), i * 5_000_000), np.full(len(pads), 7, np.uint32))
+        sample["force_n"] = np.full(len(pads), force[i])
+        sample["force_std_n"] = np.full(len(pads), 0.02 * force[i])
+        sample["palm_position_m"] = (places + ways[:, None] * normals)[pads]
+        sample["palm_normal"], sample["position_m"] = normals[pads], np.zeros((len(pads), 3))
+        sample["palm_rotation"] = np.tile(np.eye(3), (len(pads), 1, 1))
+        told += perceiver.step(sample, np.zeros(0, np.intp), i * 5_000_000)[0]
+    sways = sways_m(stream.window(0), opposite(stream, 0), held(stream, 0))
+    return [percept for percept in told if (percept.kind, percept.pad) == ("hardness", 0)][-1], sways
+
+
+def test_other_fingers_that_move_what_is_held_leave_its_stiffness_open() -> None:
+    rests, little = pressed_by_three("rests")
+    pushed, much = pressed_by_three("pushes")
+    alone, all_of_it = pressed_by_three("alone")
+    assert 0 < little < 0.25 * much
+    assert rests.state == "estimated"
+    assert rests.values["low_n_per_m"] < 2e3 < rests.values["high_n_per_m"]  # type: ignore[operator]
+    ends = [np.array([p.values[f"{end}_n_per_m"] for end in ("low", "high")]) for p in (rests, pushed, alone)]
+    wide = [float(high / low) for low, high in ends]
+    assert wide[0] < wide[1] < wide[2]
+    assert math.isinf(all_of_it)
+    assert (alone.state, alone.label) == ("unestimated", "")
+    assert "other fingers" in alone.reason
 
 
 def test_without_joints_it_says_so_and_asks_for_nothing_that_would_not_help() -> None:

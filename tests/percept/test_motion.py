@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -21,7 +22,9 @@ Way = Callable[[float], float]
 class Held:
     """Contacts at places on pads, moved along x, on links that move in the palm."""
 
-    def __init__(self, pads: int = 1, seed: int = 1) -> None:
+    def __init__(self, pads: int = 1, seed: int = 1, joints_m: float = 0.0) -> None:
+        """joints_m: deviation that joints put into places in the palm, as they tell."""
+        self._joints_m = joints_m
         self.stream = Stream(pads)
         self.motion = Motion(self.stream, PERIOD_NS)
         self.perceiver = Perceiver(self.stream, [self.motion])
@@ -58,6 +61,7 @@ class Held:
                 sample["palm_position_m"] = on_link + link
                 sample["palm_normal"] = np.tile([0.0, 0.0, 1.0], (len(pads), 1))
                 sample["palm_rotation"] = np.tile(np.eye(3), (len(pads), 1, 1))
+                sample["palm_joints_m2"] = np.full(len(pads), self._joints_m**2)
             found, asks = self.perceiver.step(sample, np.zeros(0, np.intp), int(t_ns[0]))
             told += [percept for percept in found if percept.pad == 0]
             self.asks += [ask.action.do for ask in asks]
@@ -153,6 +157,44 @@ def test_joints_tell_rolling_from_sliding() -> None:
 def test_a_hand_that_carries_the_object_along_does_not_slide() -> None:
     carried = Held(3).feel(1.5, still, links_m=[ramp(1.0, 30e-3)] * 3)
     assert {percept.label for percept in carried} == {"sticking"}
+
+
+@pytest.mark.parametrize("joints_m", [0.2e-3, 0.0])
+def test_noise_of_encoders_is_no_sliding_where_joints_tell_it(joints_m: float) -> None:
+    """Each sample's angles put a fingertip 0.2 mm off: 6 mm/s over 50 ms, that nothing moves with."""
+    rng = np.random.default_rng(8)
+    shaken = [lambda _: float(0.2e-3 * rng.standard_normal())] * 4
+    labels = {percept.label for percept in Held(4, joints_m=joints_m).feel(2.0, still, links_m=shaken)}
+    assert ("sliding" in labels) == (joints_m == 0.0)  # taken for as good as none, it is one
+
+
+def test_a_thing_that_is_dragged_under_still_centroids_slides_in_spite_of_that_noise() -> None:
+    rng = np.random.default_rng(9)
+
+    def noise(_: float) -> float:
+        return float(0.2e-3 * rng.standard_normal())
+
+    pulled = ramp(1.0, -100e-3)
+    links = [lambda t_s: pulled(t_s) + noise(t_s), *[noise] * 4]
+    told = Held(5, joints_m=0.2e-3).feel(1.3, still, links_m=links)
+    first = next(percept for percept in told if percept.label == "sliding")
+    assert 1.0 < (first.t_ns - 10**9) * 1e-9 < 1.15
+
+
+def test_evidence_about_the_threshold_does_not_chatter() -> None:
+    """R that goes up and down about even odds, a few samples each: one alarm, until it is gone for long."""
+    held = Held()
+    held.feel(1.0, still)
+    motion, pad, one = held.motion, np.array([0]), np.array([PERIOD_NS * 1e-9])
+    even = -math.log(0.05 * PERIOD_NS * 1e-9)
+    alarms, before = 0, False
+    for k in range(200):
+        motion.test.log_odds[0] = even + (0.8 if k % 6 < 3 else -1.5 if k < 100 else -9.0) if k < 106 else 0.0
+        motion._weigh(pad, one)
+        now = bool(motion._look(pad)[0] == CLASSES.index("incipient"))
+        alarms, before = alarms + (now and not before), now
+    assert alarms == 1
+    assert not before
 
 
 def test_a_single_contact_is_against_an_object_that_stands_still() -> None:

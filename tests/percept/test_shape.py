@@ -80,6 +80,20 @@ def test_a_shape_that_is_none_of_them_is_none() -> None:
     assert (found.state, found.label) == ("invalid", "")
 
 
+@pytest.mark.parametrize("kind", ["cylinder", "sphere"])
+def test_an_object_that_moves_a_little_between_touches_keeps_its_class_and_says_so(kind: str) -> None:
+    for seed in range(4):
+        points, normals, covariances = touches(kind, 20, seed)
+        rests = classify(points, normals, covariances)
+        points = points + np.random.default_rng(seed).normal(0.0, 2e-3, (20, 3))
+        moved = classify(points, normals, covariances)
+        assert (rests.state, rests.label, rests.moves) == ("estimated", kind, False)
+        assert (moved.state, moved.label, moved.moves) == ("estimated", kind, True)
+        fits = rests.fits[kind], moved.fits[kind]
+        assert abs(fits[1].radius_m - 0.02) < 3 * fits[1].radius_std_m
+        assert fits[1].radius_std_m > fits[0].radius_std_m
+
+
 def test_where_the_object_lies_makes_no_difference() -> None:
     points, normals, covariances = touches("cylinder", 12, 6)
     turn, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))

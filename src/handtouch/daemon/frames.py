@@ -51,6 +51,7 @@ class Frames:
         """Placing"""
         self.base = np.zeros(n, dtype=np.uint8)
         self._rotation = np.full((n, 3, 3), np.nan)  # of the link in the palm
+        self._joints_m2 = np.zeros(n)  # what joints add to the covariance in the palm, one way in the mean
         self._values = np.full((n, _VALUES), np.nan)  # position, normal, covariance in palm; in base; age
         self._wants_palm, self._wants_base, self._wants = (np.zeros(n, dtype=np.bool_) for _ in range(3))
         self._robots = robots
@@ -104,10 +105,12 @@ class Frames:
             kinematics.move(position)
             kinematics.in_palm(0)
 
-    def in_palm(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def in_palm(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Place, normal and covariance (k, 15) of contacts in the palm, rotations (k, 3, 3) of their links
-        in it, and ages (k,) of joints; NaN where they aren't valid."""
-        return self._values[rows, _PALM], self._rotation[rows], self._values[rows, _AGE]
+        in it, ages (k,) of joints; NaN where they aren't valid. And the variance (k,) [m^2], one way in the
+        mean, that the joints' deviations put into the place; 0 where none are told or stated."""
+        values = self._values[rows]
+        return values[:, _PALM], self._rotation[rows], values[:, _AGE], self._joints_m2[rows]
 
     def told_poses(
         self, rows: IntArray, t_ns: int, joints_at: Callable[[str, int], Joints | None]
@@ -219,11 +222,12 @@ class Frames:
             age_s = np.where(needs[links], joints.age_s, 0.0).max(axis=1, initial=0.0)
             rotation, placed = _carry([pose(link) for link in links.tolist()], *on_link)
             if at == _PALM:
-                self._rotation[rows] = rotation
+                self._rotation[rows], self._joints_m2[rows] = rotation, 0.0
             if np.count_nonzero(joint_std):
-                placed[:, _TOLD["covariance_m2"]] += _of_joints(
-                    kinematics, links, joint_std, on_link[0], at == _BASE
-                )
+                of_joints = _of_joints(kinematics, links, joint_std, on_link[0], at == _BASE)
+                placed[:, _TOLD["covariance_m2"]] += of_joints
+                if at == _PALM:
+                    self._joints_m2[rows] = of_joints[:, ::4].mean(axis=1)
             stale = age_s > self._robots.stale_s[number]
             lost = ~np.isfinite(placed[:, 0]) | ~np.isfinite(age_s)
             state[rows] = np.where(lost, _INVALID, np.where(stale, _STALE, _VALID))

@@ -111,10 +111,10 @@ class Perceiving:
             sample[name] = getattr(columns, name)[rows]
         sample["pad_noise_m2"] = tick.place_noise(rows)
         if frames.wanted:
-            placed, rotation, age_s = frames.in_palm(rows)
+            placed, rotation, age_s, joints_m2 = frames.in_palm(rows)
             sample["palm_position_m"], sample["palm_normal"] = placed[:, :3], placed[:, 3:6]
             sample["palm_covariance_m2"], sample["palm_rotation"] = placed[:, 6:], rotation
-            sample["joints_age_s"] = age_s
+            sample["joints_age_s"], sample["palm_joints_m2"] = age_s, joints_m2
         self._follow_commands(sample, ticked.t_ns)
         return sample
 

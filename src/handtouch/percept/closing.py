@@ -1,10 +1,11 @@
 """How far a hand closes on what it presses: by joint states, or as it was told to.
 
-Public names: `closing_m`, `opposite`, `Commanded`.
+Public names: `closing_m`, `sways_m`, `opposite`, `held`, `Commanded`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,6 +40,41 @@ def closing_m(window: Window, others: Sequence[Window] = ()) -> tuple[FloatArray
     return np.full(len(window), np.nan), ""
 
 
+def sways_m(window: Window, opposed: Sequence[Window], others: Sequence[Window]) -> float:
+    """How far an object that goes along with the other contacts of the hand may have gone [m], 1 sigma, of
+    which `closing_m` knows nothing.
+
+    0 where nothing else touches; infinite where something does and nothing presses from the other side. Else
+    it is taken to move as far as the farthest of `others` at most. Of that, two pads that face each other see
+    what normals that aren't quite opposite leave, and of its turns what places that aren't do.
+    """
+    normal = _by_joints(window)[1]
+    if not others or not np.isfinite(normal).all():
+        return 0.0
+    if not opposed:
+        return math.inf
+    apart = _points(window)[-1] - _points(opposed[0])[-1]
+    turns = float(np.linalg.norm(np.cross(apart, normal))) / max(float(np.linalg.norm(apart)), 1e-6)
+    left = float(np.linalg.norm(normal + _by_joints(opposed[0])[1])) + turns
+    left = left if math.isfinite(left) else 1.0
+    ways = []
+    for other in others:
+        during = other.t_ns >= window.t_ns[0]
+        point = _points(other)[during]
+        point = point[np.isfinite(point).all(axis=1)]
+        if len(point):
+            low, high = np.percentile(point, [5, 95], axis=0)  # a range of noise grows with the samples
+            ways.append(float(np.linalg.norm(high - low)))
+    return min(left, 1.0) / 2 * max(ways, default=0.0)
+
+
+def held(stream: Stream, pad: int) -> list[Window]:
+    """The other contacts of the same hand."""
+    near = (stream.hand_of == stream.hand_of[pad]) & (stream.contact > 0) & (stream.count > 1)
+    near[pad] = False
+    return [stream.window(other) for other in np.flatnonzero(near).tolist()]
+
+
 def opposite(stream: Stream, pad: int) -> list[Window]:
     """The contact of the same hand that presses most from the other side, if any does."""
     near = np.flatnonzero((stream.hand_of == stream.hand_of[pad]) & (stream.contact > 0) & (stream.count > 1))
@@ -52,15 +88,23 @@ def opposite(stream: Stream, pad: int) -> list[Window]:
 
 def _by_joints(window: Window) -> tuple[FloatArray, FloatArray]:
     """Way of a link's point along the mean normal (k,), and that normal."""
-    rotation, place, on_link = window["palm_rotation"], window["palm_position_m"], window["position_m"]
-    known = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(on_link).all(axis=1))
+    point = _points(window)
+    known = np.flatnonzero(np.isfinite(point).all(axis=1))
     if not len(known):
         return np.full(len(window), np.nan), np.full(3, np.nan)
-    offset = on_link - on_link[known].mean(axis=0)
-    point = place - (rotation @ offset[:, :, None])[:, :, 0]
     normal = window["palm_normal"][known].mean(axis=0)
     normal = normal / np.linalg.norm(normal)
     return np.asarray((point - point[known[-1]]) @ normal), normal
+
+
+def _points(window: Window) -> FloatArray:
+    """Where in the palm (k, 3) the point of the link was that is touched in the mean; NaN where unknown."""
+    rotation, place, on_link = window["palm_rotation"], window["palm_position_m"], window["position_m"]
+    known = np.isfinite(place).all(axis=1) & np.isfinite(on_link).all(axis=1)
+    if not known.any():
+        return np.full(place.shape, np.nan)
+    offset = on_link - on_link[known].mean(axis=0)
+    return np.asarray(place - (rotation @ offset[:, :, None])[:, :, 0])
 
 
 def _by_command(window: Window) -> tuple[FloatArray, FloatArray]:

@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.percept.ask import Action, Question
-from handtouch.percept.closing import closing_m, opposite
+from handtouch.percept.closing import closing_m, held, opposite, sways_m
 from handtouch.percept.stiffness import BOUNDS_N_PER_M, CLASSES, RANGE_N_PER_M, Stiffness, stiffness
-from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns
+from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns, Window
 
 FloatArray = NDArray[np.float64]
 
 _LEAST_SAMPLES = 16
 _AGAIN_NS = 100_000_000
 _SQUEEZE_N = 1.0
+_SWAYS = 0.75  # share of the depth: more isn't mended by squeezing
+_NOTHING = 2.0  # so large a share leaves nothing known
 
 
 class Hardness:
@@ -50,9 +53,10 @@ class Hardness:
         self._turns.took(pad, t_ns)
         contact, hand = int(stream.contact[pad]), int(stream.hand_of[pad])
         window = stream.window(pad)
-        depth, by = closing_m(window, opposite(stream, pad))
+        opposed = opposite(stream, pad)
+        depth, by = closing_m(window, opposed)
         if by:
-            found = stiffness(window["force_n"], depth, window["force_std_n"], **self._skin)
+            found = self._squeeze(window, depth, sways_m(window, opposed, held(stream, pad)))
         else:
             reason = "no joint states, no commands, and one sheet can't tell area from force"
             found = Stiffness("unestimated", reason)
@@ -62,6 +66,15 @@ class Hardness:
         self._best[pad] = contact, hand, found, by
         modelled = bool(np.isfinite(window["raw_force_n"]).any())
         return [_told(found, hand, pad, contact, t_ns, modelled, by)]
+
+    def _squeeze(self, window: Window, depth: FloatArray, sways: float) -> Stiffness:
+        """Fit; what may be the object's own way is no depth that is known."""
+        share = min(sways / max(float(np.ptp(depth[np.isfinite(depth)])), 1e-6), _NOTHING)
+        found = stiffness(window["force_n"], depth, window["force_std_n"], moves=share, **self._skin)
+        if found.samples and share > _SWAYS:
+            reason = "other fingers move what is held: how far this one goes in isn't known"
+            return replace(found, state="unestimated", reason=reason)
+        return found
 
     def end(self, stream: Stream, pads: IntArray, t_ns: int) -> Sequence[Percept]:
         """A last look at squeezes that no fit has seen to their end."""

@@ -30,6 +30,7 @@ FALSE_ALARM_S = 600.0
 _HAZARD_HZ = 0.05  # slips of a contact per second, before anything is known
 _UNLOADING = 5.0  # times that, while its force falls as fast as it ever does
 _ROLLS = 0.2  # share of running centroids that roll, where joints don't tell
+_OPEN_S = 0.05  # in which evidence of a slip that goes on no longer falls by a factor e
 _DOUBT = math.log(0.25)  # ln of the odds of a slip from which on it is worth asking
 _HOLD_S = 0.5
 _FIRM = 10.0  # times the current at which a contact begins
@@ -69,6 +70,7 @@ class Motion:
         self._slips = np.zeros(n, dtype=np.int64)  # of the contact so far
         self._scale_a, self._peak_a = np.zeros((2, n))
         self._in_doubt = np.zeros(n, dtype=np.bool_)
+        self._odds = np.full(n, -np.inf)
         self._contact = np.zeros((n, 2), dtype=np.int64)  # hand and id
 
     def step(self, stream: Stream, sample: Sample, began: IntArray) -> Sequence[Percept]:
@@ -94,6 +96,7 @@ class Motion:
             alarm = self.test.step(pads, dt_s[go], place[go], variance[go], press[go])
             self._start(pads[alarm & ~self.running[pads]], stream)
             self._settle(pads, dt_s[go], place[go], press[go])
+        self._weigh(sample.pads, dt_s)
         looks = self._look(sample.pads)
         rows = self._to_tell(sample, looks)
         if not len(rows):
@@ -166,6 +169,7 @@ class Motion:
         self._label[pads] = self._looks[pads] = -1
         self.running[pads] = self._in_doubt[pads] = False
         self._slips[pads] = 0
+        self._odds[pads] = -np.inf
 
     def _follow(
         self, pads: IntArray, dt_s: FloatArray, place: FloatArray, variance: FloatArray, force: FloatArray
@@ -217,11 +221,12 @@ class Motion:
         rests = self.running[pads] & (self._quiet_s[pads] > _RUNS_S)
         if np.count_nonzero(rests):
             self.running[pads[rests]] = False
+            self._odds[pads[rests]] = -np.inf
             self.test.begin(pads[rests], place[rests], press[rests], keep=True)
 
     def _look(self, pads: IntArray) -> NDArray[np.intp]:
         """The most probable class (k,) at a first look: without joints, and quick."""
-        odds, runs = self._slip_odds(pads), self.running[pads]
+        odds, runs = self._odds[pads], self.running[pads]
         self._in_doubt[pads] = (odds > _DOUBT) & ~runs
         looks = np.where(runs, 2, np.where(odds > 0, 1, 0))
         return np.where(self._ahead(pads) < 0, 4, looks)
@@ -250,16 +255,18 @@ class Motion:
         hand, contact = self._contact[pad].tolist()
         return Question("sliding", hand, pad, contact, {"sticks": 1 - slips, "slides": slips}, [hold])
 
-    def _slip_odds(self, pads: IntArray) -> FloatArray:
-        """ln of the odds (k,) of having begun to run: R, by how often contacts slip at such forces."""
+    def _weigh(self, pads: IntArray, dt_s: FloatArray) -> None:
+        """ln of the odds of having begun to run: R, by how often contacts slip at such forces. What a moment
+        ago looked like a slip is still open, or a contact near the threshold would chatter."""
         falls = np.maximum(-self._rate[pads], 0.0) / np.maximum(3 * self._rate_std[pads], 1e-9)
         hazard = _HAZARD_HZ * (1 + (_UNLOADING - 1) * np.minimum(falls, 1.0)) * self.test.period_s
-        return np.asarray(self.test.log_odds[pads] + np.log(hazard))
+        odds = self.test.log_odds[pads] + np.log(hazard)
+        self._odds[pads] = np.fmax(odds, self._odds[pads] - dt_s / _OPEN_S)
 
     def _slip_probability(self, pad: int) -> float:
         if self.running[pad]:
             return 1.0
-        odds = float(self._slip_odds(np.array([pad]))[0])
+        odds = float(self._odds[pad])
         return 1 / (1 + math.exp(min(max(-odds, -50.0), 50.0)))
 
     def _ahead(self, pads: IntArray) -> FloatArray:

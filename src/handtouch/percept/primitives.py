@@ -6,14 +6,15 @@ Laplace (D. MacKay, Information Theory, 2003, ch. 27), which charges for every p
 in `Prior`. Where along a surface it is touched is taken as given, and so is that touches lie in a row: that
 alone makes no edge, only normals that turn about the row do.
 
-Public names: `classify`, `fit`, `fitting` (a fit in pieces), `judge`, `Fit`, `Verdict`, `Prior`, `CLASSES`.
+Public names: `classify`, `fit`, `classifying` and `fitting` (the same in pieces), `judge`, `Fit`, `Verdict`,
+`Prior`, `CLASSES`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,7 +41,8 @@ class Prior:
     radius_log_std: median, and deviation of the logarithm of what a radius has above the least. reach_m: how
     far off the contacts' middle a centre or an axis may be (1 sigma). surface_std_m: how far a contact is off
     the surface (skin gives way), on top of its covariance. normal_std_rad: how far its normal is from the
-    surface's, each way. sure: probability from which a class counts as known.
+    surface's, each way. sure: probability from which a class counts as known. moves_m, turns_rad: both
+    deviations where an object is handled, which doesn't quite rest between touches; see `freely`.
     """
 
     classes: tuple[float, float, float, float] = (0.25, 0.25, 0.25, 0.25)
@@ -51,6 +53,12 @@ class Prior:
     surface_std_m: float = 0.5e-3
     normal_std_rad: float = 0.1
     sure: float = 0.9
+    moves_m: float = 2e-3
+    turns_rad: float = 0.2
+
+    def freely(self) -> Prior:
+        """The same for an object that moves a little between touches."""
+        return replace(self, surface_std_m=self.moves_m, normal_std_rad=self.turns_rad)
 
 
 @dataclass(frozen=True)
@@ -83,7 +91,8 @@ class Fit:
 
 @dataclass(frozen=True)
 class Verdict:
-    """`label` where one class is sure; probabilities and fits by class. state and reason as of a percept."""
+    """`label` where one class is sure; probabilities and fits by class. state and reason as of a percept.
+    moves: whether it only fits if the object moved a little between touches."""
 
     state: str
     label: str
@@ -91,6 +100,7 @@ class Verdict:
     contacts: int
     probabilities: dict[str, float] = field(default_factory=dict)
     fits: dict[str, Fit] = field(default_factory=dict)
+    moves: bool = False
 
 
 def classify(
@@ -105,10 +115,37 @@ def classify(
     All in one frame in which the object rests. Every row should be a touch of its own: a contact that rests
     tells the same thing each time. Raises ValueError for shapes that don't fit, or what isn't finite.
     """
+    steps = classifying(points_m, normals, covariances_m2, prior, classes)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            found: Verdict = done.value
+            return found
+
+
+def classifying(
+    points_m: FloatArray,
+    normals: FloatArray,
+    covariances_m2: FloatArray,
+    prior: Prior | None = None,
+    classes: Iterable[str] = CLASSES,
+) -> Generator[None, None, Verdict]:
+    """`classify` in small pieces, for who has little time at once.
+
+    Where no class fits an object at rest, one that moves a little between touches is tried: sizes are then
+    less sure, and the verdict says so.
+    """
     prior = Prior() if prior is None else prior
     check(points_m, normals, covariances_m2)
-    fits = {name: fit(name, points_m, normals, covariances_m2, prior) for name in classes}
-    return judge(fits, len(points_m), prior)
+    for moves, one in ((False, prior), (True, prior.freely())):
+        fits: dict[str, Fit] = {}
+        for name in classes:
+            fits[name] = yield from fitting(name, points_m, normals, covariances_m2, one)
+        verdict = replace(judge(fits, len(points_m), one), moves=moves)
+        if verdict.state != "invalid":
+            break
+    return verdict
 
 
 def judge(fits: dict[str, Fit], contacts: int, prior: Prior) -> Verdict:

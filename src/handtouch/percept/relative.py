@@ -16,9 +16,10 @@ from handtouch.percept.stream import IntArray, Stream
 
 FloatArray = NDArray[np.float64]
 _OVER_S = 0.05  # that velocities are taken over
-_LINK_STD = 1e-3  # of the velocity of a link's material, from encoders and what links give [m/s]
+_LINK_STD = 1e-3  # of the velocity of a link's material, from what links give [m/s]
 _TURNS, _MOVES = 3.0, 0.3  # prior of an object's motion in the palm: rad/s, m/s
 _SLIDES = 0.02  # prior of relative speeds, when surfaces slide [m/s]
+_SLIDES_ODDS = math.log(4.0)  # ln of the prior odds of sliding, not rolling, of a centroid that runs
 _SURE_ODDS = -9.0  # ln of the prior odds of sliding where the centroid stands still on the pad
 
 
@@ -49,12 +50,13 @@ class Relative:
 
 class Materials(NamedTuple):
     """Of the links under all contacts of which the palm and joints tell: `pads` (k,), and in the palm's frame
-    places, outward normals, and velocities of the links' material (k, 3)."""
+    places, outward normals, and velocities of the links' material (k, 3); `std` (k,) of each way of these."""
 
     pads: IntArray
     place: FloatArray
     normal: FloatArray
     velocity: FloatArray
+    std: FloatArray
 
     @classmethod
     def of(cls, stream: Stream, t_ns: int, period_s: float) -> Materials:
@@ -70,8 +72,10 @@ class Materials(NamedTuple):
         )
         moved = palm - was - (rotation @ (link - was_on_link)[:, :, None])[:, :, 0]
         known = np.isfinite(moved).all(axis=1) & (t_ns - now_ns <= _OVER_S * 1e9) & (now_ns > then_ns)
-        velocity = moved[known] / ((now_ns - then_ns)[known, None] * 1e-9)
-        return cls(pads[known], palm[known], normal[known], velocity)
+        over_s = (now_ns - then_ns)[known] * 1e-9
+        noise = sum(stream.latest(pads[known], "palm_joints_m2", b) for b in (0, back[known]))
+        std = np.hypot(_LINK_STD, np.sqrt(np.nan_to_num(noise)) / over_s)  # as if fresh with every sample
+        return cls(pads[known], palm[known], normal[known], moved[known] / over_s[:, None], std)
 
 
 def relative_to_object(
@@ -84,17 +88,19 @@ def relative_to_object(
     own = np.flatnonzero(materials.pads == pad)
     if not len(own):
         return None
-    place, normal, velocity = (column[own[0]] for column in materials[1:])
+    place, normal, velocity, own_std = (column[own[0]] for column in materials[1:])
     pads = materials.pads
     holds = (hand_of[pads] == hand_of[pad]) & ~running[pads] & (pads != pad)
     others = int(np.count_nonzero(holds))
     moves, variance = np.zeros(3), 0.0
     if others:
-        moves, covariance = _rigid(materials.place[holds] - place, materials.velocity[holds])
+        moves, covariance = _rigid(
+            materials.place[holds] - place, materials.velocity[holds], materials.std[holds]
+        )
         variance = float(np.trace(covariance) - normal @ covariance @ normal) / 2
     against = velocity - moves
     against -= normal * (normal @ against)
-    std = math.sqrt(_LINK_STD**2 + variance)
+    std = math.sqrt(own_std**2 + variance)
     wide = std**2 + _SLIDES**2
     log_ratio = 0.5 * float(against @ against) * (1 / std**2 - 1 / wide) - math.log(wide / std**2)
     return Relative(
@@ -102,22 +108,23 @@ def relative_to_object(
         std,
         "grasp" if others else "static",
         others,
-        _sigmoid(log_ratio),
+        _sigmoid(log_ratio + _SLIDES_ODDS),
         _sigmoid(log_ratio + _SURE_ODDS) if others else 0.0,
     )
 
 
-def _rigid(offset: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Velocity (3,) and covariance (3, 3) at a place of the body that moves as material (k, 3) at offsets."""
+def _rigid(offset: FloatArray, velocity: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Velocity (3,) and covariance (3, 3) at a place of the body that moves as material (k, 3) at offsets,
+    known within `std` (k,)."""
     x, y, z = offset.T
     rows = np.zeros((len(offset), 3, 6))
     rows[:, [0, 1, 2], [0, 1, 2]] = 1.0  # v + omega x offset
     rows[:, 0, 4], rows[:, 0, 5], rows[:, 1, 3] = z, -y, -z
     rows[:, 1, 5], rows[:, 2, 3], rows[:, 2, 4] = x, y, -x
-    flat = rows.reshape(-1, 6)
-    precision = np.diag([1 / _MOVES**2] * 3 + [1 / _TURNS**2] * 3) + flat.T @ flat / _LINK_STD**2
+    flat, weight = rows.reshape(-1, 6), np.repeat(std**-2, 3)
+    precision = np.diag([1 / _MOVES**2] * 3 + [1 / _TURNS**2] * 3) + (flat.T * weight) @ flat
     covariance = np.asarray(np.linalg.inv(precision), dtype=np.float64)
-    return (covariance @ (flat.T @ velocity.ravel() / _LINK_STD**2))[:3], covariance[:3, :3]
+    return (covariance @ ((flat.T * weight) @ velocity.ravel()))[:3], covariance[:3, :3]
 
 
 def _sigmoid(log_odds: float) -> float:

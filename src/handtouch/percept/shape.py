@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from handtouch.field.bank import LocatorBank
 from handtouch.percept.ask import Action, Question
-from handtouch.percept.primitives import CLASSES, SIZES, Fit, Prior, Verdict, fitting, judge
+from handtouch.percept.primitives import CLASSES, SIZES, Prior, Verdict, classifying
 from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns
 
 FloatArray = NDArray[np.float64]
@@ -182,10 +182,7 @@ class Shape:
 
     def _classifying(self, touched: _Object) -> Generator[None, None, Verdict]:
         rows = np.array(touched.points), np.array(touched.normals), np.array(touched.covariances)
-        fits: dict[str, Fit] = {}
-        for name in CLASSES:
-            fits[name] = yield from fitting(name, *rows, self.prior)
-        return judge(fits, len(rows[0]), self.prior)
+        return (yield from classifying(*rows, self.prior))
 
     def _spot(self, stream: Stream, pad: int, t_ns: int) -> Sequence[Percept]:
         window = stream.window(pad, _SPOT_SAMPLES)
@@ -249,6 +246,7 @@ def _told(verdict: Verdict, hand: int, t_ns: int, pads: int) -> Percept:
             "point_m": found.point.tolist(),
             "covariance": found.covariance.ravel().tolist(),
             "covariance_of": " ".join(found.names),
+            "object": "moves" if verdict.moves else "rests",
         }
         if verdict.label != "sphere":
             values["direction"] = found.direction.tolist()

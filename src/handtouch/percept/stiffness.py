@@ -35,6 +35,7 @@ _LEAST_SHARE = 0.3  # of the force, that has to be rise: less tells nothing that
 _PARTS = 6
 _LOW = 0.08  # of the greatest force: below, roots are mostly noise
 _VAGUE = math.log(4.0)  # from one end of the 95 % interval to the other: wider is no estimate
+_UNKNOWN = math.log(20.0)  # the same by what all samples share, which no longer squeeze makes less
 _Z = 1.96
 _GRID = np.linspace(-1.0, 1.0, 41)
 _REACH = np.geomspace(1e-5, math.log(RANGE_N_PER_M[1] / RANGE_N_PER_M[0]), 48)
@@ -74,14 +75,15 @@ def stiffness(
     *,
     skin_m_per_n: float = 0.0,
     skin_std_m_per_n: float = 0.0,
+    moves: float = 0.0,
 ) -> Stiffness:
     """Stiffness of what a squeeze (n,) pressed: forces, and depths that grow as the hand closes, in order.
 
     depth_m: from joints, or as commanded; where it is 0 doesn't matter. force_std_n: () or (n,) of forces,
     taken for what all share, as a wrong contact radius; what each sample has by itself is told from the
     scatter. depth_std_m: noise of depths, None: told from the samples, as if it were white. skin_m_per_n:
-    compliance of the pad's own skin, with its deviation: it is taken out. Raises ValueError unless shapes
-    fit.
+    compliance of the pad's own skin, with its deviation: it is taken out. moves: which share of the depth may
+    be the object's own way instead (1 sigma). Raises ValueError unless shapes fit.
     """
     force, depth = np.asarray(force_n, np.float64), np.asarray(depth_m, np.float64)
     if force.ndim != 1 or force.shape != depth.shape:
@@ -95,9 +97,10 @@ def stiffness(
     depth_noise = _noise(depth) if depth_std_m is None else depth_std_m
     loading, unloading = _branches(force)
     noises = noise, max(depth_noise, 1e-9)
-    found, back = _fit(force[loading], depth[loading], spread[loading], *noises, skin_std_m_per_n), math.nan
+    more = *noises, skin_std_m_per_n, moves
+    found, back = _fit(force[loading], depth[loading], spread[loading], *more), math.nan
     if not found.samples:  # it began pressed
-        found = _fit(force[unloading], depth[unloading], spread[unloading], *noises, skin_std_m_per_n)
+        found = _fit(force[unloading], depth[unloading], spread[unloading], *more)
         return replace(found, branch="unloading", unloading_n_per_m=found.stiffness_n_per_m)
     down = force[unloading] > max(_LOW * float(force.max()), 3 * noise)
     if np.count_nonzero(down) >= _LEAST_SAMPLES and np.ptp(force[unloading][down]) > _LEAST_RISE * noise:
@@ -235,6 +238,7 @@ def _fit(
     noise: float,
     depth_noise: float,
     skin_std: float,
+    moves: float,
 ) -> Stiffness:
     """Posterior of the tangent stiffness of one branch."""
     keep = force > max(_LOW * float(force.max(initial=0.0)), 3 * noise)
@@ -256,7 +260,7 @@ def _fit(
             break
     logs, weights = _posterior(lines, best, correlation, at_n)
     independent = len(force) / correlation
-    scale = math.hypot(_common(force, spread), skin_std * math.exp(float(weights @ logs)))
+    scale = math.hypot(_common(force, spread), skin_std * math.exp(float(weights @ logs)), moves)
     return _of_logs(logs, weights, scale, at_n, EXPONENTS[best], len(force), independent - 2)
 
 
@@ -337,8 +341,11 @@ def _of_logs(
     ends = math.exp(low), math.exp(high)
     probabilities = label_probabilities(logs, weights, math.hypot(scale, (wider - 1) * own))
     state, reason = "estimated", ""
-    if high - low > _VAGUE and scale < _VAGUE / 4:
-        state, reason = "unestimated", f"squeeze more: anything from {ends[0]:.2g} to {ends[1]:.2g} N/m fits"
+    anything = f"anything from {ends[0]:.2g} to {ends[1]:.2g} N/m fits"
+    if 2 * _Z * scale > _UNKNOWN:
+        state, reason = "unestimated", f"force or depth isn't known well enough: {anything}"
+    elif high - low > math.hypot(_VAGUE, 2 * _Z * scale):
+        state, reason = "unestimated", f"squeeze more: {anything}"
     k = math.exp(median)
     return Stiffness(
         state, reason, k, k * log_std, *ends, at_n, exponent, math.nan, scale, "", n, probabilities

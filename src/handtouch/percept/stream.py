@@ -39,6 +39,7 @@ FIELDS: dict[str, tuple[int, ...]] = {
     "palm_normal": (3,),
     "palm_covariance_m2": (3, 3),
     "palm_rotation": (3, 3),  # of the link's frame in the palm's
+    "palm_joints_m2": (),  # what joints put into palm_covariance_m2, one way in the mean
     "joints_age_s": (),
     "commanded_m": (),  # how far the link was told to close since the contact began, along the normal
     "commanded_normal": (3,),  # in the palm, where joints are as they were told to be
