@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from handtouch.percept.stream import IntArray, Stream, Window
 
 FloatArray = NDArray[np.float64]
+_FEW = 24  # samples that are enough to tell how far something goes
 _OPPOSED = -0.7  # cosine between normals of two pads that hold something between them
 
 
@@ -59,12 +60,12 @@ def sways_m(window: Window, opposed: Sequence[Window], others: Sequence[Window])
     left = left if math.isfinite(left) else 1.0
     ways = []
     for other in others:
-        during = other.t_ns >= window.t_ns[0]
-        point = _points(other)[during]
-        point = point[np.isfinite(point).all(axis=1)]
+        few = max(len(other) // _FEW, 1)
+        point = _points(other, few)[other.t_ns[::few] >= window.t_ns[0]]
+        point = np.sort(point[~np.isnan(point[:, 0])], axis=0)
         if len(point):
-            low, high = np.percentile(point, [5, 95], axis=0)  # a range of noise grows with the samples
-            ways.append(float(np.linalg.norm(high - low)))
+            tail = len(point) // 20  # noise alone has a range, too
+            ways.append(float(np.linalg.norm(point[-1 - tail] - point[tail])))
     return min(left, 1.0) / 2 * max(ways, default=0.0)
 
 
@@ -97,9 +98,11 @@ def _by_joints(window: Window) -> tuple[FloatArray, FloatArray]:
     return np.asarray((point - point[known[-1]]) @ normal), normal
 
 
-def _points(window: Window) -> FloatArray:
-    """Where in the palm (k, 3) the point of the link was that is touched in the mean; NaN where unknown."""
-    rotation, place, on_link = window["palm_rotation"], window["palm_position_m"], window["position_m"]
+def _points(window: Window, each: int = 1) -> FloatArray:
+    """Where in the palm (k, 3) the point of the link was that is touched in the mean, at each so many
+    samples; NaN where unknown."""
+    names = "palm_rotation", "palm_position_m", "position_m"
+    rotation, place, on_link = (window[name][::each] for name in names)
     known = np.isfinite(place).all(axis=1) & np.isfinite(on_link).all(axis=1)
     if not known.any():
         return np.full(place.shape, np.nan)
