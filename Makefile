@@ -54,9 +54,8 @@ examples: $(VENV)/.dev ## the programs of examples/, each closing a loop with a 
 
 .PHONY: test lint types unit coverage socketcan docs
 test: ## everything that CI runs
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types docs
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan lint types docs
 	@$(MAKE) --no-print-directory unit
-	@$(MAKE) --no-print-directory socketcan
 
 lint: $(VENV)/.dev ## style
 	$(BIN)/ruff check
