@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from handtouch.field import LocatorBank, Rectangle
 from handtouch.percept.ask import expected_bits
 from handtouch.percept.percept import Perceiver
-from handtouch.percept.primitives import CLASSES, SIZES, Verdict, classify
+from handtouch.percept.primitives import CLASSES, SIZES, Verdict, classify, classifying
 from handtouch.percept.shape import Shape, pair_distance, point_or_more
 from handtouch.percept.stream import KINDS, Percept, Sample, Stream
 
@@ -92,6 +93,24 @@ def test_an_object_that_moves_a_little_between_touches_keeps_its_class_and_says_
         fits = rests.fits[kind], moved.fits[kind]
         assert abs(fits[1].radius_m - 0.02) < 3 * fits[1].radius_std_m
         assert fits[1].radius_std_m > fits[0].radius_std_m
+
+
+def test_a_few_touches_that_fit_nothing_are_not_explained_by_motion() -> None:
+    points, normals, covariances = touches("sphere", 5, 1)
+    points = points + np.random.default_rng(2).normal(0.0, 4e-3, (5, 3))
+    found = classify(points, normals, covariances)
+    assert (found.state, found.moves) == ("invalid", False)
+
+
+def test_what_has_moved_is_not_taken_to_rest_again() -> None:
+    found: list[Verdict] = []
+
+    def pieces() -> Generator[None, None, None]:
+        found.append((yield from classifying(*touches("sphere", 12, 1), moved=True)))
+
+    for _ in pieces():
+        assert not found
+    assert (found[0].label, found[0].moves) == ("sphere", True)
 
 
 def test_where_the_object_lies_makes_no_difference() -> None:

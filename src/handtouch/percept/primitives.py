@@ -30,7 +30,7 @@ _SETTLED = 1e-3  # of the logarithm of the posterior
 _H = 1e-6  # step of the slopes, in metres, radians, and logarithms
 _SMALL_M, _LARGE_M = 1e-3, 0.3  # starts
 _MISFIT = 4.0  # standard deviations of chi^2, beyond which a model is none
-_LEAST_CONTACTS = 3
+_LEAST_CONTACTS, _LEAST_MOVING = 3, 6
 
 
 @dataclass(frozen=True)
@@ -130,21 +130,27 @@ def classifying(
     covariances_m2: FloatArray,
     prior: Prior | None = None,
     classes: Iterable[str] = CLASSES,
+    moved: bool = False,
 ) -> Generator[None, None, Verdict]:
     """`classify` in small pieces, for who has little time at once.
 
     Where no class fits an object at rest, one that moves a little between touches is tried: sizes are then
-    less sure, and the verdict says so.
+    less sure, and the verdict says so. moved: that it does is known, nothing else is tried. Few touches fit
+    anything that moves, so it isn't tried with them.
     """
     prior = Prior() if prior is None else prior
     check(points_m, normals, covariances_m2)
-    for moves, one in ((False, prior), (True, prior.freely())):
-        fits: dict[str, Fit] = {}
+    enough, verdict = len(points_m) >= _LEAST_MOVING, None
+    for moves in (True,) if moved and enough else (False, True) if enough else (False,):
+        one, fits = prior.freely() if moves else prior, dict[str, Fit]()
         for name in classes:
             fits[name] = yield from fitting(name, points_m, normals, covariances_m2, one)
-        verdict = replace(judge(fits, len(points_m), one), moves=moves)
+        found = replace(judge(fits, len(points_m), one), moves=moves)
+        if verdict is None or found.state != "invalid":
+            verdict = found
         if verdict.state != "invalid":
             break
+    assert verdict is not None
     return verdict
 
 

@@ -182,7 +182,8 @@ class Shape:
 
     def _classifying(self, touched: _Object) -> Generator[None, None, Verdict]:
         rows = np.array(touched.points), np.array(touched.normals), np.array(touched.covariances)
-        return (yield from classifying(*rows, self.prior))
+        moved = touched.verdict is not None and touched.verdict.moves  # then it has, for good
+        return (yield from classifying(*rows, self.prior, moved=moved))
 
     def _spot(self, stream: Stream, pad: int, t_ns: int) -> Sequence[Percept]:
         window = stream.window(pad, _SPOT_SAMPLES)
