@@ -96,6 +96,19 @@ def test_ordinary_presses_are_no_fault() -> None:
     assert changes == []
 
 
+@pytest.mark.parametrize("gains", [(0.96, 1, 1, 1), (0.98, 0.98, 1.02, 1.02)])
+def test_gains_within_tolerances_of_parts_are_no_fault_however_many_contacts_show_them(
+    gains: tuple[float, ...],
+) -> None:
+    _, changes = play(lambda t, _: presses(t) * gains, 100)
+    assert changes == []
+
+
+def test_a_gain_that_tolerances_do_not_explain_is_a_fault() -> None:
+    diagnosis, _ = play(lambda t, _: presses(t) * (0.87, 1, 1, 1), 100)
+    assert [finding.kind for finding in diagnosis.findings()] == [Kind.GAIN_STEP]
+
+
 def test_something_that_stays_and_does_not_tremble_sticks() -> None:
     diagnosis, _ = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 60)
     (finding,) = diagnosis.findings()

@@ -6,7 +6,7 @@ alternative to the nominal pad is tested by how well *its* pad explains the same
     dead      the electrode floats, the other three share all
     merged    two electrodes are one; each channel gets half (seen only through series resistors)
     swapped   the channels are permuted; permutations that mirror the pad leave no trace and are left out
-    gain      a channel is multiplied by a factor
+    gain      a channel is multiplied by a factor, more than tolerances of parts explain
     torn      a cut across a corner takes a part of both its sides
     (none)    no contact is a point: something that isn't in this list
 
@@ -56,6 +56,8 @@ _CUTS = (0.2, 0.35, 0.5, 0.65, 0.8, 0.92)  # parts of a side; the short side of 
 _ALIKE = (Kind.GAIN_STEP, Kind.TORN_CORNER)
 _SOME = 40  # contacts among which those at one place share
 _FACTORS = np.exp(np.append(np.arange(-19.5, -1), np.arange(1.5, 20)) * 0.07)
+_ORDINARY = np.exp(np.array([s for s in itertools.product((-0.02, 0, 0.02), repeat=4) if any(s)]))
+"""Gains of ordinary parts: no faults, but what a gain step or a torn corner has to outdo."""
 
 
 class Hypothesis(NamedTuple):
@@ -94,6 +96,10 @@ class Tables:
             self.hypotheses.append(Hypothesis(Kind.GAIN_STEP, (ELECTRODES[channel],), float(factor)))
             orders.append(np.arange(4))
             factors.append(np.where(np.arange(4) == channel, 1 / factor, 1.0))
+        for gains in _ORDINARY:
+            self.hypotheses.append(Hypothesis(Kind.GAIN_STEP, ()))
+            orders.append(np.arange(4))
+            factors.append(1 / gains)
         self._orders, self._factors = np.array(orders).T, np.array(factors).T
         self._nominal = _Table(nominal[None])
         others = []
@@ -118,6 +124,7 @@ class Tables:
         self._torn = _Table(np.stack(torn_ones))
         self.hypotheses.append(Hypothesis(Kind.UNEXPLAINED, ()))
         self.kinds = np.array([h.kind for h in self.hypotheses])
+        self.healthy = np.array([h.kind is Kind.GAIN_STEP and not h.electrodes for h in self.hypotheses])
 
     def log_ratios(self, contact: Contact, left_out: NDArray[np.bool_]) -> FloatArray:
         """Log likelihood ratios (2, hypotheses) to a nominal pad with few contacts that are no points, and
@@ -247,7 +254,7 @@ class ContactWitness:
         np.maximum(self._sums, 0.0, out=self._sums)
         self._count += 1
         if self._settled is not None:
-            same = self._tables.kinds == self._settled.hypothesis.kind
+            same = (self._tables.kinds == self._settled.hypothesis.kind) & ~self._tables.healthy
             self._back = min(max(self._back - weight * float(ratios[0, same].max()), 0.0), _MOST)
         self._judge()
 
@@ -270,6 +277,8 @@ class ContactWitness:
     def _judge(self) -> None:
         sums = self._sum
         score = sums + self._prior
+        ordinary = float(score[self._tables.healthy].max())
+        score[self._tables.healthy] = -np.inf
         best = int(np.argmax(score))
         if self._settled is not None and self._back > CLEAR:
             self.forget()
@@ -277,6 +286,8 @@ class ContactWitness:
         if sums[best] < self._needed[best]:
             return
         hypothesis, kinds = self._tables.hypotheses[best], self._tables.kinds
+        if hypothesis.kind in _ALIKE and ordinary > score[best] - DOUBT:
+            return
         odds = np.exp(score - score[best])
         same = kinds == hypothesis.kind
         share = float(odds[same].sum() / odds.sum())
