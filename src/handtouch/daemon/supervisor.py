@@ -326,9 +326,10 @@ class Supervisor:
             if finding.kind not in known:
                 self._say(pad, f"{finding.cause} ({finding.evidence}): {finding.remedy}")
         for kind in sorted(known - {finding.kind for finding in word.findings}):
-            self._say(pad, f"{kind}: over")
+            self._say(pad, f"{kind}: over", logging.INFO)
         if word.trust != trust:
-            self._say(pad, f"{trust} -> {word.trust}: {word.calibrating}")
+            level = logging.INFO if word.trust in ("nominal", "trusted") else logging.WARNING
+            self._say(pad, f"{trust} -> {word.trust}: {word.calibrating}", level)
         if (trust, known) != (word.trust, {finding.kind for finding in word.findings}) or before is None:
             self.changed.add(pad)
 
@@ -343,8 +344,8 @@ class Supervisor:
         )
         return plain(finding)
 
-    def _say(self, pad: int, text: str) -> None:
-        _log.warning("%s: %s", self._name(pad), text, extra=self._fields(pad))
+    def _say(self, pad: int, text: str, level: int = logging.WARNING) -> None:
+        _log.log(level, "%s: %s", self._name(pad), text, extra=self._fields(pad))
 
     def _name(self, pad: int) -> str:
         return f"{self._pads[pad][0]}/{self._pads[pad][1].link}"
