@@ -67,7 +67,7 @@ class Cable:
         return any(
             node == node_id
             and end - start > least_ns
-            and start <= t_ns <= end + (S if end - start > LONG_NS else S // 4)
+            and start <= t_ns <= end + (S if end - start > LONG_NS else S // 10)
             for node, start, end in self.pauses
         )
 
