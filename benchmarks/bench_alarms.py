@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
+from section import table
 
 from handtouch import config, shipped
 from handtouch.sheet import S1, S2
@@ -264,16 +265,6 @@ def used(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
          **{f"bouts: {name}": count for name, count in bouts.most_common()},
          "diagnosis, % of a core": sum(r["diagnosing_s"] for r in results) / hours / 36}
     ]  # fmt: skip
-
-
-def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
-    heads = list(rows[0])
-    lines = [f"## {title}", "", note, "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        lines.append("| " + " | ".join(cells) + " |")
-    print("\n".join(lines), end="\n\n", flush=True)
-    return [*lines, ""]
 
 
 def main() -> None:

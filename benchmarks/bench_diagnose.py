@@ -26,6 +26,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from diagnose_episodes import FAULT_FREE, FAULTY, LENGTH_S, PADS, deployment, episode, hand_of
+from section import table
 
 from handtouch import config, shipped
 from handtouch.supervise.diagnose import Block, Diagnosis, DiagnosisModel, Kind
@@ -218,16 +219,6 @@ def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
     axes.set_title(f"Naming of faults, % of each row; {len(results)} episodes of {LENGTH_S:g} s")
     figure.savefig(path, dpi=100)
     plt.close(figure)
-
-
-def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
-    heads = list(rows[0])
-    lines = [f"## {title}", "", note, "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        lines.append("| " + " | ".join(cells) + " |")
-    print("\n".join(lines), end="\n\n", flush=True)
-    return [*lines, ""]
 
 
 def main() -> None:

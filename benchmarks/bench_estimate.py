@@ -20,6 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.special import ndtri
+from section import table
 
 from handtouch.field import ElectrodeNetwork, LocatorBank, Rectangle, point_test, resolvable_separation
 from handtouch.field.model import ForwardModel
@@ -172,16 +173,6 @@ def draw_resolution(path: Path) -> None:
         "Two equal contacts told from one (false alarms 1e-3, detection 0.9); grey: never, within the pad"
     )
     figure.savefig(path, dpi=100)
-
-
-def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
-    heads = list(rows[0])
-    lines = [f"## {title}", "", note, "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        lines.append("| " + " | ".join(cells) + " |")
-    print("\n".join(lines), end="\n\n", flush=True)
-    return [*lines, ""]
 
 
 def main() -> None:

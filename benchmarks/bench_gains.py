@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from section import table
 
 from handtouch import config, shipped
 from handtouch.daemon.model import PadModel
@@ -246,16 +247,6 @@ def draw(path: Path, fisher: list[dict[str, Any]], swaps: list[dict[str, Any]]) 
     right.set_title(f"Nodes of {100 * GAIN_STD:g} % other gains in the shipped hand")
     right.legend(fontsize=8)
     figure.savefig(path, dpi=100)
-
-
-def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
-    heads = list(rows[0])
-    lines = [f"## {title}", "", note, "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        lines.append("| " + " | ".join(cells) + " |")
-    print("\n".join(lines), end="\n\n", flush=True)
-    return [*lines, ""]
 
 
 def points() -> tuple[str, list[dict[str, Any]]]:

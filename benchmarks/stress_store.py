@@ -23,6 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
+from section import table
 
 from handtouch.field import Rectangle
 from handtouch.supervise.calibration import (
@@ -243,16 +244,6 @@ def _quantiles(took_ms: list[float]) -> dict[str, float]:
         "99 %, ms": float(np.quantile(took_ms, 0.99)),
         "most, ms": max(took_ms),
     }
-
-
-def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
-    heads = list(rows[0])
-    lines = [f"## {title}", "", note, "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
-        lines.append("| " + " | ".join(cells) + " |")
-    print("\n".join(lines), end="\n\n", flush=True)
-    return [*lines, ""]
 
 
 def draw(path: Path, openings: list[float]) -> None:
