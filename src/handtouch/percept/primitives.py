@@ -16,11 +16,13 @@ import math
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 
 CLASSES = ("flat", "edge", "cylinder", "sphere")
 SIZES = {"flat": (), "edge": (), "cylinder": ("radius",), "sphere": ("radius",)}
@@ -115,13 +117,7 @@ def classify(
     All in one frame in which the object rests. Every row should be a touch of its own: a contact that rests
     tells the same thing each time. Raises ValueError for shapes that don't fit, or what isn't finite.
     """
-    steps = classifying(points_m, normals, covariances_m2, prior, classes)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as done:
-            found: Verdict = done.value
-            return found
+    return _finished(classifying(points_m, normals, covariances_m2, prior, classes))
 
 
 def classifying(
@@ -190,12 +186,16 @@ def fit(
     name: str, points_m: FloatArray, normals: FloatArray, covariances_m2: FloatArray, prior: Prior
 ) -> Fit:
     """Fit one class; see `classify`."""
-    steps = fitting(name, points_m, normals, covariances_m2, prior)
+    return _finished(fitting(name, points_m, normals, covariances_m2, prior))
+
+
+def _finished(steps: Generator[None, None, T]) -> T:
+    """What a computation in steps comes to, all steps taken at once."""
     while True:
         try:
             next(steps)
         except StopIteration as done:
-            found: Fit = done.value
+            found: T = done.value
             return found
 
 
