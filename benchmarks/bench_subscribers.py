@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -56,6 +56,8 @@ CASES = {
 }
 """Case -> bystanders, and what is sent to one more."""
 JOINING_S = 1.0
+
+Rows = list[dict[str, Any]]
 
 
 def bystanders(endpoint: str, count: int, stop: Event) -> None:
@@ -144,8 +146,9 @@ def case(config: Path, pid: int, stamps: Any, seconds: float, name: str) -> dict
     }
 
 
-def measure(config: Path, turns: int, seconds: float) -> list[dict[str, Any]]:
-    """All cases, so many times, with one daemon."""
+@contextmanager
+def serving(config: Path) -> Iterator[tuple[int, Any]]:
+    """Simulated nodes and the daemon, from the first touch on: its process, and when frames were sent."""
     deployment = load(config)
     stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
     samples = film(deployment, PATHS["sliding"])
@@ -153,26 +156,37 @@ def measure(config: Path, turns: int, seconds: float) -> list[dict[str, Any]]:
     worker.start()
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
     daemon = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    rows = []
     try:
         with zmq.Context() as context, context.socket(zmq.SUB) as socket:
             socket.setsockopt(zmq.LINGER, 0)
             socket.subscribe("hand/")
             socket.connect(deployment.daemon.live)
             wait_for_touch(socket)
-        for turn in range(turns):
-            for name in CASES:
-                rows.append({"turn": turn, **case(config, daemon.pid, stamps, seconds, name)})
-                print(rows[-1], flush=True)
+        yield daemon.pid, stamps
     finally:
         daemon.terminate()
         daemon.wait()
         stop.set()
         worker.join()
+
+
+def in_turns(turns: int, cases: Iterable[str], measured: Callable[[str], dict[str, Any]]) -> Rows:
+    """All cases, so many times, told as they are measured."""
+    rows = []
+    for turn in range(turns):
+        for name in cases:
+            rows.append({"turn": turn, **measured(name)})
+            print(rows[-1], flush=True)
     return rows
 
 
-def write(results: dict[str, Any]) -> str:
+def measure(config: Path, turns: int, seconds: float) -> Rows:
+    """All cases, so many times, with one daemon."""
+    with serving(config) as (pid, stamps):
+        return in_turns(turns, CASES, lambda name: case(config, pid, stamps, seconds, name))
+
+
+def page_of(results: dict[str, Any]) -> str:
     """The page."""
     lines = []
     for name in CASES:
@@ -189,7 +203,7 @@ def write(results: dict[str, Any]) -> str:
             f"| {middle['share']:.1%} | {drops} |"
         )
     turns = 1 + max(row["turn"] for row in results["rows"])
-    text = f"""# Subscribers
+    return f"""# Subscribers
 
 One subscriber to a hand of 15 pads at 200 Hz, 5 touched by sliding contacts, in the company of others.
 Medians of {turns} turns through all cases, {results["seconds"]:.0f} s each; spread is that of the turns'
@@ -205,26 +219,38 @@ one, did not take. All share the machine, so a hundred readers also compete for 
 
 Made by `make bench ONLY=subscribers`.
 """
+
+
+def asked_of(about: str | None, *, seconds: float, turns: int, trial_s: float) -> argparse.Namespace:
+    """Options of a benchmark that goes through its cases in turns."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("--seconds", type=float, default=seconds, help="of a case")
+    parser.add_argument("--turns", type=int, default=turns)
+    trial = f"one turn of {trial_s:g} s a case; writes nothing"
+    parser.add_argument("--trial", action="store_true", help=trial)
+    asked = parser.parse_args()
+    if asked.trial:
+        asked.turns, asked.seconds = 1, trial_s
+    return asked
+
+
+def write(name: str, page_of: Callable[[dict[str, Any]], str], rows: Rows, seconds: float) -> None:
+    """The page of a benchmark, and what it is made from."""
+    results = {"rows": rows, "seconds": seconds, "machine": machine(), "load": os.getloadavg()[0]}
+    page = page_of(results)
     OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "subscribers.md").write_text(text)
-    (OUT / "subscribers.json").write_text(json.dumps(results, indent=1) + "\n")
-    return text
+    (OUT / f"{name}.md").write_text(page)
+    (OUT / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
+    print(page)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=6.0, help="of a case")
-    parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--trial", action="store_true", help="one turn of 1.5 s a case; writes nothing")
-    asked = parser.parse_args()
+    asked = asked_of(__doc__, seconds=6.0, turns=5, trial_s=1.5)
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        turns, seconds = (1, 1.5) if asked.trial else (asked.turns, asked.seconds)
-        rows = measure(on_loopback(Path(folder), PORT), turns, seconds)
-    if asked.trial:
-        print(*rows, sep="\n")
-        return
-    print(write({"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]}))
+        rows = measure(on_loopback(Path(folder), PORT), asked.turns, asked.seconds)
+    if not asked.trial:
+        write("subscribers", page_of, rows, asked.seconds)
 
 
 if __name__ == "__main__":

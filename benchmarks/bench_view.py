@@ -10,7 +10,6 @@ docs/benchmarks/view.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
@@ -29,21 +28,13 @@ from pathlib import Path
 from typing import Any
 
 import bench_latency
-import zmq
 from bench_latency import (
-    MOST,
-    OUT,
-    PATHS,
     PORT,
     ProcessorShare,
-    film,
     in_own_network,
-    machine,
-    nodes,
     on_loopback,
-    wait_for_touch,
 )
-from bench_subscribers import bystanders
+from bench_subscribers import Rows, asked_of, bystanders, in_turns, serving, write
 
 from handtouch import Robot
 from handtouch.client import request
@@ -201,40 +192,19 @@ def tell_joints(endpoint: str, stop: threading.Event) -> None:
             robot.send_joints("right", {name: 0.4 + 0.3 * math.sin(now_s) for name in JOINTS})
 
 
-def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> list[dict[str, Any]]:
+def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> Rows:
     """All cases, so many times, with one daemon."""
     bench_latency.TOUCHED = 15  # of the film: the most that there is to show
-    deployment = load(config)
-    stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
-    worker = multiprocessing.Process(
-        target=nodes, args=(config, film(deployment, PATHS["sliding"]), stamps, stop)
-    )
-    worker.start()
-    daemon = subprocess.Popen(
-        [sys.executable, "-m", "handtouch", "run", str(config)], stderr=subprocess.DEVNULL
-    )
     still = threading.Event()
-    robot = threading.Thread(target=tell_joints, args=(deployment.daemon.inputs, still))
-    robot.start()
-    rows = []
-    try:
-        with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-            socket.setsockopt(zmq.LINGER, 0)
-            socket.subscribe("hand/")
-            socket.connect(deployment.daemon.live)
-            wait_for_touch(socket)
-        for turn in range(turns):
-            for name in (NOBODY, READER, VIEW, PAGE, *([BROWSER] if packages else []), FELT):
-                rows.append({"turn": turn, **case(config, daemon.pid, seconds, name, packages)})
-                print(rows[-1], flush=True)
-    finally:
-        still.set()
-        robot.join()
-        daemon.terminate()
-        daemon.wait()
-        stop.set()
-        worker.join()
-    return rows
+    robot = threading.Thread(target=tell_joints, args=(load(config).daemon.inputs, still))
+    cases = (NOBODY, READER, VIEW, PAGE, *([BROWSER] if packages else []), FELT)
+    with serving(config) as (pid, _):
+        robot.start()
+        try:
+            return in_turns(turns, cases, lambda name: case(config, pid, seconds, name, packages))
+        finally:
+            still.set()
+            robot.join()
 
 
 def browser_packages(folder: Path) -> Path | None:
@@ -259,7 +229,7 @@ _TOLD = (
 )
 
 
-def write(results: dict[str, Any]) -> str:
+def page_of(results: dict[str, Any]) -> str:
     """The page."""
     rows = results["rows"]
     reader = {row["turn"]: row["tick_ms"] for row in rows if row["case"] == READER}
@@ -285,7 +255,7 @@ def write(results: dict[str, Any]) -> str:
         of_view = f"{middle('view', '.1%')} | {middle('update_ms', '.1f')}"
         lines.append(f"| {name} | {loop} | {of_loop} | {of_view} | {page} |")
     turns = 1 + max(row["turn"] for row in rows)
-    text = f"""# The view
+    return f"""# The view
 
 A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, its joints told at 100 Hz. Medians of
 {turns} turns through all cases, {results["seconds"]:.0f} s each.
@@ -308,18 +278,10 @@ A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, its joints t
 
 Made by `make bench ONLY=view`.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "view.md").write_text(text)
-    (OUT / "view.json").write_text(json.dumps(results, indent=1) + "\n")
-    return text
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=5.0, help="of a case")
-    parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--trial", action="store_true", help="one turn of 2 s a case; writes nothing")
-    asked = parser.parse_args()
+    asked = asked_of(__doc__, seconds=5.0, turns=3, trial_s=2.0)
     if "HANDTOUCH_BENCH_PACKAGES" not in os.environ:
         with tempfile.TemporaryDirectory(prefix="ht.") as folder:
             os.environ["HANDTOUCH_BENCH_PACKAGES"] = str(browser_packages(Path(folder) / "js") or "")
@@ -328,13 +290,10 @@ def main() -> None:
     in_own_network()
     packages = os.environ["HANDTOUCH_BENCH_PACKAGES"]
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        turns, seconds = (1, 2.0) if asked.trial else (asked.turns, asked.seconds)
         config = on_loopback(Path(folder), PORT)
-        rows = measure(config, turns, seconds, Path(packages) if packages else None)
+        rows = measure(config, asked.turns, asked.seconds, Path(packages) if packages else None)
     if not asked.trial:
-        print(
-            write({"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]})
-        )
+        write("view", page_of, rows, asked.seconds)
 
 
 if __name__ == "__main__":

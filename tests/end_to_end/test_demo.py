@@ -48,48 +48,29 @@ force_n = [0.8]
 def test_a_scenario_with_a_fault_has_it_told_in_words_and_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "stuck.toml").write_text(STUCK)
     home = {**os.environ, "HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path / "state")}
-    demo = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "handtouch", "demo", "--plain", "--seconds", "150"),
-            *("--scenario", str(tmp_path / "stuck.toml")),
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=home,
-    )
-    assert demo.stdout is not None
-    try:
-        for text in demo.stdout:
-            if "right/ring_distal" in text and "channel xa" in text:
-                break
-        demo.send_signal(signal.SIGINT)
-        rest = demo.stdout.read()
-        assert demo.wait(30) == 0
-    finally:
-        demo.kill()
-        demo.stdout.close()
-        demo.wait()
+    command = ["--seconds", "150", "--scenario", str(tmp_path / "stuck.toml")]
+    rest = _interrupted_at(r"right/ring_distal.*channel xa", *command, env=home)
     assert re.search(r"^found right/ring_distal: channel xa", rest, re.MULTILINE)
     assert not (tmp_path / "state").exists()
 
 
 def test_ctrl_c_ends_the_demo_with_its_summary() -> None:
-    demo = subprocess.Popen(
-        [sys.executable, "-m", "handtouch", "demo", "--plain"], stdout=subprocess.PIPE, text=True
-    )
-    assert demo.stdout is not None
-    try:
-        for text in demo.stdout:
-            if " begin " in text:
-                break
-        demo.send_signal(signal.SIGINT)
-        rest = demo.stdout.read()
-        assert demo.wait(30) == 0
-    finally:
-        demo.kill()
-        demo.stdout.close()
-        demo.wait()
-    assert "touches missed invented" in rest
+    assert "touches missed invented" in _interrupted_at(" begin ")
+
+
+def _interrupted_at(said: str, *options: str, env: dict[str, str] | None = None) -> str:
+    """What a demo with these options says after a Ctrl-C, which it gets once a line matches `said`."""
+    command = [sys.executable, "-m", "handtouch", "demo", "--plain", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as demo:
+        assert demo.stdout is not None
+        try:
+            assert any(re.search(said, line) for line in demo.stdout)
+            demo.send_signal(signal.SIGINT)
+            rest = demo.stdout.read()
+            assert demo.wait(30) == 0
+        finally:
+            demo.kill()
+    return rest
 
 
 def test_two_demos_run_side_by_side() -> None:

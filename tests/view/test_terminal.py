@@ -167,7 +167,7 @@ def test_where_there_is_no_room_for_all_the_touched_pads_come_first() -> None:
 
 
 GUM = {
-    "kind": "stuck contact", "cause": "chewing gum on thumb_tip", "evidence": "it stands for 60 s",
+    "kind": "stuck contact", "cause": "chewing gum, 10 mm from x0", "evidence": "it stands for 60 s",
     "remedy": "wipe it off", "since_ns": 1, "confidence": 0.99, "pad_m": [0.01, 0.02], "size_m": 0.006,
 }  # fmt: skip
 
@@ -176,7 +176,7 @@ def test_what_the_supervisor_found_is_told_once_with_place_and_remedy(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     found = replace(HEALTH, trust="quarantined", findings=(GUM,))
-    assert "chewing gum on thumb_tip at (10, 20) mm, 6 mm across" in _page(_view(HEALTH, found), width=200)
+    assert "chewing gum, 10 mm from x0 (it stands" in _page(_view(HEALTH, found), width=200)
     assert "trusted again" in _page(_view(HEALTH, found, replace(HEALTH, trust="trusted")))
     display = LineDisplay()
     for message in (HEALTH, found, found):
@@ -201,5 +201,5 @@ def test_status_tells_findings_the_slow_half_and_the_store(capsys: pytest.Captur
     told = capsys.readouterr().out
     assert "supervisor running, process 7, 0.3 s behind, 1 restarts (died last: killed by signal 9)" in told
     assert "calibration store: it is damaged" in told
-    assert "right/thumb_tip: chewing gum on thumb_tip at (10, 20) mm" in told
+    assert "right/thumb_tip: chewing gum, 10 mm from x0 (it stands" in told
     assert not status._is_well({"state": "clear", "trust": "quarantined"})

@@ -155,12 +155,9 @@ def _scaled(value: Any, scale: float) -> Any:
 
 def finding_text(finding: Mapping[str, Any]) -> str:
     """What a supervisor found, why it thinks so and what helps, in a sentence; whatever keys are missing."""
-    where = finding.get("pad_m")
-    at = f" at ({1e3 * where[0]:.0f}, {1e3 * where[1]:.0f}) mm" if where else ""
-    size = f", {1e3 * finding['size_m']:.0f} mm across" if finding.get("size_m") else ""
     evidence = f" ({finding['evidence']})" if finding.get("evidence") else ""
     remedy = f": {finding['remedy']}" if finding.get("remedy") else ""
-    return f"{finding.get('cause') or finding.get('kind', '?')}{at}{size}{evidence}{remedy}"
+    return f"{finding.get('cause') or finding.get('kind', '?')}{evidence}{remedy}"
 
 
 def line(message: wire.Message) -> str:
