@@ -23,12 +23,9 @@ from typing import IO, Any
 
 LOADED = (
     "handtouch.bridge",
-    "handtouch.control_cli",
     "handtouch.daemon.daemon",
-    "handtouch.record.cli",
     "handtouch.simulate.run",
     "handtouch.simulate.world",
-    "handtouch.supervise.calibrations_cli",
     "handtouch.view.status",
     "can.interfaces.socketcan",
     "can.interfaces.udp_multicast",

@@ -7,13 +7,22 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handtouch.cli import CONTROL, LIVE, Command, add_endpoint, command, positive
+from handtouch.commands.options import (
+    CONTROL,
+    LIVE,
+    Command,
+    Commands,
+    add_endpoint,
+    add_json,
+    command,
+    positive,
+)
 
 if TYPE_CHECKING:
     from handtouch.view import control
 
 
-def add_control(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add(commands: Commands) -> None:
     """Add them to the command line."""
     tare = _asking(commands, "tare", _tare, "take what untouched pads read for zero; loaded ones are refused")
     _add_pads(tare, nargs="*", default=["*"], text="(default: all)")
@@ -36,7 +45,7 @@ def add_control(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     log.add_argument("level", choices=("debug", "info", "warning", "error"))
 
 
-def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_calibrate(commands: Commands) -> None:
     calibrate = _asking(
         commands,
         "calibrate",
@@ -88,7 +97,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     )
 
 
-def _add_scene(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_scene(commands: Commands) -> None:
     scene = _asking(commands, "scene", _scene, "what is used of the hand: show it, or change it")
     scene.add_argument(
         "--links", type=_listed, metavar="PATTERNS", help='such as "thumb_*,index_*"; "" for none'
@@ -116,12 +125,10 @@ def _add_pads(parser: argparse.ArgumentParser, text: str = "", **options: Any) -
     )
 
 
-def _asking(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, function: Command, text: str
-) -> argparse.ArgumentParser:
+def _asking(commands: Commands, name: str, function: Command, text: str) -> argparse.ArgumentParser:
     parser = command(commands, name, function, text)
     add_endpoint(parser, CONTROL, "control endpoint")
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    add_json(parser)
     return parser
 
 

@@ -5,11 +5,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from handtouch.commands.options import Commands, add_key, add_percepts, command, positive
 
-def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+
+def add(commands: Commands) -> None:
     """Add them to the command line."""
-    from handtouch.cli import command, positive
+    _add_record(commands)
+    _add_replay(commands)
+    _add_export(commands)
+    _add_plot(commands)
 
+
+def _add_record(commands: Commands) -> None:
     record = command(commands, "record", _record, "keep what a running daemon publishes, as MCAP files")
     record.add_argument("config", type=Path, nargs="?", help="deployment file of the daemon; kept too")
     record.add_argument(
@@ -19,22 +26,14 @@ def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--endpoint",
         help="complete stream of the daemon (default: the deployment's, or tcp://127.0.0.1:5582)",
     )
-    record.add_argument(
-        "--key",
-        metavar="FILE",
-        help="key for a daemon that asks for one (default: the file that HANDTOUCH_KEY names, if set)",
-    )
+    add_key(record)
     record.add_argument(
         "--seconds", type=positive, default=0.0, help="end after so long (default: on Ctrl-C)"
     )
     record.add_argument(
         "--hand", action="store_true", help="frames of the whole hand too (replay can make them again)"
     )
-    record.add_argument(
-        "--percepts",
-        action="store_true",
-        help="slip, hardness, shape and texture too, which the daemon then computes",
-    )
+    add_percepts(record)
     record.add_argument(
         "--rotate-mb", type=positive, default=0.0, metavar="MB", help="go on in a new file after so many MB"
     )
@@ -53,6 +52,8 @@ def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="end before less is free (default: 200)",
     )
 
+
+def _add_replay(commands: Commands) -> None:
     replay = command(
         commands,
         "replay",
@@ -95,6 +96,8 @@ def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     replay.add_argument("--report", type=Path, metavar="FILE", help="write the comparison as JSON")
     replay.add_argument("--publish", action="store_true", help="publish on the deployment's endpoints too")
 
+
+def _add_export(commands: Commands) -> None:
     export = command(commands, "export", _export, "a recording as tables")
     export.add_argument("recording", type=Path, help="MCAP recording")
     export.add_argument(
@@ -105,6 +108,8 @@ def add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     export.add_argument("-o", "--out", type=Path, default=Path("tables"), help="folder (default: tables)")
 
+
+def _add_plot(commands: Commands) -> None:
     plot = command(commands, "plot", _plot, "draw a recording: contacts in time, on pads, forces, health")
     plot.add_argument("recording", type=Path, help="MCAP recording")
     plot.add_argument("-o", "--out", type=Path, default=Path("plots"), help="folder (default: plots)")
@@ -160,6 +165,4 @@ def _plot(asked: argparse.Namespace) -> int:
 
 
 def _speed(text: str) -> float:
-    from handtouch.cli import positive
-
     return 0.0 if text == "max" else positive(text)

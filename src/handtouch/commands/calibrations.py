@@ -1,29 +1,28 @@
-"""The commands of `handtouch calibrations`; `calibrations` does their work, loaded only when called."""
+"""The commands of `handtouch calibrations`."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from handtouch.cli import EXIT, command
+from handtouch.commands.options import Commands, add_json, command, family
 
 
-def add_calibrations(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add(commands: Commands) -> None:
     """Add `calibrations` to the commands."""
-    calibrations = commands.add_parser(
+    actions = family(
+        commands,
         "calibrations",
-        help="the calibration store: what is known of every unit",
-        description="The calibration store: what is known of every unit, by serial number, with its history.",
-        epilog=EXIT,
+        "the calibration store: what is known of every unit",
+        "The calibration store: what is known of every unit, by serial number, with its history.",
     )
-    actions = calibrations.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
     listed = command(actions, "list", _list, "every unit and its newest calibration")
-    listed.add_argument("--json", action="store_true", help="as JSON")
+    add_json(listed)
 
     show = command(actions, "show", _show, "a unit's versions, and what one of them says")
     show.add_argument("--version", type=int, metavar="N", help="default: the newest")
-    show.add_argument("--json", action="store_true", help="as JSON")
+    add_json(show)
 
     diff = command(actions, "diff", _diff, "what changed; exit status 1 if anything did")
     diff.add_argument("--from", dest="before", type=int, metavar="N", help="default: the one before --to")
