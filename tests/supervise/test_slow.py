@@ -175,6 +175,20 @@ def test_gains_that_a_person_gave_end_a_quarantine_and_are_gone_on_from(
     assert slow.take(msgpack.unpackb(put(near.model_copy(update={"serial": 99}), ["gains"])), NOW) == []
 
 
+def test_gains_that_no_amplifier_has_are_told_and_never_applied(
+    bench: Bench, session: Session, tmp_path: Path
+) -> None:
+    slow = half(bench, tmp_path / "c.db")
+    slow.take(bench.introduce([11, 12, 13]), NOW)
+    wide = tuple((1e-2 * (np.eye(4) - 0.25)).ravel().tolist())
+    given = Calibrate(pad=0, serial=11, name="bench", gains=(9.9,) * 4, covariance=wide)
+    slow.take(msgpack.unpackb(put(given, ["gains"])), NOW)
+    words = play(slow, bench, session)
+    assert all(max(word.gains) <= 10 for word in calibrations(words, 0))
+    doubts = [word for word in words if isinstance(word, Judged) and word.pad == 0 and word.findings]
+    assert "no amplifier has these" in doubts[0].findings[0].cause
+
+
 def test_a_guided_session_ends_the_quarantine_of_a_pad_that_hides_its_gains(
     bench: Bench, tmp_path: Path
 ) -> None:

@@ -25,7 +25,7 @@ from handtouch.daemon.reload import Fresh, Reload
 from handtouch.daemon.report import Report
 from handtouch.daemon.scene import Demand, select
 from handtouch.daemon.tare import Tare
-from handtouch.supervise.calibration import Law
+from handtouch.supervise.calibration import LEAST_GAIN, MOST_GAIN, Law
 
 _log = logging.getLogger("handtouch.control")
 
@@ -34,7 +34,7 @@ Patterns = Annotated[
 ]
 Who = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=64)]
 Calibration = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
-Gain = Annotated[float, Field(ge=0.1, le=10)]
+Gain = Annotated[float, Field(ge=LEAST_GAIN, le=MOST_GAIN)]
 Offset = Annotated[float, Field(ge=-1e9, le=1e9)]
 Resistance = Annotated[float, Field(ge=1e-3, le=1e12)]
 

@@ -25,6 +25,10 @@ class MismatchError(ValueError):
     """A calibration was made for another unit, or for the same unit under other tables of the file."""
 
 
+LEAST_GAIN, MOST_GAIN = 0.1, 10.0
+"""What a factor may be; beyond it is no amplifier that was meant for these channels."""
+
+
 @dataclass(frozen=True)
 class Gains:
     """Factors that correct the currents of channels x0, xa, y0, yb; covariance (4, 4) of their logarithms."""

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from handtouch.config import Deployment, Table
+from handtouch.supervise.calibration import LEAST_GAIN, MOST_GAIN
 
 LARGEST_WORD = 32_768
 """Bytes of a word of the slow half; a longer one isn't read."""
 FloatArray = NDArray[np.float64]
 Text = Annotated[str, Field(max_length=1000)]
 Four = Annotated[tuple[float, float, float, float], Field(strict=False)]
-Factor = Annotated[float, Field(ge=0.1, le=10)]
+Factor = Annotated[float, Field(ge=LEAST_GAIN, le=MOST_GAIN)]
 Pair = Annotated[tuple[float, float], Field(strict=False)]
 Row3 = Annotated[tuple[float, float, float], Field(strict=False)]
 Positive = Annotated[float, Field(gt=0)]

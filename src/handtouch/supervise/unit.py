@@ -7,14 +7,14 @@ there: from the store, from ordinary contacts, or from a person. Pure; time is a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.field.model import ForwardModel
-from handtouch.supervise.calibration import Gains, four, matrix
+from handtouch.supervise.calibration import LEAST_GAIN, MOST_GAIN, Gains, four, matrix
 from handtouch.supervise.gains import BATCH, HOPELESS, GainEstimator, GainStatus
 from handtouch.supervise.link import Finding
 from handtouch.supervise.places import Place
@@ -126,6 +126,7 @@ class Unit:
         self.estimate = self._estimator.estimate
         if self.estimate.contacts == before:
             return Outcome()
+        self._bound()
         return self._judge(place.t_ns)
 
     @property
@@ -171,6 +172,18 @@ class Unit:
                 kind=kind, cause=cause, evidence=evidence, remedy=remedy, since_ns=since_ns, strength=False
             ),
         )
+
+    def _bound(self) -> None:
+        """Contacts that are none can lead an estimate anywhere."""
+        least, most = (self._common * limit(self.estimate.gains) for limit in (np.min, np.max))
+        if least >= LEAST_GAIN and most <= MOST_GAIN:
+            return
+        reason = (
+            f"gains from {least:.2g} to {most:.2g} would explain its contacts, and no amplifier has these "
+            f"({LEAST_GAIN:g} to {MOST_GAIN:g} are taken): the pad isn't as configured, or is touched by "
+            "several things at once"
+        )
+        self.estimate = replace(self.estimate, status=GainStatus.INVALID, reason=reason)
 
     def _judge(self, t_ns: int) -> Outcome:
         """A batch of contacts was taken."""
