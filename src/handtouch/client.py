@@ -111,10 +111,7 @@ class Subscriber(Generic[M]):
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
         self._socket.setsockopt(zmq.RCVHWM, queue)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
-        self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        _stay_connected(self._socket)
         for prefix in {_literal_prefix(pattern) for pattern in patterns} | {"service"}:
             self._socket.subscribe(prefix)
         self._door = _Door(self._socket, endpoint, key)
@@ -271,6 +268,14 @@ def request(
     if not isinstance(answer, dict) or not answer.get("ok"):
         raise RuntimeError(answer.get("error", "refused") if isinstance(answer, dict) else "malformed answer")
     return answer
+
+
+def _stay_connected(socket: zmq.Socket[bytes]) -> None:
+    """Notice within 1.5 s that the other end is gone, and look for it at least once a second."""
+    socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
+    socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
+    socket.setsockopt(zmq.RECONNECT_IVL, 50)
+    socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
 
 
 class _Door:

@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, Self
@@ -79,9 +79,7 @@ def run(
         return 2
     endless = view and seconds is None
     length_s = float("inf") if endless else seconds or scenario.duration_s + _BOOT_S
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = _stop_on_signals()
     sys.setswitchinterval(_GIL_SWITCH_S)
     print("building the simulated hand ...", file=sys.stderr)
     try:
@@ -91,25 +89,15 @@ def run(
             TemporaryDirectory(prefix="handtouch-demo-") as folder,
             Daemon(deployment, beside=Path(folder)) as daemon,
             _subscribe(daemon) as messages,
-            ExitStack() as opened,
+            _page(daemon) if view else nullcontext("") as url,
         ):
-            url = opened.enter_context(_page(daemon)) if view else ""
-            lines = plain or not sys.stdout.isatty()
-            title = f"handtouch demo{f', in the browser at {url}' if url else ''}: Ctrl-C ends it"
-            if lines and url:
-                print(f"in the browser at {url}", file=sys.stderr)
-            keeper = _Keeper(LineDisplay() if lines else LiveDisplay(title), keep=not endless)
+            keeper = _Keeper(_display(plain, url), keep=not endless)
             hand.tell_joints(deployment, scenario, daemon.inputs.endpoint)
             hand.start()
-            served = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
-            served.start()
-            end_s = time.monotonic() + length_s
-            try:
+            with _serving(daemon, stop):
+                end_s = time.monotonic() + length_s
                 with keeper:
                     follow(messages, keeper, lambda: stop.is_set() or time.monotonic() > end_s)
-            finally:  # also when nobody reads our lines any more
-                stop.set()
-                served.join()
     except ValueError as error:  # a scenario for another hand, an EDS that can't be simulated
         print(error, file=sys.stderr)
         return 2
@@ -118,6 +106,35 @@ def run(
     if not endless:
         print(score(keeper.contacts, hand.truth))
     return 0 if keeper.count else 1
+
+
+def _stop_on_signals() -> threading.Event:
+    """Set once somebody wants us to end."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+@contextmanager
+def _serving(daemon: Daemon, stop: threading.Event) -> Iterator[None]:
+    """The daemon at work in a thread of its own; it ends with the block, whatever ends that."""
+    served = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
+    served.start()
+    try:
+        yield
+    finally:  # also when nobody reads our lines any more
+        stop.set()
+        served.join()
+
+
+def _display(plain: bool, url: str) -> Display:
+    """Lines or the live view, which tell where the page is, if there is one."""
+    if sys.stdout.isatty() and not plain:
+        return LiveDisplay(f"handtouch demo{f', in the browser at {url}' if url else ''}: Ctrl-C ends it")
+    if url:
+        print(f"in the browser at {url}", file=sys.stderr)
+    return LineDisplay()
 
 
 def _scenario(

@@ -17,7 +17,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from handtouch.client import _Door
+from handtouch.client import _Door, _stay_connected
 from handtouch.inputs import Input, JointCommand, JointState, LinkForces, encode
 
 INPUTS = "tcp://127.0.0.1:5583"
@@ -39,10 +39,7 @@ class Robot:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XPUB)
         self._socket.setsockopt(zmq.SNDHWM, _QUEUE)
         self._socket.setsockopt(zmq.LINGER, 200)
-        self._socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
-        self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        _stay_connected(self._socket)
         self._door = _Door(self._socket, endpoint, key)
 
     def send_joints(
