@@ -26,7 +26,7 @@ import supervise_day
 from numpy.typing import NDArray
 
 from handtouch import sheet, shipped
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Behaviour, load
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.model import PadModel

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import shipped
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Deployment, load
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.model import PadModel

@@ -28,9 +28,9 @@ from typing import Any
 import can
 from bench_receive_path import FRAME, VCAN, store
 
-from handtouch.canbus.port import Port
-from handtouch.canbus.receivers import QUEUE_FRAMES, grow_receive_buffer
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.receivers import QUEUE_FRAMES, grow_receive_buffer
+from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Bus
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"

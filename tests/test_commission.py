@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from handtouch import cli, commission, config, shipped
-from handtouch.canbus.boot import Identity
-from handtouch.canbus.channels import ELECTRODES
 from handtouch.canbus.device import Device, DeviceBus
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.nodes import NodeStatus
+from handtouch.canbus.nodes.boot import Identity
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.spec import NodeStatus
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.commission.bench import Bench, Sample
 from handtouch.commission.edit import applied
 from handtouch.commission.order import ASKED, Near

@@ -19,10 +19,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import cli, config, scan, shipped
-from handtouch.canbus import survey
 from handtouch.canbus.device import DeviceBus
-from handtouch.canbus.survey import NodeFacts, TpdoFacts, four_channels
-from handtouch.canbus.traffic import Traffic, meaning
+from handtouch.canbus.find import survey
+from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, four_channels
+from handtouch.canbus.find.traffic import Traffic, meaning
 from handtouch.scan.fragment import channel_names, fragment
 from handtouch.scan.judge import judge
 from handtouch.scan.look import BusReport, Request

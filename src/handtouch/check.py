@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from handtouch import config
-from handtouch.canbus.channels import full_scale_counts, greatest_count
-from handtouch.canbus.load import burst_s, bus_load
-from handtouch.canbus.nodes import checked
+from handtouch.canbus.bus.load import burst_s, bus_load
+from handtouch.canbus.nodes.spec import checked
+from handtouch.canbus.objects.channels import full_scale_counts, greatest_count
 from handtouch.config.checks import rectangle_mm
 from handtouch.hand.robot import check as check_robots
 from handtouch.hand.robot import doubts as robot_doubts

@@ -24,7 +24,7 @@ from typing import Any, Literal
 import zmq
 
 from handtouch import config, keys
-from handtouch.canbus.receivers import RECEIVE_BUFFER_BYTES
+from handtouch.canbus.bus.receivers import RECEIVE_BUFFER_BYTES
 from handtouch.daemon import realtime
 
 State = Literal["ok", "warn", "fail"]

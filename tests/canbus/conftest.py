@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.canbus import master, sdo
-from handtouch.canbus.bus_state import Trouble
+from handtouch.canbus.bus.bus_state import Trouble
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.router import Frame, Router
+from handtouch.canbus.bus.slab import Slab
 from handtouch.canbus.device import Device, DeviceBus
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master, NodeEvent, NodeSpec, NodeStatus, SerialChanged
-from handtouch.canbus.port import Port
-from handtouch.canbus.router import Frame, Router
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.nodes import master
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.master import Master, NodeEvent, NodeSpec, NodeStatus, SerialChanged
+from handtouch.canbus.objects import sdo
 from handtouch.config import Bus
 
 MS = 1_000_000

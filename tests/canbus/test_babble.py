@@ -7,11 +7,12 @@ from typing import Any
 
 import pytest
 
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.slab import Slab
 from handtouch.canbus.device import Line
-from handtouch.canbus.lifecycle import Babble, Life, NodeState, Role, Timing, advance
-from handtouch.canbus.master import Master, NodeEvent, NodeSpec
-from handtouch.canbus.port import Port
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.nodes.life import Babble, Life, NodeState, Role, Timing
+from handtouch.canbus.nodes.lifecycle import advance
+from handtouch.canbus.nodes.master import Master, NodeEvent, NodeSpec
 from handtouch.config import Bus
 
 OPERATIONAL, FAULTED = NodeState.OPERATIONAL, NodeState.FAULTED

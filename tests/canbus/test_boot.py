@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import pytest
 
-from handtouch.canbus.boot import Expected, Identity, Idle, check_identity, configure, identify
-from handtouch.canbus.channels import STANDARD_CHANNELS, Channel, Channels, Object
-from handtouch.canbus.mapping import Mapping, Tpdo, read_mapping
-from handtouch.canbus.sdo import Outdated, Sdo, StepError
-from handtouch.canbus.slab import STANDARD, Field
+from handtouch.canbus.bus.slab import STANDARD, Field
+from handtouch.canbus.nodes.boot import Expected, Identity, Idle, check_identity, configure, identify
+from handtouch.canbus.objects.channels import STANDARD_CHANNELS, Channel, Channels, Object
+from handtouch.canbus.objects.mapping import Mapping, Tpdo, read_mapping
+from handtouch.canbus.objects.sdo import Outdated, Sdo, StepError
 
 CHANNELS = (0x64010110, 0x64010210, 0x64010310, 0x64010410)
 ABORT_NO_OBJECT, ABORT_NO_SUB = 0x06020000, 0x06090011

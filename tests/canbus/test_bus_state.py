@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.canbus.bus_state import BusState, Condition, Trouble, is_queue_full, trouble_of
+from handtouch.canbus.bus.bus_state import BusState, Condition, Trouble, is_queue_full, trouble_of
 
 S = 1_000_000_000
 DOWN = Trouble(Condition.DOWN, "Network is down")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from handtouch import shipped
-from handtouch.canbus.channels import (
+from handtouch.canbus.objects.channels import (
     ELECTRODES,
     STANDARD_CHANNELS,
     Channel,
@@ -17,7 +17,7 @@ from handtouch.canbus.channels import (
     parse,
     written,
 )
-from handtouch.canbus.eds import EdsError
+from handtouch.canbus.objects.eds import EdsError
 
 FOLDER = Path(__file__).parent.parent / "data" / "eds"
 TACTOR = ("0x2110:0", "0x2120:0", "0x2130:0", "0x2140:0")

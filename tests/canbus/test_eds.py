@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import shipped
-from handtouch.canbus.eds import EdsError, TpdoDefault, integer_type, load, tpdos
-from handtouch.canbus.eds_file import parse
+from handtouch.canbus.objects.eds import EdsError, TpdoDefault, integer_type, load, tpdos
+from handtouch.canbus.objects.eds_file import parse
 
 FILES = sorted((Path(__file__).parent.parent / "data" / "eds").iterdir())
 NODE_ID = 5

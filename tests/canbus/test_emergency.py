@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.canbus.emergency import decode, describe
+from handtouch.canbus.objects.emergency import decode, describe
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from handtouch.canbus.channels import channels_of
-from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.objects.channels import channels_of
 
 Make = Callable[..., Any]
 EDS = str(Path(__file__).parent.parent / "data" / "eds" / "tactor-q16.eds")

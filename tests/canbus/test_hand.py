@@ -10,12 +10,12 @@ import can
 import numpy as np
 import pytest
 
-from handtouch.canbus import sdo
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.slab import Slab
 from handtouch.canbus.device import DeviceBus
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master, NodeSpec
-from handtouch.canbus.port import Port
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.master import Master, NodeSpec
+from handtouch.canbus.objects import sdo
 from handtouch.config import Bus
 
 NODES = 15

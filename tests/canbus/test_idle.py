@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from handtouch import shipped
-from handtouch.canbus.boot import Idle
-from handtouch.canbus.channels import Object, channels_of, written
-from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes.boot import Idle
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.objects.channels import Object, channels_of, written
 
 MS = 1_000_000
 Make = Callable[..., Any]

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from handtouch import shipped
-from handtouch.canbus.channels import ELECTRODES, channels_of, in_order
-from handtouch.canbus.eds import EdsError
-from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.objects.channels import ELECTRODES, channels_of, in_order
+from handtouch.canbus.objects.eds import EdsError
 
 Make = Callable[..., Any]
 FOLDER = Path(__file__).parent.parent / "data" / "eds"

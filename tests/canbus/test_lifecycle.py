@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handtouch.canbus.lifecycle import (
+from handtouch.canbus.nodes.life import (
     NMT_OPERATIONAL,
     NMT_PREOPERATIONAL,
     NMT_STOPPED,
@@ -30,9 +30,8 @@ from handtouch.canbus.lifecycle import (
     Stop,
     Tick,
     Timing,
-    advance,
-    due_ns,
 )
+from handtouch.canbus.nodes.lifecycle import advance, due_ns
 
 MS = 1_000_000
 NOW = 10_000 * MS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from handtouch.canbus.load import burst_s, bus_load, frame_bits
+from handtouch.canbus.bus.load import burst_s, bus_load, frame_bits
 
 
 def test_frame_bits_are_those_of_the_literature() -> None:

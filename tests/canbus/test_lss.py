@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handtouch.canbus.lss import LssAddress, LssError, LssMaster, LssSlave
+from handtouch.canbus.find.lss import LssAddress, LssError, LssMaster, LssSlave
 
 VENDOR, PRODUCT, REVISION = 0x2F1, 0x401, 0x10000
 

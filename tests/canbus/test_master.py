@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from handtouch import shipped
-from handtouch.canbus.eds import EdsError
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master, SerialChanged
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.master import Master, SerialChanged
+from handtouch.canbus.objects.eds import EdsError
 
 OPERATIONAL, ABSENT, FAULTED = NodeState.OPERATIONAL, NodeState.ABSENT, NodeState.FAULTED
 NMT_START, NMT_STOP, NMT_PREOPERATIONAL = 1, 2, 128

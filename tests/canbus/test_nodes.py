@@ -7,9 +7,9 @@ import re
 import pytest
 
 from handtouch import shipped
-from handtouch.canbus.boot import Idle
-from handtouch.canbus.channels import STANDARD_CHANNELS, Channel, Object
-from handtouch.canbus.nodes import NodeSpec, checked, node_specs
+from handtouch.canbus.nodes.boot import Idle
+from handtouch.canbus.nodes.spec import NodeSpec, checked, node_specs
+from handtouch.canbus.objects.channels import STANDARD_CHANNELS, Channel, Object
 from handtouch.config import ConfigError, Deployment, parse
 
 PATH = shipped.path("utah_mit.toml")

@@ -20,13 +20,13 @@ import msgpack
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 
-from handtouch.canbus import receivers
-from handtouch.canbus.bus_state import Condition
-from handtouch.canbus.port import BusError, Port
-from handtouch.canbus.receivers import Retry, ThreadReceiver, within
-from handtouch.canbus.router import Router
-from handtouch.canbus.slab import Slab
-from handtouch.canbus.sockets import DatagramReceiver
+from handtouch.canbus.bus import receivers
+from handtouch.canbus.bus.bus_state import Condition
+from handtouch.canbus.bus.port import BusError, Port
+from handtouch.canbus.bus.receivers import Retry, ThreadReceiver, within
+from handtouch.canbus.bus.router import Router
+from handtouch.canbus.bus.slab import Slab
+from handtouch.canbus.bus.sockets import DatagramReceiver
 from handtouch.config import Bus
 
 _channels = itertools.count()
@@ -523,9 +523,9 @@ def test_stamps_that_cannot_be_are_replaced_by_now(stamp_s: float, t_ns: int) ->
 
 OVERFLOW = """
 import can
-from handtouch.canbus import receivers
-from handtouch.canbus.port import Port
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus import receivers
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Bus
 receivers.RECEIVE_BUFFER_BYTES = 1  # the kernel's least: a few frames
 port = Port.open(Bus(name="palm", interface="udp_multicast", channel="239.74.163.3"), Slab(1))
@@ -548,8 +548,8 @@ def test_what_udp_multicast_drops_is_counted(network: list[str]) -> None:
 
 UDP = """
 import time, can
-from handtouch.canbus.port import Port
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Bus
 bus = Bus(name="palm", interface="udp_multicast", channel="239.74.163.2")
 port = Port.open(bus, Slab(1))

@@ -6,17 +6,8 @@ from typing import Any
 
 import pytest
 
-from handtouch.canbus.lifecycle import (
-    Answer,
-    BootUp,
-    Event,
-    Heartbeat,
-    Life,
-    NodeState,
-    Tick,
-    Timing,
-    advance,
-)
+from handtouch.canbus.nodes.life import Answer, BootUp, Event, Heartbeat, Life, NodeState, Tick, Timing
+from handtouch.canbus.nodes.lifecycle import advance
 
 
 def test_status_tells_why_a_node_boots_until_it_is_up(rig: Any) -> None:

@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from handtouch import shipped
-from handtouch.canbus.boot import Idle
-from handtouch.canbus.channels import Object, written
-from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes.boot import Idle
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.objects.channels import Object, written
 
 MS = 1_000_000
 Make = Callable[..., Any]

@@ -8,9 +8,9 @@ from typing import Any
 import can
 import pytest
 
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master
-from handtouch.canbus.port import Port
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.master import Master
 from handtouch.config import Bus
 
 from .conftest import SYNC_PERIOD_MS, Rig

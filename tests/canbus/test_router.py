@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.canbus.router import NOBODY, Router
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.router import NOBODY, Router
+from handtouch.canbus.bus.slab import Slab
 
 
 @given(st.lists(st.tuples(st.integers(0, 2047), st.binary(max_size=8)), max_size=50))

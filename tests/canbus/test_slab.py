@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.canbus.slab import PDO_BYTES, PDOS, STANDARD, Field, Layout, Slab, limits
+from handtouch.canbus.bus.slab import PDO_BYTES, PDOS, STANDARD, Field, Layout, Slab, limits
 
 TWO: Layout = (
     Field(0, 0, 32, True),

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
-from handtouch.canbus import receivers
-from handtouch.canbus.bus_state import BusState, Condition
-from handtouch.canbus.port import Port
-from handtouch.canbus.slab import Slab
-from handtouch.canbus.sync import Sync
+from handtouch.canbus.bus import receivers
+from handtouch.canbus.bus.bus_state import BusState, Condition
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.slab import Slab
+from handtouch.canbus.bus.sync import Sync
 from handtouch.config import Bus
 
 pytestmark = pytest.mark.socketcan

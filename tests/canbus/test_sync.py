@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handtouch.canbus.bus_state import Condition, Trouble
-from handtouch.canbus.port import Port
-from handtouch.canbus.router import SYNC_ID, Frame, Router
-from handtouch.canbus.slab import Slab
-from handtouch.canbus.sync import Jitter, Sync
+from handtouch.canbus.bus.bus_state import Condition, Trouble
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.router import SYNC_ID, Frame, Router
+from handtouch.canbus.bus.slab import Slab
+from handtouch.canbus.bus.sync import Jitter, Sync
 from handtouch.config import Bus
 
 MS = 1_000_000

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from handtouch.canbus.device import Line
-from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes.life import NodeState
 
 MS = 1_000_000
 Make = Callable[..., Any]

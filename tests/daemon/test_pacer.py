@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes.life import NodeState
 from handtouch.config import Deployment
 from handtouch.config.tables import Idle
 from handtouch.daemon.pacer import Pacer

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from handtouch import wire
-from handtouch.canbus.master import SerialChanged
+from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.config import Behaviour
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.process import Process

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.tick import Tick, Ticked
 from handtouch.wire import PadState

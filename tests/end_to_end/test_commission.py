@@ -26,9 +26,9 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.bus.port import open_bus
 from handtouch.canbus.device import DeviceBus
-from handtouch.canbus.port import open_bus
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.world import World

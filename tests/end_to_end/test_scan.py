@@ -80,7 +80,7 @@ UNNAMED = """
 import sys, threading
 import numpy as np
 from handtouch.canbus.device import DeviceBus
-from handtouch.canbus.port import open_bus
+from handtouch.canbus.bus.port import open_bus
 from handtouch.config import Bus
 bus = Bus(name="can0", interface="udp_multicast", channel="239.74.163.2", options={"port": int(sys.argv[1])})
 nodes = DeviceBus(open_bus(bus), lambda t_ns: np.zeros((8, 4), np.int16))

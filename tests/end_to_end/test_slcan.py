@@ -17,9 +17,9 @@ from typing import Any
 import can
 import pytest
 
-from handtouch.canbus import receivers
-from handtouch.canbus.port import Port
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus import receivers
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Bus
 
 LONGEST_S = 60.0

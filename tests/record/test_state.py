@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handtouch import wire
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.daemon import state
 from handtouch.wire import PadState
 

@@ -13,7 +13,7 @@ import can
 import pytest
 
 from handtouch import config
-from handtouch.canbus.port import BusError
+from handtouch.canbus.bus.port import BusError
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import run as simulate_run
 from handtouch.simulate import truth as truth_file

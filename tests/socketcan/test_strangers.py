@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from handtouch import shipped
+from handtouch.canbus.bus.receivers import grow_receive_buffer
 from handtouch.canbus.device import DeviceBus
-from handtouch.canbus.receivers import grow_receive_buffer
 from handtouch.client import request
 from handtouch.config import load
 from tests.starter import Starter

@@ -15,8 +15,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from handtouch import client, config
-from handtouch.canbus.nodes import checked
-from handtouch.canbus.port import BusError
+from handtouch.canbus.bus.port import BusError
+from handtouch.canbus.nodes.spec import checked
 from handtouch.dialogue import open_dialogue
 
 from . import report

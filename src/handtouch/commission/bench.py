@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import STALE_PERIODS, Master
-from handtouch.canbus.nodes import NodeStatus, node_specs
-from handtouch.canbus.port import Port
-from handtouch.canbus.router import SYNC_ID
-from handtouch.canbus.slab import Slab
-from handtouch.canbus.sync import Sync
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.router import SYNC_ID
+from handtouch.canbus.bus.slab import Slab
+from handtouch.canbus.bus.sync import Sync
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.master import STALE_PERIODS, Master
+from handtouch.canbus.nodes.spec import NodeStatus, node_specs
+from handtouch.canbus.objects.channels import ELECTRODES
 
 from .edit import Edit, applied
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from handtouch.canbus.nodes import NodeStatus
+from handtouch.canbus.nodes.spec import NodeStatus
 
 from .edit import Edit
 from .outcome import Outcome, Result

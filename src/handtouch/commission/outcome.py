@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Protocol
 
 from handtouch import config
-from handtouch.canbus.nodes import NodeStatus
+from handtouch.canbus.nodes.spec import NodeStatus
 
 from .bench import Sample
 from .order import Near

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import channels_of
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.nodes import NodeStatus
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.spec import NodeStatus
+from handtouch.canbus.objects.channels import channels_of
 from handtouch.dialogue import Dialogue, Key
 from handtouch.hand import network_of, surface_of
 

@@ -23,12 +23,12 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from handtouch.canbus.eds import EdsError
-from handtouch.canbus.master import Master
-from handtouch.canbus.nodes import NodeSpec, checked, node_specs
-from handtouch.canbus.port import BusError, Port
-from handtouch.canbus.router import SYNC_ID
-from handtouch.canbus.sync import Sync
+from handtouch.canbus.bus.port import BusError, Port
+from handtouch.canbus.bus.router import SYNC_ID
+from handtouch.canbus.bus.sync import Sync
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import NodeSpec, checked, node_specs
+from handtouch.canbus.objects.eds import EdsError
 from handtouch.config import ConfigError, Deployment, load, with_bus
 from handtouch.daemon import histogram, logs, realtime
 from handtouch.daemon.commands import Commands

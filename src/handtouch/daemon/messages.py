@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.daemon.frames import Frames
 from handtouch.daemon.handframe import HandWriter
 from handtouch.daemon.model import PadModel

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES, Channels, channels_of, in_order
+from handtouch.canbus.objects.channels import ELECTRODES, Channels, channels_of, in_order
 from handtouch.config import Deployment
 from handtouch.field import LocatorBank
 from handtouch.field.network import ElectrodeNetwork

@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.master import Master
 from handtouch.config import Deployment
 from handtouch.config.tables import Scene
 from handtouch.daemon.pipeline import Pipeline
@@ -21,7 +21,7 @@ _LOOK_NS = 100_000_000  # between two looks at what may rest; waking doesn't wai
 
 
 class Beat(Protocol):
-    """What sets the period of SYNC: `canbus.sync.Sync`."""
+    """What sets the period of SYNC: `canbus.bus.sync.Sync`."""
 
     def set_period(self, period_ns: int, now_ns: int) -> None: ...
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.frames import Frames
 from handtouch.daemon.journal import Journal

@@ -12,8 +12,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from handtouch.canbus.eds import EdsError
-from handtouch.canbus.nodes import node_specs
+from handtouch.canbus.nodes.spec import node_specs
+from handtouch.canbus.objects.eds import EdsError
 from handtouch.config import ConfigError, Deployment, Table
 from handtouch.daemon.control import RefusedError
 from handtouch.daemon.model import PadModel

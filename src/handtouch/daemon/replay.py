@@ -22,9 +22,9 @@ import can
 import zmq
 
 from handtouch import wire
-from handtouch.canbus.channels import channels_of, in_order
-from handtouch.canbus.mapping import from_eds
-from handtouch.canbus.router import SYNC_ID, Counters, Router
+from handtouch.canbus.bus.router import SYNC_ID, Counters, Router
+from handtouch.canbus.objects.channels import channels_of, in_order
+from handtouch.canbus.objects.mapping import from_eds
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pipeline import Pipeline

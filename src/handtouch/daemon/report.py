@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import __version__, wire
-from handtouch.canbus.lifecycle import NodeState
-from handtouch.canbus.master import Master
-from handtouch.canbus.port import Port
-from handtouch.canbus.sync import Sync, summary_us
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.sync import Sync, summary_us
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.master import Master
 from handtouch.config import Deployment
 from handtouch.daemon.control import Control
 from handtouch.daemon.histogram import StageClock

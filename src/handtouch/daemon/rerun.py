@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Deployment
 from handtouch.daemon import state
 from handtouch.daemon.journal import build

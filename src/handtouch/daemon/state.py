@@ -19,7 +19,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.field import LocatorBank
 from handtouch.field.strength import ContactLaw

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.master import Master, NodeEvent, NodeState, SerialChanged
+from handtouch.canbus.nodes.master import Master, NodeEvent, NodeState, SerialChanged
 from handtouch.config import Deployment
 from handtouch.daemon.blocks import Blocks
 from handtouch.daemon.pipeline import Pipeline

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pacer import Pacer
 from handtouch.daemon.tick import Tick

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.canbus.slab import Slab
+from handtouch.canbus.bus.slab import Slab
 from handtouch.daemon.contacts import BoolArray, Contacts, IntArray
 from handtouch.daemon.cycle import Cycle
 from handtouch.daemon.follow import FORCE, NEAR, NORMAL, PAD, POSITION, RESIDUAL, VALUES, XY, Follower, Solved

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from handtouch import config, shipped
-from handtouch.canbus.port import BusError
+from handtouch.canbus.bus.port import BusError
 from handtouch.doctor import Machine
 
 from . import show

@@ -11,8 +11,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from handtouch import config
-from handtouch.canbus.channels import PROFILE_TYPES
-from handtouch.canbus.survey import NodeFacts, four_channels
+from handtouch.canbus.find.survey import NodeFacts, four_channels
+from handtouch.canbus.objects.channels import PROFILE_TYPES
 
 FILL_IN = "FILL IN"
 """Marks the lines that a person has to complete; they are comments until then."""

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from handtouch import config
-from handtouch.canbus import channels
-from handtouch.canbus.survey import NodeFacts
+from handtouch.canbus.find.survey import NodeFacts
+from handtouch.canbus.objects import channels
 
 from .look import BusReport, pads_on
 

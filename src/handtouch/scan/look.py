@@ -12,11 +12,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 
 from handtouch import config
-from handtouch.canbus.lss import LEAST_WAIT_S, LssAddress, LssError, LssMaster
-from handtouch.canbus.port import Port
-from handtouch.canbus.slab import Slab
-from handtouch.canbus.survey import NodeFacts, Survey
-from handtouch.canbus.traffic import Stream
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.slab import Slab
+from handtouch.canbus.find.lss import LEAST_WAIT_S, LssAddress, LssError, LssMaster
+from handtouch.canbus.find.survey import NodeFacts, Survey
+from handtouch.canbus.find.traffic import Stream
 
 _BOOT_S = 3.0  # a node that was given an id says that it is there within this
 

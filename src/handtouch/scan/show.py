@@ -17,8 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 from handtouch import config
-from handtouch.canbus.survey import NodeFacts, TpdoFacts, four_channels
-from handtouch.canbus.traffic import meaning
+from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, four_channels
+from handtouch.canbus.find.traffic import meaning
 
 from .fragment import Found, channel_names, fragment
 from .judge import Verdict, names_by_serial

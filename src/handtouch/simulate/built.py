@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES, channels_of, in_order
+from handtouch.canbus.objects.channels import ELECTRODES, channels_of, in_order
 from handtouch.sheet import SheetModel
 from handtouch.simulate import noise
 from handtouch.simulate.faults import Fault, Gum, StuckChannel

@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.simulate.faults import (
     DeadElectrode,
     Fault,

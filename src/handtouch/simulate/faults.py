@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.config.tables import Electrode, Name, NonNegative, Positive, Table
 from handtouch.simulate.circuit import Wiring
 

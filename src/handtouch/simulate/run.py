@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config, shipped
-from handtouch.canbus.channels import ELECTRODES, channels_of, parse
+from handtouch.canbus.bus.port import BusError, open_bus
 from handtouch.canbus.device import Device, DeviceBus
-from handtouch.canbus.nodes import checked
-from handtouch.canbus.port import BusError, open_bus
+from handtouch.canbus.nodes.spec import checked
+from handtouch.canbus.objects.channels import ELECTRODES, channels_of, parse
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.grasp import played as grasped

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.hand.pads import mount_of, rotation_of
 from handtouch.sheet import S1, S2, SheetModel
 from handtouch.simulate import noise

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.channels import ELECTRODES
-from handtouch.canbus.lifecycle import NodeState
+from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.wire import PadState
 
 

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from handtouch.canbus import eds
 from handtouch.canbus.device import DeviceBus
+from handtouch.canbus.objects import eds
 
 FOUR = tuple((0x2001, sub) for sub in (1, 2, 3, 4))
 OFF = 0x80000000

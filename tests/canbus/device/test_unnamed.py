@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from handtouch.canbus.lss import ANSWER_ID, REQUEST_ID, LssMaster
+from handtouch.canbus.find.lss import ANSWER_ID, REQUEST_ID, LssMaster
 
 
 class _Exchange:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import shipped
-from handtouch.canbus import lss
+from handtouch.canbus.find import lss
 
 from .agenda import Agenda, Job
 from .inputs import CHANNELS

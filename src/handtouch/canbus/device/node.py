@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import can
 from canopen.nmt import COMMAND_TO_STATE, NMT_STATES
 
-from handtouch.canbus import eds
+from handtouch.canbus.objects import eds
 
 from . import inputs
 from .faults import Switches

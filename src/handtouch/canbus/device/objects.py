@@ -10,7 +10,7 @@ from canopen.objectdictionary import datatypes
 from canopen.sdo import SdoAbortedError
 from canopen.sdo import constants as sdo
 
-from handtouch.canbus.eds_file import INTEGERS, variable_at
+from handtouch.canbus.objects.eds_file import INTEGERS, variable_at
 
 Address = tuple[int, int]
 """Index and sub-index."""

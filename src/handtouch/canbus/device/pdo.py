@@ -9,7 +9,7 @@ import can
 from canopen.sdo import SdoAbortedError
 from canopen.sdo import constants as sdo
 
-from handtouch.canbus.eds import TpdoDefault
+from handtouch.canbus.objects.eds import TpdoDefault
 
 from .objects import Address, Objects
 

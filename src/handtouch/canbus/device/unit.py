@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from canopen import ObjectDictionary
 
-from handtouch.canbus import eds
+from handtouch.canbus.objects import eds
 
 from .inputs import CHANNELS, Limits
 from .objects import Address, Objects

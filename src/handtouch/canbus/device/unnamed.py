@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from canopen import ObjectDictionary
 
-from handtouch.canbus.eds_file import raw_value
-from handtouch.canbus.lss import LssAddress, LssSlave
+from handtouch.canbus.find.lss import LssAddress, LssSlave
+from handtouch.canbus.objects.eds_file import raw_value
 
 from .node import Device
 from .unit import IDENTITY, Unit

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.supervise.diagnose.cut import CORNERS, cut_changes

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.canbus.channels import ELECTRODES, channels_of, in_order
+from handtouch.canbus.objects.channels import ELECTRODES, channels_of, in_order
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.hand import network_of, surface_of

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from handtouch.canbus.channels import ELECTRODES
+from handtouch.canbus.objects.channels import ELECTRODES
 from handtouch.supervise.diagnose.channels import ChannelFault
 from handtouch.supervise.diagnose.contacts import Verdict
 from handtouch.supervise.diagnose.findings import DiagnosisModel, Finding, FloatArray, Kind

@@ -15,9 +15,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from . import boot, emergency
-from .eds import EdsError
-from .lifecycle import (
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.router import IDENTIFIERS, NOBODY
+from handtouch.canbus.objects import emergency
+from handtouch.canbus.objects.eds import EdsError
+from handtouch.canbus.objects.mapping import Mapping as PdoMapping
+
+from . import boot
+from .life import (
     NMT_BOOT_UP,
     Action,
     Answer,
@@ -34,15 +39,10 @@ from .lifecycle import (
     Silence,
     Stop,
     Tick,
-    advance,
-    due_ns,
-    is_supervised,
 )
-from .mapping import Mapping as PdoMapping
+from .lifecycle import advance, due_ns, is_supervised
 from .member import NMT_COMMANDS, Member, Outcome, Result, command, member, outcome
-from .nodes import NodeEvent, NodeSpec, NodeStatus, SerialChanged
-from .port import Port
-from .router import IDENTIFIERS, NOBODY
+from .spec import NodeEvent, NodeSpec, NodeStatus, SerialChanged
 
 __all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus", "SerialChanged"]
 

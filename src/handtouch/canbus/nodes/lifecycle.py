@@ -1,73 +1,41 @@
 """The life of one CANopen node as a pure state machine: a life and an event in, a life and actions out.
 
-Public names: `NodeState`, `Action`, `Role`, `Timing`, `Life`, `advance`, `due_ns`, `is_supervised` and the
-events. No clock, no bus: time is an argument in ns, and whoever calls carries out the actions and reports
-their results as events.
+Public names: `advance`, `due_ns`, `is_supervised`. No clock, no bus: time is an argument in ns, and whoever
+calls carries out the actions and reports their results as events.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import Enum, IntEnum, auto
+from dataclasses import replace
 from typing import assert_never
 
+from .life import (
+    LOOK_AT,
+    NMT_NAMES,
+    NMT_OPERATIONAL,
+    NMT_PREOPERATIONAL,
+    NMT_STOPPED,
+    Action,
+    Answer,
+    Babble,
+    Beats,
+    BootUp,
+    Done,
+    Event,
+    Failed,
+    Heartbeat,
+    Life,
+    NodeState,
+    Rest,
+    Role,
+    Sample,
+    Silence,
+    Stop,
+    Tick,
+    Timing,
+)
 
-class NodeState(IntEnum):
-    """Where a node is in its life. Samples are to be trusted in OPERATIONAL only."""
-
-    ABSENT = 0  # never heard, or lost: its heartbeat timed out
-    BOOTING = 1  # heard; its identity is being read
-    IDENTIFIED = 2  # it is who it should be; its PDO mapping is being read
-    CONFIGURING = 3  # its heartbeat and PDO are being set and read back
-    SETTLING = 4  # started; its first samples are discarded
-    OPERATIONAL = 5
-    STALE = 6  # it is alive, but no samples come
-    FAULTED = 7  # it can't be used, for the reason given; tried again from time to time
-    STOPPED = 8  # by us: handtouch has ended, or nobody needs the node now
-
-
-class Action(Enum):
-    """What the machine wants done. IDENTIFY, READ_MAPPING and CONFIGURE end in a `Done` or a `Failed`."""
-
-    PROBE = auto()  # ask over SDO, without waiting, whether anybody is there
-    IDENTIFY = auto()
-    READ_MAPPING = auto()
-    CONFIGURE = auto()
-    ENTER_PREOPERATIONAL = auto()  # these three: NMT, to this node alone
-    START = auto()
-    STOP = auto()
-    POWER_DOWN = auto()  # excitation off, where it can be, then STOP
-    PACE = auto()  # event-driven or synchronous; asked for by the master itself
-
-
-NMT_BOOT_UP, NMT_STOPPED, NMT_OPERATIONAL, NMT_PREOPERATIONAL = 0, 4, 5, 127
-NMT_NAMES = {NMT_STOPPED: "stopped", NMT_OPERATIONAL: "operational", NMT_PREOPERATIONAL: "pre-operational"}
-
-
-class Role(Enum):
-    """What part we take on a node's bus."""
-
-    MASTER = "master"  # we configure and start the node
-    GUEST = "guest"  # we configure it; another NMT master starts it
-    LISTENER = "listener"  # we send nothing
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """Times of one node [ns], and our part on its bus."""
-
-    heartbeat_ns: int
-    heartbeat_timeout_ns: int
-    role: Role = Role.MASTER
-    settle_samples: int = 3
-    settle_timeout_ns: int = 1_000_000_000
-    retry_first_ns: int = 100_000_000
-    retry_last_ns: int = 5_000_000_000
-
-    def pause_ns(self, failures: int) -> int:
-        """Pause after that many failures in a row: doubled with each, up to the longest."""
-        return min(self.retry_first_ns << min(max(failures - 1, 0), 16), self.retry_last_ns)
-
+Next = tuple[Life, tuple[Action, ...]]
 
 _NEVER_NS = 1 << 62
 _NO_HEARTBEAT = (
@@ -83,115 +51,6 @@ _BABBLES = (
     "with its identifier; power-cycle it, or unplug it"
 )
 _RESTING = "outside the scene: switched off until it is needed"
-_LOOK_AT = "check its power, cable, node id and the bit rate and termination of the bus"
-
-
-@dataclass(frozen=True, slots=True)
-class Life:
-    """A node's life so far."""
-
-    state: NodeState = NodeState.ABSENT
-    since_ns: int = 0
-    reason: str = f"not heard yet; {_LOOK_AT}"
-    nmt: int | None = None  # NMT state that it last told
-    heard_ns: int | None = None  # boot-up, heartbeat or answer
-    heartbeat_ns: int | None = None  # the last one, or since when one is due; None: not supervised
-    started_ns: int = 0
-    due_ns: int = 0  # next probe (ABSENT), attempt (FAULTED) or end of patience (SETTLING)
-    attempt: int = 0  # which boot this is; results of others are void
-    failures: int = 0  # attempts in a row; they set the pause before the next
-    probes: int = 0  # unanswered in a row; they set the pause before the next
-    discard: int = 0  # samples still to be discarded
-    reboots: int = 0
-    must_beat: bool = False  # lost for want of heartbeats: not trusted before it has sent one
-    stranger: bool = False  # at its last identification it was not the configured node
-    twins: bool = False  # two nodes have its id
-    babbles: bool = False  # it sends many samples for one SYNC
-    because: str = ""  # why the present boot began
-    resting: bool = False  # not needed now: configured, but stopped instead of started
-
-
-@dataclass(frozen=True, slots=True)
-class BootUp:
-    """The node has (re)started: heartbeat identifier with a 0."""
-
-
-@dataclass(frozen=True, slots=True)
-class Heartbeat:
-    """A heartbeat with the node's NMT state."""
-
-    nmt: int
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """An SDO answer to a probe."""
-
-
-@dataclass(frozen=True, slots=True)
-class Done:
-    """A step of attempt `attempt` has succeeded."""
-
-    step: Action
-    attempt: int
-
-
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """A step of attempt `attempt` has failed. `silent`: no answer. `stranger`: not the configured node."""
-
-    step: Action
-    attempt: int
-    reason: str
-    silent: bool = False
-    stranger: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """A sample has arrived."""
-
-
-@dataclass(frozen=True, slots=True)
-class Silence:
-    """No sample for too long, this many ns."""
-
-    age_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Beats:
-    """How often its heartbeats came over a while: `twice`, as if two nodes had its id, or as they should."""
-
-    twice: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Babble:
-    """How many samples came for each SYNC over a while; 0 where it is one, as it should be."""
-
-    times: int
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """Time has passed."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rest:
-    """The node isn't needed for now (`resting`), or is again."""
-
-    resting: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """The node is not wanted any more."""
-
-
-Event = BootUp | Heartbeat | Answer | Done | Failed | Sample | Silence | Beats | Babble | Rest | Tick | Stop
-Next = tuple[Life, tuple[Action, ...]]
 
 _BOOT_STEPS = frozenset({Action.IDENTIFY, Action.READ_MAPPING, Action.CONFIGURE})
 _IN_BOOT = frozenset({NodeState.BOOTING, NodeState.IDENTIFIED, NodeState.CONFIGURING})
@@ -471,6 +330,6 @@ def _lost(life: Life, quiet_ns: int, t_ns: int, timing: Timing) -> Life:
         failures = life.failures + 1
         life = _enter(life, NodeState.FAULTED, t_ns, _NO_HEARTBEAT)
         return replace(life, heartbeat_ns=None, failures=failures, due_ns=t_ns + timing.pause_ns(failures))
-    told = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms; {_LOOK_AT}"
+    told = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms; {LOOK_AT}"
     life = replace(_enter(life, NodeState.ABSENT, t_ns, told), heartbeat_ns=None, nmt=None)
     return replace(life, must_beat=True, failures=0, due_ns=t_ns + timing.pause_ns(0))

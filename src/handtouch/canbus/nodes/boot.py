@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
-from .channels import Object
-from .mapping import COMMUNICATION, Mapping, Tpdo
-from .sdo import Sdo, StepError
+from handtouch.canbus.objects.channels import Object
+from handtouch.canbus.objects.mapping import COMMUNICATION, Mapping, Tpdo
+from handtouch.canbus.objects.sdo import Sdo, StepError
 
 SYNCHRONOUS = 1
 """Transmission type: with every SYNC."""

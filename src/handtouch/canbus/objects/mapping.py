@@ -9,10 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from handtouch.canbus.bus.slab import PDO_BYTES, Field, Layout
+
 from . import eds
 from .channels import Channel, Channels
 from .sdo import Sdo, StepError
-from .slab import PDO_BYTES, Field, Layout
 
 DEFAULT_TPDOS = (2, 1, 3, 4)
 """Without an EDS: the four of the predefined connection set, that of CiA 401's analogue inputs first."""

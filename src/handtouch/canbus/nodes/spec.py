@@ -8,14 +8,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from handtouch.canbus.objects.channels import (
+    STANDARD_CHANNELS,
+    Channels,
+    Object,
+    channels_of,
+    in_order,
+    written,
+)
+from handtouch.canbus.objects.eds import EdsError
+from handtouch.canbus.objects.emergency import Emergency
+from handtouch.canbus.objects.mapping import from_eds
 from handtouch.config import ConfigError, Deployment, Node, Problem
 
 from .boot import Identity, Idle
-from .channels import STANDARD_CHANNELS, Channels, Object, channels_of, in_order, written
-from .eds import EdsError
-from .emergency import Emergency
-from .lifecycle import NodeState
-from .mapping import from_eds
+from .life import NodeState
 
 
 @dataclass(frozen=True, slots=True)

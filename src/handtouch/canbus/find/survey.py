@@ -16,9 +16,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.objects.sdo import Sdo, StepError
+
 from .lss import ANSWER_ID, REQUEST_ID
-from .port import Port
-from .sdo import Sdo, StepError
 from .traffic import NMT_STATES, Traffic
 
 ANSWER_WAIT_S = 0.2

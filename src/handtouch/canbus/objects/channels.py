@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from handtouch.canbus.bus.slab import limits
 from handtouch.config import Node
 
 from . import eds
-from .slab import limits
 
 ELECTRODES = ("x0", "xa", "y0", "yb")
 WIDEST_BITS = 32

@@ -10,13 +10,15 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from . import boot, emergency
-from .lifecycle import NMT_PREOPERATIONAL, Action, Done, Failed, Life, NodeState, Role, Timing
-from .mapping import Mapping as PdoMapping
-from .mapping import from_eds, read_mapping, tpdo_numbers
-from .nodes import NodeSpec, NodeStatus
-from .port import Port
-from .sdo import Outdated, Sdo, StepError
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.objects import emergency
+from handtouch.canbus.objects.mapping import Mapping as PdoMapping
+from handtouch.canbus.objects.mapping import from_eds, read_mapping, tpdo_numbers
+from handtouch.canbus.objects.sdo import Outdated, Sdo, StepError
+
+from . import boot
+from .life import NMT_PREOPERATIONAL, Action, Done, Failed, Life, NodeState, Role, Timing
+from .spec import NodeSpec, NodeStatus
 
 EMERGENCIES_KEPT = 16
 Outcome = Done | Failed
