@@ -21,7 +21,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -78,13 +78,13 @@ def open_bus() -> can.BusABC:
     return can.Bus(CHANNEL, interface="udp_multicast", port=PORT, ignore_config=True)
 
 
-def film(deployment: Deployment, path: str) -> NDArray[np.int64]:
-    """Counts (k, pads, 4), one sample a SYNC period: contacts on TOUCHED pads go along the path and back."""
+def film(deployment: Deployment, path: str, touched: Sequence[int] = range(TOUCHED)) -> NDArray[np.int64]:
+    """Counts (k, pads, 4), one sample a SYNC period: contacts on these pads go along the path and back."""
     links = [pad.link for hand in deployment.hands for pad in hand.pads]
     touches = "\n".join(
         f'[[touch]]\nlink = "{link}"\nfrom_s = 0\nduration_s = {ROUND_S + 1}\nramp_s = 0.4\nforce_n = [1.5]\n'
         f"radius_mm = 2.5\npath = {path}"
-        for link in links[:TOUCHED]
+        for link in (links[n] for n in touched)
     )
     hand = VirtualHand(deployment, Scenario.parse(touches), World.ideal_parts())
     times_s = np.arange(0.5, 0.5 + ROUND_S, deployment.daemon.sync_period_ms * 1e-3)

@@ -1,13 +1,12 @@
 """Many pads at 1 kHz for a long time through the real daemon, in one process; the limit; an hour of memory.
 
 The daemon's hot loop runs in a thread, on in-process buses of 8 pads each with their bounded queues. Its
-nodes are simulated ones until they are booted; then one thread answers each SYNC with messages made before, a
-tenth of the pads touched by sliding contacts, and keeps the heartbeats up; it shares the interpreter with the
-hot loop, and its share of a core is told. --minutes says how long the run of 60 pads at 1 kHz takes, --hours
-how much of the memory run, in which samples of 15 pads at 1 kHz go through pipeline and publisher as fast as
-they can, contacts coming and going, while their stamps tell the time. --trial does a little of all of it and
-writes nothing. Writes docs/benchmarks/soak_rate.{md,json}; exit status 1 if a sample was lost or the memory
-grows.
+nodes are simulated ones until they are booted; then each SYNC is answered with messages made before, a tenth
+of the pads touched by sliding contacts, while it is sent: their share of a core is told apart. --minutes
+says how long the run of 60 pads at 1 kHz takes, --hours how much of the memory run, in which samples of 15
+pads at 1 kHz go through pipeline and publisher as fast as they can, contacts coming and going, while their
+stamps tell the time. --trial does a little of all of it and writes nothing. Writes
+docs/benchmarks/soak_rate.{md,json}; exit status 1 if a sample was lost or the memory grows.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import gc
 import json
 import multiprocessing
 import os
+import queue
 import sys
 import tempfile
 import threading
@@ -28,7 +28,7 @@ from typing import Any
 import can
 import numpy as np
 import zmq
-from bench_latency import OUT, PATHS, TOUCHED, descriptors, film, machine, resident_mb
+from bench_latency import OUT, PATHS, descriptors, film, machine, resident_mb
 from numpy.typing import NDArray
 
 from handtouch import shipped
@@ -48,6 +48,8 @@ LIMIT_S = 8.0
 MISSED = 1e-3
 """Of the samples, or of the periods: more than that is an overrun, less a moment of the machine's."""
 PERIOD_NS = 1_000_000
+HEARTBEAT_SYNCS = 100
+"""From one heartbeat of a node to its next."""
 BOOT_PERIOD_NS = 50_000_000
 SAMPLES = 1000
 GROWTH_MB_PER_H = 2.0
@@ -80,12 +82,16 @@ def hands_of(pads: int, rate_hz: float, folder: Path) -> Deployment:
 
 
 class Nodes:
-    """The nodes of a deployment: simulated until `feed`, then a thread that sends what was made before."""
+    """The nodes of a deployment: simulated until `feed`, then SYNC is answered with what was made before.
+
+    The answers are put into the daemon's queues from within the sending of SYNC, and so are heartbeats, in
+    turns: another thread would share the interpreter with the hot one, and its rests would be measured.
+    """
 
     def __init__(self, deployment: Deployment, samples: NDArray[np.int64]) -> None:
         self._pads = [pad for hand in deployment.hands for pad in hand.pads]
         self._names = [bus.name for bus in deployment.buses]
-        self._buses = [can.Bus(bus.channel, interface="virtual") for bus in deployment.buses]
+        self._buses: list[Any] = [can.Bus(bus.channel, interface="virtual") for bus in deployment.buses]
         self._simulated = []
         for name, bus in zip(self._names, self._buses, strict=True):
             devices = DeviceBus(bus, lambda _: np.zeros((PADS_PER_BUS, 4), dtype=np.int64))
@@ -94,88 +100,83 @@ class Nodes:
                     devices.add(pad.node_id, serial=pad.serial)
             devices.start()
             self._simulated.append(devices)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="feeder")
-        self._messages = self._made(samples)
-        self.answered = 0
+        self._answers = [self._answers_of(name, samples.astype("<i2")) for name in self._names]
 
     def feed(self, daemon: Daemon) -> None:
         """Take the place of the simulated nodes of a daemon that has booted them all."""
-        receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
-        self._queues = [receiver._bus.queue for receiver in receivers]
         for devices in self._simulated:
             devices.stop()
-        self._thread.start()
+        receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
+        for receiver, bus, answers in zip(receivers, self._buses, self._answers, strict=True):
+            answers.inbox = receiver._bus.queue
+            bus.channel[bus.channel.index(bus.queue)] = bus.queue = answers
+
+    @property
+    def answered(self) -> int:
+        """SYNCs."""
+        return min(answers.count for answers in self._answers)
 
     def busy_s(self) -> float:
-        """Processor time that the thread has taken."""
-        return time.clock_gettime(time.pthread_getcpuclockid(self._thread.ident or 0))
+        """Time that the answers have taken."""
+        return 1e-9 * sum(answers.busy_ns for answers in self._answers)
 
     def stop(self) -> None:
         """Fall silent."""
-        self._over.set()
-        if self._thread.is_alive():
-            self._thread.join()
         for devices in self._simulated:
             devices.stop()
         for bus in self._buses:
             bus.shutdown()
 
-    def _made(self, samples: NDArray[np.int64]) -> list[list[list[can.Message]]]:
-        """Per sample and bus, its frames; samples (k, pads, 4)."""
-
-        def frame(pad: int, counts: NDArray[np.int64]) -> can.Message:
-            can_id = 0x280 + self._pads[pad].node_id
-            return can.Message(
-                arbitration_id=can_id, data=counts.astype("<i2").tobytes(), is_extended_id=False
-            )
-
-        on_bus = [[n for n, pad in enumerate(self._pads) if pad.bus == name] for name in self._names]
-        return [[[frame(pad, row[pad]) for pad in pads] for pads in on_bus] for row in samples]
-
-    def _run(self) -> None:
-        messages = self._messages
-        alive = [
-            [
-                can.Message(arbitration_id=0x700 + pad.node_id, data=[5], is_extended_id=False)
-                for pad in self._pads
-                if pad.bus == name
-            ]
-            for name in self._names
-        ]
-        heard_s = 0.0
-        last: Any = self._buses[-1]  # the SYNC of a cycle comes there last
-        while not self._over.is_set():
-            message = last.recv(0.05)
-            for bus in self._buses[:-1]:
-                queue: Any = bus
-                queue.queue.queue.clear()
-            if time.monotonic() - heard_s > 0.1:
-                heard_s = time.monotonic()
-                for queue, frames in zip(self._queues, alive, strict=True):
-                    put(queue, frames)
-            if message is not None and message.arbitration_id == 0x80:
-                for queue, frames in zip(self._queues, messages[self.answered % len(messages)], strict=True):
-                    put(queue, frames)
-                self.answered += 1
+    def _answers_of(self, name: str, data: NDArray[np.int16]) -> Answers:
+        """Those of one bus, by samples (k, pads, 4)."""
+        numbers = [(n, pad.node_id) for n, pad in enumerate(self._pads) if pad.bus == name]
+        frames = [[frame(0x280 + node_id, row[n].tobytes()) for n, node_id in numbers] for row in data]
+        return Answers(frames, [frame(0x700 + node_id, b"\x05") for _, node_id in numbers])
 
 
-def put(queue: Any, frames: list[can.Message]) -> None:
-    """Into an in-process bus, as its `send` does, which copies deeply, too: three times the cost."""
-    for frame in frames:
-        queue.put(frame)
+class Answers(queue.Queue[can.Message]):
+    """What stands on a bus for its nodes, once the daemon's `inbox` is known."""
+
+    inbox: Any
+
+    def __init__(self, frames: list[list[can.Message]], alive: list[can.Message]) -> None:
+        super().__init__()
+        self._frames, self._alive = frames, alive
+        self.count = self.busy_ns = 0
+
+    def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:  # noqa: ARG002
+        """A frame of the daemon's."""
+        if item.arbitration_id != 0x80:
+            return
+        start_ns = time.perf_counter_ns()
+        put = self.inbox.put
+        for answer in self._frames[self.count % len(self._frames)]:
+            put(answer)
+        turn = self.count % HEARTBEAT_SYNCS
+        if turn < len(self._alive):
+            put(self._alive[turn])
+        self.count += 1
+        self.busy_ns += time.perf_counter_ns() - start_ns
+
+
+def frame(can_id: int, data: bytes) -> can.Message:
+    """A node's."""
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
 def touches(pads: int, part: float) -> NDArray[np.int64]:
     """Counts (k, pads, 4): that part of the pads touched, sliding; no two hands at the same place."""
     deployment = load(shipped.path("utah_mit.toml"))
     kilohertz = deployment.daemon.model_copy(update={"sync_period_ms": 1.0})
-    one = film(deployment.model_copy(update={"daemon": kilohertz}), PATHS["sliding"])[:SAMPLES]
+    touched = np.linspace(0, pads - 1, round(part * pads)).astype(int).tolist()
+    a_hand = len(deployment.hands[0].pads)
+    of_hand = sorted({n % a_hand for n in touched})
+    one = film(deployment.model_copy(update={"daemon": kilohertz}), PATHS["sliding"], of_hand)[:SAMPLES]
     there_and_back = np.concatenate([one, one[::-1]])
     noise = np.random.default_rng(1)
     counts = np.rint(noise.standard_normal((len(there_and_back), pads, 4))).astype(np.int64)
-    for n in np.linspace(0, pads - 1, round(part * pads)).astype(int).tolist():
-        counts[:, n] += np.roll(there_and_back[:, n % TOUCHED], 7 * n, axis=0)
+    for n in touched:
+        counts[:, n] += np.roll(there_and_back[:, n % a_hand], 7 * n, axis=0)
     return counts
 
 
@@ -258,6 +259,7 @@ def watch(
                 flush=True,
             )
     took_s, busy_s = time.monotonic() - start_s, time.clock_gettime(clock) - busy_s
+    feeding_s = nodes.busy_s() - feeding_s
     answered, ticks, overruns, missed, taken, samples, overflow = (totals() - before).tolist()
     return {
         "pads": pads,
@@ -272,8 +274,8 @@ def watch(
         "samples_taken": taken,
         "lost": max(0, (answered - 2) * pads - samples) + overflow,
         "longest_queue": longest,
-        "hot_core": busy_s / took_s,
-        "generator_core": (nodes.busy_s() - feeding_s) / took_s,
+        "hot_core": (busy_s - feeding_s) / took_s,
+        "generator_core": feeding_s / took_s,
         "sustained": missed <= MISSED * samples and overruns <= MISSED * rate_hz * took_s,
     }
 
@@ -312,6 +314,7 @@ def remember(hours: float) -> dict[str, Any]:
                 rows.append(
                     (t_ns / 3600e9, resident_mb(os.getpid()), descriptors(os.getpid()), objects, received)
                 )
+                print(f"{step / steps:4.0%} of the hour: {rows[-1][1]:.1f} MB", flush=True)
         begun = pipeline.tick.contacts.begun
         drops = dict(publisher.drops)
         reader.close(0)
@@ -344,7 +347,7 @@ def write(new: dict[str, Any]) -> str:
             "The real daemon in one process with its nodes, eight pads to an in-process bus with a",
             "bounded queue, a tenth of the pads touched by sliding contacts, one subscriber to all",
             "hands. The share of a core is the hot thread's: SYNC, receive, tick, send and all the",
-            f"rest; the aim is {AIM:.0%}. Beside it the generator of the load, in the same interpreter.",
+            f"rest, less what the nodes take that answer in the same thread; the aim is {AIM:.0%}.",
             f"{long['machine']}; load average when it ended {long['load']:.1f}, with the daemon's own.",
             "",
             *table([long]),
