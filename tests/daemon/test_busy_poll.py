@@ -22,6 +22,13 @@ def test_it_sleeps_until_shortly_before_the_last_sample_usually_comes_and_again_
     assert poll.sleep_ns(0, 900_100) > 1_000_000_000
 
 
+def test_a_sync_that_nobody_answers_teaches_nothing() -> None:
+    poll = learned(100_000)
+    before_ns = poll.expected_ns(0)
+    poll.ticked(1_000_000_000, 999_000_000)
+    assert poll.expected_ns(0) == before_ns
+
+
 @pytest.mark.parametrize("now_ns", [0, 799_000, 800_000, 801_000])
 def test_without_it_the_loop_sleeps_until_something_comes(now_ns: int) -> None:
     assert learned(0).sleep_ns(0, now_ns) > 1_000_000_000

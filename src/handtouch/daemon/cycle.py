@@ -45,14 +45,18 @@ class BusyPoll:
 
     def __init__(self, busy_ns: int) -> None:
         self._busy_ns = busy_ns
-        self._usual_ns = 0  # from SYNC to the tick
+        self._usual_ns = 0  # from SYNC to its last sample
 
-    def ticked(self, sync_ns: int, now_ns: int) -> None:
-        """The samples of this SYNC were there, or as many as came in time."""
-        self._usual_ns += (now_ns - sync_ns - self._usual_ns) // _SMOOTHING
+    def ticked(self, sync_ns: int, last_ns: int) -> None:
+        """The tick of this SYNC was, and the last sample had arrived at `last_ns`; before, if none came.
+
+        When the tick was tells nothing: who sleeps is late, and would learn to sleep so long.
+        """
+        if last_ns > sync_ns:
+            self._usual_ns += (last_ns - sync_ns - self._usual_ns) // _SMOOTHING
 
     def expected_ns(self, sync_ns: int) -> int:
-        """When the tick of this SYNC is likely to be."""
+        """When the last sample of this SYNC is likely to come."""
         return sync_ns + self._usual_ns
 
     def sleep_ns(self, sync_ns: int, now_ns: int) -> int:

@@ -63,6 +63,8 @@ _BEFORE_SYNC_NS, _BEFORE_TICK_NS = 400_000, 250_000
 _NEVER_NS = 1 << 62
 _HOUSE_NS = 4_000_000
 """Least time between two looks at nodes, buses, health and requests: a tick every millisecond needn't."""
+_CARRIERS = 3
+"""Threads that a message goes through, each waking the next: ZeroMQ's here, ZeroMQ's there, the subscriber."""
 _GIL_SWITCH_S = 0.0005  # a thread that boots a node or builds a model lets the hot one in after so long
 
 
@@ -239,11 +241,13 @@ class Daemon:
             if ticked is None and pacer.slow and pipeline.slab.fresh_count:
                 ticked = pipeline.tick_now(now_ns)
             if ticked is not None:
-                self.publisher.release()
-                busy_poll.ticked(cycle.t_ns, now_ns)
+                sent = self.publisher.release()
                 sent_ns = time.monotonic_ns()
                 stages.lap(histogram.SEND, sent_ns)
                 self.report.ticked(now_ns, sent_ns)
+                if sent:
+                    self._make_way()
+                busy_poll.ticked(cycle.t_ns, int(pipeline.slab.t_ns.max()))
                 if self.perceiving.wanted:
                     self.perceiving.step(ticked)
                     stages.lap(histogram.PERCEIVE, time.monotonic_ns())
@@ -256,6 +260,12 @@ class Daemon:
     def _stepped(self) -> None:
         self.report.stages.lap(histogram.TICK, time.monotonic_ns())
         self.publisher.hold()
+
+    def _make_way(self) -> None:
+        """Let those run that carry and take the messages, where they wait for this very processor."""
+        for _ in range(_CARRIERS):
+            os.sched_yield()
+        self.report.stages.lap(histogram.WAIT, time.monotonic_ns())
 
     def _begin(self, sync_ns: int, now_ns: int) -> None:
         """A SYNC was sent or seen: a new period."""

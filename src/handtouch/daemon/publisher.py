@@ -111,11 +111,12 @@ class Publisher:
         if self._held is None:
             self._held = []
 
-    def release(self) -> None:
-        """Send what was held, on the live stream first."""
+    def release(self) -> bool:
+        """Send what was held, on the live stream first; whether there was anything."""
         held, self._held = self._held, None
         if held:
             self._send_all(held)
+        return bool(held)
 
     def close(self) -> None:
         """Close both streams; what is queued has 0.2 s to leave."""
