@@ -4,8 +4,8 @@ Nodes, daemon and subscriber are three processes on a udp_multicast bus over loo
 of their own where that is to be had), or on vcan0 under `tests/socketcan/vcan-run`. The floor is a bare loop
 in place of the daemon: it sends SYNC, receives the same frames with the same library, sends a message of the
 same size when the last has come, and computes nothing. Daemon, daemon with busy_poll_us and floor take turns,
-with contacts at rest and with sliding ones; ratios are of medians over the turns. Writes
-docs/benchmarks/latency.{md,json}.
+and where this user may have it, daemon and floor with real-time priority, with contacts at rest and with
+sliding ones; ratios are of medians over the turns. Writes docs/benchmarks/latency.{md,json}.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from handtouch import shipped, wire
 from handtouch.canbus.device import DeviceBus
 from handtouch.client import request
 from handtouch.config import Deployment, load
-from handtouch.daemon import histogram
+from handtouch.config.tables import Daemon as DaemonTable
+from handtouch.daemon import histogram, realtime
 from handtouch.daemon.daemon import Daemon
 from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.scenario import Scenario
@@ -47,7 +48,9 @@ CHANNEL, PORT = "239.74.163.9", 43999
 VCAN = Path("/sys/class/net/vcan0")
 TOUCHED = 5
 ROUND_S = 5.0
-BUSY_POLL_US = 300
+SETTLED_S = 6.0
+"""After the first contacts: until then the slow half begins, which takes a processor for three seconds."""
+BUSY_POLL_US, PRIORITY = 300, 40
 PATHS = {"resting": "[[0.4, 0.4]]", "sliding": "[[0.3, 0.3], [0.7, 0.4], [0.3, 0.5], [0.7, 0.6], [0.4, 0.7]]"}
 """Of the contacts, through which they go within ROUND_S, and back."""
 MOST = 400_000
@@ -109,11 +112,14 @@ def nodes(config: Path, samples: NDArray[np.int64], stamps: Any, stop: Event) ->
         devices.stop()
 
 
-def bare_loop(endpoint: str, count: int, size: int, period_s: float, stop: Event) -> None:
+def bare_loop(endpoint: str, count: int, size: int, period_s: float, priority: int, stop: Event) -> None:
     """The floor: receive, store, send; nothing computed. Starts the nodes by NMT, each by its id."""
     context = zmq.Context()
     socket = context.socket(zmq.PUB)
     socket.bind(endpoint)
+    if priority:
+        refused = realtime.apply(DaemonTable(realtime_priority=priority))
+        assert not refused, refused
     slab = bytearray(8 * 128)
     payload = bytes(size - len(FLOOR_ID) - 8)
     with open_bus() as bus:
@@ -221,7 +227,8 @@ def wait_for_touch(socket: zmq.Socket[bytes]) -> None:
             break
         frame = wire.decode(parts)
         if isinstance(frame, wire.HandFrame) and frame.state.count(wire.PadState.TOUCHED) == TOUCHED:
-            break
+            receive(socket, SETTLED_S)
+            return
     receive(socket, 1.0)
 
 
@@ -286,13 +293,15 @@ def daemon_turn(config: Path, samples: NDArray[np.int64], seconds: float) -> Tur
     return serve_and_receive(config, samples, live, lambda _: subprocess.Popen(command), seconds)
 
 
-def floor_turn(config: Path, samples: NDArray[np.int64], seconds: float, size: int) -> Turn:
+def floor_turn(
+    config: Path, samples: NDArray[np.int64], seconds: float, size: int, priority: int = 0
+) -> Turn:
     """A turn of the bare loop, whose messages have so many bytes in all."""
     endpoint = f"ipc://{config.parent}/floor"
     period_s = load(config).daemon.sync_period_ms * 1e-3
 
     def server(stop: Event) -> BaseProcess:
-        args = endpoint, samples.shape[1], size, period_s, stop
+        args = endpoint, samples.shape[1], size, period_s, priority, stop
         process = multiprocessing.Process(target=bare_loop, args=args)
         process.start()
         return process
@@ -329,7 +338,9 @@ def where_it_goes(config: Path, samples: NDArray[np.int64], seconds: float) -> d
     return dict(zip(PARTS, np.median(np.array(rows) * 1e-3, axis=0).tolist(), strict=True))
 
 
-AWAKE = f"daemon, busy_poll_us = {BUSY_POLL_US}"
+AWAKE, FIRST = f"daemon, busy_poll_us = {BUSY_POLL_US}", f"daemon, realtime_priority = {PRIORITY}"
+FLOORS = {"daemon": "floor", AWAKE: "floor", FIRST: "floor with that priority"}
+"""What each is compared with."""
 _WAY = histogram.WAIT, histogram.RECEIVE, histogram.TICK, histogram.SEND
 PARTS = (
     "until the loop turns to the bus",
@@ -407,15 +418,23 @@ def measure(config: Path, turns: int, seconds: float) -> dict[str, Any]:
     """Turns of daemon and floor, for each way that contacts move."""
     deployment = load(config)
     films = {name: film(deployment, path) for name, path in PATHS.items()}
-    busy = config.with_name("busy.toml")
-    busy.write_text(config.read_text().replace("[daemon]\n", f"[daemon]\nbusy_poll_us = {BUSY_POLL_US}\n"))
+    configs = {who: config.with_name(f"{number}.toml") for number, who in enumerate((AWAKE, FIRST))}
+    options = f"busy_poll_us = {BUSY_POLL_US}", f"realtime_priority = {PRIORITY}"
+    for path, option in zip(configs.values(), options, strict=True):
+        path.write_text(config.read_text().replace("[daemon]\n", f"[daemon]\n{option}\n"))
+    if troubles := realtime.troubles(load(configs[FIRST]).daemon):
+        print(f"without: {troubles[0]}")
+        del configs[FIRST]
     rows: list[dict[str, Any]] = []
     for number in range(turns):
         for motion, samples in films.items():
-            daemon = daemon_turn(config, samples, seconds)
-            floor = floor_turn(config, samples, seconds, daemon.size)
-            awake = daemon_turn(busy, samples, seconds)
-            for who, turn in (("daemon", daemon), (AWAKE, awake), ("floor", floor)):
+            done = {"daemon": daemon_turn(config, samples, seconds)}
+            size = done["daemon"].size
+            done["floor"] = floor_turn(config, samples, seconds, size)
+            done |= {who: daemon_turn(path, samples, seconds) for who, path in configs.items()}
+            if FIRST in configs:
+                done[FLOORS[FIRST]] = floor_turn(config, samples, seconds, size, PRIORITY)
+            for who, turn in done.items():
                 late_us = turn.latencies_us()
                 p50, p99, worst = np.percentile(late_us, [50, 99, 100]).tolist()
                 figures = {"n": len(late_us), "p50_us": p50, "p99_us": p99, "max_us": worst, **turn.figures}
@@ -448,21 +467,19 @@ def section(results: dict[str, Any]) -> str:
     rows, ratios = [], []
     for motion in PATHS:
         middle = {}
-        for who in ("daemon", AWAKE, "floor"):
+        for who in dict.fromkeys((*FLOORS, *FLOORS.values())):
             turns = [row for row in results["turns"] if (row["contacts"], row["who"]) == (motion, who)]
-            if not turns:  # an earlier run, on the other bus
+            if not turns:  # an earlier run, on the other bus, or one without the right to priority
                 continue
             middle[who] = [
                 statistics.median(turn[key] for turn in turns)
                 for key in ("p50_us", "p99_us", "max_us", "processor_share")
             ]
-            p50, p99, worst, share = middle[who]
-            rows.append(f"| {motion} | {who} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {share:.0%} |")
-        floor = middle.pop("floor")
-        ratios += [
-            f"* {motion}, {who}: median {p50 / floor[0]:.2f}, p99 {p99 / floor[1]:.2f}"
-            for who, (p50, p99, *_) in middle.items()
-        ]
+            p50, tail, worst, share = middle[who]
+            rows.append(f"| {motion} | {who} | {p50:.0f} | {tail:.0f} | {worst:.0f} | {share:.0%} |")
+        for who in [who for who in FLOORS if who in middle]:
+            median, p99 = (middle[who][k] / middle[FLOORS[who]][k] for k in (0, 1))
+            ratios.append(f"* {motion}, {who}, to {FLOORS[who]}: median {median:.2f}, p99 {p99:.2f}")
     served = [row for row in results["turns"] if row["who"] == "daemon"]
     lost, missed, overruns = (
         sum(row[key] for row in served) for key in ("messages_lost", "samples_missed", "overruns")
