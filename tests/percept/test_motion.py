@@ -125,7 +125,7 @@ def test_a_contact_that_ends_has_lifted_off() -> None:
 
 def test_what_may_be_a_slow_slip_is_asked_to_be_held_still() -> None:
     held = Held()
-    held.feel(2.0, ramp(1.0, 0.8e-3))
+    held.feel(2.0, ramp(1.0, 1.5e-3))
     assert "hold" in held.asks
     firm = Held()
     firm.feel(1.0, still)
@@ -190,7 +190,7 @@ def test_evidence_about_the_threshold_does_not_chatter() -> None:
     alarms, before = 0, False
     for k in range(200):
         motion.test.log_odds[0] = even + (0.8 if k % 6 < 3 else -1.5 if k < 100 else -9.0) if k < 106 else 0.0
-        motion._weigh(pad, one)
+        motion._weigh(pad, one, held.stream.hand_of)
         now = bool(motion._look(pad)[0] == CLASSES.index("incipient"))
         alarms, before = alarms + (now and not before), now
     assert alarms == 1

@@ -40,6 +40,11 @@ _TELL_NS = 50_000_000
 _ACCELERATION = 0.01  # of the centroid, root of its spectral density [m/s^1.5]
 _LEAVES_S = 0.04  # a force that is gone in this time at the rate at which it falls is about to leave
 _RATE_S = 0.02  # over which the rate of a force is smoothed
+_HOLDS = -3.0  # ln of the odds of a slip up to which a contact is taken to hold the object
+_TOGETHER, _TOGETHER_S = (
+    1.0,
+    0.1,
+)  # ln of how much likelier a slip is so soon after another pad's began to run
 _RUNS_S = 0.06  # a centroid that stands for so long has come to rest
 _REST_SPEED = 0.5e-3
 
@@ -67,6 +72,7 @@ class Motion:
         self._rate_std = np.zeros(n)
         self._began_at = np.zeros((n, 2))  # where it began to run
         self._quiet_s = np.zeros(n)
+        self._since = np.full(n, np.inf)  # s since it began to run
         self._slips = np.zeros(n, dtype=np.int64)  # of the contact so far
         self._scale_a, self._peak_a = np.zeros((2, n))
         self._in_doubt = np.zeros(n, dtype=np.bool_)
@@ -86,7 +92,7 @@ class Motion:
         usable = np.isfinite(place.sum(axis=1) + variance.sum(axis=1) + press)
         if len(began):
             self._begin(sample.pads[new], place[new], variance[new], force[new], sample.t_ns[new])
-            self.test.begin(sample.pads[new], place[new], press[new])
+            self.test.begin(sample.pads[new], place[new], variance[new], press[new])
         dt_s = np.asarray((sample.t_ns - self._last_ns[sample.pads]) * 1e-9, dtype=np.float64)
         go = usable & ~new & (dt_s > 0)
         if np.count_nonzero(go):
@@ -95,8 +101,8 @@ class Motion:
             self._follow(pads, dt_s[go], place[go], variance[go], force[go])
             alarm = self.test.step(pads, dt_s[go], place[go], variance[go], press[go])
             self._start(pads[alarm & ~self.running[pads]], stream)
-            self._settle(pads, dt_s[go], place[go], press[go])
-        self._weigh(sample.pads, dt_s)
+            self._settle(pads, dt_s[go], place[go], variance[go], press[go])
+        self._weigh(sample.pads, dt_s, stream.hand_of)
         looks = self._look(sample.pads)
         rows = self._to_tell(sample, looks)
         if not len(rows):
@@ -207,10 +213,13 @@ class Motion:
             at = int(np.searchsorted(window.t_s, -self.test.onset_s[pad]))
             self._began_at[pad] = window["pad_m"][min(at, len(window) - 1)]
             self.running[pad] = True
+            self._since[pad] = 0.0
             self.test.runs(np.array([pad]))
             self._quiet_s[pad] = 0.0
 
-    def _settle(self, pads: IntArray, dt_s: FloatArray, place: FloatArray, press: FloatArray) -> None:
+    def _settle(
+        self, pads: IntArray, dt_s: FloatArray, place: FloatArray, variance: FloatArray, press: FloatArray
+    ) -> None:
         """What has run and stands has come to rest: the test begins anew there."""
         if not np.count_nonzero(self.running[pads]):
             return
@@ -222,7 +231,7 @@ class Motion:
         if np.count_nonzero(rests):
             self.running[pads[rests]] = False
             self._odds[pads[rests]] = -np.inf
-            self.test.begin(pads[rests], place[rests], press[rests], keep=True)
+            self.test.begin(pads[rests], place[rests], variance[rests], press[rests], keep=True)
 
     def _look(self, pads: IntArray) -> NDArray[np.intp]:
         """The most probable class (k,) at a first look: without joints, and quick."""
@@ -235,7 +244,8 @@ class Motion:
         """What is to be told of a contact now."""
         slips, leaves = self._slip_probability(pad), self._leave_probability(pad)
         self._contact[pad] = stream.hand_of[pad], stream.contact[pad]
-        relative = relative_to_object(known, pad, stream.hand_of, self.running)
+        doubtful = self.running | (self._odds > _HOLDS)
+        relative = relative_to_object(known, pad, stream.hand_of, doubtful)
         probabilities = self._probabilities(pad, slips, leaves, relative)
         best = max(range(len(CLASSES)), key=lambda k: probabilities[CLASSES[k]])
         news = best != self._label[pad]
@@ -255,12 +265,18 @@ class Motion:
         hand, contact = self._contact[pad].tolist()
         return Question("sliding", hand, pad, contact, {"sticks": 1 - slips, "slides": slips}, [hold])
 
-    def _weigh(self, pads: IntArray, dt_s: FloatArray) -> None:
+    def _weigh(self, pads: IntArray, dt_s: FloatArray, hand_of: IntArray) -> None:
         """ln of the odds of having begun to run: R, by how often contacts slip at such forces. What a moment
         ago looked like a slip is still open, or a contact near the threshold would chatter."""
+        self._since[pads] += dt_s
         falls = np.maximum(-self._rate[pads], 0.0) / np.maximum(3 * self._rate_std[pads], 1e-9)
         hazard = _HAZARD_HZ * (1 + (_UNLOADING - 1) * np.minimum(falls, 1.0)) * self.test.period_s
         odds = self.test.log_odds[pads] + np.log(hazard)
+        fresh = self._since < _TOGETHER_S
+        if np.count_nonzero(fresh):  # what a hand holds slips at several pads at once
+            odds += _TOGETHER * (
+                np.bincount(hand_of[fresh], minlength=len(hand_of))[hand_of[pads]] > fresh[pads]
+            )
         self._odds[pads] = np.fmax(odds, self._odds[pads] - dt_s / _OPEN_S)
 
     def _slip_probability(self, pad: int) -> float:

@@ -79,18 +79,18 @@ class Materials(NamedTuple):
 
 
 def relative_to_object(
-    materials: Materials, pad: int, hand_of: IntArray, running: NDArray[np.bool_]
+    materials: Materials, pad: int, hand_of: IntArray, doubtful: NDArray[np.bool_]
 ) -> Relative | None:
     """Of the contact on a pad; None where joint states don't tell the places of its link.
 
-    `running` (n,) are contacts that aren't to be relied on to stick.
+    `doubtful` (n,) are contacts that aren't to be relied on to stick.
     """
     own = np.flatnonzero(materials.pads == pad)
     if not len(own):
         return None
     place, normal, velocity, own_std = (column[own[0]] for column in materials[1:])
     pads = materials.pads
-    holds = (hand_of[pads] == hand_of[pad]) & ~running[pads] & (pads != pad)
+    holds = (hand_of[pads] == hand_of[pad]) & ~doubtful[pads] & (pads != pad)
     others = int(np.count_nonzero(holds))
     moves, variance = np.zeros(3), 0.0
     if others:
@@ -108,7 +108,7 @@ def relative_to_object(
         std,
         "grasp" if others else "static",
         others,
-        _sigmoid(log_ratio + _SLIDES_ODDS),
+        _sigmoid((log_ratio if others else max(log_ratio, 0.0)) + _SLIDES_ODDS),  # it need not stand still
         _sigmoid(log_ratio + _SURE_ODDS) if others else 0.0,
     )
 

@@ -10,9 +10,10 @@ the speed is integrated out over scales from 1 to 100 mm/s. Their sum over the o
 statistic R: under the model R less the number of samples is a martingale of mean 0, so the mean time to a
 false alarm is at least as many samples as the threshold on R says.
 
-No hand trembles as modelled: innovations are white from one sample to the next, but not over a tenth of a
-second, the less so the more samples that is. So it is learnt, for every age of an onset, by how much ramps of
-that age have met more than their variance while it stuck, and ramps count for so much less.
+No hand keeps to that: soft contacts creep and roll, at some half a millimetre a second, and what trembles as
+modelled from one sample to the next need not over a tenth of a second. So every ramp is held against one of
+a random speed, whose variance is learnt for every age of an onset by how much ramps of that age met while it
+stuck, from a prior on: a slope of the likelihood.
 
 Public names: `SlipTest`, `Grip`.
 """
@@ -40,7 +41,8 @@ _LEVEL, _COUPLING, _STATES = 0, 3, 4  # between them the wander and its speed
 _GAIN, _INFORMATION, _RAMPS = 4, 5, 6  # rows of a ramp, after the states
 _LEAST_HEARD_S = 0.3
 _FORGETS = 0.4  # times as fast as it learns: the calm between two swells of a tremor isn't its end
-_MARGIN = 1.25  # times ln of the excess: what isn't as modelled has tails that aren't, either
+_MARGIN = 1.25  # power of the excess: what isn't as modelled has tails that aren't, either
+_LEAST_CREEP = 2 * math.log(20e-6)  # ln of a variance; so slow it always is
 _CLIP = 6.0  # of an innovation squared: a slip must not pass for a new tremor
 
 
@@ -48,6 +50,8 @@ _CLIP = 6.0  # of an innovation squared: a slip must not pass for a new tremor
 class Grip:
     """What a contact may do without sliding."""
 
+    creep_m_s: float = 0.7e-3
+    """standard deviation of the speed at which soft contacts creep and roll, at the start; then learnt"""
     level_m: float = 20e-6
     """standard deviation of where the level drifts in a second"""
     wander_m: float = 30e-6
@@ -58,7 +62,7 @@ class Grip:
     learn_s: float = 1.0
     """time constant of learning it"""
     remember_s: float = 2.0
-    """the same of what tremor does beyond the model; sooner at the start"""
+    """the same of that speed; sooner at the start"""
     coupling_m: float = 1e-3
     """standard deviation of how far the current of a firm contact moves the centroid"""
     coupling_rate: float = 0.05
@@ -97,16 +101,19 @@ class SlipTest:
         self._ramps = np.zeros((pads, _RAMPS, 2, _ONSETS))
         """what a ramp of 1 m/s has done to the states; sums of f nu / S and of f^2 / S"""
         self._heard_s = np.zeros(pads)  # of the contact, as long as it doesn't slip
-        self._over = np.zeros((2, pads, _ONSETS, 2))  # ln of how much more than S, by age; and kept from then
+        self._creep = np.zeros((2, pads, _ONSETS, 2))  # ln of the variance of its speed, by age; and then
 
-    def begin(self, pads: IntArray, place: FloatArray, press: FloatArray, keep: bool = False) -> None:
-        """Contacts (k,) begin at places (k, 2), so hard pressed (k,), or stick again: `keep` the tremor."""
+    def begin(
+        self, pads: IntArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray, keep: bool = False
+    ) -> None:
+        """Contacts (k,) begin at places (k, 2) with variances of their noise (k, 2), so hard pressed (k,), or
+        stick again: `keep` the tremor."""
         self._state[pads], self._state[pads, :, _LEVEL] = 0.0, place
         cov = np.zeros((len(pads), 2, _STATES, _STATES))
-        cov[:, :, _LEVEL, _LEVEL] = _BEGINS_M**2
+        cov[:, :, _LEVEL, _LEVEL] = _BEGINS_M**2 + noise_m2
         cov[:, :, _COUPLING, _COUPLING] = self.grip.coupling_m**2
         self._wander[pads] = self._wander_then[pads] if keep else 2 * np.log(self.grip.wander_m)
-        self._over[0, pads] = self._over[1, pads] if keep else 0.0
+        self._creep[0, pads] = self._creep[1, pads] if keep else 2 * np.log(self.grip.creep_m_s)
         if not keep:
             self._press_noise[pads] = self._heard_s[pads] = 0.0
         self._pressed[pads] = press[:, None]
@@ -120,10 +127,15 @@ class SlipTest:
 
     def runs(self, pads: IntArray) -> None:
         """They slip: what is learnt from now on is none of a grip's."""
-        self._wander_then[pads], self._over[1, pads] = self._wander[pads], self._over[0, pads]
+        self._wander_then[pads], self._creep[1, pads] = self._wander[pads], self._creep[0, pads]
 
     def step(
-        self, pads: IntArray, dt_s: FloatArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray
+        self,
+        pads: IntArray,
+        dt_s: FloatArray,
+        place: FloatArray,
+        noise_m2: FloatArray,
+        press: FloatArray,
     ) -> BoolArray:
         """Take in samples (k,) that follow those before by dt (k,): places (k, 2), variances of their noise
         (k, 2), relative currents (k,). Returns which raise an alarm (k,)."""
@@ -140,7 +152,8 @@ class SlipTest:
         ramps[:, _GAIN] += weighted * innovation[:, :, None]
         ramps[:, _INFORMATION] += weighted * f
         self._ramps[pads] = ramps
-        return self._judge(pads, ramp, ramps, self._learn(pads, dt_s, ramps))
+        part = self._learn(pads, dt_s, ramps)
+        return self._judge(pads, ramp, ramps, part)
 
     def _filter(
         self,
@@ -213,22 +226,20 @@ class SlipTest:
     def _learn(self, pads: IntArray, dt_s: FloatArray, ramps: FloatArray) -> FloatArray:
         """Which part (k, 2, onsets) of what ramps have met counts, by what those of such an age met before.
 
-        Tremor isn't as modelled: innovations that are white from one sample to the next need not be so over a
-        tenth of a second, and the more samples there are in that, the less.
+        A ramp of information I, while it creeps at speeds of variance v, meets 1 + I v times its own.
         """
-        number = (self._steps[pads] - 1) // self._stride
-        age = _age(number)
-        over = self._over[0, pads[:, None], age]
-        part = np.exp(-_MARGIN * over).transpose(0, 2, 1)
-        information = ramps[:, _INFORMATION]
-        met = ramps[:, _GAIN] ** 2 / np.maximum(information, 1e-300) * np.exp(-over).transpose(0, 2, 1)
-        excess = np.where(information > 0, np.minimum(met, _CLIP) - 1, 0.0).transpose(0, 2, 1)
+        age = _age((self._steps[pads] - 1) // self._stride)
+        creep = self._creep[0, pads[:, None], age]
+        information = ramps[:, _INFORMATION].transpose(0, 2, 1)
+        more = 1 + information * np.exp(creep)
+        met = (ramps[:, _GAIN] ** 2).transpose(0, 2, 1) / np.maximum(information, 1e-300)
         self._heard_s[pads] += dt_s
         lasts = np.minimum(np.maximum(self._heard_s[pads], _LEAST_HEARD_S), self.grip.remember_s)
-        excess *= np.where(excess < 0, _FORGETS, 1.0)
-        learnt = over + excess * (dt_s / lasts)[:, None, None]
-        self._over[0, pads[:, None], age] = np.maximum(learnt, 0.0)
-        return np.asarray(part)
+        slope = (np.minimum(met / more, _CLIP) - 1) * (1 - 1 / more)  # of the likelihood, over ln creep
+        slope *= np.where(slope < 0, _FORGETS, 1.0)
+        creep += slope * (dt_s / lasts)[:, None, None]
+        self._creep[0, pads[:, None], age] = np.maximum(creep, _LEAST_CREEP)
+        return np.asarray((more**-_MARGIN).transpose(0, 2, 1))
 
     def _judge(self, pads: IntArray, ramp: FloatArray, ramps: FloatArray, part: FloatArray) -> BoolArray:
         """ln R from the onsets' likelihood ratios, each standing for `stride` samples."""
