@@ -37,6 +37,7 @@ _FIRM = 10.0  # times the current at which a contact begins
 _FEW = 4  # samples of a contact that nothing can be said of
 _LEAST_M2 = 1e-14
 _TELL_NS = 50_000_000
+_PLACE, _SPREAD = 0, 4  # rows of the velocity filter
 _ACCELERATION = 0.01  # of the centroid, root of its spectral density [m/s^1.5]
 _LEAVES_S = 0.04  # a force that is gone in this time at the rate at which it falls is about to leave
 _RATE_S = 0.02  # over which the rate of a force is smoothed
@@ -65,8 +66,7 @@ class Motion:
         self._told_ns = np.zeros(n, dtype=np.int64)
         self._label = np.zeros(n, dtype=np.intp)
         self._looks = np.zeros(n, dtype=np.intp)  # the class at a first look, without joints
-        self._place = np.zeros((n, 2, 2))  # of the velocity filter: place and velocity along x and y
-        self._cov = np.zeros((n, 2, 2, 2))
+        self._follows = np.zeros((5, n, 2))  # place, velocity; variance, covariance, variance
         self._force = np.zeros(n)  # smoothed
         self._rate = np.zeros(n)
         self._rate_std = np.zeros(n)
@@ -146,7 +146,7 @@ class Motion:
 
     def velocity(self, pads: IntArray) -> tuple[FloatArray, FloatArray]:
         """Velocities (k, 2) on the pads and their standard deviations [m/s]."""
-        return self._place[pads, :, 1], np.sqrt(self._cov[pads, :, 1, 1])
+        return self._follows[1, pads], np.sqrt(self._follows[_SPREAD, pads])
 
     # Details ----------------------------------------------------------------------------------------------
 
@@ -166,9 +166,12 @@ class Motion:
     ) -> None:
         if not len(pads):
             return
-        self._place[pads, :, 0], self._place[pads, :, 1] = place, 0.0
-        self._cov[pads] = 0.0
-        self._cov[pads, :, 0, 0], self._cov[pads, :, 1, 1] = variance, 0.01**2
+        self._follows[:, pads] = 0.0
+        self._follows[_PLACE, pads], self._follows[2, pads], self._follows[_SPREAD, pads] = (
+            place,
+            variance,
+            1e-4,
+        )
         self._force[pads], self._rate[pads], self._rate_std[pads] = force, 0.0, np.abs(force)
         self._last_ns[pads] = t_ns
         self._told_ns[pads] = 0
@@ -181,20 +184,21 @@ class Motion:
         self, pads: IntArray, dt_s: FloatArray, place: FloatArray, variance: FloatArray, force: FloatArray
     ) -> None:
         """A place that runs at a velocity which wanders; and the rate of the force."""
-        state, cov, dt = self._place[pads], self._cov[pads], dt_s[:, None]
-        density = _ACCELERATION**2
-        pp, pv, vv = cov[:, :, 0, 0], cov[:, :, 0, 1], cov[:, :, 1, 1]
-        pp = pp + 2 * dt * pv + dt**2 * vv + density * dt**3 / 3
-        pv = pv + dt * vv + density * dt**2 / 2
-        vv = vv + density * dt
-        ahead = state[:, :, 0] + dt * state[:, :, 1]
-        total = pp + variance
-        off = place - ahead
-        self._place[pads, :, 0] = ahead + pp / total * off
-        self._place[pads, :, 1] = state[:, :, 1] + pv / total * off
-        self._cov[pads, :, 0, 0] = pp - pp * pp / total
-        self._cov[pads, :, 0, 1] = self._cov[pads, :, 1, 0] = pv - pp * pv / total
-        self._cov[pads, :, 1, 1] = vv - pv * pv / total
+        dt = dt_s[:, None]
+        density = _ACCELERATION**2 * dt
+        at, velocity, pp, pv, vv = self._follows[:, pads]
+        pp += dt * (2 * pv + dt * (vv + density / 3))
+        pv += dt * (vv + density / 2)
+        vv += density
+        at += dt * velocity
+        total, off = pp + variance, place - at
+        of_place, of_velocity = pp / total, pv / total
+        at += of_place * off
+        velocity += of_velocity * off
+        vv -= of_velocity * pv
+        pv -= of_place * pv
+        pp -= of_place * pp
+        self._follows[:, pads] = at, velocity, pp, pv, vv
         part = 1 - np.exp(-dt_s / _RATE_S)
         rate = (force - self._force[pads]) / (dt_s + _RATE_S * (1 - part))
         self._force[pads] += part * (force - self._force[pads])
@@ -321,7 +325,7 @@ class Motion:
     ) -> Percept:
         (velocity,), (std,) = self.velocity(np.array([pad]))
         count = int(stream.count[pad])
-        span_s = abs(float(stream.window(pad).t_s[0])) if count else 0.0
+        times = stream.window(pad).t_ns
         label = max(probabilities, key=lambda name: probabilities[name])
         few = count < _FEW and label == "sticking"
         values: dict[str, float | str | Sequence[float] | None] = {
@@ -331,7 +335,7 @@ class Motion:
             "tremor_m": self.test.tremor_m(np.array([pad]))[0].tolist(),
         }
         if self.running[pad]:
-            way = self._place[pad, :, 0] - self._began_at[pad]
+            way = self._follows[_PLACE, pad] - self._began_at[pad]
             values["slipped_m"] = float(np.hypot(*way))
         if relative is not None:
             values |= relative.values()
@@ -348,7 +352,7 @@ class Motion:
             values,
             {
                 "samples": count,
-                "span_s": span_s,
+                "span_s": float(times[-1] - times[0]) * 1e-9 if count else 0.0,
                 "log_odds": odds if math.isfinite(odds) else 0.0,
                 "slips": int(self._slips[pad]),
             },

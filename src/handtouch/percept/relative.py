@@ -62,6 +62,10 @@ class Materials(NamedTuple):
     def of(cls, stream: Stream, t_ns: int, period_s: float) -> Materials:
         """Over the last 50 ms of samples that come every `period_s`."""
         pads = np.flatnonzero(stream.count > 1)
+        pads = pads[np.isfinite(stream.latest(pads, "palm_position_m")[:, 0])]
+        if not len(pads):  # often: no joints are told
+            none = np.zeros((0, 3))
+            return cls(pads, none, none, none, np.zeros(0))
         back = np.minimum(max(round(_OVER_S / period_s), 1), stream.count[pads] - 1)
         now_ns, then_ns = stream.latest_ns(pads), stream.latest_ns(pads, back)
         palm, link, normal = (

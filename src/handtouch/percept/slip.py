@@ -41,8 +41,8 @@ _LEVEL, _COUPLING, _STATES = 0, 3, 4  # between them the wander and its speed
 _GAIN, _INFORMATION, _RAMPS = 4, 5, 6  # rows of a ramp, after the states
 _LEAST_HEARD_S = 0.3
 _FORGETS = 0.4  # times as fast as it learns: the calm between two swells of a tremor isn't its end
-_MARGIN = 1.25  # power of the excess: what isn't as modelled has tails that aren't, either
 _LEAST_CREEP = 2 * math.log(20e-6)  # ln of a variance; so slow it always is
+_DOUBTFUL = 3.0  # ln R from which on it is worth knowing when and how fast
 _CLIP = 6.0  # of an innovation squared: a slip must not pass for a new tremor
 
 
@@ -83,7 +83,7 @@ class SlipTest:
         self.onset_s = np.zeros(pads)
         """since the most likely onset"""
         self.speed = np.zeros((pads, 2))
-        """of the ramp from then on, most likely [m/s]"""
+        """of the ramp from then on, most likely [m/s]; both of those that may slip"""
         rate = 2 * np.pi * self.grip.wander_hz
         self._still = np.diag([0.0, 1.0, rate**2, 0.0])  # covariance of wander and its speed, relative
         coupling = (self.grip.coupling_m * self.grip.coupling_rate) ** 2
@@ -101,7 +101,7 @@ class SlipTest:
         self._ramps = np.zeros((pads, _RAMPS, 2, _ONSETS))
         """what a ramp of 1 m/s has done to the states; sums of f nu / S and of f^2 / S"""
         self._heard_s = np.zeros(pads)  # of the contact, as long as it doesn't slip
-        self._creep = np.zeros((2, pads, _ONSETS, 2))  # ln of the variance of its speed, by age; and then
+        self._creep = np.zeros((2, pads, 2, _ONSETS))  # ln of the variance of its speed, by age; and then
 
     def begin(
         self, pads: IntArray, place: FloatArray, noise_m2: FloatArray, press: FloatArray, keep: bool = False
@@ -143,7 +143,8 @@ class SlipTest:
             dt_s = dt_s[:1]
         forward = self._forward(dt_s)
         gain, innovation, variance, row = self._filter(pads, dt_s, forward, place, noise_m2, press)
-        ramp, ramps = self._open(pads, dt_s), self._ramps[pads]
+        ramp, ramps = self._ramp[pads], self._ramps[pads]
+        self._open(pads, dt_s, ramp, ramps)
         flat = ramps.reshape(len(pads), _RAMPS, -1)  # a view
         flat[:, :_STATES] = forward @ flat[:, :_STATES]
         f = ramp[:, None] - (row[:, None] @ flat[:, :_STATES]).reshape(len(pads), 2, _ONSETS)
@@ -151,7 +152,7 @@ class SlipTest:
         weighted = f / variance[:, :, None]
         ramps[:, _GAIN] += weighted * innovation[:, :, None]
         ramps[:, _INFORMATION] += weighted * f
-        self._ramps[pads] = ramps
+        self._ramp[pads], self._ramps[pads] = ramp, ramps
         part = self._learn(pads, dt_s, ramps)
         return self._judge(pads, ramp, ramps, part)
 
@@ -204,42 +205,38 @@ class SlipTest:
         forward[:, 2, 1], forward[:, 2, 2] = -decay * rate * passed, decay * (1 - passed)
         return forward
 
-    def _open(self, pads: IntArray, dt_s: FloatArray) -> FloatArray:
-        """Let ramps grow (k, onsets), and a new one begin now and then, in the place of the oldest."""
-        ramp = self._ramp[pads]
+    def _open(self, pads: IntArray, dt_s: FloatArray, ramp: FloatArray, ramps: FloatArray) -> None:
+        """Let ramps grow, and a new one begin now and then: all others move on, so that they go by age."""
         ramp += np.where(ramp > 0, dt_s[:, None], 0.0)
-        steps = self._steps[pads]
-        number, rest = np.divmod(steps, self._stride)
+        number, rest = np.divmod(self._steps[pads], self._stride)
+        self._steps[pads] += 1
         due = rest == 0
         if np.count_nonzero(due):
-            fresh, slot, old = pads[due], number[due] % _FRESH, number[due] // _THIN % _OLD + _FRESH
-            last = number[due] % _THIN == _THIN - 1  # the others of its like have left before
-            self._ramps[fresh[last], :, :, old[last]] = self._ramps[fresh[last], :, :, slot[last]]
-            row = np.flatnonzero(due)
-            ramp[row[last], old[last]] = ramp[row[last], slot[last]]
-            ramp[row, slot] = np.broadcast_to(dt_s, due.shape)[due]  # it began with the sample before
-            self._ramps[fresh, :, :, slot] = 0.0
-        self._ramp[pads] = ramp
-        self._steps[pads] = steps + 1
-        return ramp
+            last = due & (number % _THIN == _THIN - 1)  # the others of its like leave
+            if np.count_nonzero(last):
+                ramp[last, _FRESH:] = ramp[last, _FRESH - 1 : -1]
+                ramps[last, ..., _FRESH:] = ramps[last, ..., _FRESH - 1 : -1]
+            every = slice(None) if due.all() else due
+            ramp[every, 1:_FRESH] = ramp[every, : _FRESH - 1]
+            ramps[every, ..., 1:_FRESH] = ramps[every, ..., : _FRESH - 1]
+            ramp[every, 0] = np.broadcast_to(dt_s, due.shape)[every]  # it began with the sample before
+            ramps[every, ..., 0] = 0.0
 
     def _learn(self, pads: IntArray, dt_s: FloatArray, ramps: FloatArray) -> FloatArray:
         """Which part (k, 2, onsets) of what ramps have met counts, by what those of such an age met before.
 
         A ramp of information I, while it creeps at speeds of variance v, meets 1 + I v times its own.
         """
-        age = _age((self._steps[pads] - 1) // self._stride)
-        creep = self._creep[0, pads[:, None], age]
-        information = ramps[:, _INFORMATION].transpose(0, 2, 1)
+        creep, information = self._creep[0, pads], ramps[:, _INFORMATION]
         more = 1 + information * np.exp(creep)
-        met = (ramps[:, _GAIN] ** 2).transpose(0, 2, 1) / np.maximum(information, 1e-300)
+        met = ramps[:, _GAIN] ** 2 / np.maximum(information, 1e-300)
         self._heard_s[pads] += dt_s
         lasts = np.minimum(np.maximum(self._heard_s[pads], _LEAST_HEARD_S), self.grip.remember_s)
         slope = (np.minimum(met / more, _CLIP) - 1) * (1 - 1 / more)  # of the likelihood, over ln creep
         slope *= np.where(slope < 0, _FORGETS, 1.0)
         creep += slope * (dt_s / lasts)[:, None, None]
-        self._creep[0, pads[:, None], age] = np.maximum(creep, _LEAST_CREEP)
-        return np.asarray((more**-_MARGIN).transpose(0, 2, 1))
+        self._creep[0, pads] = np.maximum(creep, _LEAST_CREEP)
+        return np.asarray(1 / (more * np.sqrt(np.sqrt(more))))  # the power: tails aren't as modelled, either
 
     def _judge(self, pads: IntArray, ramp: FloatArray, ramps: FloatArray, part: FloatArray) -> BoolArray:
         """ln R from the onsets' likelihood ratios, each standing for `stride` samples."""
@@ -253,19 +250,13 @@ class SlipTest:
         total *= ramp > 0  # slots that no onset has yet
         log_odds = most + np.log(total.sum(axis=1) * self._stride)
         self.log_odds[pads] = log_odds
-        best, rows = total.argmax(axis=1), np.arange(len(pads))
-        self.onset_s[pads] = ramp[rows, best]
-        known = np.maximum(ramps[rows, _INFORMATION, :, best], 1e-12)
-        self.speed[pads] = ramps[rows, _GAIN, :, best] / known
+        if len(rows := np.flatnonzero(log_odds > _DOUBTFUL)):
+            best = total[rows].argmax(axis=1)
+            self.onset_s[pads[rows]] = ramp[rows, best]
+            known = np.maximum(ramps[rows, _INFORMATION, :, best], 1e-12)
+            self.speed[pads[rows]] = ramps[rows, _GAIN, :, best] / known
         return np.asarray(log_odds > np.log(self.per_alarm))
 
     def tremor_m(self, pads: IntArray) -> FloatArray:
         """Standard deviation (k, 2) of the wander as learnt."""
         return np.asarray(np.exp(0.5 * self._wander[pads]))
-
-
-def _age(number: NDArray[np.int64]) -> IntArray:
-    """Which of all onsets (k, onsets) is in each slot, the last is 0, after so many (k,) have begun."""
-    fresh = (number[:, None] - np.arange(_FRESH)) % _FRESH
-    old = ((number[:, None] + 1) // _THIN - 1 - np.arange(_OLD)) % _OLD + _FRESH
-    return np.concatenate([fresh, old], axis=1)
