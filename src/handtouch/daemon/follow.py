@@ -33,6 +33,8 @@ _BEND = 0.6  # standard deviations that the bend of the model may add to a place
 _NOISE = 6.0  # standard deviations of a place that trust spans at least
 _VAGUE = 0.1  # of `reach`: a place less certain than this has no tangent worth the name
 _TOTAL = 0.05  # relative change of the total that a parabola of the force spans
+_TOTALS = np.array([1, 1, 1, 1 - _TOTAL, 1 + _TOTAL])[:, None]  # of the points that a force is fitted to
+_STENCIL = np.array([0, 1, 2, 0, 0])  # and where they are: at the place, along x, along y
 NEAR = 8.0  # ends of trust from which one Gauss-Newton step leads back into it
 _FORCE_BEND = 0.01  # of the force: where the parabola bends more, trust spans less
 _TOLERATED = 0.4  # of a tolerance: the bend as a rule where trust ends; off the middle it is up to twice that
@@ -168,21 +170,20 @@ class Follower:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """`by_place` (k, VALUES, 2), the covariance (k, 3, 3), and scales (3, k) of the stencil."""
         k, tangent = len(pads), at.tangent
-        points = np.repeat(tangent.point[None], 3, axis=0)  # the place, and a width along x and along y
+        points = np.empty((3, k, 2))  # the place, and a width along x and along y
+        points[:] = tangent.point
         points[1, :, 0] += width * tangent.reach[:, 0]
         points[2, :, 1] += width * tangent.reach[:, 1]
-        covariance = at.covariance[:, :2, :2] * (tangent.reach[:, :, None] * tangent.reach[:, None])
+        covariance = np.empty((3, k, 2, 2))
+        covariance[:] = at.covariance[:, :2, :2] * (tangent.reach[:, :, None] * tangent.reach[:, None])
+        flat = points.reshape(-1, 2)
         placed = self._model.placement.place(
-            np.tile(pads, 3),
-            points[:, :, 0].ravel(),
-            points[:, :, 1].ravel(),
-            np.tile(covariance, (3, 1, 1)),
+            np.concatenate((pads, pads, pads)), flat[:, 0], flat[:, 1], covariance.reshape(-1, 2, 2)
         )
-        told = np.concatenate(
-            [points.reshape(-1, 2), placed.pad_m, placed.position_m, placed.normal], axis=1
-        ).reshape(3, k, -1)
+        told = np.concatenate((flat, placed.pad_m, placed.position_m, placed.normal), axis=1)
+        told = told.reshape(3, k, -1)
         by_place = np.zeros((k, VALUES, 2))
-        by_place[:, _PLACED] = np.moveaxis(told[1:] - told[0], 0, 2) / width[:, None, None]
+        by_place[:, _PLACED] = (told[1:] - told[0]).transpose(1, 2, 0) / width[:, None, None]
         by_place[:, RESIDUAL] = -tangent.slopes[:, :, 0] - tangent.slopes[:, :, 1]
         values[:, _PLACED, 4] = told[0]
         values[:, RESIDUAL, 4] = -tangent.fractions[:, 0] - tangent.fractions[:, 1]
@@ -202,14 +203,17 @@ class Follower:
         tangent = at.tangent
         log_radius = tangent.log_radius + np.log(scales)
         log_radius[1:] += (width[:, None] * tangent.radius_slopes).T
-        fractions = np.repeat((currents / at.total[:, None])[None], 5, axis=0)
-        fractions[1:3] += np.moveaxis(width[:, None, None] * tangent.slopes, 1, 0)
+        fractions = np.empty((5, len(pads), 4))
+        fractions[:] = currents / at.total[:, None]
+        fractions[1:3] += (width[:, None, None] * tangent.slopes).transpose(1, 0, 2)
+        total_std = np.sqrt(at.covariance[:, 2, 2])
+        radius_m = np.exp(log_radius)
         strength = self._model.force(
-            np.tile(pads, 5),
+            np.concatenate((pads,) * 5),
             fractions.reshape(-1, 4).T,
-            (np.array([1, 1, 1, 1 - _TOTAL, 1 + _TOTAL])[:, None] * at.total).ravel(),
-            np.tile(np.sqrt(at.covariance[:, 2, 2]), 5),
-            np.exp(log_radius[[0, 1, 2, 0, 0]]).ravel(),
+            (_TOTALS * at.total).ravel(),
+            np.concatenate((total_std,) * 5),
+            radius_m.take(_STENCIL, axis=0).ravel(),
         )
         force, status = strength.force_n.reshape(5, -1), strength.status.reshape(5, -1)
         middle, along_x, along_y, less, more = np.where(
@@ -225,8 +229,7 @@ class Follower:
         bend = np.abs(square) * (_TOTAL**2 / _FORCE_BEND) / middle
         maps[:, 2, 5] = np.where(alike, np.fmax(bend, 1.0) / _TOTAL, np.nan)
         maps[:, 2, 4] = -maps[:, 2, 5]
-        radius_m = np.exp(log_radius[0])
-        by_law = self._model.law_std(pads, currents.T, at.total, radius_m, force[0])
+        by_law = self._model.law_std(pads, currents.T, at.total, radius_m[0], force[0])
         return np.hypot(strength.std_n.reshape(5, -1)[0], by_law), status[0] == _SATURATED
 
 
@@ -253,7 +256,7 @@ class _Linear(NamedTuple):
         mixing = np.matmul(slopes, (fractions / norm[:, None])[:, :, None])
         slopes -= mixing * fractions[:, None]
         covariance = covariance_of(
-            np.moveaxis(slopes, 0, -1),
+            slopes.transpose(1, 2, 0),
             mixing[:, :, 0].T,
             fractions.T,
             np.full(len(total), _LEAST_INFORMATION),

@@ -57,33 +57,41 @@ class Placement:
 
         NaN in gives NaN out in the same row; points off the pad continue its surface.
         """
-        step = np.where(np.isfinite(x), x, 0.0) * self._per_x[index]
-        interval = np.clip(step.astype(np.intp), 0, _INTERVALS - 1)
+        per_x = self._per_x.take(index)
+        t = x * per_x
+        step = np.where(np.isfinite(t), t, 0.0).astype(np.intp)
+        interval = np.minimum(np.maximum(step, 0), _INTERVALS - 1)
         cubic = self._meridian[index, interval]  # (n, 4, 7)
-        t = (x * self._per_x[index] - interval)[:, None]
+        t = (t - interval)[:, None]
         axial, radial, cosine, sine, scale_x, scale_y, u = (
             ((cubic[:, 0] * t + cubic[:, 1]) * t + cubic[:, 2]) * t + cubic[:, 3]
         ).T
-        off_middle = y - self._mid_y[index]
-        angle = off_middle * self._curvature[index]
+        off_middle = y - self._mid_y.take(index)
+        half = off_middle * (self._curvature.take(index) / 2)
         across = scale_y * off_middle
-        cos, sin = np.cos(angle), np.sin(angle)
+        # of the angle about the axis, by half of it: all of it is exact on a plane, where the angle is 0
+        chord, cos_half = np.sinc(half / np.pi), np.cos(half)
+        sin_half = chord * half
+        cos, sin = 1 - 2 * sin_half * sin_half, 2 * sin_half * cos_half
         vectors = np.zeros((len(x), 4, 3))  # rows: point, tangents, normal; in axis, radial, aside
         point, along, around, normal = vectors[:, 0], vectors[:, 1], vectors[:, 2], vectors[:, 3]
         point[:, 0] = axial
-        point[:, 1] = radial - across * (angle / 2) * np.sinc(angle / (2 * np.pi)) ** 2
-        point[:, 2] = across * np.sinc(angle / np.pi)
+        point[:, 1] = radial - across * sin_half * chord
+        point[:, 2] = across * chord * cos_half
         along[:, 0], along[:, 1], along[:, 2] = cosine, sine * cos, sine * sin
         around[:, 1], around[:, 2] = -sin, cos
         normal[:, 0], normal[:, 1], normal[:, 2] = -sine, cosine * cos, cosine * sin
-        vectors = vectors @ self._basis[index]
-        scales = np.stack([scale_x, scale_y], axis=1)
-        tangents = vectors[:, 1:3] * scales[:, :, None]
+        vectors = np.matmul(vectors, self._basis.take(index, axis=0))
+        tangents = vectors[:, 1:3]
+        tangents[:, 0] *= scale_x[:, None]
+        tangents[:, 1] *= scale_y[:, None]
+        pad_m = np.empty((len(x), 2))
+        pad_m[:, 0], pad_m[:, 1] = u, scale_y * y
         return Placed(
-            vectors[:, 0] + self._origin[index],
+            vectors[:, 0] + self._origin.take(index, axis=0),
             vectors[:, 3],
-            tangents.transpose(0, 2, 1) @ covariance @ tangents,
-            np.stack([u, scale_y * y], axis=1),
+            np.matmul(np.matmul(tangents.transpose(0, 2, 1), covariance), tangents),
+            pad_m,
             2 / (1 / scale_x + 1 / scale_y),
         )
 
