@@ -56,7 +56,7 @@ def slip_all(world: World, hz: float, repeats: int) -> list[tuple[float, float, 
             )
             for number, (speed, force) in enumerate(combos)
         ]
-        record = run(grips, world, hz, RUN_S, from_s)
+        record = run(grips, world, hz, RUN_S, from_s, SLIPS_S - 0.02)
         record.load = LOADS[repeat % 2]
         found += [(speed, force, record, pad) for pad, (speed, force) in enumerate(combos)]
     return found
@@ -116,6 +116,14 @@ def latency_s(value: FloatArray, threshold: float, t_s: FloatArray) -> float:
     return float(t_s[after][above[0]]) - SLIPS_S if len(above) else math.inf
 
 
+def bound_s(record: Record, pad: int, mm_per_s: float) -> float:
+    """When a ramp of known onset, speed and direction, in tremor as modelled, would be told in the mean: as
+    ln of its likelihood ratio reaches the threshold's (G. Lorden 1971); inf: not in half a second."""
+    ages, information = (of[pad] for of in record.information)
+    enough = 0.5 * (1e-3 * mm_per_s) ** 2 * information >= math.log(record.per_alarm)
+    return float(ages[enough].min()) if enough.any() else math.inf
+
+
 def curve(made: list[tuple[FloatArray, FloatArray]], held: FloatArray, t_s: FloatArray) -> Rows:
     """Thresholds that give many or few false alarms: what share of slips is found then, and how soon."""
     lasting = held[t_s > GRIPPED_S + 1.0]
@@ -138,9 +146,9 @@ def curve(made: list[tuple[FloatArray, FloatArray]], held: FloatArray, t_s: Floa
 def measure(quick: bool) -> dict[str, Any]:
     repeats, seconds = (2, 10.0) if quick else (4, 40.0)
     results: dict[str, Any] = {"latency": [], "false": [], "curves": {}, "cost": []}
-    cases = [("ideal", 200.0), ("S1", 200.0), ("S2", 200.0), ("ideal", 500.0), ("S2", 500.0)]
+    cases = [("ideal", 200.0), ("S1", 200.0), ("S2", 200.0), ("ideal", 500.0), ("S1", 500.0), ("S1", 1000.0)]
     for name, hz in cases[: 1 if quick else None]:
-        made, firm = slip_all(WORLDS[name], hz, repeats), hold(WORLDS[name], hz, seconds)
+        made, firm = slip_all(WORLDS[name], hz, repeats), hold(WORLDS[name], hz, min(seconds, 2e4 / hz))
         told = firm.running & ~np.vstack([firm.running[:1], firm.running[:-1]])
         lasting = firm.t_s > GRIPPED_S + 1.0
         minutes = told.shape[1] * float(firm.t_s[-1] - GRIPPED_S - 1.0) / 60
@@ -170,13 +178,14 @@ def latencies(name: str, hz: float, made: list[tuple[float, float, Record, int]]
     rows = []
     for speed in SPEEDS:
         for force in FORCES:
-            late, before = [], 0
+            late, bounds, before = [], [], 0
             for v, f, record, pad in made:
                 if (v, f) == (speed, force):
                     ran = record.running[:, pad].astype(float)
                     just = (record.t_s > SLIPS_S - 0.3) & (record.t_s <= SLIPS_S)
                     before += bool(ran[just].any())
                     late.append(latency_s(ran, 0.5, record.t_s))
+                    bounds.append(bound_s(record, pad, speed))
             times = np.array(late)
             rows.append(
                 {
@@ -188,6 +197,7 @@ def latencies(name: str, hz: float, made: list[tuple[float, float, Record, int]]
                     "found": float(np.isfinite(times).mean()),
                     "median_ms": 1e3 * float(np.median(times)),
                     "p90_ms": 1e3 * float(np.quantile(times, 0.9, method="higher")),
+                    "bound_ms": 1e3 * float(np.median(bounds)),
                     "median_samples": float(np.median(times)) * hz,
                     "running_before": before,
                 }
@@ -290,6 +300,7 @@ def report(results: dict[str, Any]) -> str:
             f"{row['median_ms']:.0f}",
             f"{row['median_samples']:.0f}",
             f"{row['p90_ms']:.0f}",
+            f"{row['bound_ms']:.0f}",
         ]
         for row in results["latency"]
     ]
@@ -323,9 +334,12 @@ shared cores.
 
 ## From onset to alarm
 
-Sequential test at a stated mean time between false alarms of 600 s. Found: within {LATEST_S:g} s.
+Sequential test at a stated mean time between false alarms of 600 s. Found: within {LATEST_S:g} s. *Bound*:
+when ln of the likelihood ratio of a slip of known onset, speed and direction would reach the threshold in
+the mean (Lorden), with the information that the test itself has of tremor and noise. The test knows none of
+the three, and counts with creep and tremor that aren't as modelled: slow slips pay for that.
 
-{table(["sheet", "Hz", "mm/s", "N", "found", "median ms", "samples", "90 % ms"], late)}
+{table(["sheet", "Hz", "mm/s", "N", "found", "median ms", "samples", "90 % ms", "bound ms"], late)}
 
 ## False alarms of a firm grip
 

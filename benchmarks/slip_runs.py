@@ -55,6 +55,11 @@ class Record:
     """(k,) that samples to contacts took, and the next: what perception added"""
     perceive_s: FloatArray
     percepts: list[wire.Percept]
+    information: tuple[FloatArray, FloatArray]
+    """at `look_s`: ages [s] of ramps (pads, onsets), and what a ramp of 1 m/s along either axis would have
+    told by then, in the mean: twice the mean of ln of its likelihood ratio"""
+    per_alarm: float
+    """threshold on R of an alarm"""
     load: float = 1.0
     """force while slipping, as a part of that before"""
 
@@ -76,7 +81,9 @@ def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:
     return found
 
 
-def run(grips: list[Grip], world: World, hz: float, seconds: float, from_s: float = 0.0) -> Record:
+def run(
+    grips: list[Grip], world: World, hz: float, seconds: float, from_s: float = 0.0, look_s: float = 0.0
+) -> Record:
     """Every grip is one contact on its link's pad; the run begins at `from_s` of the scenario."""
     deployment, period_ns = DEPLOYMENT, round(1e9 / hz)
     hand = VirtualHand(deployment, Scenario.model_validate({"touch": grips}), world)
@@ -96,7 +103,7 @@ def run(grips: list[Grip], world: World, hz: float, seconds: float, from_s: floa
     shape = len(times), model.size
     log_odds, force, running = np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
     took = np.empty((2, len(times)))
-    payload = counts.astype("<i2")
+    payload, known = counts.astype("<i2"), (np.zeros((model.size, 0)), np.zeros((model.size, 0)))
     for k, t_s in enumerate(times.tolist()):
         t_ns = 10**9 + round(t_s * 1e9)
         pipeline.begin(t_ns, t_ns)
@@ -111,5 +118,17 @@ def run(grips: list[Grip], world: World, hz: float, seconds: float, from_s: floa
         pipeline.settle()
         took[:, k] = ticked_s - began_s, perceived_s - ticked_s
         log_odds[k], running[k] = motion.test.log_odds, motion.running
+        if k == round(look_s * hz):
+            known = motion.test.told()
         force[k] = pipeline.tick.columns.force_n
-    return Record(times - from_s, log_odds, force, running, took[0], took[1], taker.percepts)
+    return Record(
+        times - from_s,
+        log_odds,
+        force,
+        running,
+        took[0],
+        took[1],
+        taker.percepts,
+        known,
+        motion.test.per_alarm,
+    )

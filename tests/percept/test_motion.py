@@ -203,6 +203,25 @@ def test_a_single_contact_is_against_an_object_that_stands_still() -> None:
     assert told.label == "sliding"
 
 
+def test_a_centroid_that_runs_on_a_link_at_rest_slides_where_nothing_else_holds_the_object() -> None:
+    told = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[still])[-1]
+    assert told.values["object"] == "static"
+    assert told.label == "sliding"
+
+
+def test_a_contact_slips_likelier_just_after_another_of_its_hand() -> None:
+    held = Held(2)
+    held.feel(1.0, still)
+    motion, pads, no_time = held.motion, np.array([0, 1]), np.zeros(2)
+    motion.test.log_odds[:] = 8.0
+    motion._weigh(pads, no_time, held.stream.hand_of)
+    alone = motion._odds.copy()
+    motion._since[1] = 0.0  # it has begun to run
+    motion._weigh(pads, no_time, held.stream.hand_of)
+    assert motion._odds[0] > alone[0] + 0.5
+    assert motion._odds[1] == pytest.approx(alone[1])
+
+
 def test_samples_without_place_or_force_are_survived() -> None:
     held = Held()
     held.feel(0.5, still)

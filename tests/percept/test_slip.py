@@ -139,3 +139,32 @@ def test_onset_and_speed_are_those_of_the_slip() -> None:
         test.step(pads, one, place[k], np.full((1, 2), NOISE_M**2), np.ones(1))
     assert test.onset_s[0] == pytest.approx(11 * DT_S, abs=3 * DT_S)
     assert test.speed[0] == pytest.approx([0, -20e-3], abs=3e-3)
+
+
+def test_a_centroid_that_creeps_is_no_slip() -> None:
+    """At half a millimetre a second, as pads on things that are held do, from the first sample on."""
+    rng, pads, steps = np.random.default_rng(7), 12, 500
+    creeps = 0.5e-3 * DT_S * np.arange(steps)[:, None, None] * np.array([0.8, -0.6])
+    place = creeps + 0.2 * wandering(pads, steps, rng, Grip())
+    assert alarms(SlipTest(pads, DT_S, 600.0), place, np.full((steps, pads), FORCE_N), rng) == []
+
+
+def test_a_light_contact_may_begin_far_from_where_it_is() -> None:
+    rng, pads, noise_m = np.random.default_rng(8), np.arange(8), 1e-3
+    test, noise = SlipTest(8, DT_S, 600.0), np.full((8, 2), noise_m**2)
+    test.begin(pads, 2 * noise_m * np.ones((8, 2)), noise, np.ones(8))
+    for _ in range(100):
+        seen = noise_m * rng.standard_normal((8, 2))
+        assert not test.step(pads, np.full(8, DT_S), seen, noise, np.ones(8)).any()
+
+
+def test_what_a_slip_tells_grows_with_its_age() -> None:
+    test, noise = SlipTest(1, DT_S, 600.0), np.full((1, 2), NOISE_M**2)
+    test.begin(np.array([0]), np.zeros((1, 2)), noise, np.ones(1))
+    for _ in range(60):
+        test.step(np.array([0]), np.full(1, DT_S), np.zeros((1, 2)), noise, np.ones(1))
+    (ages,), (information,) = test.told()
+    begun = ages > 0
+    assert ages[begun].max() == pytest.approx(59 * DT_S, abs=5 * DT_S)
+    assert (np.diff(information[begun]) > 0).all()
+    assert (np.diff(ages[begun]) > 0).all()

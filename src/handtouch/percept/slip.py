@@ -257,6 +257,11 @@ class SlipTest:
             self.speed[pads[rows]] = ramps[rows, _GAIN, :, best] / known
         return np.asarray(log_odds > np.log(self.per_alarm))
 
+    def told(self) -> tuple[FloatArray, FloatArray]:
+        """Of every ramp (n, onsets): its age [s], and twice what one of 1 m/s along an axis adds to ln of its
+        likelihood ratio, in the mean, if it is one: no test can know it sooner."""
+        return self._ramp.copy(), self._ramps[:, _INFORMATION].mean(axis=1)
+
     def tremor_m(self, pads: IntArray) -> FloatArray:
         """Standard deviation (k, 2) of the wander as learnt."""
         return np.asarray(np.exp(0.5 * self._wander[pads]))
