@@ -423,7 +423,8 @@ centre of force ran on the pad by more than 0.2 mm in 0.1 s, as squeezed fingers
 moved with less than a slip, or was about to stop. A threshold on the rate of force, |dF/dt| / F >
 {threshold} /s, set so that its false alarms are no more than those ({rate_false} a minute), finds
 {rate_found}, median {rate_ms} ms; with {OFTEN[0]:.0f} and {OFTEN[1]:.0f} a minute, {if_often}.
-Many of these slips move no centroid: a ball or a rod that is pulled along under a fingertip touches it where it did before. Only joints and other contacts could show them.
+Many of these slips move no centroid: a ball or a rod that is pulled along under a fingertip touches it
+where it did before. Only joints and other contacts could show them.
 
 ## Hardness
 

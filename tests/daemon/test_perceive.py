@@ -12,6 +12,7 @@ from handtouch.config.tables import Wants
 from handtouch.daemon.perceive import Perceiving
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.daemon.scene import Demand, Needs, Scenes, Wanted
+from handtouch.percept.shape import pair_distance
 from handtouch.percept.stream import KINDS
 from handtouch.view.lines import line
 from handtouch.wire import PadState
@@ -134,3 +135,22 @@ def test_only_what_is_asked_for_is_wanted_and_pads_outside_the_scene_are_not(
     assert np.array_equal(rig.demand.wanted.asks, [topic.endswith(b"ask"), False, False])
     told = rig.demand.tell()[PLANE]["computed"]
     assert kinds <= set(told)
+
+
+@pytest.mark.parametrize(("residual", "axis"), [(0.02, 0), (-0.02, 1)])
+def test_two_points_are_as_far_apart_on_the_pad_as_their_residual_says(
+    bench: Any, residual: float, axis: int
+) -> None:
+    """In metres on the surface, along x of the pad or along y."""
+    rig = Rig(bench, MOTION, PLAIN)
+    assert np.isinf(rig.perceiving._pair_m(PLANE, residual, 1e-3)[1])  # nothing touches: no place
+    rig.feel(20)
+    locator, (x, y) = bench.model.locator, rig.pipeline.tick.columns.xy[PLANE].tolist()
+    on_sheet, std = pair_distance(locator, PLANE, x, y, residual, 1e-3)
+    way = np.array([x, y]) + np.outer([-0.5, 0.5], np.eye(2)[axis]) * on_sheet
+    placed = bench.model.placement.place(
+        np.full(2, PLANE), way[:, 0], way[:, 1], np.zeros((2, 2, 2))
+    ).position_m
+    distance_m, std_m = rig.perceiving._pair_m(PLANE, residual, 1e-3)
+    assert distance_m == pytest.approx(float(np.linalg.norm(placed[1] - placed[0])), rel=1e-6)
+    assert std_m == pytest.approx(std * distance_m / on_sheet)

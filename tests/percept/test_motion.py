@@ -190,7 +190,7 @@ def test_evidence_about_the_threshold_does_not_chatter() -> None:
     alarms, before = 0, False
     for k in range(200):
         motion.test.log_odds[0] = even + (0.8 if k % 6 < 3 else -1.5 if k < 100 else -9.0) if k < 106 else 0.0
-        motion._weigh(pad, one, held.stream.hand_of)
+        motion._weigh(pad, one)
         now = bool(motion._look(pad)[0] == CLASSES.index("incipient"))
         alarms, before = alarms + (now and not before), now
     assert alarms == 1
@@ -207,19 +207,6 @@ def test_a_centroid_that_runs_on_a_link_at_rest_slides_where_nothing_else_holds_
     told = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[still])[-1]
     assert told.values["object"] == "static"
     assert told.label == "sliding"
-
-
-def test_a_contact_slips_likelier_just_after_another_of_its_hand() -> None:
-    held = Held(2)
-    held.feel(1.0, still)
-    motion, pads, no_time = held.motion, np.array([0, 1]), np.zeros(2)
-    motion.test.log_odds[:] = 8.0
-    motion._weigh(pads, no_time, held.stream.hand_of)
-    alone = motion._odds.copy()
-    motion._since[1] = 0.0  # it has begun to run
-    motion._weigh(pads, no_time, held.stream.hand_of)
-    assert motion._odds[0] > alone[0] + 0.5
-    assert motion._odds[1] == pytest.approx(alone[1])
 
 
 def test_samples_without_place_or_force_are_survived() -> None:

@@ -42,10 +42,6 @@ _ACCELERATION = 0.01  # of the centroid, root of its spectral density [m/s^1.5]
 _LEAVES_S = 0.04  # a force that is gone in this time at the rate at which it falls is about to leave
 _RATE_S = 0.02  # over which the rate of a force is smoothed
 _HOLDS = -3.0  # ln of the odds of a slip up to which a contact is taken to hold the object
-_TOGETHER, _TOGETHER_S = (
-    1.0,
-    0.1,
-)  # ln of how much likelier a slip is so soon after another pad's began to run
 _RUNS_S = 0.06  # a centroid that stands for so long has come to rest
 _REST_SPEED = 0.5e-3
 
@@ -72,7 +68,6 @@ class Motion:
         self._rate_std = np.zeros(n)
         self._began_at = np.zeros((n, 2))  # where it began to run
         self._quiet_s = np.zeros(n)
-        self._since = np.full(n, np.inf)  # s since it began to run
         self._slips = np.zeros(n, dtype=np.int64)  # of the contact so far
         self._scale_a, self._peak_a = np.zeros((2, n))
         self._in_doubt = np.zeros(n, dtype=np.bool_)
@@ -102,7 +97,7 @@ class Motion:
             alarm = self.test.step(pads, dt_s[go], place[go], variance[go], press[go])
             self._start(pads[alarm & ~self.running[pads]], stream)
             self._settle(pads, dt_s[go], place[go], variance[go], press[go])
-        self._weigh(sample.pads, dt_s, stream.hand_of)
+        self._weigh(sample.pads, dt_s)
         looks = self._look(sample.pads)
         rows = self._to_tell(sample, looks)
         if not len(rows):
@@ -217,7 +212,6 @@ class Motion:
             at = int(np.searchsorted(window.t_s, -self.test.onset_s[pad]))
             self._began_at[pad] = window["pad_m"][min(at, len(window) - 1)]
             self.running[pad] = True
-            self._since[pad] = 0.0
             self.test.runs(np.array([pad]))
             self._quiet_s[pad] = 0.0
 
@@ -269,18 +263,12 @@ class Motion:
         hand, contact = self._contact[pad].tolist()
         return Question("sliding", hand, pad, contact, {"sticks": 1 - slips, "slides": slips}, [hold])
 
-    def _weigh(self, pads: IntArray, dt_s: FloatArray, hand_of: IntArray) -> None:
+    def _weigh(self, pads: IntArray, dt_s: FloatArray) -> None:
         """ln of the odds of having begun to run: R, by how often contacts slip at such forces. What a moment
         ago looked like a slip is still open, or a contact near the threshold would chatter."""
-        self._since[pads] += dt_s
         falls = np.maximum(-self._rate[pads], 0.0) / np.maximum(3 * self._rate_std[pads], 1e-9)
         hazard = _HAZARD_HZ * (1 + (_UNLOADING - 1) * np.minimum(falls, 1.0)) * self.test.period_s
         odds = self.test.log_odds[pads] + np.log(hazard)
-        fresh = self._since < _TOGETHER_S
-        if np.count_nonzero(fresh):  # what a hand holds slips at several pads at once
-            odds += _TOGETHER * (
-                np.bincount(hand_of[fresh], minlength=len(hand_of))[hand_of[pads]] > fresh[pads]
-            )
         self._odds[pads] = np.fmax(odds, self._odds[pads] - dt_s / _OPEN_S)
 
     def _slip_probability(self, pad: int) -> float:
