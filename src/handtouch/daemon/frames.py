@@ -191,12 +191,15 @@ class Frames:
         robots = self._robots
         if robots is not None:
             for number, of in enumerate(robots.rows):
-                mine = rows[(rows >= of[0]) & (rows <= of[-1])]
-                times = columns.sample_ns.take(mine)
-                for t_ns in np.unique(times).tolist():
-                    self._place(number, mine[times == t_ns], t_ns, columns)
-        self.palm[rows[~self._wants_palm[rows]]] = _SKIPPED
-        self.base[rows[~self._wants_base[rows]]] = _SKIPPED
+                mine = rows if len(of) == len(self.palm) else rows[(rows >= of[0]) & (rows <= of[-1])]
+                times = columns.sample_ns.take(mine).tolist()
+                for t_ns in sorted(set(times)):  # one, but for pads that sample when something moves
+                    now = mine if times.count(t_ns) == len(times) else mine[np.equal(times, t_ns)]
+                    self._place(number, now, t_ns, columns)
+        for state, wants in ((self.palm, self._wants_palm), (self.base, self._wants_base)):
+            wanted = wants.take(rows)
+            if np.count_nonzero(wanted) < len(rows):
+                state[rows[~wanted]] = _SKIPPED
 
     def _place(self, number: int, rows: IntArray, t_ns: int, columns: Columns) -> None:
         """Contacts of one hand, sampled at one time."""

@@ -47,17 +47,17 @@ class Groups:
     def _join(
         self, here: NDArray[np.intp], position_m: FloatArray, normal: FloatArray, changed: bool
     ) -> None:
-        square = np.ix_(here, here)
-        before = self._joined[square]
+        before = self._joined.take(here, axis=0).take(here, axis=1)
         apart = position_m[:, None] - position_m
         distance2 = np.einsum("ijk,ijk->ij", apart, apart)
-        limit2 = np.where(before, _APART**2, 1.0) * self._within2[here]
+        limit2 = self._within2.take(here) * np.where(before, _APART**2, 1.0)
         near = (distance2 <= limit2) & (normal @ normal.T >= _FACING)
-        near &= self._hand[here, None] == self._hand[here]
+        hand = self._hand.take(here)
+        near &= hand[:, None] == hand
         joined = np.where(np.isnan(distance2), before, near)
-        np.fill_diagonal(joined, False)
-        if changed or not np.array_equal(joined, before):
-            self._joined[square] = joined
+        joined.flat[:: len(here) + 1] = False
+        if changed or np.count_nonzero(joined != before):
+            self._joined[np.ix_(here, here)] = joined
             self._name(here, joined)
 
     def _name(self, here: NDArray[np.intp], joined: NDArray[np.bool_]) -> None:
