@@ -1,72 +1,64 @@
 """How far a hand closes on what it presses: by joint states, or as it was told to.
 
-Public names: `closing_m`, `sways_m`, `opposite`, `held`, `Commanded`.
+What nothing else touches is taken to rest in the palm. What several contacts hold moves with them, by far
+more than it gives: how it does is solved for, from all of them (`grasped`).
+
+Public names: `closing`, `Closing`, `held`, `Commanded`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.percept.grasped import gives, rigid
 from handtouch.percept.stream import IntArray, Stream, Window
 
 FloatArray = NDArray[np.float64]
-_FEW = 24  # samples that are enough to tell how far something goes
-_OPPOSED = -0.7  # cosine between normals of two pads that hold something between them
+
+_LEAST_SAMPLES = 16
+_CREEPS_M, _GIVES_M = 0.15e-3, 0.03e-3  # of a contact that sticks: along the pad, and beyond its spring
+_UNKNOWN_M = 0.1
+_FAR_M = 0.8e-3  # farther in a squeeze goes what isn't held firmly yet, and slides
 
 
-def closing_m(window: Window, others: Sequence[Window] = ()) -> tuple[FloatArray, str]:
-    """How far the hand has closed on a contact, (k,) [m], along the contact's normal; and by what: joints,
-    command, or "" where neither is known.
+class Closing(NamedTuple):
+    """Depths [m] of the samples of a window from `first` on; `share` of their rise (1 sigma) that may be the
+    thing's own way. sides: how many contacts give in it. by: joints, command, or "" where nothing tells."""
 
-    Of the point of the link where the contact is, so that noise of the place on the pad doesn't count.
-    others: of the same hand; one that presses from the other side closes, too. Without any, the object is
-    taken to be at rest in the palm's frame.
+    depth_m: FloatArray
+    first: int = 0
+    share: float = 0.0
+    sides: int = 1
+    by: str = ""
+
+
+def closing(window: Window, others: Sequence[Window] = ()) -> Closing:
+    """How far the hand has closed on a contact since its force began to rise.
+
+    others: contacts of the same hand. With any, it is twice what a contact gives in the mean: as far as two
+    fingers that pinch the thing would close. Infinite `share`: they don't tell how the thing went.
     """
-    for by, along in (("joints", _by_joints), ("command", _by_command)):
-        moved, normal = along(window)
-        if not np.isfinite(moved).any():
+    for by, follow in (("joints", _by_joints), ("command", _by_command)):
+        one = follow(window)
+        if one is None:
             continue
-        for other in others:
-            there, facing = along(other)
-            known = np.isfinite(there)
-            if known.any() and float(facing @ normal) < _OPPOSED:
-                t, when = (np.asarray(w.t_ns - window.t_ns[0], np.float64) for w in (window, other))
-                moved = moved + np.interp(t, when[known], there[known])
-                break
-        return moved, by
-    return np.full(len(window), np.nan), ""
-
-
-def sways_m(window: Window, opposed: Sequence[Window], others: Sequence[Window]) -> float:
-    """How far an object that goes along with the other contacts of the hand may have gone [m], 1 sigma, of
-    which `closing_m` knows nothing.
-
-    0 where nothing else touches; infinite where something does and nothing presses from the other side. Else
-    it is taken to move as far as the farthest of `others` at most. Of that, two pads that face each other see
-    what normals that aren't quite opposite leave, and of its turns what places that aren't do.
-    """
-    normal = _by_joints(window)[1]
-    if not others or not np.isfinite(normal).all():
-        return 0.0
-    if not opposed:
-        return math.inf
-    apart = _points(window)[-1] - _points(opposed[0])[-1]
-    turns = float(np.linalg.norm(np.cross(apart, normal))) / max(float(np.linalg.norm(apart)), 1e-6)
-    left = float(np.linalg.norm(normal + _by_joints(opposed[0])[1])) + turns
-    left = left if math.isfinite(left) else 1.0
-    ways = []
-    for other in others:
-        few = max(len(other) // _FEW, 1)
-        point = _points(other, few)[other.t_ns[::few] >= window.t_ns[0]]
-        point = np.sort(point[~np.isnan(point[:, 0])], axis=0)
-        if len(point):
-            tail = len(point) // 20  # noise alone has a range, too
-            ways.append(float(np.linalg.norm(point[-1 - tail] - point[tail])))
-    return min(left, 1.0) / 2 * max(ways, default=0.0)
+        own = np.where(one.known, (one.way - one.way[one.known][-1]) @ one.normal, np.nan)
+        if not others:
+            return Closing(own, by=by)
+        first, top = _rising(window["force_n"])
+        when, rise = window.t_ns[first:], slice(0, top - first + 1)
+        ends = int(when[0]), int(when[top - first])
+        tracks = [one, *(track for other in others if (track := follow(other)) is not None)]
+        tracks = [track for track in tracks if track.covers(*ends)]
+        known = top - first >= _LEAST_SAMPLES and bool(np.isfinite(one.force).all())
+        if len(tracks) < 2 or tracks[0] is not one or not known:
+            return Closing(own, share=np.inf, sides=2, by=by)
+        return _together(tracks, when, rise)._replace(first=first, by=by)
+    return Closing(np.full(len(window), np.nan))
 
 
 def held(stream: Stream, pad: int) -> list[Window]:
@@ -76,46 +68,109 @@ def held(stream: Stream, pad: int) -> list[Window]:
     return [stream.window(other) for other in np.flatnonzero(near).tolist()]
 
 
-def opposite(stream: Stream, pad: int) -> list[Window]:
-    """The contact of the same hand that presses most from the other side, if any does."""
-    near = np.flatnonzero((stream.hand_of == stream.hand_of[pad]) & (stream.contact > 0) & (stream.count > 1))
-    for name in ("palm_normal", "commanded_normal"):
-        normals = stream.latest(near, name)
-        cosine = normals @ stream.latest(np.array([pad]), name)[0]
-        if np.isfinite(cosine).any() and np.nanmin(cosine) < _OPPOSED:
-            return [stream.window(int(near[np.nanargmin(cosine)]))]
-    return []
+class _Track(NamedTuple):
+    """A contact in the palm: ways (k, 3) of the point of the link that is touched in the mean, where `known`;
+    its mean outward normal and place; rotations (k, 3, 3) of the link. Without these the way is known along
+    the normal alone."""
+
+    t_ns: NDArray[np.int64]
+    known: NDArray[np.bool_]
+    way: FloatArray
+    normal: FloatArray
+    place: FloatArray
+    rotation: FloatArray | None
+    force: FloatArray
+
+    def covers(self, from_ns: int, until_ns: int) -> bool:
+        """Whether it was there all the time."""
+        known = self.t_ns[self.known]
+        return len(known) >= _LEAST_SAMPLES and bool(known[0] <= from_ns + 3e7 and known[-1] >= until_ns)
+
+    def at(self, when: NDArray[np.int64]) -> FloatArray:
+        """Ways (k, 3) at these times."""
+        since, then = (np.asarray(t - when[0], np.float64) for t in (self.t_ns[self.known], when))
+        return np.stack([np.interp(then, since, along) for along in self.way[self.known].T], axis=1)
+
+    def force_at(self, when: NDArray[np.int64]) -> FloatArray:
+        """Forces (k,) then, NaN where they aren't known all the time."""
+        if not np.isfinite(self.force).all():
+            return np.full(len(when), np.nan)
+        since, then = (np.asarray(t - when[0], np.float64) for t in (self.t_ns, when))
+        return np.interp(then, since, self.force)
+
+    def turned(self, from_ns: int, until_ns: int) -> FloatArray:
+        """How the link turned between, (3,) [rad]; small angles, NaN where unknown."""
+        if self.rotation is None:
+            return np.full(3, np.nan)
+        begin, end = np.searchsorted(self.t_ns, [from_ns, until_ns]).tolist()
+        before = self.rotation[begin : begin + 6].mean(axis=0)
+        turn = self.rotation[max(end - 5, 0) : end + 1].mean(axis=0) @ before.T
+        return np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
 
 
-def _by_joints(window: Window) -> tuple[FloatArray, FloatArray]:
-    """Way of a link's point along the mean normal (k,), and that normal."""
-    point = _points(window)
-    known = np.flatnonzero(np.isfinite(point).all(axis=1))
-    if not len(known):
-        return np.full(len(window), np.nan), np.full(3, np.nan)
-    normal = window["palm_normal"][known].mean(axis=0)
-    normal = normal / np.linalg.norm(normal)
-    return np.asarray((point - point[known[-1]]) @ normal), normal
+def _together(tracks: Sequence[_Track], when: NDArray[np.int64], rise: slice) -> Closing:
+    """Closing on the first of the tracks, where the others hold the thing, too."""
+    force = np.stack([track.force_at(when) for track in tracks])
+    frames = np.stack([_frame(track.normal) for track in tracks])
+    ways = np.stack([track.at(when) @ frame.T for track, frame in zip(tracks, frames, strict=True)], axis=1)
+    rose = float(np.ptp(force[0, rise]))
+    of = force[0, rise] - force[0, rise].mean()
+    of = of * rose / max(float(of @ of), 1e-12)  # times it: by how much anything went with the force
+    std = np.tile([_GIVES_M, _CREEPS_M, _CREEPS_M], (len(tracks), 1))
+    std[[track.rotation is None for track in tracks], 1:] = _UNKNOWN_M
+    weights, give, deviation, far_m = gives(
+        np.tensordot(of, ways[rise], 1),
+        force[:, rise] @ of,
+        rigid(frames, np.stack([track.place for track in tracks]) - tracks[0].place),
+        np.stack([track.turned(int(when[0]), int(when[rise.stop - 1])) for track in tracks]),
+        std,
+    )
+    share = deviation / give if give > 0 and far_m < _FAR_M else np.inf
+    return Closing(2 * rose * np.tensordot(ways, weights, 2), share=share, sides=2)
 
 
-def _points(window: Window, each: int = 1) -> FloatArray:
-    """Where in the palm (k, 3) the point of the link was that is touched in the mean, at each so many
-    samples; NaN where unknown."""
-    names = "palm_rotation", "palm_position_m", "position_m"
-    rotation, place, on_link = (window[name][::each] for name in names)
+def _frame(normal: FloatArray) -> FloatArray:
+    """A normal and two ways across it, as rows."""
+    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    across /= np.linalg.norm(across)
+    return np.stack([normal, across, np.cross(normal, across)])
+
+
+def _rising(force: FloatArray) -> tuple[int, int]:
+    """From where to where the force rises to its greatest."""
+    width = max(len(force) // 64, 1)
+    smooth = np.convolve(np.nan_to_num(force), np.full(width, 1 / width), mode="valid")
+    top = int(np.argmax(smooth))
+    return int(np.argmin(smooth[: top + 1])), top
+
+
+def _by_joints(window: Window) -> _Track | None:
+    """Of the point of the link that is touched in the mean, so that noise of the place doesn't count."""
+    rotation, place, on_link = (window[name] for name in ("palm_rotation", "palm_position_m", "position_m"))
     known = np.isfinite(place).all(axis=1) & np.isfinite(on_link).all(axis=1)
     if not known.any():
-        return np.full(place.shape, np.nan)
+        return None
     offset = on_link - on_link[known].mean(axis=0)
-    return np.asarray(place - (rotation @ offset[:, :, None])[:, :, 0])
+    way = place - (rotation @ offset[:, :, None])[:, :, 0]
+    normal = window["palm_normal"][known].mean(axis=0)
+    middle = place[known].mean(axis=0)
+    normal = normal / np.linalg.norm(normal)
+    return _Track(window.t_ns, np.asarray(known), way, normal, middle, rotation, _force(window))
 
 
-def _by_command(window: Window) -> tuple[FloatArray, FloatArray]:
+def _by_command(window: Window) -> _Track | None:
     moved = window["commanded_m"]
-    known = np.flatnonzero(np.isfinite(moved))
-    if not len(known):
-        return moved, np.full(3, np.nan)
-    return moved - moved[known[-1]], window["commanded_normal"][known].mean(axis=0)
+    known = np.isfinite(moved)
+    if not known.any():
+        return None
+    normal = window["commanded_normal"][known].mean(axis=0)
+    normal = normal / np.linalg.norm(normal)
+    return _Track(window.t_ns, known, moved[:, None] * normal, normal, np.zeros(3), None, _force(window))
+
+
+def _force(window: Window) -> FloatArray:
+    """NaN where no bound is known above."""
+    return np.where(np.isfinite(window["force_std_n"]), window["force_n"], np.nan)
 
 
 class Commanded:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.percept.ask import Action, Question
-from handtouch.percept.closing import closing_m, held, opposite, sways_m
+from handtouch.percept.closing import Closing, closing, held
 from handtouch.percept.stiffness import BOUNDS_N_PER_M, CLASSES, RANGE_N_PER_M, Stiffness, stiffness
 from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns, Window
 
@@ -34,8 +34,8 @@ class Hardness:
     def __init__(self, pads: int, skin_m_per_n: float = 0.0, skin_std_m_per_n: float = 0.0) -> None:
         self.wanted = np.zeros(pads, dtype=np.bool_)
         self._turns = Turns(pads, _AGAIN_NS)
-        self._best: dict[int, tuple[int, int, Stiffness, str]] = {}
-        """pad -> contact, hand, what is known, and by which depth"""
+        self._best: dict[int, tuple[int, int, Stiffness, Closing]] = {}
+        """pad -> contact, hand, what is known, and by how far the hand closed"""
         self._skin = {"skin_m_per_n": skin_m_per_n, "skin_std_m_per_n": skin_std_m_per_n}
 
     def step(self, stream: Stream, sample: Sample, began: IntArray) -> Sequence[Percept]:  # noqa: ARG002
@@ -53,24 +53,27 @@ class Hardness:
         self._turns.took(pad, t_ns)
         contact, hand = int(stream.contact[pad]), int(stream.hand_of[pad])
         window = stream.window(pad)
-        opposed = opposite(stream, pad)
-        depth, by = closing_m(window, opposed)
-        if by:
-            found = self._squeeze(window, depth, sways_m(window, opposed, held(stream, pad)))
+        closed = closing(window, held(stream, pad))
+        if closed.by:
+            found = self._squeeze(window, closed)
         else:
             reason = "no joint states, no commands, and one sheet can't tell area from force"
             found = Stiffness("unestimated", reason)
         before = self._best.get(pad)
-        if before is not None and before[0] == contact and _worth(before[2]) > _worth(found):
-            found, by = before[2:]
-        self._best[pad] = contact, hand, found, by
+        # what was taken to rest, and is held by others now, may have moved
+        kept = before is not None and before[0] == contact and before[3].sides >= closed.sides
+        if before is not None and kept and _worth(before[2]) > _worth(found):
+            found, closed = before[2:]
+        self._best[pad] = contact, hand, found, closed
         modelled = bool(np.isfinite(window["raw_force_n"]).any())
-        return [_told(found, hand, pad, contact, t_ns, modelled, by)]
+        return [_told(found, hand, pad, contact, t_ns, modelled, closed.by)]
 
-    def _squeeze(self, window: Window, depth: FloatArray, sways: float) -> Stiffness:
+    def _squeeze(self, window: Window, closed: Closing) -> Stiffness:
         """Fit; what may be the object's own way is no depth that is known."""
-        share = min(sways / max(float(np.ptp(depth[np.isfinite(depth)])), 1e-6), _NOTHING)
-        found = stiffness(window["force_n"], depth, window["force_std_n"], moves=share, **self._skin)
+        share = min(closed.share, _NOTHING)
+        force, std = (window[name][closed.first :] for name in ("force_n", "force_std_n"))
+        skin = {name: closed.sides * each for name, each in self._skin.items()}
+        found = stiffness(force, closed.depth_m, std, moves=share, **skin)
         if found.samples and share > _SWAYS:
             reason = "other fingers move what is held: how far this one goes in isn't known"
             return replace(found, state="unestimated", reason=reason)
@@ -89,8 +92,10 @@ class Hardness:
         """Of contacts whose stiffness isn't known: how hard?"""
         return [
             _question(hand, pad, contact, found)
-            for pad, (contact, hand, found, by) in self._best.items()
-            if found.state == "unestimated" and self.wanted[pad] and by  # without depth it tells nothing
+            for pad, (contact, hand, found, closed) in self._best.items()
+            if found.state == "unestimated"
+            and self.wanted[pad]
+            and closed.by  # without depth it tells nothing
         ]
 
 
