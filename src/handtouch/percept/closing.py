@@ -19,18 +19,18 @@ from handtouch.percept.stream import IntArray, Stream, Window
 
 FloatArray = NDArray[np.float64]
 
-_LEAST_SAMPLES = 16
+_LEAST_SAMPLES, _MANY = 16, 96  # of a contact; of a squeeze that many hold, which costs more time
 _CREEPS_M, _GIVES_M = 0.15e-3, 0.03e-3  # of a contact that sticks: along the pad, and beyond its spring
 _UNKNOWN_M = 0.1
 _FAR_M = 0.8e-3  # farther in a squeeze goes what isn't held firmly yet, and slides
 
 
 class Closing(NamedTuple):
-    """Depths [m] of the samples of a window from `first` on; `share` of their rise (1 sigma) that may be the
+    """Depths [m] of the samples `rows` of a window; `share` of their rise (1 sigma) that may be the
     thing's own way. sides: how many contacts give in it. by: joints, command, or "" where nothing tells."""
 
     depth_m: FloatArray
-    first: int = 0
+    rows: slice = slice(None)
     share: float = 0.0
     sides: int = 1
     by: str = ""
@@ -42,22 +42,24 @@ def closing(window: Window, others: Sequence[Window] = ()) -> Closing:
     others: contacts of the same hand. With any, it is twice what a contact gives in the mean: as far as two
     fingers that pinch the thing would close. Infinite `share`: they don't tell how the thing went.
     """
+    each = max(len(window) // _MANY, 1) if others else 1
     for by, follow in (("joints", _by_joints), ("command", _by_command)):
-        one = follow(window)
+        one = follow(window, each)
         if one is None:
             continue
         own = np.where(one.known, (one.way - one.way[one.known][-1]) @ one.normal, np.nan)
         if not others:
             return Closing(own, by=by)
         first, top = _rising(window["force_n"])
-        when, rise = window.t_ns[first:], slice(0, top - first + 1)
-        ends = int(when[0]), int(when[top - first])
-        tracks = [one, *(track for other in others if (track := follow(other)) is not None)]
+        rows = slice(first, None, each)
+        when, rise = window.t_ns[rows], slice(0, (top - first) // rows.step + 1)
+        ends = int(when[0]), int(window.t_ns[top])
+        tracks = [one, *(track for other in others if (track := follow(other, each)) is not None)]
         tracks = [track for track in tracks if track.covers(*ends)]
         known = top - first >= _LEAST_SAMPLES and bool(np.isfinite(one.force).all())
         if len(tracks) < 2 or tracks[0] is not one or not known:
-            return Closing(own, share=np.inf, sides=2, by=by)
-        return _together(tracks, when, rise)._replace(first=first, by=by)
+            return Closing(own, slice(None, None, each), np.inf, 2, by)
+        return _together(tracks, when, rise)._replace(rows=rows, by=by)
     return Closing(np.full(len(window), np.nan))
 
 
@@ -84,7 +86,7 @@ class _Track(NamedTuple):
     def covers(self, from_ns: int, until_ns: int) -> bool:
         """Whether it was there all the time."""
         known = self.t_ns[self.known]
-        return len(known) >= _LEAST_SAMPLES and bool(known[0] <= from_ns + 3e7 and known[-1] >= until_ns)
+        return len(known) >= _LEAST_SAMPLES and bool(known[0] <= from_ns + 3e7 and known[-1] >= until_ns - 3e7)
 
     def at(self, when: NDArray[np.int64]) -> FloatArray:
         """Ways (k, 3) at these times."""
@@ -144,33 +146,37 @@ def _rising(force: FloatArray) -> tuple[int, int]:
     return int(np.argmin(smooth[: top + 1])), top
 
 
-def _by_joints(window: Window) -> _Track | None:
+def _by_joints(window: Window, each: int) -> _Track | None:
     """Of the point of the link that is touched in the mean, so that noise of the place doesn't count."""
-    rotation, place, on_link = (window[name] for name in ("palm_rotation", "palm_position_m", "position_m"))
+    rotation, place, on_link = (
+        window[name][::each] for name in ("palm_rotation", "palm_position_m", "position_m")
+    )
     known = np.isfinite(place).all(axis=1) & np.isfinite(on_link).all(axis=1)
     if not known.any():
         return None
     offset = on_link - on_link[known].mean(axis=0)
     way = place - (rotation @ offset[:, :, None])[:, :, 0]
-    normal = window["palm_normal"][known].mean(axis=0)
+    normal = window["palm_normal"][::each][known].mean(axis=0)
     middle = place[known].mean(axis=0)
     normal = normal / np.linalg.norm(normal)
-    return _Track(window.t_ns, np.asarray(known), way, normal, middle, rotation, _force(window))
+    return _Track(window.t_ns[::each], np.asarray(known), way, normal, middle, rotation, _force(window, each))
 
 
-def _by_command(window: Window) -> _Track | None:
-    moved = window["commanded_m"]
+def _by_command(window: Window, each: int) -> _Track | None:
+    moved = window["commanded_m"][::each]
     known = np.isfinite(moved)
     if not known.any():
         return None
-    normal = window["commanded_normal"][known].mean(axis=0)
+    normal = window["commanded_normal"][::each][known].mean(axis=0)
     normal = normal / np.linalg.norm(normal)
-    return _Track(window.t_ns, known, moved[:, None] * normal, normal, np.zeros(3), None, _force(window))
+    return _Track(
+        window.t_ns[::each], known, moved[:, None] * normal, normal, np.zeros(3), None, _force(window, each)
+    )
 
 
-def _force(window: Window) -> FloatArray:
+def _force(window: Window, each: int) -> FloatArray:
     """NaN where no bound is known above."""
-    return np.where(np.isfinite(window["force_std_n"]), window["force_n"], np.nan)
+    return np.where(np.isfinite(window["force_std_n"]), window["force_n"], np.nan)[::each]
 
 
 class Commanded:

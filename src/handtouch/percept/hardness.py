@@ -71,7 +71,7 @@ class Hardness:
     def _squeeze(self, window: Window, closed: Closing) -> Stiffness:
         """Fit; what may be the object's own way is no depth that is known."""
         share = min(closed.share, _NOTHING)
-        force, std = (window[name][closed.first :] for name in ("force_n", "force_std_n"))
+        force, std = (window[name][closed.rows] for name in ("force_n", "force_std_n"))
         skin = {name: closed.sides * each for name, each in self._skin.items()}
         found = stiffness(force, closed.depth_m, std, moves=share, **skin)
         if found.samples and share > _SWAYS:
