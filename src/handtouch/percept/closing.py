@@ -21,6 +21,7 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_SAMPLES, _MANY = 16, 96  # of a contact; of a squeeze that many hold, which costs more time
 _CREEPS_M, _GIVES_M = 0.15e-3, 0.03e-3  # of a contact that sticks: along the pad, and beyond its spring
+_LATE_NS = 30_000_000
 _UNKNOWN_M = 0.1
 _FAR_M = 0.8e-3  # farther in a squeeze goes what isn't held firmly yet, and slides
 
@@ -86,7 +87,9 @@ class _Track(NamedTuple):
     def covers(self, from_ns: int, until_ns: int) -> bool:
         """Whether it was there all the time."""
         known = self.t_ns[self.known]
-        return len(known) >= _LEAST_SAMPLES and bool(known[0] <= from_ns + 3e7 and known[-1] >= until_ns - 3e7)
+        if len(known) < _LEAST_SAMPLES:
+            return False
+        return bool(known[0] <= from_ns + _LATE_NS and known[-1] >= until_ns - _LATE_NS)
 
     def at(self, when: NDArray[np.int64]) -> FloatArray:
         """Ways (k, 3) at these times."""
