@@ -441,8 +441,8 @@ shape fits only if the thing moved by about 2 mm between touches, which makes th
 * Hardness of what many fingers hold rests on their sticking to it. Most squeezes here shift the thing by more
   than it gives, its contacts roll and creep, and nothing is told; what is told is known within a factor of 3
   either way, and tends to be too soft.
-* A thing that turns by more than a few degrees in the hand, as a thin rod does, blurs its shape; touches
-  aren't weighted by age. A fit that needs a moving thing takes twice as long, the first time.
+* A thing that turns by more than a few degrees in the hand, as a thin rod does, blurs its shape, though
+  older touches count less. A fit that needs a moving thing takes twice as long, the first time.
 
 Made by `make bench ONLY=percept_grasp`.
 """

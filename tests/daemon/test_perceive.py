@@ -154,3 +154,27 @@ def test_two_points_are_as_far_apart_on_the_pad_as_their_residual_says(
     distance_m, std_m = rig.perceiving._pair_m(PLANE, residual, 1e-3)
     assert distance_m == pytest.approx(float(np.linalg.norm(placed[1] - placed[0])), rel=1e-6)
     assert std_m == pytest.approx(std * distance_m / on_sheet)
+
+
+def test_where_no_joint_states_tell_commands_tell_how_far_the_link_closes(bench: Any) -> None:
+    """Of pads whose hardness is wanted, since their contact began; along the pad's outward normal."""
+    rig = Rig(bench, frozenset([b"percept/h/hardness"]), PLAIN)
+    asked: list[tuple[list[int], int]] = []
+    outward = np.array([0.0, 0.0, 1.0])
+
+    def poses(pads: Any, t_ns: int, commands_at: Any) -> Any:
+        asked.append((pads.tolist(), t_ns))
+        assert commands_at is rig.perceiving.commands_at
+        closed_m = 1e-3 * len(asked)
+        return np.tile(np.c_[np.eye(3), closed_m * outward], (len(pads), 1, 1))
+
+    rig.pipeline.frames.told_poses = poses  # type: ignore[method-assign,assignment]
+    rig.feel(30)
+    perceiver = rig.perceiving._perceiver
+    assert perceiver is not None
+    window = perceiver.stream.window(PLANE)
+    assert asked[-1] == ([PLANE], rig.t_ns)
+    facing = float(window["commanded_normal"][-1] @ outward)
+    ways = window["commanded_m"]
+    assert ways[0] == 0.0
+    assert np.diff(ways) == pytest.approx(np.full(len(ways) - 1, 1e-3 * facing))

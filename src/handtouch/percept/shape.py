@@ -30,6 +30,7 @@ _MOST = 100  # contacts kept of a hand
 _MOVED_M, _TURNED = 2e-3, 0.1  # from one that is kept to the next; radians
 _SETTLED = 8  # samples of a new contact before it counts
 _FORGET_NS = 5_000_000_000  # untouched for so long: the next touch is another object's
+_TURNS_M_PER_S, _TURNS_M = 1.5e-3, 3e-3  # what was touched has moved since, by so much a second, and at most
 _STEPS = 2  # of a fit at a time
 _SPOT_NS = 500_000_000
 _SPOT_SAMPLES = 64
@@ -86,16 +87,18 @@ class _Object:
     normals: list[FloatArray] = field(default_factory=list)
     covariances: list[FloatArray] = field(default_factory=list)
     links: list[int] = field(default_factory=list)
+    times_ns: list[int] = field(default_factory=list)
     seen_ns: int = 0
     news: bool = False
     at_work: Generator[None, None, Verdict] | None = None
     verdict: Verdict | None = None
 
-    def add(self, pad: int, point: FloatArray, normal: FloatArray, covariance: FloatArray) -> None:
+    def add(self, pad: int, t_ns: int, point: FloatArray, normal: FloatArray, covariance: FloatArray) -> None:
         self.points = [*self.points[1 - _MOST :], point.copy()]
         self.normals = [*self.normals[1 - _MOST :], normal.copy()]
         self.covariances = [*self.covariances[1 - _MOST :], covariance.copy()]
         self.links = [*self.links[1 - _MOST :], pad]
+        self.times_ns = [*self.times_ns[1 - _MOST :], t_ns]
         self.news = True
 
 
@@ -127,7 +130,7 @@ class Shape:
             touched = self._objects.setdefault(int(stream.hand_of[pad]), _Object())
             if t_ns - touched.seen_ns > _FORGET_NS and touched.points:
                 touched = self._objects[int(stream.hand_of[pad])] = _Object()
-            touched.add(pad, place[row], normal[row], sample["palm_covariance_m2"][row])
+            touched.add(pad, t_ns, place[row], normal[row], sample["palm_covariance_m2"][row])
             self._kept_m[pad], self._kept_normal[pad] = place[row], normal[row]
             self._kept_of[pad] = sample.contact[row]
         for hand in set(stream.hand_of[pads].tolist()) & self._objects.keys():
@@ -181,7 +184,11 @@ class Shape:
         return found
 
     def _classifying(self, touched: _Object) -> Generator[None, None, Verdict]:
-        rows = np.array(touched.points), np.array(touched.normals), np.array(touched.covariances)
+        """Older touches count less: things turn in the hand."""
+        age_s = 1e-9 * (touched.times_ns[-1] - np.array(touched.times_ns))
+        moved_m = np.minimum(_TURNS_M_PER_S * age_s, _TURNS_M)
+        covariances = np.array(touched.covariances) + (moved_m**2)[:, None, None] * np.eye(3)
+        rows = np.array(touched.points), np.array(touched.normals), covariances
         moved = touched.verdict is not None and touched.verdict.moves  # then it has, for good
         return (yield from classifying(*rows, self.prior, moved=moved))
 
