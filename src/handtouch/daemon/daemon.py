@@ -64,7 +64,7 @@ _NEVER_NS = 1 << 62
 _HOUSE_NS = 4_000_000
 """Least time between two looks at nodes, buses, health and requests: a tick every millisecond needn't."""
 _CARRIERS = 3
-"""Threads that a message goes through, each waking the next: ZeroMQ's here, ZeroMQ's there, the subscriber."""
+"""Threads that a message goes through, each waking the next: ZeroMQ's here and there, and the subscriber."""
 _GIL_SWITCH_S = 0.0005  # a thread that boots a node or builds a model lets the hot one in after so long
 
 
