@@ -30,8 +30,9 @@ from handtouch.config.tables import Behaviour
 from handtouch.daemon.model import PadModel
 from handtouch.daemon.pipeline import Pipeline
 from handtouch.field import Sandwich
+from handtouch.percept.classify import classify
 from handtouch.percept.parts import made
-from handtouch.percept.primitives import CLASSES, classify, fit
+from handtouch.percept.primitives import CLASSES, fit
 from handtouch.percept.primitives import Prior as ShapePrior
 from handtouch.percept.spectrum import texture
 from handtouch.percept.stiffness import stiffness, stiffness_from_area

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from handtouch.field import LocatorBank, Rectangle
 from handtouch.percept.ask import expected_bits
+from handtouch.percept.classify import Verdict, classify, classifying
 from handtouch.percept.percept import Perceiver
-from handtouch.percept.primitives import CLASSES, SIZES, Verdict, classify, classifying
+from handtouch.percept.primitives import CLASSES, SIZES
 from handtouch.percept.shape import Shape, pair_distance, point_or_more
 from handtouch.percept.stream import KINDS, Percept, Sample, Stream
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from handtouch.field.bank import LocatorBank
 from handtouch.percept.ask import Action, Question
-from handtouch.percept.primitives import CLASSES, SIZES, Prior, Verdict, classifying
+from handtouch.percept.classify import Verdict, classifying
+from handtouch.percept.primitives import CLASSES, SIZES, Prior
 from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns
 
 FloatArray = NDArray[np.float64]
