@@ -440,7 +440,7 @@ shape fits only if the thing moved by about 2 mm between touches, which makes th
   is pulled along under flat pads. All pads slip at once then, and none is left to tell how the thing moves.
 * Hardness of what many fingers hold rests on their sticking to it. Most squeezes here shift the thing by more
   than it gives, its contacts roll and creep, and nothing is told; what is told is known within a factor of 3
-  either way, and tends to be too soft.
+  or 4 either way.
 * A thing that turns by more than a few degrees in the hand, as a thin rod does, blurs its shape, though
   older touches count less. A fit that needs a moving thing takes twice as long, the first time.
 
