@@ -1,6 +1,6 @@
 """Words to a terminal or a pipe, and keys from it.
 
-Public names: `Key`, `Dialogue`, `open_dialogue`, `Terminal`, `Lines`.
+Public names: `Key`, `Dialogue`, `open_dialogue`, `Interrupts`, `Terminal`, `Lines`.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import sys
 import termios
 import tty
@@ -47,21 +48,57 @@ class Dialogue(Protocol):
         """What is felt now, in the place of what was shown before; drawn only where somebody sees it."""
 
     def key(self) -> Key | None:
-        """The next key pressed, None if there is none; doesn't wait."""
+        """The next key pressed, None if there is none; doesn't wait. Raises KeyboardInterrupt once Ctrl-C
+        was."""
 
 
 @contextlib.contextmanager
 def open_dialogue() -> Iterator[Dialogue]:
-    """Live feedback where standard input and output are a terminal, else plain lines."""
+    """Live feedback where standard input and output are a terminal, else plain lines.
+
+    Until it is closed, SIGINT and SIGTERM are told by `key`; a second one interrupts whatever is done.
+    """
+    with Interrupts() as interrupts, _opened(interrupts) as dialogue:
+        yield dialogue
+
+
+class Interrupts:
+    """SIGINT and SIGTERM, kept until somebody asks: an exception out of nowhere is lost now and then, in
+    calls from C whose errors nobody reads."""
+
+    def __init__(self) -> None:
+        self._came = False
+
+    def __enter__(self) -> Interrupts:
+        numbers = signal.SIGINT, signal.SIGTERM
+        self._before = {number: signal.signal(number, self._take) for number in numbers}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if one came."""
+        if self._came:
+            raise KeyboardInterrupt
+
+    def _take(self, *_: object) -> None:
+        self.check()
+        self._came = True
+
+
+@contextlib.contextmanager
+def _opened(interrupts: Interrupts) -> Iterator[Dialogue]:
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        yield Lines()
+        yield Lines(interrupts)
         return
     descriptor = sys.stdin.fileno()
     before = termios.tcgetattr(descriptor)
     try:
         tty.setcbreak(descriptor)
         with Live(console=Console(highlight=False), auto_refresh=False, transient=True) as live:
-            yield Terminal(live)
+            yield Terminal(live, interrupts)
     finally:
         termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
@@ -71,8 +108,8 @@ class Terminal:
 
     listens = True
 
-    def __init__(self, live: Live) -> None:
-        self._live = live
+    def __init__(self, live: Live, interrupts: Interrupts) -> None:
+        self._live, self._interrupts = live, interrupts
         self._drawn_ns = 0
 
     def say(self, text: str, style: str = "") -> None:
@@ -88,6 +125,7 @@ class Terminal:
 
     def key(self) -> Key | None:
         """The next key; others than ours are ignored."""
+        self._interrupts.check()
         while select.select([sys.stdin], (), (), 0)[0]:
             pressed = os.read(sys.stdin.fileno(), 1).decode(errors="replace").lower()
             if not pressed:
@@ -101,8 +139,9 @@ class Terminal:
 class Lines:
     """Plain lines, each flushed; keys are lines too. When the input ends, nobody listens any more."""
 
-    def __init__(self) -> None:
+    def __init__(self, interrupts: Interrupts) -> None:
         self.listens = True
+        self._interrupts = interrupts
         self._waiting: deque[str] = deque()
         self._part = b""
 
@@ -115,6 +154,7 @@ class Lines:
 
     def key(self) -> Key | None:
         """The next line, as far as it is a key."""
+        self._interrupts.check()
         self._read()
         while self._waiting:
             if (key := _key(self._waiting.popleft().strip().lower())) is not None:
