@@ -233,7 +233,7 @@ def test_what_is_done_is_kept_when_it_is_interrupted_and_the_rest_is_done_later(
     with pressed(rig, right) as presser:
         status, printed = commission(rig, presser, "--yes", stop_at="[2/3]")
         assert status == 1
-        assert "Interrupted" in printed
+        assert "Interrupted" in printed, printed
         half = config.load(rig.config)
         assert half.hands[0].pads[0] == config.parse(right).hands[0].pads[0]
         assert (rig.folder / "hand.toml.commissioned").read_text() == "right/thumb_proximal\n"
