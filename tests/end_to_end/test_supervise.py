@@ -142,9 +142,10 @@ class Bench:
         assert self.daemon.supervisor is not None
         return self.daemon.supervisor.figures()
 
-    def told(self, link: str, trust: str) -> wire.Health | None:
-        """The first that health said so of a pad."""
-        return next((h for h in self.health if (h.link, h.trust) == (link, trust)), None)
+    def told(self, link: str, trust: str, after_ns: int = 0) -> wire.Health | None:
+        """The first that health said so of a pad since then."""
+        said = (h for h in self.health if (h.link, h.trust) == (link, trust) and h.t_ns > after_ns)
+        return next(said, None)
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +199,7 @@ def test_a_swapped_unit_is_told_calibrates_itself_and_is_trusted_again(bench: Be
     assert finding["kind"] == "swapped unit"
     assert "serial 1001 was here, 2002 is" in finding["cause"]
     assert "touch the pad all over" in finding["remedy"]
-    trusted = bench.wait("trusted", lambda: bench.told("swapped", "trusted"))
+    trusted = bench.wait("trusted", lambda: bench.told("swapped", "trusted", told.t_ns))
     assert trusted.findings == ()
     assert trusted.calibration.startswith("2002-")
     end_ns = trusted.t_ns + 2_000_000_000
