@@ -42,8 +42,8 @@ from handtouch.wire import PadState
 
 PADS_PER_BUS = 8
 AIM = 0.60
-LIMITS = ((60, 1000), (60, 1500), (60, 2000), (60, 3000), (120, 1000), (240, 500), (240, 1000), (480, 500))
-"""Pads and SYNCs a second that are tried, one after the other, for where the loop no longer keeps up."""
+LIMITS = ((30, 500), (60, 500), (30, 1000), (240, 200), (60, 1000), (120, 500), (480, 200), (240, 500))
+"""Pads and SYNCs a second that are tried, by their product, for where the loop no longer keeps up."""
 LIMIT_S = 8.0
 MISSED = 1e-3
 """Of the samples, or of the periods: more than that is an overrun, less a moment of the machine's."""

@@ -116,7 +116,7 @@ class _Track(NamedTuple):
 def _together(tracks: Sequence[_Track], when: NDArray[np.int64], rise: slice) -> Closing:
     """Closing on the first of the tracks, where the others hold the thing, too."""
     force = np.stack([track.force_at(when) for track in tracks])
-    frames = np.stack([_frame(track.normal) for track in tracks])
+    frames = _frames(np.stack([track.normal for track in tracks]))
     ways = np.stack([track.at(when) @ frame.T for track, frame in zip(tracks, frames, strict=True)], axis=1)
     rose = float(np.ptp(force[0, rise]))
     of = force[0, rise] - force[0, rise].mean()
@@ -134,11 +134,11 @@ def _together(tracks: Sequence[_Track], when: NDArray[np.int64], rise: slice) ->
     return Closing(2 * rose * np.tensordot(ways, weights, 2), share=share, sides=2)
 
 
-def _frame(normal: FloatArray) -> FloatArray:
-    """A normal and two ways across it, as rows."""
-    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    across /= np.linalg.norm(across)
-    return np.stack([normal, across, np.cross(normal, across)])
+def _frames(normals: FloatArray) -> FloatArray:
+    """Normals (m, 3) and two ways across each, as rows (m, 3, 3)."""
+    across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return np.stack([normals, across, np.cross(normals, across)], axis=1)
 
 
 def _rising(force: FloatArray) -> tuple[int, int]:

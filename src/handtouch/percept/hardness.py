@@ -20,7 +20,7 @@ from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns, W
 FloatArray = NDArray[np.float64]
 
 _LEAST_SAMPLES = 16
-_AGAIN_NS = 100_000_000
+_AGAIN_NS = 250_000_000  # a squeeze takes a second; what many fingers hold takes milliseconds to fit
 _SQUEEZE_N = 1.0
 _SWAYS = 0.75  # share of the depth: more isn't mended by squeezing
 _NOTHING = 2.0  # so large a share leaves nothing known

@@ -194,7 +194,7 @@ class Part(Protocol):
     """One kind of perception, over all pads. `wanted` (n,) are the pads that it is for.
 
     `step` is called at every tick and has to be quick; what takes long belongs into `fit`, which is called
-    for one pad at a time, now and then, and has to stay below a millisecond.
+    for one pad at a time, now and then, and has to stay below a few milliseconds.
     """
 
     kind: str
