@@ -4,8 +4,9 @@ Nodes, daemon and subscriber are three processes on a udp_multicast bus over loo
 of their own where that is to be had), or on vcan0 under `tests/socketcan/vcan-run`. The floor is a bare loop
 in place of the daemon: it sends SYNC, receives the same frames with the same library, sends a message of the
 same size when the last has come, and computes nothing. Daemon and floor take turns, as ordinary processes,
-and where this user may have it, with real-time priority, the daemon then also with busy_poll_us; with contacts
-at rest and with sliding ones; ratios are of medians over the turns. Writes docs/benchmarks/latency.{md,json}.
+and where this user may have it, with real-time priority, the daemon then also with busy_poll_us; with
+contacts at rest and with sliding ones. Ratios are of medians over the turns. Writes
+docs/benchmarks/latency.{md,json}.
 """
 
 from __future__ import annotations
