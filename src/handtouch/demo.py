@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from handtouch.config import Deployment, load
 from handtouch.config.tables import Behaviour
 from handtouch.daemon.daemon import Daemon
 from handtouch.hand import kinematics
+from handtouch.signals import stop_on_signals
 from handtouch.simulate.grasp import played as grasped
 from handtouch.simulate.play import Play
 from handtouch.simulate.run import SimulatedHand
@@ -79,7 +79,7 @@ def run(
         return 2
     endless = view and seconds is None
     length_s = float("inf") if endless else seconds or scenario.duration_s + _BOOT_S
-    stop = _stop_on_signals()
+    stop = stop_on_signals()
     sys.setswitchinterval(_GIL_SWITCH_S)
     print("building the simulated hand ...", file=sys.stderr)
     try:
@@ -106,14 +106,6 @@ def run(
     if not endless:
         print(score(keeper.contacts, hand.truth))
     return 0 if keeper.count else 1
-
-
-def _stop_on_signals() -> threading.Event:
-    """Set once somebody wants us to end."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
 
 
 @contextmanager

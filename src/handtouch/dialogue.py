@@ -1,6 +1,6 @@
 """Words to a terminal or a pipe, and keys from it.
 
-Public names: `Key`, `Dialogue`, `open_dialogue`, `Interrupts`, `Terminal`, `Lines`.
+Public names: `Key`, `Dialogue`, `open_dialogue`, `Terminal`, `Lines`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import signal
 import sys
 import termios
 import tty
@@ -20,6 +19,8 @@ from typing import Protocol
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
+
+from handtouch.signals import Interrupts
 
 _REDRAW_NS = 100_000_000
 _STYLES = {"": "", "ask": "bold", "good": "green", "bad": "yellow"}
@@ -60,32 +61,6 @@ def open_dialogue() -> Iterator[Dialogue]:
     """
     with Interrupts() as interrupts, _opened(interrupts) as dialogue:
         yield dialogue
-
-
-class Interrupts:
-    """SIGINT and SIGTERM, kept until somebody asks: an exception out of nowhere is lost now and then, in
-    calls from C whose errors nobody reads."""
-
-    def __init__(self) -> None:
-        self._came = False
-
-    def __enter__(self) -> Interrupts:
-        numbers = signal.SIGINT, signal.SIGTERM
-        self._before = {number: signal.signal(number, self._take) for number in numbers}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if one came."""
-        if self._came:
-            raise KeyboardInterrupt
-
-    def _take(self, *_: object) -> None:
-        self.check()
-        self._came = True
 
 
 @contextlib.contextmanager

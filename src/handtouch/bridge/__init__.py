@@ -8,7 +8,6 @@ Public names: `run`, `Options`, `BridgeError`, `Robot`, `robots`.
 from __future__ import annotations
 
 import logging
-import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from handtouch.config import ConfigError, load
 from handtouch.daemon import logs
+from handtouch.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from handtouch.bridge.relay import Relay
@@ -61,9 +61,7 @@ class Options:
 
 def run(options: Options) -> int:
     """Carry until SIGINT or SIGTERM; exit status 0, 1 (a daemon lets us not in), 2 (wrong usage or file)."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     said = logs.start()
     try:
         with ExitStack() as opened:

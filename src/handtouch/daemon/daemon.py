@@ -9,7 +9,6 @@ import gc
 import logging
 import os
 import select
-import signal
 import sys
 import threading
 import time
@@ -52,6 +51,7 @@ from handtouch.daemon.supervisor import Supervisor
 from handtouch.hand.joints import JointStates
 from handtouch.hand.robot import Robots, served
 from handtouch.keys import KeysError
+from handtouch.signals import stop_on_signals
 from handtouch.supervise.store import store_path
 
 _log = logging.getLogger("handtouch.daemon")
@@ -366,9 +366,7 @@ def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     said = logs.start(deployment.daemon.log_level)
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
     try:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.percept.directions import across
 from handtouch.percept.grasped import gives, rigid
 from handtouch.percept.stream import IntArray, Stream, Window
 
@@ -136,9 +137,7 @@ def _together(tracks: Sequence[_Track], when: NDArray[np.int64], rise: slice) ->
 
 def _frames(normals: FloatArray) -> FloatArray:
     """Normals (m, 3) and two ways across each, as rows (m, 3, 3)."""
-    across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    return np.stack([normals, across, np.cross(normals, across)], axis=1)
+    return np.stack([normals, *across(normals)], axis=1)
 
 
 def _rising(force: FloatArray) -> tuple[int, int]:

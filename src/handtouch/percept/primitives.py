@@ -20,6 +20,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.percept.directions import across
+
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 
@@ -129,9 +131,7 @@ class _Frame:
     @classmethod
     def of(cls, axis: FloatArray) -> _Frame:
         axis = axis / np.linalg.norm(axis)
-        first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-        first /= np.linalg.norm(first)
-        return cls(axis, first, np.cross(axis, first))
+        return cls(axis, *(one[0] for one in across(axis[None])))
 
     def turned(self, by: FloatArray) -> FloatArray:
         """Directions (b, 3) for turns (b, 2)."""
@@ -156,10 +156,7 @@ class _Task:
     @cached_property
     def across(self) -> tuple[FloatArray, FloatArray]:
         """Two directions (n, 3) across each normal."""
-        least = np.eye(3)[np.argmin(np.abs(self.outward), axis=1)]
-        first = np.cross(self.outward, least)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        return first, np.cross(self.outward, first)
+        return across(self.outward)
 
     @cached_property
     def aside(self) -> FloatArray:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import platform
-import signal
 import sys
 import threading
 import time
@@ -23,6 +22,7 @@ from handtouch.client import SILENCE_S, Subscriber
 from handtouch.config import ConfigError, load
 from handtouch.record.file import RecordingFile
 from handtouch.record.recorder import Limits, Recorder
+from handtouch.signals import stop_on_signals
 
 COMPLETE = "tcp://127.0.0.1:5582"
 TOPICS = tuple(
@@ -163,7 +163,6 @@ def run(options: Options) -> int:
     Exit status 0; 1 where nothing was heard, messages were lost, the disk is full or the daemon doesn't let
     us in; 2 for wrong usage or file.
     """
-    stop = threading.Event()
     try:
         endpoint = _endpoint(options)
         files = _Files(options, endpoint)
@@ -172,8 +171,7 @@ def run(options: Options) -> int:
     except (ConfigError, ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     limits = Limits(
         *(round(value * unit) or 1 << 62 for value, unit in (
             (options.rotate_mb, _MB), (options.rotate_minutes, 60_000_000_000)

@@ -6,7 +6,6 @@ Public names: `SimulatedHand`, `run`.
 from __future__ import annotations
 
 import contextlib
-import signal
 import sys
 import threading
 import time
@@ -25,6 +24,7 @@ from handtouch.canbus.device import Device, DeviceBus
 from handtouch.canbus.nodes.spec import checked
 from handtouch.canbus.objects.channels import ELECTRODES, channels_of, parse
 from handtouch.config.problems import ConfigError
+from handtouch.signals import stop_on_signals
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.grasp import played as grasped
 from handtouch.simulate.gripper import GripperPlay
@@ -269,7 +269,7 @@ def run(
             print(f"{truth}: {error.strerror}", file=sys.stderr)
             return 1
         hand.tell_joints(deployment, played, deployment.daemon.inputs.replace("//*:", "//127.0.0.1:"))
-        _play(hand, deployment, file, seconds, stop or _stop_on_signal())
+        _play(hand, deployment, file, seconds, stop or stop_on_signals())
     return 0
 
 
@@ -331,10 +331,3 @@ def _usual(deployment: config.Deployment) -> Scenario:
         session.check_links(pad.link for hand in deployment.hands for pad in hand.pads)
         return session.model_copy(update={"repeat": True})
     return Scenario.tour(deployment)
-
-
-def _stop_on_signal() -> threading.Event:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop

@@ -5,7 +5,6 @@ Public names: `run`. The page draws with WebGL and needs nothing from elsewhere.
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 import time
@@ -13,6 +12,7 @@ import webbrowser
 from typing import Any
 
 from handtouch.client import LIVE, Subscriber, connect
+from handtouch.signals import stop_on_signals
 from handtouch.view.page.picture import Picture
 from handtouch.view.page.serve import PageServer
 
@@ -39,9 +39,7 @@ def run(
 
     Exit status 0, 1 when the daemon doesn't let us in, 2 for an endpoint, key or port that can't be used.
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     picture = Picture(percepts)
     try:
         topics = (*TOPICS, PERCEPTS) if percepts else TOPICS
