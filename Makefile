@@ -1,4 +1,4 @@
-# Install, show, test and package handtouch. Needs make and Python 3.11 or later with venv; `make help` lists what there is.
+# Install, show, test and package handtouch. Needs make and Python 3.11 or later with venv; `make help` lists the targets.
 
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
@@ -7,18 +7,18 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 ONLY ?= *
 ARGS ?=
-# tests start hundreds of processes; without bytecode each would compile the source anew
+# tests start hundreds of processes; without bytecode each of them would compile the source
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help
-help: ## what can be made (the default)
+help: ## list the targets (default)
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | while IFS='	' read -r name text; do \
 		printf '  make %-10s %s\n' "$$name" "$$text"; done
 
-# --- installation: a stamp file tells what a virtual environment holds, so a second run costs nothing
+# --- installation: a stamp file records what a virtual environment holds, so that a second run is skipped
 
 $(BIN)/python:
-	@test -n "$(PYTHON)" || { echo "no Python 3.11 or later found; say make PYTHON=/path/to/python3"; exit 1; }
+	@test -n "$(PYTHON)" || { echo "no Python 3.11 or later found; give make PYTHON=/path/to/python3"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { echo "python3 -m venv failed; on Debian: apt-get install python3-venv"; exit 1; }
 
 $(VENV)/.run: pyproject.toml requirements.lock | $(BIN)/python
@@ -32,48 +32,48 @@ $(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python
 	@touch $(VENV)/.run $(VENV)/.view $@
 
 $(VENV)/.view: pyproject.toml requirements.lock | $(VENV)/.run
-	@echo "installing what the view follows joints and reads meshes with ..."
+	@echo "installing packages for joints and meshes in the view ..."
 	@$(PIP) install --no-compile -c requirements.lock -e '.[view]'
 	@touch $@
 
 .PHONY: install dev
-install: $(VENV)/.run ## install into .venv what a robot needs
-dev: $(VENV)/.dev ## install into .venv what a developer needs
+install: $(VENV)/.run ## install the packages for a robot into .venv
+dev: $(VENV)/.dev ## install the packages for development into .venv
 
 # --- use
 
 .PHONY: demo
-demo: $(VENV)/.run $(if $(VIEW),$(VENV)/.view) ## a simulated hand, the daemon and a live view; VIEW=1: in the browser too
+demo: $(VENV)/.run $(if $(VIEW),$(VENV)/.view) ## run a simulated hand, the daemon and a live view (VIEW=1: in the browser)
 	@$(BIN)/handtouch demo $(if $(VIEW),--view) $(ARGS)
 
 .PHONY: examples
-examples: $(VENV)/.dev ## the programs of examples/, each closing a loop with a simulated gripper; a minute
+examples: $(VENV)/.dev ## run examples/, each a control loop with a simulated gripper; one minute
 	@$(BIN)/python examples/run_all.py
 
 # --- test
 
 .PHONY: test lint types unit coverage socketcan docs
-test: ## everything that CI runs
+test: ## run everything that CI runs
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan lint types docs
 	@$(MAKE) --no-print-directory unit
 
-lint: $(VENV)/.dev ## style
+lint: $(VENV)/.dev ## check style
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 
-types: $(VENV)/.dev ## static types
+types: $(VENV)/.dev ## check static types
 	$(BIN)/mypy --strict
 
-docs: $(VENV)/.dev ## the documentation site, in docs/_build; a warning is an error
+docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
-unit: $(VENV)/.dev ## all tests that need no SocketCAN
+unit: $(VENV)/.dev ## run all tests that need no SocketCAN
 	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-coverage: $(VENV)/.dev ## the same, telling which lines they don't reach; slower
+coverage: $(VENV)/.dev ## run them with a report of lines not covered; slower
 	@$(MAKE) --no-print-directory unit ARGS="--cov --cov-report=term:skip-covered $(ARGS)"
 
-socketcan: $(VENV)/.dev ## the tests on real SocketCAN; skipped with the reason where there is none, which fails CI
+socketcan: $(VENV)/.dev ## run the tests on SocketCAN; skipped without it, which fails CI
 	@marked=$$(grep -rl --include='*.py' 'mark\.socketcan' tests); \
 	tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $$marked $(ARGS); status=$$?; \
 	if [ $$status -eq 77 ] && [ "$(CI)" != true ]; then echo "SocketCAN tests SKIPPED, see the reason above"; exit 0; \
@@ -82,9 +82,9 @@ socketcan: $(VENV)/.dev ## the tests on real SocketCAN; skipped with the reason 
 # --- measure: every benchmarks/{bench,soak,stress}_NAME.py; ONLY=NAME chooses one
 
 .PHONY: bench soak stress
-bench: ## run time against error, latency, load
-soak: ## long runs
-stress: ## sweeps too slow for every test run
+bench: ## run the benchmarks: errors, latency, load
+soak: ## run the endurance tests
+stress: ## run sweeps that are too slow for the tests
 bench soak stress: $(VENV)/.dev
 	@set -e; for program in benchmarks/$@_$(ONLY).py; do \
 		test -e "$$program" || { echo "there is no $$program"; exit 1; }; \
@@ -93,21 +93,21 @@ bench soak stress: $(VENV)/.dev
 # --- maintain
 
 .PHONY: format lock schema dist clean
-format: $(VENV)/.dev ## put the source in form
+format: $(VENV)/.dev ## format the source
 	$(BIN)/ruff check --fix-only
 	$(BIN)/ruff format
 
-lock: $(BIN)/python ## choose versions of all packages anew
+lock: $(BIN)/python ## update the pinned versions of all packages
 	@$(PIP) install uv
 	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
 		--no-emit-index-url --no-emit-find-links --output-file requirements.lock pyproject.toml
 
-schema: $(VENV)/.run ## write config/handtouch.schema.json from the definitions that check a deployment
+schema: $(VENV)/.run ## write config/handtouch.schema.json from the models of the deployment file
 	$(BIN)/handtouch check --schema >config/handtouch.schema.json
 
 dist: $(VENV)/.dev ## build the wheel and the source archive
 	rm -rf dist
 	$(BIN)/python -m build --no-isolation
 
-clean: ## remove what was made, .venv too
+clean: ## remove build results and .venv
 	rm -rf $(VENV) dist build .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis

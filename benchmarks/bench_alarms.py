@@ -1,4 +1,4 @@
-"""Count false alarms: weeks of a hand that nothing is wrong with, mostly idle, now and then in use.
+"""Count false positives: weeks of a hand without faults, mostly idle, now and then in use.
 
 Prints its tables and writes docs/benchmarks/alarms.md and alarms.json. `--hours N` of a hand (default: 70).
 `--quick` plays one and writes nothing; `--journal FILE` keeps what was played: a run that was stopped goes
@@ -27,13 +27,15 @@ import numpy as np
 from scipy.stats import chi2
 from section import table
 
-from handtouch import config, shipped
+from handtouch import config
+from handtouch.config import shipped
 from handtouch.sheet import S1, S2
 from handtouch.simulate.faults import INFLUENCES, Fault
-from handtouch.simulate.hand import VirtualHand
-from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
-from handtouch.supervise.diagnose import Block, Diagnosis, DiagnosisModel
+from handtouch.supervisor.diagnose import DiagnosisModel, HandDiagnostics, HandSamples
 
 ROOT = Path(__file__).parent.parent
 FIRST_SEED = 7000  # no other benchmark's, nor a test's
@@ -56,7 +58,7 @@ def deployment() -> config.Deployment:
 
 @lru_cache(maxsize=1)
 def model() -> DiagnosisModel:
-    return DiagnosisModel.of(deployment(), "right")
+    return DiagnosisModel.from_deployment(deployment(), "right")
 
 
 class Hour:
@@ -65,7 +67,7 @@ class Hour:
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng((FIRST_SEED, seed))
         self.links = [pad.link for hand in deployment().hands for pad in hand.pads]
-        self.touches: list[Touch] = []
+        self.touches: list[ScenarioTouch] = []
         self.warm: list[Fault] = []
         self.busy: Spans = []
         self.bouts: Counter[str] = Counter()
@@ -81,9 +83,9 @@ class Hour:
             bouts[name](at, at + lasts)
             self.busy.append((at, at + lasts + LINGER_S))
             at += lasts + LINGER_S + float(self._rng.exponential(lasts * (1 / IN_USE - 1)))
-        self._world = World.drifting(FIRST_SEED + seed, (S1, S2)[seed % 2])
+        self._world = World.with_drift(FIRST_SEED + seed, (S1, S2)[seed % 2])
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[HandSamples]:
         """Samples of all pads, block after block: dense while in use, sparse while at rest."""
         scenario = Scenario(touch=tuple(self.touches) or (self._touch(self.links[0], 1.0, 0.5, [0.5]),))
         hand = VirtualHand(deployment(), scenario, self._world, faults=tuple(self.warm))
@@ -98,7 +100,7 @@ class Hour:
                 fresh = np.ones((per_block, len(self.links)), np.bool_)
                 for k in range(0, len(times), per_block):
                     part = slice(k, k + per_block)
-                    yield Block(stamps[part], counts[part], fresh)
+                    yield HandSamples(stamps[part], counts[part], fresh)
 
     def _stretches(self) -> Iterator[tuple[float, float, int]]:
         at = 0.0
@@ -162,16 +164,16 @@ class Hour:
             self._single(link, from_s, until_s)
 
     def _grasp(self, from_s: float, lasts_s: float) -> list[str]:
-        """An object in the hand trembles in place and force, at about 3 Hz; and is let go of at once."""
+        """Hold an object with tremor in position and force, at about 3 Hz; and release it at once."""
         rng, links = self._rng, self._some(2, 10)
         for link in links:
             delay = float(rng.uniform(0, min(0.5, lasts_s / 4)))
             steps = max(int(3 * (lasts_s - delay)), 2)
             wander = float(np.exp(rng.uniform(np.log(0.002), np.log(0.03))))
-            tremble = float(np.exp(rng.uniform(np.log(0.005), np.log(0.1))))
+            tremor = float(np.exp(rng.uniform(np.log(0.005), np.log(0.1))))
             middle = np.array(self._place(0.15))
             places = np.clip(middle + wander * rng.normal(size=(steps, 2)), 0.02, 0.98).tolist()
-            force = self._forces(1)[0] * np.exp(tremble * rng.normal(size=steps))
+            force = self._forces(1)[0] * np.exp(tremor * rng.normal(size=steps))
             way = [(float(x), float(y)) for x, y in places]
             self.touches.append(self._touch(link, from_s + delay, lasts_s - delay, force.tolist(), way))
         return links
@@ -183,8 +185,10 @@ class Hour:
         lasts_s: float,
         force: list[float],
         path: Sequence[Place] = ((0.5, 0.5),),
-    ) -> Touch:
-        return Touch(link=link, from_s=from_s, duration_s=lasts_s, path=tuple(path), force_n=tuple(force))
+    ) -> ScenarioTouch:
+        return ScenarioTouch(
+            link=link, from_s=from_s, duration_s=lasts_s, path=tuple(path), force_n=tuple(force)
+        )
 
     def _forces(self, count: int) -> list[float]:
         rng = self._rng
@@ -201,15 +205,17 @@ class Hour:
 
 
 def play(seed: int) -> dict[str, Any]:
-    """One hour: what was told of a hand that nothing is wrong with."""
-    hour, diagnosis, alarms = Hour(seed), Diagnosis(model(), tables=_TABLES), []
+    """Return the diagnoses in one hour of a hand without faults."""
+    hour, diagnosis, alarms = Hour(seed), HandDiagnostics(model(), tables=_TABLES), []
     began, diagnosing = time.process_time(), 0.0
     for block in hour.blocks():
         before = time.process_time()
-        for f in diagnosis.step(block):
-            if f.fault and f.until_ns is None:
-                told = {key: float(value) for key, value in f.evidence.items()}
-                alarms.append({"kind": f.kind.value, "link": f.link, "t_s": f.since_ns * 1e-9, **told})
+        for f in diagnosis.process_block(block):
+            if f.is_fault and f.until_ns is None:
+                values = {key: float(value) for key, value in f.values.items()}
+                alarms.append(
+                    {"kind": f.kind.value, "link": f.link, "t_s": f.published.since_ns * 1e-9, **values}
+                )
         diagnosing += time.process_time() - before
     return {
         "seed": seed, "alarms": alarms, "bouts": dict(hour.bouts), "touches": len(hour.touches),
@@ -232,7 +238,9 @@ def run(hours: int, workers: int, journal: Path | None) -> list[dict[str, Any]]:
                     file.write(json.dumps(result) + "\n")
             left = (time.monotonic() - began) / number * (len(tasks) - number)
             alarms = sum(len(r["alarms"]) for r in found.values())
-            print(f"{len(found)} of {hours} hours, {alarms} false alarms, {left:.0f} s left", file=sys.stderr)
+            print(
+                f"{len(found)} of {hours} hours, {alarms} false positives, {left:.0f} s left", file=sys.stderr
+            )
     return [found[seed] for seed in sorted(found)]
 
 
@@ -244,19 +252,19 @@ def limits(alarms: int, scale: float) -> dict[str, float]:
 
 
 def counted(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """False alarms by what was told wrongly, and all together."""
+    """Return false positives by kind, and all together."""
     pads = len(model().links)
     hours = len(results) * LENGTH_S / 3600
     kinds = Counter(alarm["kind"] for r in results for alarm in r["alarms"])
     return [
-        {"told": told, "hand hours": hours, "pad hours": pads * hours, "false alarms": count,
+        {"diagnosis": kind, "hand hours": hours, "pad hours": pads * hours, "false positives": count,
          **limits(count, 168 / hours)}
-        for told, count in [*kinds.most_common(), ("all", kinds.total())]
+        for kind, count in [*kinds.most_common(), ("all", kinds.total())]
     ]  # fmt: skip
 
 
 def used(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What the hand did meanwhile."""
+    """Use of the hand meanwhile."""
     bouts = sum((Counter(r["bouts"]) for r in results), Counter[str]())
     hours = len(results) * LENGTH_S / 3600
     return [
@@ -268,7 +276,7 @@ def used(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="false alarms of a hand that nothing is wrong with")
+    parser = argparse.ArgumentParser(description="false positives of a hand without faults")
     parser.add_argument("--quick", action="store_true", help="one hour, nothing written")
     parser.add_argument("--hours", type=int, default=70, help="of a hand")
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
@@ -276,12 +284,12 @@ def main() -> None:
     args = parser.parse_args()
     results = run(1 if args.quick else args.hours, args.workers, args.journal)
     tables = {
-        "False alarms": (
-            "Each fault told of a pad counts, as none has one. Limits are Poisson's, 95 %; where none was "
+        "False positives": (
+            "Each diagnosed fault counts, as no pad has one. Limits are Poisson's, 95 %; where none was "
             "seen, the upper one alone.",
             counted(results),
         ),
-        "What the hand did": ("Bouts of 10 to 180 s.", used(results)),
+        "Use of the hand": ("Bouts of 10 to 180 s.", used(results)),
     }
     page = [line for title, (note, rows) in tables.items() for line in table(title, note, rows)]
     if args.quick:
@@ -290,11 +298,11 @@ def main() -> None:
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
     head = [
-        "# False alarms of a hand in ordinary use", "",
+        "# False positives of a hand in ordinary use", "",
         f"Made by `make bench ONLY=alarms`; {machine}.", "",
         f"{len(results)} hours, each on a hand of its own: the shipped one, {len(model().links)} pads, "
         "of seeds that nothing was tuned on, built from tolerances, with sheets that creep, "
-        "adapt and scatter (S1 and S2 by turns), zeros that wander by up to 0.05 counts a second, a hand "
+        "adapt and scatter (S1 and S2 alternately), zeros that drift by up to 0.05 counts a second, a hand "
         "whose temperature does by 0.01 K a second (2 counts/K), and a supply that does. As a hand's week "
         "is, it mostly rests; between, single touches and slides, things taken and put down, long grasps, "
         f"wipes, hot cups (10 to 30 K), two objects on a pad. Sampled at {BUSY_HZ} Hz while in use and "

@@ -1,4 +1,4 @@
-"""Measure how well faults of pads are named: confusion, time to name, false alarms, cost.
+"""Measure how well faults of pads are named: confusion, time to name, false positives, cost.
 
 Prints its tables and writes docs/benchmarks/diagnose.md, diagnose.json and diagnose.png. `--quick` plays four
 episodes of each name and writes nothing; `--episodes N` says how many of each; `--seed S` where seeds begin.
@@ -28,8 +28,14 @@ import numpy as np
 from diagnose_episodes import FAULT_FREE, FAULTY, LENGTH_S, PADS, deployment, episode, hand_of
 from section import table
 
-from handtouch import config, shipped
-from handtouch.supervise.diagnose import Block, Diagnosis, DiagnosisModel, Kind
+from handtouch import config
+from handtouch.config import shipped
+from handtouch.supervisor.diagnose import (
+    DiagnosisModel,
+    HandDiagnostics,
+    HandSamples,
+)
+from handtouch.wire.faults import FaultKind
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -38,52 +44,52 @@ ROOT = Path(__file__).parent.parent
 NAMES = (*FAULTY, *FAULT_FREE)
 NOTHING = "nothing"
 SETTLED_S = 15.0
-"""An episode is over so long after its fault was named, if nothing wrong was told."""
+"""Time from the naming of a fault to the end of its episode, without a wrong diagnosis."""
 _TABLES: dict[int, Any] = {}
 _MODEL: list[DiagnosisModel] = []
 
 
 def play(task: tuple[str, int]) -> dict[str, Any]:
-    """One episode: what was told of its pad, when, and what was told wrongly."""
+    """Play one episode; return the diagnoses of its pad, their times, and the wrong ones."""
     name, seed = task
     if not _MODEL:
-        _MODEL.append(DiagnosisModel.of(deployment(), "right"))
+        _MODEL.append(DiagnosisModel.from_deployment(deployment(), "right"))
     it = episode(name, seed)
-    diagnosis = Diagnosis(_MODEL[0], tables=_TABLES)
+    diagnosis = HandDiagnostics(_MODEL[0], tables=_TABLES)
     truth = FAULTY[name].value if name in FAULTY else NOTHING
     mine: list[str] = []
     alarms: list[str] = []
     named_s, t_s = None, 0.0
     for block in it.blocks():
         t_s = float(block.sample_ns.max()) * 1e-9
-        for f in diagnosis.step(block):
-            if not f.fault or f.until_ns is not None:
+        for f in diagnosis.process_block(block):
+            if not f.is_fault or f.until_ns is not None:
                 continue
-            if truth == NOTHING or f.link != it.link or t_s < it.begin_s:
+            if truth == NOTHING or f.link != it.link or t_s < it.begin_delays_s:
                 alarms.append(f.kind.value)
                 continue
             mine.append(f.kind.value)
             if f.kind == truth and named_s is None:
                 named_s = t_s
-        wrong = [kind for kind in mine if kind not in (truth, Kind.UNEXPLAINED)]
+        wrong = [kind for kind in mine if kind not in (truth, FaultKind.UNEXPLAINED)]
         if named_s is not None and t_s > named_s + SETTLED_S and not wrong and not alarms:
             break
-    told = mine if truth != NOTHING else alarms
+    diagnoses = mine if truth != NOTHING else alarms
     return {
-        "name": name, "seed": seed, "truth": truth, "last": told[-1] if told else NOTHING,
-        "after_s": None if named_s is None else named_s - it.begin_s, "wrong": wrong + alarms,
-        "alarms": len(alarms), "doubt": Kind.UNEXPLAINED in mine,
+        "name": name, "seed": seed, "truth": truth, "last": diagnoses[-1] if diagnoses else NOTHING,
+        "after_s": None if named_s is None else named_s - it.begin_delays_s, "wrong": wrong + alarms,
+        "alarms": len(alarms), "doubt": FaultKind.UNEXPLAINED in mine,
         "details": it.details if name in FAULTY else {},
-        "pad_s": t_s * len(PADS) - (t_s - it.begin_s if truth != NOTHING else 0.0),
+        "pad_s": t_s * len(PADS) - (t_s - it.begin_delays_s if truth != NOTHING else 0.0),
     }  # fmt: skip
 
 
 def run(count: int, first: int, workers: int, journal: Path | None) -> list[dict[str, Any]]:
-    """Play them all, seed after seed, telling how far it is; what a journal holds isn't played again."""
+    """Play all episodes, seed by seed, with progress; results in a journal aren't computed again."""
     lines = journal.read_text().splitlines() if journal and journal.exists() else []
     tasks = [(name, seed) for seed in range(first, first + count) for name in NAMES]
-    wanted = {*tasks}
-    found = [r for r in map(json.loads, lines) if (r["name"], r["seed"]) in wanted]
+    requested = {*tasks}
+    found = [r for r in map(json.loads, lines) if (r["name"], r["seed"]) in requested]
     done = {(r["name"], r["seed"]) for r in found}
     tasks = [task for task in tasks if task not in done]
     before, began = len(found), time.monotonic()
@@ -107,7 +113,7 @@ def run(count: int, first: int, workers: int, journal: Path | None) -> list[dict
 
 
 def by_name(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Recall and time to name, of each fault; false alarms, of what is none."""
+    """Recall and time to name, of each fault; false positives, of what is none."""
     rows = []
     for name in NAMES:
         mine = [r for r in results if r["name"] == name]
@@ -116,14 +122,14 @@ def by_name(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         faulty = name in FAULTY
         rows.append(
             {
-                "what happens": name,
+                "fault played": name,
                 "episodes": len(mine),
                 "named, %": 100 * len(times) / len(mine) if faulty else "",
-                "at the end right, %": 100 * np.mean([r["last"] == r["truth"] for r in mine]),
+                "right at the end, %": 100 * np.mean([r["last"] == r["truth"] for r in mine]),
                 "median s to name": float(np.median(times)) if times else "",
                 "95 % within, s": float(np.quantile(times, 0.95)) if times else "",
-                "told in doubt, %": 100 * np.mean([r["doubt"] for r in mine]),
-                "with something wrong told, %": 100 * np.mean([bool(r["wrong"]) for r in mine]),
+                "ambiguous, %": 100 * np.mean([r["doubt"] for r in mine]),
+                "with a wrong diagnosis, %": 100 * np.mean([bool(r["wrong"]) for r in mine]),
                 "what": ", ".join(f"{kind} {n}" for kind, n in wrong.most_common(3)),
             }
         )
@@ -131,23 +137,28 @@ def by_name(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def by_kind(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Precision: of all that was told as a kind, how much was right."""
+    """Return the precision of each kind of diagnosis."""
     rows = []
     for kind in (
         *sorted({k.value for k in FAULTY.values()}),
-        Kind.COMMON_DRIFT.value,
-        Kind.UNEXPLAINED.value,
+        FaultKind.COMMON_DRIFT.value,
+        FaultKind.UNEXPLAINED.value,
     ):
         right = sum(r["truth"] == kind and r["after_s"] is not None for r in results)
         wrong = sum(kind in r["wrong"] for r in results)
         if right + wrong:
             rows.append(
-                {"told": kind, "right": right, "wrong": wrong, "precision, %": 100 * right / (right + wrong)}
+                {
+                    "diagnosis": kind,
+                    "right": right,
+                    "wrong": wrong,
+                    "precision, %": 100 * right / (right + wrong),
+                }
             )
     right, wrong = (sum(int(row[key]) for row in rows) for key in ("right", "wrong"))
     total = sum(r["truth"] != NOTHING for r in results)
     precision = 100 * right / max(right + wrong, 1)
-    rows.append({"told": f"all (recall {100 * right / total:.1f} %)", "right": right, "wrong": wrong,
+    rows.append({"diagnosis": f"all (recall {100 * right / total:.1f} %)", "right": right, "wrong": wrong,
                  "precision, %": precision})  # fmt: skip
     return rows
 
@@ -171,7 +182,7 @@ def false_alarms(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             {
                 "in": label,
                 "pad hours": pad_hours,
-                "false alarms": alarms,
+                "false positives": alarms,
                 "per hand and week": alarms * scale,
                 "at least": (chi2.ppf(0.025, 2 * alarms) / 2 if alarms else 0.0) * scale,
                 "at most": (chi2.ppf(0.975, 2 * alarms + 2) / 2 if alarms else chi2.ppf(0.95, 2) / 2) * scale,
@@ -182,9 +193,9 @@ def false_alarms(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def cost() -> list[dict[str, Any]]:
     """Share of a core for 15 pads at 200 Hz: half a minute of plain use on every pad."""
-    model = DiagnosisModel.of(config.load(shipped.path("utah_mit.toml")), "right")
+    model = DiagnosisModel.from_deployment(config.load(shipped.path("utah_mit.toml")), "right")
     blocks = list(episode("plain use", 1).blocks(30.0))
-    diagnosis, pads, spent = Diagnosis(model), len(model.links), []
+    diagnosis, pads, spent = HandDiagnostics(model), len(model.links), []
     for number in range(2):  # tables are made in the first round
         spent.append(0.0)
         for block in blocks:
@@ -192,19 +203,19 @@ def cost() -> list[dict[str, Any]]:
             t = block.sample_ns[:, :1] + number * 30_000_000_000
             stamps = np.repeat(np.repeat(t, 2, axis=0), pads, axis=1)
             start = time.process_time()
-            diagnosis.step(Block(stamps, counts, np.ones(stamps.shape, np.bool_)))
+            diagnosis.process_block(HandSamples(stamps, counts, np.ones(stamps.shape, np.bool_)))
             spent[-1] += time.process_time() - start
     return [{"round": k + 1, "share of a core, %": 100 * s / 30.0} for k, s in enumerate(spent)]
 
 
 def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
-    """What happened against what was told at the end."""
-    told = [*dict.fromkeys(kind.value for kind in FAULTY.values())]
-    told += [k.value for k in (Kind.COMMON_DRIFT, Kind.UNEXPLAINED)]
-    told = [*told, NOTHING]
-    share = np.zeros((len(NAMES), len(told)))
+    """Draw the confusion matrix of faults and last diagnoses."""
+    diagnoses = [*dict.fromkeys(kind.value for kind in FAULTY.values())]
+    diagnoses += [k.value for k in (FaultKind.COMMON_DRIFT, FaultKind.UNEXPLAINED)]
+    diagnoses = [*diagnoses, NOTHING]
+    share = np.zeros((len(NAMES), len(diagnoses)))
     for r in results:
-        share[NAMES.index(r["name"]), told.index(r["last"])] += 1
+        share[NAMES.index(r["name"]), diagnoses.index(r["last"])] += 1
     share *= 100 / share.sum(axis=1, keepdims=True)
     figure, axes = plt.subplots(figsize=(10, 9), layout="constrained")
     axes.imshow(np.sqrt(share), cmap="Blues", vmin=0, vmax=14)
@@ -212,11 +223,11 @@ def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
         if value:
             text = f"{value:.0f}" if value >= 1 else f"{value:.1f}"
             axes.text(column, row, text, ha="center", va="center", color="white" if value > 50 else "black")
-    axes.set_xticks(range(len(told)), told, rotation=40, ha="right")
+    axes.set_xticks(range(len(diagnoses)), diagnoses, rotation=40, ha="right")
     axes.set_yticks(range(len(NAMES)), NAMES)
     axes.axhline(len(FAULTY) - 0.5, color="black", lw=0.8)
-    axes.set(xlabel="told at the end of the episode", ylabel="what happened")
-    axes.set_title(f"Naming of faults, % of each row; {len(results)} episodes of {LENGTH_S:g} s")
+    axes.set(xlabel="diagnosis at the end of the episode", ylabel="fault played")
+    axes.set_title(f"Diagnosis of faults, % of each row; {len(results)} episodes of {LENGTH_S:g} s")
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
@@ -228,21 +239,23 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2000, help="where seeds begin")
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument(
-        "--journal", type=Path, help="file to keep results in; a run that was stopped goes on from it"
+        "--journal", type=Path, help="file to keep results in; an interrupted run continues from it"
     )
     args = parser.parse_args()
     results = run(4 if args.quick else args.episodes, args.seed, args.workers, args.journal)
     tables = {
-        "By what happens": (
-            "Named: the right kind was told of the right pad; at the end right: it is what was told last. "
-            "Something wrong: any other kind, or any other pad, at any time. In doubt: the fault is told as "
-            "one that can't be explained, or with two candidates; that is neither named nor wrong.",
+        "By fault": (
+            "Named: the right kind was diagnosed on the right pad; right at the end: it is the last "
+            "diagnosis. "
+            "Wrong: any other kind, or any other pad, at any time. Ambiguous: the diagnosis is "
+            "`unexplained`, or has two candidates; that is neither named nor wrong.",
             by_name(results),
         ),
-        "By what is told": ("Recall counts faults named at any time.", by_kind(results)),
-        "False alarms": (
-            "Each fault told of a pad that has none counts. Limits are Poisson's, 95 %; where none was "
-            "seen, the upper one alone. Most of these hours are hard cases on end, as no hand's week is.",
+        "By diagnosis": ("Recall counts faults named at any time.", by_kind(results)),
+        "False positives": (
+            "Each fault diagnosed on a pad without one counts. Limits are Poisson's, 95 %; where none was "
+            "seen, the upper one alone. Most of these hours are hard cases in sequence, unlike "
+            "any real week.",
             false_alarms(results),
         ),
         "Cost": ("15 pads at 200 Hz, all in use; tables are made in the first round.", cost()),
@@ -254,14 +267,15 @@ def main() -> None:
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
     head = [
-        "# Naming of faults", "",
+        "# Diagnosis of faults", "",
         f"Made by `make bench ONLY=diagnose`; {machine}.", "",
         f"{len(results)} episodes of {LENGTH_S:g} s on three pads of the shipped hand at 100 Hz, seeds "
-        f"from {args.seed}; a fault befalls one pad while all are in use. An episode ends {SETTLED_S:g} s "
-        "after its fault was named, if nothing wrong was told. Thresholds were tuned on seeds below 1100, on "
+        f"from {args.seed}; one pad has a fault while all are in use. An episode ends {SETTLED_S:g} s "
+        "after its fault was named, if there was no wrong diagnosis. Thresholds were tuned on seeds below "
+        "1100, on "
         f"other hands: these are {len({hand_of(r['seed']) for r in results})}, built from tolerances. "
         "Finite elements, noise, tolerances of gains, gaps and resistors and sizes of contacts are "
-        "hidden from the diagnosis. Left out as invisible: cables of opposite electrodes swapped, "
+        "hidden from the diagnosis. Left out as not observable: cables of opposite electrodes swapped, "
         "which mirrors the pad, and short circuits between electrodes without series resistors.", "",
     ]  # fmt: skip
     out = ROOT / "docs" / "benchmarks"

@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from section import table
 
-from handtouch.field import ElectrodeNetwork, LocatorBank, Rectangle, point_test, resolvable_separation
+from handtouch.field import (
+    ElectrodeNetwork,
+    LocatorBank,
+    Rectangle,
+    point_test,
+    resolvable_separation,
+)
 from handtouch.field.model import ForwardModel
 
 matplotlib.use("Agg")
@@ -97,7 +103,7 @@ def efficiency() -> list[dict[str, Any]]:
 
 
 def false_alarms() -> list[dict[str, Any]]:
-    """How often a point fails the test, against the rate asked for."""
+    """Rate at which a point fails the test, against the configured rate."""
     pad, rows = Rectangle(1.77, 1.0), []
     for part, noise in enumerate((1e-4, 1e-3, 1e-2)):
         sigma, scores, trials = np.full(4, noise), [], ALARM_TRIALS
@@ -108,8 +114,8 @@ def false_alarms() -> list[dict[str, Any]]:
         score = np.concatenate(scores)
         row: dict[str, Any] = {"noise": noise, "trials": trials}
         for rate in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
-            count, wanted = int((score > -ndtri(rate / 2)).sum()), rate * trials
-            row[f"at {rate:.0e}"] = f"{count / wanted:.2f} +- {wanted**-0.5:.2f}"
+            count, expected = int((score > -ndtri(rate / 2)).sum()), rate * trials
+            row[f"at {rate:.0e}"] = f"{count / expected:.2f} +- {expected**-0.5:.2f}"
         rows.append(row)
     return rows
 
@@ -156,7 +162,7 @@ def costs() -> list[dict[str, Any]]:
 
 
 def draw_resolution(path: Path) -> None:
-    """How far apart two equal contacts must be, over the pad, for three noises."""
+    """Resolvable distance of two equal contacts over the pad, for three noises."""
     figure, axes = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
     pad = Rectangle(1.0, 1.0)
     side = np.linspace(0.06, 0.94, 34)
@@ -168,9 +174,9 @@ def draw_resolution(path: Path) -> None:
                 x, y, np.where(np.isinf(apart), np.nan, apart), levels=np.linspace(0, 0.6, 13)
             )
             axis.set(title=f"{words}, noise {100 * noise:g} % of the total", aspect="equal", facecolor="0.85")
-    figure.colorbar(shown, ax=axes, label="distance of two contacts told from one, sides")
+    figure.colorbar(shown, ax=axes, label="distance of two contacts distinguished from one, sides")
     figure.suptitle(
-        "Two equal contacts told from one (false alarms 1e-3, detection 0.9); grey: never, within the pad"
+        "Two equal contacts distinguished from one (false alarms 1e-3, detection 0.9); grey: never on the pad"
     )
     figure.savefig(path, dpi=100)
 
@@ -188,11 +194,11 @@ def main() -> None:
         ),
         "Cost for a hand of 15 pads": (
             "Six models in one bank; medians of processor time. Aim: 250 us for new contacts, 120 us for "
-            "those that are followed.",
+            "tracked ones.",
             costs(),
         ),
         "False alarms of the test for a point": (
-            "Counted over asked for, with the scatter of counting. Pad 1.77:1, 5 % margin.",
+            "Counted over configured rate, with the scatter of counting. Pad 1.77:1, 5 % margin.",
             false_alarms(),
         ),
     }

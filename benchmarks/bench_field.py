@@ -21,12 +21,17 @@ import numpy as np
 import scipy
 import skfem
 from numpy.typing import NDArray
+from ratio_table import RatioTable
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import least_squares
 from skfem.models.poisson import laplace
 
-from handtouch.field import LocatorBank, RatioTable, Rectangle, estimate
-from handtouch.field.classic import LogRatioTable, log_ratio, single_sum_fractions
+from handtouch.field import (
+    LocatorBank,
+    Rectangle,
+    estimate,
+)
+from handtouch.field.paper_methods import LogRatioTable, log_ratio, single_sum_fractions
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -84,7 +89,7 @@ def finite_elements(pad: Rectangle) -> Locator:
     columns = np.stack(potentials, axis=1)
 
     def forward(px: float, py: float) -> FloatArray:
-        found: FloatArray = np.asarray(basis.probes(np.array([[px], [py]])) @ columns)[0]
+        found: FloatArray = np.asarray(basis.unanswered_probes(np.array([[px], [py]])) @ columns)[0]
         return found
 
     return _one_by_one(pad, forward)
@@ -116,7 +121,7 @@ def grid_interpolator(kind: Literal["linear", "cubic"], cells: int) -> Maker:
 
     def make(pad: Rectangle) -> Locator:
         adjusted, table = LogRatioTable(pad, cells=0), LogRatioTable(pad, cells)
-        places, origin, steps = table.table
+        places, origin, steps = table.correction_table
         axes = [origin[i] + steps[i] * np.arange(cells + 1) for i in range(2)]
         interpolator = RegularGridInterpolator(axes, places, method=kind, bounds_error=False, fill_value=None)
 
@@ -316,7 +321,7 @@ def main() -> None:
         "Errors are distances in shorter sides, over random contacts 5 % of a side and farther from the",
         "edges, without noise. Times are medians of processor time; the spread",
         "is half the distance between their quartiles, the largest of the four columns. Formulations of the",
-        "exact method that were tried and lost are in [formulations.md](formulations.md).",
+        "exact method that were tried and rejected are in [formulations.md](formulations.md).",
         "",
         *aims,
         "",

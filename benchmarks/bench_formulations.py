@@ -22,9 +22,10 @@ import numpy as np
 import scipy
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from ratio_table import RatioTable
 from scipy.special import elliprf
 
-from handtouch.field import RatioTable, Rectangle
+from handtouch.field import Rectangle
 
 FloatArray = NDArray[np.float64]
 Locator = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -109,13 +110,13 @@ def newton_on_images(pad: Rectangle) -> Locator:
     def locate(currents: FloatArray) -> tuple[FloatArray, FloatArray]:
         f = currents / currents.sum(axis=0)
         logs = np.log(np.tan(np.pi / 2 * f))
-        wanted = logs[1::2] - logs[::2]
+        target = logs[1::2] - logs[::2]
         sides, other = np.array([[pad.a], [pad.b]]), np.array([[pad.b], [pad.a]])
-        place = np.clip(sides / 2 + other / (2 * np.pi) * wanted, 0.02 * sides, 0.98 * sides)
+        place = np.clip(sides / 2 + other / (2 * np.pi) * target, 0.02 * sides, 0.98 * sides)
         h = 1e-6
         for _ in range(8):
             value, ahead = (_log_ratio(image_sums(*(place + d))) for d in (0.0, np.array([[h], [h]])))
-            step = (wanted - value) / ((ahead - value) / h)  # each ratio depends on its own coordinate alone
+            step = (target - value) / ((ahead - value) / h)  # each ratio depends on its own coordinate alone
             place = np.clip(place + step, place * 0.1, sides - (sides - place) * 0.1)
         return place[0], place[1]
 
@@ -233,11 +234,11 @@ def main() -> None:
         "# Formulations of the exact location",
         "",
         f"Made by `make bench ONLY=formulations`; {machine}.",
-        "Contacts 0.1 % of a side and farther from the edges; errors in shorter sides against the places",
-        "that made the currents; medians of processor time. Only the adopted one gives the residual as well,",
-        "and only it was built to hold from 1e-3 to 1e3 (`make stress`). The separable form itself, in which",
-        "each coordinate has a ratio of its own, is new here; it beats the half plane of theory.md on error",
-        "and, whatever its last step, in bulk.",
+        "Contacts 0.1 % of a side and farther from the edges; errors in shorter sides against the positions",
+        "that produced the currents; medians of processor time. Only the adopted one returns the residual",
+        "as well, and only it is designed for aspect ratios from 1e-3 to 1e3 (`make stress`). The separable",
+        "form itself, in which each coordinate has a ratio of its own, is new here; it has a smaller error",
+        "than the half plane of theory.md and is faster in bulk, whatever its last step.",
         "",
     ]
     out = ROOT / "docs" / "benchmarks"

@@ -1,7 +1,7 @@
 """Measure the self-calibration of gains: against the Fisher bound, with elongated contacts, after a swap.
 
 Prints its tables and writes docs/benchmarks/gains.md, gains.json and gains.png. `--only NUMBER ...` measures
-some of the tables anew, counted from 1; the others are kept as they were.
+only these tables, counted from 1, and keeps the others.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from section import table
 
-from handtouch import config, shipped
-from handtouch.daemon.model import PadModel
+from handtouch import config
+from handtouch.calibration.gains import GainEstimator, fisher_covariance, gain_deviation
+from handtouch.config import shipped
+from handtouch.core.pad_model import PadModel
 from handtouch.field import Rectangle
-from handtouch.hand import network_of
-from handtouch.simulate.hand import VirtualHand
-from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.hand import electrode_network
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
-from handtouch.supervise.gains import GainEstimator, fisher_covariance, gain_deviation
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -83,9 +85,9 @@ def trials(label: str, noise: float, elongated: float) -> list[dict[str, Any]]:
         running = GainEstimator(pad, tolerance=0.2, drift_per_day=0, model_error=0)
         done = 0
         for count in COUNTS:
-            running.add(currents[:, done:count], noise, 0)
+            running.add_contacts(currents[:, done:count], noise, 0)
             done, settled = count, copy.deepcopy(running)
-            settled.settle()
+            settled.process_pending()
             found = settled.estimate
             error = np.log(found.gains) - truth
             errors[count].append(error)
@@ -117,7 +119,7 @@ def swapped(label: str) -> list[dict[str, Any]]:
     deployment = config.load(shipped.path("utah_mit.toml"))
     pads = [(hand, pad) for hand in deployment.hands for pad in hand.pads]
     model = PadModel(deployment)
-    networks = [network_of(pad, deployment.sheets[pad.sheet]) for _, pad in pads]
+    networks = [electrode_network(pad, deployment.sheets[pad.sheet]) for _, pad in pads]
     errors: dict[int, list[FloatArray]] = {count: [] for count in SWAP_COUNTS}
     least: list[FloatArray] = []
     gain_errors: dict[int, list[FloatArray]] = {count: [] for count in SWAP_COUNTS}
@@ -130,7 +132,7 @@ def swapped(label: str) -> list[dict[str, Any]]:
         for row, network in enumerate(networks):
             running, done = GainEstimator(network), 0
             for count in SWAP_COUNTS:
-                running.add(learn[row].currents[:, done:count], learn[row].noise, count)
+                running.add_contacts(learn[row].currents[:, done:count], learn[row].noise, count)
                 done, found = count, running.estimate
                 errors[count].append(_located(model, row, test[row], found.gains))
                 truth = np.log(true[row]) - np.log(true[row]).mean()
@@ -145,7 +147,7 @@ def swapped(label: str) -> list[dict[str, Any]]:
             {
                 "world": label,
                 "contacts since": count,
-                "location error, rms mm": float(np.sqrt(np.mean(error**2))),
+                "position error, rms mm": float(np.sqrt(np.mean(error**2))),
                 "95 % below, mm": float(np.quantile(error, 0.95)),
                 "rms with the true gains, mm": float(np.sqrt(np.mean(np.concatenate(least) ** 2))),
                 "gain error, rms %": float(100 * np.sqrt(np.mean(np.square(gain_errors[count])))),
@@ -167,7 +169,7 @@ class Readings:
 def _readings(
     deployment: config.Deployment, model: PadModel, world: World, count: int, seed: tuple[int, int]
 ) -> list[Readings]:
-    """Of every pad: `count` contacts anywhere, of 0.5 to 5 N."""
+    """Return readings of `count` contacts of 0.5 to 5 N anywhere on every pad."""
     generator = np.random.default_rng(seed)
     currents, places = np.zeros((model.size, 4, count)), np.zeros((model.size, count, 3))
     for first in range(0, count, 32):
@@ -177,7 +179,9 @@ def _readings(
             at = generator.uniform(0.08, 0.92, (model.size, 2)).tolist()
             force = np.exp(generator.uniform(np.log(0.5), np.log(5.0), model.size)).tolist()
             touches += [
-                Touch(link=link, from_s=k * 1.0, duration_s=0.8, path=(tuple(place),), force_n=(newton,))
+                ScenarioTouch(
+                    link=link, from_s=k * 1.0, duration_s=0.8, path=(tuple(place),), force_n=(newton,)
+                )
                 for link, place, newton in zip(model.links, at, force, strict=True)
             ]
         hand = VirtualHand(deployment, Scenario(touch=tuple(touches)), world)
@@ -195,12 +199,12 @@ def _located(model: PadModel, row: int, readings: Readings, gains: FloatArray) -
     """Distance [mm] of each located contact from the truth (n,)."""
     factors, index = gains[:, None], np.full(readings.currents.shape[1], row)
     found = model.locator.estimate(index, readings.currents * factors, readings.noise * factors)
-    placed = model.placement.place(index, found.x, found.y, np.zeros((index.size, 2, 2)))
+    placed = model.placement.to_link_frame(index, found.x, found.y, np.zeros((index.size, 2, 2)))
     return np.asarray(1e3 * np.linalg.norm(placed.position_m - readings.places, axis=1))
 
 
 def shapes() -> list[dict[str, Any]]:
-    """What shapes of pad permit."""
+    """Return the Fisher bound of gains by shape of pad."""
     rows = []
     for aspect in (1.0, 1.2, 1.5, 1.8, 2.0, 2.2, 2.5, 3.0):
         deviation = gain_deviation(Rectangle(aspect, 1.0))
@@ -233,7 +237,7 @@ def draw(path: Path, fisher: list[dict[str, Any]], swaps: list[dict[str, Any]]) 
         rows = [r for r in swaps if r["world"] == label]
         (line,) = right.plot(
             [r["contacts since"] for r in rows],
-            [r["location error, rms mm"] for r in rows],
+            [r["position error, rms mm"] for r in rows],
             "o-",
             label=label,
         )
@@ -243,7 +247,7 @@ def draw(path: Path, fisher: list[dict[str, Any]], swaps: list[dict[str, Any]]) 
             ls=":",
             label="with the true gains",
         )
-    right.set(xlabel="contacts since the swap", ylabel="location error, rms mm", ylim=(0, None))
+    right.set(xlabel="contacts since the swap", ylabel="position error, rms mm", ylim=(0, None))
     right.set_title(f"Nodes of {100 * GAIN_STD:g} % other gains in the shipped hand")
     right.legend(fontsize=8)
     figure.savefig(path, dpi=100)
@@ -270,7 +274,7 @@ def swaps() -> tuple[str, list[dict[str, Any]]]:
     note = (
         f"The shipped hand's 15 pads, {len(SWAP_SEEDS)} sets of nodes; finite elements, noise, quantisation "
         f"and sizes of contacts hidden from the estimator; contacts of 0.5 to 5 N, means of {HELD} samples; "
-        "100 other contacts a pad tell the error. The second world also has electrodes that end elsewhere."
+        "100 other contacts a pad measure the error. The second world also has electrodes that end elsewhere."
     )
     return note, [row for label in WORLDS for row in swapped(label)]
 
@@ -278,7 +282,7 @@ def swaps() -> tuple[str, list[dict[str, Any]]]:
 TABLES: dict[str, Callable[[], tuple[str, list[dict[str, Any]]]]] = {
     "Error against the Fisher bound": points,
     "With elongated contacts among them": edges,
-    "Location error after a swap": swaps,
+    "Position error after a node replacement": swaps,
     "Shapes": lambda: ("Fisher bound for the least certain gain.", shapes()),
 }
 

@@ -1,4 +1,4 @@
-"""What a scene doesn't need and what that saves: bus load, ticks, processor; how soon a pad is awake.
+"""Savings by scenes: bus load, ticks and CPU time of unneeded pads, and wake-up time of idle ones.
 
 The real daemon serves simulated nodes over udp_multicast, as in bench_latency. Each case is the hand in one
 scene, touched so much; then, again and again, one pad of an idle hand is touched, and its samples are timed
@@ -23,9 +23,9 @@ import numpy as np
 from bench_latency import OUT, PORT, ProcessorShare, in_own_network, on_loopback, open_bus
 from numpy.typing import NDArray
 
-from handtouch.canbus.device import DeviceBus
 from handtouch.client import request
 from handtouch.config import Deployment, load
+from handtouch.device import DeviceBus
 
 TOUCH = np.array([900, 700, 800, 600])
 IDLE_AFTER_S = 0.5
@@ -33,7 +33,7 @@ FOLLOWED = 40  # periods that a woken pad's samples are followed for
 
 
 class Nodes:
-    """The nodes of a deployment, their touches set by hand, and a listener that remembers who sent when."""
+    """Nodes of a deployment with settable touches, and a receiver that records the send times of frames."""
 
     def __init__(self, deployment: Deployment) -> None:
         self.pads = [pad for hand in deployment.hands for pad in hand.pads]
@@ -44,7 +44,7 @@ class Nodes:
         self._devices = DeviceBus(self._buses[0], self._sample)
         for pad in self.pads:
             self._devices.add(pad.node_id, serial=pad.serial)
-        self._notifier = can.Notifier(self._buses[1], [self._heard])
+        self._notifier = can.Notifier(self._buses[1], [self._record_frame])
 
     def start(self) -> None:
         self._devices.start()
@@ -55,7 +55,7 @@ class Nodes:
         for bus in self._buses:
             bus.shutdown()
 
-    def _heard(self, message: can.Message) -> None:
+    def _record_frame(self, message: can.Message) -> None:
         if 0x280 < message.arbitration_id < 0x300:
             self.seen.append((message.arbitration_id - 0x280, message.timestamp))
 
@@ -67,12 +67,12 @@ class Nodes:
 
 
 class Daemon:
-    """`handtouch run` for a scene."""
+    """Run `handtouch run` for a scene."""
 
     def __init__(self, folder: Path, *, links: str, idle: bool) -> None:
         self.config = on_loopback(folder, PORT)
         text = self.config.read_text()
-        kind = 'excitation = "0x2100:0:u8"\n' + ("idle = { delta_counts = 12 }\n" if idle else "")
+        kind = 'excitation_object = "0x2100:0:u8"\n' + ("idle = { delta_counts = 12 }\n" if idle else "")
         text = text.replace("heartbeat_ms = 100\n", f"heartbeat_ms = 100\n{kind}")
         scene = f"[scene]\nlinks = {links}\nidle_after_s = {IDLE_AFTER_S}\n\n[touch]"
         self.config.write_text(text.replace("[touch]", scene))
@@ -83,7 +83,7 @@ class Daemon:
         command = [sys.executable, "-m", "handtouch", "run", str(self.config)]
         self._process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         end_s = time.monotonic() + 60
-        while any(pad["node"] not in ("operational", "stopped") for pad in self.status()["pads"]):
+        while any(pad["node_state"] not in ("operational", "stopped") for pad in self.status()["pads"]):
             if time.monotonic() > end_s:
                 raise RuntimeError("the hand never became operational")
             time.sleep(0.1)
@@ -92,7 +92,7 @@ class Daemon:
         return request("status", endpoint=self.deployment.daemon.control, timeout_s=60)
 
     def measure(self, seconds: float) -> dict[str, float]:
-        """Means over a while."""
+        """Return means over a time."""
         assert self._process is not None
         share = ProcessorShare()
         before, start_s = self.status(), time.monotonic()
@@ -119,7 +119,7 @@ class Daemon:
 
 
 def loads(folder: Path, seconds: float) -> list[dict[str, Any]]:
-    """One row a case."""
+    """Measure all cases; return one row each."""
     rows = []
     scenes = (
         ("all pads, SYNC only", '["*"]', False, (0, 1, 15)),
@@ -142,7 +142,7 @@ def loads(folder: Path, seconds: float) -> list[dict[str, Any]]:
 
 
 def wakes(folder: Path, trials: int) -> dict[str, Any]:
-    """Periods from the first event frame of a pad touched in an idle hand to sampling at full rate."""
+    """Measure the periods from the first event frame of a touched idle pad to sampling at full rate."""
     daemon = Daemon(folder, links='["*"]', idle=True)
     nodes = Nodes(daemon.deployment)
     nodes.start()
@@ -176,7 +176,7 @@ def wakes(folder: Path, trials: int) -> dict[str, Any]:
 
 
 def full_rate_after(stamps: NDArray[np.float64], period_s: float) -> tuple[float, float]:
-    """Periods from the first frame to the second, and the part of the full rate from there on.
+    """Return the periods from the first frame to the second, and the fraction of the full rate afterwards.
 
     Event frames come when something moves; a pad that is pressed and held sends its second frame because of
     the SYNC that it follows from then on.
@@ -195,23 +195,23 @@ def write(results: dict[str, Any]) -> str:
         for r in results["loads"]
     )
     wake = results["wake"]
-    text = f"""# What a scene doesn't need
+    text = f"""# Savings by scenes
 
-15 pads at 200 Hz on one bus of 1 Mbit/s; nodes and daemon are processes of their own, udp_multicast over
+15 pads at 200 Hz on one bus of 1 Mbit/s; nodes and daemon run in separate processes, with udp_multicast over
 loopback. {results["machine"]}.
 
 | scene | touched | bus load | samples/s | ticks/s | daemon's share of a core |
 | --- | --- | --- | --- | --- | --- |
 {rows}
 
-A node outside the scene is stopped and its excitation is off; only its heartbeat is left. One in the scene
-that nothing has touched for `idle_after_s` sends when a channel moves by `delta_counts`, and ten times a
-second in any case; when all do so, SYNC slows down to `idle_sync_period_ms`.
+A node outside the scene is stopped with its excitation off; it sends heartbeats only. A node in the scene
+that is untouched for `idle_after_s` transmits when a channel changes by `delta_counts`, and at least
+ten times a second; when all nodes do so, SYNC slows down to `idle_sync_period_ms`.
 
-**Awake again**: from the first event frame of a touched pad to its next sample, which follows SYNC at full
+**Wake-up**: from the first event frame of a touched pad to its next sample, which follows SYNC at full
 rate: median {wake["median_periods"]:.2f} periods, 95 % {wake["p95_periods"]:.2f}, worst
 {wake["worst_periods"]:.2f} ({wake["trials"]} touches at random times;
-{100 * wake["within_two_periods"]:.1f} % within two). From there on {100 * wake["rate_after"]:.0f} % of the
+{100 * wake["within_two_periods"]:.1f} % within two). Afterwards {100 * wake["rate_after"]:.0f} % of the
 full rate.
 
 Made by `make bench ONLY=idle`.

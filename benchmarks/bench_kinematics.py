@@ -1,4 +1,4 @@
-"""What palm and base frame cost the tick: 15 pads of the shipped hand, at rest under a steady press.
+"""Tick time with palm and base frames: 15 pads of the shipped hand, at rest under a steady press.
 
 Cases take turns on the same samples, with joint states at 1 kHz beside them; a case is the pipeline of the
 daemon from the last sample to encoded messages. Then the parts by themselves.
@@ -18,23 +18,23 @@ from typing import Any
 
 import numpy as np
 
-from handtouch import shipped, wire
-from handtouch.config import load
-from handtouch.config.tables import Wants
-from handtouch.daemon.inputs import Inputs
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.pipeline import Pipeline
-from handtouch.daemon.scene import Demand, Scenes
-from handtouch.daemon.security import Gate
-from handtouch.hand.joints import JointStates
-from handtouch.hand.robot import Robots
-from handtouch.inputs import JointState, decode, encode
+from handtouch import wire
+from handtouch.config import load, shipped
+from handtouch.config.tables import SceneRequest
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.scene import ActiveScenes, Demand
+from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.inputs import InputReceiver
+from handtouch.hand.joints import JointStateBuffer
+from handtouch.hand.robot_models import RobotModels
+from handtouch.wire.inputs import JointState, decode, encode
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PERIOD_NS = 5_000_000
 JOINTS_EVERY_NS = 1_000_000
 STRENGTH = 20.0  # of the threshold's current
-PLAIN = ("location", "strength")
+PLAIN = ("position", "force")
 STATED = {"mount_std_mm": 0.3, "mount_std_deg": 1.0, "joint_std_deg": 0.3}
 CASES: dict[str, tuple[tuple[str, ...], dict[str, float] | None]] = {
     "no URDF": (PLAIN, None),
@@ -52,36 +52,38 @@ class Case:
 
     subscriptions = frozenset({b""})
 
-    def __init__(self, model: PadModel, robots: Robots, described: bool, outputs: tuple[str, ...]) -> None:
+    def __init__(
+        self, model: PadModel, robots: RobotModels, described: bool, outputs: tuple[str, ...]
+    ) -> None:
         self.pipeline = Pipeline(model, PERIOD_NS, 0.6, self, robots=robots if described else None)
         self.pipeline.node_state[:] = 0
         self.spent: list[int] = []
         self.sent_bytes = 0
         names = list(zip(model.hands, model.links, strict=True))
-        self._joints = JointStates(robots.joint_names[0])
-        self.pipeline.frames.joints_at = lambda _, t_ns: self._joints.at(t_ns)
-        Demand(Scenes(Wants(outputs=outputs), names), self, 200.0, self._apply).step(0)  # type: ignore[arg-type]
+        self._joints = JointStateBuffer(robots.joint_names[0])
+        self.pipeline.transforms.joints_at = lambda _, t_ns: self._joints.interpolate(t_ns)
+        Demand(ActiveScenes(SceneRequest(outputs=outputs), names), self, 200.0, self._apply).update(0)  # type: ignore[arg-type]
 
-    def wants(self, topic: str) -> bool:
+    def has_subscriber(self, topic: str) -> bool:
         return topic.startswith(("contact/", "hand/"))
 
-    def send(self, message: wire.Outgoing) -> None:
+    def send(self, message: wire.OutgoingMessage) -> None:
         self.sent_bytes += sum(map(len, wire.encode(message)))
 
-    def _apply(self, wanted: Any, *_: Any) -> None:
-        self.pipeline.want(wanted)
+    def _apply(self, demand: Any, *_: Any) -> None:
+        self.pipeline.apply_demand(demand)
 
     def tick(self, t_ns: int, counts: Any) -> None:
         for joints_ns in range(t_ns - PERIOD_NS, t_ns, JOINTS_EVERY_NS):
             angle = 0.5 + 0.4 * np.sin(joints_ns * 1e-9 + np.arange(16))
-            self._joints.take(joints_ns, self._joints.names, angle)
+            self._joints.add_state(joints_ns, self._joints.names, angle)
         pipeline = self.pipeline
-        pipeline.begin(t_ns, t_ns)
+        pipeline.begin_cycle(t_ns, t_ns)
         for pad, row in enumerate(counts):
-            pipeline.slab.write(pad, row.tobytes(), t_ns + 1000)
+            pipeline.slab.write_pdo(pad, row.tobytes(), t_ns + 1000)
         begin_ns = time.thread_time_ns()
-        if pipeline.advance(t_ns + 2000) is None:  # before the first tick no pad is expected
-            pipeline.advance(t_ns + PERIOD_NS - 1)
+        if pipeline.tick_if_due(t_ns + 2000) is None:  # before the first tick no pad is expected
+            pipeline.tick_if_due(t_ns + PERIOD_NS - 1)
         self.spent.append(time.thread_time_ns() - begin_ns)
 
 
@@ -92,11 +94,15 @@ def measure(touched: int, ticks: int) -> list[dict[str, Any]]:
     cases = {}
     for name, (outputs, stated) in CASES.items():
         hand = deployment.hands[0].model_copy(update=stated or {})
-        robots = Robots(deployment.model_copy(update={"hands": (hand,)}))
+        robots = RobotModels(deployment.model_copy(update={"hands": (hand,)}))
         cases[name] = Case(model, robots, stated is not None, outputs)
     pads = np.arange(model.size)
     x, y = (np.full((model.size, 2), 0.5) * model.locator.sides).T
-    share = model.locator.fractions(pads, x, y).T * (STRENGTH * model.on_a[:, None]) / model.ampere_per_count
+    share = (
+        model.locator.fractions(pads, x, y).T
+        * (STRENGTH * model.begin_threshold_a[:, None])
+        / model.ampere_per_count
+    )
     share[touched:] = 0.0
     chance, order = np.random.default_rng(1), list(cases.values())
     for number in range(ticks + 20):
@@ -122,38 +128,38 @@ def parts(repeats: int) -> dict[str, float]:
     import zmq
 
     deployment = load(shipped.path("utah_mit.toml"))
-    robots = Robots(deployment)
+    robots = RobotModels(deployment)
     kinematics, names = robots.kinematics[0], robots.joint_names[0]
-    states = JointStates(names)
+    states = JointStateBuffer(names)
     for number in range(64):
-        states.take(number * JOINTS_EVERY_NS, names, np.full(16, 0.01 * number))
+        states.add_state(number * JOINTS_EVERY_NS, names, np.full(16, 0.01 * number))
     message = encode(JointState("right", 1, names, np.full(16, 0.5)))
     position, point = np.full(16, 0.5), np.array([0.01, 0.0, 0.01])
     clock = iter(range(10**12, 10**15))
     with zmq.Context() as context:
-        known = {"right": JointStates(names)}
+        known = {"right": JointStateBuffer(names)}
         pads = [("right", pad.link) for pad in deployment.hands[0].pads]
-        inputs = Inputs(context, "tcp://127.0.0.1:*", Gate(context), known, pads)
+        inputs = InputReceiver.open(context, "tcp://127.0.0.1:*", Authenticator.open(context), known, pads)
 
         def take() -> None:
             now_ns = next(clock)
             topic, payload = message
-            inputs.take([topic, payload.replace(b"\xa4t_ns\x01", b"\xa4t_ns\xc0")], now_ns)
+            inputs.process_message([topic, payload.replace(b"\xa4t_ns\x01", b"\xa4t_ns\xc0")], now_ns)
 
         def pose() -> None:
-            kinematics.move(position)
+            kinematics.set_joint_positions(position)
             for link in range(5):
-                kinematics.in_palm(link)
+                kinematics.pose_in_palm(link)
 
         found = {
             "take in a joint state of 16 joints": _each_us(take, repeats),
             "of that, decode it": _each_us(lambda: decode(message), repeats),
             "look for messages, none there": _each_us(lambda: inputs.poll(0), repeats),
-            "joints at the time of a sample": _each_us(lambda: states.at(60_500_000), repeats),
-            "kinematics of 16 joints": _each_us(lambda: kinematics.move(position), repeats),
+            "joints at the time of a sample": _each_us(lambda: states.interpolate(60_500_000), repeats),
+            "kinematics of 16 joints": _each_us(lambda: kinematics.set_joint_positions(position), repeats),
             "kinematics, and the poses of 5 links in the palm": _each_us(pose, repeats),
             "slope of a point with the joints, of one pose": _each_us(
-                lambda: kinematics.slope(0, point), repeats
+                lambda: kinematics.point_jacobian(0, point), repeats
             ),
         }
         assert not inputs.dropped, inputs.problem
@@ -192,7 +198,7 @@ def _page(rows: list[dict[str, Any]], single: dict[str, float]) -> str:
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
     machine += f", load {os.getloadavg()[0]:.0f}"  # others' work cools the caches
     lines = [
-        "# What palm and base frame cost the tick",
+        "# Tick time of palm and base frames",
         "",
         "From the last sample to encoded contacts and hand frame, 15 pads of the shipped hand, steady",
         "presses; joint states come at 1 kHz. Cases take turns on the same samples; medians of processor",
@@ -206,7 +212,7 @@ def _page(rows: list[dict[str, Any]], single: dict[str, float]) -> str:
         f"| {r['bytes']:.0f} |"
         for r in rows
     ]
-    lines += ["", "The parts by themselves, medians, one after the other with warm caches:", ""]
+    lines += ["", "The parts alone, medians, consecutively with warm caches:", ""]
     lines += ["| part | us |", "| --- | --- |"]
     lines += [f"| {name} | {us:.1f} |" for name, us in single.items()]
     return "\n".join(lines) + "\n"

@@ -33,15 +33,16 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from handtouch import shipped, wire
-from handtouch.canbus.device import DeviceBus
+from handtouch import wire
 from handtouch.client import request
-from handtouch.config import Deployment, load
+from handtouch.config import Deployment, load, shipped
 from handtouch.config.tables import Daemon as DaemonTable
-from handtouch.daemon import histogram, realtime
-from handtouch.daemon.daemon import Daemon
-from handtouch.simulate.hand import VirtualHand
+from handtouch.daemon import stage_timer as histogram
+from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.device import DeviceBus
+from handtouch.host import realtime
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
@@ -50,16 +51,16 @@ VCAN = Path("/sys/class/net/vcan0")
 TOUCHED = 5
 ROUND_S = 5.0
 SETTLED_S = 6.0
-"""After the first contacts: until then the slow half begins, which takes a processor for three seconds."""
+"""Wait after the first contacts: the supervisor process starts, which loads one CPU for 3 s"""
 BUSY_POLL_US, PRIORITY = 1000, 40
 PATHS = {"resting": "[[0.4, 0.4]]", "sliding": "[[0.3, 0.3], [0.7, 0.4], [0.3, 0.5], [0.7, 0.6], [0.4, 0.7]]"}
-"""Of the contacts, through which they go within ROUND_S, and back."""
+"""Path of the contacts, passed within ROUND_S in both directions"""
 MOST = 400_000
 FLOOR_ID = b"hand/floor"
 
 
 class StampedBus:
-    """A bus that remembers when the last frame of each answer to SYNC was sent."""
+    """A bus that records the send time of the last frame of each reply to SYNC."""
 
     def __init__(self, bus: can.BusABC, last_id: int, stamps: Any) -> None:
         self._bus, self._last_id, self._stamps = bus, last_id, stamps
@@ -76,14 +77,14 @@ class StampedBus:
 
 
 def open_bus() -> can.BusABC:
-    """The bus that all processes share."""
+    """Open the bus shared by all processes."""
     if VCAN.exists():
         return can.Bus(VCAN.name, interface="socketcan", ignore_config=True)
     return can.Bus(CHANNEL, interface="udp_multicast", port=PORT, ignore_config=True)
 
 
 def film(deployment: Deployment, path: str, touched: Sequence[int] = range(TOUCHED)) -> NDArray[np.int64]:
-    """Counts (k, pads, 4), one sample a SYNC period: contacts on these pads go along the path and back."""
+    """Return counts (k, pads, 4), one sample per SYNC: contacts slide along the path and back."""
     links = [pad.link for hand in deployment.hands for pad in hand.pads]
     touches = "\n".join(
         f'[[touch]]\nlink = "{link}"\nfrom_s = 0\nduration_s = {ROUND_S + 1}\nramp_s = 0.4\nforce_n = [1.5]\n'
@@ -97,7 +98,7 @@ def film(deployment: Deployment, path: str, touched: Sequence[int] = range(TOUCH
 
 
 def nodes(config: Path, samples: NDArray[np.int64], stamps: Any, stop: Event) -> None:
-    """The simulated nodes, as a process; they play the samples again and again."""
+    """Run the simulated nodes in a process; they repeat the samples."""
     deployment = load(config)
     pads = [pad for hand in deployment.hands for pad in hand.pads]
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
@@ -114,12 +115,12 @@ def nodes(config: Path, samples: NDArray[np.int64], stamps: Any, stop: Event) ->
 
 
 def bare_loop(endpoint: str, count: int, size: int, period_s: float, priority: int, stop: Event) -> None:
-    """The floor: receive, store, send; nothing computed. Starts the nodes by NMT, each by its id."""
+    """Run the floor: receive, store, send, without computing; start the nodes by NMT, each by its id."""
     context = zmq.Context()
     socket = context.socket(zmq.PUB)
     socket.bind(endpoint)
     if priority:
-        refused = realtime.apply(DaemonTable(realtime_priority=priority))
+        refused = realtime.apply_realtime_settings(DaemonTable(realtime_priority=priority))
         assert not refused, refused
     slab = bytearray(8 * 128)
     payload = bytes(size - len(FLOOR_ID) - 8)
@@ -151,8 +152,8 @@ def bare_loop(endpoint: str, count: int, size: int, period_s: float, priority: i
     context.term()
 
 
-class Tracer(histogram.StageClock):
-    """Remembers when each part of the loop ended."""
+class Tracer(histogram.StageTimer):
+    """Records the end of each part of the loop."""
 
     def __init__(self, now_ns: int) -> None:
         super().__init__(now_ns)
@@ -162,16 +163,16 @@ class Tracer(histogram.StageClock):
         self.trace.append((stage, now_ns))
         super().lap(stage, now_ns)
 
-    def slept(self, wake_ns: int, now_ns: int) -> None:
+    def record_wait(self, wake_ns: int, now_ns: int) -> None:
         self.trace.append((histogram.WAIT, now_ns))
-        super().slept(wake_ns, now_ns)
+        super().record_wait(wake_ns, now_ns)
 
 
 def traced(config: Path, out: Path, stop: Event) -> None:
-    """The daemon with a tracer, as a process."""
-    with Daemon(load(config)) as daemon:
+    """Run the daemon with a tracer in a process."""
+    with HandtouchDaemon.open(load(config)) as daemon:
         tracer = Tracer(time.monotonic_ns())
-        daemon.report.stages = tracer
+        daemon.reporter.stage_timer = tracer
         over = threading.Event()
 
         def end() -> None:
@@ -184,7 +185,7 @@ def traced(config: Path, out: Path, stop: Event) -> None:
 
 
 class Turn(NamedTuple):
-    """What one turn gave: rows (k, 2) of the SYNC a message is of and when it came, ns, and what else."""
+    """Results of one pass: rows (k, 2) of SYNC time and arrival time of each message [ns], and statistics."""
 
     came_ns: NDArray[np.int64]
     last_frames_ns: NDArray[np.int64]
@@ -192,7 +193,7 @@ class Turn(NamedTuple):
     size: int
 
     def latencies_us(self) -> NDArray[np.float64]:
-        """From the last frame of each SYNC to the message of the tick that took it in."""
+        """Return the latency from the last frame of each SYNC to the message of its tick."""
         sync_ns, got_ns = self.came_ns.T
         which = np.searchsorted(self.last_frames_ns, sync_ns)
         known = which < len(self.last_frames_ns)
@@ -201,7 +202,7 @@ class Turn(NamedTuple):
 
 
 def receive(socket: zmq.Socket[bytes], seconds: float) -> list[tuple[list[bytes], int]]:
-    """What comes within so long, with its time; decoded later: the subscriber is the floor's, too."""
+    """Receive for a time; decode later, as the floor uses the same subscriber."""
     received: list[tuple[list[bytes], int]] = []
     end_ns = time.monotonic_ns() + round(seconds * 1e9)
     now_ns = 0
@@ -213,15 +214,15 @@ def receive(socket: zmq.Socket[bytes], seconds: float) -> list[tuple[list[bytes]
 
 
 def sync_of(parts: list[bytes]) -> int | None:
-    """The SYNC that a message is of; None for one that is there for late joiners."""
+    """Return the SYNC time of a message; None for a retained one."""
     if parts[0] == FLOOR_ID:
         return int.from_bytes(parts[1][:8], "little")
     frame = wire.decode(parts)
-    return None if frame.repeat else frame.t_ns
+    return None if frame.retained else frame.t_ns
 
 
 def wait_for_touch(socket: zmq.Socket[bytes]) -> None:
-    """Until TOUCHED pads are, and for a while longer; a floor is ready when it speaks."""
+    """Wait until TOUCHED pads are touched, and a while longer; the floor is ready with its first message."""
     while True:
         parts = socket.recv_multipart()
         if parts[0] == FLOOR_ID:
@@ -240,7 +241,7 @@ def serve_and_receive(
     server: Callable[[Event], BaseProcess | subprocess.Popen[bytes]],
     seconds: float,
 ) -> Turn:
-    """A turn with this server between nodes and a subscriber."""
+    """Measure one pass with this server between nodes and a subscriber."""
     stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
     worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
     worker.start()
@@ -275,7 +276,7 @@ def serve_and_receive(
 
 
 def losses(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
-    """What went wrong between two answers to `status`."""
+    """Return losses between two replies to `status`."""
 
     def grown(figure: Callable[[dict[str, Any]], int]) -> int:
         return figure(after) - figure(before)
@@ -288,7 +289,7 @@ def losses(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
 
 
 def daemon_turn(config: Path, samples: NDArray[np.int64], seconds: float) -> Turn:
-    """A turn of `handtouch run`."""
+    """Measure one pass of `handtouch run`."""
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
     live = load(config).daemon.live
     return serve_and_receive(config, samples, live, lambda _: subprocess.Popen(command), seconds)
@@ -297,7 +298,7 @@ def daemon_turn(config: Path, samples: NDArray[np.int64], seconds: float) -> Tur
 def floor_turn(
     config: Path, samples: NDArray[np.int64], seconds: float, size: int, priority: int = 0
 ) -> Turn:
-    """A turn of the bare loop, whose messages have so many bytes in all."""
+    """Measure one pass of the bare loop with messages of the given size."""
     endpoint = f"ipc://{config.parent}/floor"
     period_s = load(config).daemon.sync_period_ms * 1e-3
 
@@ -311,7 +312,7 @@ def floor_turn(
 
 
 def where_it_goes(config: Path, samples: NDArray[np.int64], seconds: float) -> dict[str, float]:
-    """Medians, in us, of the parts of the way from the last frame to the subscriber."""
+    """Return the medians [us] of the parts of the latency from the last frame to the subscriber."""
     out = config.parent / "trace.npy"
 
     def server(stop: Event) -> BaseProcess:
@@ -342,19 +343,19 @@ def where_it_goes(config: Path, samples: NDArray[np.int64], seconds: float) -> d
 OPTIONS = {"realtime_priority": PRIORITY, "busy_poll_us": BUSY_POLL_US}
 FIRST = ", ".join(("daemon", *(f"{name} = {value}" for name, value in OPTIONS.items())))
 FLOORS = {"daemon": "floor", FIRST: "floor with that priority"}
-"""What each is compared with."""
+"""Floor that each is compared with"""
 _WAY = histogram.WAIT, histogram.RECEIVE, histogram.TICK, histogram.SEND
 PARTS = (
-    "until the loop turns to the bus",
-    "receiving what waits",
+    "until the loop reads the bus",
+    "receiving the waiting frames",
     "tick",
     "encoding and sending",
-    "until the subscriber has it",
+    "until the subscriber receives it",
 )
 
 
 class ProcessorShare:
-    """Share of one processor that a process takes between `start` and `stop`."""
+    """CPU share of a process between `start` and `stop`, of one CPU."""
 
     def start(self, pid: int) -> None:
         self._pid, self._ticks, self._since_s = pid, self._read(pid), time.monotonic()
@@ -370,18 +371,18 @@ class ProcessorShare:
 
 
 def resident_mb(pid: int) -> float:
-    """Memory of a process that is in RAM."""
+    """Return the resident memory of a process."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * 4096 / 1e6
 
 
 def descriptors(pid: int) -> int:
-    """Open files of a process."""
+    """Return the number of open files of a process."""
     return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def in_own_network() -> None:
-    """Run this program again in a network namespace with multicast over loopback, if one can be had."""
+    """Run this program again in a network namespace with multicast over loopback, if possible."""
     if os.environ.get("HANDTOUCH_BENCH_NETWORK"):
         return
     user = [] if os.geteuid() == 0 else ["--map-root-user"]
@@ -396,7 +397,7 @@ def in_own_network() -> None:
 
 
 def on_loopback(folder: Path, port: int) -> Path:
-    """The shipped hand on a udp_multicast bus, its endpoints in `folder`; path of the deployment."""
+    """Write the shipped hand on a udp_multicast bus with endpoints in `folder`; return the path."""
     endpoints = "\n".join(f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs"))
     own = f'{endpoints}\nstore = "{folder}/calibrations.db"'
     text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{own}\n")
@@ -411,19 +412,19 @@ def on_loopback(folder: Path, port: int) -> Path:
 
 
 def machine() -> str:
-    """Where this was measured."""
+    """Return a description of the machine."""
     where = f"{os.environ['VCAN_RUN']}, " if "VCAN_RUN" in os.environ else ""
     return f"{where}{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
 
 
 def measure(config: Path, turns: int, seconds: float) -> dict[str, Any]:
-    """Turns of daemon and floor, for each way that contacts move."""
+    """Measure daemon and floor alternately, for each motion of the contacts."""
     deployment = load(config)
     films = {name: film(deployment, path) for name, path in PATHS.items()}
     first = config.with_name("first.toml")
     options = "\n".join(f"{name} = {value}" for name, value in OPTIONS.items())
     first.write_text(config.read_text().replace("[daemon]\n", f"[daemon]\n{options}\n"))
-    if troubles := realtime.troubles(load(first).daemon):
+    if troubles := realtime.check_realtime_settings(load(first).daemon):
         print(f"without: {troubles[0]}")
     rows: list[dict[str, Any]] = []
     for number in range(turns):
@@ -453,7 +454,7 @@ def measure(config: Path, turns: int, seconds: float) -> dict[str, Any]:
 
 
 def write(results: dict[str, dict[str, Any]]) -> str:
-    """The page, of one or both buses."""
+    """Return the page, of one or both buses."""
     text = "# Latency: last frame of a SYNC to the subscriber\n" + "".join(map(section, results.values()))
     text += "\nMade by `make bench ONLY=latency`, with SocketCAN under `tests/socketcan/vcan-run`.\n"
     OUT.mkdir(parents=True, exist_ok=True)
@@ -463,7 +464,7 @@ def write(results: dict[str, dict[str, Any]]) -> str:
 
 
 def section(results: dict[str, Any]) -> str:
-    """What was found on one bus."""
+    """Return the section of one bus."""
     rows, ratios = [], []
     for motion in PATHS:
         middle = {}
@@ -490,11 +491,11 @@ def section(results: dict[str, Any]) -> str:
 ## On {results["bus"]}
 
 {results["pads"]} pads at {results["rate_hz"]:.0f} Hz, {TOUCHED} touched; medians of {count}
-turns of {results["seconds"]:.0f} s each, daemon and floor by turns. Nodes, daemon and subscriber are three
-processes, with ZeroMQ over ipc. {results["machine"]};
+passes of {results["seconds"]:.0f} s each, daemon and floor alternately. Nodes, daemon and subscriber are
+three processes, with ZeroMQ over ipc. {results["machine"]};
 load average when it ended {results["load"]:.1f}.
 
-| contacts | | p50, us | p99, us | worst, us | processor share |
+| contacts | | p50, us | p99, us | worst, us | CPU share |
 | --- | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
@@ -505,7 +506,7 @@ same size, and computes nothing:
 
 Of {ticks} ticks of the daemon: {lost} messages lost, {missed} samples missed, {overruns} overruns.
 
-Where the daemon's way goes with sliding contacts, from a turn with a trace (medians of the parts, us):
+Parts of the daemon's latency with sliding contacts, from a traced pass (medians, us):
 
 | part | us |
 | --- | --- |

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from handtouch import shipped, wire
-from handtouch.config import Deployment, load
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.pipeline import Pipeline
-from handtouch.simulate.hand import VirtualHand
+from handtouch import wire
+from handtouch.config import Deployment, load, shipped
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
 from handtouch.simulate.scenario import Scenario
-from handtouch.simulate.score import Score, score
+from handtouch.simulate.score import Score, score_contacts
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
 from handtouch.wire import PadState
 
@@ -41,10 +41,10 @@ class Collector:
     def __init__(self) -> None:
         self.contacts: list[wire.Contact] = []
 
-    def wants(self, topic: str) -> bool:
+    def has_subscriber(self, topic: str) -> bool:
         return topic.startswith("contact/")
 
-    def send(self, message: wire.Outgoing) -> None:
+    def send(self, message: wire.OutgoingMessage) -> None:
         if isinstance(message, wire.Contact):
             self.contacts.append(message)
 
@@ -54,16 +54,16 @@ def play(deployment: Deployment, model: PadModel, scenario: Scenario, world: Wor
     hand = VirtualHand(deployment, scenario, world)
     taken = Collector()
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
-    pipeline = Pipeline(model, period_ns, deployment.daemon.window, taken)
+    pipeline = Pipeline(model, period_ns, deployment.daemon.sample_window_fraction, taken)
     pipeline.node_state[:] = PadState.CLEAR
     truth = []
     for t_ns in range(period_ns, round(scenario.duration_s * 1e9), period_ns):
-        pipeline.begin(t_ns, t_ns)
+        pipeline.begin_cycle(t_ns, t_ns)
         for pad, counts in enumerate(hand.sample(t_ns * 1e-9)):
-            pipeline.slab.write(pad, counts.astype("<i2").tobytes(), t_ns + 1)
-        pipeline.advance(t_ns + period_ns)
+            pipeline.slab.write_pdo(pad, counts.astype("<i2").tobytes(), t_ns + 1)
+        pipeline.tick_if_due(t_ns + period_ns)
         truth += hand.truth(t_ns * 1e-9, t_ns)
-    return score(taken.contacts, truth)
+    return score_contacts(taken.contacts, truth)
 
 
 def line(name: str, scores: list[Score]) -> str:
@@ -76,7 +76,7 @@ def line(name: str, scores: list[Score]) -> str:
         f"| {np.mean(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f}) | {1e6 * mean('median_error_m'):.1f} "
         f"| {1e6 * mean('bias_m'):.1f} | {1e6 * mean('scatter_m'):.0f} | {1e3 * mean('force_rms_n'):.1f} "
         f"| {sum(r.total.touches for r in scores)} | {sum(r.total.missed for r in scores)} "
-        f"| {sum(r.total.invented for r in scores)} |"
+        f"| {sum(r.total.false_positives for r in scores)} |"
     )
 
 
@@ -85,7 +85,7 @@ def write(results: dict[str, list[Score]], samples: int) -> str:
     seeds = len(next(iter(results.values())))
     header = f"| {' | '.join(_COLUMNS)} |"
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    text = f"""# Where, and how hard: the demo's session against its truth
+    text = f"""# Position and force: the demo's session against ground truth
 
 15 pads at 200 Hz, touches 5 % or farther from the edges; {seeds} seeds each, {samples} contact samples a
 seed. Lengths in um, force in mN. {machine}.
@@ -95,7 +95,7 @@ seed. Lengths in um, force in mN. {machine}.
 {rows}
 
 * *bound*: the least rms error that an unbiased estimate can have from each sample's currents and noise
-  (Cramer-Rao). Weak samples, where a touch begins and ends, carry most of both rms; the median tells of the
+  (Cramer-Rao). Weak samples, where a touch begins and ends, carry most of both rms; the median is of the
   rest.
 * *tolerances*: 2 % gain of each channel, 0.2 mm of each gap, 5 % of each resistor, and the contact's size.
   Their *bias* is the mean error of each touch; what noise does to it is the *scatter*.

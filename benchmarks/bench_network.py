@@ -25,9 +25,9 @@ from handtouch.field import (
     ContactLaw,
     Electrode,
     ElectrodeNetwork,
+    ForceEstimateStatus,
     Rectangle,
     Sandwich,
-    Status,
     contact_stack_resistance,
 )
 from handtouch.field.model import ForwardModel
@@ -59,7 +59,7 @@ class Report:
         out.mkdir(parents=True, exist_ok=True)
         machine = f"{platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}, "
         machine += f"scipy {scipy.__version__}"
-        head = ["# Pads as they are built", "", f"Made by `make bench ONLY=network`; {machine}.", ""]
+        head = ["# Pads with real electrodes", "", f"Made by `make bench ONLY=network`; {machine}.", ""]
         (out / "network.md").write_text("\n".join(head + self.page))
         (out / "network.json").write_text(
             json.dumps({"machine": machine, "tables": self.data}, indent=1) + "\n"
@@ -110,7 +110,7 @@ def build(report: Report) -> None:
             )
     report.table(
         "Building a network",
-        "Error: what is missing from 1 and 0 on the electrodes and from an insulated gap (normal over "
+        "Error: deviation from 1 and 0 on the electrodes and from an insulated gap (normal over "
         "tangential slope). Expansion on the electrodes needs 40 (gap 5.6 %) to 400 (1 %) functions each.",
         rows,
     )
@@ -119,13 +119,15 @@ def build(report: Report) -> None:
 def boundary_error(pad: ElectrodeNetwork, gap: float, aspect: float) -> float:
     along = gap + (aspect - 2 * gap) * np.linspace(0.001, 0.999, 201)
     on_side = pad.ideal_fractions(along, np.zeros_like(along)) - np.array([[0.0], [0.0], [1.0], [0.0]])
-    _, slopes = pad.with_series((0.0,) * 4).fractions_with_jacobian(gap * np.linspace(0.02, 0.98, 101), 0.0)
+    _, slopes = pad.with_series_ohm((0.0,) * 4).fractions_with_jacobian(
+        gap * np.linspace(0.02, 0.98, 101), 0.0
+    )
     leak = np.abs(slopes[:, 1]).max() / np.abs(slopes[:, 0]).max()
     return float(max(np.abs(on_side).max(), leak))
 
 
 def gaps(report: Report) -> None:
-    """What gaps change, and what it costs to leave them out."""
+    """Effect of gaps, and the error of neglecting them."""
     steps = np.linspace(0.1, 0.9, 33)
     x, y = np.meshgrid(steps, steps)
     ideal, rows = Rectangle(1.0, 1.0), []
@@ -141,7 +143,7 @@ def gaps(report: Report) -> None:
                 ),
             }
         )
-    report.table("What gaps change", "Square, 10 % and more from the edges.", rows)
+    report.table("Effect of gaps", "Square, 10 % and more from the edges.", rows)
 
 
 def evaluate(report: Report) -> None:
@@ -175,7 +177,7 @@ def weigh(report: Report) -> None:
         current = law.current(force, 5.0, SHEET, 0.017, 50.0)
         both = pair.currents(0.2 * force, 2.5e-3, 5.0, 0.017)
         found = replace(law, radius_std_m=0.0).force(current, 5.0, SHEET, 0.017, 50.0)
-        valid = found.status == Status.VALID
+        valid = found.status == ForceEstimateStatus.VALID
         calls: dict[str, Callable[[], object]] = {
             "eq. 11": lambda c=layer: contact_stack_resistance(SHEET, c, 2.5e-3, 0.017),  # type: ignore[misc]
             "ContactLaw.force": lambda law=law, i=current: law.force(  # type: ignore[misc]
@@ -187,7 +189,7 @@ def weigh(report: Report) -> None:
         row |= {f"{name}, us": microseconds(call, 5)[0] for name, call in calls.items()}
         row["force: worst relative error"] = float(np.abs(found.force_n / force - 1)[valid].max())
         rows.append(row)
-    report.table("Weighing contacts", "The whole call; force by table, without iteration.", rows)
+    report.table("Force of contacts", "The whole call; force by table, without iteration.", rows)
 
 
 def straightness(report: Report) -> None:
@@ -218,7 +220,7 @@ def straightness(report: Report) -> None:
         "The 336 ohm experiment (paper 4.2)",
         "Square of 12.5 cm, gaps of 7 mm, 2.4 kohm per square, 6 V, a plug of 0.5 mm radius with 200 ohm of "
         "contact. Bend: greatest deviation of x_obs from its least-squares line over +-5.5 cm. The paper "
-        "found 3 times straighter, and half the current, which no resistor of this size explains.",
+        "found 3 times straighter, and half the current, which a resistor of this size doesn't explain.",
         rows,
     )
 
@@ -235,7 +237,7 @@ def expected_error(model: ForwardModel, noise: float = 0.01, margin: float = 0.1
 
 
 def noise_cost(report: Report) -> None:
-    """What resistors, gaps, divided sides and anisotropy cost or win in noise."""
+    """Effect of resistors, gaps, divided sides and anisotropy on noise."""
     tenth = 0.1 * SHEET
     cases: list[tuple[str, ForwardModel]] = [
         ("square, ideal", Rectangle(1.0, 1.0)),
@@ -280,7 +282,7 @@ def noise_cost(report: Report) -> None:
         "Expected location error",
         "Cramer-Rao bound of the root of var x + var y, % of the short side; noise of 1 % of the total "
         "on every channel; 10 % of each side left out. G: conductance between neighbours, for one ohm per "
-        "square. It grows without limit as gaps close, and what resistors mix, and so cost, grows with it.",
+        "square. It grows without limit as gaps close, and with it the mixing by resistors, and their cost.",
         rows,
     )
 
@@ -345,7 +347,7 @@ def curved(report: Report) -> None:
             )
     report.table(
         "Curved pads",
-        "Largest difference of a fraction, three places. The shortcut takes the pad for the rectangle of its "
+        "Largest difference of a fraction, three places. The approximation is the rectangle of the pad's "
         "length and its mid-length arc (20 x 17 mm and 13 x 18 mm).",
         rows,
     )

@@ -1,4 +1,4 @@
-"""Measure hardness, shape and texture on simulated contacts; what is hidden isn't told the estimators.
+"""Measure stiffness, shape and texture on simulated contacts with hidden parameters.
 
 Stiffness: squeezes on the shipped hand's 15 pads, whose contacts have radii of their own and whose sheets are
 ideal, S1 or S2, through the daemon's tick; depth with noise of encoders. Shape: touches of objects that lie
@@ -24,23 +24,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from handtouch import shipped
-from handtouch.config import Deployment, load
+from handtouch.config import Deployment, load, shipped
 from handtouch.config.tables import Behaviour
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.pipeline import Pipeline
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
 from handtouch.field import Sandwich
-from handtouch.percept.classify import classify
-from handtouch.percept.parts import made
-from handtouch.percept.primitives import CLASSES, fit
-from handtouch.percept.primitives import Prior as ShapePrior
-from handtouch.percept.spectrum import texture
-from handtouch.percept.stiffness import stiffness, stiffness_from_area
-from handtouch.percept.stream import KINDS, Sample, Stream
+from handtouch.percept.classify import classify_shape
+from handtouch.percept.primitives import SHAPE_CLASSES, fit_primitive
+from handtouch.percept.primitives import ShapePrior as ShapePrior
+from handtouch.percept.registry import build_percept_pipeline
+from handtouch.percept.samples import ContactBuffer, ContactSamples
+from handtouch.percept.spectrum import estimate_texture
+from handtouch.percept.stiffness import estimate_stiffness, estimate_stiffness_from_area
 from handtouch.sheet import S1, S2, SheetModel
-from handtouch.simulate.hand import VirtualHand
-from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
+from handtouch.wire import PERCEPT_KINDS
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -64,11 +65,11 @@ SLIDE, MODULATION, PATH_M = 512, 0.02, 2e-6
 
 
 class Silent:
-    """Nobody subscribes."""
+    """Publisher without subscribers."""
 
     subscriptions: frozenset[bytes] = frozenset()
 
-    def wants(self, topic: str) -> bool:  # noqa: ARG002
+    def has_subscriber(self, topic: str) -> bool:  # noqa: ARG002
         return False
 
     def send(self, message: Any) -> None:
@@ -78,7 +79,7 @@ class Silent:
 def squeezes(links: list[str]) -> Scenario:
     """Every pad pressed with 1 N, squeezed to 4 N and let go, `PRESSES` times."""
     touches = [
-        Touch(
+        ScenarioTouch(
             link=link,
             from_s=0.5 + number * (SQUEEZE_S + PAUSE_S),
             duration_s=SQUEEZE_S,
@@ -92,8 +93,8 @@ def squeezes(links: list[str]) -> Scenario:
     return Scenario(touch=tuple(touches))
 
 
-def felt(deployment: Deployment, world: World) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Times, true forces, forces and deviations (ticks, pads) as the daemon's tick tells them."""
+def play(deployment: Deployment, world: World) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Times, true forces, forces and deviations (ticks, pads) as published by the daemon's tick."""
     model = PadModel(deployment)
     scenario = squeezes(model.links)
     hand = VirtualHand(deployment, scenario, world)
@@ -101,22 +102,22 @@ def felt(deployment: Deployment, world: World) -> tuple[FloatArray, FloatArray, 
     counts = np.stack([hand.counts(row, times) for row in range(model.size)], axis=1).astype("<i2")
     pipeline = Pipeline(model, PERIOD_NS, 0.6, Silent())
     pipeline.node_state[:] = 0
-    told = np.full((2, len(times), model.size), np.nan)
+    estimates = np.full((2, len(times), model.size), np.nan)
     for number in range(len(times)):
         t_ns = 10**9 + number * PERIOD_NS
-        pipeline.begin(t_ns, t_ns)
+        pipeline.begin_cycle(t_ns, t_ns)
         for pad in range(model.size):
-            pipeline.slab.write(pad, counts[number, pad].tobytes(), t_ns + 1000)
-        if pipeline.advance(t_ns + 2000) is None:
-            pipeline.advance(t_ns + PERIOD_NS - 1)
+            pipeline.slab.write_pdo(pad, counts[number, pad].tobytes(), t_ns + 1000)
+        if pipeline.tick_if_due(t_ns + 2000) is None:
+            pipeline.tick_if_due(t_ns + PERIOD_NS - 1)
         touching = pipeline.tick.contacts.touching
         columns = pipeline.tick.columns
-        told[0, number] = np.where(touching, columns.force_n, np.nan)
-        told[1, number] = np.where(touching, columns.force_std_n, np.nan)
+        estimates[0, number] = np.where(touching, columns.force_n, np.nan)
+        estimates[1, number] = np.where(touching, columns.force_std_n, np.nan)
     truth = np.zeros((len(times), model.size))
     for touch in scenario.touches:
         truth[:, model.links.index(touch.link)] += touch.forces(times)
-    return times, truth, told[0], told[1]
+    return times, truth, estimates[0], estimates[1]
 
 
 def stiffnesses(seeds: int) -> Rows:
@@ -130,10 +131,10 @@ def stiffnesses(seeds: int) -> Rows:
                 behaviour = Behaviour(preset="S2" if name == "S2" else "S1")
                 sheets = {k: s.model_copy(update={"behaviour": behaviour}) for k, s in plain.sheets.items()}
                 deployment = plain.model_copy(update={"sheets": sheets})
-            runs = [felt(deployment, World(seed, sheet=sheet)) for seed in range(101, 101 + seeds)]
+            runs = [play(deployment, World(seed, sheet=sheet)) for seed in range(101, 101 + seeds)]
             for k in STIFFNESSES:
                 rows.append(
-                    {"sheet": name, "compensated": compensated, "k": float(k), **judged(runs, float(k))}
+                    {"sheet": name, "compensated": compensated, "k": float(k), **assess(runs, float(k))}
                 )
             print(
                 name,
@@ -144,7 +145,7 @@ def stiffnesses(seeds: int) -> Rows:
     return rows
 
 
-def judged(runs: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]], k: float) -> dict[str, Any]:
+def assess(runs: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]], k: float) -> dict[str, Any]:
     """Objects with stiffness k at 2 N, springs and spheres in turn."""
     chance = np.random.default_rng((101, int(k)))
     errors, held, known, widths, scales = [], 0, 0, [], []
@@ -156,16 +157,16 @@ def judged(runs: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]], k:
                 p = (1.0, 1.5)[(pad + press) % 2]
                 c = (k / (p * 2.0 ** (1 - 1 / p))) ** p
                 depth = (truth[at, pad] / c) ** (1 / p) + ENCODER_M * chance.normal(size=len(at))
-                found = stiffness(force[at, pad], depth, std[at, pad])
+                found = estimate_stiffness(force[at, pad], depth, std[at, pad])
                 if not found.samples:
                     errors.append(math.nan)
                     continue
-                real = k * (found.force_n / 2.0) ** (1 - 1 / p)
+                real = k * (found.at_force_n / 2.0) ** (1 - 1 / p)
                 known += found.state == "estimated"
                 held += found.low_n_per_m <= real <= found.high_n_per_m
                 errors.append(math.log(found.stiffness_n_per_m / real))
                 widths.append(math.log(found.high_n_per_m / found.low_n_per_m) / 2)
-                scales.append(found.scale_std)
+                scales.append(found.common_relative_std)
     n = len(errors)
     return {
         "squeezes": n,
@@ -205,7 +206,7 @@ def areas(seeds: int) -> dict[str, Any]:
     for k in STIFFNESSES:
         for known, log_std in ((True, 0.05), (False, 0.7)):
             chance = np.random.default_rng((7, int(k)))
-            errors, held, widths, told = [], 0, [], 0
+            errors, held, widths, estimates = [], 0, [], 0
             for _ in range(seeds):
                 radius = OBJECT_M * math.exp((0.05 if known else 0.7) * chance.normal())
                 reduced = math.sqrt(k**3 / (6 * radius * 2.0))  # Hertz: dF/dd = k at 2 N
@@ -231,13 +232,13 @@ def areas(seeds: int) -> dict[str, Any]:
                 good = np.isfinite(std).all(axis=1)
                 if np.count_nonzero(good) < 16:
                     continue
-                found = stiffness_from_area(
+                found = estimate_stiffness_from_area(
                     read.force_n[good], read.radius_m[good], std[good].mean(axis=0), OBJECT_M, log_std
                 )
                 if not found.stiffness_n_per_m > 0:
                     continue
-                truth = k * (found.force_n / 2.0) ** (1 / 3)
-                told += found.state == "estimated"
+                truth = k * (found.at_force_n / 2.0) ** (1 / 3)
+                estimates += found.state == "estimated"
                 errors.append(math.log(found.stiffness_n_per_m / truth))
                 held += found.low_n_per_m <= truth <= found.high_n_per_m
                 widths.append(math.log(found.high_n_per_m / found.low_n_per_m) / 2)
@@ -247,7 +248,7 @@ def areas(seeds: int) -> dict[str, Any]:
                     "k": float(k),
                     "radius_known": known,
                     "answered": n / seeds,
-                    "estimated": told / seeds,
+                    "estimated": estimates / seeds,
                     "error": float(np.sqrt(np.mean(np.square(errors)))) if n else math.nan,
                     "coverage": held / n if n else math.nan,
                     "half_width": float(np.median(widths)) if n else math.nan,
@@ -300,7 +301,7 @@ def plain(points: FloatArray) -> dict[str, tuple[float, float]]:
     away = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(away)
     if len(points) < 3:
-        return dict.fromkeys(CLASSES, (0.0, math.nan))
+        return dict.fromkeys(SHAPE_CLASSES, (0.0, math.nan))
 
     def sphere(v: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.norm(away - v[:3], axis=1) - v[3])
@@ -327,24 +328,26 @@ def shapes(objects: int) -> dict[str, Any]:
     """Confusion by contacts, and errors of radii, of the classifier and of plain least squares."""
     found: dict[str, Any] = {}
     for n in CONTACTS:
-        table = {kind: dict.fromkeys((*CLASSES, "not enough yet", "none"), 0) for kind in CLASSES}
-        by_points = {kind: dict.fromkeys(CLASSES, 0) for kind in CLASSES}
+        table = {kind: dict.fromkeys((*SHAPE_CLASSES, "not enough yet", "none"), 0) for kind in SHAPE_CLASSES}
+        by_points = {kind: dict.fromkeys(SHAPE_CLASSES, 0) for kind in SHAPE_CLASSES}
         sizes: dict[str, list[float]] = {"cylinder": [], "sphere": []}
         scores: list[float] = []
         others: dict[str, list[float]] = {"cylinder": [], "sphere": []}
-        for kind in CLASSES:
+        for kind in SHAPE_CLASSES:
             chance = np.random.default_rng((n, *kind.encode()))
             for _ in range(objects):
                 points, normals, covariances, radius = touched(kind, n, chance)
-                told = classify(points, normals, covariances)
-                answer = {"unestimated": "not enough yet", "invalid": "none"}.get(told.state, told.label)
+                estimates = classify_shape(points, normals, covariances)
+                answer = {"undetermined": "not enough yet", "invalid": "none"}.get(
+                    estimates.state, estimates.label
+                )
                 table[kind][answer] += 1
                 fits = plain(points)
                 by_points[kind][min(fits, key=lambda name: fits[name][0]) if n > 2 else "flat"] += 1
                 if kind in sizes:
-                    own = told.fits[kind]
+                    own = estimates.fits[kind]
                     others[kind].append(abs(fits[kind][1] / radius - 1))
-                    if told.label == kind:
+                    if estimates.label == kind:
                         sizes[kind].append(abs(own.radius_m / radius - 1))
                         scores.append((own.radius_m - radius) / own.radius_std_m)
         found[str(n)] = {
@@ -387,7 +390,7 @@ def textures(name: str, seeds: int, speeds: tuple[float, ...], rates: tuple[floa
                     "speed_m_per_s": speed,
                     "rate_hz": rate,
                     "nyquist_m": nyquist,
-                    "finest_m": min(good, default=math.nan),
+                    "min_period_m": min(good, default=math.nan),
                     "share": share.tolist(),
                 }
             )
@@ -396,7 +399,7 @@ def textures(name: str, seeds: int, speeds: tuple[float, ...], rates: tuple[floa
 
 
 def found_right(current: FloatArray, way: FloatArray, period: float) -> bool:
-    found = texture(current, way)
+    found = estimate_texture(current, way)
     return found.label == "periodic" and abs(found.period_m / period - 1) < 0.02
 
 
@@ -421,7 +424,7 @@ def slid(
         way = speed * np.linspace(0, lasts, steps)
         force = 1 + MODULATION * np.sin(2 * np.pi * way / period + chance.uniform(0, 6))
         touches.append(
-            Touch(
+            ScenarioTouch(
                 link=link,
                 from_s=begins[-1],
                 duration_s=lasts + 2 * ramp,
@@ -454,44 +457,46 @@ def costs(repeats: int) -> dict[str, float]:
     current = 1e-3 * (1 + 0.01 * np.sin(way / 1e-4) + 1e-3 * chance.normal(size=512))
     contacts = {n: touched("cylinder", n, chance)[:3] for n in (20, 100)}
     found = {
-        "stiffness of a squeeze of 512 samples": each(lambda: stiffness(force, depth, 0.1 * force), repeats),
-        "texture of a slide of 512 samples": each(lambda: texture(current, way), repeats),
+        "stiffness of a squeeze of 512 samples": each(
+            lambda: estimate_stiffness(force, depth, 0.1 * force), repeats
+        ),
+        "texture of a slide of 512 samples": each(lambda: estimate_texture(current, way), repeats),
     }
     for n, rows in contacts.items():
-        for name in CLASSES:
+        for name in SHAPE_CLASSES:
             call = f"shape: {name}, {n} contacts, all steps"
-            found[call] = each(partial(fit, name, *rows, ShapePrior()), repeats)
+            found[call] = each(partial(fit_primitive, name, *rows, ShapePrior()), repeats)
     return found
 
 
 def ticks(kind: str, seconds: float) -> dict[str, float]:
     """Microseconds a tick of one part with 15 contacts at 200 Hz, with a slow fit and without."""
     pads, chance = np.arange(15), np.random.default_rng(2)
-    perceiver = made(Stream(15), PERIOD_NS)
-    wanted = np.zeros((len(KINDS), 15), dtype=np.bool_)
-    wanted[KINDS.index(kind)] = True
-    perceiver.want(wanted, np.zeros(15, dtype=np.bool_))
+    perceiver = build_percept_pipeline(ContactBuffer(15), PERIOD_NS)
+    requested = np.zeros((len(PERCEPT_KINDS), 15), dtype=np.bool_)
+    requested[PERCEPT_KINDS.index(kind)] = True
+    perceiver.set_requested(requested, np.zeros(15, dtype=np.bool_))
     angle = np.linspace(0, 2 * np.pi, 15, endpoint=False)
     facing = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     none, took, fitted = np.zeros(0, np.intp), [], []
     for number in range(round(seconds * RATE_HZ)):
         t_ns, t_s = 10**9 + number * PERIOD_NS, number / RATE_HZ
-        sample = Sample(pads, np.full(15, t_ns), np.full(15, 5, np.uint32))
+        sample = ContactSamples(pads, np.full(15, t_ns), np.full(15, 5, np.uint32))
         place = 1e-5 * chance.normal(size=(15, 2)) + 1e-3 * t_s * (kind == "texture")
         on_link = np.concatenate([place, np.zeros((15, 1))], axis=1)
         force = 1.5 + math.sin(3 * t_s) + 0.01 * chance.normal(size=15)
         sample["pad_m"], sample["position_m"], sample["force_n"] = place, on_link, force
         sample["pad_noise_m2"] = np.tile(1e-10 * np.eye(2), (15, 1, 1))
         sample["covariance_m2"] = sample["palm_covariance_m2"] = np.tile(1e-8 * np.eye(3), (15, 1, 1))
-        sample["force_std_n"], sample["current_a"] = 0.1 * force, 1e-3 * force
+        sample["force_std_n"], sample["total_current_a"] = 0.1 * force, 1e-3 * force
         sample["residual"], sample["residual_std"] = 1e-3 * chance.normal(size=15), np.full(15, 1e-3)
         sample["palm_rotation"] = np.tile(np.eye(3), (15, 1, 1))
         spread = 0.02 * facing - 2e-3 * math.sin(3 * t_s) * facing
         sample["palm_position_m"] = spread + on_link + 1e-2 * t_s * (kind == "shape") * np.array([0, 0, 1.0])
         sample["palm_normal"], sample["normal"] = -facing, -facing
-        fits, begun_s = perceiver.fits, time.perf_counter()
-        perceiver.step(sample, none, t_ns)
-        fitted.append(perceiver.fits > fits)
+        fits, begun_s = perceiver.fit_count, time.perf_counter()
+        perceiver.process_tick(sample, none, t_ns)
+        fitted.append(perceiver.fit_count > fits)
         took.append(1e6 * (time.perf_counter() - begun_s))
     late = np.array(took[len(took) // 3 :])
     with_fit = np.array(fitted[len(took) // 3 :])
@@ -539,10 +544,10 @@ def drawn(found: dict[str, Any], path: Path) -> None:
         (0.2, "plain", "#8a8a8a", "least squares of points: right"),
     ):
         total = [sum(sum(row.values()) for row in shape[str(n)][key].values()) for n in CONTACTS]
-        right = [sum(shape[str(n)][key][k][k] for k in CLASSES) for n in CONTACTS]
+        right = [sum(shape[str(n)][key][k][k] for k in SHAPE_CLASSES) for n in CONTACTS]
         axes[1, 0].bar(at + offset, np.divide(right, total), 0.38, color=colour, label=label)
-    yet = [sum(shape[str(n)]["table"][k]["not enough yet"] for k in CLASSES) for n in CONTACTS]
-    right = [sum(shape[str(n)]["table"][k][k] for k in CLASSES) for n in CONTACTS]
+    yet = [sum(shape[str(n)]["table"][k]["not enough yet"] for k in SHAPE_CLASSES) for n in CONTACTS]
+    right = [sum(shape[str(n)]["table"][k][k] for k in SHAPE_CLASSES) for n in CONTACTS]
     total = [sum(sum(row.values()) for row in shape[str(n)]["table"].values()) for n in CONTACTS]
     axes[1, 0].bar(
         at - 0.2,
@@ -564,10 +569,10 @@ def drawn(found: dict[str, Any], path: Path) -> None:
         speed = [1e3 * row["speed_m_per_s"] for row in rows]
         colour = plt.get_cmap("viridis")(number / 3.5)
         axes[1, 1].loglog(speed, [1e3 * r["nyquist_m"] for r in rows], ls=":", color=colour)
-        finest = [1e3 * row["finest_m"] for row in rows]
+        finest = [1e3 * row["min_period_m"] for row in rows]
         axes[1, 1].loglog(speed, finest, marker="o", ms=4, color=colour, label=f"{rate:.0f} Hz")
         for shift, (name, marker) in ((1.06, ("S1", "^")), (1.12, ("S2", "s"))):
-            finest = [1e3 * row["finest_m"] for row in sheets[name]]
+            finest = [1e3 * row["min_period_m"] for row in sheets[name]]
             at_speed = [shift * 1e3 * row["speed_m_per_s"] for row in sheets[name]]
             axes[1, 1].loglog(at_speed, finest, marker, ms=4, color=colour, mfc="none")
     axes[1, 1].set(xlabel="slip speed, mm/s", ylabel="finest period found, mm")
@@ -583,7 +588,7 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
-def told(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> str:
     """The page."""
     stiff = table(
         ["sheet", "forces", "stiffness, N/mm", "median error", "rms error", "half of the 95 % interval",
@@ -598,10 +603,10 @@ def told(found: dict[str, Any]) -> str:
     parts = []
     for n in CONTACTS:
         one = found["shape"][str(n)]
-        columns = [*CLASSES, "not enough yet", "none"]
+        columns = [*SHAPE_CLASSES, "not enough yet", "none"]
         rows = [
             [kind, *(str(one["table"][kind][c]) for c in columns), str(one["plain"][kind][kind])]
-            for kind in CLASSES
+            for kind in SHAPE_CLASSES
         ]
         sizes = ", ".join(
             f"{k} {100 * v:.1f} %"
@@ -613,7 +618,7 @@ def told(found: dict[str, Any]) -> str:
         )
         inside = f"; {100 * one['within_95']:.0f} % within 1.96 deviations" if one["within_95"] else ""
         parts.append(
-            f"{n} contacts. Median error of radii: {sizes or 'none told'}{inside}; least squares:"
+            f"{n} contacts. Median error of radii: {sizes or 'none'}{inside}; least squares:"
             f" {plain_sizes or 'none'}.\n\n" + table(["is", *columns, "right by least squares"], rows)
         )
     waves = table(
@@ -624,8 +629,8 @@ def told(found: dict[str, Any]) -> str:
                 f"{1e3 * r['speed_m_per_s']:.0f}",
                 f"{r['rate_hz']:.0f}",
                 f"{1e3 * r['nyquist_m']:.3g}",
-                f"{1e3 * r['finest_m']:.3g}" if math.isfinite(r["finest_m"]) else "none",
-                f"{r['finest_m'] / r['nyquist_m']:.2f}" if math.isfinite(r["finest_m"]) else "",
+                f"{1e3 * r['min_period_m']:.3g}" if math.isfinite(r["min_period_m"]) else "none",
+                f"{r['min_period_m'] / r['nyquist_m']:.2f}" if math.isfinite(r["min_period_m"]) else "",
             ]
             for r in found["texture"]
         ],
@@ -679,48 +684,48 @@ def told(found: dict[str, Any]) -> str:
 
 
 HEAD = """\
-# Hardness, shape and texture
+# Stiffness, shape and texture
 
-`make bench ONLY=percept`: seeded simulation; the estimators aren't told noise, tolerances, contact radii,
+`make bench ONLY=percept`: seeded simulation; the estimators don't know noise, tolerances, contact radii,
 sheets. On {system}, Python {python}, numpy {numpy}.
 
 ![Stiffness, shape and texture](percept.png)"""
 STIFF = """\
-Seeds that nothing was tuned on. Squeezes from 1 to 4 N and back in 1.9 s at 200 Hz on 15 pads; 120 squeezes a
+Seeds not used for tuning. Squeezes from 1 to 4 N and back in 1.9 s at 200 Hz on 15 pads; 120 squeezes a
 row, half of the objects springs, half spheres; depths with 10 um of noise. A contact's radius is 20 % off
 what the law assumes (1 sigma), which is most of the deviation on the ideal sheet, and S1 and S2 read 7 and
-17 % differently from press to press: no compensation undoes either, both are in the interval. What
-compensation undoes is creep: without it the interval doesn't hold the truth as often as it says. Errors are
+17 % differently from press to press: neither can be compensated, both are in the interval. Compensation
+removes creep: without it the interval contains ground truth less often than stated. Errors are
 of the logarithm."""
 SHAPE = """\
 40 objects of each class. Touches spread over the object (cylinder and sphere over 140 degrees), radii 6
-to 45 mm, places off by 0.2 to 1 mm, pads askew by 0.03 rad each way, normals by 0.06. A class counts as
-told from a probability of 0.9. Least squares: each class fitted to the points alone, the least root mean
-square is taken, from one start each; with less than three contacts it says flat."""
+to 45 mm, position errors of 0.2 to 1 mm, pads tilted by 0.03 rad per axis, normals by 0.06. A label needs a
+probability of 0.9. Least squares: each class fitted to the points alone from one start each, the class of
+least root mean square; with fewer than three contacts it returns flat."""
 WAVES = """\
-A sine of 2 % in a force of 1 N, 512 samples at even speed, ways with 2 um of noise;
-finest: found within 2 % in at least 4 of 5 slides, as are all coarser ones that were tried (steps of 10 to
-50 %). The contact presses as a whole: that its own size averages over what is finer than it isn't
-simulated, and is what limits a real pad. At 5 mm/s and 1 kHz a sample is 5 um after the last: there the
-noise of the way breaks the slide into pieces (the daemon takes a mean of five ways; here they are as they
-come)."""
+A sine of 2 % in a force of 1 N, 512 samples at even speed, distances with 2 um of noise;
+finest: found within 2 % in at least 4 of 5 slides, as are all coarser periods tried (steps of 10 to
+50 %). The contact presses as a whole: averaging over its own size, which limits real pads, isn't
+simulated. At 5 mm/s and 1 kHz samples are 5 um apart: there the
+noise of the distance breaks the slide into pieces (the daemon averages five distances; here they are
+raw)."""
 AREA = """\
-Without joint states, area has to stand for depth. One sheet gives one total current, and what is left over
-of its four currents tells how long a contact is, not how large. These forces give the same current of a
+Without joint states, area must replace depth. One sheet gives one total current, and the residual
+of its four currents measures a contact's elongation, not its size. These forces give the same current of a
 single sheet (eqs. 9 to 12, 2 N on the middle disc):"""
 AREAS = """\
-Two sheets of one sandwich, alphas of 0.6 and 1.8, tell both. Round objects of 12 mm radius (known within 5 %,
-or within a factor of 2), pressed from 0.5 to 4 N; the sheets' layers, alphas and resistances are each 2 %
-(1 sigma) off what the estimator takes them for. Answered: the sandwich had a force and a radius for the
-currents; harder objects make contacts too small for these sheets, softer ones too large. A daemon has one
-sheet a pad: this is for who reads two."""
+Two sheets of one sandwich, alphas of 0.6 and 1.8, measure both. Round objects of 12 mm radius (known within
+5 %, or within a factor of 2), pressed from 0.5 to 4 N; the sheets' layers, alphas and resistances are each
+2 % (1 sigma) off the estimator's values. Answered: the sandwich had a force and a radius for the
+currents; harder objects make contacts too small for these sheets, softer ones too large. The daemon has one
+sheet per pad: this is for hardware that reads two."""
 TICKS = """\
-One part at a time, 15 contacts at 200 Hz with joint states: wall time of a tick's perception, with a slow
-fit and without; 10 % quantiles, for the cores were shared and full. What nobody wants isn't called and costs
-nothing: a test."""
+One estimator at a time, 15 contacts at 200 Hz with joint states: wall time of a tick's percepts, with a slow
+fit and without; 10 % quantiles, because the cores were shared and full. Percepts without
+subscriber aren't called and cost nothing, as a test shows."""
 COST = """\
-Processor time, median of calls by themselves. Perception does one of these in 10 ms at most, and of a
-shape's fit two steps at a time (a class takes 6 to 26); none of it while nobody wants it."""
+Processor time, median of calls by themselves. At most one of these runs in 10 ms, and of a
+shape's fit two steps at a time (a class takes 6 to 26); none of it without a subscriber."""
 
 
 def main() -> None:
@@ -743,11 +748,11 @@ def main() -> None:
                 textures(name, 1, SPEEDS[::2], RATES[::2]) if quick else textures(name, 5, SPEEDS, RATES)
             )
         ],
-        "ticks_us": {kind: ticks(kind, 2.0 if quick else 10.0) for kind in KINDS},
+        "ticks_us": {kind: ticks(kind, 2.0 if quick else 10.0) for kind in PERCEPT_KINDS},
         "cost_us": costs(10 if quick else 50),
     }
     (out / "percept.json").write_text(json.dumps(found, indent=1).replace("NaN", "null") + "\n")
-    (out / "percept.md").write_text(told(found))
+    (out / "percept.md").write_text(report(found))
     drawn(found, out / "percept.png")
     print(f"written to {out}")
 

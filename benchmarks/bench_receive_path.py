@@ -1,10 +1,10 @@
-"""What a received frame costs: `Port.drain` against a bare receive-and-store loop on the same interface.
+"""Cost of a received frame: `Port.drain` against a bare receive-and-store loop on the same interface.
 
-For in-process buses and udp_multicast, or, where there is a vcan0, SocketCAN. Bursts of samples are put on
-the bus, then the time is taken until the last one is in the slab (in-process: processor time, from when they
-are put into the bus's queue). The bare loop reads with the
-cheapest call there is for the interface, looks the slot up and stores data and arrival time: no counting, no
-checks, no routes. Both run in turns. Writes docs/benchmarks/receive_path.{md,json}.
+For in-process buses and udp_multicast or, with a vcan0, SocketCAN. Bursts of samples are sent on the bus, and
+the time until the last one is in the slab is measured (in-process: processor time, from putting them into the
+bus's queue). The bare loop reads with the cheapest call for the interface, looks up the slot and stores data
+and arrival time, without counters, checks or routes. Both run alternately. Writes
+docs/benchmarks/receive_path.{md,json}.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ import can
 
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.receivers import grow_receive_buffer
-from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Bus
+from handtouch.core.slab import Slab
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PADS, BURST, TURNS = 15, 400, 100
@@ -39,20 +39,20 @@ FRAME = struct.Struct("=IB3x8s")
 
 
 def store(slab: Slab) -> Callable[[int, bytes | bytearray], None]:
-    """The bare loop's store: slot of the identifier, data, arrival."""
+    """Return the bare loop's store function: slot of the identifier, data, arrival."""
     slots = dict.fromkeys(range(ID0, ID0 + PADS), 0) | {ID0 + slot: slot for slot in range(PADS)}
-    data_of, t_ns_of, clock = memoryview(bytearray(8 * PADS)), slab.t_ns.data, time.monotonic_ns
+    data_view, arrival_ns, clock = memoryview(bytearray(8 * PADS)), slab.arrival_ns.data, time.monotonic_ns
 
     def keep(can_id: int, data: bytes | bytearray) -> None:
         slot = slots[can_id]
-        data_of[8 * slot : 8 * slot + 8] = data
-        t_ns_of[slot] = clock()
+        data_view[8 * slot : 8 * slot + 8] = data
+        arrival_ns[slot] = clock()
 
     return keep
 
 
 def bare_recv(bus: can.BusABC, slab: Slab) -> int:
-    """Read with python-can's `recv` until nothing waits; frames read."""
+    """Read with python-can's `recv` until no frame is waiting; return the frames read."""
     keep, recv, count = store(slab), bus.recv, 0
     while (message := recv(0)) is not None:
         keep(message.arbitration_id, message.data)
@@ -61,7 +61,7 @@ def bare_recv(bus: can.BusABC, slab: Slab) -> int:
 
 
 def bare_socket(bus: can.BusABC, slab: Slab) -> int:
-    """Read from SocketCAN's socket, without time stamps, until nothing waits; frames read."""
+    """Read from SocketCAN's socket, without stamps, until it is empty; return the frames read."""
     sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketcanBus has it
     keep, recv, unpack, count = store(slab), sock.recv, FRAME.unpack, 0
     while True:
@@ -74,7 +74,7 @@ def bare_socket(bus: can.BusABC, slab: Slab) -> int:
 
 
 def fill(bus: can.BusABC) -> None:
-    """One burst, as fast as it goes."""
+    """Send one burst at full speed."""
     for number in range(BURST):
         data = number.to_bytes(2, "little") * 4
         bus.send(can.Message(arbitration_id=ID0 + number % PADS, data=data, is_extended_id=False))
@@ -90,7 +90,7 @@ def drained(port: Port) -> None:
 
 
 def in_process() -> dict[str, Any]:
-    """Putting frames into the receiver's queue is part of both; the copies that `send` makes, of neither."""
+    """Measure in-process buses: both include queueing the frames, but not the copies that `send` makes."""
     messages = [
         can.Message(arbitration_id=ID0 + n % PADS, data=bytes(8), is_extended_id=False) for n in range(BURST)
     ]
@@ -117,7 +117,7 @@ def in_process() -> dict[str, Any]:
 
 
 def put(bus: Any, messages: list[can.Message]) -> None:
-    """Into an in-process bus's own queue."""
+    """Put messages into an in-process bus's own queue."""
     for message in messages:
         bus.queue.put(message)
 
@@ -125,7 +125,7 @@ def put(bus: Any, messages: list[can.Message]) -> None:
 def over_socket(
     name: str, interface: str, channel: str, bare_loop: Callable[[can.BusABC, Slab], int]
 ) -> dict[str, Any]:
-    """Both receivers are open all the time and each gets every frame."""
+    """Measure a socket interface; both receivers stay open and each receives every frame."""
     slab = Slab(PADS)
     bare, port_us = [], []
     sender = can.Bus(interface=interface, channel=channel)
@@ -138,7 +138,7 @@ def over_socket(
         fill(sender)
         bare.append(cost(lambda: check(bare_loop(bus, slab))))
         port_us.append(cost(lambda: drained(port)))
-        while sender.recv(0) is not None:  # udp_multicast gives back what was sent
+        while sender.recv(0) is not None:  # udp_multicast echoes sent frames
             pass
     port.close()
     bus.shutdown()
@@ -157,19 +157,19 @@ def route(port: Port) -> None:
 
 
 def cost(work: Callable[[], object], clock: Callable[[], int] = time.perf_counter_ns) -> float:
-    """Time of a burst, microseconds a frame."""
+    """Return the time of a burst in microseconds per frame."""
     start = clock()
     work()
     return (clock() - start) / BURST / 1e3
 
 
 def summary(name: str, bare: list[float], port: list[float]) -> dict[str, Any]:
-    where = os.environ.get("VCAN_RUN", "host")
+    host = os.environ.get("VCAN_RUN", "host")
     row = {
         "interface": name,
         "bare_us": round(statistics.median(bare), 3),
         "port_us": round(statistics.median(port), 3),
-        "machine": f"{where}, {platform.machine()}, Python {platform.python_version()}",
+        "machine": f"{host}, {platform.machine()}, Python {platform.python_version()}",
         "ratio": round(statistics.median(port) / statistics.median(bare), 3),
     }
     print(f"{name:14} bare {row['bare_us']:6.2f} us  port {row['port_us']:6.2f} us  ratio {row['ratio']:.2f}")
@@ -177,7 +177,7 @@ def summary(name: str, bare: list[float], port: list[float]) -> dict[str, Any]:
 
 
 def report(rows: list[dict[str, Any]]) -> None:
-    """Add to what earlier runs, on other interfaces, have left."""
+    """Add the rows to those of earlier runs on other interfaces."""
     OUT.mkdir(parents=True, exist_ok=True)
     path = OUT / "receive_path.json"
     kept = json.loads(path.read_text())["rows"] if path.exists() else []
@@ -185,12 +185,12 @@ def report(rows: list[dict[str, Any]]) -> None:
     rows = [row for row in kept if row["interface"] not in names] + rows
     path.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     lines = [
-        "# What a received frame costs",
+        "# Cost of a received frame",
         "",
         "`Port.drain` against a bare receive-and-store loop on the same interface, in the same run; medians.",
         "Made by `benchmarks/bench_receive_path.py`; under `tests/socketcan/vcan-run` it measures SocketCAN.",
         "",
-        "| interface | bare, us | port, us | ratio | on |",
+        "| interface | bare, us | port, us | ratio | machine |",
         "|---|---|---|---|---|",
     ]
     lines += ["| {interface} | {bare_us} | {port_us} | {ratio} | {machine} |".format(**row) for row in rows]
@@ -198,7 +198,7 @@ def report(rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """In a network namespace of its own, but for SocketCAN."""
+    """Run in a network namespace of its own, except for SocketCAN."""
     if VCAN.exists():
         report([over_socket("socketcan", "socketcan", "vcan0", bare_socket)])
         return

@@ -1,9 +1,9 @@
-"""What does recording cost the daemon and the machine, how much disk does it take, how fast is replay?
+"""Cost of recording: processor time of daemon and recorder, disk space, losses; speed of replay.
 
 The daemon's pipeline and its two streams at 500 Hz with 15 pads, fed with the counts of a simulated hand as
 from a bus; the recorder is the real `handtouch record`, a process of its own, and every recording is replayed
-by `handtouch replay`, which must give the same contacts bit for bit. All is told per tick, in processor time
-and bytes, which others on the machine hardly change. Writes docs/benchmarks/record.{md,json}.
+by `handtouch replay`, which must give equal contacts bit for bit. Results are processor time and bytes per
+tick, which depend little on other load of the machine. Writes docs/benchmarks/record.{md,json}.
 """
 
 from __future__ import annotations
@@ -25,27 +25,29 @@ import zmq
 from bench_latency import OUT, PATHS, machine
 from numpy.typing import NDArray
 
-from handtouch import shipped, wire
-from handtouch.config import Deployment, load
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.pipeline import Pipeline
+from handtouch import wire
+from handtouch.config import Deployment, load, shipped
+from handtouch.config.files import deployment_files
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.publisher import Publisher
-from handtouch.simulate.hand import VirtualHand
+from handtouch.host.build import build_info
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
 from handtouch.wire import PadState
 
 RATE_HZ = 500
 PERIOD_NS = 1_000_000_000 // RATE_HZ
 FILM_S = 2.0
-MODES: dict[str, list[str] | None] = {"nobody": None, "record": [], "record --hand": ["--hand"]}
-"""Who listens -> options of the recorder, None: no recorder."""
+MODES: dict[str, list[str] | None] = {"none": None, "record": [], "record --hand": ["--hand"]}
+"""Subscriber -> options of the recorder, None: no recorder."""
 SERVICE_TICKS = RATE_HZ // 2
 _START_S = 2.0
 
 
 def film(deployment: Deployment, touched: int) -> NDArray[np.int64]:
-    """Counts (k, pads, 4), a sample each 5 ms: contacts slide on so many pads."""
+    """Return counts (k, pads, 4), a sample each 5 ms, of contacts sliding on some pads."""
     links = [pad.link for hand in deployment.hands for pad in hand.pads]
     touches = "\n".join(
         f'[[touch]]\nlink = "{link}"\nfrom_s = 0\nduration_s = {FILM_S + 1}\nramp_s = 0.4\nforce_n = [1.5]\n'
@@ -58,22 +60,23 @@ def film(deployment: Deployment, touched: int) -> NDArray[np.int64]:
 
 
 class Loop:
-    """The daemon's loop without a bus: `run` it for so long; what its thread took of a processor."""
+    """The daemon's loop without a bus; `run` returns the processor time of its thread."""
 
     def __init__(self, deployment: Deployment, samples: NDArray[np.int64], folder: Path) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
-        self.publisher = Publisher(self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
-        self.pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.6, self.publisher, self.publisher.run)
+        self.publisher = Publisher.open(self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
+        self.pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.6, self.publisher, self.publisher.session)
         self.pipeline.node_state[:] = PadState.CLEAR
-        self.publisher.present.update(self.pipeline.messages.present())
-        self.publisher.present.update(self.pipeline.journal.present())
-        self.pipeline.journal.serve(deployment, time.monotonic_ns())
+        self.publisher.retained_messages.update(self.pipeline.messages.retained_messages())
+        self.publisher.retained_messages.update(self.pipeline.journal.retained_messages())
+        files = deployment_files(deployment)
+        self.pipeline.journal.publish_config(deployment, files, build_info(), time.monotonic_ns())
         self._hands = {hand.name: [pad.link for pad in hand.pads] for hand in deployment.hands}
-        self._told = 0
+        self._service_seq = 0
         self._film = [[row.astype("<i2").tobytes() for row in sample] for sample in samples]
 
     def run(self, seconds: float) -> float:
-        """Tick at RATE_HZ for so many seconds' worth of ticks; processor seconds of the thread per tick."""
+        """Tick at RATE_HZ for some seconds; return the processor time of the thread per tick [s]."""
         pipeline, publisher = self.pipeline, self.publisher
         next_ns = time.monotonic_ns()
         busy_s, ticks = time.thread_time(), round(seconds * RATE_HZ)
@@ -81,34 +84,51 @@ class Loop:
             next_ns = max(next_ns + PERIOD_NS, time.monotonic_ns() - PERIOD_NS)
             time.sleep(max(0.0, (next_ns - time.monotonic_ns()) * 1e-9))
             now_ns = time.monotonic_ns()
-            pipeline.begin(now_ns, now_ns)
+            pipeline.begin_cycle(now_ns, now_ns)
             for pad, data in enumerate(self._film[pipeline.ticks % len(self._film)]):
-                pipeline.slab.write(pad, data, now_ns + 1)
-            pipeline.advance(now_ns + 2)
-            pipeline.settle()
-            publisher.take_subscriptions(now_ns)
+                pipeline.slab.write_pdo(pad, data, now_ns + 1)
+            pipeline.tick_if_due(now_ns + 2)
+            pipeline.prepare_next_tick()
+            publisher.poll_subscriptions(now_ns)
             if pipeline.ticks % SERVICE_TICKS == 1:
                 publisher.send(self._service(now_ns))
         return (time.thread_time() - busy_s) / ticks
 
     def close(self) -> None:
-        """Give the endpoints back."""
+        """Close the endpoints."""
         self.publisher.close()
         self._context.term()
 
     def _service(self, now_ns: int) -> wire.Service:
-        self._told += 1
+        self._service_seq += 1
         return wire.Service(
-            v=wire.SCHEMA_VERSION, run=self.publisher.run, seq=self._told, t_ns=now_ns,
-            wall_offset_ns=time.time_ns() - time.monotonic_ns(), version="", pid=0, uptime_s=0.0,
-            period_s=1 / RATE_HZ, hands=self._hands, ticks=self.pipeline.ticks, overruns=0, rate_hz=RATE_HZ,
-            tick_us={}, loop={}, contacts=self.pipeline.tick.contacts.begun, refused={}, process={}, buses={},
-            drops=dict(self.publisher.drops), subscriptions=(), repeat=False,
-        )  # fmt: skip
+            v=wire.SCHEMA_VERSION,
+            session=self.publisher.session,
+            seq=self._service_seq,
+            t_ns=now_ns,
+            wall_offset_ns=time.time_ns() - time.monotonic_ns(),
+            version="",
+            pid=0,
+            uptime_s=0.0,
+            period_s=1 / RATE_HZ,
+            hands=self._hands,
+            ticks=self.pipeline.ticks,
+            overruns=0,
+            rate_hz=RATE_HZ,
+            tick_us={},
+            loop={},
+            contacts=self.pipeline.tick.contacts.begun_count,
+            rejected={},
+            process={},
+            buses={},
+            drops=dict(self.publisher.drops),
+            subscriptions=(),
+            retained=False,
+        )
 
 
 def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> dict[str, Any]:
-    """Record for so long; what it took, what was lost, and how the replay went."""
+    """Record for some seconds and replay; return cost, losses and equality."""
     out = folder / f"{time.monotonic_ns()}.mcap"
     command = [sys.executable, "-m", "handtouch"]
     endpoint = ["--endpoint", f"ipc://{folder}/complete"]
@@ -120,17 +140,17 @@ def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> di
     loop.run(1.0)
     size, busy_s = out.stat().st_size, processor_s(process.pid)
     loop_s = loop.run(seconds)
-    time.sleep(1.2)  # what waits is written once a second
+    time.sleep(1.2)  # the recorder writes once a second
     size, busy_s = out.stat().st_size - size, processor_s(process.pid) - busy_s
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    _, summary = process.communicate(timeout=60)
     report = folder / "report.json"
     before_s = os.times().children_user + os.times().children_system
     replayed = subprocess.run(
         [*command, "replay", str(out), "--report", str(report)], capture_output=True, text=True, check=False
     )
     if not report.exists():
-        raise RuntimeError(f"replay: {replayed.stderr}\nrecord: {told}")
+        raise RuntimeError(f"replay: {replayed.stderr}\nrecord: {summary}")
     took_s = os.times().children_user + os.times().children_system - before_s
     result = json.loads(report.read_text())
     out.unlink()
@@ -139,23 +159,23 @@ def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> di
         "recorder_us": 1e6 * busy_s / (seconds * RATE_HZ),
         "ticks_hz": result["ticks"] / result["seconds"],
         "mb_per_minute": size / seconds * 60 / 1e6,
-        "lost": sum(map(int, re.findall(r"(\d+) messages of \S+ were lost", told))),
+        "lost": sum(map(int, re.findall(r"\S+: (\d+) messages lost", summary))),
         "drops": loop.publisher.drops["complete"],
         "status": process.returncode,
         "compared": result["compared"],
-        "same": result["same"],
+        "equal": result["equal"],
         "replay_times_real": result["ticks"] / RATE_HZ / took_s,
     }
 
 
 def processor_s(pid: int) -> float:
-    """Processor time of a process so far."""
+    """Return the processor time of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measure(touched: list[int], turns: int, seconds: float) -> list[dict[str, Any]]:
-    """All cases, so many times."""
+    """Measure all cases, `turns` times."""
     deployment = load(shipped.path("utah_mit.toml"))
     rows = []
     for count in touched:
@@ -165,7 +185,7 @@ def measure(touched: list[int], turns: int, seconds: float) -> list[dict[str, An
             loop.run(1.0)
             for turn in range(turns):
                 for mode, options in MODES.items():
-                    row: dict[str, Any] = {"touched": count, "listener": mode, "turn": turn}
+                    row: dict[str, Any] = {"touched": count, "subscriber": mode, "turn": turn}
                     if options is None:
                         row["loop_us"] = 1e6 * loop.run(seconds)
                     else:
@@ -181,16 +201,16 @@ def _median(rows: list[dict[str, Any]], key: str) -> float:
 
 
 def write(results: dict[str, Any]) -> str:
-    """The page."""
+    """Write the page and return it."""
     rows = results["rows"]
-    alone = {(row["touched"], row["turn"]): row["loop_us"] for row in rows if row["listener"] == "nobody"}
+    baseline = {(row["touched"], row["turn"]): row["loop_us"] for row in rows if row["subscriber"] == "none"}
     for row in rows:
-        row["to_alone"] = row["loop_us"] / alone[row["touched"], row["turn"]]
+        row["relative"] = row["loop_us"] / baseline[row["touched"], row["turn"]]
     lines = []
     for count in sorted({row["touched"] for row in results["rows"]}):
         for mode in MODES:
-            of_case = [r for r in rows if (r["touched"], r["listener"]) == (count, mode)]
-            ratio = _median(of_case, "to_alone")
+            of_case = [r for r in rows if (r["touched"], r["subscriber"]) == (count, mode)]
+            ratio = _median(of_case, "relative")
             line = f"| {count} | {mode} | {_median(of_case, 'loop_us'):.0f} | {ratio:.2f} "
             if MODES[mode] is None:
                 lines.append(f"{line}| | | | | | |")
@@ -199,7 +219,7 @@ def write(results: dict[str, Any]) -> str:
             lines.append(
                 f"{line}| {recorder_us:.0f} | {recorder_us * RATE_HZ / 1e6:.0%} "
                 f"| {_median(of_case, 'mb_per_minute'):.1f} | {sum(r['lost'] + r['drops'] for r in of_case)} "
-                f"| {sum(r['same'] for r in of_case)} of {sum(r['compared'] for r in of_case)} "
+                f"| {sum(r['equal'] for r in of_case)} of {sum(r['compared'] for r in of_case)} "
                 f"| {_median(of_case, 'replay_times_real'):.1f} |"
             )
     turns = 1 + max(row["turn"] for row in rows)
@@ -209,17 +229,17 @@ A hand of 15 pads at {RATE_HZ} Hz, of which some are touched by sliding contacts
 {results["seconds"]:.0f} s each.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
-| touched | listener | loop, us a tick | of nobody's | recorder, us a tick | its share | MB/min | lost \
-| same | replay, times real |
+| touched | subscriber | loop, us a tick | relative | recorder, us a tick | of a core | MB/min | lost \
+| equal | replay, times real |
 | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
 {chr(10).join(lines)}
 
 * *loop* is the daemon's pipeline and streams fed with counts, without a bus: processor time of its thread.
-  Where nobody listens it computes no places and forces and encodes nothing, most of the difference.
+  *relative*: to that without subscriber, which computes no positions and forces and encodes nothing.
 * *recorder* is `handtouch record`, a process of its own: its processor time for each tick of the daemon, and
-  what that is of a core at {RATE_HZ} Hz. MB (10^6 bytes) are of the file on disk, compressed with zstd.
-* *lost* are gaps that the recorder saw and messages that the daemon's queue did not take.
-* Every recording is replayed: contact messages that came out the *same* to the last bit, of all; and recorded
+  as a fraction of a core at {RATE_HZ} Hz. MB (10^6 bytes) are of the file on disk, compressed with zstd.
+* *lost*: messages missing in the recorder, and messages dropped by the daemon's queue.
+* Every recording is replayed: contact messages that are *equal* bit for bit, of all; and recorded
   time over the processor time of `handtouch replay`, start and model included (some {_START_S:.0f} s).
 
 `make bench ONLY=record` measures this again.
@@ -231,17 +251,19 @@ A hand of 15 pads at {RATE_HZ} Hz, of which some are touched by sliding contacts
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=6.0, help="of a case")
+    parser.add_argument("--seconds", type=float, default=6.0, help="duration of a case")
     parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--touched", type=int, nargs="+", default=[1, 5, 15], help="pads that are touched")
-    parser.add_argument("--trial", action="store_true", help="a turn of 2 s, 5 touched; writes nothing")
-    asked = parser.parse_args()
+    parser.add_argument(
+        "--trial", action="store_true", help="one turn of 2 s with 5 touched pads; writes no file"
+    )
+    args = parser.parse_args()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if asked.trial:
+    if args.trial:
         measure([5], 1, 2.0)
         return
-    rows = measure(asked.touched, asked.turns, asked.seconds)
-    print(write({"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]}))
+    rows = measure(args.touched, args.turns, args.seconds)
+    print(write({"rows": rows, "seconds": args.seconds, "machine": machine(), "load": os.getloadavg()[0]}))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Measure the models of real sheets: what they reproduce of the paper's experiments, and what they cost.
+"""Measure the sheet models: agreement with the paper's experiments, compensation, cost.
 
 Prints its tables and writes docs/benchmarks/sheet.md, sheet.json and sheet.png.
 """
@@ -21,19 +21,19 @@ import numpy as np
 import numpy.typing as npt
 
 from handtouch.sheet import (
-    GRAM_FORCE,
+    GRAM_FORCE_N,
     S1,
     S1_BENCH,
     S2,
     S2_BENCH,
-    Bench,
-    Compensator,
+    BenchCircuit,
     Creep,
-    Doubt,
     Fluctuation,
+    ParameterUncertainty,
     PrandtlIshlinskii,
+    SheetCompensator,
     SheetModel,
-    SheetState,
+    SheetModelState,
 )
 
 matplotlib.use("Agg")
@@ -46,7 +46,10 @@ Rows = list[dict[str, Any]]
 ROOT = Path(__file__).parent.parent
 HALF_CYCLE_S = 5.0  # 6 per minute, as long down as up
 NIGHT_S = 36_000.0
-S1_RUNS, S2_RUNS = (2075,) * 4, (3434, 3433, 3433)  # 8300 and 10 300 cycles, a night's rest between
+S1_RUNS, S2_RUNS = (
+    (2075,) * 4,
+    (3434, 3433, 3433),
+)  # 8300 and 10 300 cycles, a night without potential between
 PADS, DT_S, BATCH, BATCHES = 60, 1e-3, 200, 60
 FULL_N, LOOP = 5.0, 0.1
 INK, FAINT, ACCENT = "#1a1a1a", "#8a8a8a", "#1f6fb4"
@@ -56,9 +59,9 @@ def calm(model: SheetModel) -> SheetModel:
     return replace(model, fluctuation=Fluctuation())
 
 
-def cycle(model: SheetModel, state: SheetState, gf: float, count: int) -> FloatArray:
-    """Apparent loads (count,) of one pad at the end of each press of a weight."""
-    half, load = model.at(HALF_CYCLE_S), np.full(1, gf * GRAM_FORCE)
+def cycle(model: SheetModel, state: SheetModelState, gf: float, count: int) -> FloatArray:
+    """Return apparent loads (count,) of one pad at the end of each press of a weight."""
+    half, load = model.discretise(HALF_CYCLE_S), np.full(1, gf * GRAM_FORCE_N)
     peaks = np.empty(count)
     for i in range(count):
         peaks[i] = half.forward(state, load)[0]
@@ -66,24 +69,24 @@ def cycle(model: SheetModel, state: SheetState, gf: float, count: int) -> FloatA
     return peaks
 
 
-def runs(model: SheetModel, bench: Bench, counts: tuple[int, ...]) -> list[FloatArray]:
-    """Peak currents [A] of 300 gf, run by run, a night without potential between them."""
-    state, currents = model.start(1, seed=7), []
+def runs(model: SheetModel, bench: BenchCircuit, counts: tuple[int, ...]) -> list[FloatArray]:
+    """Return peak currents [A] of 300 gf, run by run, with a night without potential between them."""
+    state, currents = model.initial_state(1, seed=7), []
     for count in counts:
         currents.append(bench.current(cycle(model, state, 300, count)))
-        model.at(NIGHT_S).forward(state, 0.0, powered=False)
+        model.discretise(NIGHT_S).forward(state, 0.0, powered=False)
     return currents
 
 
-# What the paper saw
+# Observations of the paper
 
 
 def experiments() -> Rows:
-    """The rows of the paper's sections 4.3 and 4.4 against the models."""
+    """Return the rows of the paper's sections 4.3 and 4.4 with the models' values."""
     rows: Rows = []
 
     def row(*cells: str) -> None:
-        rows.append(dict(zip(("seen", "paper", "S1", "S2", "how"), cells, strict=True)))
+        rows.append(dict(zip(("observation", "paper", "S1", "S2", "how"), cells, strict=True)))
 
     sheets = ((S1, S1_BENCH, S1_RUNS), (S2, S2_BENCH, S2_RUNS))
     row("threshold", "2 gf, 5 gf", *(f"{threshold(calm(m)):.2g} gf" for m, _, _ in sheets), "set")
@@ -94,46 +97,48 @@ def experiments() -> Rows:
     last = [f"{d[0][-1] / d[0][0]:.3f} of the first" for d in decays]
     row("300 gf, end of the first run", "0 and about 1/4", *last, "fitted")
     lasts = [[int(np.argmax(r < 0.27 * r[0])) for r in d] for d in decays]
-    told = [", ".join(map(str, found)) for found in lasts]
-    row("cycles to 27 %, run by run", "sooner each time; as before", *told, "set")
-    rested = [f"{d[1][0] / d[0][0]:.3f} of the first" for d in decays]
-    row("after 10 h without potential", "original state", *rested, "set")
+    cycles = [", ".join(map(str, found)) for found in lasts]
+    row("cycles to 27 %, run by run", "sooner each time; as before", *cycles, "set")
+    recovered = [f"{d[1][0] / d[0][0]:.3f} of the first" for d in decays]
+    row("after 10 h without potential", "original state", *recovered, "set")
     varied = [f"{variety(calm(m), b):.2f} of the first" for m, b, _ in sheets]
     row("after 30 various weights", "initial condition", *varied, "follows")
     added, back = history()
-    row("+ 200 gf on a silent 300 gf", "exactly that of 200 gf", f"{added:.3f} of it", "", "chosen")
-    row("the 200 gf taken off", "currents observed again", f"{back:.3f} of the first", "", "chosen")
+    row("+ 200 gf on an adapted 300 gf", "exactly that of 200 gf", f"{added:.3f} of it", "", "chosen")
+    row("the 200 gf removed", "currents observed again", f"{back:.3f} of the first", "", "chosen")
     return rows
 
 
 def threshold(model: SheetModel) -> float:
     gf = np.arange(0.5, 8, 0.05)
-    felt = model.at(HALF_CYCLE_S).forward(model.start(len(gf)), gf * GRAM_FORCE)
-    return float(gf[felt > 0][0])
+    effective = model.discretise(HALF_CYCLE_S).forward(model.initial_state(len(gf)), gf * GRAM_FORCE_N)
+    return float(gf[effective > 0][0])
 
 
-def rise(model: SheetModel, bench: Bench) -> str:
-    state, step = model.start(1), model.at(0.01)
-    current = np.array([bench.current(step.forward(state, 300 * GRAM_FORCE))[0] for _ in range(500)])
+def rise(model: SheetModel, bench: BenchCircuit) -> str:
+    state, step = model.initial_state(1), model.discretise(0.01)
+    current = np.array([bench.current(step.forward(state, 300 * GRAM_FORCE_N))[0] for _ in range(500)])
     share = current / current[-1]
     return f"{100 * share[0]:.0f} % at once, 98 % at {0.01 * np.argmax(share > 0.98):.2f} s"
 
 
 def release(model: SheetModel) -> str:
-    state = model.start(1)
-    model.at(HALF_CYCLE_S).forward(state, 3.0)
-    left = float(model.at(1e-3).forward(state, 0.0)[0])
+    state = model.initial_state(1)
+    model.discretise(HALF_CYCLE_S).forward(state, 3.0)
+    left = float(model.discretise(1e-3).forward(state, 0.0)[0])
     return f"{left:g} left after 1 ms"
 
 
-def spread(model: SheetModel, bench: Bench) -> str:
-    current = bench.current(model.at(HALF_CYCLE_S).forward(model.start(20_000, seed=2), 300 * GRAM_FORCE))
+def spread(model: SheetModel, bench: BenchCircuit) -> str:
+    current = bench.current(
+        model.discretise(HALF_CYCLE_S).forward(model.initial_state(20_000, seed=2), 300 * GRAM_FORCE_N)
+    )
     return f"{100 * current.std() / current.mean():.1f} %"
 
 
-def variety(model: SheetModel, bench: Bench) -> float:
-    """Current of 300 gf after it was worn out and 30 weights of 10 to 500 gf; median of 20 draws."""
-    worn = model.start(1)
+def variety(model: SheetModel, bench: BenchCircuit) -> float:
+    """Return the current of 300 gf after adaptation to it and 30 weights of 10 to 500 gf; median of 20."""
+    worn = model.initial_state(1)
     first = bench.current(cycle(model, worn, 300, 8300))[0]
     found = []
     for seed in range(20):
@@ -145,35 +150,40 @@ def variety(model: SheetModel, bench: Bench) -> float:
 
 
 def history() -> tuple[float, float]:
-    """Currents of S1 with 200 gf added, and off again, over those of fresh 200 and 300 gf."""
-    model, state = calm(S1), calm(S1).start(1)
+    """Return currents of S1 with 200 gf added and removed, over those of fresh 200 and 300 gf."""
+    model, state = calm(S1), calm(S1).initial_state(1)
     cycle(model, state, 300, 8300)
-    fresh = [S1_BENCH.current(cycle(model, model.start(1), gf, 1))[0] for gf in (200, 300)]
+    fresh = [S1_BENCH.current(cycle(model, model.initial_state(1), gf, 1))[0] for gf in (200, 300)]
     added = S1_BENCH.current(cycle(model, state, 500, 2000))[0]
     back = S1_BENCH.current(cycle(model, state, 300, 2))[1]
     return float(added / fresh[0]), float(back / fresh[1])
 
 
-# What compensation leaves
+# Residual errors of compensation
 
 
 def loops() -> Rows:
-    """Width of a loop 0 - 5 N - 0 at half load, in % of 5 N, one minute up and down."""
-    model = replace(calm(S1), hysteresis=PrandtlIshlinskii.of_loop(LOOP, FULL_N), creep=Creep.power_law(0.05))
+    """Return the width of a loop 0 - 5 N - 0 at half load, in % of 5 N, one minute up and down."""
+    model = replace(
+        calm(S1), hysteresis=PrandtlIshlinskii.from_width(LOOP, FULL_N), creep=Creep.power_law(0.05)
+    )
     wrong = replace(
         model,
-        hysteresis=PrandtlIshlinskii.of_loop(0.8 * LOOP, FULL_N),
+        hysteresis=PrandtlIshlinskii.from_width(0.8 * LOOP, FULL_N),
         creep=Creep.power_law(0.04),
         adaptation=replace(S1.adaptation, time_s=3750.0),
     )
     rows = []
-    for name, known in (("every number known", model), ("hysteresis, creep and adaptation 20 % low", wrong)):
-        state, compensator = model.start(1), Compensator(known, 1)
+    for name, known in (
+        ("all parameters known", model),
+        ("hysteresis, creep and adaptation 20 % low", wrong),
+    ):
+        state, compensator = model.initial_state(1), SheetCompensator(known, 1)
         load = np.concatenate([np.linspace(0, FULL_N, 601), np.linspace(FULL_N, 0, 601)[1:]])
         apparent, found, stated = np.empty((3, len(load)))
         for i, value in enumerate(load):
-            reading = model.at(0.1).forward(state, np.full(1, value))
-            apparent[i], found[i] = reading[0], compensator.step(reading, 0.1)[0]
+            reading = model.discretise(0.1).forward(state, np.full(1, value))
+            apparent[i], found[i] = reading[0], compensator.compensate(reading, 0.1)[0]
             stated[i] = compensator.std_n()[0]
         rows.append(
             {
@@ -189,7 +199,7 @@ def loops() -> Rows:
 
 
 def percent(value_n: npt.ArrayLike) -> float:
-    """The greatest of some differences, of full scale."""
+    """Return the greatest difference, in % of full scale."""
     return float(np.abs(value_n).max() / FULL_N * 100)
 
 
@@ -205,13 +215,13 @@ def prony() -> Rows:
     ]
 
 
-# What it costs
+# Cost
 
 
 def costs() -> Rows:
     rng = np.random.default_rng(1)
     load = rng.uniform(0.5, 5, PADS) * (rng.random(PADS) < 0.5)
-    looped = replace(S1, hysteresis=PrandtlIshlinskii.of_loop(LOOP, FULL_N))
+    looped = replace(S1, hysteresis=PrandtlIshlinskii.from_width(LOOP, FULL_N))
     power = replace(looped, creep=Creep.power_law(0.05))
     rows: Rows = []
     for name, model in (
@@ -219,14 +229,14 @@ def costs() -> Rows:
         ("S1 + hysteresis of 6 plays", looped),
         ("S1 + hysteresis + power-law creep, 7 modes", power),
     ):
-        exact, held = Compensator(model, PADS), Compensator(model, PADS, settle_s=0.1)
-        step, state = model.at(DT_S), model.start(PADS)
+        exact, held = SheetCompensator(model, PADS), SheetCompensator(model, PADS, update_period_s=0.1)
+        step, state = model.discretise(DT_S), model.initial_state(PADS)
         rows.append(
             {
                 "model": name,
                 "forward": timed(partial(step.forward, state, load)),
-                "inverse, exact": timed(partial(exact.step, load, DT_S)),
-                "inverse, settling each 0.1 s": timed(partial(held.step, load, DT_S)),
+                "inverse, exact": timed(partial(exact.compensate, load, DT_S)),
+                "inverse, updated every 0.1 s": timed(partial(held.compensate, load, DT_S)),
                 "std of 60": timed(held.std_n),
                 "std of 8": timed(partial(held.std_n, np.arange(8))),
             }
@@ -235,7 +245,7 @@ def costs() -> Rows:
 
 
 def timed(call: Callable[[], object]) -> str:
-    """Median and least processor time over batches, in us."""
+    """Return median and least processor time over batches, in us."""
     found = []
     for _ in range(BATCHES):
         start = time.process_time()
@@ -265,15 +275,15 @@ def draw(path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def label(axis: Axes, title: str, words: str, **names: Any) -> None:
+def label(axis: Axes, title: str, text: str, **names: Any) -> None:
     axis.set_title(title, loc="left", color=INK)
     axis.set(**names)
-    axis.text(0.02, 0.985, words, transform=axis.transAxes, va="top", fontsize=8, style="italic", color=FAINT)
+    axis.text(0.02, 0.985, text, transform=axis.transAxes, va="top", fontsize=8, style="italic", color=FAINT)
     axis.set_ylim(0, 1.35 * axis.get_ylim()[1])
 
 
 def draw_runs(
-    axis: Axes, title: str, model: SheetModel, bench: Bench, counts: tuple[int, ...], words: str
+    axis: Axes, title: str, model: SheetModel, bench: BenchCircuit, counts: tuple[int, ...], words: str
 ) -> None:
     start = 0
     for number, current in enumerate(runs(model, bench, counts)):
@@ -283,13 +293,13 @@ def draw_runs(
         axis.plot(start + np.arange(len(current)), 1e3 * current, ".", ms=1.2, color=ACCENT)
         start += len(current)
         if model is S2:
-            quarter = 250 * float(bench.current(300 * GRAM_FORCE))
+            quarter = 250 * float(bench.current(300 * GRAM_FORCE_N))
             axis.plot([start - len(current), start], [quarter] * 2, color=INK, lw=0.8)
     label(axis, title, words, xlabel="cycle", ylabel="peak current, mA")
 
 
 def draw_history(axis: Axes) -> None:
-    model, state, start = S1, S1.start(1, seed=9), 0
+    model, state, start = S1, S1.initial_state(1, seed=9), 0
     cycle(model, state, 300, 7900)
     for gf, count in ((300, 400), (500, 1200), (300, 1000)):
         current = 1e3 * S1_BENCH.current(cycle(model, state, gf, count))
@@ -298,11 +308,11 @@ def draw_history(axis: Axes) -> None:
         axis.axvline(start, ymax=0.84, color=FAINT, lw=0.8, ls=":")
         start += count
     for gf in (200, 300):
-        fresh = 1e3 * float(S1_BENCH.current(gf * GRAM_FORCE))
+        fresh = 1e3 * float(S1_BENCH.current(gf * GRAM_FORCE_N))
         axis.axhline(fresh, color=INK, lw=0.8)
         axis.text(start, fresh, f"fresh {gf} gf", ha="right", va="bottom", fontsize=8, color=INK)
     label(
-        axis, "S1 once silent: 200 gf added, taken off",
+        axis, "S1 adapted to 300 gf: 200 gf added, removed",
         "paper: “applying an extra 200 gms gave exactly the signal expected for 200\n"
         "gms (and this also decayed); removing the 200 gm weight caused currents\n"
         "to be observed again for the 300 gms”",
@@ -313,8 +323,8 @@ def draw_history(axis: Axes) -> None:
 def draw_press(axis: Axes) -> None:
     t = np.arange(0, 8, 0.005)
     for name, model, bench, colour in (("S1", S1, S1_BENCH, ACCENT), ("S2", S2, S2_BENCH, INK)):
-        state, step = model.start(1, seed=4), model.at(0.005)
-        load = np.where((t % 4 >= 1) & (t % 4 < 3), 300 * GRAM_FORCE, 0.0)
+        state, step = model.initial_state(1, seed=4), model.discretise(0.005)
+        load = np.where((t % 4 >= 1) & (t % 4 < 3), 300 * GRAM_FORCE_N, 0.0)
         current = np.array([bench.current(step.forward(state, np.full(1, f)))[0] for f in load])
         axis.plot(t, 1e3 * current, color=colour, lw=1, label=name)
     axis.legend(frameon=False, loc="center")
@@ -342,17 +352,17 @@ def main() -> None:
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
     tables = {
-        "What the paper saw": (
-            "Without fluctuation but in the row of 5 %. *set*: a parameter is that number; *fitted*: a "
+        "Observations of the paper": (
+            "Without fluctuation, except in the row of 5 %. *set*: a parameter is that number; *fitted*: a "
             "parameter was chosen to give it; *chosen*: a rule of the "
             "model was; *follows*: nothing was chosen for it. The paper gives no decay "
             "times and no split into runs: these are ours.",
             experiments(),
         ),
-        "What compensation leaves": (
+        "Residual errors of compensation": (
             "S1 with a loop of 10 % and power-law creep (exponent 0.05), 0 to 5 N and back in two minutes, "
             "without fluctuation; % of 5 N. The worst error of a known sheet is at the end, where the "
-            "load is less than the back force and not felt. Stated: with the default doubt.",
+            "load is less than the back force, without response. Stated: with the default uncertainty.",
             loops(),
         ),
         "Power law as a sum of exponentials": (
@@ -361,11 +371,11 @@ def main() -> None:
         ),
         "Cost of a step of 60 pads": (
             f"Half of them touched, {DT_S:g} s; processor time in us, median of {BATCHES} batches (least). "
-            "Aim: 10 us for what a tick needs, on a machine by itself.",
+            "Aim: 10 us for a tick's part, on an idle machine.",
             costs(),
         ),
     }
-    page = ["# How sheets misbehave", "", f"Made by `make bench ONLY=sheet`; {machine}.", ""]
+    page = ["# Sheet behaviour", "", f"Made by `make bench ONLY=sheet`; {machine}.", ""]
     page += ["![the paper's experiments](sheet.png)", ""]
     for title, (note, rows) in tables.items():
         page += table(title, note, rows)
@@ -373,7 +383,7 @@ def main() -> None:
     (out / "sheet.md").write_text("\n".join(page))
     record = {
         "machine": machine,
-        "doubt": repr(Doubt()),
+        "uncertainty": repr(ParameterUncertainty()),
         "tables": {t: rows for t, (_, rows) in tables.items()},
     }
     (out / "sheet.json").write_text(json.dumps(record, indent=1) + "\n")

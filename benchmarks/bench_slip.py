@@ -1,4 +1,4 @@
-"""Measure how soon a slip is told and how often a firm grip is taken for one; and what force alone tells.
+"""Measure latency and false positives of slip detection, and of detection by force alone.
 
 Prints its tables and writes docs/benchmarks/slip.md, slip.json and slip.png. `--quick` does a tenth of it.
 """
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from slip_runs import DEPLOYMENT, ROOT, Record, pads_of, run
 
 from handtouch.sheet import S1, S2
-from handtouch.simulate.grip import Grip
+from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.world import World
 
 matplotlib.use("Agg")
@@ -68,9 +68,9 @@ def hold(world: World, hz: float, seconds: float) -> Record:
     return run(grips, world, hz, seconds)
 
 
-def grip(number: int, from_s: float, seconds: float, force_n: float, seed: int, **slip: float) -> Grip:
+def grip(number: int, from_s: float, seconds: float, force_n: float, seed: int, **slip: float) -> GripTouch:
     link, size_mm = PADS[number]
-    return Grip(
+    return GripTouch(
         link=link,
         size_mm=size_mm,
         from_s=from_s + GRIPPED_S,
@@ -117,10 +117,10 @@ def latency_s(value: FloatArray, threshold: float, t_s: FloatArray) -> float:
 
 
 def bound_s(record: Record, pad: int, mm_per_s: float) -> float:
-    """When a ramp of known onset, speed and direction, in tremor as modelled, would be told in the mean: as
+    """Mean detection time of a ramp of known onset, speed and direction, in tremor as modelled: as
     ln of its likelihood ratio reaches the threshold's (G. Lorden 1971); inf: not in half a second."""
     ages, information = (of[pad] for of in record.information)
-    enough = 0.5 * (1e-3 * mm_per_s) ** 2 * information >= math.log(record.per_alarm)
+    enough = 0.5 * (1e-3 * mm_per_s) ** 2 * information >= math.log(record.samples_per_false_alarm)
     return float(ages[enough].min()) if enough.any() else math.inf
 
 
@@ -149,17 +149,17 @@ def measure(quick: bool) -> dict[str, Any]:
     cases = [("ideal", 200.0), ("S1", 200.0), ("S2", 200.0), ("ideal", 500.0), ("S1", 500.0), ("S1", 1000.0)]
     for name, hz in cases[: 1 if quick else None]:
         made, firm = slip_all(WORLDS[name], hz, repeats), hold(WORLDS[name], hz, min(seconds, 2e4 / hz))
-        told = firm.running & ~np.vstack([firm.running[:1], firm.running[:-1]])
+        alarms = firm.running & ~np.vstack([firm.running[:1], firm.running[:-1]])
         lasting = firm.t_s > GRIPPED_S + 1.0
-        minutes = told.shape[1] * float(firm.t_s[-1] - GRIPPED_S - 1.0) / 60
-        early = int(told[~lasting].sum())
+        minutes = alarms.shape[1] * float(firm.t_s[-1] - GRIPPED_S - 1.0) / 60
+        early = int(alarms[~lasting].sum())
         results["false"].append(
             {
                 "sheet": name,
                 "hz": hz,
                 "contact_minutes": minutes,
-                "alarms": int(told[lasting].sum()),
-                "per_min": float(told[lasting].sum()) / minutes,
+                "alarms": int(alarms[lasting].sum()),
+                "per_min": float(alarms[lasting].sum()) / minutes,
                 "first_second": early,
             }
         )
@@ -322,11 +322,11 @@ def report(results: dict[str, Any]) -> str:
     ]  # fmt: skip
     return f"""# Slip: latency and false alarms
 
-Simulated Utah/MIT hand, 15 pads at once, through the daemon's own pipeline and perception; channel noise of
-1 count, tolerances of all parts, sheets (`ideal`, `S1`, `S2`) that the daemon isn't told. A grip trembles:
+Simulated Utah/MIT hand, 15 pads at once, through the daemon's own pipeline and percepts; channel noise of
+1 count, tolerances of all parts, sheets (`ideal`, `S1`, `S2`) unknown to the daemon. A grip has tremor:
 10 % ripple of force and 15 um of sway, both of eight tones from 1 to 10 Hz, and the centroid rolls 0.1 mm a
-newton. In half of the slips the force stays as it was, in half it falls to 70 % within 20 ms. The test was
-tuned on other hands, with other grips, than those measured here. Made by
+newton. In half of the slips the force stays constant, in half it falls to 70 % within 20 ms. The test was
+tuned on hands and grips other than those measured here. Made by
 `benchmarks/bench_slip.py` on {platform.machine()}, Python {platform.python_version()}, {os.cpu_count()}
 shared cores.
 
@@ -336,15 +336,15 @@ shared cores.
 
 Sequential test at a stated mean time between false alarms of 600 s. Found: within {LATEST_S:g} s. *Bound*:
 when ln of the likelihood ratio of a slip of known onset, speed and direction would reach the threshold in
-the mean (Lorden), with the information that the test itself has of tremor and noise. The test knows none of
-the three, and counts with creep and tremor that aren't as modelled: slow slips pay for that.
+the mean (Lorden), with the test's own estimates of tremor and noise. The test knows none of
+the three, and allows for creep and tremor that deviate from the model, at the expense of slow slips.
 
 {table(["sheet", "Hz", "mm/s", "N", "found", "median ms", "samples", "90 % ms", "bound ms"], late)}
 
 ## False alarms of a firm grip
 
 From a second after the grip has closed; the last column counts alarms in the second before, while force rises
-and nothing is known yet of the tremor.
+and the tremor isn't learnt yet.
 
 {table(["sheet", "Hz", "contact minutes", "alarms", "a minute", "in the first second"], false)}
 
@@ -358,8 +358,9 @@ ideal sheets; thresholds with at most one false alarm a minute and contact. The 
 
 ## Cost
 
-Of a tick with {len(PADS)} contacts: samples to contacts, and what perceiving motion adds, after contacts are
-sent; wall time on shared cores, so the ratio is what counts. Nothing is called while nobody wants it: a test.
+Of a tick with {len(PADS)} contacts: samples to contacts, and the additional time for motion percepts,
+after contacts are sent; wall time on shared cores, so only the ratio is meaningful. Nothing is called without
+a subscriber, as a test shows.
 
 {table(["Hz", "contacts", "tick us", "perception us", "99 % us", "ratio"], cost)}
 """

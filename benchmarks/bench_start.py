@@ -1,4 +1,4 @@
-"""How long until the daemon's first frame, and until a command line answers; where the time goes.
+"""Start-up time: to the daemon's first hand frame and to the output of a command, by part.
 
 15 simulated nodes are there, on udp_multicast over loopback, and a subscriber waits for `handtouch run` to
 start: the first hand frame, and the first in which every pad delivers. Again with the files of Python and its
@@ -39,7 +39,7 @@ def lap(name):
 import numpy; lap("numpy")
 import can, canopen; lap("python-can and canopen")
 import pydantic; lap("pydantic")
-import handtouch.daemon.daemon as d; lap("everything else that the daemon imports")
+import handtouch.daemon.daemon as d; lap("other imports of the daemon")
 deployment = d.load(Path(sys.argv[1])); lap("reading the deployment")
 model = d.PadModel(deployment); lap("model of the pads: tables of their surfaces")
 daemon = d.Daemon(deployment, model); lap("opening endpoints and buses")
@@ -62,15 +62,15 @@ def forget_files() -> None:
 
 
 def processor_s(pid: int) -> float:
-    """Processor time of a process so far, user and system, all its threads; not of its children."""
+    """Return the CPU time of a process so far, user and system, all threads, without children."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def first_frames(config: Path) -> dict[str, float]:
-    """Seconds from the start of `handtouch run` to its first hand frame, and to one of all pads at work.
+    """Return the seconds from the start of `handtouch run` to its first hand frame, and to one with all pads.
 
-    And its processor time until the first: other load on the machine hardly changes that.
+    And its CPU time until the first: other load on the machine hardly changes that.
     """
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.LINGER, 0)
@@ -99,7 +99,7 @@ def first_frames(config: Path) -> dict[str, float]:
 
 
 def help_once() -> dict[str, float]:
-    """Seconds that `handtouch --help` takes."""
+    """Return the seconds that `handtouch --help` takes."""
     start_s, before = time.monotonic(), os.times()
     subprocess.run([sys.executable, "-m", "handtouch", "--help"], check=True, stdout=subprocess.DEVNULL)
     took_s, after = time.monotonic() - start_s, os.times()
@@ -108,7 +108,7 @@ def help_once() -> dict[str, float]:
 
 
 def steps(config: Path) -> dict[str, float]:
-    """Seconds of the parts of a start, without the dialogue with the nodes."""
+    """Return the seconds of each part of the start, without booting nodes."""
     done = subprocess.run(
         [sys.executable, "-c", STEPS, str(config)], check=True, capture_output=True, text=True
     )
@@ -117,12 +117,12 @@ def steps(config: Path) -> dict[str, float]:
 
 
 def medians(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Of each figure."""
+    """Return the median of each value."""
     return {name: statistics.median(row[name] for row in rows) for name in rows[0]}
 
 
 def measure(config: Path, runs: int) -> dict[str, Any]:
-    """Warm and cold by turns."""
+    """Measure warm and cold starts alternately."""
     once: dict[str, Callable[[], dict[str, float]]] = {
         "first": lambda: first_frames(config),
         "help": help_once,
@@ -142,18 +142,18 @@ def measure(config: Path, runs: int) -> dict[str, Any]:
 
 
 def write(results: dict[str, Any]) -> str:
-    """The page."""
+    """Return the page."""
     warm, cold = ({**results[cache]["first"], **results[cache]["help"]} for cache in ("warm", "cold"))
-    told = {
+    titles = {
         "first frame": "`handtouch run` to the first hand frame at a subscriber",
-        "processor": "processor time of the daemon by then, user and system",
-        "all pads": "to the first in which all pads deliver",
+        "processor": "CPU time of the daemon until then, user and system",
+        "all pads": "to the first with samples of all pads",
         "help": "`handtouch --help`",
-        "help, processor": "its processor time",
+        "help, processor": "its CPU time",
     }
     rows = "\n".join(
         f"| {text} | {warm[name]:.2f} | {cold[name]:.2f} | {AIMS_S.get(name, '')} |"
-        for name, text in told.items()
+        for name, text in titles.items()
     )
     parts = "\n".join(
         f"| {name} | {took:.2f} | {results['cold']['steps'][name]:.2f} |"
@@ -161,16 +161,16 @@ def write(results: dict[str, Any]) -> str:
     )
     text = f"""# Start
 
-15 simulated nodes are there, on udp_multicast over loopback. Seconds, medians of {results["runs"]} runs,
-warm and cold by turns; before a cold one the files of Python and its packages are put out of the page cache,
-but for what other processes have mapped. {results["machine"]};
+15 simulated nodes run on udp_multicast over loopback. Seconds, medians of {results["runs"]} runs,
+warm and cold alternately; before a cold start the files of Python and its packages are dropped from the page
+cache, except pages mapped by other processes. {results["machine"]};
 load average when it ended {results["load"]:.1f}.
 
 | | warm | cold | aim |
 | --- | --- | --- | --- |
 {rows}
 
-Where it goes before the dialogue with the nodes begins:
+By part, before the boot of the nodes:
 
 | | warm | cold |
 | --- | --- | --- |

@@ -1,4 +1,4 @@
-"""Do subscribers cost the publisher or each other anything? One, ten, a hundred; one stalled, one killed.
+"""Cost of 1, 10 and 100 subscribers for the publisher and each other; one stalled, one killed.
 
 The real daemon and simulated nodes, as in bench_latency. One subscriber's latency is measured while others
 read the same hand frames: bystanders share a process, each with its own connection; the one that is stopped
@@ -54,14 +54,14 @@ CASES = {
     "10, one of them stalled": (8, signal.SIGSTOP),
     "10, one of them killed": (8, signal.SIGKILL),
 }
-"""Case -> bystanders, and what is sent to one more."""
+"""Case -> other subscribers, and the signal sent to one more"""
 JOINING_S = 1.0
 
 Rows = list[dict[str, Any]]
 
 
 def bystanders(endpoint: str, count: int, stop: Event) -> None:
-    """So many subscribers, as a process; they only read."""
+    """Run subscribers in a process; they only read."""
     with zmq.Context() as context:
         context.set(zmq.MAX_SOCKETS, 2 * count + 10)
         poller, sockets = zmq.Poller(), []
@@ -81,7 +81,7 @@ def bystanders(endpoint: str, count: int, stop: Event) -> None:
 
 @contextmanager
 def company(endpoint: str, count: int, fate: signal.Signals | None) -> Iterator[None]:
-    """Other subscribers beside ours; one more meets its fate while we measure."""
+    """Run other subscribers; stop or kill one more during the measurement."""
     stop = multiprocessing.Event()
     others = multiprocessing.Process(target=bystanders, args=(endpoint, count, stop))
     victim = multiprocessing.Process(target=bystanders, args=(endpoint, 1, multiprocessing.Event()))
@@ -104,14 +104,14 @@ def company(endpoint: str, count: int, fate: signal.Signals | None) -> Iterator[
 
 
 def stage_us(before: dict[str, Any], after: dict[str, Any], stage: str) -> float:
-    """Mean time per period in a stage of the loop between two answers to `status`."""
+    """Return the mean time per period in a stage of the loop between two replies to `status`."""
     sums = [status["service"]["loop"]["stages"][stage] for status in (before, after)]
     count = sum(sums[1]["counts"]) - sum(sums[0]["counts"])
     return float((sums[1]["sum_s"] - sums[0]["sum_s"]) / max(1, count) * 1e6)
 
 
 def case(config: Path, pid: int, stamps: Any, seconds: float, name: str) -> dict[str, Any]:
-    """One subscriber in the company of others."""
+    """Measure one subscriber beside others."""
     endpoints = load(config).daemon
     count, fate = CASES[name]
     cpu = ProcessorShare()
@@ -148,7 +148,7 @@ def case(config: Path, pid: int, stamps: Any, seconds: float, name: str) -> dict
 
 @contextmanager
 def serving(config: Path) -> Iterator[tuple[int, Any]]:
-    """Simulated nodes and the daemon, from the first touch on: its process, and when frames were sent."""
+    """Run simulated nodes and the daemon from the first touch on; yield its process and send times."""
     deployment = load(config)
     stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
     samples = film(deployment, PATHS["sliding"])
@@ -171,7 +171,7 @@ def serving(config: Path) -> Iterator[tuple[int, Any]]:
 
 
 def in_turns(turns: int, cases: Iterable[str], measured: Callable[[str], dict[str, Any]]) -> Rows:
-    """All cases, so many times, told as they are measured."""
+    """Measure all cases repeatedly, and print each result."""
     rows = []
     for turn in range(turns):
         for name in cases:
@@ -181,13 +181,13 @@ def in_turns(turns: int, cases: Iterable[str], measured: Callable[[str], dict[st
 
 
 def measure(config: Path, turns: int, seconds: float) -> Rows:
-    """All cases, so many times, with one daemon."""
+    """Measure all cases repeatedly with one daemon."""
     with serving(config) as (pid, stamps):
         return in_turns(turns, CASES, lambda name: case(config, pid, stamps, seconds, name))
 
 
 def page_of(results: dict[str, Any]) -> str:
-    """The page."""
+    """Return the page."""
     lines = []
     for name in CASES:
         rows = [row for row in results["rows"] if row["case"] == name]
@@ -205,12 +205,13 @@ def page_of(results: dict[str, Any]) -> str:
     turns = 1 + max(row["turn"] for row in results["rows"])
     return f"""# Subscribers
 
-One subscriber to a hand of 15 pads at 200 Hz, 5 touched by sliding contacts, in the company of others.
-Medians of {turns} turns through all cases, {results["seconds"]:.0f} s each; spread is that of the turns'
-medians. Latency is from the last frame of a SYNC to the message; periods lost are our subscriber's. Tick and
-send are means per period; the daemon's share of a core is the loop's thread alone, and all threads with those
-of ZeroMQ, which write to every connection. Drops are messages that a full queue, such as that of the stalled
-one, did not take. All share the machine, so a hundred readers also compete for its processors.
+One subscriber to a hand of 15 pads at 200 Hz, 5 touched by sliding contacts, beside other subscribers.
+Medians of {turns} passes over all cases, {results["seconds"]:.0f} s each; spread is that of the
+medians per pass. Latency is from the last frame of a SYNC to the message; periods lost are those of the
+measured subscriber. Tick and send are means per period; the daemon's share of a core is the loop's thread
+alone, and all threads with those of ZeroMQ, which write to every connection. Drops are messages
+dropped by a full queue, such as that of the stalled subscriber. All run on one
+machine, so a hundred readers also compete for its CPUs.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
 | subscribers | p50, us | spread | p99, us | periods lost | tick, us | send, us | loop | daemon | drops |
@@ -222,7 +223,7 @@ Made by `make bench ONLY=subscribers`.
 
 
 def asked_of(about: str | None, *, seconds: float, turns: int, trial_s: float) -> argparse.Namespace:
-    """Options of a benchmark that goes through its cases in turns."""
+    """Return the options of a benchmark with repeated cases."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--seconds", type=float, default=seconds, help="of a case")
     parser.add_argument("--turns", type=int, default=turns)
@@ -235,7 +236,7 @@ def asked_of(about: str | None, *, seconds: float, turns: int, trial_s: float) -
 
 
 def write(name: str, page_of: Callable[[dict[str, Any]], str], rows: Rows, seconds: float) -> None:
-    """The page of a benchmark, and what it is made from."""
+    """Write the page of a benchmark and its data."""
     results = {"rows": rows, "seconds": seconds, "machine": machine(), "load": os.getloadavg()[0]}
     page = page_of(results)
     OUT.mkdir(parents=True, exist_ok=True)

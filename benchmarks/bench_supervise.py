@@ -1,7 +1,7 @@
-"""What the fast half of the supervisor is worth and costs: baseline, and strength of sheets that misbehave.
+"""Measure effect and cost of baseline tracking and sheet force compensation.
 
 Drift, presses and sheets are drawn with fixed seeds, others than anything was tuned with; drift is the
-simulator's. The estimator is told presets, never the numbers drawn. Two processes share the work.
+simulator's. The estimator knows presets, never the drawn parameters. Two processes share the work.
 Writes docs/benchmarks/supervise.{md,json,png}; `--quick` tries it out in a minute and writes nothing.
 """
 
@@ -25,14 +25,14 @@ import numpy as np
 import supervise_day
 from numpy.typing import NDArray
 
-from handtouch import sheet, shipped
-from handtouch.canbus.bus.slab import Slab
-from handtouch.config import Behaviour, load
-from handtouch.daemon.cycle import Cycle
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.tick import Tick
-from handtouch.simulate.world import Climate, World
-from handtouch.supervise.strength import SheetStrength, behaviour_of
+from handtouch import sheet
+from handtouch.config import Behaviour, load, shipped
+from handtouch.core.cycle import Cycle
+from handtouch.core.pad_model import PadModel
+from handtouch.core.sheet_force import SheetForceCompensation, sheet_behaviour_of
+from handtouch.core.slab import Slab
+from handtouch.core.tick import TickProcessor
+from handtouch.simulate.world import ElectronicsDrift, World
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -41,14 +41,14 @@ FloatArray = NDArray[np.float64]
 Rows = list[dict[str, Any]]
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PERIOD_NS, TICK_NS = 100_000_000, 5_000_000
-DRIFT = World(seed=71, drift_counts_per_s=0.05, warmth_k_per_s=0.01, offset_counts_per_k=2.0)
+DRIFT = World(seed=71, zero_drift_counts_per_s=0.05, temperature_drift_k_per_s=0.01, offset_counts_per_k=2.0)
 SPAN_S = 60.0  # of drift that is drawn at once
 HELD = 5  # pads
 FULL_N = 5.0
 DT_S = 0.1
 PART_H = 1.0  # of a day, for what is compared with it
 SEEDS = (31, 32)
-DAY, PARTS = "A day of mixed use of real sheets", "What the parts of that are worth"
+DAY, PARTS = "A day of mixed use of sheets with creep and adaptation", "Effect of the parts"
 WARM, TURNED = "A hand that gets warm", "A hand that is turned over"
 INK, FAINT, ACCENT, RED = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c23b22"
 
@@ -65,11 +65,11 @@ class Rig:
     """A hand whose channels drift; currents of contacts in the middle of its pads are given in counts."""
 
     def __init__(self, model: PadModel, seed: int, drifts: bool) -> None:
-        self.model, self.tick, self.slab = model, Tick(model, PERIOD_NS), Slab(model.size)
+        self.model, self.tick, self.slab = model, TickProcessor(model, PERIOD_NS), Slab(model.size)
         self.cycle = Cycle(PERIOD_NS, 0.6)
         self._rng = np.random.default_rng(seed)
         names = list(zip(model.hands, model.links, strict=True))
-        self._climate = Climate(DRIFT if drifts else World.ideal_parts(), names)
+        self._climate = ElectronicsDrift(DRIFT if drifts else World.ideal_parts(), names)
         self._zeros = np.zeros((0, model.size, 4))
         self._at = 0
         pads = np.arange(model.size)
@@ -82,60 +82,60 @@ class Rig:
         self.t_ns += PERIOD_NS
         if self._at == len(self._zeros):
             times_s = self.t_ns * 1e-9 - 1 + np.arange(0, SPAN_S, PERIOD_NS * 1e-9)
-            self._zeros, self._at = self._climate.zero(times_s), 0
+            self._zeros, self._at = self._climate.zero_counts(times_s), 0
         counts = self.fractions * contact_counts[:, None] + self._zeros[self._at] + zero
         self._at += 1
         counts += self._rng.standard_normal(counts.shape)
-        self.tick.settle()
+        self.tick.prepare_next_tick()
         self.slab.begin_cycle(self.t_ns)
-        self.cycle.begin(self.t_ns)
+        self.cycle.begin_cycle(self.t_ns)
         for slot, data in enumerate(np.rint(counts).astype("<i2")):
-            self.slab.write(slot, data.tobytes(), self.t_ns + 1000)
-        self.tick.step(self.slab, self._up, self.cycle, self.t_ns + 2000)
+            self.slab.write_pdo(slot, data.tobytes(), self.t_ns + 1000)
+        self.tick.run_tick(self.slab, self._up, self.cycle, self.t_ns + 2000)
 
 
 # Held object
 
 
-def without_common(tick: Tick) -> None:
-    tick.baseline._member[:] = 0.0
+def without_common(tick: TickProcessor) -> None:
+    tick.baseline._hand_membership[:] = 0.0
 
 
-def without_baseline(tick: Tick) -> None:
-    tick.baseline.learn = lambda *_: False  # type: ignore[method-assign]
+def without_baseline(tick: TickProcessor) -> None:
+    tick.baseline.update_baseline = lambda *_: False  # type: ignore[method-assign]
 
 
-def without_following(tick: Tick) -> None:
+def without_following(tick: TickProcessor) -> None:
     """The first minute's baseline is the last."""
-    baseline, learn, ends_ns = tick.baseline, tick.baseline.learn, [0]
+    baseline, learn, ends_ns = tick.baseline, tick.baseline.update_baseline, [0]
 
-    def still(t_ns: int, touching: NDArray[np.bool_]) -> bool:
-        ends_ns[0] = ends_ns[0] or t_ns + 50 * 10**9
-        return t_ns < ends_ns[0] and learn(t_ns, touching)
+    def still(sync_ns: int, touching: NDArray[np.bool_]) -> bool:
+        ends_ns[0] = ends_ns[0] or sync_ns + 50 * 10**9
+        return sync_ns < ends_ns[0] and learn(sync_ns, touching)
 
-    baseline.learn = still  # type: ignore[method-assign]
+    baseline.update_baseline = still  # type: ignore[method-assign]
 
 
-def without_gate(tick: Tick) -> None:
+def without_gate(tick: TickProcessor) -> None:
     """Baselines follow in contact too."""
-    baseline, learn = tick.baseline, tick.baseline.learn
+    baseline, learn = tick.baseline, tick.baseline.update_baseline
 
-    def ungated(t_ns: int, touching: NDArray[np.bool_]) -> bool:
-        baseline.waiting[:] = False
-        return learn(t_ns, touching & False)
+    def ungated(sync_ns: int, touching: NDArray[np.bool_]) -> bool:
+        baseline.held[:] = False
+        return learn(sync_ns, touching & False)
 
-    baseline.learn = ungated  # type: ignore[method-assign]
+    baseline.update_baseline = ungated  # type: ignore[method-assign]
 
     def gather() -> None:
-        if not tick._gathered:
-            tick._gathered = True
-            baseline.gather(tick._excess, tick._sampled & tick._trusted)
+        if not tick._baseline_samples_added:
+            tick._baseline_samples_added = True
+            baseline.add_samples(tick._excess, tick._sampled & tick._trusted)
 
-    tick._gather = gather  # type: ignore[method-assign]
+    tick._add_baseline_samples = gather  # type: ignore[method-assign]
 
 
-HALVES: dict[str, Callable[[Tick], None]] = {
-    "the whole fast half": lambda _: None,
+HALVES: dict[str, Callable[[TickProcessor], None]] = {
+    "all compensation": lambda _: None,
     "without the common mode": without_common,
     "followed for a minute only": without_following,
     "without any baseline": without_baseline,
@@ -162,7 +162,7 @@ def held(name: str, seconds: float) -> Rows:
         if number >= 20:
             lost |= set(np.flatnonzero(~rig.tick.contacts.touching[:HELD]).tolist())
     off = np.mean(late, axis=0) / np.mean(early, axis=0) - 1
-    begun = rig.tick.contacts.begun
+    begun = rig.tick.contacts.begun_count
     for _ in range(round(60e9 / PERIOD_NS)):
         rig.step(none)
     return [
@@ -182,17 +182,17 @@ def held(name: str, seconds: float) -> Rows:
 
 def grips(model: PadModel) -> FloatArray:
     grip = np.zeros(model.size)
-    grip[:HELD] = model.on_counts[:HELD] * np.geomspace(5, 60, HELD)
+    grip[:HELD] = model.begin_threshold_counts[:HELD] * np.geomspace(5, 60, HELD)
     return grip
 
 
 def follow(rig: Rig, seconds: float, zero: Callable[[float], FloatArray]) -> dict[str, Any]:
     """Five pads of fifteen hold on for so long while zeros move, and the others are touched lightly before
     and during that: force errors, and contacts that are none."""
-    light = np.where(np.arange(rig.model.size) < HELD, 0.0, 2 * rig.model.on_counts)
+    light = np.where(np.arange(rig.model.size) < HELD, 0.0, 2 * rig.model.begin_threshold_counts)
     again = 600 + round(seconds * 4)
     held, touches = [], []
-    begun = rig.tick.contacts.begun
+    begun = rig.tick.contacts.begun_count
     for number in range(600 + round(seconds * 10)):
         touched = 300 <= number < 350 or again <= number < again + 50
         rig.step(grips(rig.model) * (number >= 600) + light * touched, zero(0.1 * number))
@@ -207,7 +207,7 @@ def follow(rig: Rig, seconds: float, zero: Callable[[float], FloatArray]) -> dic
         "held, worst": f"{100 * float(np.nanmax(np.abs(off))):.2f} %",
         "light touch, rms": f"{100 * float(np.sqrt(np.mean((touches[1] / touches[0] - 1) ** 2))):.1f} %",
         "contacts lost or false": int(
-            abs(rig.tick.contacts.begun - begun - 2 * rig.model.size + HELD) + np.isnan(force).any()
+            abs(rig.tick.contacts.begun_count - begun - 2 * rig.model.size + HELD) + np.isnan(force).any()
         ),
     }
 
@@ -227,8 +227,8 @@ def warm(alike: float, name: str) -> Rows:
     return [{"in common": f"{100 * alike:.0f} %", "": name, **follow(rig, 1500, zero)}]
 
 
-def turned(told: bool) -> Rows:
-    """Turned over every quarter of a minute or so; channels feel 4 counts rms of gravity along each axis."""
+def turned(known: bool) -> Rows:
+    """Turned over every quarter of a minute or so; gravity causes 4 counts rms along each axis."""
     rig, rng = Rig(hands(1), 75, False), np.random.default_rng(75)
     by_gravity = rng.normal(0, 4.0, (rig.model.size, 4, 3))
     ways, speeds = rng.normal(size=(2, 3)), np.array([0.21, 0.34, 0.55])
@@ -236,14 +236,14 @@ def turned(told: bool) -> Rows:
     def zero(t_s: float) -> FloatArray:
         way = ways[0] * np.sin(speeds * t_s) + ways[1] * np.cos(speeds[::-1] * t_s)
         way /= np.linalg.norm(way)
-        if told:
-            rig.tick.turn(np.tile(way, (rig.model.size, 1)))
+        if known:
+            rig.tick.set_gravity(np.tile(way, (rig.model.size, 1)))
         return np.asarray(by_gravity @ way)
 
     none = np.zeros(rig.model.size)
     for number in range(6000):
         rig.step(none, zero(0.1 * number))
-    return [{"joint states": "told" if told else "not told", **follow(rig, 600, zero)}]
+    return [{"joint states": "known" if known else "unknown", **follow(rig, 600, zero)}]
 
 
 # Slow presses
@@ -255,7 +255,9 @@ def slow(quick: bool) -> Rows:
     for speed in (3e-3, 1e-2, 1e-1) if quick else (3e-4, 1e-3, 3e-3, 1e-2, 1e-1):
         rig = Rig(hands(1), 72, False)
         model = rig.model
-        per_law = model.on_counts[0] / model.on_n[0] ** 1.5  # light contacts: the layer dominates
+        per_law = (
+            model.begin_threshold_counts[0] / model.begin_threshold_n[0] ** 1.5
+        )  # light contacts: the layer dominates
         none = np.zeros(model.size)
         for _ in range(round(10e9 / PERIOD_NS)):
             rig.step(none)
@@ -267,7 +269,7 @@ def slow(quick: bool) -> Rows:
             rig.step(press)
             if math.isnan(found) and rig.tick.contacts.touching[0]:
                 found = force
-        taken = float(rig.tick.baseline.expected[0].sum()) / press[0]
+        taken = float(rig.tick.baseline.expected_counts[0].sum()) / press[0]
         rows.append(
             {
                 "speed, N/s": speed,
@@ -283,19 +285,19 @@ def slow(quick: bool) -> Rows:
 
 
 CUTS: dict[str, dict[str, Any]] = {
-    "the same, whole": {},
-    "silence forgets nothing": {"silence_s": 1e9},
-    "numbers not doubted": {"doubt": 0.0},
-    "no adaptation undone": {"adaptation_share": 0.0},
-    "no creep undone": {"creep_share": 0.0},
-    "nothing undone": {"adaptation_share": 0.0, "creep_share": 0.0},
+    "complete": {},
+    "no forgetting": {"forget_time_s": 1e9},
+    "no parameter uncertainty": {"parameter_std_fraction": 0.0},
+    "no adaptation compensation": {"adaptation_share": 0.0},
+    "no creep compensation": {"creep_share": 0.0},
+    "no compensation": {"adaptation_share": 0.0, "creep_share": 0.0},
 }
 
 
 def day(preset: str, hours: float, seed: int, changes: dict[str, Any]) -> dict[str, Any]:
     behaviour = Behaviour.model_validate({"preset": preset, **changes})
-    told: dict[str, Any] = supervise_day.day(preset, behaviour, hours, seed)
-    return told
+    result: dict[str, Any] = supervise_day.day(preset, behaviour, hours, seed)
+    return result
 
 
 def pooled(days: list[dict[str, Any]], part: Callable[[dict[str, Any]], dict[str, float]]) -> dict[str, Any]:
@@ -311,25 +313,25 @@ def pooled(days: list[dict[str, Any]], part: Callable[[dict[str, Any]], dict[str
 
 
 def loops() -> Rows:
-    """Width of a loop 0 - 5 N - 0 half-way, of sheets whose loop and creep are a fifth more than is told."""
+    """Width of a loop 0 - 5 N - 0 half-way, of sheets whose loop and creep are a fifth more than assumed."""
     rows = []
     for preset in ("S1", "S2"):
         base = {"S1": sheet.S1, "S2": sheet.S2}[preset]
-        told = Behaviour(preset=preset, loop=0.1, gain_std=0.0, history_std_n=0.0)
+        assumed = Behaviour(preset=preset, hysteresis_width=0.1, gain_std=0.0, back_force_std_n=0.0)
         true = replace(
             base,
-            hysteresis=sheet.PrandtlIshlinskii.of_loop(0.12, FULL_N),
+            hysteresis=sheet.PrandtlIshlinskii.from_width(0.12, FULL_N),
             creep=sheet.Creep.first_order(0.3, 0.3),
             fluctuation=sheet.Fluctuation(),
         )
-        state, step = true.start(1), true.at(DT_S)
-        strength = SheetStrength([behaviour_of(told)], round(DT_S * 1e9))
+        state, step = true.initial_state(1), true.discretise(DT_S)
+        strength = SheetForceCompensation([sheet_behaviour_of(assumed)], round(DT_S * 1e9))
         ramp = np.concatenate([np.linspace(0, FULL_N, 601), np.linspace(FULL_N, 0, 601)[1:]])
         raw, found, t_ns, one = np.zeros(1201), np.zeros(1201), 10**9, np.ones(1)
         for number, force in enumerate(ramp):
             t_ns += round(DT_S * 1e9)
             apparent = step.forward(state, force * one)
-            strength.step(apparent, 0 * one, apparent > 0, t_ns)
+            strength.compensate_forces(apparent, 0 * one, apparent > 0, t_ns)
             raw[number], found[number] = apparent[0], strength.force_n[0]
         rows.append(
             {
@@ -359,18 +361,18 @@ def costs() -> Rows:
     for count in (1, 4, 16):
         rig = Rig(hands(count), 73, False)
         model, tick = rig.model, rig.tick
-        grip = model.on_counts * 10 * (np.arange(model.size) % 2)
+        grip = model.begin_threshold_counts * 10 * (np.arange(model.size) % 2)
         for _ in range(60):
             rig.step(grip)
         baseline, free = tick.baseline, np.ones(model.size, np.bool_)
-        strength = SheetStrength([behaviour_of(Behaviour())] * model.size, TICK_NS)
+        strength = SheetForceCompensation([sheet_behaviour_of(Behaviour())] * model.size, TICK_NS)
         touching, raw = tick.contacts.touching, np.ones(model.size)
         clock = [rig.t_ns]
 
         def block(baseline: Any = baseline, touching: Any = touching, clock: list[int] = clock) -> None:
             clock[0] += 10**8
             baseline._count[:] = 20.0
-            baseline.learn(clock[0], touching)
+            baseline.update_baseline(clock[0], touching)
 
         def sheets(
             strength: Any = strength, touching: Any = touching, raw: Any = raw, clock: list[int] = clock
@@ -380,9 +382,9 @@ def costs() -> Rows:
 
         def each(tick: Any = tick, free: Any = free, baseline: Any = baseline) -> None:
             np.subtract(tick.counts, baseline.expected, out=tick._excess)
-            tick._sampled, tick._trusted, tick._gathered = free, free, False
+            tick._sampled, tick._trusted, tick._baseline_samples_added = free, free, False
             tick._gather()
-            baseline.learn(tick._cycle_ns, tick.contacts.touching)
+            baseline.update_baseline(tick._sync_ns, tick.contacts.touching)
 
         parts = median_us(each), median_us(block, 500), median_us(sheets)
         rows.append(
@@ -412,10 +414,10 @@ def draw(curves: dict[str, list[list[float]]], presses: Rows, path: Path) -> Non
         axis.set_ylim(0, None)
         axis.legend(frameon=False)
     speed = [row["speed, N/s"] for row in presses]
-    force = [row["found at, N"] for row in presses]
-    axes[2].plot(speed, [math.nan if f is None else f for f in force], "o-", color=ACCENT)
+    detected_n = [row["found at, N"] for row in presses]
+    axes[2].plot(speed, [math.nan if newton is None else newton for newton in detected_n], "o-", color=ACCENT)
     axes[2].axhline(0.06, color=FAINT, lw=0.8)
-    axes[2].text(speed[-1], 0.0615, "on_n", ha="right", va="bottom", color=FAINT)
+    axes[2].text(speed[-1], 0.0615, "begin_threshold_n", ha="right", va="bottom", color=FAINT)
     axes[2].set(title="Slow presses", xscale="log", xlabel="speed of the press, N/s", ylabel="found at, N")
     axes[2].set_ylim(0, None)
     figure.savefig(path, dpi=110)
@@ -438,45 +440,46 @@ def notes(hours: float, held_s: float) -> dict[str, str]:
     )
     return {
         "Held object": f"""Five pads of fifteen hold something for {held_s:g} s. The drift is the
-simulator's: each zero wanders by {DRIFT.drift_counts_per_s:g} counts a second at most, and the hand's
-temperature by {DRIFT.warmth_k_per_s:g} K a second, for {DRIFT.offset_counts_per_k:g} counts/K of either
-sign. The error is that of the force at the end against the same grip at its start; below, parts of the
-fast half are taken out. In so slow a drift what counts is that it isn't followed in contact; the next two
-sections show what the other parts are for.""",
+simulator's: each zero wanders by {DRIFT.zero_drift_counts_per_s:g} counts a second at most, and the hand's
+temperature by {DRIFT.temperature_drift_k_per_s:g} K a second, for {DRIFT.offset_counts_per_k:g} counts/K
+of either
+sign. The error is that of the force at the end against the same grip at its start; below, without parts of
+the compensation. With so slow a drift it matters only that it isn't tracked in contact; the next two
+sections show the effect of the other parts.""",
         WARM: """8 K more within some minutes, and back 12 minutes later, with the same grip held for 25. The
 other pads are touched lightly, with twice the current of the threshold, before and while it is warm. Channels
-drift by 2 counts/K (rms), a part of which all have in common, as amplifiers of one make and one supply do.
+drift by 2 counts/K (rms), a part of it common to all, as with amplifiers of one type on one supply.
 Errors are against the grip's first seconds, and against the touch before.""",
         TURNED: """The whole hand is turned over four times a minute, untouched for ten minutes and then
 with the same grip for ten. Each channel reads 4 counts (rms) more for a unit of gravity along each axis of
 its link.""",
-        "Slow presses": "On a pad of the shipped hand, on_n 0.06 N, slow_touch_s 20.",
+        "Slow presses": "On a pad of the shipped hand, begin_threshold_n 0.06 N, max_rise_time_s 20.",
         DAY: f"""{supervise_day.PADS} sheets of each kind, {hours:g} h each, seeds {SEEDS}: grips
 of 2 to 40 s, some of minutes, 0.1 to 5 N, half of them waxing and waning; breaks, and a night from hour 16.
-The estimator is told the preset and no more. Truths: the preset with its numbers off by 20 or 50 % (1 sigma);
+The estimator knows the preset only. Truths: the preset with its parameters off by 20 or 50 % (1 sigma);
 or, besides 20 %, creep by a power law (t / 1 s)^{supervise_day.POWER:g} for hours, a Preisach operator with a
-loop of {100 * supervise_day.LOOP:g} % that the estimator knows nothing of, or adaptation of two speeds.
-Gains are off by 5 %. Errors in % of 5 N (rms), where strength is called valid; `first second`: of a touch;
-`inside 95 %`: part of those readings whose stated interval holds the truth, then that of each seed in %;
+loop of {100 * supervise_day.LOOP:g} % unknown to the estimator, or adaptation of two speeds.
+Gains are off by 5 %. Errors in % of 5 N (rms), with valid force status; `first second`: of a touch;
+`inside 95 %`: part of those readings whose interval holds the ground truth, then that of each seed in %;
 `valid`: part of the time touched.""",
-        PARTS: f"""The first {min(hours, PART_H):g} h of another such day, all kinds together, with parts
-taken out.""",
+        PARTS: f"""The first {min(hours, PART_H):g} h of another such day, all kinds together, without
+some parts.""",
         "Loop": """0 to 5 N and back in two minutes. True loop and creep are a fifth more than the
-estimator is told.""",
+estimator assumes.""",
         "Cost": f"Medians in us; {machine}. Sheets: S1, half of the pads touched.",
     }
 
 
 def page(parts: dict[str, Rows], hours: float, held_s: float) -> str:
     lines = [
-        "# The fast half of the supervisor",
+        "# Baseline and sheet force compensation",
         "",
         "![mixed use of two sheets, slow presses](supervise.png)",
         "",
     ]
-    words = notes(hours, held_s)
+    texts = notes(hours, held_s)
     for title, rows in parts.items():
-        lines += [f"## {title}", "", words[title], "", *table(rows), ""]
+        lines += [f"## {title}", "", texts[title], "", *table(rows), ""]
     return "\n".join([*lines, "Made by `make bench ONLY=supervise`.", ""])
 
 
@@ -508,7 +511,7 @@ def main() -> None:
     tasks: list[tuple[str, Callable[..., Any], tuple[Any, ...]]] = []
     tasks += [("Held object", held, (name, held_s)) for name in names]
     tasks += [(WARM, warm, (alike, name)) for alike in (0.0, 0.5, 0.9) for name in names[:3]]
-    tasks += [(TURNED, turned, (told,)) for told in (True, False)]
+    tasks += [(TURNED, turned, (known,)) for known in (True, False)]
     tasks += [("Slow presses", slow, (quick,)), ("Loop", loops, ())]
     with ProcessPoolExecutor(2) as pool:
         presets, seeds = list(supervise_day.PRESETS), SEEDS[: 1 if quick else None]

@@ -1,4 +1,4 @@
-"""Measure how well a swapped unit locates, by contacts since: the daemon's slow half on hidden gains.
+"""Measure the position error of a replaced node, by contacts since: the supervisor worker on hidden gains.
 
 Prints its table and writes docs/benchmarks/swap.md, swap.json and swap.png; with --quick it only prints.
 """
@@ -21,13 +21,20 @@ import scipy
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.daemon.model import PadModel
-from handtouch.simulate.hand import VirtualHand
-from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.calibration.store_client import StoreClient
+from handtouch.core.pad_model import PadModel
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
-from handtouch.supervise.archive import Archive
-from handtouch.supervise.link import Block, Calibrate, Judged, Start, serials
-from handtouch.supervise.slow import SlowHalf
+from handtouch.supervisor.ipc import (
+    CalibrationAssessment,
+    CalibrationUpdate,
+    SampleBlock,
+    WorkerConfig,
+    pack_serials,
+)
+from handtouch.supervisor.worker import SupervisorWorker
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -79,7 +86,7 @@ gap_mm = 0.6
 
 
 def deployment_of(units: int) -> config.Deployment:
-    """As many pads of each shape."""
+    """Return a deployment with this many pads of each shape."""
     rows = [(shape, unit) for shape in SHAPES for unit in range(units)]
     pads = "".join(
         PAD.format(link=f"p{k}", node_id=k + 1, length=SHAPES[shape]) for k, (shape, _) in enumerate(rows)
@@ -95,7 +102,7 @@ def touches(model: PadModel, count: int, seed: int) -> Scenario:
         at = generator.uniform(0.08, 0.92, (model.size, 2))
         force = np.exp(generator.uniform(np.log(0.5), np.log(5.0), model.size))
         made += [
-            Touch(
+            ScenarioTouch(
                 link=link,
                 from_s=number * STEP_S,
                 duration_s=TICKS * PERIOD_NS * 1e-9,
@@ -115,7 +122,7 @@ def block_of(hand: VirtualHand, number: int, pads: int) -> dict[str, Any]:
     contact = np.full((TICKS + 1, pads), number + 1, np.uint32)
     contact[-1] = 0
     times = round(first_s * 1e9) + PERIOD_NS * np.arange(TICKS + 1, dtype=np.int64)
-    block = Block(
+    block = SampleBlock(
         times,
         np.repeat(times[:, None], pads, axis=1),
         counts.astype(np.int32),
@@ -151,7 +158,7 @@ def errors_mm(model: PadModel, counts: FloatArray, places: FloatArray) -> FloatA
         index = np.full(len(counts), pad)
         currents = (counts[:, pad] * model.ampere_per_count[pad]).T
         at = model.locator.estimate(index, currents, model.noise_a[pad][:, None])
-        placed = model.placement.place(index, at.x, at.y, np.zeros((index.size, 2, 2)))
+        placed = model.placement.to_link_frame(index, at.x, at.y, np.zeros((index.size, 2, 2)))
         found.append(1e3 * np.linalg.norm(placed.position_m - places[:, pad], axis=1))
     return np.array(found)
 
@@ -163,28 +170,34 @@ def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
     world = World(5, gain_tolerance=GAIN_TOLERANCE, gap_tolerance_mm=0.1, resistor_tolerance=0)
     hand = VirtualHand(deployment, touches(model, max(counts), 3), world)
     readings, places = test_set(deployment, model, world)
-    start = Start(deployment, "", tuple(model.nominal), model.ampere_per_count.copy(), model.noise_counts)
+    start = WorkerConfig(
+        deployment,
+        "",
+        tuple(model.default_calibration_ids),
+        model.ampere_per_count.copy(),
+        model.noise_counts,
+    )
     trust = ["nominal"] * model.size
     deviation = np.full(model.size, np.nan)
     taken: dict[int, tuple[FloatArray, list[str], FloatArray]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        slow = SlowHalf(start, Archive(Path(folder) / "calibrations.db"))
+        slow = SupervisorWorker(start, StoreClient(Path(folder) / "calibrations.db"))
         new, old = [1000 + k for k in range(model.size)], [k + 1 for k in range(model.size)]
-        words = slow.take(msgpack.unpackb(serials(new, old, 0)), NOW)
+        words = slow.process_message(msgpack.unpackb(pack_serials(new, old, 0)), NOW)
         for number in range(max(counts) + 1):
             for word in words:
-                if isinstance(word, Judged):
-                    trust[word.pad] = word.trust
-                elif isinstance(word, Calibrate):
-                    model.calibrate(word.pad, word.gains, word.name)
+                if isinstance(word, CalibrationAssessment):
+                    trust[word.pad] = word.calibration_state
+                elif isinstance(word, CalibrationUpdate):
+                    model.set_gains_and_law(word.pad, word.gains, word.calibration_id)
                     deviation[word.pad] = np.sqrt(np.diag(np.reshape(word.covariance, (4, 4))).max())
             if number in counts:
                 taken[number] = errors_mm(model, readings, places), list(trust), deviation.copy()
             if number < max(counts):
-                words = slow.take(block_of(hand, number, model.size), NOW)
+                words = slow.process_message(block_of(hand, number, model.size), NOW)
         slow.finish(NOW)
     for pad, (name, entry) in enumerate(hand.pads):
-        model.calibrate(pad, 1 / np.array(world.parts(name, entry).gain), "true")
+        model.set_gains_and_law(pad, 1 / np.array(world.parts(name, entry).gain), "true")
     least = errors_mm(model, readings, places)
     rows = []
     for first, shape in enumerate(SHAPES):
@@ -195,10 +208,10 @@ def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                 {
                     "pad": shape,
                     "contacts since": number,
-                    "location error, rms mm": float(np.sqrt(np.mean(error[own] ** 2))),
+                    "position error, rms mm": float(np.sqrt(np.mean(error[own] ** 2))),
                     "95 % below, mm": float(np.quantile(error[own], 0.95)),
                     "with the true gains, rms mm": float(np.sqrt(np.mean(least[own] ** 2))),
-                    "trusted, %": 100 * state[own].count("trusted") / units,
+                    "calibrated, %": 100 * state[own].count("trusted") / units,
                     "stated std of the gains, %": _percent(float(np.mean(std[own]))),
                 }
             )
@@ -215,7 +228,7 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
     for shape in SHAPES:
         own = [row for row in rows if row["pad"] == shape]
         at = [row["contacts since"] for row in own]
-        (line,) = left.plot(at, [row["location error, rms mm"] for row in own], "o-", label=shape)
+        (line,) = left.plot(at, [row["position error, rms mm"] for row in own], "o-", label=shape)
         left.plot(at, [row["95 % below, mm"] for row in own], "^:", color=line.get_color(), alpha=0.5)
         least = own[0]["with the true gains, rms mm"]
         left.axhline(least, color=line.get_color(), ls="--", lw=1, label=f"{shape}, with the true gains")
@@ -257,16 +270,17 @@ def main() -> None:
     if quick:
         return
     lines = [
-        "# After a swap",
+        "# After a node replacement",
         "",
         f"Made by `make bench ONLY=swap`; {machine}.",
         "",
-        "The slow half of the supervisor is given blocks of ticks as the daemon gives them, of "
-        f"{units} units of each shape ({' and '.join(f'{x:g} x {WIDTH_MM:g} mm' for x in SHAPES.values())}), "
-        "each in the place of another, nothing of it in the store. Finite elements, noise of 2 counts of "
+        "The supervisor worker receives blocks of ticks as from the daemon, of "
+        f"{units} nodes of each shape ({' and '.join(f'{x:g} x {WIDTH_MM:g} mm' for x in SHAPES.values())}), "
+        "each a replacement without a stored calibration. Finite elements, noise of 2 counts of "
         "32767, gains 5 % rms from configured, electrodes that end up to 0.1 mm elsewhere and true sizes of "
         f"contacts are hidden from it. Contacts of 0.5 to 5 N anywhere, {TICKS} samples each; 100 others a "
-        "pad, single samples, tell the error. A unit is trusted once its least certain log gain is known to "
+        "pad, single samples, measure the error. A node is calibrated once its least certain log gain is "
+        "known to "
         "2 %, after 32 contacts at least.",
         "",
         *table,

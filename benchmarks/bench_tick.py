@@ -1,9 +1,9 @@
-"""Cost of a tick: 15 to 960 pads, none, a tenth or all of them touched, contacts at rest and sliding.
+"""Cost of a tick: 15 to 960 pads, none, a tenth or all of them touched, static and sliding contacts.
 
-A tick is timed in two parts: the step, from the last sample to columns that are ready to be sent, and what is
-left for after the sending (`settle`). Each is timed hot, tick after tick, and cold, after a sleep as between
-two SYNCs, in which caches are lost. The floor, in the same run, is what nobody can do without: counts to
-currents, their sums, and one comparison. Writes docs/benchmarks/tick.{md,json}.
+A tick is timed in two parts: from the last sample to columns that are ready to be sent, and the work done
+after sending (`prepare`). Each is timed hot, one tick after another, and cold, after a sleep as between two
+SYNCs, in which caches are lost. The floor, in the same run, is the least work: counts to currents, their
+sums, and one comparison. Writes docs/benchmarks/tick.{md,json}.
 """
 
 from __future__ import annotations
@@ -20,20 +20,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch import shipped
-from handtouch.canbus.bus.slab import Slab
-from handtouch.config import Deployment, load
-from handtouch.daemon.cycle import Cycle
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.tick import Tick
+from handtouch.config import Deployment, load, shipped
+from handtouch.core.cycle import Cycle
+from handtouch.core.pad_model import PadModel
+from handtouch.core.slab import Slab
+from handtouch.core.tick import TickProcessor
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PADS = (15, 60, 240, 960)
 PARTS = (0.1, 1.0)
 PERIOD_NS = 5_000_000
 SLIDING_M = 1e-4  # a tick: 20 mm/s at 200 Hz
-SPEEDS = {"resting": 0.0, "sliding": SLIDING_M}
-STRENGTH = 20.0  # of the threshold's current
+SPEEDS = {"static": 0.0, "sliding": SLIDING_M}
+CURRENT_RATIO = 20.0  # of the threshold's current
 PAUSE_S = 0.003
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +40,7 @@ Row = dict[str, Any]
 
 
 def hands(pads: int) -> PadModel:
-    """The shipped hand, as often as it takes."""
+    """Return a model of as many copies of the shipped hand as needed."""
     deployment: Deployment = load(shipped.path("utah_mit.toml"))
     (hand,) = deployment.hands
     many = [hand.model_copy(update={"name": f"hand{k}"}) for k in range(pads // len(hand.pads))]
@@ -49,51 +48,57 @@ def hands(pads: int) -> PadModel:
 
 
 class Driver:
-    """Ticks a daemon's worth of pads with contacts on some."""
+    """Runs ticks of many pads with contacts on some."""
 
     def __init__(self, model: PadModel, touched: int, sliding_m: float) -> None:
         self.model, self.touched = model, touched
-        self.tick, self.slab = Tick(model, PERIOD_NS), Slab(model.size)
+        self.tick, self.slab = TickProcessor(model, PERIOD_NS), Slab(model.size)
         self.cycle = Cycle(PERIOD_NS, 0.6)
         self._up = np.zeros(model.size, dtype=np.uint8)
         self._random = np.random.default_rng(model.size + touched)
         self._sides = model.locator.sides
-        self._place = self._random.uniform(0.3, 0.7, (model.size, 2))
+        self._position = self._random.uniform(0.3, 0.7, (model.size, 2))
         angle = self._random.uniform(0, 2 * np.pi, model.size)
-        self._way = sliding_m * np.stack([np.cos(angle), np.sin(angle)], axis=1) / self._sides
+        self._velocity = sliding_m * np.stack([np.cos(angle), np.sin(angle)], axis=1) / self._sides
         self._t_ns = 10**9
 
     def sample(self) -> None:
-        """The next period's samples, with a count of noise."""
+        """Write the next samples, with a noise of one count."""
         self._t_ns += PERIOD_NS
-        self._place += self._way
-        self._way[(self._place < 0.2) | (self._place > 0.8)] *= -1
+        self._position += self._velocity
+        self._velocity[(self._position < 0.2) | (self._position > 0.8)] *= -1
         pads = np.arange(self.touched)
-        at = self._place[pads] * self._sides[pads]
+        at = self._position[pads] * self._sides[pads]
         counts = self._random.normal(size=(self.model.size, 4))
-        current = self.model.locator.fractions(pads, *at.T).T * (STRENGTH * self.model.on_a[pads, None])
+        current = self.model.locator.fractions(pads, *at.T).T * (
+            CURRENT_RATIO * self.model.begin_threshold_a[pads, None]
+        )
         counts[pads] += current / self.model.ampere_per_count[pads]
         self.slab.begin_cycle(self._t_ns)
-        self.cycle.begin(self._t_ns)
+        self.cycle.begin_cycle(self._t_ns)
         for slot, data in enumerate(np.rint(counts).astype("<i2")):
-            self.slab.write(slot, data.tobytes(), self._t_ns + 1000)
+            self.slab.write_pdo(slot, data.tobytes(), self._t_ns + 1000)
 
-    def step(self) -> None:
-        self.tick.step(self.slab, self._up, self.cycle, self._t_ns + 2000)
+    def run_tick(self) -> None:
+        """Run the measured tick."""
+        self.tick.run_tick(self.slab, self._up, self.cycle, self._t_ns + 2000)
 
     def floor(self) -> None:
-        """Counts to currents, and which pads are touched."""
-        currents = self.slab.read() * self.model.ampere_per_count
-        np.count_nonzero(currents @ np.ones(4) > self.model.on_a)
+        """Convert counts to currents and find touched pads."""
+        currents = self.slab.unpack_counts() * self.model.ampere_per_count
+        np.count_nonzero(currents @ np.ones(4) > self.model.begin_threshold_a)
 
     def measure(self, ticks: int, pause_s: float) -> dict[str, float]:
-        """Median microseconds of each part."""
-        spent: dict[str, list[int]] = {"floor": [], "step": [], "settle": []}
-        parts: list[tuple[str, Callable[[], None]]] = [("step", self.step), ("settle", self.tick.settle)]
+        """Return the median microseconds of each part."""
+        spent: dict[str, list[int]] = {"floor": [], "tick": [], "prepare": []}
+        parts: list[tuple[str, Callable[[], None]]] = [
+            ("tick", self.run_tick),
+            ("prepare", self.tick.prepare_next_tick),
+        ]
         for number in range(ticks + 10):
             self.sample()
             for name, part in [("floor", self.floor)] * (number % 4 == 0) + parts:
-                if name != "settle" and pause_s:
+                if name != "prepare" and pause_s:
                     time.sleep(pause_s)
                 begin_ns = time.perf_counter_ns()
                 part()
@@ -116,29 +121,29 @@ def measure(ticks: int) -> list[Row]:
 
 
 def pick(rows: list[Row], state: str, pads: int, touched: int, contacts: str) -> Row:
-    wanted = (state, pads, touched, contacts)
-    return next(r for r in rows if (r["state"], r["pads"], r["touched"], r["contacts"]) == wanted)
+    key = (state, pads, touched, contacts)
+    return next(r for r in rows if (r["state"], r["pads"], r["touched"], r["contacts"]) == key)
 
 
 def line(rows: list[Row], row: Row) -> str:
-    """A row of the table, from a hot one and its cold sister."""
+    """Return a line of the table, from a hot row and the cold one."""
     cold = pick(rows, "cold", row["pads"], row["touched"], row["contacts"])
     each = f"{whole(row) / row['touched']:.1f}" if row["touched"] else ""
     columns = [row["pads"], row["touched"], row["contacts"]]
-    columns += [f"{row[part]:.0f}" for part in ("floor", "step", "settle")] + [each]
-    columns += [f"{cold[part]:.0f}" for part in ("floor", "step", "settle")]
+    columns += [f"{row[part]:.0f}" for part in ("floor", "tick", "prepare")] + [each]
+    columns += [f"{cold[part]:.0f}" for part in ("floor", "tick", "prepare")]
     return "| " + " | ".join(map(str, columns)) + " |"
 
 
 def whole(row: Row) -> float:
-    """Step and settling."""
-    return float(row["step"] + row["settle"])
+    """Return the time of both parts."""
+    return float(row["tick"] + row["prepare"])
 
 
 def write(rows: list[Row], machine: str) -> str:
     table = "\n".join(line(rows, row) for row in rows if row["state"] == "hot")
     idle = "\n".join(
-        f"* {pads} pads: {whole(none) / whole(pick(rows, 'hot', pads, pads, 'resting')):.0%} of all at rest, "
+        f"* {pads} pads: {whole(none) / whole(pick(rows, 'hot', pads, pads, 'static')):.0%} of all static, "
         f"{whole(none) / whole(pick(rows, 'hot', pads, pads, 'sliding')):.0%} of all sliding"
         for pads in PADS
         for none in [pick(rows, "hot", pads, 0, "none")]
@@ -149,21 +154,21 @@ def write(rows: list[Row], machine: str) -> str:
     text = f"""# Cost of a tick
 
 Microseconds, medians; {machine}.
-Contacts at {STRENGTH:.0f} times the threshold, noise of one count a channel; sliding ones move
-{SLIDING_M * 1e3:.1f} mm a tick and turn back near edges. Hot: tick after tick. Cold: {PAUSE_S * 1e3:.0f} ms
-of sleep before each step. The step is what a message waits for; settling comes after it was sent. The floor
-is counts to currents and a comparison.
+Contacts at {CURRENT_RATIO:.0f} times the threshold, noise of one count a channel; sliding ones move
+{SLIDING_M * 1e3:.1f} mm a tick and turn back near edges. Hot: one tick after another.
+Cold: {PAUSE_S * 1e3:.0f} ms of sleep before each tick. *tick* is the latency from samples to messages;
+*prepare* runs after they were sent. The floor converts counts to currents and compares them.
 
-| pads | touched | contacts | floor | step | settle | both, a contact | floor cold | step | settle |
+| pads | touched | contacts | floor | tick | prepare | both, per contact | floor cold | tick | prepare |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {table}
 
-Cost of idle pads as part of that of touched ones:
+Cost of untouched pads as a fraction of that of touched ones:
 
 {idle}
 
-Growth from {few} to {many} pads, {many // few} times as many, all touched: {growth["resting"]:.1f}
-times at rest, {growth["sliding"]:.1f} times sliding.
+Growth from {few} to {many} pads, {many // few} times as many, all touched: {growth["static"]:.1f}
+times static, {growth["sliding"]:.1f} times sliding.
 
 Made by `make bench ONLY=tick`.
 """

@@ -1,10 +1,10 @@
-"""What the page in the browser costs, and what it shows: updates delivered, frames drawn, processor shares.
+"""Cost of the page in the browser: updates delivered, frames drawn, CPU shares of view and daemon.
 
 The real daemon and simulated nodes, as in bench_latency, but with all 15 pads touched by sliding contacts,
-and joints told at 100 Hz. Cases take turns: nobody listens; somebody reads hand frames, as a controller does;
-the view without a page; with one that only reads; with one in Chromium, drawing in software where there is no
-graphics processor. Chromium is left out where it isn't installed. What the daemon takes is told as processor
-time of its loop per tick, which others on the machine hardly change, and as ratios within a turn. Writes
+and joint states at 100 Hz. Cases alternate: no subscriber; a reader of hand frames, like a controller;
+the view without a page; with a page that only reads; with a page in Chromium, rendering in software without a
+graphics processor. Chromium is left out where it isn't installed. The daemon's cost is the CPU time of its
+loop per tick, which other processes hardly change, and ratios within a round. Writes
 docs/benchmarks/view.{md,json}.
 """
 
@@ -41,8 +41,8 @@ from handtouch.client import request
 from handtouch.config import load
 
 HERE = Path(__file__).parents[1] / "tests" / "javascript"
-NOBODY, READER, VIEW, PAGE, BROWSER, FELT = (
-    "nobody listens",
+NO_SUBSCRIBER, READER, VIEW, PAGE, BROWSER, PERCEPTS = (
+    "no subscriber",
     "a reader of hand frames",
     "the view, no page open",
     "the view, a page that only reads",
@@ -56,7 +56,7 @@ JOINTS = ("index_mcp", "index_pip", "index_dip", "middle_mcp", "ring_mcp", "thum
 
 @contextmanager
 def view(endpoint: str, *options: str) -> Iterator[tuple[int, str]]:
-    """`handtouch view`: its process and URL."""
+    """Run `handtouch view`; yield its process id and URL."""
     command = [sys.executable, "-m", "handtouch", "view", "--key", "", "--port", "0", "--endpoint", endpoint]
     command += options
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -66,7 +66,7 @@ def view(endpoint: str, *options: str) -> Iterator[tuple[int, str]]:
 
 
 class Reader:
-    """A page that only reads: `updates` so far, and the times between them."""
+    """A page that only reads: counts `updates`, and their intervals."""
 
     def __init__(self, url: str) -> None:
         self.updates = 0
@@ -94,7 +94,7 @@ class Chromium:
         self.ask(wait="handtouch.counts.frames > 3")
 
     def ask(self, **command: Any) -> Any:
-        """The answer to a command."""
+        """Send a command; return its answer."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(command) + "\n")
@@ -102,28 +102,28 @@ class Chromium:
         return json.loads(self._process.stdout.readline()).get("value")
 
     def counts(self) -> dict[str, int]:
-        """Updates taken and frames drawn."""
+        """Return the numbers of received updates and drawn frames."""
         return dict(self.ask(evaluate="handtouch.counts"))
 
     def close(self) -> None:
-        """End the browser."""
+        """Close the browser."""
         self._process.communicate()
 
 
 def case(config: Path, pid: int, seconds: float, name: str, packages: Path | None) -> dict[str, Any]:
-    """Shares and rates over a time."""
+    """Measure shares and rates over a time."""
     daemon = load(config).daemon
     row: dict[str, Any] = {"case": name}
     stop = multiprocessing.Event()
     reader = multiprocessing.Process(target=bystanders, args=(daemon.live, 1, stop))
     if name == READER:
         reader.start()
-    if name in (NOBODY, READER):
+    if name in (NO_SUBSCRIBER, READER):
         time.sleep(JOINING_S)
         row |= shares(daemon.control, pid, None, seconds)
     else:
-        with view(daemon.live, *["--percepts"] * (name == FELT)) as (view_pid, url):
-            page = Reader(url) if name in (FELT, PAGE) else None
+        with view(daemon.live, *["--percepts"] * (name == PERCEPTS)) as (view_pid, url):
+            page = Reader(url) if name in (PERCEPTS, PAGE) else None
             browser = Chromium(packages, url) if name == BROWSER and packages else None
             time.sleep(JOINING_S)
             start_s, before = time.monotonic(), browser.counts() if browser else {}
@@ -145,7 +145,7 @@ def case(config: Path, pid: int, seconds: float, name: str, packages: Path | Non
 
 
 def shares(control: str, pid: int, view_pid: int | None, seconds: float) -> dict[str, Any]:
-    """Of a core, that the daemon's loop, the daemon and the view take; how the ticks fare meanwhile."""
+    """Measure the CPU shares of the daemon's loop, the daemon and the view, and tick statistics."""
     cpu, of_view = ProcessorShare(), ProcessorShare()
     before = request("status", endpoint=control, timeout_s=30)["service"]
     cpu.start(pid)
@@ -173,7 +173,7 @@ def shares(control: str, pid: int, view_pid: int | None, seconds: float) -> dict
 
 
 def median_ms(before: list[int], after: list[int]) -> float:
-    """Of what a histogram of the wire counted in between; within its bin as if spread evenly."""
+    """Return the median of a histogram's increments, interpolated within its bin."""
     counts = [now - then for then, now in zip([*before, *[0] * len(after)], after, strict=False)]
     half, below = sum(counts) / 2, 0.0
     for number, count in enumerate(counts):
@@ -184,8 +184,8 @@ def median_ms(before: list[int], after: list[int]) -> float:
     return math.nan
 
 
-def tell_joints(endpoint: str, stop: threading.Event) -> None:
-    """A robot that moves."""
+def send_joints(endpoint: str, stop: threading.Event) -> None:
+    """Send the joint states of a moving robot."""
     with Robot(endpoint, key="") as robot:
         while not stop.wait(0.01):
             now_s = time.monotonic()
@@ -193,11 +193,11 @@ def tell_joints(endpoint: str, stop: threading.Event) -> None:
 
 
 def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> Rows:
-    """All cases, so many times, with one daemon."""
+    """Run all cases repeatedly with one daemon."""
     bench_latency.TOUCHED = 15  # of the film: the most that there is to show
     still = threading.Event()
-    robot = threading.Thread(target=tell_joints, args=(load(config).daemon.inputs, still))
-    cases = (NOBODY, READER, VIEW, PAGE, *([BROWSER] if packages else []), FELT)
+    robot = threading.Thread(target=send_joints, args=(load(config).daemon.inputs, still))
+    cases = (NO_SUBSCRIBER, READER, VIEW, PAGE, *([BROWSER] if packages else []), PERCEPTS)
     with serving(config) as (pid, _):
         robot.start()
         try:
@@ -208,7 +208,7 @@ def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> 
 
 
 def browser_packages(folder: Path) -> Path | None:
-    """What drives Chromium; None without Chromium. Before the program enters a network of its own."""
+    """Install the packages that drive Chromium, before entering the private network, if it is installed."""
     if not (shutil.which("chromium") and shutil.which("npm")):
         return None
     shutil.copytree(HERE, folder)
@@ -217,7 +217,7 @@ def browser_packages(folder: Path) -> Path | None:
     return folder
 
 
-_TOLD = (
+_FORMATS = (
     *(
         ("to_reader", ".2f"),
         ("latency_ms", ".2f"),
@@ -230,7 +230,7 @@ _TOLD = (
 
 
 def page_of(results: dict[str, Any]) -> str:
-    """The page."""
+    """Return the page of results."""
     rows = results["rows"]
     reader = {row["turn"]: row["tick_ms"] for row in rows if row["case"] == READER}
     for row in rows:
@@ -257,24 +257,24 @@ def page_of(results: dict[str, Any]) -> str:
     turns = 1 + max(row["turn"] for row in rows)
     return f"""# The view
 
-A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, its joints told at 100 Hz. Medians of
-{turns} turns through all cases, {results["seconds"]:.0f} s each.
+A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, with joint states at 100 Hz. Medians of
+{turns} rounds through all cases, {results["seconds"]:.0f} s each.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
-| who listens | loop, ms a tick | its share | of the reader's | latency, ms | ticks/s | view | ms an update \
-| updates/s | frames/s drawn | kB/s |
+| subscriber | loop, ms per tick | share of a core | ratio to reader | latency, ms | ticks/s | view \
+| ms per update | updates/s | frames/s drawn | kB/s |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(lines)}
 
-* *loop* is processor time of the daemon's loop per tick, and what that is of a core at {RATE_HZ} ticks/s; *of
-  the reader's* the ratio to a reader of hand frames in the same turn. Where nobody listens, the daemon
-  computes no places and forces: what a view costs is what it takes beyond that reader, which any controller
-  is: joints and health; with --percepts what is felt above contacts, computed after these were sent.
+* *loop* is CPU time of the daemon's loop per tick, and its share of a core at {RATE_HZ} ticks/s; *ratio to
+  reader* is relative to a reader of hand frames in the same round. Without a subscriber, the daemon
+  computes no positions and forces. The cost of a view is its excess over that reader, which is what any
+  controller does: joints and health; with --percepts also the percepts, computed after the contacts.
 * *latency* is from the last sample to the last message of a tick, median, by the daemon's own clock.
-* *view* is the share of a core that `handtouch view` takes. *updates* are delivered to the page, of 30 that
-  are due; *frames* are drawn: Chromium draws 1024 x 640 pixels in software here, on the same cores, and the
-  page then leaves half of the time to others.
-* Where ticks/s stay below {RATE_HZ}, others had the machine: then rates are lower limits.
+* *view* is the share of a core that `handtouch view` takes. *updates* are delivered to the page, nominally
+  30 per second; *frames* are drawn: Chromium renders 1024 x 640 pixels in software here, on the same cores,
+  and the page then uses at most half of the time.
+* Where ticks/s are below {RATE_HZ}, other processes used the machine: rates are lower limits then.
 
 Made by `make bench ONLY=view`.
 """

@@ -1,4 +1,4 @@
-"""Episodes for bench_diagnose: a small hand in use, what happens to one of its pads, and its name."""
+"""Episodes for bench_diagnose: a small hand in use, and a fault of one of its pads."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from handtouch import config, shipped
+from handtouch import config
+from handtouch.config import shipped
 from handtouch.simulate.faults import FAULTS, INFLUENCES, Fault
-from handtouch.simulate.hand import VirtualHand
-from handtouch.simulate.scenario import Scenario, Touch
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
-from handtouch.supervise.diagnose import Block, Kind
+from handtouch.supervisor.diagnose import HandSamples
+from handtouch.wire.faults import FaultKind
 
 PADS = ("index_distal", "index_proximal", "palm_thumb")
 RATE_HZ = 100
@@ -22,25 +25,25 @@ BLOCK = 50  # samples
 LENGTH_S = 110.0
 ELECTRODES = ("x0", "xa", "y0", "yb")
 FAULTY = {
-    "gum": Kind.STUCK_CONTACT,
-    "moisture": Kind.MOISTURE,
-    "dead electrode": Kind.DEAD_ELECTRODE,
-    "shorted electrode": Kind.SHORTED_ELECTRODE,
-    "swapped cables": Kind.SWAPPED_ELECTRODES,
-    "saturated channel": Kind.SATURATED_CHANNEL,
-    "stuck channel": Kind.STUCK_CHANNEL,
-    "torn corner": Kind.TORN_CORNER,
-    "offset": Kind.OFFSET,
-    "gain step": Kind.GAIN_STEP,
-    "hysteresis tail": Kind.HYSTERESIS_TAIL,
+    "gum": FaultKind.GUM,
+    "moisture": FaultKind.MOISTURE,
+    "dead electrode": FaultKind.DEAD_ELECTRODE,
+    "shorted electrode": FaultKind.SHORTED_ELECTRODE,
+    "swapped cables": FaultKind.SWAPPED_CABLES,
+    "saturated channel": FaultKind.SATURATED_CHANNEL,
+    "stuck channel": FaultKind.STUCK_CHANNEL,
+    "torn corner": FaultKind.TORN_CORNER,
+    "offset": FaultKind.OFFSET,
+    "gain step": FaultKind.GAIN_STEP,
+    "hysteresis tail": FaultKind.HYSTERESIS_TAIL,
 }
-"""What happens, and what it should be called."""
+"""Fault played, and its right diagnosis."""
 FAULT_FREE = ("plain use", "long grasp", "wet object", "sweeping wipes", "hot cup", "two objects")
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One of them: what happens from begin_s on to the pad `link`, and how big it is."""
+    """One episode: a fault of pad `link` from begin_s on, and its size."""
 
     name: str
     seed: int
@@ -49,8 +52,8 @@ class Episode:
     details: dict[str, Any]
     hand: VirtualHand
 
-    def blocks(self, length_s: float = LENGTH_S) -> Iterator[Block]:
-        """Its samples, block after block."""
+    def blocks(self, length_s: float = LENGTH_S) -> Iterator[HandSamples]:
+        """Yield its samples in blocks."""
         ticks = int(length_s * RATE_HZ) // BLOCK * BLOCK
         times = np.arange(ticks) / RATE_HZ
         counts = np.stack([self.hand.counts(row, times) for row in range(len(PADS))], axis=1)
@@ -58,7 +61,7 @@ class Episode:
         fresh = np.ones((BLOCK, len(PADS)), dtype=np.bool_)
         for first in range(0, ticks, BLOCK):
             part = slice(first, first + BLOCK)
-            yield Block(stamps[part], counts[part], fresh)
+            yield HandSamples(stamps[part], counts[part], fresh)
 
 
 @lru_cache(maxsize=1)
@@ -118,7 +121,7 @@ class _Play:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self.touches: list[Touch] = []
+        self.touches: list[ScenarioTouch] = []
 
     def use(self, link: str, from_s: float, until_s: float) -> None:
         """Taps, presses and slides one after another, with rests."""
@@ -133,7 +136,7 @@ class _Play:
             at += length + float(rng.uniform(0.3, 4.0))
 
     def held(self, link: str, from_s: float, length_s: float) -> dict[str, Any]:
-        """An object in the hand: trembles by 0.03 to 0.5 mm and 0.5 to 10 % of its force, at about 3 Hz."""
+        """Hold an object with a tremor of 0.03 to 0.5 mm and 0.5 to 10 % of its force, at about 3 Hz."""
         rng = self._rng
         steps = int(3 * length_s)
         middle, size = np.array(self._place(0.15)), _size_mm(link)
@@ -143,7 +146,7 @@ class _Play:
         path = np.clip(middle + rng.normal(size=(steps, 2)) * wander_mm / np.array(size), 0.02, 0.98)
         forces = force * np.exp(relative * rng.normal(size=steps))
         self._add(link, from_s, length_s, [(float(x), float(y)) for x, y in path], forces.tolist())
-        return {"wander_mm": wander_mm, "tremble": relative, "force_n": force}
+        return {"wander_mm": wander_mm, "tremor": relative, "force_n": force}
 
     def grasp(self, from_s: float, length_s: float) -> dict[str, Any]:
         """Two or more pads hold an object for long."""
@@ -212,7 +215,7 @@ class _Play:
         ramp_s: float = 0.15,
     ) -> None:  # fmt: skip
         self.touches.append(
-            Touch(
+            ScenarioTouch(
                 link=link,
                 from_s=from_s,
                 duration_s=length_s,
@@ -229,15 +232,15 @@ class _Play:
 
 @lru_cache(maxsize=8)
 def _size_mm(link: str) -> tuple[float, float]:
-    from handtouch.hand import surface_of
+    from handtouch.hand import pad_surface
 
     (pad,) = (pad for pad in deployment().hands[0].pads if pad.link == link)
-    u, v = surface_of(pad).extent_m
+    u, v = pad_surface(pad).extent_m
     return 1e3 * u, 1e3 * v
 
 
 def _fault(name: str, rng: np.random.Generator, size_mm: tuple[float, float]) -> dict[str, Any]:
-    """A fault of that name, of a size that somebody would want to hear of."""
+    """Return a fault of that name, of a size that needs attention."""
     electrode = ELECTRODES[int(rng.integers(4))]
     place = tuple(rng.uniform(0.12, 0.88, 2).tolist())
     if name == "gum":

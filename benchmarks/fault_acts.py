@@ -1,4 +1,4 @@
-"""What the faults of stress_faults.py are and do: on a node or on the bus, and how it is taken back.
+"""Faults of stress_faults.py: how each is caused on a node or on the bus, and how it is removed.
 
 Public names: `Kind`, `Fault`, and the acts that the kinds are made of.
 """
@@ -13,10 +13,10 @@ from typing import Any
 import can
 from fault_bench import TPDO
 
-from handtouch.canbus.device import Device, Line
+from handtouch.device import Device, LineFaults
 
 SYNC_ID, NMT, SDO_ANSWER, HEARTBEAT = 0x080, 0x000, 0x580, 0x700
-BOOT_REQUESTS = 14  # SDO requests of the boot of a shipped node; an abort of each is told
+BOOT_REQUESTS = 14  # SDO requests of the boot of a shipped node; an abort of each is reported
 ABORT = 0x08000000
 OBJECTS = ((0x1018, 1), (0x1018, 4), (0x1A01, 0), (0x1A01, 2), (0x1801, 1), (0x1801, 2), (0x1017, 0))
 
@@ -36,39 +36,39 @@ class Fault:
     health: dict[int, Any]
     """node id -> its message before"""
     bus: Mapping[str, Any]
-    """its figures in `service` before, and now"""
+    """its statistics in `service` before, and now"""
     bus_now: Mapping[str, Any] = field(default_factory=dict)
     ended_ns: int = 0
-    told_ns: dict[int, int] = field(default_factory=dict)
-    """node id, 0 for the bus -> when the right cause was told"""
+    reported_ns: dict[int, int] = field(default_factory=dict)
+    """node id, 0 for the bus -> when the right cause was reported"""
     well_ns: dict[int, int] = field(default_factory=dict)
     history: list[str] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     disturbed_ns: list[int] = field(default_factory=list)
-    """when it changed what it mustn't"""
+    """when it changed a state that must not change"""
     kept: Any = None
-    """whatever has to be taken back"""
+    """whatever has to be restored"""
 
     @property
     def node(self) -> Device:
-        """The node that it is on."""
+        """Device with the fault."""
         assert self.device is not None
         return self.device
 
 
-Told = Callable[[Fault, Any], bool]
-"""Whether a health message tells the cause."""
+ReportCheck = Callable[[Fault, Any], bool]
+"""Returns True if a health message reports the cause"""
 
 
 @dataclass(frozen=True)
 class Kind:
     """A kind of fault.
 
-    `begin` and `end` cause it and take it back; `lasts_s` the shortest and longest time between. `told` is
-    how a health message of the node tells it, `told_by_bus` how the bus's figures in `service` do; with
-    neither nothing is required. `quiet`: the node must stay operational and trusted all the while; `loose`:
-    operational it must stay, but what its pad shows is wrong, which is for the supervisor of pads to tell.
-    `within_s` for the telling, `well_s` for being operational again.
+    `begin` and `end` cause and remove it; `lasts_s` are the shortest and longest time between. `reported`
+    checks that a health message of the node reports it, `reported_by_bus` that the bus statistics in
+    `service` do; with neither no report is required. `quiet`: the node must stay operational and its samples
+    valid; `loose`: the node must stay operational, but its samples are wrong, which the supervisor diagnoses.
+    `within_s` limits the time to the report, `well_s` the time to recovery.
     """
 
     name: str
@@ -76,14 +76,14 @@ class Kind:
     begin: Callable[[Fault, Any], None]
     end: Callable[[Fault, Any], None]
     lasts_s: tuple[float, float] = (0.4, 1.5)
-    told: Told | None = None
-    told_by_bus: Callable[[Fault], bool] | None = None
+    reported: ReportCheck | None = None
+    reported_by_bus: Callable[[Fault], bool] | None = None
     quiet: bool = False
     loose: bool = False
     bus_wide: bool = False
     alone: bool = False
     lag: float = 0.0
-    """periods by which its samples are late: a pause that makes it stale is so much shorter"""
+    """periods by which its samples are late; shortens the pause that makes it stale"""
     within_s: float = 1.0
     well_s: float = 2.0
     weight: float = 1.0
@@ -93,19 +93,19 @@ class Kind:
 
 
 def nothing(_: Fault, __: Any) -> None:
-    """It ends by itself."""
+    """Do nothing: the fault ends by itself."""
 
 
 def line(**settings: Any) -> Callable[[Fault, Any], None]:
     def begin(fault: Fault, _: Any) -> None:
-        fault.node.line = Line(**settings, seed=fault.number)
+        fault.node.line = LineFaults(**settings, seed=fault.number)
 
     return begin
 
 
 def late(fault: Fault, bench: Any) -> None:
-    """After their tick, before the next SYNC."""
-    fault.node.line = Line(late_ns=round(fault.kind.lag * bench.period_ns))
+    """Delay samples until after their tick, before the next SYNC."""
+    fault.node.line = LineFaults(late_ns=round(fault.kind.lag * bench.period_ns))
 
 
 def no_line(fault: Fault, _: Any) -> None:
@@ -113,7 +113,7 @@ def no_line(fault: Fault, _: Any) -> None:
 
 
 def attribute(name: str, during: Any, after: Any) -> dict[str, Any]:
-    """A switch of the node."""
+    """Set an attribute of the node, and restore it."""
     return {
         "begin": lambda fault, _: setattr(fault.node, name, during),
         "end": lambda fault, _: setattr(fault.node, name, after),
@@ -121,23 +121,23 @@ def attribute(name: str, during: Any, after: Any) -> dict[str, Any]:
 
 
 def stick(fault: Fault, _: Any) -> None:
-    fault.node.stick(fault.chance.randrange(4))
+    fault.node.stick_channel(fault.chance.randrange(4))
 
 
 def dead(fault: Fault, _: Any) -> None:
-    fault.node.dead = {fault.chance.randrange(4)}
+    fault.node.open_electrodes = {fault.chance.randrange(4)}
 
 
 def alive(fault: Fault, _: Any) -> None:
-    fault.node.dead = frozenset()
+    fault.node.open_electrodes = frozenset()
 
 
 def saturate(fault: Fault, _: Any) -> None:
-    fault.node.saturate()
+    fault.node.saturate_channels()
 
 
 def release(fault: Fault, _: Any) -> None:
-    fault.node.release()
+    fault.node.release_channels()
 
 
 def brown_out(fault: Fault, _: Any) -> None:
@@ -145,7 +145,7 @@ def brown_out(fault: Fault, _: Any) -> None:
 
 
 def brown_outs(fault: Fault, _: Any) -> None:
-    """Three, so close that they hit the boot."""
+    """Cause three brown-outs in quick succession, during the boot."""
     away_ms = fault.chance.randrange(2, 60)
     every_ms = away_ms + fault.chance.randrange(3, 120)
     fault.node.brown_out(away_ms * 1_000_000, times=3, every_ns=every_ms * 1_000_000)
@@ -157,11 +157,11 @@ def bus_off(fault: Fault, _: Any) -> None:
 
 def swap(fault: Fault, _: Any) -> None:
     fault.kept = fault.node.serial
-    fault.node.swap(fault.kept + 5000)
+    fault.node.replace_device(fault.kept + 5000)
 
 
 def swap_back(fault: Fault, _: Any) -> None:
-    fault.node.swap(fault.kept)
+    fault.node.replace_device(fault.kept)
 
 
 def twin(fault: Fault, bench: Any) -> None:
@@ -176,15 +176,15 @@ def no_twin(fault: Fault, bench: Any) -> None:
 
 
 def babble(fault: Fault, _: Any) -> None:
-    fault.node.babble(1000)
+    fault.node.start_babbling(1000)
 
 
 def chatter(fault: Fault, _: Any) -> None:
-    fault.node.babble(400, 0x1F0, b"\x01")
+    fault.node.start_babbling(400, 0x1F0, b"\x01")
 
 
 def hush(fault: Fault, _: Any) -> None:
-    fault.node.hush()
+    fault.node.stop_babbling()
 
 
 def fail_at_step(code: int | None) -> Callable[[Fault, Any], None]:
@@ -233,18 +233,18 @@ def heal_sdo(fault: Fault, bench: Any) -> None:
 def emergency(fault: Fault, _: Any) -> None:
     code = 0xFF00 + fault.number % 256
     fault.kept = f"0x{code:04X}"
-    fault.node.emergency(code, 0x81, b"hand")
+    fault.node.send_emergency(code, 0x81, b"hand")
 
 
 def nmt(command: int) -> Callable[[Fault, Any], None]:
     def begin(fault: Fault, bench: Any) -> None:
-        bench.stranger.send(message(NMT, bytes((command, fault.node.node_id))))
+        bench.unknown_device.send(message(NMT, bytes((command, fault.node.node_id))))
 
     return begin
 
 
 def no_beat_time(fault: Fault, _: Any) -> None:
-    fault.node.write(0x1017, 0, 0)
+    fault.node.write_object(0x1017, 0, 0)
 
 
 def reboot(fault: Fault, _: Any) -> None:
@@ -283,13 +283,13 @@ def all_reboot(_: Fault, bench: Any) -> None:
 
 
 def sending(make: Callable[[random.Random, Sequence[int]], can.Message], rate_hz: float) -> dict[str, Any]:
-    """Frames of the stranger."""
+    """Send frames of an unknown device."""
 
     def begin(fault: Fault, bench: Any) -> None:
         nodes = sorted(bench.devices.devices)
-        bench.stranger.start(fault.number, lambda: make(fault.chance, nodes), rate_hz)
+        bench.unknown_device.start(fault.number, lambda: make(fault.chance, nodes), rate_hz)
 
-    return {"begin": begin, "end": lambda fault, bench: bench.stranger.stop(fault.number)}
+    return {"begin": begin, "end": lambda fault, bench: bench.unknown_device.stop(fault.number)}
 
 
 def message(can_id: int, data: bytes = b"") -> can.Message:
@@ -297,7 +297,7 @@ def message(can_id: int, data: bytes = b"") -> can.Message:
 
 
 def foreign(chance: random.Random, _: Sequence[int]) -> can.Message:
-    """Identifiers that no node uses: those of ids 0x60 to 0x7F, and 29-bit ones."""
+    """Frames with identifiers that no node uses: node ids 0x60 to 0x7F, and 29-bit ones."""
     if chance.random() < 0.1:
         return can.Message(arbitration_id=chance.randrange(1 << 29), data=b"\x01\x02", is_extended_id=True)
     base = chance.choice((0x180, 0x280, 0x580, 0x700, 0x080))
@@ -305,17 +305,17 @@ def foreign(chance: random.Random, _: Sequence[int]) -> can.Message:
 
 
 def sync(_: random.Random, __: Sequence[int]) -> can.Message:
-    """As another SYNC producer sends it."""
+    """SYNC of another producer."""
     return message(SYNC_ID)
 
 
 def malformed(chance: random.Random, nodes: Sequence[int]) -> can.Message:
-    """Samples, heartbeats, EMCY and SDO answers in the name of our nodes, of wrong lengths."""
+    """Samples, heartbeats, EMCY and SDO answers with our nodes' identifiers and wrong lengths."""
     base = chance.choice((TPDO, HEARTBEAT, SDO_ANSWER, SYNC_ID))
     size = chance.choice((0, 2, 3, 4, 5, 6, 7) if base != HEARTBEAT else (0, 2, 5, 8))
     return message(base + chance.choice(nodes), chance.randbytes(size))
 
 
 def answers(chance: random.Random, nodes: Sequence[int]) -> can.Message:
-    """SDO answers that nobody asked for."""
+    """Unrequested SDO answers."""
     return message(SDO_ANSWER + chance.choice(nodes), b"\x43\x18\x10\x04" + chance.randbytes(4))

@@ -1,6 +1,6 @@
-"""Around a fault campaign: the nodes' cable, a stranger, what nodes measure, what the daemon takes.
+"""Around a fault campaign: the nodes' cable, a unknown_device, what nodes measure, what the daemon takes.
 
-Public names: `Bench`, `Cable`, `Stranger`, `Resources`, `sampler`, `open_bus`, `PRESSED`.
+Public names: `Bench`, `Cable`, `UnknownDevice`, `Resources`, `sampler`, `open_bus`, `PRESSED`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import can
 import numpy as np
 from bench_latency import CHANNEL, PORT
 
-from handtouch.canbus.device import DeviceBus
 from handtouch.config import Deployment
+from handtouch.device import DeviceBus
 
 S = 1_000_000_000
 TPDO = 0x280
@@ -58,10 +58,10 @@ class Cable:
         return None if self.silent else message
 
     def paused(self, node_id: int, t_ns: int, lag: float = 0.0) -> bool:
-        """Whether the node's program or SYNC paused around this time, for two periods less `lag`.
+        """Return True if the node's program or SYNC paused at this time, for two periods less `lag`.
 
         A pad is stale after three, counted from the SYNC of its newest sample, not from its sending. After a
-        long pause the node has to be started anew.
+        long pause the node has to be restarted.
         """
         least_ns = (2 - lag) * self._period_ns
         return any(
@@ -105,7 +105,7 @@ class Resources:
         }
 
 
-class Stranger:
+class UnknownDevice:
     """Another device on the bus; `pump` sends what is due."""
 
     def __init__(self, bus: can.BusABC) -> None:
@@ -137,10 +137,10 @@ class Stranger:
 
 @dataclass
 class Bench:
-    """What faults act on."""
+    """Devices, bus and frames that faults act on."""
 
     devices: DeviceBus
-    stranger: Stranger
+    unknown_device: UnknownDevice
     period_ns: int
     cable: Any
     """the nodes' side of the bus, with `silent` to cut it"""

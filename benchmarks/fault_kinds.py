@@ -1,4 +1,4 @@
-"""The kinds of faults of the campaign in stress_faults.py, and what is to be told of each.
+"""The kinds of faults of the campaign in stress_faults.py, and the expected report of each.
 
 Public names: `KINDS`.
 """
@@ -13,7 +13,7 @@ from fault_acts import (
     ABORT,
     Fault,
     Kind,
-    Told,
+    ReportCheck,
     alive,
     all_off,
     all_on,
@@ -60,13 +60,13 @@ from fault_acts import (
 ALONE: dict[str, Any] = {"bus_wide": True, "alone": True, "weight": 0.25}
 
 
-# How a message tells -------------------------------------------------------------------------------------
+# Checks of reports --------------------------------------------------------------------------------------
 
 
-def says(pattern: str) -> Told:
-    """The reason has words that match."""
-    words = re.compile(pattern)
-    return lambda _, health: bool(words.search(health.reason))
+def matches(pattern: str) -> ReportCheck:
+    """Return a check that the reason matches a pattern."""
+    compiled = re.compile(pattern)
+    return lambda _, health: bool(compiled.search(health.reason))
 
 
 def rebooted(fault: Fault, health: Any) -> bool:
@@ -74,116 +74,122 @@ def rebooted(fault: Fault, health: Any) -> bool:
 
 
 def rebooted_or_away(fault: Fault, health: Any) -> bool:
-    """For one that is dark for as long as it takes to be lost, more or less."""
+    """Check for a node without power for about as long as it takes to be lost."""
     return rebooted(fault, health) or _LOST(fault, health)
 
 
 def missed(fault: Fault, health: Any) -> bool:
-    return bool(health.missed > fault.health[health.node_id].missed)
+    return bool(health.missed_samples > fault.health[health.node_id].missed_samples)
 
 
 def beats_missed(fault: Fault, health: Any) -> bool:
     return bool(health.heartbeats_missed > fault.health[health.node_id].heartbeats_missed)
 
 
-def emergency_told(fault: Fault, health: Any) -> bool:
+def emergency_reported(fault: Fault, health: Any) -> bool:
     return any(fault.kept in text for text in health.emergencies)
 
 
 def grew(counter: str, by: int = 1) -> Callable[[Fault], bool]:
-    """A counter of the bus."""
+    """Return a check that a counter of the bus has grown."""
     return lambda fault: bool(fault.bus_now[counter] >= fault.bus[counter] + by)
 
 
 def other_sync(fault: Fault) -> bool:
     now, before = fault.bus_now["sync"], fault.bus["sync"]
-    return now["others"] > before["others"] and "another SYNC producer" in now["problem"]
+    return now["other_syncs"] > before["other_syncs"] and "another SYNC producer" in now["problem"]
 
 
-_LOST = says("lost: no heartbeat")
-_STALE = says("its heartbeat comes, its samples don't|no sample for .* its heartbeat is there")
-_GONE = says("lost: no heartbeat|its heartbeat comes, its samples don't|no sample for")
-_REFUSED = says("refused by the node")
-_NO_ANSWER = says("no answer within 200 ms, asked 2 times")
+_LOST = matches("lost: no heartbeat")
+_STALE = matches("heartbeats arrive, samples don't|no sample for .* heartbeat present")
+_GONE = matches("lost: no heartbeat|heartbeats arrive, samples don't|no sample for")
+_REFUSED = matches("refused by the node")
+_NO_ANSWER = matches("no answer within 200 ms in 2 attempts")
 
 
 KINDS = (
     # quiet: nothing but counters may change
-    Kind("lost: 1 sample in 20", "`missed`", line(lost_every=20), no_line,
-         told=missed, quiet=True, within_s=2.8),
-    Kind("late samples", "`missed`", late, no_line, lag=0.8,
-         told=missed, quiet=True, within_s=2.8),
+    Kind("lost: 1 sample in 20", "`missed_samples`", line(lost_every=20), no_line,
+         reported=missed, quiet=True, within_s=2.8),
+    Kind("late samples", "`missed_samples`", late, no_line, lag=0.8,
+         reported=missed, quiet=True, within_s=2.8),
     Kind("duplicate samples", "nothing", line(duplicate=0.5), no_line, quiet=True),
     Kind("heartbeats lost, two at most", "`heartbeats_missed`", **attribute("send_heartbeat", False, True),
-         lasts_s=(0.15, 0.2), told=beats_missed, quiet=True, within_s=1.6),
+         lasts_s=(0.15, 0.2), reported=beats_missed, quiet=True, within_s=1.6),
     Kind("EMCY", "its text in `emergencies`", emergency, nothing,
-         told=emergency_told, quiet=True, within_s=1.6),
+         reported=emergency_reported, quiet=True, within_s=1.6),
     Kind("SDO server frozen, node runs", "nothing", freeze(reboot=False), heal_sdo, quiet=True),
-    Kind("babbles as somebody unknown", "`foreign`", chatter, hush,
-         told_by_bus=grew("foreign", 100), quiet=True, within_s=1.6),
+    Kind("babbles with unknown identifiers", "`unknown_frames`", chatter, hush,
+         reported_by_bus=grew("unknown_frames", 100), quiet=True, within_s=1.6),
     # loose: the pad is wrong, the node isn't
-    Kind("stuck channel", "nothing yet", stick, release, loose=True),
-    Kind("dead electrode", "nothing yet", dead, alive, loose=True),
-    # the pad is told
+    Kind("stuck channel", "none here", stick, release, loose=True),
+    Kind("dead electrode", "none here", dead, alive, loose=True),
+    # the pad is reported
     Kind("corrupt samples", "faulted: no such currents", line(corrupt=1.0), no_line,
-         told=says("at the end of its range|no electrode can give current")),
-    Kind("saturated", "faulted: end of range", saturate, release, told=says("at the end of its range")),
-    # the node is told
-    Kind("short samples", "stale; `short`", **attribute("frame_bytes", 7, None), told=_STALE),
-    Kind("heartbeat without data", "stale", **attribute("send_data", False, True), told=_STALE),
+         reported=matches("at the end of its range|electrode currents can't be negative")),
+    Kind("saturated", "faulted: end of range", saturate, release,
+         reported=matches("at the end of its range")),
+    # the node is reported
+    Kind("short samples", "stale; `wrong_length`", **attribute("frame_bytes", 7, None), reported=_STALE),
+    Kind("heartbeat without data", "stale", **attribute("send_data", False, True), reported=_STALE),
     Kind("data without heartbeat", "lost: no heartbeat", **attribute("send_heartbeat", False, True),
-         lasts_s=(0.8, 3.0), told=_LOST, well_s=7.0),
+         lasts_s=(0.8, 3.0), reported=_LOST, well_s=7.0),
     Kind("all frames lost", "lost: no heartbeat", line(lost=1.0, data_only=False), no_line,
-         lasts_s=(0.8, 2.5), told=_LOST),
-    Kind("one frame in three lost", "`missed`, stale or lost", line(lost=0.33, data_only=False), no_line,
-         told=lambda fault, health: missed(fault, health) or _GONE(fault, health), within_s=2.8, well_s=7.0),
-    Kind("heartbeat switched off by somebody", "lost: no heartbeat", no_beat_time, nothing,
-         lasts_s=(0.8, 1.0), told=_LOST),
-    Kind("reboot", "`reboots`", reboot, nothing, lasts_s=(0.0, 0.0), told=rebooted, weight=3.0),
+         lasts_s=(0.8, 2.5), reported=_LOST),
+    Kind("one frame in three lost", "`missed_samples`, stale or lost", line(lost=0.33, data_only=False),
+         no_line,
+         reported=lambda fault, health: missed(fault, health) or _GONE(fault, health),
+         within_s=2.8, well_s=7.0),
+    Kind("heartbeat disabled by another client", "lost: no heartbeat", no_beat_time, nothing,
+         lasts_s=(0.8, 1.0), reported=_LOST),
+    Kind("reboot", "`reboots`", reboot, nothing, lasts_s=(0.0, 0.0), reported=rebooted, weight=3.0),
     Kind("brown-out, up to 0.7 s", "`reboots`, or lost", brown_out, nothing,
-         lasts_s=(0.005, 0.7), told=rebooted_or_away, within_s=1.5, weight=3.0),
-    Kind("three brown-outs", "`reboots`", brown_outs, nothing, lasts_s=(0.6, 0.6), told=rebooted, weight=2.0),
+         lasts_s=(0.005, 0.7), reported=rebooted_or_away, within_s=1.5, weight=3.0),
+    Kind("three brown-outs", "`reboots`", brown_outs, nothing, lasts_s=(0.6, 0.6),
+         reported=rebooted, weight=2.0),
     Kind("unplugged for long", "lost: no heartbeat", unplug, plug,
-         lasts_s=(0.8, 5.0), told=_LOST, weight=2.0),
-    Kind("bus-off, short", "stale", bus_off, nothing, lasts_s=(0.1, 0.25), told=_GONE),
-    Kind("bus-off, long", "lost: no heartbeat", bus_off, nothing, lasts_s=(0.7, 1.5), told=_LOST),
+         lasts_s=(0.8, 5.0), reported=_LOST, weight=2.0),
+    Kind("bus-off, short", "stale", bus_off, nothing, lasts_s=(0.1, 0.25), reported=_GONE),
+    Kind("bus-off, long", "lost: no heartbeat", bus_off, nothing, lasts_s=(0.7, 1.5), reported=_LOST),
     Kind("bus-off, then boots", "`reboots`, or lost", bus_off, nothing,
-         lasts_s=(0.1, 1.0), told=rebooted_or_away, within_s=1.8),
-    Kind("another unit in its place", "faulted: another device, both numbers", swap, swap_back,
+         lasts_s=(0.1, 1.0), reported=rebooted_or_away, within_s=1.8),
+    Kind("node replaced", "faulted: another device, both numbers", swap, swap_back,
          lasts_s=(0.3, 2.0), weight=2.0,
-         told=says(r"another device: serial number is (\d+) .* configured is (\d+)")),
+         reported=matches(r"another device: serial number is (\d+) .* configured is (\d+)")),
     Kind("two nodes with its id", "faulted: two nodes, or another device", twin, no_twin,
          lasts_s=(2.0, 6.0), within_s=5.0, well_s=9.0,
-         told=says("two nodes have its id|another device: serial number")),
+         reported=matches("two nodes have its id|another device: serial number")),
     Kind("reboot, SDO abort at a step", "faulted: refused", fail_at_step(ABORT), heal_sdo,
-         lasts_s=(0.5, 0.5), told=_REFUSED, weight=3.0),
+         lasts_s=(0.5, 0.5), reported=_REFUSED, weight=3.0),
     Kind("reboot, silence at a step", "`reboots`", fail_at_step(None), heal_sdo,
-         lasts_s=(0.5, 0.5), told=rebooted, weight=2.0),
-    Kind("reboot, an object refused", "faulted: refused", fail_object, heal_sdo, told=_REFUSED, well_s=7.0),
+         lasts_s=(0.5, 0.5), reported=rebooted, weight=2.0),
+    Kind("reboot, an object refused", "faulted: refused", fail_object, heal_sdo,
+         reported=_REFUSED, well_s=7.0),
     Kind("reboot, SDO answers are noise", "faulted: 0x1018:01", garble("noise"), heal_sdo,
-         told=says("0x1018:01"), well_s=7.0),
+         reported=matches("0x1018:01"), well_s=7.0),
     Kind("reboot, SDO answers name another object", "faulted: 0x1018:01", garble("object"), heal_sdo,
-         told=says("0x1018:01"), well_s=7.0),
+         reported=matches("0x1018:01"), well_s=7.0),
     Kind("reboot, SDO server frozen", "faulted: no answer", freeze(reboot=True), heal_sdo,
-         lasts_s=(0.8, 2.0), told=_NO_ANSWER, within_s=1.5, well_s=7.0),
+         lasts_s=(0.8, 2.0), reported=_NO_ANSWER, within_s=1.5, well_s=7.0),
     Kind("stopped by another master", "NMT state", nmt(2), nothing, lasts_s=(0.3, 0.3),
-         told=says("node is stopped, though it was started|no sample|samples don't")),
+         reported=matches("node is stopped, although it was started|no sample|samples don't")),
     Kind("made pre-operational by another master", "NMT state", nmt(128), nothing, lasts_s=(0.3, 0.3),
-         told=says("node is pre-operational, though it was started|no sample|samples don't")),
-    Kind("reset by another master", "`reboots`", nmt(129), nothing, lasts_s=(0.0, 0.0), told=rebooted),
+         reported=matches("node is pre-operational, although it was started|no sample|samples don't")),
+    Kind("reset by another master", "`reboots`", nmt(129), nothing, lasts_s=(0.0, 0.0), reported=rebooted),
     Kind("babbles as itself", "faulted: too many samples", babble, hush,
-         lasts_s=(1.5, 2.5), told=says("times as often"), within_s=2.0, well_s=4.0),
+         lasts_s=(1.5, 2.5), reported=matches("samples per SYNC"), within_s=2.0, well_s=4.0),
     # the bus; no pad may be disturbed by what others send
-    Kind("flood of foreign identifiers", "`foreign`", **sending(foreign, 1000),
-         told_by_bus=grew("foreign", 100), bus_wide=True, within_s=1.6, weight=0.7),
-    Kind("wrong lengths in our nodes' names", "`short`", **sending(malformed, 200),
-         told_by_bus=grew("short", 20), bus_wide=True, within_s=1.6, weight=0.7),
-    Kind("SDO answers nobody asked for", "nothing", **sending(answers, 100), bus_wide=True, weight=0.7),
-    Kind("another SYNC producer", "told of the bus", **sending(sync, 40),
-         lasts_s=(2.0, 3.0), told_by_bus=other_sync, bus_wide=True, within_s=3.0, weight=0.5),
+    Kind("flood of unknown identifiers", "`unknown_frames`", **sending(foreign, 1000),
+         reported_by_bus=grew("unknown_frames", 100), bus_wide=True, within_s=1.6, weight=0.7),
+    Kind("wrong lengths with our nodes' identifiers", "`wrong_length`", **sending(malformed, 200),
+         reported_by_bus=grew("wrong_length", 20), bus_wide=True, within_s=1.6, weight=0.7),
+    Kind("unrequested SDO answers", "nothing", **sending(answers, 100), bus_wide=True, weight=0.7),
+    Kind("another SYNC producer", "problem of the bus", **sending(sync, 40),
+         lasts_s=(2.0, 3.0), reported_by_bus=other_sync, bus_wide=True, within_s=3.0, weight=0.5),
     # the bus; all pads are disturbed, so nothing else happens meanwhile
-    Kind("bus silent, short", "all stale", silence, sound, lasts_s=(0.1, 0.25), told=_GONE, **ALONE),
-    Kind("bus silent, long", "all lost", silence, sound, lasts_s=(0.8, 2.0), told=_LOST, **ALONE),
-    Kind("all nodes without power", "all lost", all_off, all_on, lasts_s=(0.8, 3.0), told=_LOST, **ALONE),
-    Kind("all nodes reboot", "`reboots`", all_reboot, nothing, lasts_s=(0.0, 0.0), told=rebooted, **ALONE),
+    Kind("bus silent, short", "all stale", silence, sound, lasts_s=(0.1, 0.25), reported=_GONE, **ALONE),
+    Kind("bus silent, long", "all lost", silence, sound, lasts_s=(0.8, 2.0), reported=_LOST, **ALONE),
+    Kind("all nodes without power", "all lost", all_off, all_on, lasts_s=(0.8, 3.0), reported=_LOST, **ALONE),
+    Kind("all nodes reboot", "`reboots`", all_reboot, nothing, lasts_s=(0.0, 0.0),
+         reported=rebooted, **ALONE),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What came of a fault campaign: figures by kind, what is wrong, and the page.
+"""Report of a fault campaign: statistics by kind, failures, and the page.
 
 Public names: `by_kind`, `verdict`, `section`, `page`.
 """
@@ -21,17 +21,17 @@ def by_kind(done: list[Fault]) -> list[dict[str, Any]]:
         faults = [fault for fault in done if fault.kind is kind and fault.failures != ["paused"]]
         if not faults:
             continue
-        detect = [(max(f.told_ns.values()) - f.start_ns) * 1e-9 for f in faults if f.told_ns]
+        detect = [(max(f.reported_ns.values()) - f.start_ns) * 1e-9 for f in faults if f.reported_ns]
         recover = [(max(f.well_ns.values()) - f.ended_ns) * 1e-9 for f in faults if f.well_ns]
-        asked = kind.told is not None or kind.told_by_bus is not None
+        required = kind.reported is not None or kind.reported_by_bus is not None
         failures = Counter(failure for f in faults for failure in set(f.failures))
         rows.append(
             {
                 "kind": kind.name,
                 "expected": kind.expected,
                 "number": len(faults),
-                "told": len(faults) - failures["not told"] if asked else None,
-                "detect_s": spread(detect) if asked else None,
+                "reported": len(faults) - failures["not reported"] if required else None,
+                "detect_s": spread(detect) if required else None,
                 "recover_s": None if kind.quiet or kind.loose else spread(recover),
                 "failures": dict(failures),
             }
@@ -48,15 +48,15 @@ def spread(values: list[float]) -> dict[str, float] | None:
 
 
 def verdict(results: dict[str, Any]) -> list[str]:
-    """What is wrong; empty when all is as it should be."""
+    """Return the failures; empty if there are none."""
     wrong = [
         f"{row['kind']}: {number} {failure}"
         for row in results["kinds"]
         for failure, number in row["failures"].items()
     ]
-    told = Counter(f"{s['state']}, {s['reason']}" for s in results["surprises"])
-    wrong += [f"without a fault, {number} times: {what}" for what, number in told.items()]
-    wrong += [f"contact out of nothing: {ghost}" for ghost in results["ghosts"]]
+    unexpected = Counter(f"{s['state']}, {s['reason']}" for s in results["surprises"])
+    wrong += [f"without a fault, {number} times: {what}" for what, number in unexpected.items()]
+    wrong += [f"contact without a touch: {ghost}" for ghost in results["ghosts"]]
     wrong += [f"exception: {line}" for line in results["exceptions"]]
     if results["samples_lost"]:
         wrong.append(f"{results['samples_lost']} samples lost on the way")
@@ -73,14 +73,14 @@ def verdict(results: dict[str, Any]) -> list[str]:
 def page(every: dict[str, dict[str, Any]]) -> str:
     parts = [
         "# Fault campaign\n\nFaults of simulated nodes and of their bus at random times (Poisson, seeded), "
-        "several at once on different nodes;\neach lasts a random while and is taken back. The daemon is a "
-        "process of its own; a client on its stream judges by\nwhat `health` and `service` say. Times are "
-        "those of the messages, after the fault began and after it was taken\nback; figures that "
-        "are published once a second (`missed`, `emergencies`) or twice (`service`) are told no sooner. "
-        "A node is well\nagain when it is operational and its samples are trusted.\n\nBeside every fault: no "
-        "node without one changes its state, no pad that nothing touches shows a contact.\n\n"
-        "A machine that is busy with other things pauses nodes and daemon. What was told while a node sent\n"
-        "nothing, though nothing was wrong with it, is counted apart, as void.\n\n"
+        "several at once on different nodes;\neach lasts a random time and is removed. The daemon runs in "
+        "its own process; a client checks\n`health` and `service`. Times are "
+        "those of the messages, after the fault began and after it was removed;\ncounters that "
+        "are published once a second (`missed_samples`, `emergencies`) or twice (`service`) are reported no "
+        "sooner. A node has\nrecovered when it is operational and its samples are valid.\n\nDuring every "
+        "fault: no node without a fault changes its state, no untouched pad reports a contact.\n\n"
+        "A busy machine pauses nodes and daemon. Reports while a fault-free node sent nothing\n"
+        "are counted separately, as void.\n\n"
         "Made by `make stress ONLY=faults`; on SocketCAN by `tests/socketcan/vcan-run .venv/bin/python\n"
         "benchmarks/stress_faults.py --interface socketcan --faults 60 --rate 1 --period-ms 20 "
         "--patience 3`.\n"
@@ -111,22 +111,22 @@ On {results["machine"]}; load {results["load"]:.1f} at the end.
 
 Seconds: median, 90 %, worst.
 
-| fault | to be told | number | told | until told | until well |
+| fault | expected report | number | reported | until reported | until recovered |
 | --- | --- | --- | --- | --- | --- |
 {rows}
 
-A dash: nothing of the kind is asked for. Stuck channels and dead electrodes are for the supervisor of pads to
-name; here it is only asked that the node stays operational and the others undisturbed.
+A dash: not required. Stuck channels and dead electrodes are diagnosed by the supervisor; here the node only
+has to stay operational and the others undisturbed.
 
 | | |
 | --- | --- |
-| told wrongly, not recovered, or disturbed | {"; ".join(wrong) or "nothing"} |
+| wrong report, no recovery, or disturbance | {"; ".join(wrong) or "nothing"} |
 | samples sent by the nodes and lost on the way | {results["samples_lost"]} of {results["samples_sent"]} |
 | nodes without a fault: ticks without their sample | {undisturbed["missed"]} of {undisturbed["samples"]} |
-| void, as the machine paused: faults, states told | {results["void"]}, {results["excused"]} |
+| void because of machine pauses: faults, states | {results["void"]}, {results["excused"]} |
 | ticks overrun | {results["overruns"]} of {results["ticks"]} |
 | memory of the daemon, MB: start, half, end | {series("rss_mb")} |
-| its slope in the second half, kB a minute | {used["rss_kb_per_min"]:+.0f} |
+| its growth in the second half, kB a minute | {used["rss_kb_per_min"]:+.0f} |
 | file descriptors: start, half, end, most | {series("descriptors")} |
 | threads: start, half, end, most | {series("threads")} |
 | exceptions on stderr | {len(results["exceptions"])} |
@@ -135,7 +135,7 @@ name; here it is only asked that the node stays operational and the others undis
 
 
 def share(row: dict[str, Any]) -> str:
-    return "-" if row["told"] is None else f"{100 * row['told'] / row['number']:.0f} %"
+    return "-" if row["reported"] is None else f"{100 * row['reported'] / row['number']:.0f} %"
 
 
 def times(values: dict[str, float] | None) -> str:

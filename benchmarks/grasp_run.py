@@ -1,8 +1,8 @@
-"""One grasp of MuJoCo's through the daemon's own pipeline, and what became of it beside MuJoCo's truth.
+"""Process one MuJoCo grasp with the daemon's pipeline, and compare the output with MuJoCo's ground truth.
 
-Public names: `Setting`, `served` -> `Served`; `against` and `at_best` compare its contacts. Samples go in at
-200 Hz, joint states through the decoder of the inputs endpoint at 100 Hz, in the order of their arrival; no
-clock is waited for.
+Public names: `Setting`, `served` -> `Served`; `against` and `at_best` score its contacts. Samples enter at
+200 Hz, joint states at 100 Hz through the decoder of the inputs endpoint, in the order of their arrival, not
+in real time.
 """
 
 from __future__ import annotations
@@ -16,25 +16,31 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment, Touch
-from handtouch.daemon.inputs import Inputs
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.perceive import Perceiving
-from handtouch.daemon.pipeline import Pipeline
-from handtouch.daemon.scene import Wanted
-from handtouch.daemon.security import Gate
-from handtouch.hand.joints import JointStates
-from handtouch.hand.pads import mount_of
-from handtouch.hand.robot import Robots
-from handtouch.inputs import JointState, encode
-from handtouch.percept.stream import KINDS
-from handtouch.simulate.grasp.episode import DURATION_S, Grasp, grasp
-from handtouch.simulate.grasp.events import Events, Span, compare, joined, sampled, touches
-from handtouch.simulate.grasp.patches import Patches, patches
-from handtouch.simulate.grasp.scene import STEP_S
-from handtouch.simulate.grasp.timeline import Encoders, Timeline
-from handtouch.simulate.hand import VirtualHand
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.scene import RequestedOutputs
+from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.inputs import InputReceiver
+from handtouch.daemon.percepts import PerceptPublisher
+from handtouch.hand.joints import JointStateBuffer
+from handtouch.hand.pads import mount_transform
+from handtouch.hand.robot_models import RobotModels
+from handtouch.simulate.grasp.event_score import (
+    EventScore,
+    Span,
+    compare_contacts,
+    ideal_contact_spans,
+    merge_spans,
+    touch_spans,
+)
+from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
+from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
+from handtouch.simulate.grasp.patches import ContactPatches, contact_patches
+from handtouch.simulate.grasp.simulation import DURATION_S, GraspRecord, simulate_grasp
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
-from handtouch.wire import PadState
+from handtouch.wire import PERCEPT_KINDS, PadState
+from handtouch.wire.inputs import JointState, encode
 
 FloatArray = NDArray[np.float64]
 PARTS = ("pad", "mount", "kinematics", "time")
@@ -45,52 +51,52 @@ _PER_TICK = 5  # steps of MuJoCo
 
 @dataclass(frozen=True)
 class Setting:
-    """What is hidden from the daemon."""
+    """World and encoders, which the daemon doesn't know."""
 
     world: World
-    encoders: Encoders
+    encoders: EncoderErrors
 
     @classmethod
     def usual(cls, seed: int) -> Setting:
-        """Parts with tolerances, pads and encoders a little off, joint states that are late."""
-        world = replace(World(seed=seed), mount_mm=0.2, mount_deg=0.5)
-        return cls(world, Encoders(seed, offset_deg=0.2, noise_deg=0.05, delay_s=0.003))
+        """Return tolerances of parts, misaligned pads and encoders, and delayed joint states."""
+        world = replace(World(seed=seed), mount_std_mm=0.2, mount_std_deg=0.5)
+        return cls(world, EncoderErrors(seed, offset_deg=0.2, noise_deg=0.05, delay_s=0.003))
 
     @classmethod
     def ideal(cls, seed: int) -> Setting:
-        """Noise of the channels, and nothing else."""
-        return cls(World.ideal_parts(seed), Encoders(seed))
+        """Return noise of the channels only."""
+        return cls(World.ideal_parts(seed), EncoderErrors(seed))
 
 
 @dataclass(frozen=True, eq=False)
 class Served:
-    """What the daemon told of a grasp: k samples of contacts with a place in the palm; lengths in metres."""
+    """The daemon's output for a grasp: k contact samples with a position in the palm; lengths in metres."""
 
-    grasp: Grasp
-    patches: Patches
+    grasp: GraspRecord
+    patches: ContactPatches
     step: NDArray[np.intp]
-    """(k,) MuJoCo's"""
+    """(k,), step of MuJoCo."""
     pad: NDArray[np.intp]
     palm_m: FloatArray
-    """(k, 3) as told"""
+    """(k, 3), reported position."""
     covariance_m2: FloatArray
-    """(k, 3, 3) as told"""
+    """(k, 3, 3), reported covariance."""
     true_m: FloatArray
-    """(k, 3) centre of force"""
+    """(k, 3), centre of force."""
     error_m: dict[str, FloatArray]
-    """(k, 3) by PARTS; they add up to palm_m - true_m"""
+    """(k, 3) by PARTS; their sum is palm_m - true_m."""
     force_n: FloatArray
     force_std_n: FloatArray
-    """(k,) as told; NaN where the force is a lower bound"""
+    """(k,), reported; NaN where the force is a lower bound."""
     true_n: FloatArray
     moving_rad_s: FloatArray
-    """(k,) the fastest joint"""
+    """(k,), speed of the fastest joint."""
     railed: int
-    """samples of a pad at the end of a channel's range"""
+    """Samples with a channel at the end of its range."""
     spans: list[list[Span]]
-    """of each pad, when contacts were told"""
+    """Reported contacts by pad."""
     percepts: list[wire.Percept]
-    """what was perceived, if that was asked for"""
+    """Published percepts, if requested."""
 
 
 def served(
@@ -102,124 +108,142 @@ def served(
     assumed_radius: bool = False,
     perceive: bool = False,
     duration_s: float = DURATION_S,
-    done: Grasp | None = None,
+    done: GraspRecord | None = None,
 ) -> Served:
-    """Let the first hand grasp, and serve it; `assumed_radius`: as if every pad were pressed by one disc of
-    the radius that forces assume; `perceive`: all that there is to perceive. `done` is the grasp, if it has
-    been made."""
+    """Let the first hand grasp and process the samples.
+
+    `assumed_radius` replaces the discs of each pad by one of the radius that the force estimate assumes;
+    `perceive` requests all percepts; `done` is the grasp if it has been simulated already.
+    """
     hand = deployment.hands[0]
-    went = done or grasp(hand, name, seed, setting.world, duration_s=duration_s)
-    pressed = patches(went)
-    timeline = Timeline.play(went, pressed, setting.encoders)
+    grasp = done or simulate_grasp(hand, name, seed, setting.world, duration_s=duration_s)
+    patches = contact_patches(grasp)
+    stimulus = GraspStimulus.from_grasp(grasp, patches, setting.encoders)
     if assumed_radius:
         radii = [deployment.sheets[pad.sheet].contact_radius_mm * 1e-3 for pad in hand.pads]
-        timeline = timeline.evenly(np.array(radii))
-    virtual = VirtualHand(deployment, timeline, setting.world)
-    steps = np.arange(0, len(went.times_s), _PER_TICK)
-    counts = np.stack([virtual.counts(row, steps * STEP_S) for row in range(len(hand.pads))], axis=1)
+        stimulus = stimulus.with_single_discs(np.array(radii))
+    virtual = VirtualHand(deployment, stimulus, setting.world)
+    steps = np.arange(0, len(grasp.times_s), _PER_TICK)
+    counts = np.stack([virtual.counts(row, steps * TIME_STEP_S) for row in range(len(hand.pads))], axis=1)
     with zmq.Context() as context:
-        run = _Run(deployment, context, went, setting, perceive)
+        run = _Run(deployment, context, grasp, setting, perceive)
         for step, now in zip(steps.tolist(), counts, strict=True):
             run.tick(step, now)
         run.inputs.close()
     railed = int((np.abs(counts) >= 32767).any(axis=2).sum())
-    return _compared(deployment, went, pressed, run, railed)
+    return _compared(deployment, grasp, patches, run, railed)
 
 
 class _Run:
-    """The pipeline, fed tick by tick."""
+    """The core's pipeline, fed tick by tick."""
 
     def __init__(
         self,
         deployment: Deployment,
         context: zmq.Context[Any],
-        went: Grasp,
+        grasp: GraspRecord,
         setting: Setting,
         perceive: bool = False,
     ) -> None:
-        model, robots = PadModel(deployment), Robots(deployment)
+        model, robots = PadModel(deployment), RobotModels(deployment)
         self.kinematics = robots.kinematics[0]
         hand, names = deployment.hands[0].name, self.kinematics.joints
-        self._order = np.array([went.joints.index(name) for name in names])
-        self._names, self._hand, self._went = robots.joint_names[0], hand, went
-        self._told, self._std = setting.encoders.read(went.position_rad), setting.encoders.std_rad
-        self._clean = setting.encoders.delayed(went.position_rad)
-        states, self._timely = JointStates(self._names), JointStates(self._names)
+        self._order = np.array([grasp.joints.index(name) for name in names])
+        self._names, self._hand = robots.joint_names[0], hand
+        self._reported, self._std = setting.encoders.readings(grasp.joint_rad), setting.encoders.std_rad
+        self._clean = setting.encoders.delayed_only(grasp.joint_rad)
+        states, self._timely = JointStateBuffer(self._names), JointStateBuffer(self._names)
         pads = list(zip(model.hands, model.links, strict=True))
-        self.inputs = Inputs(context, "tcp://127.0.0.1:*", Gate(context), {hand: states}, pads)
-        self.pipeline = Pipeline(model, _PERIOD_NS, deployment.daemon.window, self, robots=robots)
+        self.inputs = InputReceiver.open(
+            context, "tcp://127.0.0.1:*", Authenticator.open(context), {hand: states}, pads
+        )
+        self.pipeline = Pipeline(
+            model, _PERIOD_NS, deployment.daemon.sample_window_fraction, self, robots=robots
+        )
         self.pipeline.node_state[:] = PadState.CLEAR
-        self.pipeline.frames.joints_at = self.inputs.joints_at
-        every = np.ones(model.size, np.bool_)
-        wanted = Wanted(every, every, np.zeros(model.size), np.ones(model.size, np.int64), every, ~every)
-        self.pipeline.want(wanted)
-        self._perceiving = Perceiving(self.pipeline, self)
+        self.pipeline.transforms.joints_at = self.inputs.joints_at
+        all_pads = np.ones(model.size, np.bool_)
+        requested = RequestedOutputs(
+            all_pads, all_pads, np.zeros(model.size), np.ones(model.size, np.int64), all_pads, ~all_pads
+        )
+        self.pipeline.apply_demand(requested)
+        self._perceiving = PerceptPublisher(self.pipeline, self)
         if perceive:
-            self._perceiving.want(wanted._replace(percepts=np.ones((len(KINDS), model.size), np.bool_)))
+            self._perceiving.set_requested(
+                requested._replace(percepts=np.ones((len(PERCEPT_KINDS), model.size), np.bool_))
+            )
         self.contacts: list[wire.Contact] = []
         self.percepts: list[wire.Percept] = []
         self.used: dict[int, tuple[FloatArray, FloatArray]] = {}
-        """by step: the joints that the daemon took, and what it would have taken from faultless encoders"""
-        self._next_ns = 3_000_000  # the robot's clock and ours don't go together
+        """By step: joint positions used by the daemon, and those of exact encoders."""
+        self._next_ns = 3_000_000  # joint states aren't synchronous with samples
 
-    def wants(self, topic: str) -> bool:
+    def has_subscriber(self, topic: str) -> bool:
         return topic.startswith(("contact/", "percept/"))
 
-    def send(self, message: wire.Outgoing) -> None:
+    def send(self, message: wire.OutgoingMessage) -> None:
         if isinstance(message, wire.Contact):
             self.contacts.append(message)
         elif isinstance(message, wire.Percept):
             self.percepts.append(message)
 
     def tick(self, step: int, counts: NDArray[np.int64]) -> None:
-        since_ns = round(step * STEP_S * 1e9)
+        since_ns = round(step * TIME_STEP_S * 1e9)
         while self._next_ns + _ARRIVES_NS <= since_ns:
-            self._tell(self._next_ns)
+            self._send_joints(self._next_ns)
             self._next_ns += _JOINTS_NS
         t_ns = _START_NS + since_ns
-        self.pipeline.begin(t_ns, t_ns)
+        self.pipeline.begin_cycle(t_ns, t_ns)
         for pad, now in enumerate(counts):
-            self.pipeline.slab.write(pad, now.astype("<i2").tobytes(), t_ns + 1)
-        ticked = self.pipeline.advance(t_ns + 7 * _PERIOD_NS // 10)
+            self.pipeline.slab.write_pdo(pad, now.astype("<i2").tobytes(), t_ns + 1)
+        ticked = self.pipeline.tick_if_due(t_ns + 7 * _PERIOD_NS // 10)
         assert ticked is not None
-        self._perceiving.step(ticked)
-        self.pipeline.settle()
-        if self.pipeline.frames.used:
+        self._perceiving.process_tick(ticked)
+        self.pipeline.prepare_next_tick()
+        if self.pipeline.transforms.used_joints:
             self.used[step] = (
-                self.pipeline.frames.used[-1][2].copy(),
-                self._timely.at(t_ns).position_rad,
+                self.pipeline.transforms.used_joints[-1][2].copy(),
+                self._timely.interpolate(t_ns).position_rad,
             )
 
-    def _tell(self, since_ns: int) -> None:
-        t_ns, number = _START_NS + since_ns, round(since_ns * 1e-9 / STEP_S)
-        told, clean = self._told[number, self._order], self._clean[number, self._order]
-        std = np.full(len(told), self._std) if self._std else None
-        topic, data = encode(JointState(self._hand, t_ns, self._names, told, None, None, std))
-        self.inputs.take([topic, data], t_ns + _ARRIVES_NS)
-        self._timely.take(t_ns, self._names, clean, None, std)
+    def _send_joints(self, since_ns: int) -> None:
+        t_ns, number = _START_NS + since_ns, round(since_ns * 1e-9 / TIME_STEP_S)
+        reported, clean = self._reported[number, self._order], self._clean[number, self._order]
+        std = np.full(len(reported), self._std) if self._std else None
+        topic, data = encode(JointState(self._hand, t_ns, self._names, reported, None, None, std))
+        self.inputs.process_message([topic, data], t_ns + _ARRIVES_NS)
+        self._timely.add_state(t_ns, self._names, clean, None, std)
 
 
-def against(run: Served, touch: Touch, apart_s: float) -> Events:
-    """Contacts beside MuJoCo's touches at 1 kHz; breaks of either shorter than `apart_s` are none."""
-    events = Events()
-    for pad, told in enumerate(run.spans):
+def against(run: Served, touch: Touch, min_gap_s: float) -> EventScore:
+    """Score contacts against MuJoCo's touches at 1 kHz, ignoring gaps of either shorter than `min_gap_s`."""
+    events = EventScore()
+    for pad, contacts in enumerate(run.spans):
         total = run.patches.total_n[:, pad]
-        true = touches(total, STEP_S, touch.on_n, touch.off_n, apart_s)
-        compare(events, true, touches(total, STEP_S, 0.0, 1e-9, 0.0), joined(told, apart_s))
+        true = touch_spans(total, TIME_STEP_S, touch.begin_threshold_n, touch.end_threshold_n, min_gap_s)
+        compare_contacts(
+            events, true, touch_spans(total, TIME_STEP_S, 0.0, 1e-9, 0.0), merge_spans(contacts, min_gap_s)
+        )
     return events
 
 
-def at_best(run: Served, touch: Touch) -> Events:
-    """Contacts beside those of pads that feel MuJoCo's forces exactly, whenever they are sampled."""
-    events, period_s = Events(), _PER_TICK * STEP_S
-    for pad, told in enumerate(run.spans):
+def at_best(run: Served, touch: Touch) -> EventScore:
+    """Score contacts against those of pads with exact samples of MuJoCo's forces."""
+    events, period_s = EventScore(), _PER_TICK * TIME_STEP_S
+    for pad, contacts in enumerate(run.spans):
         total = run.patches.total_n[::_PER_TICK, pad]
-        true = sampled(total, period_s, touch.on_n, touch.off_n, touch.begin_samples)
-        compare(events, true, touches(total, period_s, 0.0, 1e-9, 0.0), told, least_s=0.0)
+        true = ideal_contact_spans(
+            total, period_s, touch.begin_threshold_n, touch.end_threshold_n, touch.begin_samples
+        )
+        compare_contacts(
+            events, true, touch_spans(total, period_s, 0.0, 1e-9, 0.0), contacts, min_touch_s=0.0
+        )
     return events
 
 
-def _compared(deployment: Deployment, went: Grasp, pressed: Patches, run: _Run, railed: int) -> Served:
+def _compared(
+    deployment: Deployment, grasp: GraspRecord, patches: ContactPatches, run: _Run, railed: int
+) -> Served:
     pads = deployment.hands[0].pads
     row = {pad.link: number for number, pad in enumerate(pads)}
     spans: list[list[Span]] = [[] for _ in pads]
@@ -227,31 +251,31 @@ def _compared(deployment: Deployment, went: Grasp, pressed: Patches, run: _Run, 
     kept: list[tuple[wire.Contact, int, int]] = []
     for contact in run.contacts:
         pad, t_s = row[contact.link], (contact.t_ns - _START_NS) * 1e-9
-        step = round(t_s / STEP_S)
+        step = round(t_s / TIME_STEP_S)
         if contact.event == "begin":
             begun[pad] = t_s
         elif contact.event == "end":
             spans[pad].append((begun.pop(pad), t_s))
-        if contact.event != "end" and contact.palm_position_m is not None and pressed.total_n[step, pad] > 0:
+        if contact.event != "end" and contact.palm_position_m is not None and patches.total_n[step, pad] > 0:
             kept.append((contact, step, pad))
     for pad, t_s in begun.items():
-        spans[pad].append((t_s, len(went.times_s) * STEP_S))
-    places = [_split(run, went, pressed, deployment, *of) for of in kept]
+        spans[pad].append((t_s, len(grasp.times_s) * TIME_STEP_S))
+    positions = [_split(run, grasp, patches, deployment, *it) for it in kept]
     steps = np.array([step for _, step, _ in kept], np.intp)
     rows = np.array([pad for *_, pad in kept], np.intp)
-    speed = np.abs(np.gradient(went.position_rad, STEP_S, axis=0)).max(axis=1)
+    speed = np.abs(np.gradient(grasp.joint_rad, TIME_STEP_S, axis=0)).max(axis=1)
     return Served(
-        went,
-        pressed,
+        grasp,
+        patches,
         steps,
         rows,
         np.array([contact.palm_position_m for contact, *_ in kept]).reshape(-1, 3),
         np.array([contact.palm_covariance_m2 for contact, *_ in kept]).reshape(-1, 3, 3),
-        np.array([true_m for true_m, _ in places]).reshape(-1, 3),
-        {part: np.array([of[part] for _, of in places]).reshape(-1, 3) for part in PARTS},
+        np.array([true_m for true_m, _ in positions]).reshape(-1, 3),
+        {part: np.array([error[part] for _, error in positions]).reshape(-1, 3) for part in PARTS},
         np.array([np.nan if c.force_n is None else c.force_n for c, *_ in kept]),
         np.array([np.nan if c.force_std_n is None else c.force_std_n for c, *_ in kept]),
-        pressed.total_n[steps, rows],
+        patches.total_n[steps, rows],
         speed[steps],
         railed,
         spans,
@@ -261,32 +285,32 @@ def _compared(deployment: Deployment, went: Grasp, pressed: Patches, run: _Run, 
 
 def _split(
     run: _Run,
-    went: Grasp,
-    pressed: Patches,
+    grasp: GraspRecord,
+    patches: ContactPatches,
     deployment: Deployment,
     contact: wire.Contact,
     step: int,
     pad: int,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """True place in the palm, and the error by its causes; telescoping, so that they add up to all of it."""
-    kinematics, built = run.kinematics, went.pads[pad]
-    rotation, offset_m = mount_of(deployment.hands[0].pads[pad])
-    x, y = pressed.centre[step, pad].tolist()
+    """Return the true position in the palm, and the error's components by cause, which sum to the error."""
+    kinematics, built = run.kinematics, grasp.pads[pad]
+    rotation, offset_m = mount_transform(deployment.hands[0].pads[pad])
+    x, y = patches.force_centre[step, pad].tolist()
     in_pad = built.shape.point(x * built.shape.length_m, y * built.shape.arc)
     true_on_link = built.rotation @ in_pad + built.translation_m
     nominal = rotation @ in_pad + offset_m
-    told = np.array(contact.position_m)
-    turn, origin = went.link_rotation[step, pad], went.link_m[step, pad]  # MuJoCo's
+    reported = np.array(contact.position_m)
+    true_rotation, origin = grasp.link_rotation[step, pad], grasp.link_m[step, pad]
     used, timely = run.used[step]
 
     def by(position_rad: FloatArray) -> FloatArray:
-        kinematics.move(position_rad)
-        pose = kinematics.in_palm(pad)
-        return np.asarray(pose.rotation @ told + pose.translation_m)
+        kinematics.set_joint_positions(position_rad)
+        pose = kinematics.pose_in_palm(pad)
+        return np.asarray(pose.rotation @ reported + pose.translation_m)
 
-    return turn @ true_on_link + origin, {
-        "pad": turn @ (told - nominal),
-        "mount": turn @ (nominal - true_on_link),
+    return true_rotation @ true_on_link + origin, {
+        "pad": true_rotation @ (reported - nominal),
+        "mount": true_rotation @ (nominal - true_on_link),
         "kinematics": by(used) - by(timely),
-        "time": by(timely) - (turn @ told + origin),
+        "time": by(timely) - (true_rotation @ reported + origin),
     }

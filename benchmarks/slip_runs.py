@@ -1,4 +1,4 @@
-"""Grips on a simulated hand through the daemon's own pipeline and perception, tick by tick."""
+"""Process grips of a simulated hand with the daemon's pipeline and percepts, tick by tick."""
 
 from __future__ import annotations
 
@@ -12,60 +12,62 @@ import numpy.typing as npt
 
 from handtouch import wire
 from handtouch.config import Deployment, load
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.perceive import Perceiving
-from handtouch.daemon.pipeline import Pipeline
-from handtouch.daemon.scene import Wanted
-from handtouch.percept.motion import Motion
-from handtouch.percept.stream import KINDS
-from handtouch.simulate.grip import Grip
-from handtouch.simulate.hand import VirtualHand
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.scene import RequestedOutputs
+from handtouch.daemon.percepts import PerceptPublisher
+from handtouch.percept.motion import MotionEstimator
+from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
-from handtouch.wire import PadState
+from handtouch.wire import PERCEPT_KINDS, PadState
 
 FloatArray = npt.NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
 DEPLOYMENT = load(ROOT / "config" / "utah_mit.toml")
 
 
-class Taker:
-    """Keeps percepts."""
+class PerceptCollector:
+    """Publisher that collects percepts."""
 
     def __init__(self) -> None:
         self.percepts: list[wire.Percept] = []
 
-    def wants(self, topic: str) -> bool:
+    def has_subscriber(self, topic: str) -> bool:
         return topic.startswith("percept/")
 
-    def send(self, message: wire.Outgoing) -> None:
+    def send(self, message: wire.OutgoingMessage) -> None:
         if isinstance(message, wire.Percept):
             self.percepts.append(message)
 
 
 @dataclass
 class Record:
-    """Of a run, by tick: times [s] (k,) from its begin, and (k, pads): ln R, force [N], who runs."""
+    """Results by tick: times [s] (k,) since the begin; ln R, force [N], running tests (k, pads)."""
 
     t_s: FloatArray
     log_odds: FloatArray
     force_n: FloatArray
     running: npt.NDArray[np.bool_]
     tick_s: FloatArray
-    """(k,) that samples to contacts took, and the next: what perception added"""
+    """(k,), duration of the tick."""
     perceive_s: FloatArray
+    """(k,), duration of the percepts."""
     percepts: list[wire.Percept]
     information: tuple[FloatArray, FloatArray]
-    """at `look_s`: ages [s] of ramps (pads, onsets), and what a ramp of 1 m/s along either axis would have
-    told by then, in the mean: twice the mean of ln of its likelihood ratio"""
+    """At `information_s`: ages [s] of ramps (pads, onsets), and information of 1 m/s along either axis.
+
+    The information is twice the mean logarithm of the likelihood ratio.
+    """
     per_alarm: float
-    """threshold on R of an alarm"""
+    """Threshold on R of an alarm."""
     load: float = 1.0
-    """force while slipping, as a part of that before"""
+    """Force during the slip, relative to that before."""
 
 
 def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:
-    """Link and size [mm], along x and at the middle along y, of every pad."""
+    """Return link and size [mm] of every pad, along x, and at the middle along y."""
     found = []
     for hand in deployment.hands:
         for pad in hand.pads:
@@ -82,53 +84,60 @@ def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:
 
 
 def run(
-    grips: list[Grip], world: World, hz: float, seconds: float, from_s: float = 0.0, look_s: float = 0.0
+    grips: list[GripTouch],
+    world: World,
+    hz: float,
+    seconds: float,
+    from_s: float = 0.0,
+    information_s: float = 0.0,
 ) -> Record:
-    """Every grip is one contact on its link's pad; the run begins at `from_s` of the scenario."""
+    """Process grips, each one contact on its link's pad, from `from_s` of the scenario on."""
     deployment, period_ns = DEPLOYMENT, round(1e9 / hz)
     hand = VirtualHand(deployment, Scenario.model_validate({"touch": grips}), world)
     times = from_s + np.arange(1, round(seconds * hz) + 1) / hz
     counts = np.stack([hand.counts(row, times) for row in range(len(hand.pads))], axis=1)
-    taker, model = Taker(), PadModel(deployment)
-    pipeline = Pipeline(model, period_ns, 0.6, taker)
+    collector, model = PerceptCollector(), PadModel(deployment)
+    pipeline = Pipeline(model, period_ns, 0.6, collector)
     pipeline.node_state[:] = PadState.CLEAR
-    perceiving = Perceiving(pipeline, taker)
-    every = np.ones(model.size, dtype=np.bool_)
-    percepts = np.zeros((len(KINDS), model.size), dtype=np.bool_)
-    percepts[KINDS.index("motion")] = True
-    wanted = Wanted(every, every, np.zeros(model.size), np.ones(model.size, np.int64), ~every, ~every)
-    pipeline.want(wanted)
-    perceiving.want(wanted._replace(percepts=percepts))
-    motion = next(part for part in perceiving._perceiver.parts if isinstance(part, Motion))  # type: ignore[union-attr]
+    perceiving = PerceptPublisher(pipeline, collector)
+    all_pads = np.ones(model.size, dtype=np.bool_)
+    percepts = np.zeros((len(PERCEPT_KINDS), model.size), dtype=np.bool_)
+    percepts[PERCEPT_KINDS.index("motion")] = True
+    requested = RequestedOutputs(
+        all_pads, all_pads, np.zeros(model.size), np.ones(model.size, np.int64), ~all_pads, ~all_pads
+    )
+    pipeline.apply_demand(requested)
+    perceiving.set_requested(requested._replace(percepts=percepts))
+    motion = next(part for part in perceiving._perceiver.estimators if isinstance(part, MotionEstimator))  # type: ignore[union-attr]
     shape = len(times), model.size
     log_odds, force, running = np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
-    took = np.empty((2, len(times)))
-    payload, known = counts.astype("<i2"), (np.zeros((model.size, 0)), np.zeros((model.size, 0)))
+    durations_s = np.empty((2, len(times)))
+    payload, information = counts.astype("<i2"), (np.zeros((model.size, 0)), np.zeros((model.size, 0)))
     for k, t_s in enumerate(times.tolist()):
         t_ns = 10**9 + round(t_s * 1e9)
-        pipeline.begin(t_ns, t_ns)
+        pipeline.begin_cycle(t_ns, t_ns)
         for pad in range(model.size):
-            pipeline.slab.write(pad, payload[k, pad].tobytes(), t_ns + 1000 + pad)
+            pipeline.slab.write_pdo(pad, payload[k, pad].tobytes(), t_ns + 1000 + pad)
         began_s = time.perf_counter()
-        ticked = pipeline.advance(t_ns + round(0.7 * period_ns))
+        ticked = pipeline.tick_if_due(t_ns + round(0.7 * period_ns))
         assert ticked is not None
         ticked_s = time.perf_counter()
-        perceiving.step(ticked)
+        perceiving.process_tick(ticked)
         perceived_s = time.perf_counter()
-        pipeline.settle()
-        took[:, k] = ticked_s - began_s, perceived_s - ticked_s
-        log_odds[k], running[k] = motion.test.log_odds, motion.running
-        if k == round(look_s * hz):
-            known = motion.test.told()
+        pipeline.prepare_next_tick()
+        durations_s[:, k] = ticked_s - began_s, perceived_s - ticked_s
+        log_odds[k], running[k] = motion.slip_test.log_odds, motion.slipping
+        if k == round(information_s * hz):
+            information = motion.slip_test.onset_information()
         force[k] = pipeline.tick.columns.force_n
     return Record(
         times - from_s,
         log_odds,
         force,
         running,
-        took[0],
-        took[1],
-        taker.percepts,
-        known,
-        motion.test.per_alarm,
+        durations_s[0],
+        durations_s[1],
+        collector.percepts,
+        information,
+        motion.slip_test.samples_per_false_alarm,
     )

@@ -1,11 +1,11 @@
-"""The receive path at the rate of full buses for a long time: losses, queue, and the share of a core.
+"""Receive path at the rate of fully loaded buses for a long time: losses, queue length, CPU load.
 
-Without SocketCAN: one and seven in-process buses that carry 8,500 frames/s each, what a 1 Mbit/s bus can, in
-batches a millisecond apart, as an adapter on USB delivers them. All write one slab. The processor time is of
-the receiving threads, the readers of the buses and the one that drains them; --seconds says how long each
-takes. Under `tests/socketcan/vcan-run`: the highest rate of cangen that `Port.drain` and a bare receive loop
-each take without a loss, in turns. Writes docs/benchmarks/soak_bus.{md,json}; exit status 1 if a frame was
-lost in-process, or if the port falls behind the bare loop.
+Without SocketCAN: one and seven in-process buses with 8,500 frames/s each, the capacity of a 1 Mbit/s bus, in
+batches a millisecond apart, as from a USB adapter. All write one slab. The processor time is that of the
+receiving threads: the readers of the buses and the one that drains them; --seconds sets the duration of each
+run. Under `tests/socketcan/vcan-run`: the highest rate of cangen that `Port.drain` and a bare receive loop
+each receive without a loss, alternately. Writes docs/benchmarks/soak_bus.{md,json}; exit status 1 if a frame
+was lost in-process, or if the port is slower than the bare loop.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ import can
 from bench_receive_path import FRAME, VCAN, store
 
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.receivers import QUEUE_FRAMES, grow_receive_buffer
-from handtouch.canbus.bus.slab import Slab
+from handtouch.canbus.bus.receivers import MAX_QUEUE_FRAMES, grow_receive_buffer
 from handtouch.config import Bus
+from handtouch.core.slab import Slab
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PADS, ID0 = 15, 0x281
@@ -49,7 +49,7 @@ class Feeder:
         self.sent = 0
         self._buses = buses
         self._rate = rate
-        self._over = threading.Event()
+        self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
     def __enter__(self) -> Feeder:
@@ -57,7 +57,7 @@ class Feeder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
+        self._stopped.set()
         self._thread.join()
 
     def _run(self) -> None:
@@ -65,10 +65,10 @@ class Feeder:
             can.Message(arbitration_id=ID0 + n, data=bytes(8), is_extended_id=False) for n in range(PADS)
         ]
         start, count = time.monotonic(), 0  # frames on each bus
-        while not self._over.wait(BATCH_S):
+        while not self._stopped.wait(BATCH_S):
             due = int((time.monotonic() - start) * self._rate)
             for bus in self._buses:
-                queue = bus.queue  # its `send` copies deeply, at three times the cost of receiving
+                queue = bus.queue  # `send` makes a deep copy, at three times the cost of receiving
                 with queue.mutex:
                     queue.queue.extend(messages[number % PADS] for number in range(count, due))
                     queue.not_empty.notify()
@@ -77,7 +77,7 @@ class Feeder:
 
 
 def in_process(buses: int, seconds: float) -> dict[str, Any]:
-    """`buses` full buses into one slab for so long."""
+    """Run `buses` fully loaded buses into one slab for `seconds`."""
     slab = Slab(buses * PADS)
     ports = [
         Port.open(Bus(name=f"can{n}", interface="virtual", channel=f"soak{n}"), slab) for n in range(buses)
@@ -99,7 +99,7 @@ def in_process(buses: int, seconds: float) -> dict[str, Any]:
                 longest = max(longest, len(receiver._queue))
                 port.drain()
         busy = [time.clock_gettime(clock) - then for clock, then in zip(clocks, before, strict=True)]
-        took = time.monotonic() - start
+        elapsed_s = time.monotonic() - start
     deadline = time.monotonic() + 5
     while sum(port.counters.frames for port in ports) < feeder.sent and time.monotonic() < deadline:
         for port in ports:
@@ -111,16 +111,16 @@ def in_process(buses: int, seconds: float) -> dict[str, Any]:
         port.close()
     return {
         "buses": buses,
-        "seconds": round(took, 1),
+        "seconds": round(elapsed_s, 1),
         "frames": feeder.sent,
-        "frames_per_s": round(feeder.sent / took),
+        "frames_per_s": round(feeder.sent / elapsed_s),
         "lost": lost,
         "overflow": overflow,
         "longest_queue": longest,
-        "queue_limit": QUEUE_FRAMES,
-        "readers_core": round(sum(busy[:-1]) / took, 4),
-        "drain_core": round(busy[-1] / took, 4),
-        "core": round(sum(busy) / took, 4),
+        "queue_limit": MAX_QUEUE_FRAMES,
+        "readers_core": round(sum(busy[:-1]) / elapsed_s, 4),
+        "drain_core": round(busy[-1] / elapsed_s, 4),
+        "core": round(sum(busy) / elapsed_s, 4),
         "aim": AIM[buses],
         "memory_growth_mb": round(grown, 2),
         "machine": machine(),
@@ -128,12 +128,12 @@ def in_process(buses: int, seconds: float) -> dict[str, Any]:
 
 
 def resident_mb() -> float:
-    """Memory of this process that is in RAM."""
+    """Return the resident memory of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def port_loop() -> tuple[Callable[[], int], Callable[[], None]]:
-    """A port on vcan0: frames read by a call, and how to close it."""
+    """Open a port on vcan0; return functions that read, returning the frames read, and close it."""
     port = Port.open(Bus(name="port", interface="socketcan", channel="vcan0"), Slab(PADS))
     for pad in range(PADS):
         port.route(ID0 + pad, pad)
@@ -148,7 +148,7 @@ def port_loop() -> tuple[Callable[[], int], Callable[[], None]]:
 
 
 def bare_loop() -> tuple[Callable[[], int], Callable[[], None]]:
-    """The same with a socket, without stamps, counts and checks."""
+    """Open a bare socket likewise, without stamps, counters and checks."""
     bus = can.Bus(interface="socketcan", channel="vcan0")
     sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketcanBus has it
     grow_receive_buffer(sock)
@@ -169,11 +169,11 @@ def bare_loop() -> tuple[Callable[[], int], Callable[[], None]]:
 
 
 def keeps_up(loop: Callable[[], tuple[Callable[[], int], Callable[[], None]]], rate: int) -> float:
-    """Frames/s that came while cangen sent `rate` a second for RUN_S, 0 if one was lost."""
+    """Return the frames/s received while cangen sent `rate` a second for RUN_S, 0 if one was lost."""
     read, close = loop()
     batch = max(1, rate // 100)
     count = int(rate * RUN_S)
-    start, got, last = time.monotonic(), 0, time.monotonic()
+    start, received, last = time.monotonic(), 0, time.monotonic()
     cangen = subprocess.Popen(
         [
             "cangen",
@@ -192,24 +192,24 @@ def keeps_up(loop: Callable[[], tuple[Callable[[], int], Callable[[], None]]], r
             "100",
         ]
     )
-    while got < count and time.monotonic() - last < 1.0:
+    while received < count and time.monotonic() - last < 1.0:
         if new := read():
-            got, last = got + new, time.monotonic()
+            received, last = received + new, time.monotonic()
     cangen.wait()
     close()
-    return count / (last - start) if got == count else 0.0
+    return count / (last - start) if received == count else 0.0
 
 
 def without_loss() -> dict[str, Any]:
-    """The highest rate of RATES that each loop keeps up with, and what it made of it."""
+    """Find the highest rate of RATES that each loop receives without a loss."""
     best = {"bare": [0.0] * TURNS, "port": [0.0] * TURNS}
     for turn in range(TURNS):
         for name, loop in (("bare", bare_loop), ("port", port_loop)):
             for rate in RATES:
                 reached = keeps_up(loop, rate)
                 best[name][turn] = max(best[name][turn], reached)
-                print(f"{name} {rate:6} asked: {reached:8.0f} frames/s")
-                if reached < 0.7 * rate:  # lost, or no faster than that
+                print(f"{name} {rate:6} requested: {reached:8.0f} frames/s")
+                if reached < 0.7 * rate:  # a loss, or cangen can't send faster
                     break
     bare, port = (statistics.median(best[name]) for name in ("bare", "port"))
     return {
@@ -221,23 +221,24 @@ def without_loss() -> dict[str, Any]:
 
 
 def machine() -> str:
-    """Where this was measured."""
-    where = os.environ.get("VCAN_RUN", "host")
-    return f"{where}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    """Describe the machine."""
+    host = os.environ.get("VCAN_RUN", "host")
+    return f"{host}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
 def report(new: dict[str, Any]) -> None:
-    """Add to what earlier runs, in the other place, have left."""
+    """Add the figures to those of earlier runs."""
     path = OUT / "soak_bus.json"
     figures: dict[str, Any] = (json.loads(path.read_text()) if path.exists() else {}) | new
     path.write_text(json.dumps(figures, indent=1) + "\n")
     lines = [
-        "# Full buses for a long time",
+        "# Fully loaded buses for a long time",
         "",
-        f"In-process buses with {FULL_BUS} frames/s each, all into one slab. The share of a core is that of",
-        "the receiving threads: one that reads each bus, one that drains all. By `benchmarks/soak_bus.py`.",
+        f"In-process buses with {FULL_BUS} frames/s each, all into one slab. CPU loads are those of the",
+        "receiving threads: one reads each bus, one drains all. By `benchmarks/soak_bus.py`.",
         "",
-        "| buses | seconds | frames/s | lost | longest queue | of | readers | drain | core | aim | on |",
+        "| buses | seconds | frames/s | lost | longest queue | limit "
+        "| readers | drain | CPU | aim | machine |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     lines += [
@@ -249,9 +250,9 @@ def report(new: dict[str, Any]) -> None:
         lines += [
             "",
             "Highest rate of cangen without a loss on SocketCAN, medians of "
-            f"{TURNS} turns; a bare loop reads, looks up and stores:",
+            f"{TURNS} runs; a bare loop reads, looks up and stores:",
             "",
-            "| bare loop, frames/s | port, frames/s | ratio | on |",
+            "| bare loop, frames/s | port, frames/s | ratio | machine |",
             "|---|---|---|---|",
             "| {bare_per_s} | {port_per_s} | {ratio} | {machine} |".format(**figures["socketcan"]),
         ]
@@ -260,8 +261,10 @@ def report(new: dict[str, Any]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=600.0, help="of each in-process run (600)")
-    asked = parser.parse_args()
+    parser.add_argument(
+        "--seconds", type=float, default=600.0, help="duration of each in-process run (default: 600)"
+    )
+    arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     if VCAN.exists():
         figures = without_loss()
@@ -270,7 +273,7 @@ def main() -> int:
         return int(figures["ratio"] < 1 / 1.5)
     rows = []
     for buses in AIM:
-        rows.append(in_process(buses, asked.seconds))
+        rows.append(in_process(buses, arguments.seconds))
         print(rows[-1], flush=True)
     report({"in_process": rows})
     return int(any(row["lost"] or row["overflow"] for row in rows))

@@ -1,4 +1,4 @@
-"""The real daemon and a simulated hand for a long time: memory, descriptors, losses; status 1 if they grow.
+"""Soak test of the real daemon with a simulated hand: memory, descriptors, losses; status 1 if they grow.
 
 Nodes, daemon and a subscriber to everything on a udp_multicast bus, the session played again and again.
 ARGS="--minutes 60" sets how long.
@@ -23,7 +23,7 @@ GROWTH_MB = 5.0
 
 
 def soak(config: Path, minutes: float) -> int:
-    """Run it; 1 if something grew or was lost."""
+    """Run the test; return 1 if memory or descriptors grew or messages were lost."""
     endpoints = load(config).daemon
     nodes = subprocess.Popen([sys.executable, "-m", "handtouch", "simulate", str(config)])
     daemon = subprocess.Popen([sys.executable, "-m", "handtouch", "run", str(config)])
@@ -44,7 +44,7 @@ def soak(config: Path, minutes: float) -> int:
                     left = (end_s - time.monotonic()) / 60
                     now = (resident_mb(daemon.pid), descriptors(daemon.pid))
                     print(f"{left:6.1f} min to go: {now[0]:.1f} MB, {now[1]} descriptors")
-            lost = all_of_it.gaps
+            lost = all_of_it.lost_messages
         after = (resident_mb(daemon.pid), descriptors(daemon.pid))
         status = request("status", endpoint=endpoints.control)
         service, missed = status["service"], sum(pad["missed"] for pad in status["pads"])

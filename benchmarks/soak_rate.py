@@ -1,12 +1,12 @@
-"""Many pads at 1 kHz for a long time through the real daemon, in one process; the limit; an hour of memory.
+"""Soak test of many pads at 1 kHz through the real daemon in one process; rate limits; memory over an hour.
 
 The daemon's hot loop runs in a thread, on in-process buses of 8 pads each with their bounded queues. Its
 nodes are simulated ones until they are booted; then each SYNC is answered with messages made before, a tenth
-of the pads touched by sliding contacts, while it is sent: their share of a core is told apart. --minutes
-says how long the run of 60 pads at 1 kHz takes, --hours how much of the memory run, in which samples of 15
-pads at 1 kHz go through pipeline and publisher as fast as they can, contacts coming and going, while their
-stamps tell the time. --trial does a little of all of it and writes nothing. Writes
-docs/benchmarks/soak_rate.{md,json}; exit status 1 if a sample was lost or the memory grows.
+of the pads touched by sliding contacts, while it is sent: their share of a core is measured separately.
+--minutes says how long the run of 60 pads at 1 kHz takes, --hours how much of the memory run, in which
+samples of 15 pads at 1 kHz go through pipeline and publisher as fast as they can, contacts
+begin and end, and their stamps are the clock. --trial runs a short version of all parts and writes nothing.
+Writes docs/benchmarks/soak_rate.{md,json}; exit status 1 if a sample was lost or the memory grows.
 """
 
 from __future__ import annotations
@@ -31,35 +31,39 @@ import zmq
 from bench_latency import OUT, PATHS, descriptors, film, machine, resident_mb
 from numpy.typing import NDArray
 
-from handtouch import shipped
-from handtouch.canbus.device import DeviceBus
-from handtouch.config import Bus, Deployment, load
-from handtouch.daemon.daemon import Daemon
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.pipeline import Pipeline
+from handtouch.config import (
+    Bus,
+    Deployment,
+    load,
+    shipped,
+)
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.publisher import Publisher
+from handtouch.device import DeviceBus
 from handtouch.wire import PadState
 
 PADS_PER_BUS = 8
 AIM = 0.60
 LIMITS = ((30, 500), (60, 500), (30, 1000), (240, 200), (60, 1000), (120, 500), (480, 200), (240, 500))
-"""Pads and SYNCs a second that are tried, by their product, for where the loop no longer keeps up."""
+"""Pads and SYNC rates [Hz] tried, by their product, to find the overrun of the loop"""
 LIMIT_S = 8.0
 MISSED = 1e-3
-"""Of the samples, or of the periods: more than that is an overrun, less a moment of the machine's."""
+"""Fraction of late samples or skipped periods above which a run counts as overrun"""
 PERIOD_NS = 1_000_000
 HEARTBEAT_SYNCS = 100
-"""From one heartbeat of a node to its next."""
+"""Heartbeat period of a node"""
 BOOT_PERIOD_NS = 50_000_000
 SAMPLES = 1000
 GROWTH_MB_PER_H = 2.0
 GIL_SWITCH_S = 0.0005
-"""As `handtouch run` sets it."""
-TELL_S = 15.0
+"""Switch interval that `handtouch run` sets"""
+REPORT_PERIOD_S = 15.0
 
 
 def hands_of(pads: int, rate_hz: float, folder: Path) -> Deployment:
-    """So many pads as hands of the shipped kind, PADS_PER_BUS to an in-process bus."""
+    """Return a deployment of shipped hands with PADS_PER_BUS pads per in-process bus."""
     shipped_hand = load(shipped.path("utah_mit.toml"))
     (hand,) = shipped_hand.hands
     hands = []
@@ -82,7 +86,7 @@ def hands_of(pads: int, rate_hz: float, folder: Path) -> Deployment:
 
 
 class Nodes:
-    """The nodes of a deployment: simulated until `feed`, then SYNC is answered with what was made before.
+    """Nodes of a deployment: simulated until `feed`, then SYNC is answered with precomputed frames.
 
     The answers are put into the daemon's queues from within the sending of SYNC, and so are heartbeats, in
     turns: another thread would share the interpreter with the hot one, and its rests would be measured.
@@ -102,8 +106,8 @@ class Nodes:
             self._simulated.append(devices)
         self._answers = [self._answers_of(name, samples.astype("<i2")) for name in self._names]
 
-    def feed(self, daemon: Daemon) -> None:
-        """Take the place of the simulated nodes of a daemon that has booted them all."""
+    def feed(self, daemon: HandtouchDaemon) -> None:
+        """Replace the simulated nodes after the daemon has booted them all."""
         for devices in self._simulated:
             devices.stop()
         receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
@@ -113,29 +117,29 @@ class Nodes:
 
     @property
     def answered(self) -> int:
-        """SYNCs."""
+        """Number of SYNC frames."""
         return min(answers.count for answers in self._answers)
 
     def busy_s(self) -> float:
-        """Time that the answers have taken."""
+        """Time spent answering."""
         return 1e-9 * sum(answers.busy_ns for answers in self._answers)
 
     def stop(self) -> None:
-        """Fall silent."""
+        """Stop answering."""
         for devices in self._simulated:
             devices.stop()
         for bus in self._buses:
             bus.shutdown()
 
     def _answers_of(self, name: str, data: NDArray[np.int16]) -> Answers:
-        """Those of one bus, by samples (k, pads, 4)."""
+        """Return the nodes of one bus, with samples (k, pads, 4)."""
         numbers = [(n, pad.node_id) for n, pad in enumerate(self._pads) if pad.bus == name]
         frames = [[frame(0x280 + node_id, row[n].tobytes()) for n, node_id in numbers] for row in data]
         return Answers(frames, [frame(0x700 + node_id, b"\x05") for _, node_id in numbers])
 
 
 class Answers(queue.Queue[can.Message]):
-    """What stands on a bus for its nodes, once the daemon's `inbox` is known."""
+    """Stand-in for the nodes of a bus, once the daemon's `inbox` is known."""
 
     inbox: Any
 
@@ -145,7 +149,7 @@ class Answers(queue.Queue[can.Message]):
         self.count = self.busy_ns = 0
 
     def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:  # noqa: ARG002
-        """A frame of the daemon's."""
+        """Handle a frame from the daemon."""
         if item.arbitration_id != 0x80:
             return
         start_ns = time.perf_counter_ns()
@@ -160,12 +164,12 @@ class Answers(queue.Queue[can.Message]):
 
 
 def frame(can_id: int, data: bytes) -> can.Message:
-    """A node's."""
+    """Return a frame of a node."""
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
 def touches(pads: int, part: float) -> NDArray[np.int64]:
-    """Counts (k, pads, 4): that part of the pads touched, sliding; no two hands at the same place."""
+    """Return counts (k, pads, 4) with a fraction of the pads touched by sliding contacts, out of phase."""
     deployment = load(shipped.path("utah_mit.toml"))
     kilohertz = deployment.daemon.model_copy(update={"sync_period_ms": 1.0})
     touched = np.linspace(0, pads - 1, round(part * pads)).astype(int).tolist()
@@ -181,12 +185,12 @@ def touches(pads: int, part: float) -> NDArray[np.int64]:
 
 
 def served(pads: int, rate_hz: int, seconds: float) -> dict[str, Any]:
-    """The daemon at this rate for so long."""
+    """Run the daemon at this rate for a time."""
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, ExitStack() as opened:
         deployment = hands_of(pads, rate_hz, Path(folder))
         nodes = Nodes(deployment, touches(pads, 0.1))
         opened.callback(nodes.stop)
-        daemon = opened.enter_context(Daemon(deployment))
+        daemon = opened.enter_context(HandtouchDaemon.open(deployment))
         period_ns = daemon.sync.period_ns
         daemon.sync.set_period(BOOT_PERIOD_NS, time.monotonic_ns())
         stop = threading.Event()
@@ -206,7 +210,7 @@ def served(pads: int, rate_hz: int, seconds: float) -> dict[str, Any]:
 
 
 def read(endpoint: str) -> None:
-    """A subscriber to all hands, as a process."""
+    """Run a subscriber to all hands in a process."""
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.subscribe("hand/")
         socket.connect(endpoint)
@@ -214,8 +218,8 @@ def read(endpoint: str) -> None:
             socket.recv_multipart()
 
 
-def wait_until_up(daemon: Daemon) -> None:
-    """Until every node is operational. Raises RuntimeError if that takes a minute."""
+def wait_until_up(daemon: HandtouchDaemon) -> None:
+    """Wait until every node is operational. Raises RuntimeError after a minute."""
     end_s = time.monotonic() + 60
     while np.count_nonzero(daemon.pipeline.node_state) and time.monotonic() < end_s:
         time.sleep(0.05)
@@ -224,14 +228,14 @@ def wait_until_up(daemon: Daemon) -> None:
 
 
 def watch(
-    daemon: Daemon,
+    daemon: HandtouchDaemon,
     nodes: Nodes,
     thread: threading.Thread,
     pads: int,
     rate_hz: int,
     seconds: float,
 ) -> dict[str, Any]:
-    """What the daemon does for so long, while a subscriber reads its hand frames."""
+    """Measure the daemon for a time, while a subscriber reads its hand frames."""
     clock = time.pthread_getcpuclockid(thread.ident or 0)
     receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
     counters = [port.counters for port in daemon.ports.values()]
@@ -239,19 +243,19 @@ def watch(
     def totals() -> NDArray[np.int64]:
         tick, bus = daemon.pipeline.tick, [(c.samples, c.overflow) for c in counters]
         samples, overflow = np.sum(bus, axis=0).tolist()
-        missed, taken = int(tick.missed.sum()), int(tick.samples.sum())
+        missed, taken = int(tick.missed_sample_counts.sum()), int(tick.sample_counts.sum())
         return np.array(
             [nodes.answered, daemon.pipeline.ticks, daemon.sync.overruns, missed, taken, samples, overflow]
         )
 
     before, busy_s, start_s = totals(), time.clock_gettime(clock), time.monotonic()
     feeding_s = nodes.busy_s()
-    longest, told_s = 0, start_s
+    longest, reported_s = 0, start_s
     while (now_s := time.monotonic()) - start_s < seconds:
         longest = max(longest, *(len(receiver._queue) for receiver in receivers))
         time.sleep(0.05)
-        if now_s - told_s > TELL_S:
-            told_s = now_s
+        if now_s - reported_s > REPORT_PERIOD_S:
+            reported_s = now_s
             _, ticks, overruns, missed, *_ = (totals() - before).tolist()
             print(
                 f"{seconds - now_s + start_s:4.0f} s to go: {ticks} ticks, {overruns} periods skipped, "
@@ -281,31 +285,31 @@ def watch(
 
 
 def remember(hours: float) -> dict[str, Any]:
-    """Memory, descriptors and objects while samples of so many hours go through pipeline and publisher."""
+    """Measure memory, descriptors and objects while hours of samples pass pipeline and publisher."""
     deployment = load(shipped.path("utah_mit.toml"))
     moving = film(deployment, PATHS["sliding"])
     untouched = np.rint(np.random.default_rng(2).standard_normal((len(moving), *moving.shape[1:])))
     script = np.concatenate([moving, untouched.astype(np.int64)]).astype("<i2")
     rows: list[tuple[float, float, int, int, int]] = []
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, zmq.Context() as context:
-        publisher = Publisher(context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
+        publisher = Publisher.open(context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
         pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.8, publisher)
         pipeline.node_state[:] = PadState.CLEAR
         reader = context.socket(zmq.SUB)
         reader.subscribe("")
         reader.connect(publisher.endpoints["complete"])
         time.sleep(0.3)
-        publisher.take_subscriptions(0)
+        publisher.poll_subscriptions(0)
         steps = round(hours * 3600e9 / PERIOD_NS)
         received = 0
         for step in range(steps):
             t_ns = (step + 1) * PERIOD_NS
-            pipeline.begin(t_ns, t_ns)
+            pipeline.begin_cycle(t_ns, t_ns)
             sample: bytes = script[step % len(script)].tobytes()
             for pad in range(pipeline.slab.size):
-                pipeline.slab.write(pad, sample[8 * pad : 8 * pad + 8], t_ns + 1000 * pad)
-            pipeline.advance(t_ns + 20_000)
-            pipeline.settle()
+                pipeline.slab.write_pdo(pad, sample[8 * pad : 8 * pad + 8], t_ns + 1000 * pad)
+            pipeline.tick_if_due(t_ns + 20_000)
+            pipeline.prepare_next_tick()
             while reader.poll(0):
                 reader.recv_multipart()
                 received += 1
@@ -315,7 +319,7 @@ def remember(hours: float) -> dict[str, Any]:
                     (t_ns / 3600e9, resident_mb(os.getpid()), descriptors(os.getpid()), objects, received)
                 )
                 print(f"{step / steps:4.0%} of the hour: {rows[-1][1]:.1f} MB", flush=True)
-        begun = pipeline.tick.contacts.begun
+        begun = pipeline.tick.contacts.begun_count
         drops = dict(publisher.drops)
         reader.close(0)
         publisher.close()
@@ -338,23 +342,23 @@ def remember(hours: float) -> dict[str, Any]:
 
 
 def write(new: dict[str, Any]) -> str:
-    """The page, with what earlier runs of the other parts have left."""
+    """Return the page, with the stored results of other parts."""
     path = OUT / "soak_rate.json"
     results = (json.loads(path.read_text()) if path.exists() else {}) | new
-    text = ["# Rates that one core sustains, and memory", ""]
+    text = ["# Sustained rates of one core, and memory", ""]
     if long := results.get("long"):
         text += [
             "The real daemon in one process with its nodes, eight pads to an in-process bus with a",
             "bounded queue, a tenth of the pads touched by sliding contacts, one subscriber to all",
-            "hands. The share of a core is the hot thread's: SYNC, receive, tick, send and all the",
-            f"rest, less what the nodes take that answer in the same thread; the aim is {AIM:.0%}.",
+            "hands. The share of a core is the hot thread's: SYNC, receive, tick, send and all",
+            f"other stages, without the nodes that answer in the same thread; the aim is {AIM:.0%}.",
             f"{long['machine']}; load average when it ended {long['load']:.1f}, with the daemon's own.",
             "",
             *table([long]),
         ]
     if rows := results.get("limits"):
         text += [
-            f"How far it goes, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples late,",
+            f"Rate limits, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples late,",
             "or of the periods skipped, without a SYNC:",
             "",
             *table(rows),
@@ -388,7 +392,7 @@ def write(new: dict[str, Any]) -> str:
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines of runs of the daemon."""
+    """Return table rows of daemon runs."""
     return [
         "| pads | SYNCs/s | s | ticks | samples | lost | late | skipped | queue | core | generator | |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",

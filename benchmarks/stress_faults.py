@@ -1,9 +1,9 @@
-"""A fault campaign on a hand of 15 simulated nodes: is each fault told with its cause, and over when it ends?
+"""Fault campaign on a hand of 15 simulated nodes: is each fault reported with its cause until it ends?
 
-The real daemon, a process of its own, serves nodes on a bus over loopback in a network namespace of its own
+The real daemon, in its own process, serves nodes on a bus over loopback in a separate network namespace
 (or on SocketCAN with --interface). Faults of the kinds in fault_kinds.py begin at random times (Poisson,
-seeded), several at once on different nodes, last a random while and are taken back. A client watches health,
-service and contacts, and judges. Writes docs/benchmarks/faults.{md,json}; exit status 1 if anything was told
+seeded), several at once on different nodes, last a random time and are removed. A client checks health,
+service and contacts. Writes docs/benchmarks/faults.{md,json}; exit status 1 if anything was reported
 wrongly, did not recover, disturbed a node without a fault, lost a frame, leaked, or raised.
 """
 
@@ -27,14 +27,14 @@ from typing import Any
 
 from bench_latency import OUT, PORT, in_own_network, on_loopback
 from fault_acts import Fault, Kind
-from fault_bench import PRESSED, Bench, Cable, Resources, S, Stranger, open_bus, sampler
+from fault_bench import PRESSED, Bench, Cable, Resources, S, UnknownDevice, open_bus, sampler
 from fault_kinds import KINDS
 from fault_report import by_kind, page, section, verdict
 
 from handtouch import connect, wire
-from handtouch.canbus.device import DeviceBus
 from handtouch.client import Subscriber
 from handtouch.config import load
+from handtouch.device import DeviceBus
 
 WELL = ("clear", "touched")
 HOLD_NS = S // 3  # a node has to stay well for so long
@@ -43,9 +43,9 @@ ALONE_AT_ONCE = 4
 
 
 class Campaign:
-    """Causes faults and judges what is told of them."""
+    """Causes faults and checks their reports."""
 
-    def __init__(self, bench: Bench, messages: Subscriber[Any], links: dict[str, int], asked: Any) -> None:
+    def __init__(self, bench: Bench, messages: Subscriber[Any], links: dict[str, int], options: Any) -> None:
         self.bench = bench
         self.done: list[Fault] = []
         self.surprises: list[dict[str, Any]] = []
@@ -55,10 +55,10 @@ class Campaign:
         self.service: Any = None
         self._messages = messages
         self._links = links
-        self._chance = random.Random(asked.seed)
-        self._asked = asked
+        self._chance = random.Random(options.seed)
+        self._options = options
         self._coming: deque[Kind] = deque(self._chance.sample(KINDS, len(KINDS)))
-        self._alone: list[Kind] = []  # waiting for everything else to be over
+        self._alone: list[Kind] = []  # waiting for all other faults to end
         self._draining = False
         self._active: list[Fault] = []
         self._busy: dict[int, Fault] = {}
@@ -70,12 +70,12 @@ class Campaign:
         end_s = time.monotonic() + seconds
         while self.service is None or sum(map(is_well, self.health.values())) < len(self._links):
             if time.monotonic() > end_s or not resources.alive:
-                told = {h.link: (h.state, h.node, h.reason) for h in self.health.values()}
-                raise RuntimeError(f"the hand never became operational: {told}")
+                states = {h.link: (h.state, h.node_state, h.reason) for h in self.health.values()}
+                raise RuntimeError(f"the hand never became operational: {states}")
             self._take(self._messages.recv(0.1))
 
     def take_last_figures(self) -> None:
-        """What `service` says once the nodes have fallen silent."""
+        """Receive the `service` messages after the nodes have stopped."""
         silent_ns = time.monotonic_ns() + S // 2
         while self.service.t_ns < silent_ns:
             message = self._messages.recv(0.1)
@@ -83,15 +83,15 @@ class Campaign:
                 self.service = message
 
     def run(self, resources: Resources, faults: int) -> None:
-        """Until so many faults are over."""
+        """Run until this many faults have ended."""
         self._next_ns = time.monotonic_ns() + S
         while self._started < faults or self._active:
-            message = self._messages.recv(0.001 if self.bench.stranger.busy else 0.005)
+            message = self._messages.recv(0.001 if self.bench.unknown_device.busy else 0.005)
             while message is not None:
                 self._take(message)
                 message = self._messages.recv(0)
             now_ns = time.monotonic_ns()
-            self.bench.stranger.pump(now_ns)
+            self.bench.unknown_device.pump(now_ns)
             resources.look(now_ns)
             if self._started < faults:
                 self._start_due(now_ns)
@@ -125,7 +125,7 @@ class Campaign:
                 return
             self._begin(self._coming.popleft(), self._chance.choice(free), now_ns)
         self._next_ns = max(
-            self._next_ns + int(self._chance.expovariate(self._asked.rate) * S), now_ns - S // 2
+            self._next_ns + int(self._chance.expovariate(self._options.rate) * S), now_ns - S // 2
         )
 
     def _may_begin(self, node_id: int, now_ns: int) -> bool:
@@ -156,8 +156,8 @@ class Campaign:
             self.service = message
             for fault in self._active:
                 fault.bus_now = next(iter(message.buses.values()))
-                if fault.kind.told_by_bus is not None and fault.kind.told_by_bus(fault):
-                    fault.told_ns.setdefault(0, message.t_ns)
+                if fault.kind.reported_by_bus is not None and fault.kind.reported_by_bus(fault):
+                    fault.reported_ns.setdefault(0, message.t_ns)
         elif isinstance(message, wire.Contact) and message.event == "begin":
             node_id = self._links[message.link]
             fault = self._busy.get(node_id)
@@ -175,16 +175,16 @@ class Campaign:
         if health.t_ns < fault.start_ns:
             return
         fault.history.append(
-            f"{(health.t_ns - fault.start_ns) * 1e-9:.3f} s {health.link}: {health.state}, {health.node}, "
-            f"{health.reason}"
+            f"{(health.t_ns - fault.start_ns) * 1e-9:.3f} s {health.link}: {health.state}, "
+            f"{health.node_state}, {health.reason}"
         )
-        if fault.kind.told is not None and fault.kind.told(fault, health):
-            fault.told_ns.setdefault(node_id, health.t_ns)
-        if (fault.kind.quiet and not well) or (fault.kind.loose and health.node != "operational"):
+        if fault.kind.reported is not None and fault.kind.reported(fault, health):
+            fault.reported_ns.setdefault(node_id, health.t_ns)
+        if (fault.kind.quiet and not well) or (fault.kind.loose and health.node_state != "operational"):
             fault.disturbed_ns.append(health.t_ns)
         if not well:
             fault.well_ns.pop(node_id, None)
-        elif fault.ended_ns and health.t_ns > fault.ended_ns and self._is_told(fault, node_id):
+        elif fault.ended_ns and health.t_ns > fault.ended_ns and self._is_reported(fault, node_id):
             fault.well_ns.setdefault(node_id, health.t_ns)
 
     def _take_undisturbed(self, health: Any, before: Any, well: bool) -> None:
@@ -192,41 +192,41 @@ class Campaign:
         if not well and self._started:
             self.surprises.append(
                 {"t_ns": health.t_ns, "node_id": health.node_id, "link": health.link, "state": health.state,
-                 "node": health.node, "reason": health.reason,
+                 "node": health.node_state, "reason": health.reason,
                  "meanwhile": [fault.kind.name for fault in self._active]}
             )  # fmt: skip
         if before is not None and before.t_ns > free_ns:
             self.quiet_samples += health.samples - before.samples
-            self.quiet_missed += health.missed - before.missed
+            self.quiet_missed += health.missed_samples - before.missed_samples
 
-    # Judging -----------------------------------------------------------------------------------------
+    # Checking ----------------------------------------------------------------------------------------
 
-    def _is_told(self, fault: Fault, node_id: int) -> bool:
-        return fault.kind.told is None or node_id in fault.told_ns
+    def _is_reported(self, fault: Fault, node_id: int) -> bool:
+        return fault.kind.reported is None or node_id in fault.reported_ns
 
     def _follow(self, fault: Fault, now_ns: int) -> None:
-        kind, patience = fault.kind, self._asked.patience
+        kind, patience = fault.kind, self._options.patience
         if not fault.ended_ns:
             if now_ns < fault.end_ns:
                 return
             kind.end(fault, self.bench)
             fault.ended_ns = now_ns if kind.lasts_s[1] else fault.start_ns
-        wanted = set(fault.nodes) if kind.told else {0} if kind.told_by_bus else set()
-        told = wanted <= set(fault.told_ns)
-        if not told and now_ns - fault.start_ns > (kind.within_s * patience) * S and fault.ended_ns:
-            _once(fault, "not told")
+        expected = set(fault.nodes) if kind.reported else {0} if kind.reported_by_bus else set()
+        reported = expected <= set(fault.reported_ns)
+        if not reported and now_ns - fault.start_ns > (kind.within_s * patience) * S and fault.ended_ns:
+            _once(fault, "not reported")
         passed_s = (now_ns - fault.ended_ns) * 1e-9
         if kind.quiet or kind.loose or not fault.nodes:
-            over = passed_s > 0.5 and (told or "not told" in fault.failures)
+            ended = passed_s > 0.5 and (reported or "not reported" in fault.failures)
         else:
-            over = set(fault.nodes) == set(fault.well_ns)
-            over = over and now_ns - max(fault.well_ns.values(), default=0) > HOLD_NS
-            if not over and passed_s > max(kind.well_s, kind.within_s) * patience:
+            ended = set(fault.nodes) == set(fault.well_ns)
+            ended = ended and now_ns - max(fault.well_ns.values(), default=0) > HOLD_NS
+            if not ended and passed_s > max(kind.well_s, kind.within_s) * patience:
                 _once(fault, "not recovered in time")
             if passed_s > GIVE_UP_S:
                 _once(fault, "never recovered")
-                over = True
-        if over:
+                ended = True
+        if ended:
             self._finish(fault, now_ns)
 
     def _finish(self, fault: Fault, now_ns: int) -> None:
@@ -239,7 +239,7 @@ class Campaign:
             paused = self.bench.cable.paused(fault.nodes[0], t_ns, fault.kind.lag)
             _once(fault, "paused" if paused else "disturbed")
         if "paused" in fault.failures:
-            fault.failures = ["paused"]  # nothing can be said of it
+            fault.failures = ["paused"]  # void
         if fault.failures and fault.failures != ["paused"]:
             what = f"fault {fault.number}, {fault.kind.name}: {fault.failures}"
             print(what, *fault.history[:40], sep="\n  ", flush=True)
@@ -248,13 +248,13 @@ class Campaign:
 
 
 def is_well(health: Any) -> bool:
-    """Operational, its samples trusted."""
-    return health.state in WELL and health.node == "operational"
+    """Return True if the node is operational and its samples are valid."""
+    return health.state in WELL and health.node_state == "operational"
 
 
 def may_touch(kind: Kind) -> bool:
-    """Whether a pad may look touched because of it."""
-    return kind.loose or any(word in kind.name for word in ("corrupt", "saturated"))
+    """Return True if the fault may look like a touch."""
+    return kind.loose or any(name in kind.name for name in ("corrupt", "saturated"))
 
 
 def _once(fault: Fault, failure: str) -> None:
@@ -262,12 +262,13 @@ def _once(fault: Fault, failure: str) -> None:
         fault.failures.append(failure)
 
 
-def measure(folder: Path, asked: Any) -> dict[str, Any]:
+def measure(folder: Path, options: Any) -> dict[str, Any]:
     config = on_loopback(folder, PORT)
     config.write_text(
         re.sub(
             r"sync_period_ms = [\d.]+",
-            f'sync_period_ms = {asked.period_ms}\nanother_unit = "refuse"',  # so that it shows as a fault
+            # a replaced node is a fault here
+            f'sync_period_ms = {options.period_ms}\non_node_replaced = "refuse"',
             config.read_text(),
         )
     )
@@ -275,17 +276,17 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
     pads = [pad for hand in deployment.hands for pad in hand.pads]
     raised: list[str] = []
     threading.excepthook = lambda args: raised.append(f"{args.exc_type.__name__}: {args.exc_value}")
-    buses = [open_bus(asked.interface), open_bus(asked.interface)]
-    cable = Cable(buses[0], round(asked.period_ms * 1e6))
-    devices = DeviceBus(cable, sampler(deployment, asked.seed))
+    buses = [open_bus(options.interface), open_bus(options.interface)]
+    cable = Cable(buses[0], round(options.period_ms * 1e6))
+    devices = DeviceBus(cable, sampler(deployment, options.seed))
     for pad in pads:
         devices.add(pad.node_id, serial=pad.serial)
-    stranger = Stranger(buses[1])
+    unknown_device = UnknownDevice(buses[1])
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
-    if asked.interface == "socketcan":
+    if options.interface == "socketcan":
         command += ["--bus", "can0=socketcan:vcan0"]
     stderr = folder / "daemon.txt"
-    sys.setswitchinterval(0.0005)  # or reading an EDS for a twin holds up the other nodes
+    sys.setswitchinterval(0.0005)  # reading an EDS for a twin would block the other nodes
     devices.start()
     with stderr.open("w") as output:
         daemon = subprocess.Popen(command, stdout=output, stderr=output)
@@ -294,16 +295,16 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
     try:
         with connect(*patterns, endpoint=deployment.daemon.complete, queue=100_000) as messages:
             campaign = Campaign(
-                Bench(devices, stranger, round(asked.period_ms * 1e6), cable),
+                Bench(devices, unknown_device, round(options.period_ms * 1e6), cable),
                 messages,
                 {p.link: p.node_id for p in pads},
-                asked,
+                options,
             )
-            campaign.wait_operational(resources, 60 * asked.patience)
+            campaign.wait_operational(resources, 60 * options.patience)
             before, start_s = campaign.service, time.monotonic()
-            campaign.run(resources, asked.faults)
+            campaign.run(resources, options.faults)
             seconds = time.monotonic() - start_s
-            campaign.wait_operational(resources, 20 * asked.patience)
+            campaign.wait_operational(resources, 20 * options.patience)
             devices.stop()
             campaign.take_last_figures()
     finally:
@@ -314,16 +315,16 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
         for bus in buses:
             bus.shutdown()
     text = stderr.read_text()
-    if asked.keep:
-        (asked.out / "faults.txt").write_text(text)
+    if options.keep:
+        (options.out / "faults.txt").write_text(text)
     bus = next(iter(campaign.service.buses.values()))
     excused = [s for s in campaign.surprises if cable.paused(s["node_id"], s["t_ns"])]
     return {
-        "interface": asked.interface,
-        "seed": asked.seed,
-        "rate": asked.rate,
-        "period_ms": asked.period_ms,
-        "patience": asked.patience,
+        "interface": options.interface,
+        "seed": options.seed,
+        "rate": options.rate,
+        "period_ms": options.period_ms,
+        "patience": options.patience,
         "machine": machine(),
         "load": os.getloadavg()[0],
         "faults": len([f for f in campaign.done if f.failures != ["paused"]]),
@@ -347,7 +348,7 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
 
 
 def machine() -> str:
-    """Where this was measured."""
+    """Return a description of the machine."""
     where = os.environ.get("VCAN_RUN", "host")
     return f"{where}, {platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
 
@@ -359,20 +360,20 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=4)
     parser.add_argument("--period-ms", type=float, default=10.0)
     parser.add_argument("--interface", choices=("udp_multicast", "socketcan"), default="udp_multicast")
-    parser.add_argument("--patience", type=float, default=1.0, help="times the limits that hold on a robot")
+    parser.add_argument("--patience", type=float, default=1.0, help="factor on the time limits of a robot")
     parser.add_argument("--out", type=Path, default=OUT, help="folder for faults.md and faults.json")
-    parser.add_argument("--keep", action="store_true", help="the daemon's log too, as faults.txt")
-    asked = parser.parse_args()
-    asked.out.mkdir(parents=True, exist_ok=True)
-    if asked.interface == "udp_multicast":
+    parser.add_argument("--keep", action="store_true", help="keep the daemon's log, as faults.txt")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.interface == "udp_multicast":
         in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        results = measure(Path(folder), asked)
-    kept = asked.out / "faults.json"
+        results = measure(Path(folder), options)
+    kept = options.out / "faults.json"
     every = json.loads(kept.read_text()) if kept.exists() else {}
-    every[asked.interface] = results
+    every[options.interface] = results
     kept.write_text(json.dumps(every, indent=1) + "\n")
-    (asked.out / "faults.md").write_text(page(every))
+    (options.out / "faults.md").write_text(page(every))
     print(section(results))
     return 1 if verdict(results) else 0
 

@@ -23,9 +23,21 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from ratio_table import RatioTable
 
-from handtouch.field import LocatorBank, RatioTable, Rectangle, estimate, point_test, resolvable_separation
-from handtouch.field.classic import LogRatioTable, double_sum_fractions, log_ratio, single_sum_fractions
+from handtouch.field import (
+    LocatorBank,
+    Rectangle,
+    estimate,
+    point_test,
+    resolvable_separation,
+)
+from handtouch.field.paper_methods import (
+    LogRatioTable,
+    double_sum_fractions,
+    log_ratio,
+    single_sum_fractions,
+)
 
 FloatArray = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)

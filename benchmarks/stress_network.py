@@ -24,19 +24,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handtouch.field import (
-    Anisotropic,
-    Cone,
+    AnisotropicSurface,
+    ConeSurface,
     ContactLaw,
-    Cylinder,
+    CylinderSurface,
     Electrode,
     ElectrodeNetwork,
-    Plane,
-    Prism,
+    ForceEstimateStatus,
+    PlaneSurface,
+    PrismSurface,
     Rectangle,
-    Revolution,
+    RevolutionSurface,
     Sandwich,
-    Sphere,
-    Status,
+    SphereSurface,
     Surface,
     contact_stack_resistance,
 )
@@ -111,7 +111,7 @@ def law() -> Iterator[Row]:
             curve = ContactLaw(layer, alpha, 2e-3, hertz_n=hertz)
             current = float(curve.current(force, 5.0, 2400.0, outer))
             found = curve.force(current, 5.0, 2400.0, outer)
-            if found.status != Status.VALID:
+            if found.status != ForceEstimateStatus.VALID:
                 worst.add(max(float(found.force_n) / force - 1, 0.0), 1e9, (layer, alpha, force, outer))
                 continue
             step = float(curve.current(force * 1.0001, 5.0, 2400.0, outer)) / current - 1
@@ -127,7 +127,7 @@ def surfaces() -> Iterator[Row]:
         unit, near = 10.0 ** rng.uniform(-100, 100), 1.0
         slope = 10.0 ** rng.uniform(-14, 0) * rng.choice([-1, 1])
         slant = float(rng.uniform(0.1, 0.9 / max(abs(slope), 0.1)))
-        pad = Cone(near * unit, (near + slope * slant) * unit, slant * unit, 2.0)
+        pad = ConeSurface(near * unit, (near + slope * slant) * unit, slant * unit, 2.0)
         u = float(rng.uniform(0, 1)) * slant * unit
         n, f, s = (mp.mpf(float(v)) for v in (pad.near_radius_m, pad.far_radius_m, pad.slant_m))
         tilt = (f - n) / s
@@ -143,7 +143,7 @@ def surfaces() -> Iterator[Row]:
     for _ in range(2000):
         low = -math.pi / 2 + 10.0 ** rng.uniform(-6, 0)
         high = low + (math.pi / 2 - 1e-6 - low) * 10.0 ** rng.uniform(-6, 0)
-        pad_ = Sphere(1.0, low, high, 2.0)
+        pad_ = SphereSurface(1.0, low, high, 2.0)
         u = float(rng.uniform(0.01, 1)) * pad_.extent_m[0]
         lat0, lat = mp.mpf(low), mp.mpf(low) + mp.mpf(u)
         mid = mp.cos(lat0 + (mp.mpf(high) - lat0) / 2)
@@ -177,8 +177,8 @@ class HalfPlane:
         for row, (start, stop) in enumerate(gaps[:3]):
             for power in range(3):
                 steps[row, power] = self.step(start, stop, power)
-        wanted = {"y0": (-1, 0, 0), "xa": (1, -1, 0), "yb": (0, 1, -1), "x0": (0, 0, 1)}
-        self.coefficients = {side: mp.lu_solve(steps, mp.matrix(v)) for side, v in wanted.items()}
+        targets = {"y0": (-1, 0, 0), "xa": (1, -1, 0), "yb": (0, 1, -1), "x0": (0, 0, 1)}
+        self.coefficients = {side: mp.lu_solve(steps, mp.matrix(v)) for side, v in targets.items()}
 
     def w(self, x: Any, y: Any) -> Any:
         u = (2 * mp.mpf(x) / self.a - 1) * self.K + 1j * mp.mpf(y) / self.b * self.Kp
@@ -311,7 +311,7 @@ def round_trip() -> Iterator[Row]:
 
 
 def _condition(pad: ElectrodeNetwork, x: float, y: float) -> float:
-    """Of a location: its size and sum |I dx / dI|, how far relative rounding of the currents moves it."""
+    """Condition of a location: its size, and sum |I dx / dI|, its motion by rounding of the currents."""
     fractions, slopes = pad.fractions_with_jacobian(x, y)
     columns = np.concatenate([slopes, fractions[:, None]], axis=1)
     moves = np.abs(np.linalg.pinv(columns)[:2]) @ np.abs(fractions)
@@ -323,13 +323,13 @@ def arguments() -> Iterator[Row]:
     pad = ElectrodeNetwork(1.3, 1.0, 0.05, 2400.0, (0.0, 336.0, 0.0, 100.0))
     curve, sized = ContactLaw(2e-2, 1.5, 2e-3, 3e-4), ContactLaw(2e-2, 1.5, 2e-3, hertz_n=1.0)
     shapes: list[Surface] = [
-        Plane(1.3, 1.0),
-        Cylinder(0.5, 1.3, 2.0),
-        Cone(0.6, 0.4, 1.3, 2.0),
-        Sphere(1.0, -0.3, 1.0, 2.0),
-        Revolution((0.0, 0.5, 1.3), (0.5, 0.6, 0.4), 2.0),
-        Prism(1.3, (0.0, 0.5, 1.0), (0.0, 0.2, 0.0)),
-        Anisotropic(Plane(1.3, 1.0), 3.0),
+        PlaneSurface(1.3, 1.0),
+        CylinderSurface(0.5, 1.3, 2.0),
+        ConeSurface(0.6, 0.4, 1.3, 2.0),
+        SphereSurface(1.0, -0.3, 1.0, 2.0),
+        RevolutionSurface((0.0, 0.5, 1.3), (0.5, 0.6, 0.4), 2.0),
+        PrismSurface(1.3, (0.0, 0.5, 1.0), (0.0, 0.2, 0.0)),
+        AnisotropicSurface(PlaneSurface(1.3, 1.0), 3.0),
     ]
     pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
     pieces = [Electrode(side, start, stop) for side in SIDES for start, stop in ((0.02, 0.48), (0.52, 0.98))]
@@ -341,7 +341,7 @@ def arguments() -> Iterator[Row]:
     functions: dict[str, Callable[[Any, Any], npt.ArrayLike]] = {
         "network.estimate": lambda x, y: pad.estimate(four(x, y), 0.01).x,
         "from_electrodes.currents": parted.currents,
-        "with_series.currents": pad.with_series((0.0, 0.0, 500.0, 1e-3)).currents,
+        "with_series.currents": pad.with_series_ohm((0.0, 0.0, 500.0, 1e-3)).currents,
         "Sandwich.currents": lambda x, y: pair.currents(x, y, 12.0, 0.02),
         "Sandwich.force": lambda x, y: pair.force(np.stack(np.broadcast_arrays(x, y)), 12.0, 0.02).force_n,
         "network.currents": pad.currents,
@@ -413,7 +413,7 @@ part = st.floats(0.03, 0.97)
 
 
 def searches() -> Iterator[Row]:
-    """What hypothesis finds when it looks for trouble; any floating-point warning is trouble too."""
+    """Failures found by hypothesis; any floating-point warning counts as one."""
     yield from (_search_networks(), _search_points(), _search_surfaces(), _search_law(), _search_sandwich())
 
 
@@ -468,11 +468,11 @@ def _search_surfaces() -> Row:
     @given(st.floats(0.1, 10), st.floats(0.1, 10), st.floats(0.05, 6.2), part, part)
     def attempt(near: float, far: float, arc: float, u: float, v: float) -> None:
         made: list[Surface] = [
-            Cylinder(near, far, arc),
-            Cone(near, far, abs(far - near) + near, arc),
-            Sphere(near, -0.1 * min(far, 10) * 0.9, 0.1 * near, arc),
+            CylinderSurface(near, far, arc),
+            ConeSurface(near, far, abs(far - near) + near, arc),
+            SphereSurface(near, -0.1 * min(far, 10) * 0.9, 0.1 * near, arc),
         ]
-        for surface in [*made, *(Anisotropic(other, far) for other in made)]:
+        for surface in [*made, *(AnisotropicSurface(other, far) for other in made)]:
             x, y = u * surface.a, v * surface.b
             again = surface.to_rectangle(*surface.from_rectangle(x, y))
             worst.add(float(again[0] - x) / surface.a, 1, (type(surface).__name__, near, far, arc, u, v))
@@ -496,7 +496,7 @@ def _search_law() -> Row:
         radius = float(law.radius(10**force)) * 10**spread
         current = law.current(10**force, 5.0, 2400.0, radius)
         found = law.force(current, 5.0, 2400.0, radius)
-        if found.status == Status.VALID:
+        if found.status == ForceEstimateStatus.VALID:
             worst.add(float(found.force_n) / 10**force - 1, 1, (force, layer, alpha, spread, hertz))
 
     attempt()
@@ -513,7 +513,7 @@ def _search_sandwich() -> Row:
     @given(st.floats(-2, 1), st.floats(-3.5, -2.5))
     def attempt(force: float, radius: float) -> None:
         found = pair.force(pair.currents(10**force, 10**radius, 12.0, 0.02), 12.0, 0.02)
-        if found.status == Status.VALID:
+        if found.status == ForceEstimateStatus.VALID:
             worst.add(float(found.force_n) / 10**force - 1, 1, (force, radius))
 
     attempt()

@@ -25,19 +25,19 @@ import matplotlib
 import numpy as np
 from section import table
 
-from handtouch.field import Rectangle
-from handtouch.supervise.calibration import (
+from handtouch.calibration.calibration import (
     Calibration,
     Gains,
-    Law,
+    LawParameters,
     Offsets,
     Provenance,
-    SheetState,
-    four,
+    StoredSheetState,
+    channel_values,
     matrix,
 )
-from handtouch.supervise.gains import GainEstimator
-from handtouch.supervise.store import Store
+from handtouch.calibration.gains import GainEstimator
+from handtouch.calibration.store import Store
+from handtouch.field import Rectangle
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -54,28 +54,28 @@ PHASES = ("opening", "calibrating", "storing", "between")
 
 
 def calibration(serial: int, number: int, estimator: GainEstimator) -> Calibration:
-    """Gains from contacts, and values that only this version of this unit has."""
+    """Gains from contacts, and values that only this version of this node has."""
     generator = np.random.default_rng((serial, number))
     pad = Rectangle(1.4, 1.0)
     x, y = generator.uniform(0.1, 0.9, (2, 32)) * [[pad.a], [pad.b]]
-    estimator.add(pad.fractions(x, y) + 1e-3 * generator.normal(size=(4, 32)), 1e-3, number)
+    estimator.add_contacts(pad.fractions(x, y) + 1e-3 * generator.normal(size=(4, 32)), 1e-3, number)
     found = estimator.estimate
     return Calibration(
-        Gains(four(found.gains), matrix(found.covariance)),
-        Offsets(four(generator.normal(0, 3, 4)), (1.0, 1.0, 1.0, 1.0)),
-        Law(20_000.0, 1.5, 2400.0, matrix(np.diag([1e-4] * 3))),
-        SheetState("stress", number, mark(serial, number)),
+        Gains(channel_values(found.gains), matrix(found.covariance)),
+        Offsets(channel_values(generator.normal(0, 3, 4)), (1.0, 1.0, 1.0, 1.0)),
+        LawParameters(20_000.0, 1.5, 2400.0, matrix(np.diag([1e-4] * 3))),
+        StoredSheetState("stress", number, mark(serial, number)),
     )
 
 
 def mark(serial: int, number: int) -> bytes:
-    """What the sheet's state of a version must be: 200 to 20,000 bytes."""
+    """Return the expected sheet state of a version: 200 to 20,000 bytes."""
     generator = np.random.default_rng((serial, number, 1))
     return generator.bytes(int(200 * 10 ** generator.uniform(0, 2)))
 
 
 def calibrate_and_store(path: Path, pipe: int) -> None:
-    """For ever; what is begun and every commit is told on the pipe before going on."""
+    """Calibrate and store endlessly; report each phase and commit on the pipe before continuing."""
     with Store(path) as store:
         estimators = {serial: GainEstimator(Rectangle(1.4, 1.0)) for serial in SERIALS}
         while True:
@@ -102,28 +102,28 @@ class Killer:
         """Start a process and kill it; what it committed."""
         steps = 3 * int(self._generator.integers(MOST_COMMITS)) + int(self._generator.integers(3))
         child, reading = _start(path)
-        told = []
+        reported = []
         for _ in range(steps):
             begin = time.monotonic()
-            told.append(_RECORD.unpack(os.read(reading, _RECORD.size)))
-            self._saw(told[-2][0] if len(told) > 1 else OPENING, time.monotonic() - begin)
-        last = told[-1][0] if told else OPENING
+            reported.append(_RECORD.unpack(os.read(reading, _RECORD.size)))
+            self._saw(reported[-2][0] if len(reported) > 1 else OPENING, time.monotonic() - begin)
+        last = reported[-1][0] if reported else OPENING
         time.sleep(float(self._generator.uniform(0, 1.2 * self._usual_s[last])))
         os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
         if not os.WIFSIGNALED(status):
             raise RuntimeError(f"the writer ended by itself with status {status}")
         with os.fdopen(reading, "rb") as pipe:
-            told += _RECORD.iter_unpack(pipe.read())
-        self.phases[PHASES[told[-1][0] if told else OPENING]] += 1
-        return [(serial, number) for phase, serial, number in told if phase == COMMITTED]
+            reported += _RECORD.iter_unpack(pipe.read())
+        self.phases[PHASES[reported[-1][0] if reported else OPENING]] += 1
+        return [(serial, number) for phase, serial, number in reported if phase == COMMITTED]
 
     def _saw(self, phase: int, took_s: float) -> None:
         self._usual_s[phase] += 0.1 * (took_s - self._usual_s[phase])
 
 
 def _start(path: Path) -> tuple[int, int]:
-    """Process number, and where what it tells can be read."""
+    """Start a writer; return its process number and the reading end of its pipe."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -137,16 +137,16 @@ def _start(path: Path) -> tuple[int, int]:
 
 
 def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
-    """KILLS times: kill, open, compare all that is there with all that was told."""
+    """KILLS times: kill, open, compare the versions with the reported ones."""
     path, killer = folder / "store.db", Killer()
-    told: dict[int, int] = dict.fromkeys(SERIALS, 0)
-    counts = dict.fromkeys(("undone", "untold", "lost", "wrong", "unopened"), 0)
+    reported: dict[int, int] = dict.fromkeys(SERIALS, 0)
+    counts = dict.fromkeys(("undone", "unreported", "lost", "wrong", "unopened"), 0)
     openings = []
     for kill in range(KILLS):
         if kill % 50 == 0:
             print(f"kill {kill} of {KILLS}", file=sys.stderr)
         for serial, number in killer.kill(path):
-            told[serial] = max(told[serial], number)
+            reported[serial] = max(reported[serial], number)
         journal = path.with_name("store.db-journal")
         counts["undone"] += journal.exists() and journal.stat().st_size > 0
         begin = time.perf_counter()
@@ -160,21 +160,21 @@ def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
         with store:
             for serial in SERIALS:
                 versions = store.versions(serial)
-                counts["lost"] += len(versions) < told[serial]
-                # one commit more than was told: killed between the two
-                counts["untold"] += len(versions) == told[serial] + 1
-                counts["wrong"] += len(versions) > told[serial] + 1
+                counts["lost"] += len(versions) < reported[serial]
+                # one commit more than reported: killed between the two
+                counts["unreported"] += len(versions) == reported[serial] + 1
+                counts["wrong"] += len(versions) > reported[serial] + 1
                 counts["wrong"] += [v.number for v in versions] != list(range(1, len(versions) + 1))
-                for version in versions[told[serial] - 5 :]:
+                for version in versions[reported[serial] - 5 :]:
                     sheet = version.calibration.sheet
                     counts["wrong"] += sheet is None or sheet.data != mark(serial, version.number)
-                told[serial] = len(versions)
+                reported[serial] = len(versions)
     row = {
         "kills": KILLS,
         **{f"while {phase}": count for phase, count in killer.phases.items()},
-        "commits": sum(told.values()),
+        "commits": sum(reported.values()),
         "interrupted writes undone": counts["undone"],
-        "committed but not told yet": counts["untold"],
+        "committed but not reported yet": counts["unreported"],
         "lost commits": counts["lost"],
         "wrong contents": counts["wrong"],
         "not opened": counts["unopened"],
@@ -266,7 +266,7 @@ def main() -> None:
         tables = {
             "Kill -9 while calibrating and storing": (
                 "A process opens the store, estimates gains by contacts and writes versions of three "
-                "units without a pause, and is killed at a random instant of any of that. It tells what it "
+                "nodes without a pause, and is killed at a random instant of any of that. It reports what it "
                 "begins and every commit on a pipe. A kill doesn't lose what the kernel has; for power loss "
                 "see `docs/calibrations.md`.",
                 [killed],

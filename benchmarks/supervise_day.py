@@ -1,7 +1,7 @@
-"""A day of mixed use of sheets of which the estimator is told a preset alone, for bench_supervise.
+"""A day of mixed use of sheets of which the estimator knows the preset only, for bench_supervise.
 
-Some sheets are the preset with other numbers, others creep, remember or adapt by laws that the estimator
-doesn't have. Stretches in which nobody touches the hand are one step each, exact whatever their length.
+Some sheets are the preset with other parameters, others creep, adapt or have hysteresis by laws that the
+estimator doesn't have. Periods without contact are one step each, exact whatever their length.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handtouch import sheet
 from handtouch.config import Behaviour
-from handtouch.supervise.strength import SheetStrength, StrengthState, behaviour_of
+from handtouch.core.sheet_force import ForceReliability, SheetForceCompensation, sheet_behaviour_of
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -24,9 +24,9 @@ FULL_N = 5.0
 DT_S = 0.4
 PADS = 40
 """of each kind"""
-FELT_N = 0.05
+DETECTED_N = 0.05
 EVERY = 5
-"""steps from one reading that is judged to the next"""
+"""steps between evaluated readings"""
 HOUR_S = 3600.0
 NIGHT_H = 16.0
 """when it begins"""
@@ -73,14 +73,14 @@ class TwoTimes:
         )
 
     def start(self, pads: int) -> TwoStates:
-        return TwoStates(*(part.start(pads) for part in self.parts))
+        return TwoStates(*(part.initial_state(pads) for part in self.parts))
 
     def at(self, dt_s: float) -> TwoTimesStep:
         return TwoTimesStep(self.parts, dt_s)
 
 
 class TwoStates(NamedTuple):
-    """Of the two parts."""
+    """States of the two parts."""
 
     one: sheet.AdaptationState
     two: sheet.AdaptationState
@@ -94,15 +94,15 @@ class TwoTimesStep:
     """Over one interval."""
 
     def __init__(self, parts: tuple[sheet.Adaptation, ...], dt_s: float) -> None:
-        self._steps = [part.at(dt_s) for part in parts]
-        self._threshold_n, self._wipe = np.asarray(parts[0].threshold_n), np.asarray(parts[0].wipe)
+        self._steps = [part.discretise(dt_s) for part in parts]
+        self._threshold_n, self._wipe = np.asarray(parts[0].threshold_n), np.asarray(parts[0].wipe_fraction)
 
     def forward(self, states: TwoStates, load_n: FloatArray, powered: BoolArray) -> FloatArray:
         one, two = states
         flows = powered & (load_n - one.back_n - two.back_n > self._threshold_n)
         for state, step in zip(states, self._steps, strict=True):
-            step.adapt(state, load_n, flows, step.kept(state))
-            step.fade(state, powered)
+            step.update_back_force(state, load_n, flows, step.remaining_fraction(state))
+            step.recover(state, powered)
         pressed, back = load_n > self._threshold_n, states.back_n
         wiped = ~pressed & (one.peak_n > 0) & (one.peak_n < self._wipe * back)
         one.back_n[wiped] = two.back_n[wiped] = 0.0
@@ -144,8 +144,8 @@ def two_times(preset: sheet.SheetModel, rng: np.random.Generator) -> sheet.Sheet
 
 
 KINDS = {
-    "numbers off by 20 %": near,
-    "numbers off by 50 %": far,
+    "parameters off by 20 %": near,
+    "parameters off by 50 %": far,
     "creep by a power law": power_law,
     "Preisach hysteresis": preisach,
     "adaptation of two speeds": two_times,
@@ -153,7 +153,7 @@ KINDS = {
 
 
 class Use:
-    """What a hand is used for: grips of 2 to 40 s, some of minutes, of 0.1 to 5 N, half of them waxing and
+    """Use of a hand: grips of 2 to 40 s, some of minutes, of 0.1 to 5 N, half of them waxing and
     waning; pauses of 0.3 to 30 s; half of the grips of a pad are alike. Breaks, and a night from hour 16."""
 
     def __init__(self, pads: int, rng: np.random.Generator) -> None:
@@ -189,45 +189,45 @@ class Use:
 
 
 def day(preset: str, behaviour: Behaviour, hours: float, seed: int) -> dict[str, Any]:
-    """What a hand of sheets of all kinds finds of its loads, as `summary`."""
+    """Return the force errors of a hand with sheets of all kinds, as `summary`."""
     rng = np.random.default_rng([seed, preset == "S2"])
     models = [draw(PRESETS[preset], rng) for draw in KINDS.values()]
-    states = [model.start(PADS, seed + number) for number, model in enumerate(models)]
-    steps = [model.at(DT_S) for model in models]
+    states = [model.initial_state(PADS, seed + number) for number, model in enumerate(models)]
+    steps = [model.discretise(DT_S) for model in models]
     pads = PADS * len(models)
     gain = np.exp(rng.normal(0, behaviour.gain_std, pads))
-    strength = SheetStrength([behaviour_of(behaviour)] * pads, round(DT_S * 1e9))
+    strength = SheetForceCompensation([sheet_behaviour_of(behaviour)] * pads, round(DT_S * 1e9))
     use, kind = Use(pads, rng), np.repeat(np.arange(len(models)), PADS)
     touching, none, t_ns = np.zeros(pads, np.bool_), np.zeros(pads), 10**9
-    strength.step(none, none, touching, t_ns)
-    told: list[FloatArray] = []
+    strength.compensate_forces(none, none, touching, t_ns)
+    readings: list[FloatArray] = []
     gone_s = 0.0
     for long_s, work in use.hours(hours):
         for number in range(round(long_s / DT_S) if work else 2):
             load, dt_s = use.load() if work else none, DT_S if work or number == 0 else long_s - DT_S
             if dt_s != DT_S:
-                steps = [model.at(dt_s) for model in models]
+                steps = [model.discretise(dt_s) for model in models]
             t_ns += round(dt_s * 1e9)
             gone_s += dt_s
             parts = zip(steps, states, load.reshape(len(models), -1), strict=True)
             apparent = gain * np.concatenate([step.forward(state, own) for step, state, own in parts])
-            now = apparent > FELT_N
+            now = apparent > DETECTED_N
             if (began := np.flatnonzero(now & ~touching)).size:
-                strength.begin(began)
+                strength.begin_contacts(began)
             touching = now
-            strength.step(apparent, none, touching, t_ns)
+            strength.compensate_forces(apparent, none, touching, t_ns)
             if dt_s != DT_S:
-                steps = [model.at(DT_S) for model in models]
+                steps = [model.discretise(DT_S) for model in models]
             if number % EVERY == 0 and work:
-                valid = strength.state == StrengthState.ESTIMATED
+                valid = strength.state == ForceReliability.RELIABLE
                 columns = (kind, use.age_s, apparent - load, strength.force_n - load, strength.std_n, valid)
-                told.append(np.stack([np.full(pads, gone_s / HOUR_S), *columns])[:, touching])
-    return summary(np.concatenate(told, axis=1), hours)
+                readings.append(np.stack([np.full(pads, gone_s / HOUR_S), *columns])[:, touching])
+    return summary(np.concatenate(readings, axis=1), hours)
 
 
-def summary(told: FloatArray, hours: float) -> dict[str, Any]:
+def summary(readings: FloatArray, hours: float) -> dict[str, Any]:
     """Errors in % of full scale: of each kind, of all, and by the hour."""
-    hour, kind, age_s, raw, off, std, valid = told
+    hour, kind, age_s, raw, off, std, valid = readings
 
     def figures(some: BoolArray) -> dict[str, float]:
         good = some & (valid > 0)

@@ -1,4 +1,4 @@
-"""How Sphinx builds the documentation: `make docs`, result in docs/_build."""
+"""Sphinx configuration: `make docs` builds the site in docs/_build."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the examples share: their command line, a fresh object to touch, and a touch to go by."""
+"""Shared by the examples: command line, a new object in the gripper, contacts of one pad."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
 import handtouch
-from handtouch.client import CONTROL, LIVE
-from handtouch.simulate.gripper_client import GRIPPER, Gripper
+from handtouch.client import CONTROL_ENDPOINT, LIVE_ENDPOINT
+from handtouch.simulate.gripper_client import DEFAULT_ENDPOINT, GripperClient
 from handtouch.wire import Contact, PadState
 
-SILENCE_S, PATIENCE_S = 0.05, 5.0
+SAMPLE_TIMEOUT_S, CONTACT_TIMEOUT_S = 0.05, 5.0
 
 
 @dataclass(frozen=True)
 class Options:
-    """Where the daemon and the robot are."""
+    """Endpoints of the daemon and the robot."""
 
-    live: str = LIVE
-    control: str = CONTROL
-    robot: str = GRIPPER
+    live: str = LIVE_ENDPOINT
+    control: str = CONTROL_ENDPOINT
+    robot: str = DEFAULT_ENDPOINT
 
 
 def options(description: str | None) -> Options:
@@ -29,39 +29,45 @@ def options(description: str | None) -> Options:
     parser = argparse.ArgumentParser(
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="Before: `handtouch simulate config/two_finger.toml --gripper` in one terminal and "
-        "`handtouch run config/two_finger.toml` in another. Or all at once: `make examples`.",
+        epilog="Start `handtouch simulate config/two_finger.toml --gripper` in one terminal and "
+        "`handtouch run config/two_finger.toml` in another first. `make examples` runs everything.",
     )
-    parser.add_argument("--live", default=LIVE, help=f"the daemon's stream (default: {LIVE})")
-    parser.add_argument("--control", default=CONTROL, help=f"its control endpoint (default: {CONTROL})")
-    parser.add_argument("--robot", default=GRIPPER, help=f"the simulated gripper (default: {GRIPPER})")
-    asked = parser.parse_args()
-    return Options(asked.live, asked.control, asked.robot)
+    parser.add_argument(
+        "--live", default=LIVE_ENDPOINT, help=f"the daemon's stream (default: {LIVE_ENDPOINT})"
+    )
+    parser.add_argument(
+        "--control", default=CONTROL_ENDPOINT, help=f"its control endpoint (default: {CONTROL_ENDPOINT})"
+    )
+    parser.add_argument(
+        "--robot", default=DEFAULT_ENDPOINT, help=f"the simulated gripper (default: {DEFAULT_ENDPOINT})"
+    )
+    arguments = parser.parse_args()
+    return Options(arguments.live, arguments.control, arguments.robot)
 
 
-async def touches(live: str, link: str) -> AsyncIterator[Contact | None]:
-    """The touch on a pad, sample by sample; None when there is nothing to go by for the moment: then stop.
+async def contacts_on(live: str, link: str) -> AsyncIterator[Contact | None]:
+    """Yield the contact on a pad, sample by sample; None while there is no sample: stop the robot then.
 
-    Raises RuntimeError when the pad is released, or a moment has become seconds.
+    Raises RuntimeError when the contact is released, or after CONTACT_TIMEOUT_S without a sample.
     """
-    felt_s = time.monotonic()
+    last_s = time.monotonic()
     async with handtouch.connect(f"contact/*/{link}", endpoint=live) as contacts:
-        while time.monotonic() - felt_s < PATIENCE_S:
-            contact = await contacts.arecv(SILENCE_S)
+        while time.monotonic() - last_s < CONTACT_TIMEOUT_S:
+            contact = await contacts.arecv(SAMPLE_TIMEOUT_S)
             if contact is None or contact.event == "end":
-                if contact is not None and contact.reason == "released":
-                    raise RuntimeError(f"{link} touches nothing any more")
-                yield None  # a pad that is stale may be back at once, with a new contact
+                if contact is not None and contact.end_reason == "released":
+                    raise RuntimeError(f"{link}: contact released")
+                yield None  # a stale pad may recover at once, with a new contact
             else:
-                felt_s = time.monotonic()
+                last_s = time.monotonic()
                 yield contact
-    raise RuntimeError(f"nothing comes from {link}: `handtouch status` tells why")
+    raise RuntimeError(f"{link}: no contact sample for {CONTACT_TIMEOUT_S:g} s; see `handtouch status`")
 
 
-async def fresh(gripper: Gripper, thing: str, live: str, **numbers: float) -> None:
-    """Open the gripper, put in another object, and wait until no pad is touched any more."""
-    gripper.reset(thing, **numbers)
+async def insert_object(gripper: GripperClient, kind: str, live: str, **parameters: float) -> None:
+    """Open the gripper, insert a new object, and wait until no pad is touched."""
+    gripper.reset(kind, **parameters)
     async with handtouch.connect("hand/*", endpoint=live) as frames:
         async for frame in frames:
-            if not frame.repeat and set(handtouch.columns(frame)["state"]) == {PadState.CLEAR}:
+            if not frame.retained and set(handtouch.columns(frame)["state"]) == {PadState.CLEAR}:
                 return

@@ -1,4 +1,4 @@
-"""Run every example against a simulated gripper: `make examples`. Starts all that is needed, and ends it."""
+"""Run every example against a simulated gripper (`make examples`); starts and stops all processes."""
 
 from __future__ import annotations
 
@@ -26,73 +26,78 @@ _START_S, _LOG_S = 60.0, 9.0
 
 @contextlib.contextmanager
 def rig(folder: Path, prefix: Sequence[str] = (), period_ms: float = 10.0) -> Iterator[Options]:
-    """The gripper and its daemon, on a bus and with endpoints of their own; `prefix` of their commands."""
+    """Run the gripper and its daemon on a private bus and private endpoints; `prefix`: of their commands."""
     bus = f"udp_multicast:239.74.163.2,port={free_port()}"
     endpoints = {name: f"ipc://{folder}/{name}" for name in ("live", "complete", "control", "inputs")}
-    told = "".join(f'{name} = "{endpoint}"\n' for name, endpoint in endpoints.items())
+    endpoint_keys = "".join(f'{name} = "{endpoint}"\n' for name, endpoint in endpoints.items())
     deployment = (HERE.parent / "config/two_finger.toml").read_text()
     config = folder / "two_finger.toml"
     deployment = deployment.replace("sync_period_ms = 10.0", f"sync_period_ms = {period_ms}")
-    config.write_text(deployment.replace("[daemon]\n", f"[daemon]\nsupervise = false\n{told}", 1))
-    asked = Options(endpoints["live"], endpoints["control"], f"ipc://{folder}/gripper")
+    config.write_text(deployment.replace("[daemon]\n", f"[daemon]\nsupervise = false\n{endpoint_keys}", 1))
+    options = Options(endpoints["live"], endpoints["control"], f"ipc://{folder}/gripper")
     simulate, run = (
         [*prefix, sys.executable, "-m", "handtouch", name, str(config), "--bus", f"can0={bus}"]
         for name in ("simulate", "run")
     )
     with contextlib.ExitStack() as stack:
-        for command in ([*simulate, "--gripper", asked.robot], run):
+        for command in ([*simulate, "--gripper", options.robot], run):
             log = stack.enter_context((folder / "log.txt").open("a"))
             process = stack.enter_context(subprocess.Popen(command, stdout=log, stderr=log))
             stack.callback(process.terminate)
-        wait_until_up(asked.control, folder / "log.txt")
-        yield asked
+        wait_operational(options.control, folder / "log.txt")
+        yield options
 
 
 def free_port() -> int:
-    """A UDP port that nobody has."""
+    """Return an unused UDP port."""
     with socket.socket(type=socket.SOCK_DGRAM) as udp:
         udp.bind(("", 0))
         return int(udp.getsockname()[1])
 
 
-def wait_until_up(control: str, log: Path) -> None:
-    """Until both pads are sampled; raises RuntimeError with what was printed."""
+def wait_operational(control: str, log: Path) -> None:
+    """Wait until both pads are sampled. Raises RuntimeError with the output of the processes."""
     end_s = time.monotonic() + _START_S
     while time.monotonic() < end_s:
         with contextlib.suppress(TimeoutError):
             pads = handtouch.request("status", endpoint=control, timeout_s=1.0)["pads"]
-            if all(pad["node"] == "operational" for pad in pads):
+            if all(pad["node_state"] == "operational" for pad in pads):
                 return
         time.sleep(0.05)
-    raise RuntimeError(f"the gripper didn't come up within {_START_S:.0f} s:\n{log.read_text()}")
+    raise RuntimeError(f"the gripper is not operational after {_START_S:.0f} s:\n{log.read_text()}")
 
 
 def cells(notebook: Path) -> str:
-    """The code of a notebook, as a program."""
+    """Return the code of a notebook as a program."""
     found = json.loads(notebook.read_text())["cells"]
     return "\n\n".join("".join(cell["source"]) for cell in found if cell["cell_type"] == "code")
 
 
 def log(live: str, figure: Path, seconds: float) -> subprocess.Popen[bytes]:
-    """Run the notebook's code, without Jupyter, so that it logs while something else goes on."""
-    told = {"HANDTOUCH_LIVE": live, "SECONDS": str(seconds), "FIGURE": str(figure), "MPLBACKEND": "agg"}
-    return subprocess.Popen([sys.executable, "-c", cells(NOTEBOOK)], env={**os.environ, **told})
+    """Start the notebook's code without Jupyter, to log while an example runs."""
+    environment = {
+        "HANDTOUCH_LIVE": live,
+        "SECONDS": str(seconds),
+        "FIGURE": str(figure),
+        "MPLBACKEND": "agg",
+    }
+    return subprocess.Popen([sys.executable, "-c", cells(NOTEBOOK)], env={**os.environ, **environment})
 
 
 def main() -> int:
-    """Run them one after the other, the notebook beside the last; how many failed."""
+    """Run the examples in sequence, the notebook during the last one; return the number of failures."""
     failed = 0
-    with tempfile.TemporaryDirectory(prefix="ht.") as folder, rig(Path(folder)) as asked:
-        where = ["--live", asked.live, "--control", asked.control, "--robot", asked.robot]
+    with tempfile.TemporaryDirectory(prefix="ht.") as folder, rig(Path(folder)) as options:
+        arguments = ["--live", options.live, "--control", options.control, "--robot", options.robot]
         for name in PROGRAMS:
             print(f"== examples/{name}.py", flush=True)
-            notebook = log(asked.live, FIGURE, _LOG_S) if name == PROGRAMS[-1] else None
+            notebook = log(options.live, FIGURE, _LOG_S) if name == PROGRAMS[-1] else None
             failed += (
-                subprocess.run([sys.executable, HERE / f"{name}.py", *where], check=False).returncode != 0
+                subprocess.run([sys.executable, HERE / f"{name}.py", *arguments], check=False).returncode != 0
             )
         print(f"== {NOTEBOOK.relative_to(HERE.parent)}", flush=True)
         failed += notebook is None or notebook.wait() != 0
-        print(f"the figure is {FIGURE}")
+        print(f"figure: {FIGURE}")
     return failed
 
 

@@ -1,16 +1,16 @@
 #!/bin/sh
-# Install handtouch on a robot controller, or take it away:
+# Install handtouch on a robot controller, or uninstall it:
 #
-#   services/install.sh [all]       the program, the systemd units, and a deployment to start from
-#   services/install.sh program     the program alone (containers)
-#   services/install.sh uninstall   all of it but /etc/handtouch
+#   services/install.sh [all]       the program, the systemd units, and an example deployment
+#   services/install.sh program     the program only (containers)
+#   services/install.sh uninstall   everything but /etc/handtouch
 #
-# The program lives in a virtual environment of its own, PREFIX/lib/handtouch; PREFIX/bin/handtouch leads to it. Running
-# it again brings it up to date; files in SYSCONFDIR/handtouch that are there already stay as they are.
+# The program is installed in a virtual environment, PREFIX/lib/handtouch, with the link PREFIX/bin/handtouch. Running the
+# script again updates it; existing files in SYSCONFDIR/handtouch are kept.
 #
-#   PREFIX      /usr/local      where programs and units go
-#   SYSCONFDIR  /etc            where deployments go
-#   DESTDIR     (empty)         put before both, to stage an image or a package
+#   PREFIX      /usr/local      prefix of program and units
+#   SYSCONFDIR  /etc            folder of the deployments
+#   DESTDIR     (empty)         prepended to both, to stage an image or a package
 #   WHEEL       (this source)   handtouch wheel to install
 #   PYTHON      python3         interpreter, 3.11 or later
 #   PIP_ARGS    (empty)         further arguments of pip install, e.g. --no-index --find-links /media/wheels
@@ -71,7 +71,7 @@ reload() {
   ! on_this_machine || systemctl try-restart systemd-sysctl.service
 }
 
-on_this_machine() { # is this where a running systemd looks, and may we tell it
+on_this_machine() { # true if the units are installed for a running systemd that we may reload
   [ -z "$DESTDIR" ] && { [ "$PREFIX" = /usr/local ] || [ "$PREFIX" = /usr ]; } &&
     [ "$(id -u)" = 0 ] && [ -d /run/systemd/system ]
 }
@@ -81,7 +81,7 @@ all)
   install_program
   install_services
   reload
-  echo "Edit $settings/hand.toml, look it over with \`handtouch check\` and \`handtouch doctor\`, then:"
+  echo "Edit $settings/hand.toml, check it with \`handtouch check\` and \`handtouch doctor\`, then:"
   echo "  systemctl enable --now handtouch-can@can0 handtouch@hand"
   ;;
 program) install_program ;;
@@ -93,7 +93,7 @@ uninstall)
   fi
   uninstall
   reload
-  echo "$settings is left as it is"
+  echo "$settings is kept"
   ;;
 *)
   sed -n '2,/^set/s/^#\( \|$\)//p' "$0"

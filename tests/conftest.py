@@ -57,14 +57,14 @@ def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture
 def endpoints() -> Iterator[dict[str, str]]:
-    """ZeroMQ endpoints for a `[daemon]` table, nobody else's."""
+    """ZeroMQ endpoints for a `[daemon]` table, private to this test."""
     with own_endpoints() as made:
         yield made
 
 
 @pytest.fixture
 def free_port() -> int:
-    """A TCP and UDP port that is free on loopback (until somebody takes it)."""
+    """A TCP and UDP port that is free on loopback (until another process takes it)."""
     return find_port()
 
 
@@ -73,7 +73,7 @@ def network() -> Iterator[list[str]]:
     """Prefix of commands that are to meet in a network of their own, with loopback up and multicast over it.
 
     `[*network, sys.executable, "-m", "handtouch", ...]` sees the same files; its ports and its
-    udp_multicast buses are nobody else's.
+    udp_multicast buses are private.
     """
     rootless = [] if os.geteuid() == 0 else ["--map-root-user"]
     ready = "ip link set lo up && ip route add 239.0.0.0/8 dev lo && echo ready && exec cat"

@@ -22,11 +22,11 @@ from collections.abc import Iterator
 from typing import IO, Any
 
 LOADED = (
-    "handtouch.bridge",
+    "handtouch.bridge.runner",
     "handtouch.daemon.daemon",
-    "handtouch.simulate.run",
+    "handtouch.simulate.simulated_hand",
     "handtouch.simulate.world",
-    "handtouch.view.status",
+    "handtouch.cli.status",
     "can.interfaces.socketcan",
     "can.interfaces.udp_multicast",
     "pinocchio",
@@ -37,13 +37,13 @@ _STREAMS = ("live", "complete", "control", "inputs")
 
 @contextlib.contextmanager
 def own_endpoints() -> Iterator[dict[str, str]]:
-    """ZeroMQ endpoints for a `[daemon]` table, nobody else's; seen from every network namespace."""
+    """ZeroMQ endpoints for a `[daemon]` table, private to this test; seen from every network namespace."""
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:  # tmp_path is longer than ipc paths may be
         yield {stream: f"ipc://{folder}/{stream}" for stream in _STREAMS}
 
 
 def find_port() -> int:
-    """A TCP and UDP port that is free on loopback (until somebody takes it)."""
+    """A TCP and UDP port that is free on loopback (until another process takes it)."""
     while True:
         with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
             tcp.bind(("127.0.0.1", 0))
@@ -61,7 +61,7 @@ class Started:
     def __init__(self, pid: int, status: int) -> None:
         self.pid = pid
         self.returncode: int | None = None
-        self._status = status  # a pipe that tells how it ended
+        self._status = status  # pipe that carries its exit status
 
     def poll(self) -> int | None:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -73,9 +73,9 @@ class Started:
         if self.returncode is None:
             if not select.select([self._status], [], [], timeout)[0]:
                 raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
-            told = os.read(self._status, 16)
+            status = os.read(self._status, 16)
             os.close(self._status)
-            self.returncode = int(told or -signal.SIGKILL)
+            self.returncode = int(status or -signal.SIGKILL)
         return self.returncode
 
     def send_signal(self, number: int) -> None:
@@ -127,9 +127,9 @@ def _serve(requests: socket.socket) -> None:
         ready, _, _ = select.select([requests.fileno(), *running], [], [])
         for ended in set(ready) & running.keys():
             pid, status = running.pop(ended)
-            told = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-            with contextlib.suppress(BrokenPipeError):  # nobody waits for it any more
-                os.write(status, str(told).encode())
+            exit_code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+            with contextlib.suppress(BrokenPipeError):  # the starter has ended
+                os.write(status, str(exit_code).encode())
             os.close(status)
             os.close(ended)
         if requests.fileno() in ready:

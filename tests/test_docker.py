@@ -1,4 +1,4 @@
-"""The image and the compose file, as far as they can be checked without an engine."""
+"""Image and compose file, checked without a container engine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 
 
 def stages() -> list[list[tuple[str, str]]]:
-    """Instructions of the Dockerfile, by stage; what stands before the first FROM is left out."""
+    """Return the instructions of the Dockerfile by stage, from the first FROM on."""
     text = (ROOT / "docker/Dockerfile").read_text().replace("\\\n", " ")
     found: list[list[tuple[str, str]]] = []
     for line in text.splitlines():
@@ -38,7 +38,7 @@ def stages() -> list[list[tuple[str, str]]]:
 
 
 def ignored(path: str) -> bool:
-    """Whether the build context leaves a path out; the last rule that fits decides."""
+    """Return True if the build context excludes a path; the last matching rule decides."""
     verdict = False
     for line in (ROOT / "docker/Dockerfile.dockerignore").read_text().splitlines():
         rule = line.removeprefix("!")
@@ -50,7 +50,7 @@ def ignored(path: str) -> bool:
 
 
 def copies() -> list[str]:
-    """Sources of every COPY from the build context."""
+    """Return the sources of every COPY from the build context."""
     lines = [rest.split() for stage in stages() for name, rest in stage if name == "COPY"]
     return [source for words in lines if not words[0].startswith("--from") for source in words[:-1]]
 
@@ -75,8 +75,8 @@ def test_the_image_is_slim_and_not_run_by_root() -> None:
     )
 
 
-def test_the_image_installs_as_a_controller_does(wheel: Path, tmp_path: Path) -> None:
-    """Lays out what COPY brings, runs what RUN says, in a folder in place of /."""
+def test_image_installs_like_a_controller(wheel: Path, tmp_path: Path) -> None:
+    """Replay COPY and RUN in a folder instead of /."""
     _, final = stages()
     (run,) = [rest for name, rest in final if name == "RUN"]
     for name, rest in final:
@@ -138,10 +138,8 @@ def test_the_build_finds_its_dockerfile() -> None:
     assert (context / build["dockerfile"]).is_file()
 
 
-def test_the_composed_processes_find_one_another(
-    installation: Installation, network: list[str], tmp_path: Path
-) -> None:
-    """Starts what compose.yaml starts, in one network and without containers, until the daemon is healthy."""
+def test_composed_processes_connect(installation: Installation, network: list[str], tmp_path: Path) -> None:
+    """Run the commands of compose.yaml in one network, without containers, until the daemon is healthy."""
 
     def command(words: list[str]) -> list[str]:
         settings = str(installation.settings)

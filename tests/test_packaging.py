@@ -1,4 +1,4 @@
-"""What users download is whole: the wheel comes from the source archive, installs, and finds its files."""
+"""Source archive and wheel are complete: the wheel is built from it, installs and finds its files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def pins() -> dict[str, list[str]]:
     return found
 
 
-def test_the_source_archive_holds_what_building_and_testing_need(archives: Path) -> None:
+def test_source_archive_is_complete(archives: Path) -> None:
     (archive,) = archives.glob("*.tar.gz")
     with tarfile.open(archive) as opened:
         names = {name.partition("/")[2] for name in opened.getnames()}
@@ -49,23 +49,23 @@ def test_the_source_archive_holds_what_building_and_testing_need(archives: Path)
     assert not [name for name in names if name.startswith((".venv", ".git/", "dist/"))]
 
 
-def test_the_wheel_holds_the_package_and_its_files_alone(wheel: Path) -> None:
+def test_wheel_has_only_the_package_and_its_files(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as opened:
         names = set(opened.namelist())
     shipped = {f"handtouch/shipped_files/{path.name}" for path in (ROOT / "config").glob("*.*")}
-    assert {"handtouch/cli.py", "handtouch/py.typed"} | shipped <= names
+    assert {"handtouch/cli/__init__.py", "handtouch/py.typed"} | shipped <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"handtouch"}
 
 
-def test_the_version_is_the_same_everywhere(wheel: Path) -> None:
+def test_version_is_the_same_everywhere(wheel: Path) -> None:
     changes = (ROOT / "CHANGELOG.md").read_text()
     newest = re.search(r"^## (\S+)", changes, re.MULTILINE)
     assert newest is not None
     assert {PROJECT["version"], newest[1], wheel.name.split("-")[1]} == {handtouch.__version__}
 
 
-def test_every_requirement_has_a_pin_that_satisfies_it() -> None:
+def test_every_requirement_is_pinned() -> None:
     extras = [item for extra in PROJECT["optional-dependencies"].values() for item in extra]
     pinned = pins()
     for text in [*PROJECT["dependencies"], *extras]:
@@ -76,11 +76,11 @@ def test_every_requirement_has_a_pin_that_satisfies_it() -> None:
             assert all(requirement.specifier.contains(version) for version in pinned[name]), name
 
 
-def test_the_lock_names_no_place_to_download_from() -> None:
+def test_lock_names_no_package_index() -> None:
     assert not re.search(r"://|^-", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
 
 
-def test_the_installed_program_helps_at_once(installation: Installation) -> None:
+def test_installed_program_prints_help_quickly(installation: Installation) -> None:
     times_s = []
     for _ in range(3):
         start = time.perf_counter()
@@ -97,7 +97,7 @@ def test_the_installed_program_helps_at_once(installation: Installation) -> None
     assert min(times_s) < 1.0  # 0.1 s, where nothing else runs
 
 
-def test_help_loads_no_numerical_package(installation: Installation) -> None:
+def test_help_imports_no_numerical_package(installation: Installation) -> None:
     code = "import sys, handtouch.cli as cli; cli.build_parser().format_help(); print(*sys.modules)"
     done = subprocess.run(
         [installation.prefix / "lib/handtouch/bin/python", "-c", code],
@@ -110,9 +110,9 @@ def test_help_loads_no_numerical_package(installation: Installation) -> None:
     assert not {"numpy", "scipy", "can", "zmq", "pydantic"} & set(done.stdout.split())
 
 
-def test_the_installed_program_finds_its_files(installation: Installation) -> None:
+def test_installed_program_finds_its_files(installation: Installation) -> None:
     code = (
-        "from handtouch import config, shipped\n"
+        "from handtouch import config\nfrom handtouch.config import shipped\n"
         "path = shipped.path('utah_mit.toml')\n"
         "print(path, len(config.load(path).hands[0].pads))"
     )

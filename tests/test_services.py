@@ -1,4 +1,4 @@
-"""The services as installed: systemd accepts them, they restart when they should, and serve a deployment."""
+"""Installed systemd services: units are valid, restart rules are correct, and the daemon starts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNITS = ("handtouch@.service", "handtouch-can@.service")
 
 
 def unit(installation: Installation, name: str) -> configparser.ConfigParser:
-    """A unit file as installed; of settings given twice the last counts."""
+    """Return an installed unit file; the last of repeated settings counts."""
     parser = configparser.ConfigParser(strict=False, interpolation=None, delimiters=["="])
     parser.optionxform = str  # type: ignore[assignment, method-assign]  # the documented way
     parser.read(installation.prefix / "lib/systemd/system" / name)
@@ -32,13 +32,13 @@ def unit(installation: Installation, name: str) -> configparser.ConfigParser:
 
 
 def command(installation: Installation, deployment: str, options: str = "") -> list[str]:
-    """ExecStart of the daemon for a deployment, as systemd would expand it."""
+    """Return ExecStart of the daemon for a deployment, expanded as by systemd."""
     line = unit(installation, UNITS[0])["Service"]["ExecStart"]
     return shlex.split(line.replace("%i", deployment).replace("$HANDTOUCH_RUN_OPTIONS", options))
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_systemd_has_nothing_to_say(installation: Installation, name: str) -> None:
+def test_systemd_analyze_reports_no_problem(installation: Installation, name: str) -> None:
     if shutil.which("systemd-analyze") is None:
         assert os.environ.get("CI") != "true", "CI needs systemd-analyze"
         pytest.skip("systemd-analyze is missing (Debian package systemd)")
@@ -49,7 +49,7 @@ def test_systemd_has_nothing_to_say(installation: Installation, name: str) -> No
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_no_path_of_the_stage_and_no_placeholder_is_left(installation: Installation) -> None:
+def test_no_staging_path_or_placeholder_remains(installation: Installation) -> None:
     scripts = (installation.prefix / "lib/handtouch/bin").iterdir()
     units = (installation.prefix / "lib/systemd/system").iterdir()
     for path in [*scripts, *units]:
@@ -67,7 +67,7 @@ def test_a_stalled_or_failed_daemon_restarts_and_a_wrong_deployment_does_not(
     assert unit(installation, UNITS[0])["Unit"]["StartLimitIntervalSec"] == "0"
 
 
-def test_the_ipc_endpoint_that_is_given_as_an_example_lies_where_the_service_may_write(
+def test_example_ipc_endpoint_is_writable_by_the_service(
     installation: Installation,
 ) -> None:
     folder = unit(installation, UNITS[0])["Service"]["RuntimeDirectory"].replace("%i", "hand")
@@ -77,7 +77,7 @@ def test_the_ipc_endpoint_that_is_given_as_an_example_lies_where_the_service_may
         )
 
 
-def test_a_wrong_deployment_ends_the_service_with_status_2(installation: Installation) -> None:
+def test_wrong_deployment_exits_with_status_2(installation: Installation) -> None:
     done = subprocess.run(
         command(installation, "missing"),
         env=installation.environment,
@@ -90,7 +90,7 @@ def test_a_wrong_deployment_ends_the_service_with_status_2(installation: Install
     assert "missing.toml: the file: No such file" in done.stderr
 
 
-def test_the_service_reports_ready_feeds_its_watchdog_and_stops(
+def test_service_notifies_ready_and_watchdog_and_stops(
     installation: Installation, network: list[str], tmp_path: Path, free_port: int
 ) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -104,14 +104,14 @@ def test_the_service_reports_ready_feeds_its_watchdog_and_stops(
         run = command(installation, "hand", f"--bus can0=udp_multicast:239.74.163.2:{free_port}")
         with subprocess.Popen([*network, *run], env=environment) as daemon:
             try:
-                heard = ""
+                received = ""
                 deadline = time.monotonic() + 60
-                while "READY=1" not in heard or heard.count("WATCHDOG=1") < 2:
+                while "READY=1" not in received or received.count("WATCHDOG=1") < 2:
                     assert daemon.poll() is None, "it ended"
-                    assert time.monotonic() < deadline, heard
+                    assert time.monotonic() < deadline, received
                     with contextlib.suppress(TimeoutError):
-                        heard += systemd.recv(4096).decode() + "\n"
-                assert heard.index("READY=1") < heard.rindex("WATCHDOG=1")
+                        received += systemd.recv(4096).decode() + "\n"
+                assert received.index("READY=1") < received.rindex("WATCHDOG=1")
                 start = time.monotonic()
                 daemon.send_signal(signal.SIGTERM)
                 assert daemon.wait(10) == 0
@@ -120,7 +120,7 @@ def test_the_service_reports_ready_feeds_its_watchdog_and_stops(
                 daemon.kill()
 
 
-def test_installing_again_keeps_what_the_owner_edited(installation: Installation, wheel: Path) -> None:
+def test_reinstalling_keeps_edited_files(installation: Installation, wheel: Path) -> None:
     deployment = installation.settings / "hand.toml"
     original = deployment.read_text()
     edited = original.replace('name = "right"', 'name = "left"')
@@ -132,7 +132,7 @@ def test_installing_again_keeps_what_the_owner_edited(installation: Installation
         deployment.write_text(original)
 
 
-def test_uninstalling_leaves_the_settings_alone(tmp_path: Path, wheel: Path) -> None:
+def test_uninstalling_keeps_settings(tmp_path: Path, wheel: Path) -> None:
     fresh = Installation(tmp_path)
     for path in ("usr/lib/handtouch/bin/python", "usr/bin/handtouch", "etc/handtouch/hand.toml"):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +146,7 @@ def test_uninstalling_leaves_the_settings_alone(tmp_path: Path, wheel: Path) -> 
 
 
 @pytest.mark.parametrize("script", ["services/install.sh", ".ci/run"])
-def test_a_shell_script_is_one(script: str) -> None:
+def test_shell_scripts_are_valid(script: str) -> None:
     if not (ROOT / script).exists():
         pytest.skip("not in the source archive")
     subprocess.run(["sh", "-n", str(ROOT / script)], check=True)

@@ -9,8 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from handtouch.client import Subscriber, columns, connect, request
-    from handtouch.robot import Robot
+    from handtouch.client import (
+        Subscriber,
+        columns,
+        connect,
+        request,
+    )
+    from handtouch.client.robot import Robot
 
 __version__ = "0.1.0"
 __all__ = ["Robot", "Subscriber", "__version__", "columns", "connect", "request"]
@@ -22,7 +27,7 @@ def __getattr__(name: str) -> Any:
 
         return getattr(client, name)
     if name == "Robot":
-        from handtouch.robot import Robot
+        from handtouch.client.robot import Robot
 
         return Robot
     raise AttributeError(f"module 'handtouch' has no attribute {name!r}")

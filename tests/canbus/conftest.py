@@ -1,4 +1,4 @@
-"""A hand of simulated nodes and the master in one thread, on a bus and a clock of the test's own."""
+"""A hand of simulated nodes and the master in one thread, on a simulated bus and clock."""
 
 from __future__ import annotations
 
@@ -12,23 +12,29 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.canbus.bus.bus_state import Trouble
+from handtouch.canbus.bus.bus_state import BusFault
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.router import Frame, Router
-from handtouch.canbus.bus.slab import Slab
-from handtouch.canbus.device import Device, DeviceBus
+from handtouch.canbus.bus.router import CanFrame, Router
 from handtouch.canbus.nodes import master
-from handtouch.canbus.nodes.life import NodeState
-from handtouch.canbus.nodes.master import Master, NodeEvent, NodeSpec, NodeStatus, SerialChanged
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.nodes.master import (
+    Master,
+    NodeEvent,
+    NodeSpec,
+    NodeStatus,
+    SerialChanged,
+)
 from handtouch.canbus.objects import sdo
 from handtouch.config import Bus
+from handtouch.core.slab import Slab
+from handtouch.device import Device, DeviceBus
 
 MS = 1_000_000
 SYNC_PERIOD_MS = 5
 
 
 class Jobs:
-    """The master's worker, whose jobs are done when `work` is called, in that thread."""
+    """Replacement of the master's workers; jobs run when `work` is called, in that thread."""
 
     def __init__(self, **_: object) -> None:
         self.waiting: deque[tuple[Callable[..., None], tuple[object, ...]]] = deque()
@@ -49,7 +55,7 @@ class Wire:
     """The bus between them: `DeviceBus` takes it for python-can's, `Port` for a receiver."""
 
     def __init__(self, rig: Rig) -> None:
-        self.trouble: Trouble | None = None
+        self.fault: BusFault | None = None
         self.to_master: deque[can.Message] = deque()
         self.sent: list[tuple[int, bytes]] = []  # by the master
         self.asked: list[int] = []  # identifiers of its remote frames
@@ -60,7 +66,7 @@ class Wire:
 
     # the devices' side
     def recv(self, timeout: float | None = None) -> None:
-        """Nothing: frames are brought to the devices when they are sent."""
+        """Return nothing: frames are passed to the devices when they are sent."""
 
     def send(self, *frame: Any) -> None:
         if len(frame) == 1:
@@ -75,12 +81,12 @@ class Wire:
         return -1
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to close."""
 
     def send_cyclically(self, *_: object) -> None:
-        """Nobody but us could do it."""
+        """No cyclic sender."""
 
-    def drain(self, router: Router) -> list[Frame]:
+    def drain(self, router: Router) -> list[CanFrame]:
         others = []
         while self.to_master:
             frame = router.accept_message(self.to_master.popleft(), self._rig.t_ns)
@@ -100,22 +106,22 @@ class Wire:
         message = can.Message(
             arbitration_id=can_id, data=b"" if remote else data, is_remote_frame=remote, is_extended_id=False
         )
-        self._rig.devices.handle(message, self._rig.t_ns)
+        self._rig.devices.handle_frame(message, self._rig.t_ns)
         if 0x600 < can_id < 0x680:
             self._answer(can_id - 0x80)
 
     def _answer(self, can_id: int) -> None:
-        """Bring the answers to an SDO request to the job that waits for them; those to a probe stay."""
+        """Deliver responses to an SDO request to the waiting job; responses to a probe stay queued."""
         sdo = self._rig.sdo_of(can_id - 0x580)
-        if sdo is None or not sdo.waiting:
+        if sdo is None or not sdo.awaiting_response:
             return
         for message in [m for m in self.to_master if m.arbitration_id == can_id]:
             self.to_master.remove(message)
-            sdo.deliver(bytes(message.data))
+            sdo.deliver_response(bytes(message.data))
 
 
 class Rig:
-    """Nodes 1 to n in slots 0 to n - 1, the master, and time that passes when it is told to.
+    """Nodes 1 to n in slots 0 to n - 1, the master, and simulated time.
 
     `device` are options of `DeviceBus.add`, `role` our part on the bus, `spec` changes of every NodeSpec.
     """
@@ -139,11 +145,11 @@ class Rig:
         self.restart()
 
     def restart(self) -> None:
-        """A new master, as after a restart of the daemon."""
+        """Make a new master, as after a restart of the daemon."""
         self.master = Master({"can": self.port}, self.specs, SYNC_PERIOD_MS * MS)
 
-    def sdo_of(self, node_id: int) -> Any:
-        """SDO client that the master has for a node, None without one."""
+    def sdo_of(self, node_id: int) -> sdo.SdoTransport | None:
+        """SDO transport that the master has for a node, None without one."""
         for node in self.master._nodes:
             if node.port is self.port and node.spec.node_id == node_id:
                 return node.sdo
@@ -170,29 +176,29 @@ class Rig:
         self.master.start(self.t_ns)
 
     def boot(self) -> None:
-        """From power-up to a hand that is operational."""
+        """Power up the hand and wait until it is operational."""
         self.plug_all()
         self.start()
         self.run(300)
         assert (self.master.states == NodeState.OPERATIONAL).all(), self.master.status()
-        self.master.take_events()
+        self.master.drain_events()
         self.wire.sent.clear()
 
     def nmt(self, command: int, node_id: int) -> None:
-        """Another NMT master's command."""
+        """Send a command of another NMT master."""
         message = can.Message(arbitration_id=0, data=bytes((command, node_id)), is_extended_id=False)
-        self.devices.handle(message, self.t_ns)
+        self.devices.handle_frame(message, self.t_ns)
         self.inject(0, bytes(message.data))
 
     def run(self, ms: int) -> list[NodeEvent | SerialChanged]:
-        """Let time pass, in steps of a millisecond; what happened in the nodes' lives."""
+        """Advance the time in steps of a millisecond; return the nodes' events."""
         for _ in range(ms):
             self.t_ns += MS
             self.step()
-        return self.master.take_events()
+        return self.master.drain_events()
 
     def step(self) -> None:
-        """Do what is due now."""
+        """Run what is due now."""
         if self.syncs and self.t_ns // MS % SYNC_PERIOD_MS == 0:
             self.sync()
         self.devices.advance(self.t_ns)
@@ -202,19 +208,19 @@ class Rig:
             self.master._workers.work()
 
     def sync(self) -> None:
-        """A SYNC, ours or that of another producer."""
+        """Send a SYNC, of the master or of another producer."""
         self.slab.begin_cycle(self.t_ns)
         if self.foreign_sync:
-            self.devices.handle(can.Message(arbitration_id=0x80, is_extended_id=False), self.t_ns)
+            self.devices.handle_frame(can.Message(arbitration_id=0x80, is_extended_id=False), self.t_ns)
         else:
             self.port.send(0x80, b"")
 
     def pump(self) -> None:
         for frame in self.port.drain():
-            self.master.handle("can", *frame)
+            self.master.handle_frame("can", *frame)
 
     def inject(self, can_id: int, data: bytes) -> None:
-        """A frame from somebody else."""
+        """Receive a frame of another device."""
         self.wire.to_master.append(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         self.pump()
 
@@ -230,7 +236,7 @@ def _copy(message: can.Message) -> can.Message:
 
 @pytest.fixture
 def make_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
-    """Rigs; silence of a node costs 5 ms of real time."""
+    """Make rigs in which an SDO timeout takes 5 ms of real time."""
     monkeypatch.setattr(master, "ThreadPoolExecutor", Jobs)
     monkeypatch.setattr(sdo, "SDO_TIMEOUT_S", 0.005)
     rigs: list[Rig] = []

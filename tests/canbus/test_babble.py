@@ -1,4 +1,4 @@
-"""A node that sends far more samples than SYNC asks for is told; one SYNC too many is not its fault."""
+"""Nodes that send far more samples than SYNC requests; an extra SYNC is not their fault."""
 
 from __future__ import annotations
 
@@ -8,48 +8,54 @@ from typing import Any
 import pytest
 
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.slab import Slab
-from handtouch.canbus.device import Line
-from handtouch.canbus.nodes.life import Babble, Life, NodeState, Role, Timing
 from handtouch.canbus.nodes.lifecycle import advance
+from handtouch.canbus.nodes.lifecycle_types import (
+    BusRole,
+    Lifecycle,
+    NodeState,
+    NodeTiming,
+    SampleRate,
+)
 from handtouch.canbus.nodes.master import Master, NodeEvent, NodeSpec
 from handtouch.config import Bus
+from handtouch.core.slab import Slab
+from handtouch.device import LineFaults
 
 OPERATIONAL, FAULTED = NodeState.OPERATIONAL, NodeState.FAULTED
 MS = 1_000_000
 
 
-def test_babbling_node_is_told_once_and_used_again_when_it_is_quiet(rig: Any) -> None:
+def test_babbling_node_is_reported_once_and_used_again_when_it_is_quiet(rig: Any) -> None:
     rig.boot()
-    rig.node(2).babble(2000)
+    rig.node(2).start_babbling(2000)
     (event,) = rig.run(8000)
-    assert (event.slot, event.new) == (1, FAULTED)
-    assert re.search(r"samples come \d+ times as often as SYNC asks", event.reason)
-    rig.node(2).hush()
+    assert (event.slot, event.new_state) == (1, FAULTED)
+    assert re.search(r"babbling: it sends \d+ samples per SYNC", event.reason)
+    rig.node(2).stop_babbling()
     rig.run(1200)
     assert [rig.state(n) for n in (1, 2, 3)] == [OPERATIONAL] * 3
 
 
-def test_duplicate_samples_are_no_babble(rig: Any) -> None:
+def test_duplicate_samples_do_not_count_as_babbling(rig: Any) -> None:
     rig.boot()
-    rig.node(2).line = Line(duplicate=1.0)
+    rig.node(2).line = LineFaults(duplicate=1.0)
     assert rig.run(3000) == []
 
 
-def test_babble_that_goes_on_through_a_reboot_is_told_again(rig: Any) -> None:
+def test_babbling_that_continues_after_a_reboot_is_reported_again(rig: Any) -> None:
     rig.boot()
-    rig.node(2).babble(2000)
+    rig.node(2).start_babbling(2000)
     rig.run(1000)
     rig.node(2).reboot()
-    rig.node(2).babble(2000)
+    rig.node(2).start_babbling(2000)
     rig.run(1500)
     assert rig.state(2) is FAULTED
-    assert "times as often" in rig.status(2).reason
+    assert "samples per SYNC" in rig.status(2).reason
 
 
 @pytest.mark.parametrize("size", [1, 2])
-def test_another_sync_on_one_bus_makes_nobody_there_babble(make_rig: Any, size: int) -> None:
-    """Three nodes follow ours at 200 Hz, those on a bus of somebody else's drives that one's at 1 kHz."""
+def test_extra_sync_producer_does_not_make_nodes_babbling(make_rig: Any, size: int) -> None:
+    """Three nodes follow the master's SYNC at 200 Hz, those on a shared bus another one at 1 kHz."""
     ours, theirs = rigs = [make_rig(3), make_rig(size)]
     specs: list[NodeSpec] = []
     slab, ports = Slab(3 + size), {}
@@ -71,14 +77,14 @@ def test_another_sync_on_one_bus_makes_nobody_there_babble(make_rig: Any, size: 
         for rig in rigs:
             rig.devices.advance(rig.t_ns)
             for frame in rig.port.drain():
-                master.handle(rig.port.name, *frame)
+                master.handle_frame(rig.port.name, *frame)
         master.poll(ours.t_ns)
         master._workers.work()  # type: ignore[union-attr]
     assert master.states.tolist() == [OPERATIONAL] * (3 + size)
-    assert not [e for e in master.take_events() if isinstance(e, NodeEvent) and e.new is FAULTED]
+    assert not [e for e in master.drain_events() if isinstance(e, NodeEvent) and e.new_state is FAULTED]
 
 
-@pytest.mark.parametrize("role", [Role.GUEST, Role.LISTENER])
-def test_node_that_another_master_configures_may_send_as_it_likes(role: Role) -> None:
-    life = Life(state=OPERATIONAL)
-    assert advance(life, Babble(11), 0, Timing(100 * MS, 350 * MS, role)) == (life, ())
+@pytest.mark.parametrize("role", [BusRole.GUEST, BusRole.LISTENER])
+def test_node_configured_by_another_master_may_send_at_any_rate(role: BusRole) -> None:
+    life = Lifecycle(state=OPERATIONAL)
+    assert advance(life, SampleRate(11), 0, NodeTiming(100 * MS, 350 * MS, role)) == (life, ())

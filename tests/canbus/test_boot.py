@@ -1,16 +1,29 @@
-"""What is read from a node and written to it over SDO, and what is said when it isn't as it should be."""
+"""Boot steps over SDO: values read from and written to a node, and error texts."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import pytest
 
-from handtouch.canbus.bus.slab import STANDARD, Field
-from handtouch.canbus.nodes.boot import Expected, Identity, Idle, check_identity, configure, identify
-from handtouch.canbus.objects.channels import STANDARD_CHANNELS, Channel, Channels, Object
-from handtouch.canbus.objects.mapping import Mapping, Tpdo, read_mapping
-from handtouch.canbus.objects.sdo import Outdated, Sdo, StepError
+from handtouch.canbus.nodes.boot import (
+    ExpectedIdentity,
+    Identity,
+    IdleSettings,
+    check_identity,
+    configure_node,
+    read_identity,
+)
+from handtouch.canbus.objects.mapping import NodeTpdo, PdoMapping, read_mapping
+from handtouch.canbus.objects.sdo import BootStepCancelled, BootStepError, NodeSdoClient, SdoTransport
+from handtouch.config.channels import (
+    STANDARD_CHANNELS,
+    Channel,
+    Channels,
+    WritableObject,
+)
+from handtouch.core.slab import STANDARD_LAYOUT, ChannelField
 
 CHANNELS = (0x64010110, 0x64010210, 0x64010310, 0x64010410)
 ABORT_NO_OBJECT, ABORT_NO_SUB = 0x06020000, 0x06090011
@@ -25,8 +38,16 @@ class Node:
         self.halts: list[bool] = []
         self.deaf: set[int] = set()
         self.forgets: set[int] = set()
-        self.sdo = Sdo(5, self.answer)
-        self.sdo._client.RESPONSE_TIMEOUT = 0.005
+        self._respond: Callable[[int, bytes], bool] = self.answer
+        self.transport = SdoTransport(5, self._send, timeout_s=0.005)
+        self.sdo = NodeSdoClient(self.transport)
+
+    def intercept(self, respond: Callable[[int, bytes], bool]) -> None:
+        """Have another function answer instead of `answer`."""
+        self._respond = respond
+
+    def _send(self, can_id: int, data: bytes) -> bool:
+        return self._respond(can_id, data)
 
     def answer(self, can_id: int, data: bytes) -> bool:
         assert can_id == 0x605
@@ -35,11 +56,11 @@ class Node:
             return True
         if (index, sub) not in self.objects:
             code = ABORT_NO_SUB if any(i == index for i, _ in self.objects) else ABORT_NO_OBJECT
-            self.sdo.deliver(b"\x80" + data[1:4] + code.to_bytes(4, "little"))
+            self.transport.deliver_response(b"\x80" + data[1:4] + code.to_bytes(4, "little"))
         elif data[0] & 0xE0 == 0x40:
             value, size = self.objects[index, sub]
             head = bytes((0x43 | (4 - size) << 2,))
-            self.sdo.deliver(head + data[1:4] + value.to_bytes(size, "little").ljust(4, b"\0"))
+            self.transport.deliver_response(head + data[1:4] + value.to_bytes(size, "little").ljust(4, b"\0"))
         else:
             size = 4 - (data[0] >> 2 & 3)
             value = int.from_bytes(data[4 : 4 + size], "little")
@@ -47,7 +68,7 @@ class Node:
             if index not in self.forgets:
                 self.objects[index, sub] = (value, size)
             self.writes.append((index, sub, value))
-            self.sdo.deliver(b"\x60" + data[1:4] + bytes(4))
+            self.transport.deliver_response(b"\x60" + data[1:4] + bytes(4))
         return True
 
 
@@ -60,42 +81,42 @@ def tpdo(
 
 
 @dataclass
-class Wanted:
+class Settings:
     heartbeat_ms: int
-    idle: Idle | None = None
-    excitation: Object | None = None
+    idle: IdleSettings | None = None
+    excitation: WritableObject | None = None
     event_timer_ms: int = 5
 
 
-def found(enabled: bool = True, transmission: int = 1) -> Tpdo:
-    return Tpdo(2, 0x285, enabled, transmission, CHANNELS)
+def found(enabled: bool = True, transmission: int = 1) -> NodeTpdo:
+    return NodeTpdo(2, 0x285, enabled, transmission, CHANNELS)
 
 
 def identity(*values: int) -> dict[tuple[int, int], tuple[int, int]]:
     return {(0x1018, sub): (value, 4) for sub, value in enumerate(values, 1)}
 
 
-def test_identity_is_read_whole() -> None:
-    found = identify(Node(identity(1, 2, 3, 4)).sdo)
+def test_all_parts_of_the_identity_are_read() -> None:
+    found = read_identity(Node(identity(1, 2, 3, 4)).sdo)
     assert found == Identity(1, 2, 3, 4)
-    check_identity(found, Expected(1, 2, 3, 4))
+    check_identity(found, ExpectedIdentity(1, 2, 3, 4))
 
 
 def test_only_the_vendor_id_is_mandatory() -> None:
-    assert identify(Node(identity(9)).sdo) == Identity(9)
+    assert read_identity(Node(identity(9)).sdo) == Identity(9)
 
 
 def test_node_without_serial_number_is_not_the_one_with_the_configured_one() -> None:
-    with pytest.raises(StepError, match="serial number is none, configured is 4") as caught:
-        check_identity(Identity(1, 2, 3), Expected(serial=4))
-    assert caught.value.stranger
+    with pytest.raises(BootStepError, match="serial number is none, configured is 4") as caught:
+        check_identity(Identity(1, 2, 3), ExpectedIdentity(serial=4))
+    assert caught.value.wrong_device
 
 
-def test_another_pads_node_is_refused_though_any_number_is_welcome() -> None:
-    check_identity(Identity(1, 2, 3, 6), Expected(foreign=frozenset({4, 5})))
-    with pytest.raises(StepError, match="serial number 5 is configured for another pad") as caught:
-        check_identity(Identity(1, 2, 3, 5), Expected(foreign=frozenset({4, 5})))
-    assert caught.value.stranger
+def test_node_of_another_pad_is_refused_even_without_a_configured_serial_number() -> None:
+    check_identity(Identity(1, 2, 3, 6), ExpectedIdentity(serials_of_other_pads=frozenset({4, 5})))
+    with pytest.raises(BootStepError, match="serial number 5 is configured for another pad") as caught:
+        check_identity(Identity(1, 2, 3, 5), ExpectedIdentity(serials_of_other_pads=frozenset({4, 5})))
+    assert caught.value.wrong_device
 
 
 WIDE: Channels = (
@@ -106,14 +127,14 @@ WIDE: Channels = (
 )
 
 
-def mapping_of(node: Node, channels: Channels = STANDARD_CHANNELS, remap: bool = False) -> Mapping:
+def mapping_of(node: Node, channels: Channels = STANDARD_CHANNELS, remap: bool = False) -> PdoMapping:
     halt = (lambda: node.halts.append(True)) if remap else None
     return read_mapping(node.sdo, 5, (2, 1, 3, 4), channels, halt)
 
 
 def test_mapping_is_found_in_whatever_tpdo_carries_it() -> None:
     node = Node(tpdo(1, (0x60000108,), 0x185) | tpdo(3, CHANNELS, 0x385, 255))
-    assert mapping_of(node) == Mapping((Tpdo(3, 0x385, True, 255, CHANNELS),), STANDARD)
+    assert mapping_of(node) == PdoMapping((NodeTpdo(3, 0x385, True, 255, CHANNELS),), STANDARD_LAYOUT)
 
 
 def test_channels_are_found_in_any_order_between_other_objects() -> None:
@@ -121,12 +142,12 @@ def test_channels_are_found_in_any_order_between_other_objects() -> None:
     entries = (0x20000108, 0x64010410, 0x64010310, 0x00050008, 0x64010210)
     node = Node(tpdo(1, (0x64010110, 0x20000208), 0x185) | tpdo(2, entries, 0x285))
     found = mapping_of(node)
-    assert [(t.number, t.size) for t in found.tpdos] == [(2, 8), (1, 3)]
+    assert [(t.number, t.size_bytes) for t in found.tpdos] == [(2, 8), (1, 3)]
     assert found.layout == (
-        Field(1, 0, 16, True),
-        Field(0, 48, 16, True),
-        Field(0, 24, 16, True),
-        Field(0, 8, 16, True),
+        ChannelField(1, 0, 16, True),
+        ChannelField(0, 48, 16, True),
+        ChannelField(0, 24, 16, True),
+        ChannelField(0, 8, 16, True),
     )
 
 
@@ -136,7 +157,7 @@ def test_one_tpdo_with_all_channels_goes_before_several() -> None:
 
 
 @pytest.mark.parametrize(
-    ("objects", "told"),
+    ("objects", "expected"),
     [
         ({}, "the node has no TPDO"),
         (tpdo(1, (), 0x185), "TPDO1 has nothing"),
@@ -150,19 +171,19 @@ def test_one_tpdo_with_all_channels_goes_before_several() -> None:
         ({(0x1A01, 0): (255, 1)}, "TPDO2 has nothing"),
     ],
 )
-def test_unusable_mapping_is_told_as_it_is(
-    objects: dict[tuple[int, int], tuple[int, int]], told: str
+def test_unusable_mapping_is_reported_with_its_entries(
+    objects: dict[tuple[int, int], tuple[int, int]], expected: str
 ) -> None:
-    with pytest.raises(StepError, match=told):
+    with pytest.raises(BootStepError, match=expected):
         mapping_of(Node(objects))
 
 
 def test_channels_in_no_tpdo_are_mapped_to_one_that_carries_nothing_else() -> None:
-    """As CiA 301 has it: off, emptied, filled, counted; and only after the node was halted."""
+    """The order of CiA 301, disable, clear, write, count, and only in pre-operational."""
     node = Node(tpdo(2, (0x60000108,), 0x285) | tpdo(3, (), 0x80000385, 255))
     node.objects |= {(0x1A02, sub): (0, 4) for sub in (1, 2, 3, 4)}
     found = mapping_of(node, remap=True)
-    assert found == Mapping((Tpdo(3, 0x385, False, 255, CHANNELS),), STANDARD)
+    assert found == PdoMapping((NodeTpdo(3, 0x385, False, 255, CHANNELS),), STANDARD_LAYOUT)
     assert node.halts == [True]
     assert node.writes == [*((0x1A02, sub, entry) for sub, entry in enumerate(CHANNELS, 1)), (0x1A02, 0, 4)]
     assert node.objects[0x1A01, 1] == (0x60000108, 4)
@@ -172,16 +193,16 @@ def test_channels_too_wide_for_one_tpdo_are_mapped_to_two() -> None:
     node = Node(tpdo(1, (), 0x80000185) | tpdo(2, (0x91300120,), 0x285) | tpdo(4, (0x60000108,), 0x485))
     node.objects |= {(index, sub): (0, 4) for index in (0x1A00, 0x1A01) for sub in (1, 2)}
     found = mapping_of(node, WIDE, remap=True)
-    assert [(t.number, t.cob_id, t.size, t.enabled) for t in found.tpdos] == [
+    assert [(t.number, t.cob_id, t.size_bytes, t.enabled) for t in found.tpdos] == [
         (2, 0x285, 8, False),
         (1, 0x185, 8, False),
     ]
-    assert [(field.pdo, field.bit) for field in found.layout] == [(0, 0), (0, 32), (1, 0), (1, 32)]
+    assert [(field.pdo, field.first_bit) for field in found.layout] == [(0, 0), (0, 32), (1, 0), (1, 32)]
 
 
-def test_tpdos_with_other_objects_are_never_mapped_anew() -> None:
+def test_tpdos_with_other_objects_are_never_remapped() -> None:
     node = Node(tpdo(1, (0x60000108,), 0x185) | tpdo(2, (0x64010110, 0x20000108), 0x285))
-    with pytest.raises(StepError, match="1 that carry nothing else are needed"):
+    with pytest.raises(BootStepError, match="1 that carry nothing else are needed"):
         mapping_of(node, remap=True)
     assert node.writes == []
     assert node.halts == []
@@ -197,92 +218,100 @@ def test_tpdos_with_other_objects_are_never_mapped_anew() -> None:
         (found(enabled=False, transmission=0), 0, [(0x1801, 2, 1), (0x1801, 1, 0x285), (0x1017, 0, 100)], 1),
     ],
 )
-def test_only_what_differs_is_written_and_only_pdo_changes_halt(
-    found: Tpdo, heartbeat: int, writes: list[tuple[int, int, int]], halts: int
+def test_only_differences_are_written_and_only_pdo_changes_need_pre_operational(
+    found: NodeTpdo, heartbeat: int, writes: list[tuple[int, int, int]], halts: int
 ) -> None:
     cob_id = found.cob_id | (0 if found.enabled else 1 << 31)
-    node = Node(tpdo(2, CHANNELS, cob_id, found.transmission) | {(0x1017, 0): (heartbeat, 2)})
+    node = Node(tpdo(2, CHANNELS, cob_id, found.transmission_type) | {(0x1017, 0): (heartbeat, 2)})
     halted: list[bool] = []
-    made = configure(node.sdo, Mapping((found,), STANDARD), Wanted(100), lambda: halted.append(True))
+    made = configure_node(
+        node.sdo, PdoMapping((found,), STANDARD_LAYOUT), Settings(100), lambda: halted.append(True)
+    )
     assert not made.guarded
     assert (node.writes, len(halted)) == (writes, halts)
 
 
 def test_node_without_heartbeat_gets_it_as_guard_time() -> None:
     node = Node(tpdo(2, CHANNELS, 0x285) | {(0x100C, 0): (0, 2), (0x100D, 0): (0, 1)})
-    assert configure(node.sdo, Mapping((found(),), STANDARD), Wanted(150), lambda: None).guarded
+    assert configure_node(
+        node.sdo, PdoMapping((found(),), STANDARD_LAYOUT), Settings(150), lambda: None
+    ).guarded
     assert node.writes == [(0x100C, 0, 150), (0x100D, 0, 3)]
 
 
-def test_node_that_has_neither_is_guarded_all_the_same() -> None:
-    assert configure(Node({}).sdo, Mapping((found(),), STANDARD), Wanted(150), lambda: None).guarded
+def test_node_without_heartbeat_and_guard_time_is_guarded_all_the_same() -> None:
+    assert configure_node(
+        Node({}).sdo, PdoMapping((found(),), STANDARD_LAYOUT), Settings(150), lambda: None
+    ).guarded
 
 
-def test_transmission_type_of_a_strict_node_is_changed_while_its_pdo_is_off() -> None:
+def test_transmission_type_of_a_strict_node_is_changed_with_its_pdo_disabled() -> None:
     node = Node(tpdo(2, CHANNELS, 0x285, 255) | {(0x1017, 0): (100, 2)})
     plain = node.answer
 
     def strict(can_id: int, data: bytes) -> bool:
         valid = not node.objects[0x1801, 1][0] >> 31
         if data[0] & 0xE0 == 0x20 and data[1:4] == b"\x01\x18\x02" and valid:
-            node.sdo.deliver(b"\x80\x01\x18\x02" + (0x08000022).to_bytes(4, "little"))
+            node.transport.deliver_response(b"\x80\x01\x18\x02" + (0x08000022).to_bytes(4, "little"))
             return True
         return plain(can_id, data)
 
-    node.sdo._client.network._send = strict
-    configure(node.sdo, Mapping((found(transmission=255),), STANDARD), Wanted(100), lambda: None)
+    node.intercept(strict)
+    configure_node(
+        node.sdo, PdoMapping((found(transmission=255),), STANDARD_LAYOUT), Settings(100), lambda: None
+    )
     assert node.writes == [(0x1801, 1, 0x80000285), (0x1801, 2, 1), (0x1801, 1, 0x285)]
 
 
-def test_value_that_does_not_stick_is_an_error() -> None:
+def test_value_that_is_not_kept_is_an_error() -> None:
     node = Node({(0x1017, 0): (0, 2)})
     node.forgets.add(0x1017)
-    with pytest.raises(StepError, match="heartbeat time, 0x1017:00, was set to 100 but reads 0"):
-        configure(node.sdo, Mapping((found(),), STANDARD), Wanted(100), lambda: None)
+    with pytest.raises(BootStepError, match="heartbeat time, 0x1017:00, was set to 100 but reads 0"):
+        configure_node(node.sdo, PdoMapping((found(),), STANDARD_LAYOUT), Settings(100), lambda: None)
 
 
-def test_silence_and_refusal_are_told_apart() -> None:
+def test_timeout_and_refusal_are_distinguished() -> None:
     node = Node(identity(1))
     node.deaf.add(0x1018)
-    with pytest.raises(StepError, match="reading vendor id, 0x1018:01: no answer") as silence:
-        identify(node.sdo)
-    assert silence.value.silent
+    with pytest.raises(BootStepError, match="reading vendor id, 0x1018:01: no answer") as silence:
+        read_identity(node.sdo)
+    assert silence.value.timed_out
     with pytest.raises(
-        StepError, match=r"refused by the node \(Code 0x06020000, Object does not exist\)"
+        BootStepError, match=r"refused by the node \(Code 0x06020000, Object does not exist\)"
     ) as refusal:
         Node({}).sdo.read(0x1017, 0, "heartbeat time")
-    assert not refusal.value.silent
+    assert not refusal.value.timed_out
 
 
-def test_answers_for_other_objects_are_not_taken_for_ours() -> None:
+def test_responses_for_other_objects_are_ignored() -> None:
     """An answer to a probe, to another master or to an earlier request that came too late."""
     node = Node({(0x1017, 0): (100, 2)})
     plain = node.answer
 
     def with_noise(can_id: int, data: bytes) -> bool:
-        node.sdo.deliver(bytes.fromhex("4300100091010f00"))
-        node.sdo.deliver(bytes.fromhex("6018100400000000"))
-        node.sdo.deliver(bytes.fromhex("8000100000000206"))
+        node.transport.deliver_response(bytes.fromhex("4300100091010f00"))
+        node.transport.deliver_response(bytes.fromhex("6018100400000000"))
+        node.transport.deliver_response(bytes.fromhex("8000100000000206"))
         return plain(can_id, data)
 
-    node.sdo._client.network._send = with_noise
+    node.intercept(with_noise)
     assert node.sdo.read(0x1017, 0, "heartbeat time") == 100
 
 
-def test_garbled_answer_is_an_error_not_a_value() -> None:
+def test_garbled_response_is_an_error_not_a_value() -> None:
     node = Node({})
 
     def garbled(_id: int, _data: bytes) -> bool:
-        node.sdo.deliver(bytes.fromhex("ff17100000000000"))
+        node.transport.deliver_response(bytes.fromhex("ff17100000000000"))
         return True
 
-    node.sdo._client.network._send = garbled
-    with pytest.raises(StepError, match="Unexpected response 0xFF") as caught:
+    node.intercept(garbled)
+    with pytest.raises(BootStepError, match="Unexpected response 0xFF") as caught:
         node.sdo.read(0x1017, 0, "heartbeat time")
-    assert not caught.value.silent
+    assert not caught.value.timed_out
 
 
-def test_one_lost_answer_is_asked_for_again() -> None:
+def test_request_is_repeated_after_a_lost_response() -> None:
     node = Node(identity(7))
     plain, asked = node.answer, 0
 
@@ -291,22 +320,22 @@ def test_one_lost_answer_is_asked_for_again() -> None:
         asked += data[0] != 0x80  # the client aborts what it gave up
         return True if asked == 1 else plain(can_id, data)
 
-    node.sdo._client.network._send = lossy
+    node.intercept(lossy)
     assert node.sdo.read(0x1018, 1, "vendor id") == 7
     assert asked == 2
 
 
-def test_attempt_that_is_outdated_meanwhile_does_not_ask_again() -> None:
+def test_step_cancelled_during_a_transfer_does_not_retry() -> None:
     node = Node(identity(1))
     node.deaf.add(0x1018)
     turns = iter([False, True])
-    node.sdo.outdated = lambda: next(turns)
-    with pytest.raises(Outdated):
+    node.sdo.is_cancelled = lambda: next(turns)
+    with pytest.raises(BootStepCancelled):
         node.sdo.read(0x1018, 1, "vendor id")
 
 
-def test_outdated_attempt_asks_nothing_more() -> None:
+def test_cancelled_step_sends_no_more_requests() -> None:
     node = Node(identity(1))
-    node.sdo.outdated = lambda: True
-    with pytest.raises(Outdated):
-        identify(node.sdo)
+    node.sdo.is_cancelled = lambda: True
+    with pytest.raises(BootStepCancelled):
+        read_identity(node.sdo)

@@ -1,4 +1,4 @@
-"""The state of a bus follows ISO 11898-1 and <linux/can/error.h>, in words that help."""
+"""Bus state by ISO 11898-1 and <linux/can/error.h>, with remedies."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.canbus.bus.bus_state import BusState, Condition, Trouble, is_queue_full, trouble_of
+from handtouch.canbus.bus.bus_state import (
+    BusFault,
+    BusState,
+    ErrorState,
+    fault_from_exception,
+    is_queue_full,
+)
 
 S = 1_000_000_000
-DOWN = Trouble(Condition.DOWN, "Network is down")
+DOWN = BusFault(ErrorState.DOWN, "Network is down")
 
 
 def state_after(classes: int, data: str, interface: str = "socketcan") -> BusState:
     state = BusState(interface, "can0")
-    state.error_frame(classes, bytes.fromhex(data), S, 0, 0)
+    state.handle_error_frame(classes, bytes.fromhex(data), S, 0, 0)
     return state
 
 
@@ -40,7 +46,7 @@ def state_after(classes: int, data: str, interface: str = "socketcan") -> BusSta
         (0x008, "0000080000000000", "active", ["bit error"]),
         (0x008, "0000200000000000", "active", ["overload"]),
         (0x008, "0000000800000000", "active", ["CRC error"]),
-        (0x008, "0000800000000000", "active", ["unspecified"]),  # while sending: no kind told
+        (0x008, "0000800000000000", "active", ["unspecified"]),  # while sending: no kind given
         (0x008, "0000801900000000", "active", ["no acknowledge"]),
         (0x010, "0000000004000000", "active", ["transceiver"]),
         (0x020, "", "active", ["no acknowledge"]),
@@ -54,48 +60,48 @@ def state_after(classes: int, data: str, interface: str = "socketcan") -> BusSta
         (0x048, "0000040000000000", "bus-off", ["bus-off", "stuff error"]),
     ],
 )
-def test_every_class_of_error_frame_is_told(
+def test_every_class_of_error_frame_is_reported(
     classes: int, data: str, condition: str, causes: list[str]
 ) -> None:
     state = state_after(classes, data)
-    assert state.condition.value == condition
+    assert state.error_state.value == condition
     assert list(state.causes.items()) == [(cause, 1) for cause in causes]
 
 
 @given(st.integers(0, 0x1FFFFFFF), st.binary(max_size=64))
 def test_no_error_frame_however_malformed_raises_or_goes_uncounted(classes: int, data: bytes) -> None:
     state = BusState()
-    state.error_frame(classes, data, S, 0, 0)
-    state.look(2 * S, 0, 0, 0, None)
+    state.handle_error_frame(classes, data, S, 0, 0)
+    state.update(2 * S, 0, 0, 0, None)
     assert sum(state.causes.values()) >= 1
-    assert bool(state.problem) == (state.condition is not Condition.ACTIVE)
+    assert bool(state.problem) == (state.error_state is not ErrorState.ACTIVE)
 
 
 def test_error_counters_are_kept() -> None:
-    figures = state_after(0x204, "0020000000008803").figures()
+    figures = state_after(0x204, "0020000000008803").report()
     assert (figures["transmit_errors"], figures["receive_errors"]) == (0x88, 3)
     assert (figures["state"], figures["since_ns"]) == ("passive", S)
 
 
-def test_bus_off_says_how_to_come_back() -> None:
+def test_bus_off_is_reported_with_a_remedy() -> None:
     state = state_after(0x040, "")
     assert "can0 stays off until `ip link set can0 type can restart`" in state.problem
     assert "restart-ms 100" in state.problem
     state.restart_ms = 100
     assert "the kernel restarts can0 after 100 ms" in state.problem
     other = BusState("pcan", "PCAN_USBBUS1")
-    other.look(S, 0, 0, 0, Trouble(Condition.BUS_OFF, "The bus is off"))
-    assert "closed and opened again" in other.problem
+    other.update(S, 0, 0, 0, BusFault(ErrorState.BUS_OFF, "The bus is off"))
+    assert "reopened until it works" in other.problem
     assert other.causes == {"bus-off": 1}
-    other.look(2 * S, 0, 0, 0, Trouble(Condition.BUS_OFF, "The bus is off"))
+    other.update(2 * S, 0, 0, 0, BusFault(ErrorState.BUS_OFF, "The bus is off"))
     assert other.causes == {"bus-off": 1}  # still the same one
 
 
-def test_lonely_node_is_told_that_nobody_acknowledges() -> None:
+def test_missing_acknowledgement_is_reported() -> None:
     state = BusState()
     for _ in range(16):
-        state.error_frame(0x008, bytes.fromhex("0000801900000000"), S, 0, 0)
-    state.error_frame(0x004, bytes.fromhex("0020000000008000"), S, 0, 0)
+        state.handle_error_frame(0x008, bytes.fromhex("0000801900000000"), S, 0, 0)
+    state.handle_error_frame(0x004, bytes.fromhex("0020000000008000"), S, 0, 0)
     assert "mostly no acknowledge" in state.problem
     assert "no other node acknowledges" in state.problem
 
@@ -103,26 +109,26 @@ def test_lonely_node_is_told_that_nobody_acknowledges() -> None:
 def test_damaged_frames_point_at_the_wiring() -> None:
     state = BusState()
     for _ in range(5):
-        state.error_frame(0x008, bytes.fromhex("0000040000000000"), S, 0, 0)
-    state.error_frame(0x004, bytes.fromhex("0010000000000080"), S, 0, 0)
+        state.handle_error_frame(0x008, bytes.fromhex("0000040000000000"), S, 0, 0)
+    state.handle_error_frame(0x004, bytes.fromhex("0010000000000080"), S, 0, 0)
     assert "mostly stuff error" in state.problem
     assert "termination" in state.problem
 
 
-def test_controller_that_restarts_is_active_again_since_then() -> None:
+def test_restarted_controller_is_active_since_its_restart() -> None:
     state = state_after(0x040, "")
-    state.error_frame(0x100, b"", 3 * S, 0, 0)
-    assert (state.condition, state.since_ns, state.problem) == (Condition.ACTIVE, 3 * S, "")
+    state.handle_error_frame(0x100, b"", 3 * S, 0, 0)
+    assert (state.error_state, state.since_ns, state.problem) == (ErrorState.ACTIVE, 3 * S, "")
 
 
 def test_frame_after_bus_off_proves_that_the_controller_is_on() -> None:
     """Drivers that restart silently: one that is off receives nothing."""
     state = BusState()
-    state.error_frame(0x040, b"", S, 700, 0)
-    state.look(2 * S, 700, 50, 0, None)
-    assert state.condition is Condition.BUS_OFF  # what we sent may wait in a queue
-    state.look(3 * S, 701, 50, 0, None)
-    assert (state.condition, state.since_ns) == (Condition.ACTIVE, 3 * S)
+    state.handle_error_frame(0x040, b"", S, 700, 0)
+    state.update(2 * S, 700, 50, 0, None)
+    assert state.error_state is ErrorState.BUS_OFF  # what we sent may wait in a queue
+    state.update(3 * S, 701, 50, 0, None)
+    assert (state.error_state, state.since_ns) == (ErrorState.ACTIVE, 3 * S)
 
 
 @pytest.mark.parametrize(
@@ -137,45 +143,45 @@ def test_frame_after_bus_off_proves_that_the_controller_is_on() -> None:
 def test_error_counters_that_must_have_fallen_end_a_passive_state(
     bits: str, frames: int, sent: int, condition: str
 ) -> None:
-    """Drivers that don't tell it: each good frame takes one off a counter of at most 255."""
+    """For drivers that don't report recovery: each good frame takes one off a counter of at most 255."""
     state = BusState()
-    state.error_frame(0x004, bytes.fromhex(f"00{bits}000000000000"), S, 100, 10)
-    state.look(2 * S, 100 + frames, 10 + sent, 0, None)
-    assert state.condition.value == condition
+    state.handle_error_frame(0x004, bytes.fromhex(f"00{bits}000000000000"), S, 100, 10)
+    state.update(2 * S, 100 + frames, 10 + sent, 0, None)
+    assert state.error_state.value == condition
 
 
 def test_interface_that_goes_down_and_comes_up() -> None:
     state = BusState()
-    state.look(S, 0, 0, 0, DOWN)
-    assert (state.condition, state.since_ns) == (Condition.DOWN, S)
+    state.update(S, 0, 0, 0, DOWN)
+    assert (state.error_state, state.since_ns) == (ErrorState.DOWN, S)
     assert "ip link set can0 up" in state.problem
-    state.look(2 * S, 0, 0, 0, DOWN)
+    state.update(2 * S, 0, 0, 0, DOWN)
     assert state.since_ns == S
-    state.look(3 * S, 0, 0, 0, None)
-    assert (state.condition, state.problem) == (Condition.ACTIVE, "")
+    state.update(3 * S, 0, 0, 0, None)
+    assert (state.error_state, state.problem) == (ErrorState.ACTIVE, "")
 
 
-def test_full_transmit_queue_is_told_while_it_is_news() -> None:
+def test_full_transmit_queue_is_reported_for_two_seconds() -> None:
     state = BusState()
-    state.look(S, 0, 0, 3, None)
-    assert state.condition is Condition.ACTIVE
+    state.update(S, 0, 0, 3, None)
+    assert state.error_state is ErrorState.ACTIVE
     assert "transmit queue full, 3 frames not sent" in state.problem
     assert "txqueuelen" in state.problem
-    state.look(3 * S, 0, 0, 3, None)
+    state.update(3 * S, 0, 0, 3, None)
     assert state.problem
-    state.look(4 * S, 0, 0, 3, None)
+    state.update(4 * S, 0, 0, 3, None)
     assert state.problem == ""
 
 
-def test_bad_datagram_is_told_and_no_more() -> None:
+def test_bad_datagram_is_reported_without_a_state_change() -> None:
     state = BusState("udp_multicast", "239.0.0.1")
-    state.look(S, 0, 0, 0, Trouble(Condition.ACTIVE, "could not unpack"))
-    assert (state.condition, state.problem) == (Condition.ACTIVE, "could not unpack")
+    state.update(S, 0, 0, 0, BusFault(ErrorState.ACTIVE, "could not unpack"))
+    assert (state.error_state, state.problem) == (ErrorState.ACTIVE, "could not unpack")
 
 
 def test_error_frames_in_an_unknown_layout_are_only_counted() -> None:
     state = state_after(0x040, "ffffffffffffffff", "kvaser")
-    assert (state.condition, state.causes) == (Condition.ACTIVE, {"error frame": 1})
+    assert (state.error_state, state.causes) == (ErrorState.ACTIVE, {"error frame": 1})
 
 
 @pytest.mark.parametrize(
@@ -188,10 +194,10 @@ def test_error_frames_in_an_unknown_layout_are_only_counted() -> None:
         (ValueError(), "active"),
     ],
 )
-def test_exceptions_tell_what_they_can(error: Exception, condition: str) -> None:
-    told = trouble_of(error)
-    assert told.condition.value == condition
-    assert told.text
+def test_exceptions_are_mapped_to_faults(error: Exception, condition: str) -> None:
+    expected = fault_from_exception(error)
+    assert expected.error_state.value == condition
+    assert expected.text
 
 
 @pytest.mark.parametrize(
@@ -206,5 +212,5 @@ def test_exceptions_tell_what_they_can(error: Exception, condition: str) -> None
         (can.CanOperationError("no such thing"), False),
     ],
 )
-def test_full_queue_is_told_from_other_failures(error: Exception, full: bool) -> None:
+def test_full_queue_is_distinguished_from_other_failures(error: Exception, full: bool) -> None:
     assert is_queue_full(error) is full

@@ -1,4 +1,4 @@
-"""EMCY messages become words."""
+"""EMCY messages as text."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.canbus.objects.emergency import decode, describe
+from handtouch.canbus.objects.emergency import decode_emergency, describe_emergency
 
 
 @pytest.mark.parametrize(
@@ -23,17 +23,18 @@ from handtouch.canbus.objects.emergency import decode, describe
         (0xA000, 0, "0xA000 unknown error"),
     ],
 )
-def test_code_and_register_in_words(code: int, register: int, text: str) -> None:
-    assert describe(code, register) == text
+def test_code_and_register_are_described(code: int, register: int, text: str) -> None:
+    assert describe_emergency(code, register) == text
 
 
 @given(st.integers(0, 0xFFFF), st.integers(0, 0xFF), st.binary(min_size=5, max_size=5))
 def test_decoding_keeps_every_field(code: int, register: int, detail: bytes) -> None:
-    message = decode(code.to_bytes(2, "little") + bytes((register,)) + detail, 7)
+    message = decode_emergency(code.to_bytes(2, "little") + bytes((register,)) + detail, 7)
     assert message is not None
-    assert (message.t_ns, message.code, message.register, message.detail) == (7, code, register, detail)
+    assert str(message) == message.text == describe_emergency(code, register)
+    assert (message.arrival_ns, message.code, message.register, message.detail) == (7, code, register, detail)
 
 
 @given(st.binary(max_size=20).filter(lambda data: len(data) != 8))
-def test_other_lengths_are_no_emergency(data: bytes) -> None:
-    assert decode(data, 0) is None
+def test_other_lengths_are_not_decoded(data: bytes) -> None:
+    assert decode_emergency(data, 0) is None

@@ -1,4 +1,4 @@
-"""A node without a heartbeat is asked for its state, and supervised all the same."""
+"""Guarding of nodes without heartbeat."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from handtouch.canbus.nodes.life import NodeState
-from handtouch.canbus.objects.channels import channels_of
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.config.channels import resolve_channels
 
 Make = Callable[..., Any]
 EDS = str(Path(__file__).parent.parent / "data" / "eds" / "tactor-q16.eds")
@@ -19,7 +19,7 @@ OPERATIONAL, ABSENT, STOPPED = NodeState.OPERATIONAL, NodeState.ABSENT, NodeStat
 @pytest.fixture
 def make_guarded(make_rig: Make) -> Make:
     """Rigs of nodes with guarding instead of a heartbeat."""
-    channels = channels_of([f"0x21{n}0:0" for n in (1, 2, 3, 4)], EDS)
+    channels = resolve_channels([f"0x21{n}0:0" for n in (1, 2, 3, 4)], EDS)
     device = {"eds": EDS, "channels": tuple((c.index, c.sub) for c in channels)}
 
     def make(size: int = 2, **more: Any) -> Any:
@@ -37,10 +37,10 @@ def rig(make_guarded: Make) -> Any:
     return rig
 
 
-def test_guarded_node_is_asked_once_a_period(rig: Any) -> None:
+def test_guarding_request_is_sent_once_a_period(rig: Any) -> None:
     assert rig.status(1).guarded
-    assert rig.node(1).read(0x100C, 0) == 100
-    assert rig.node(1).read(0x100D, 0) == 3
+    assert rig.node(1).read_object(0x100C, 0) == 100
+    assert rig.node(1).read_object(0x100D, 0) == 3
     before = rig.status(1).heartbeats
     rig.run(1000)
     assert rig.wire.asked.count(0x701) == rig.wire.asked.count(0x702) == 10
@@ -49,9 +49,9 @@ def test_guarded_node_is_asked_once_a_period(rig: Any) -> None:
     assert rig.state(1) is OPERATIONAL
 
 
-def test_guarded_node_that_vanishes_is_lost_in_time_and_comes_back(rig: Any) -> None:
+def test_unplugged_guarded_node_is_lost_in_time_and_recovers(rig: Any) -> None:
     rig.node(1).unplug()
-    events = [e for e in rig.run(600) if e.new is ABSENT]
+    events = [e for e in rig.run(600) if e.new_state is ABSENT]
     assert [e.slot for e in events] == [0]
     assert "no heartbeat for 35" in events[0].reason
     rig.run(3000)
@@ -62,18 +62,18 @@ def test_guarded_node_that_vanishes_is_lost_in_time_and_comes_back(rig: Any) -> 
     assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
 
 
-def test_guarded_node_that_does_not_answer_any_more_is_not_trusted_for_its_data(rig: Any) -> None:
+def test_guarded_node_without_responses_is_lost_despite_its_data(rig: Any) -> None:
     rig.node(1).send_heartbeat = False
     events = rig.run(10_000)
-    assert events[-1].new is NodeState.FAULTED
-    assert OPERATIONAL not in [e.new for e in events]
+    assert events[-1].new_state is NodeState.FAULTED
+    assert OPERATIONAL not in [e.new_state for e in events]
     rig.node(1).send_heartbeat = True
     rig.run(5500)
     assert rig.state(1) is OPERATIONAL
 
 
-def test_wrong_toggle_bit_is_no_fault(rig: Any) -> None:
-    """It tells that an answer was lost; what that means is told by time."""
+def test_wrong_toggle_bit_is_not_a_fault(rig: Any) -> None:
+    """It shows a lost response; only a timeout makes the node lost."""
     for _ in range(5):
         rig.run(100)
         rig.inject(0x701, b"\x05")
@@ -90,7 +90,7 @@ def test_wrong_toggle_bit_is_no_fault(rig: Any) -> None:
 
 def test_guarded_node_that_stopped_is_started_again(rig: Any) -> None:
     rig.run(300)
-    rig.node(1).on_nmt(2)
+    rig.node(1).handle_nmt(2)
     rig.run(500)
     assert rig.state(1) is OPERATIONAL
     assert rig.node(1).state == "OPERATIONAL"
@@ -106,12 +106,12 @@ def test_stopped_guarded_node_is_found_after_a_restart(rig: Any) -> None:
     assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
 
 
-def test_guarded_node_at_rest_is_watched_and_woken(rig: Any) -> None:
-    rig.master.rest(0, True, rig.t_ns)
+def test_guarded_node_in_standby_is_supervised_and_started_again(rig: Any) -> None:
+    rig.master.set_standby(0, True, rig.t_ns)
     rig.run(2000)
     assert rig.state(1) is STOPPED
     assert rig.node(1).state == "STOPPED"
-    assert rig.node(1).read(0x100C, 0) == 100  # nor has it been forgotten
+    assert rig.node(1).read_object(0x100C, 0) == 100  # nor has it been forgotten
     assert rig.status(1).emergencies == ()
     rig.node(1).unplug()
     rig.run(600)
@@ -119,19 +119,19 @@ def test_guarded_node_at_rest_is_watched_and_woken(rig: Any) -> None:
     rig.node(1).plug()
     rig.run(300)
     assert rig.state(1) is STOPPED
-    rig.master.rest(0, False, rig.t_ns)
+    rig.master.set_standby(0, False, rig.t_ns)
     rig.run(200)
     assert rig.state(1) is OPERATIONAL
 
 
-def test_life_guarding_of_the_node_never_fires_while_we_run(rig: Any) -> None:
+def test_life_guarding_of_the_node_does_not_expire_while_the_master_runs(rig: Any) -> None:
     rig.run(5000)
     assert [rig.status(n).emergencies for n in (1, 2)] == [(), ()]
     assert rig.status(1).reboots == 0
 
 
-def test_guarded_node_is_asked_in_time_however_slow_sync_is(make_guarded: Make) -> None:
-    """Who polls when `wake_ns` has come, and once a second with SYNC otherwise, keeps it."""
+def test_guarding_requests_are_in_time_with_a_slow_sync(make_guarded: Make) -> None:
+    """Polling at `wake_ns`, and otherwise once a second with SYNC, suffices."""
     rig = make_guarded(1)
     rig.syncs = False
     rig.plug_all()
@@ -146,10 +146,10 @@ def test_guarded_node_is_asked_in_time_however_slow_sync_is(make_guarded: Make) 
     assert rig.wire.asked.count(0x701) >= 65
     assert rig.status(1).emergencies == ()
     assert rig.status(1).heartbeats_missed == 0
-    assert ABSENT not in [e.new for e in rig.master.take_events()]
+    assert ABSENT not in [e.new_state for e in rig.master.drain_events()]
 
 
-def test_two_guarded_nodes_with_one_id_are_told(rig: Any) -> None:
+def test_two_guarded_nodes_with_one_id_are_reported(rig: Any) -> None:
     twin = rig.devices.add_twin(1, serial=999)
     twin.plug()
     rig.run(4000)

@@ -1,4 +1,4 @@
-"""Bus load: known lengths of frames, and the sums made of them."""
+"""Bus load: known lengths of frames, and sums of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LSS: all nodes without an id are found, in seconds, and each gets one; by a bus of simulated time."""
+"""LSS: all unconfigured nodes are found within seconds and get ids; on a bus with simulated time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handtouch.canbus.find.lss import LssAddress, LssError, LssMaster, LssSlave
+from handtouch.canbus.cia305 import LssAddress
+from handtouch.canbus.find.lss import LssError, LssMaster
+from handtouch.device.lss import LssSlave
 
 VENDOR, PRODUCT, REVISION = 0x2F1, 0x401, 0x10000
 
@@ -57,7 +59,7 @@ class Bus:
         self._coming = [item for item in self._coming if item[0] > self.t_ns]
         heapq.heapify(self._coming)
         for number, slave in enumerate(self.slaves):
-            answer = slave.handle(request)
+            answer = slave.handle_request(request)
             if answer is not None and self.random.random() >= self._lost:
                 delay_s = self._delays_s[number % len(self._delays_s)]
                 delay_s *= self._jitter ** self.random.uniform(-1, 1)
@@ -76,7 +78,7 @@ def address(serial: int, revision: int = REVISION) -> LssAddress:
 
 
 def pads(count: int) -> list[LssSlave]:
-    """As they leave the factory: serial numbers all over 32 bits."""
+    """Return unconfigured slaves with random serial numbers of 32 bits."""
     numbers = random.Random(3)
     return [LssSlave(address(numbers.getrandbits(32))) for _ in range(count)]
 
@@ -102,7 +104,7 @@ addresses = st.builds(
     delays_s=st.lists(st.floats(0.0001, 0.02), min_size=1, max_size=4),
     merging=st.booleans(),
 )
-def test_any_set_of_nodes_is_found_completely_and_named_uniquely(
+def test_any_set_of_nodes_is_found_completely_and_gets_unique_ids(
     present: set[LssAddress], delays_s: list[float], merging: bool
 ) -> None:
     slaves = [LssSlave(each) for each in sorted(present, key=hash)]
@@ -112,7 +114,7 @@ def test_any_set_of_nodes_is_found_completely_and_named_uniquely(
     assert found == sorted(present)
     assert master.problem == ""
     for node_id, each in enumerate(found, 0x20):
-        assert master.assign(each, node_id) == ""
+        assert master.assign_node_id(each, node_id) == ""
     assert {slave.address: slave.node_id for slave in slaves} == {
         each: node_id for node_id, each in enumerate(found, 0x20)
     }
@@ -132,21 +134,21 @@ def test_a_scan_changes_no_node(present: set[LssAddress]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_lost_answers_cost_time_but_no_node(seed: int) -> None:
+def test_lost_responses_cost_time_but_no_node(seed: int) -> None:
     bus = Bus(pads(6), (0.0004, 0.0011), lost=0.01)
     bus.random.seed(seed)
     assert bus.master().scan() == sorted(slave.address for slave in bus.slaves)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_answers_that_come_early_and_late_by_chance_cost_time_but_no_node(seed: int) -> None:
+def test_responses_with_jitter_cost_time_but_no_node(seed: int) -> None:
     bus = Bus(pads(6), (0.002,), jitter=4.0)
     bus.random.seed(seed)
     assert bus.master().scan() == sorted(slave.address for slave in bus.slaves)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_on_a_bus_too_bad_for_a_search_nobody_is_invented_and_the_trouble_is_told(seed: int) -> None:
+def test_very_bad_bus_yields_a_problem_and_no_false_node(seed: int) -> None:
     bus = Bus(pads(6), lost=0.2)
     bus.random.seed(seed)
     master = bus.master()
@@ -162,36 +164,36 @@ def test_eight_nodes_are_found_within_three_seconds_on_a_bus_that_answers_in_hal
     assert bus.seconds < 3.0
 
 
-def test_known_values_are_tried_whole() -> None:
-    blind, told = Bus(pads(1)), Bus(pads(1))
-    assert blind.master().scan() == told.master().scan([9, VENDOR], [PRODUCT], [REVISION])
-    assert len(told.sent) < len(blind.sent) - 90  # three parts in four requests instead of 99
+def test_known_values_are_tried_as_a_whole() -> None:
+    blind, expected = Bus(pads(1)), Bus(pads(1))
+    assert blind.master().scan() == expected.master().scan([9, VENDOR], [PRODUCT], [REVISION])
+    assert len(expected.sent) < len(blind.sent) - 90  # three parts in four requests instead of 99
 
 
-def test_no_node_is_told_after_the_first_wait() -> None:
+def test_bus_without_nodes_is_known_after_the_first_timeout() -> None:
     bus = Bus([])
     assert bus.master().scan() == []
     assert bus.seconds < 0.3
 
 
-def test_slow_nodes_are_waited_for_and_fast_ones_not() -> None:
+def test_timeout_adapts_to_slow_and_fast_nodes() -> None:
     fast, slow = Bus(pads(1), (0.0005,)), Bus(pads(1), (0.03,))
     for bus in (fast, slow):
         assert bus.master().scan() == [bus.slaves[0].address]
     assert slow.seconds > 4 * fast.seconds
 
 
-def test_the_least_wait_is_kept() -> None:
+def test_timeout_is_never_below_the_minimum() -> None:
     bus = Bus(pads(1))
     master = bus.master(least_wait_s=0.02)
     master.scan()
     assert master.wait_s >= 0.02
 
 
-def test_a_node_that_cannot_store_is_told_and_uses_its_id_until_power_off() -> None:
+def test_a_node_that_cannot_store_is_reported_and_uses_its_id_until_power_off() -> None:
     slave = LssSlave(address(1), can_store=False)
     master = Bus([slave]).master()
-    assert master.assign(slave.address, 9) == "it has no memory for it"
+    assert master.assign_node_id(slave.address, 9) == "it has no memory for it"
     assert slave.node_id == 9
     slave.power_on()
     assert slave.node_id is None
@@ -199,57 +201,57 @@ def test_a_node_that_cannot_store_is_told_and_uses_its_id_until_power_off() -> N
 
 def test_a_node_keeps_a_stored_id() -> None:
     slave = LssSlave(address(1))
-    assert Bus([slave]).master().assign(slave.address, 9) == ""
+    assert Bus([slave]).master().assign_node_id(slave.address, 9) == ""
     slave.power_on()
     assert slave.node_id == 9
 
 
-def test_a_node_that_has_an_id_tells_it_and_takes_another_at_its_next_reset() -> None:
+def test_a_node_reports_its_id_and_uses_a_changed_one_after_a_reset() -> None:
     slave = LssSlave(address(1), node_id=5)
     master = Bus([LssSlave(address(2)), slave]).master()
-    assert master.inquire(slave.address) == 5
-    assert master.inquire(address(2)) is None
-    assert master.assign(slave.address, 6) == ""
+    assert master.inquire_node_id(slave.address) == 5
+    assert master.inquire_node_id(address(2)) is None
+    assert master.assign_node_id(slave.address, 6) == ""
     assert slave.node_id == 5
     slave.reset()
     assert slave.node_id == 6
 
 
-def test_a_node_that_is_gone_is_named() -> None:
+def test_a_missing_node_is_named() -> None:
     master = Bus([LssSlave(address(1))]).master()
-    with pytest.raises(LssError, match=r"serial 2 doesn't answer"):
-        master.assign(address(2), 9)
-    with pytest.raises(LssError, match=r"serial 2 doesn't answer"):
-        master.inquire(address(2))
+    with pytest.raises(LssError, match=r"serial 2: no response"):
+        master.assign_node_id(address(2), 9)
+    with pytest.raises(LssError, match=r"serial 2: no response"):
+        master.inquire_node_id(address(2))
 
 
 @pytest.mark.parametrize("node_id", [0, 128, 255])
-def test_an_id_that_cannot_be_is_refused_before_anything_is_sent(node_id: int) -> None:
+def test_an_invalid_id_is_refused_before_anything_is_sent(node_id: int) -> None:
     bus = Bus([LssSlave(address(1))])
     with pytest.raises(ValueError, match="1 to 127"):
-        bus.master().assign(address(1), node_id)
+        bus.master().assign_node_id(address(1), node_id)
     assert bus.sent == []
 
 
-def test_bit_timing_is_never_touched() -> None:
+def test_bit_timing_is_never_changed() -> None:
     bus = Bus(pads(3))
     master = bus.master()
     for each in master.scan():
-        master.assign(each, 5)
+        master.assign_node_id(each, 5)
     assert not {request[0] for request in bus.sent} & {0x13, 0x15}
 
 
 class Restless(LssSlave):
     """Forgets that it was found."""
 
-    def handle(self, data: bytes) -> bytes | None:
-        answer = super().handle(data)
+    def handle_request(self, data: bytes) -> bytes | None:
+        answer = super().handle_request(data)
         if data[0] == 0x51:
             self.configuring = False
         return answer
 
 
-def test_a_node_that_takes_part_again_after_it_was_found_is_told() -> None:
+def test_a_node_that_responds_again_after_it_was_found_is_reported() -> None:
     master = Bus([Restless(address(1))]).master()
     assert master.scan() == [address(1)]
     assert "after it was found" in master.problem
@@ -258,14 +260,14 @@ def test_a_node_that_takes_part_again_after_it_was_found_is_told() -> None:
 class Contrary(LssSlave):
     """Says yes to every bit, and no to the value."""
 
-    def handle(self, data: bytes) -> bytes | None:
+    def handle_request(self, data: bytes) -> bytes | None:
         return frame(0x4F) if data[0] == 0x51 and data[6] == data[7] else None
 
 
 def test_a_node_that_contradicts_itself_ends_the_scan_with_a_reason() -> None:
     master = Bus([Contrary(address(1))]).master()
     assert master.scan() == []
-    assert "not so that its identity can be told" in master.problem
+    assert "its identity can't be determined" in master.problem
 
 
 # The slave alone: what CiA 305 says of each request.
@@ -274,34 +276,34 @@ def test_a_node_that_contradicts_itself_ends_the_scan_with_a_reason() -> None:
 def test_a_fast_scan_is_for_nodes_without_an_id_in_the_waiting_state() -> None:
     confirm = frame(0x51, 0, 0, 0, 0, 0x80)
     slave = LssSlave(address(1))
-    assert slave.handle(confirm) == frame(0x4F)
-    slave.handle(frame(0x04, 1))
-    assert slave.handle(confirm) is None
-    assert LssSlave(address(1), node_id=3).handle(confirm) is None
+    assert slave.handle_request(confirm) == frame(0x4F)
+    slave.handle_request(frame(0x04, 1))
+    assert slave.handle_request(confirm) is None
+    assert LssSlave(address(1), node_id=3).handle_request(confirm) is None
 
 
 def test_a_fast_scan_goes_through_the_parts_in_their_order_only() -> None:
     slave = LssSlave(address(1))
     wrong = struct.pack("<BIBBB", 0x51, PRODUCT, 0, 1, 2)
-    assert slave.handle(wrong) is None
-    assert slave.handle(struct.pack("<BIBBB", 0x51, VENDOR, 0, 0, 1)) == frame(0x4F)
-    assert slave.handle(wrong) == frame(0x4F)
+    assert slave.handle_request(wrong) is None
+    assert slave.handle_request(struct.pack("<BIBBB", 0x51, VENDOR, 0, 0, 1)) == frame(0x4F)
+    assert slave.handle_request(wrong) == frame(0x4F)
 
 
 def test_only_the_node_that_is_named_is_selected() -> None:
     slaves = [LssSlave(address(1)), LssSlave(address(2))]
     answers = [
-        [slave.handle(struct.pack("<BI3x", command, value)) for slave in slaves]
+        [slave.handle_request(struct.pack("<BI3x", command, value)) for slave in slaves]
         for command, value in zip((0x40, 0x41, 0x42, 0x43), address(2).parts, strict=True)
     ]
     assert answers == [[None, None]] * 3 + [[None, frame(0x44)]]
     assert [slave.configuring for slave in slaves] == [False, True]
 
 
-def test_a_name_in_pieces_out_of_order_selects_nobody() -> None:
+def test_an_address_in_the_wrong_order_selects_no_node() -> None:
     slave = LssSlave(address(1))
     for command, value in zip((0x40, 0x42, 0x41, 0x43), address(1).parts, strict=True):
-        assert slave.handle(struct.pack("<BI3x", command, value)) is None
+        assert slave.handle_request(struct.pack("<BI3x", command, value)) is None
     assert not slave.configuring
 
 
@@ -311,37 +313,37 @@ def test_a_name_in_pieces_out_of_order_selects_nobody() -> None:
 def test_a_node_in_the_range_asked_for_answers(serials: tuple[int, int], expected: int | None) -> None:
     slave = LssSlave(address(3), node_id=8)
     values = (VENDOR, PRODUCT, 0, 0xFFFFFFFF, *serials)
-    answers = [slave.handle(struct.pack("<BI3x", 0x46 + n, value)) for n, value in enumerate(values)]
+    answers = [slave.handle_request(struct.pack("<BI3x", 0x46 + n, value)) for n, value in enumerate(values)]
     assert answers == [None] * 5 + [frame(expected) if expected else None]
 
 
-def test_nodes_without_an_id_say_so() -> None:
-    assert LssSlave(address(1)).handle(frame(0x4C)) == frame(0x50)
-    assert LssSlave(address(1), node_id=1).handle(frame(0x4C)) is None
+def test_unconfigured_nodes_respond_to_their_inquiry() -> None:
+    assert LssSlave(address(1)).handle_request(frame(0x4C)) == frame(0x50)
+    assert LssSlave(address(1), node_id=1).handle_request(frame(0x4C)) is None
 
 
-def test_identity_and_id_are_told_in_the_configuration_state_only() -> None:
+def test_identity_and_id_are_returned_in_the_configuration_state_only() -> None:
     slave = LssSlave(address(0x01020304), node_id=7)
-    assert slave.handle(frame(0x5D)) is None
-    slave.handle(frame(0x04, 1))
-    assert slave.handle(frame(0x5D)) == frame(0x5D, 4, 3, 2, 1)
-    assert slave.handle(frame(0x5A)) == frame(0x5A, 0xF1, 0x02)
-    assert slave.handle(frame(0x5E)) == frame(0x5E, 7)
+    assert slave.handle_request(frame(0x5D)) is None
+    slave.handle_request(frame(0x04, 1))
+    assert slave.handle_request(frame(0x5D)) == frame(0x5D, 4, 3, 2, 1)
+    assert slave.handle_request(frame(0x5A)) == frame(0x5A, 0xF1, 0x02)
+    assert slave.handle_request(frame(0x5E)) == frame(0x5E, 7)
 
 
 @pytest.mark.parametrize("node_id", [0, 128, 254])
 def test_a_slave_refuses_an_id_out_of_range(node_id: int) -> None:
     slave = LssSlave(address(1))
-    slave.handle(frame(0x04, 1))
-    assert slave.handle(frame(0x11, node_id)) == frame(0x11, 1)
-    slave.handle(frame(0x04, 0))
+    slave.handle_request(frame(0x04, 1))
+    assert slave.handle_request(frame(0x11, node_id)) == frame(0x11, 1)
+    slave.handle_request(frame(0x04, 0))
     assert slave.node_id is None
 
 
 @given(st.binary(max_size=12), st.booleans())
-def test_no_frame_upsets_a_slave(data: bytes, configuring: bool) -> None:
+def test_no_frame_raises_in_a_slave(data: bytes, configuring: bool) -> None:
     slave = LssSlave(address(1))
     slave.configuring = configuring
-    answer = slave.handle(data)
+    answer = slave.handle_request(data)
     assert answer is None or len(answer) == 8
     assert len(data) == 8 or (answer is None and slave.rejected == 1)

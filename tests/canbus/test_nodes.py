@@ -1,4 +1,4 @@
-"""From a deployment to what the master is told of every node."""
+"""Node specifications from a deployment."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import re
 
 import pytest
 
-from handtouch import shipped
-from handtouch.canbus.nodes.boot import Idle
-from handtouch.canbus.nodes.spec import NodeSpec, checked, node_specs
-from handtouch.canbus.objects.channels import STANDARD_CHANNELS, Channel, Object
-from handtouch.config import ConfigError, Deployment, parse
+from handtouch.canbus.nodes.boot import IdleSettings
+from handtouch.canbus.nodes.spec import NodeSpec, check_nodes, node_specs
+from handtouch.config import (
+    ConfigError,
+    Deployment,
+    parse,
+    shipped,
+)
+from handtouch.config.channels import STANDARD_CHANNELS, Channel, WritableObject
 
 PATH = shipped.path("utah_mit.toml")
 KIND = "[node.four_channel]"
@@ -27,7 +31,7 @@ def deployment(more: str = "", tables: str = "", bus: str = "") -> Deployment:
 
 
 def specs(more: str = "", tables: str = "") -> list[NodeSpec]:
-    """Of that hand."""
+    """Return the node specifications of the hand."""
     return node_specs(deployment(more, tables))
 
 
@@ -42,10 +46,12 @@ def test_every_pad_is_a_node_in_the_slot_of_its_order() -> None:
 
 
 def test_idling_is_timed_by_the_sync_period() -> None:
-    made = specs('excitation = "0x2100:0:u8"', "[node.four_channel.idle]\ndelta_counts = 40\nperiod_ms = 200")
-    assert made[0].excitation == Object(0x2100, 0, 1)
-    deltas = tuple(Object(0x6426, sub, 4) for sub in (1, 2, 3, 4))
-    assert made[0].idle == Idle(40, 200, 50, deltas, Object(0x6423, 0, 1))
+    made = specs(
+        'excitation_object = "0x2100:0:u8"', "[node.four_channel.idle]\ndelta_counts = 40\nperiod_ms = 200"
+    )
+    assert made[0].excitation == WritableObject(0x2100, 0, 1)
+    deltas = tuple(WritableObject(0x6426, sub, 4) for sub in (1, 2, 3, 4))
+    assert made[0].idle == IdleSettings(40, 200, 50, deltas, WritableObject(0x6423, 0, 1))
 
 
 IDLE = "\n[node.four_channel.idle]\ndelta_counts = 256\n"
@@ -68,34 +74,36 @@ SMALL = 'delta_objects = ["0x6426:1:u8", "0x6426:2:u32", "0x6426:3:u32", "0x6426
         (
             'channels = ["0x2500:1", "0x2500:2", "0x2500:3", "0x2500:4"]',
             "",
-            "channels: .* its type is not known",
+            "channels: .* its type is unknown",
         ),
-        ('excitation = "0x2100:0"', "", 'excitation: "0x2100:0": its type is not told; write it'),
-        ('excitation = "on"', "", 'excitation: "on" is no object; write'),
+        (
+            'excitation_object = "0x2100:0"',
+            "",
+            'excitation_object: "0x2100:0": its type is missing; add it',
+        ),
+        ('excitation_object = "on"', "", 'excitation_object: "on" is no object; write'),
         ("", IDLE + SMALL, r'idle\]: delta_objects: "0x6426:1:u8": delta_counts = 256 is beyond its type'),
         (
             "",
             IDLE + 'enable_object = "0x6423:0"',
-            r"idle\]: enable_object: .* its type is not told; write it",
+            r"idle\]: enable_object: .* its type is missing; add it",
         ),
     ],
 )
-def test_objects_that_cannot_be_are_named_with_file_section_and_key(
-    more: str, tables: str, message: str
-) -> None:
+def test_invalid_objects_are_named_with_file_section_and_key(more: str, tables: str, message: str) -> None:
     with pytest.raises(
         ConfigError, match=rf"^{re.escape(str(PATH))}: \[node.four_channel.*{message}"
     ) as error:
-        checked(deployment(more, tables), str(PATH))
+        check_nodes(deployment(more, tables), str(PATH))
     assert len(error.value.problems) == 1
 
 
-def test_what_a_listener_needs_to_know_and_no_eds_tells_is_named() -> None:
+def test_listener_without_a_usable_eds_is_refused() -> None:
     wide = 'channels = ["0x6402:1", "0x6402:2", "0x6402:3", "0x6402:4"]'
     listener = deployment(wide, bus='role = "listener"')
-    with pytest.raises(ConfigError, match="come in several PDOs; give the node's eds"):
-        checked(listener, "hand.toml")
-    assert checked(deployment(wide), "hand.toml")
+    with pytest.raises(ConfigError, match="need several PDOs; give the node's eds"):
+        check_nodes(listener, "hand.toml")
+    assert check_nodes(deployment(wide), "hand.toml")
 
 
 def test_channels_of_the_configuration_are_those_of_every_node() -> None:

@@ -1,4 +1,4 @@
-"""Whatever goes wrong, whenever: the cause is told, the others go on, and it ends when the fault does."""
+"""Any fault at any time is reported, affects no other node, and ends with its cause."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from handtouch import shipped
-from handtouch.canbus.nodes.boot import Idle
-from handtouch.canbus.nodes.life import NodeState
-from handtouch.canbus.objects.channels import Object, written
+from handtouch.canbus.nodes.boot import IdleSettings
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.config import shipped
+from handtouch.config.channels import WritableObject, parse_writable_object
 
 MS = 1_000_000
 Make = Callable[..., Any]
 OPERATIONAL, FAULTED, ABSENT = NodeState.OPERATIONAL, NodeState.FAULTED, NodeState.ABSENT
-DELTAS = tuple(Object(0x6426, sub, 4) for sub in (1, 2, 3, 4))
+DELTAS = tuple(WritableObject(0x6426, sub, 4) for sub in (1, 2, 3, 4))
 KIND = {
     "eds": str(shipped.path("handtouch-node.eds")),
-    "idle": Idle(50, 100, 50, DELTAS, Object(0x6423, 0, 1)),
-    "excitation": written("0x2100:0:u8"),
+    "idle": IdleSettings(50, 100, 50, DELTAS, WritableObject(0x6423, 0, 1)),
+    "excitation": parse_writable_object("0x2100:0:u8"),
 }
 OBJECTS = [  # all that are read or written when a node boots, and whether it can do without
     ((0x1018, 1), False),
@@ -50,7 +50,7 @@ def booted(rig: Any, ms: int) -> None:
     rig.run(ms)
 
 
-def test_these_are_the_objects(make_rig: Make) -> None:
+def test_boot_uses_these_objects(make_rig: Make) -> None:
     """The list above is all that a boot touches."""
     rig = make_rig(1, **KIND)
     booted(rig, 200)
@@ -64,7 +64,7 @@ def test_these_are_the_objects(make_rig: Make) -> None:
 
 @pytest.mark.parametrize("code", [0x08000000, 0x06010000, None], ids=["general", "access", "silence"])
 @pytest.mark.parametrize(("where", "optional"), OBJECTS, ids=[f"{i:04X}:{s}" for (i, s), _ in OBJECTS])
-def test_object_that_fails_is_named_and_tried_again(
+def test_failing_object_is_named_and_retried(
     make_rig: Make, where: tuple[int, int], optional: bool, code: int | None
 ) -> None:
     rig = make_rig(2, **KIND)
@@ -98,7 +98,7 @@ def test_one_failure_at_any_step_costs_one_attempt_at_most(
 
 
 @pytest.mark.parametrize("garble", ["toggle", "object", "noise"])
-def test_garbage_instead_of_answers_is_a_fault_in_words_while_it_lasts(make_rig: Make, garble: str) -> None:
+def test_garbled_responses_are_a_fault_while_they_last(make_rig: Make, garble: str) -> None:
     rig = make_rig(2, **KIND)
     rig.node(1).sdo.garble = garble
     booted(rig, 3000)
@@ -114,7 +114,7 @@ def test_garbage_instead_of_answers_is_a_fault_in_words_while_it_lasts(make_rig:
     assert rig.state(1) is OPERATIONAL
 
 
-def test_frozen_server_of_a_running_node_costs_nothing(make_rig: Make) -> None:
+def test_frozen_sdo_server_of_a_running_node_has_no_effect(make_rig: Make) -> None:
     rig = make_rig(1, **KIND)
     rig.boot()
     rig.node(1).sdo.frozen = True
@@ -122,7 +122,7 @@ def test_frozen_server_of_a_running_node_costs_nothing(make_rig: Make) -> None:
     rig.node(1).reboot()
     rig.run(500)
     assert rig.state(1) is FAULTED
-    assert "no answer within 5 ms, asked 2 times; is its SDO server running" in rig.status(1).reason
+    assert "no answer within 5 ms in 2 attempts; is its SDO server running" in rig.status(1).reason
 
 
 @settings(
@@ -194,7 +194,7 @@ def cause(rig: Any, fault: str, lasts_ms: int) -> None:
         case "bus-off":
             node.bus_off(lasts_ms * MS)
         case "nmt":
-            node.on_nmt(2)
+            node.handle_nmt(2)
         case "cable":
             rig.wire.cut = {1}
         case "sync":
@@ -205,20 +205,20 @@ def cause(rig: Any, fault: str, lasts_ms: int) -> None:
     node.plug()
 
 
-def test_heartbeat_without_data_is_told_once(rig: Any) -> None:
+def test_heartbeat_without_data_is_reported_once(rig: Any) -> None:
     rig.boot()
     rig.node(1).send_data = False
     events = rig.run(10_000)
-    assert [e.new for e in events] == [NodeState.STALE]
-    assert "its heartbeat is there" in events[0].reason
+    assert [e.new_state for e in events] == [NodeState.STALE]
+    assert "heartbeat present" in events[0].reason
 
 
 def test_node_whose_samples_are_too_short_is_stale_and_they_are_counted(rig: Any) -> None:
     rig.boot()
     rig.node(1).frame_bytes = 7
     events = rig.run(1000)
-    assert [e.new for e in events] == [NodeState.STALE]
-    assert rig.port.counters.short >= 199
+    assert [e.new_state for e in events] == [NodeState.STALE]
+    assert rig.port.counters.wrong_length >= 199
     rig.node(1).frame_bytes = None
     rig.run(10)
     assert rig.state(1) is OPERATIONAL
@@ -226,7 +226,7 @@ def test_node_whose_samples_are_too_short_is_stale_and_they_are_counted(rig: Any
 
 def test_node_that_answers_one_probe_and_nothing_else_does_not_flap(rig: Any) -> None:
     """No heartbeat, and silent but for its device type: every try later than the one before."""
-    rig.node(1).write(0x1017, 0, 0, keep=True)
+    rig.node(1).write_object(0x1017, 0, 0, keep=True)
     rig.node(1).sdo.fail[0x1018, 1] = None
     rig.plug_all()
     rig.start()

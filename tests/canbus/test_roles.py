@@ -1,4 +1,4 @@
-"""Our part on a bus that belongs to others too: guest, who starts nothing, and listener, who says nothing."""
+"""Roles on a shared bus: guest, which starts no node, and listener, which sends nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import can
 import pytest
 
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.nodes.life import NodeState
+from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master
 from handtouch.config import Bus
 
@@ -43,7 +43,7 @@ def guest(make_rig: Make) -> Any:
 def test_guest_configures_and_leaves_the_start_to_the_other_master(guest: Any) -> None:
     assert [guest.state(n) for n in (1, 2)] == [SETTLING] * 2
     assert "another master has to start it" in guest.status(1).reason
-    assert guest.node(1).read(0x1017, 0) == 50
+    assert guest.node(1).read_object(0x1017, 0) == 50
     guest.nmt(START, 0)
     guest.run(100)
     assert [guest.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
@@ -66,7 +66,7 @@ def test_guest_follows_the_stop_of_the_other_master(guest: Any, command: int) ->
     assert commands(guest) == []
 
 
-def test_guest_tells_a_started_node_without_samples_from_one_that_is_not_started(guest: Any) -> None:
+def test_guest_distinguishes_a_started_node_without_samples_from_one_not_started(guest: Any) -> None:
     guest.syncs = False
     guest.nmt(START, 0)
     guest.run(1200)
@@ -77,7 +77,7 @@ def test_guest_tells_a_started_node_without_samples_from_one_that_is_not_started
 def test_guest_waits_for_a_node_that_the_other_master_holds_stopped(make_rig: Make) -> None:
     rig = make_rig(1, role="guest")
     rig.plug_all()
-    rig.devices.handle(can.Message(arbitration_id=0, data=b"\x02\x01", is_extended_id=False), rig.t_ns)
+    rig.devices.handle_frame(can.Message(arbitration_id=0, data=b"\x02\x01", is_extended_id=False), rig.t_ns)
     rig.start()
     rig.run(20_000)
     assert rig.state(1) is not OPERATIONAL
@@ -93,16 +93,16 @@ def test_guest_configures_a_rebooted_node_again_and_waits(guest: Any) -> None:
     guest.node(1).reboot()
     guest.run(300)
     assert guest.state(1) is SETTLING
-    assert guest.node(1).read(0x1017, 0) == 50
+    assert guest.node(1).read_object(0x1017, 0) == 50
     guest.nmt(START, 1)
     guest.run(100)
     assert guest.state(1) is OPERATIONAL
 
 
-def test_guest_leaves_nodes_as_they_are_when_it_ends_or_needs_them_no_more(guest: Any) -> None:
+def test_guest_leaves_nodes_unchanged_at_its_end_and_outside_the_scene(guest: Any) -> None:
     guest.nmt(START, 0)
     guest.run(100)
-    guest.master.rest(0, True, guest.t_ns)
+    guest.master.set_standby(0, True, guest.t_ns)
     guest.run(100)
     assert guest.state(1) is OPERATIONAL
     guest.master.stop(guest.t_ns)
@@ -114,7 +114,7 @@ def test_guest_leaves_nodes_as_they_are_when_it_ends_or_needs_them_no_more(guest
 def other_master(rig: Any, heartbeat_ms: int) -> None:
     """Nodes as another master has left them."""
     for device in rig.devices.devices.values():
-        device.write(0x1017, 0, heartbeat_ms, keep=True)
+        device.write_object(0x1017, 0, heartbeat_ms, keep=True)
         device.plug()
     rig.start()
     rig.run(20)
@@ -122,13 +122,13 @@ def other_master(rig: Any, heartbeat_ms: int) -> None:
 
 
 @pytest.mark.parametrize("heartbeat_ms", [0, 20, 100])
-def test_listener_sends_nothing_at_all_whatever_happens(make_rig: Make, heartbeat_ms: int) -> None:
+def test_listener_sends_nothing_in_any_case(make_rig: Make, heartbeat_ms: int) -> None:
     """And its nodes are operational by what it overhears, with heartbeats of whatever period or none."""
     rig = make_rig(2, role="listener")
     other_master(rig, heartbeat_ms)
     rig.run(500)
     assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
-    assert rig.slab.read().tolist() == [[10, 20, 30, 40]] * 2
+    assert rig.slab.unpack_counts().tolist() == [[10, 20, 30, 40]] * 2
     rig.run(3000)  # that their heartbeats come oftener than ours would is no fault
     assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2
     rig.node(1).reboot()
@@ -137,9 +137,9 @@ def test_listener_sends_nothing_at_all_whatever_happens(make_rig: Make, heartbea
     rig.run(300)
     assert rig.state(1) is OPERATIONAL
     rig.node(2).unplug()
-    rig.node(1).emergency(0x2310)
-    rig.master.rest(0, True, rig.t_ns)
-    rig.master.pace(0, True, rig.t_ns)
+    rig.node(1).send_emergency(0x2310)
+    rig.master.set_standby(0, True, rig.t_ns)
+    rig.master.set_transmission(0, True, rig.t_ns)
     rig.run(5000)
     assert rig.state(2) is (ABSENT if heartbeat_ms else STALE)
     rig.node(2).plug()
@@ -152,7 +152,7 @@ def test_listener_sends_nothing_at_all_whatever_happens(make_rig: Make, heartbea
     assert rig.wire.asked == []
 
 
-def test_listener_knows_from_heartbeats_who_runs(make_rig: Make) -> None:
+def test_listener_derives_states_from_heartbeats(make_rig: Make) -> None:
     rig = make_rig(1, role="listener")
     other_master(rig, 100)
     rig.run(500)
@@ -165,14 +165,14 @@ def test_listener_knows_from_heartbeats_who_runs(make_rig: Make) -> None:
     assert rig.state(1) is OPERATIONAL
 
 
-def test_listener_does_not_trust_data_of_a_node_whose_heartbeats_have_ended(make_rig: Make) -> None:
+def test_listener_discards_data_of_a_node_whose_heartbeats_have_ended(make_rig: Make) -> None:
     rig = make_rig(1, role="listener")
     other_master(rig, 100)
     rig.run(500)
-    rig.master.take_events()
+    rig.master.drain_events()
     rig.node(1).send_heartbeat = False
     events = rig.run(5000)
-    assert [e.new for e in events] == [ABSENT]
+    assert [e.new_state for e in events] == [ABSENT]
     assert "no heartbeat" in rig.status(1).reason
     rig.node(1).send_heartbeat = True
     rig.run(300)
@@ -199,10 +199,10 @@ def test_buses_of_different_roles_share_a_slab(make_rig: Make) -> None:
     run_all(rigs, 100)
     for rig in rigs[1:]:
         message = can.Message(arbitration_id=0, data=b"\x01\x01", is_extended_id=False)
-        rig.devices.handle(message, rig.t_ns)
+        rig.devices.handle_frame(message, rig.t_ns)
     run_all(rigs, 300)
     assert master.states.tolist() == [OPERATIONAL] * 3
-    assert slab.read().tolist() == [[0, 1, 2, 3], [1, 1, 2, 3], [2, 1, 2, 3]]
+    assert slab.unpack_counts().tolist() == [[0, 1, 2, 3], [1, 1, 2, 3], [2, 1, 2, 3]]
     sent = [{can_id for can_id, _ in rig.wire.sent} for rig in rigs]
     assert sent == [{0, 0x80, 0x601}, {0x80, 0x601}, set()]
 
@@ -216,5 +216,5 @@ def run_all(rigs: list[Rig], ms: int) -> None:
                 rig.sync()
             rig.devices.advance(rig.t_ns)
             for frame in rig.port.drain():
-                rig.master.handle(rig.port.name, *frame)
+                rig.master.handle_frame(rig.port.name, *frame)
         rigs[0].step()

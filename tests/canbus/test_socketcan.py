@@ -1,4 +1,4 @@
-"""A port on a real SocketCAN bus, with can-utils as the stranger; runs where there is a vcan0."""
+"""A port on a real SocketCAN bus, with can-utils as another device; needs a vcan0."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import can
 import pytest
 
 from handtouch.canbus.bus import receivers
-from handtouch.canbus.bus.bus_state import BusState, Condition
+from handtouch.canbus.bus.bus_state import BusState, ErrorState
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.slab import Slab
 from handtouch.canbus.bus.sync import Sync
 from handtouch.config import Bus
+from handtouch.core.slab import Slab
 
 pytestmark = pytest.mark.socketcan
 
@@ -36,7 +36,7 @@ def eventually(port: Port, what: Callable[[], bool], seconds: float = 10.0) -> b
 
 
 def look(port: Port) -> BusState:
-    return port.look(time.monotonic_ns())
+    return port.update_state(time.monotonic_ns())
 
 
 def open_port(slots: int = 1) -> Port:
@@ -52,7 +52,7 @@ def port() -> Iterator[Port]:
     port.close()
 
 
-def test_every_kind_of_frame_is_told_apart(port: Port) -> None:
+def test_every_kind_of_frame_is_distinguished(port: Port) -> None:
     before = time.monotonic_ns()
     run(
         "cansend vcan0 281#0100020003000400; cansend vcan0 281#01; cansend vcan0 281#R; cansend vcan0 701#05;"
@@ -61,10 +61,15 @@ def test_every_kind_of_frame_is_told_apart(port: Port) -> None:
     assert select.select([port.fileno()], [], [], 1.0)[0]
     others = port.drain()
     counters = port.counters
-    assert (counters.samples, counters.short, counters.foreign, counters.errors) == (1, 1, 2, 1)
+    assert (counters.samples, counters.wrong_length, counters.unknown_frames, counters.error_frames) == (
+        1,
+        1,
+        2,
+        1,
+    )
     assert [(can_id, data) for can_id, data, _ in others] == [(0x701, b"\x05")]
-    assert port.slab.read()[0].tolist() == [1, 2, 3, 4]
-    assert before < port.slab.t_ns[0] < others[0][2] <= time.monotonic_ns()  # kernel stamps, our clock
+    assert port.slab.unpack_counts()[0].tolist() == [1, 2, 3, 4]
+    assert before < port.slab.arrival_ns[0] < others[0][2] <= time.monotonic_ns()  # kernel stamps, our clock
     assert not select.select([port.fileno()], [], [], 0)[0]
 
 
@@ -79,7 +84,7 @@ def test_interface_may_go_down_and_come_up(port: Port) -> None:
     try:
         assert eventually(port, lambda: port.counters.receive_failures == 1)
         assert "ip link set vcan0 up" in look(port).problem
-        assert port.state.condition is Condition.DOWN
+        assert port.bus_state.error_state is ErrorState.DOWN
         assert not port.send(0x80, b"")
         assert (port.counters.send_failures, port.counters.queue_full) == (1, 0)
     finally:
@@ -90,14 +95,14 @@ def test_interface_may_go_down_and_come_up(port: Port) -> None:
     assert port.send(0x80, b"")
 
 
-def test_interface_is_seen_to_be_up_again_where_nobody_else_sends(port: Port) -> None:
+def test_interface_is_detected_up_on_a_bus_without_other_senders(port: Port) -> None:
     run("ip link set vcan0 down")
     try:
-        assert eventually(port, lambda: look(port).condition is Condition.DOWN)
+        assert eventually(port, lambda: look(port).error_state is ErrorState.DOWN)
     finally:
         run("ip link set vcan0 up")
     assert eventually(port, lambda: port.send(0x80, b""))
-    assert look(port).condition is Condition.ACTIVE
+    assert look(port).error_state is ErrorState.ACTIVE
 
 
 def test_interface_may_be_unplugged_and_plugged_in_again(port: Port) -> None:
@@ -115,7 +120,7 @@ def test_interface_may_be_unplugged_and_plugged_in_again(port: Port) -> None:
     assert port.fileno() == descriptor
 
 
-def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_dropped_by_the_kernel_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receivers, "RECEIVE_BUFFER_BYTES", 1)  # the kernel's least: a few frames
     port = open_port()
     run("cangen vcan0 -g 0 -n 500 -I 700 -L 8 -D i")
@@ -124,19 +129,19 @@ def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> No
     port.close()
 
 
-def test_error_frames_are_told_in_words(port: Port) -> None:
+def test_error_frames_are_reported_as_text(port: Port) -> None:
     """By cansend, in the layout of <linux/can/error.h>; vcan itself makes none."""
     run("cansend vcan0 20000204#0020000000008803; cansend vcan0 20000020#; cansend vcan0 20000002#0B")
-    assert eventually(port, lambda: port.counters.errors == 3)
-    figures = look(port).figures()
+    assert eventually(port, lambda: port.counters.error_frames == 3)
+    figures = look(port).report()
     assert figures["state"] == "passive"
     assert (figures["transmit_errors"], figures["receive_errors"]) == (0x88, 3)
     assert figures["causes"] == {"transmit passive": 1, "no acknowledge": 1, "lost arbitration": 1}
     run("cansend vcan0 20000040#0000000000000000")
-    assert eventually(port, lambda: look(port).condition is Condition.BUS_OFF)
+    assert eventually(port, lambda: look(port).error_state is ErrorState.BUS_OFF)
     assert "restart-ms 100" in port.problem
     run("cansend vcan0 20000100#0000000000000000")
-    assert eventually(port, lambda: look(port).condition is Condition.ACTIVE)
+    assert eventually(port, lambda: look(port).error_state is ErrorState.ACTIVE)
     assert port.problem == ""
 
 
@@ -149,7 +154,7 @@ def test_remote_frame_is_sent_as_one(port: Port) -> None:
 
 
 def produce(sync: Sync, port: Port, seconds: float) -> int:
-    """What the daemon's loop does; the number of cycles."""
+    """Run the daemon's loop; return the number of cycles."""
     cycles, end_s = 0, time.monotonic() + seconds
     while time.monotonic() < end_s:
         now_ns = time.monotonic_ns()
@@ -157,8 +162,8 @@ def produce(sync: Sync, port: Port, seconds: float) -> int:
         select.select([port.fileno()], [], [], max(0.0, (sync.wake_ns - now_ns) * 1e-9))
         for can_id, _, t_ns in port.drain():
             assert can_id == 0x80
-            cycles += sync.seen(port.name, t_ns, time.monotonic_ns()) is not None
-        port.look(time.monotonic_ns())
+            cycles += sync.handle_sync(port.name, t_ns, time.monotonic_ns()) is not None
+        port.update_state(time.monotonic_ns())
     return cycles
 
 
@@ -179,17 +184,17 @@ def test_kernel_sends_sync_at_changing_periods_and_stops(port: Port) -> None:
             expected = seconds * 1e9 / period_ns
             assert expected / 2 < cycles < expected + 3
             assert expected / 2 < syncs_of(stranger) < expected + 3
-        assert sync.figures("palm", time.monotonic_ns())["by"] == "kernel"
+        assert sync.report("palm", time.monotonic_ns())["by"] == "kernel"
         assert port.counters.sent == 0  # by the loop
-        assert sync.figures("palm", time.monotonic_ns())["others"] == 0
-        assert sync.figures("palm", time.monotonic_ns())["jitter_us"]["p50"] < 20_000
+        assert sync.report("palm", time.monotonic_ns())["other_syncs"] == 0
+        assert sync.report("palm", time.monotonic_ns())["jitter_us"]["p50"] < 20_000
         sync.stop()
         syncs_of(stranger)
         time.sleep(0.1)  # long enough for five more
         assert syncs_of(stranger) == 0
 
 
-def test_loop_takes_over_while_the_interface_is_gone_and_one_sender_is_left(port: Port) -> None:
+def test_loop_takes_over_while_the_interface_is_missing_and_one_sender_is_left(port: Port) -> None:
     sync = Sync([port], 20_000_000)
     sync.start(time.monotonic_ns())
     produce(sync, port, 0.3)
@@ -197,7 +202,7 @@ def test_loop_takes_over_while_the_interface_is_gone_and_one_sender_is_left(port
     try:
         cycles = produce(sync, port, 1.0)
         assert cycles > 20  # silence of the bus is no silence of the hand
-        assert sync.figures("palm", time.monotonic_ns())["by"] == "loop"
+        assert sync.report("palm", time.monotonic_ns())["by"] == "loop"
         assert port.counters.send_failures > 0
     finally:
         run("ip link add vcan0 type vcan && ip link set vcan0 up")
@@ -205,26 +210,26 @@ def test_loop_takes_over_while_the_interface_is_gone_and_one_sender_is_left(port
     with can.Bus(interface="socketcan", channel="vcan0") as stranger:
         produce(sync, port, 1.0)
         assert 25 < syncs_of(stranger) < 54
-    assert sync.figures("palm", time.monotonic_ns())["by"] == "kernel"
-    assert sync.figures("palm", time.monotonic_ns())["others"] == 0
+    assert sync.report("palm", time.monotonic_ns())["by"] == "kernel"
+    assert sync.report("palm", time.monotonic_ns())["other_syncs"] == 0
     sync.stop()
 
 
-def test_another_sync_producer_is_told(port: Port) -> None:
+def test_other_sync_producer_is_reported(port: Port) -> None:
     sync = Sync([port], 20_000_000)
     sync.start(time.monotonic_ns())
     other = subprocess.Popen(["cangen", "vcan0", "-g", "10", "-I", "080", "-L", "0", "-n", "150"])
     produce(sync, port, 2.5)
     other.wait()
-    figures = sync.figures("palm", time.monotonic_ns())
-    assert figures["others"] > 20
+    figures = sync.report("palm", time.monotonic_ns())
+    assert figures["other_syncs"] > 20
     assert 'sync = "consumer"' in figures["problem"]
     sync.stop()
 
 
-def test_a_flood_of_strangers_costs_no_sample(port: Port) -> None:
+def test_a_flood_of_foreign_frames_costs_no_sample(port: Port) -> None:
     for number in range(12):
         run(f"cangen vcan0 -g 0 -n 400 -I 700 -L 8; cansend vcan0 281#{number:02x}00020003000400")
         port.drain()
     assert (port.counters.frames, port.counters.samples, port.counters.overflow) == (4812, 12, 0)
-    assert port.slab.read()[0, 0] == 11
+    assert port.slab.unpack_counts()[0, 0] == 11

@@ -1,4 +1,4 @@
-"""What control can be asked for: arguments are checked first; what is not done is told with its reason."""
+"""Control commands: arguments are validated first; refused requests get a reason."""
 
 from __future__ import annotations
 
@@ -14,24 +14,29 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from handtouch.calibration.calibration import (
+    Calibration,
+    Gains,
+    LawParameters,
+    Offsets,
+)
 from handtouch.config import ConfigError, Deployment, parse
-from handtouch.daemon.daemon import Daemon
-from handtouch.daemon.model import PadModel
-from handtouch.supervise.calibration import Calibration, Gains, Law, Offsets
+from handtouch.core.pad_model import PadModel
+from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.wire import PadState
 
 PERIOD_NS = 5_000_000
 COMMANDS = ("status", "snapshot", "scene", "tare", "calibrate", "enable", "disable", "reload", "log")
 KEYS = (
     *("pads", "pad", "name", "links", "outputs", "tolerance_mm", "rate_hz", "lease_s", "reset", "gains"),
-    *("offset_counts", "law", "trial", "level", "anything"),
+    *("offset_counts", "law", "dry_run", "level", "anything"),
 )
 VALUES = st.recursive(
     st.none()
     | st.booleans()
     | st.integers(-(2**63), 2**64 - 1)
     | st.floats()
-    | st.sampled_from(["*", "plane", "location", "strength", "raw", "bench-1", "debug", ""])
+    | st.sampled_from(["*", "plane", "position", "force", "raw", "bench-1", "debug", ""])
     | st.binary(max_size=9),
     lambda inner: st.lists(inner, max_size=4),
     max_leaves=8,
@@ -39,13 +44,13 @@ VALUES = st.recursive(
 
 
 class Bench:
-    """A real daemon whose loop is the test: on a bus without nodes, samples are written into its slab."""
+    """A real daemon driven by the test; samples are written to its slab, as its bus has no nodes."""
 
     def __init__(self, deployment: Deployment, model: Any, endpoints: dict[str, str]) -> None:
         settings = deployment.daemon.model_copy(update=endpoints)
         self.deployment = deployment.model_copy(update={"daemon": settings})
-        self.fresh: Callable[[], Deployment] = lambda: self.deployment
-        self.daemon = Daemon(self.deployment, model, lambda: self.fresh())
+        self.reloaded: Callable[[], Deployment] = lambda: self.deployment
+        self.daemon = HandtouchDaemon.open(self.deployment, model, lambda: self.reloaded())
         self.pipeline, self.control = self.daemon.pipeline, self.daemon.control
         self.pipeline.node_state[:] = PadState.CLEAR
         self.t_ns = 10**12
@@ -54,21 +59,21 @@ class Bench:
 
     def tick(self) -> None:
         self.t_ns += PERIOD_NS
-        self.pipeline.begin(self.t_ns, self.t_ns)
+        self.pipeline.begin_cycle(self.t_ns, self.t_ns)
         read = np.rint(self.counts + self._noise.normal(size=self.counts.shape)).astype("<i2")
         for pad, row in enumerate(read):
-            self.pipeline.slab.write(pad, row.tobytes(), self.t_ns + 1000)
-        self.pipeline.advance(self.t_ns + 2000)
-        self.daemon.demand.step(self.t_ns)
+            self.pipeline.slab.write_pdo(pad, row.tobytes(), self.t_ns + 1000)
+        self.pipeline.tick_if_due(self.t_ns + 2000)
+        self.daemon.demand.update(self.t_ns)
 
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """The answer, ticking on until it is there."""
+        """Run ticks until the reply is there, and return it."""
         request = msgpack.packb({"v": 1, "command": command, **arguments})
-        _, answer = self.control.begin(request, self.t_ns)
+        _, answer = self.control.start_request(request, self.t_ns)
         while not isinstance(answer, dict):
             self.tick()
             time.sleep(0 if command == "tare" else 0.001)  # a reload's thread needs its share
-            answer = self.control._try(command, partial(answer.poll, self.t_ns)) or answer
+            answer = self.control._call_command(command, partial(answer.poll, self.t_ns)) or answer
         return dict(msgpack.unpackb(msgpack.packb(answer)))
 
     def pads(self, answer: dict[str, Any]) -> dict[str, Any]:
@@ -88,11 +93,11 @@ def served(bench: Any, endpoints: dict[str, str]) -> Iterator[Bench]:
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(COMMANDS), st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=5))
-def test_any_arguments_are_answered_and_the_tick_goes_on(
+def test_any_arguments_get_a_reply_and_ticks_continue(
     served: Bench, command: str, arguments: dict[str, Any]
 ) -> None:
     request = msgpack.packb({"v": 1, "command": command, **arguments})
-    _, answer = served.control.begin(request, served.t_ns)
+    _, answer = served.control.start_request(request, served.t_ns)
     if isinstance(answer, dict):
         assert msgpack.unpackb(msgpack.packb(answer))["v"] == 1
         assert "failed" not in answer.get("error", "")
@@ -107,15 +112,18 @@ def test_any_arguments_are_answered_and_the_tick_goes_on(
     ("command", "arguments", "why"),
     [
         ("tare", {}, "pads is missing"),
-        ("tare", {"pads": []}, "at least 1"),
+        ("tare", {"pads": []}, "pads = []: must have at least 1 elements"),
         ("tare", {"pads": ["nowhere"]}, 'no pad is named "nowhere"'),
-        ("tare", {"pads": "plane"}, "tuple"),
+        ("tare", {"pads": "plane"}, 'pads = "plane": must be an array'),
+        ("tare", {"pads": [1]}, "pads[0] = 1: must be a string"),
+        ("reload", {"dry_run": "yes"}, 'dry_run = "yes": must be true or false'),
+        ("calibrate", {"pad": "plane", "name": "c", "law": 1}, "law = 1: must be an object"),
         ("scene", {"tolerance": 1}, "tolerance"),
-        ("scene", {"outputs": ["smell"]}, "location"),
-        ("scene", {"tolerance_mm": -1.0}, "greater than or equal to 0"),
+        ("scene", {"outputs": ["smell"]}, "position"),
+        ("scene", {"tolerance_mm": -1.0}, "tolerance_mm = -1.0: must be at least 0"),
         ("scene", {"tolerance_mm": float("nan")}, "tolerance_mm"),
         ("scene", {"links": ["thumb*"]}, "no pad is named"),
-        ("scene", {"reset": True, "rate_hz": 5.0}, "one after the other"),
+        ("scene", {"reset": True, "rate_hz": 5.0}, "send two requests"),
         ("scene", {"name": "a\nb"}, "name"),
         ("calibrate", {"pad": "*", "name": "c", "gains": [1] * 4, "offset_counts": [0] * 4}, "3 pads"),
         ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 3, "offset_counts": [0] * 4}, "gains"),
@@ -124,10 +132,10 @@ def test_any_arguments_are_answered_and_the_tick_goes_on(
         ("calibrate", {"pad": "plane", "gains": [1] * 4}, "name is missing"),
         ("calibrate", {"pad": "plane", "name": "c", "law": {"alpha": 1.5}}, "contact_ohm_mm2 is missing"),
         ("log", {"level": "loud"}, "level"),
-        ("status", {"verbose": True}, "verbose"),
+        ("status", {"verbose": True}, "verbose = true: unknown argument"),
     ],
 )
-def test_what_is_wrong_with_arguments_is_told_and_nothing_changes(
+def test_invalid_arguments_are_refused_in_json_terms_and_change_nothing(
     served: Bench, command: str, arguments: dict[str, Any], why: str
 ) -> None:
     before = served.daemon.demand.scenes.version
@@ -135,10 +143,10 @@ def test_what_is_wrong_with_arguments_is_told_and_nothing_changes(
     assert not answer["ok"]
     assert why in answer["error"]
     assert served.daemon.demand.scenes.version == before
-    assert not served.pipeline.tick.baseline.expected.any()
+    assert not served.pipeline.tick.baseline.expected_counts.any()
 
 
-def test_tare_takes_off_what_an_unloaded_pad_reads(served: Bench) -> None:
+def test_tare_sets_the_offsets_of_an_unloaded_pad(served: Bench) -> None:
     served.counts[0] = [5, -4, 3, 2]
     (pad,) = served.pads(served.ask("tare", pads=["plane"])).values()
     assert (pad["tared"], pad["samples"]) == (True, 200)
@@ -147,19 +155,21 @@ def test_tare_takes_off_what_an_unloaded_pad_reads(served: Bench) -> None:
     for _ in range(100):
         served.tick()
     noise_a = served.pipeline.model.noise_a[0].sum()
-    assert abs(served.pipeline.tick.columns.current_a[0]) < 4 * noise_a
+    assert abs(served.pipeline.tick.columns.total_current_a[0]) < 4 * noise_a
 
 
 @pytest.mark.parametrize(
     ("part", "noise", "why"),
-    [(10.0, 0.0, "touched"), (0.9, 0.0, "from their baseline"), (0.0, 12.0, "scatters")],
+    [(10.0, 0.0, "touched"), (0.9, 0.0, "from the baseline"), (0.0, 12.0, "standard deviation")],
     ids=["touched", "lightly loaded", "noisy"],
 )
 def test_tare_is_refused_with_the_reason(served: Bench, part: float, noise: float, why: str) -> None:
     model = served.pipeline.model
-    for _ in range(60):  # seen untouched before
+    for _ in range(60):  # untouched before
         served.tick()
-    counts = part * model.on_a[0] / 4 / model.ampere_per_count[0]  # of what begins a contact
+    counts = (
+        part * model.begin_threshold_a[0] / 4 / model.ampere_per_count[0]
+    )  # fraction of the begin threshold
     extra = np.random.default_rng(9)
     job = served.daemon.control.commands["tare"]({"pads": ["plane", "round"]}, served.t_ns)
     answer = None
@@ -171,17 +181,17 @@ def test_tare_is_refused_with_the_reason(served: Bench, part: float, noise: floa
     assert not plane["tared"]
     assert why in plane["reason"]
     assert round_["tared"]
-    assert served.pipeline.tick.baseline.expected[0] == pytest.approx(0.0, abs=3.0)
+    assert served.pipeline.tick.baseline.expected_counts[0] == pytest.approx(0.0, abs=3.0)
 
 
-def test_tare_is_refused_where_no_samples_come(served: Bench) -> None:
+def test_tare_is_refused_without_samples(served: Bench) -> None:
     served.pipeline.node_state[2] = PadState.LOST
     pad = served.pads(served.ask("tare", pads=["resisted"]))["resisted"]
     assert not pad["tared"]
     assert "lost" in pad["reason"]
 
 
-def test_a_calibration_scales_and_shifts_what_channels_tell(served: Bench) -> None:
+def test_calibration_scales_and_shifts_currents(served: Bench) -> None:
     served.counts[0] = 200
     served.ask("calibrate", pad="plane", name="c1", gains=[2, 1, 1, 1], offset_counts=[100, 0, 0, 0])
     for _ in range(3):
@@ -189,33 +199,37 @@ def test_a_calibration_scales_and_shifts_what_channels_tell(served: Bench) -> No
     model = served.pipeline.model
     amperes = served.deployment.nodes["n"].full_scale_ma * 1e-3 / 32767
     expected = (2 * 100 + 3 * 200) * amperes
-    assert served.pipeline.tick.columns.current_a[0] == pytest.approx(expected, abs=10 * amperes)
-    assert model.calibration[:2] == ["c1", model.nominal[1]]
+    assert served.pipeline.tick.columns.total_current_a[0] == pytest.approx(expected, abs=10 * amperes)
+    assert model.calibration_ids[:2] == ["c1", model.default_calibration_ids[1]]
 
 
-def test_status_tells_what_is_computed_and_for_whom(served: Bench) -> None:
+def test_status_lists_computed_outputs_and_their_requesters(served: Bench) -> None:
     pads = served.pads(served.ask("status")["scene"] | {"ok": True})
-    assert pads["plane"]["computed"] == ["touched"]
-    assert pads["plane"]["skipped"]["location"] == "nobody subscribed"
+    assert pads["plane"]["computed"] == ["contact"]
+    assert pads["plane"]["not_computed"]["position"] == "no subscriber"
     served.ask("disable", pads=["round"], name="me")
     pads = served.pads(served.ask("scene", links=["plane", "round"]))
-    assert pads["round"]["skipped"]["touched"] == "disabled by me"
-    assert pads["resisted"]["skipped"]["touched"] == "outside every scene"
+    assert pads["round"]["not_computed"]["contact"] == "disabled by me"
+    assert pads["resisted"]["not_computed"]["contact"] == "in no scene"
 
 
-def test_a_snapshot_solves_what_nobody_wants_and_leaves_nothing_behind(served: Bench) -> None:
+def test_snapshot_solves_unrequested_outputs_and_leaves_no_trace(served: Bench) -> None:
     served.counts[0] = 400
     for _ in range(4):
         served.tick()
     columns = served.pipeline.tick.columns
     assert np.isnan(columns.position_m[0]).all()
     (contact,) = served.ask("snapshot")["contacts"]
-    assert (contact["location"], contact["strength"], contact["link"]) == ("valid", "valid", "plane")
+    assert (contact["position_status"], contact["force_status"], contact["link"]) == (
+        "valid",
+        "valid",
+        "plane",
+    )
     assert np.isnan(columns.position_m[0]).all()
-    assert np.isnan(columns.located.view("<f4")).all()
+    assert np.isnan(columns.contact_columns.view("<f4")).all()
 
 
-def test_a_reload_keeps_corrections_and_contacts(served: Bench) -> None:
+def test_reload_keeps_calibrations_and_contacts(served: Bench) -> None:
     served.ask("calibrate", pad="round", name="c1", gains=[1.1] * 4, offset_counts=[2] * 4)
     served.counts[0] = 400
     for _ in range(4):
@@ -230,61 +244,61 @@ def test_a_reload_keeps_corrections_and_contacts(served: Bench) -> None:
         served.tick()
     model = served.pipeline.model
     assert served.pipeline.tick.model is model
-    assert model.calibration[1] == "c1"
-    assert served.pipeline.tick.baseline.expected[1] == pytest.approx(2.0, abs=0.2)
-    assert model.calibration[0] == model.nominal[0]
+    assert model.calibration_ids[1] == "c1"
+    assert served.pipeline.tick.baseline.expected_counts[1] == pytest.approx(2.0, abs=0.2)
+    assert model.calibration_ids[0] == model.default_calibration_ids[0]
     assert int(served.pipeline.tick.contacts.id[0]) == contact
-    assert model.on_a[0] != 0
-    assert served.ask("reload")["tables"] == []  # the new file is the present one now
+    assert model.begin_threshold_a[0] != 0
+    assert served.ask("reload")["tables"] == []  # the new file is applied already
 
 
-def test_a_law_weighs_from_the_next_sample_on_and_what_is_not_given_stays(served: Bench) -> None:
+def test_contact_law_applies_from_the_next_sample_and_other_parts_stay(served: Bench) -> None:
     served.counts[0] = 900.0
     for _ in range(4):
         served.tick()
     model = served.pipeline.model
-    on_a = model.on_a.copy()
+    on_a = model.begin_threshold_a.copy()
     (before,) = served.ask("snapshot")["contacts"]
     file = served.ask("calibrate", pad="plane")
-    assert file["now"] == file["before"] == file["nominal"]
+    assert file["calibration_id"] == file["previous_calibration_id"] == file["default_calibration_id"]
     assert file["law"] == {"contact_ohm_mm2": 20000.0, "alpha": 1.5, "ohm_per_square": 2400.0}
     law = {**file["law"], "contact_ohm_mm2": 20000.0 * 8}
     now = served.ask("calibrate", pad="plane", name="c2", law=law)
-    assert (now["law"], now["gains"], now["now"]) == (law, file["gains"], "c2")
+    assert (now["law"], now["gains"], now["calibration_id"]) == (law, file["gains"], "c2")
     served.tick()
     (after,) = served.ask("snapshot")["contacts"]
-    assert (before["id"], after["calibration"]) == (after["id"], "c2")
+    assert (before["id"], after["calibration_id"]) == (after["id"], "c2")
     assert after["force_n"] == pytest.approx(4 * before["force_n"], rel=0.02)  # 8^(1 / alpha)
-    assert model.on_a[0] == pytest.approx(on_a[0] / 8, rel=0.1)
-    assert (model.on_a[1:] == on_a[1:]).all()
+    assert model.begin_threshold_a[0] == pytest.approx(on_a[0] / 8, rel=0.1)
+    assert (model.begin_threshold_a[1:] == on_a[1:]).all()
     served.ask("calibrate", pad="plane", name="c3", offset_counts=[1] * 4)
     assert served.ask("calibrate", pad="plane")["law"] == law
 
 
-def test_a_calibration_of_the_store_is_applied_whole_and_its_lack_is_the_file_again(served: Bench) -> None:
+def test_stored_calibration_is_applied_whole_and_an_empty_one_restores_the_file(served: Bench) -> None:
     model = served.pipeline.model
     nothing, none = ((0.0,) * 3,) * 3, ((0.0,) * 4,) * 4
-    law, gains = Law(1e4, 1.2, 3000.0, nothing), Gains((1.1, 0.9, 1.0, 1.0), none)
-    on_a = model.on_a.copy()
-    model.apply(0, Calibration(gains, Offsets((1.0,) * 4, (0.1,) * 4), law), "7-1")
-    assert (model.law(0), model.calibration[0], model.gains[0, 0]) == (law, "7-1", 1.1)
-    fresh = PadModel(served.deployment)
-    fresh.take_over(model)
-    assert (fresh.law(0), fresh.on_a[0]) == (law, model.on_a[0])
-    model.apply(0, Calibration(), "7-2")
+    law, gains = LawParameters(1e4, 1.2, 3000.0, nothing), Gains((1.1, 0.9, 1.0, 1.0), none)
+    on_a = model.begin_threshold_a.copy()
+    model.apply_calibration(0, Calibration(gains, Offsets((1.0,) * 4, (0.1,) * 4), law), "7-1")
+    assert (model.law(0), model.calibration_ids[0], model.gains[0, 0]) == (law, "7-1", 1.1)
+    new_model = PadModel(served.deployment)
+    new_model.copy_calibrations(model)
+    assert (new_model.law(0), new_model.begin_threshold_a[0]) == (law, model.begin_threshold_a[0])
+    model.apply_calibration(0, Calibration(), "7-2")
     assert model.law(0).ohm_per_square == 2400.0
-    assert model.on_a == pytest.approx(on_a)
+    assert model.begin_threshold_a == pytest.approx(on_a)
 
 
-def test_a_trial_changes_nothing(served: Bench) -> None:
+def test_dry_run_changes_nothing(served: Bench) -> None:
     _change_sheet(served)
     model = served.pipeline.model
-    assert served.ask("reload", trial=True)["tables"] == ["sheet.s"]
+    assert served.ask("reload", dry_run=True)["tables"] == ["sheet.s"]
     assert served.pipeline.model is model
-    assert served.ask("reload", trial=True)["tables"] == ["sheet.s"]
+    assert served.ask("reload", dry_run=True)["tables"] == ["sheet.s"]
 
 
-def test_a_reload_refuses_what_needs_a_restart_or_is_wrong(served: Bench) -> None:
+def test_reload_refuses_changes_that_need_a_restart_and_invalid_files(served: Bench) -> None:
     present = served.deployment
     (hand,) = present.hands
 
@@ -295,16 +309,16 @@ def test_a_reload_refuses_what_needs_a_restart_or_is_wrong(served: Bench) -> Non
     def broken() -> Deployment:
         return parse("nonsense = 1")
 
-    for fresh, why in (
+    for reloaded, why in (
         (lambda: with_pad(node_id=9), "the node of h/plane"),
         (lambda: with_pad(electrodes=("xa", "x0", "y0", "yb")), "wiring"),
         (lambda: with_pad(link="other"), "the pads or their order"),
         (broken, "nonsense"),
     ):
-        served.fresh = fresh
+        served.reloaded = reloaded
         answer = served.ask("reload")
         assert not answer["ok"]
-        assert "nothing is changed" in answer["error"]
+        assert "nothing changed" in answer["error"]
         assert why in answer["error"]
     with pytest.raises(ConfigError):
         broken()
@@ -313,4 +327,4 @@ def test_a_reload_refuses_what_needs_a_restart_or_is_wrong(served: Bench) -> Non
 def _change_sheet(served: Bench) -> None:
     sheet = served.deployment.sheets["s"].model_copy(update={"ohm_per_square": 3000.0})
     changed = served.deployment.model_copy(update={"sheets": {"s": sheet}})
-    served.fresh = lambda: changed
+    served.reloaded = lambda: changed

@@ -1,4 +1,4 @@
-"""The control endpoint: every request is answered or counted, whatever its bytes, and nothing stops it."""
+"""Control endpoint: every request gets a reply or is counted, whatever its bytes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ import zmq
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from handtouch.daemon.control import LARGEST_BYTES, MOST_JOBS, Control, RefusedError
+from handtouch.daemon.control import (
+    MAX_JOBS,
+    MAX_REQUEST_BYTES,
+    ControlServer,
+    RefusedError,
+)
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
@@ -24,8 +29,8 @@ VALUES = st.recursive(
 )
 
 
-class Later:
-    """A job that is done when told."""
+class PendingJob:
+    """A job that ends when `answer` is set."""
 
     def __init__(self) -> None:
         self.answer: dict[str, Any] | None = None
@@ -37,12 +42,12 @@ class Later:
 
 
 class Bench:
-    """A control endpoint with a quick command, one that refuses, one that fails and one that takes long."""
+    """A control endpoint with a quick command, one that refuses, one that fails and a long one."""
 
     def __init__(self) -> None:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.control = Control(self.context, "tcp://127.0.0.1:*")
-        self.jobs: list[Later] = []
+        self.control = ControlServer.open(self.context, "tcp://127.0.0.1:*")
+        self.jobs: list[PendingJob] = []
         self.control.commands.update(
             quick=lambda arguments, now_ns: {"arguments": arguments, "now_ns": now_ns},
             refusing=self._refuse,
@@ -55,8 +60,8 @@ class Bench:
     def _refuse(self, _: dict[str, Any], __: int) -> dict[str, Any]:
         raise RefusedError("not now")
 
-    def _begin(self, _: dict[str, Any], __: int) -> Later:
-        self.jobs.append(Later())
+    def _begin(self, _: dict[str, Any], __: int) -> PendingJob:
+        self.jobs.append(PendingJob())
         return self.jobs[-1]
 
     def asker(self, kind: int = zmq.REQ) -> zmq.Socket[bytes]:
@@ -70,7 +75,7 @@ class Bench:
         self.control.poll(self.now_ns)
 
     def answer(self, asker: zmq.Socket[bytes]) -> dict[str, Any]:
-        """Poll until the answer is there."""
+        """Poll until the reply arrives."""
         for _ in range(3000):
             self.poll()
             if asker.poll(1):
@@ -93,7 +98,7 @@ def bench() -> Iterator[Bench]:
     made.context.destroy(0)
 
 
-def test_a_command_gets_its_arguments_and_its_answer_says_ok(bench: Bench) -> None:
+def test_command_gets_its_arguments_and_the_reply_is_ok(bench: Bench) -> None:
     answer = bench.ask({"command": "quick", "x": [1, "a"]})
     assert (answer["v"], answer["ok"], answer["arguments"]) == (1, True, {"x": [1, "a"]})
 
@@ -108,19 +113,17 @@ def test_a_command_gets_its_arguments_and_its_answer_says_ok(bench: Bench) -> No
         (b"\x91" * 5000 + b"\x01", "malformed"),
         (msgpack.packb({"v": 1}), "not a string"),
         (msgpack.packb({"command": "quick"}), "version v = None"),
-        (msgpack.packb({"v": 2, "command": "quick"}), "speaks v = 1"),
-        (msgpack.packb({"v": True, "command": "quick"}), "speaks v = 1"),
+        (msgpack.packb({"v": 2, "command": "quick"}), "supports v = 1"),
+        (msgpack.packb({"v": True, "command": "quick"}), "supports v = 1"),
         (msgpack.packb({"v": 1, "command": ["quick"]}), "not a string"),
         (msgpack.packb({"v": 1, "command": "nonsense"}), "unknown command"),
-        (msgpack.packb({"v": 1, "command": "quick", "x": b"x" * LARGEST_BYTES}), "at most"),
+        (msgpack.packb({"v": 1, "command": "quick", "x": b"x" * MAX_REQUEST_BYTES}), "the limit is"),
         (msgpack.packb({"v": 1, "command": "refusing"}), "refusing: not now"),
         (msgpack.packb({"v": 1, "command": "failing"}), "failing failed: division by zero"),
-        (msgpack.packb({"v": 1, "command": "unpackable"}), "can't be packed"),
+        (msgpack.packb({"v": 1, "command": "unpackable"}), "can't be encoded"),
     ],
 )
-def test_what_is_wrong_with_a_request_is_answered_and_counted(
-    bench: Bench, request_: bytes, why: str
-) -> None:
+def test_invalid_request_gets_an_error_reply_and_is_counted(bench: Bench, request_: bytes, why: str) -> None:
     before = bench.control.refused
     answer = bench.ask(request_)
     assert (answer["v"], answer["ok"]) == (1, False)
@@ -131,10 +134,10 @@ def test_what_is_wrong_with_a_request_is_answered_and_counted(
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=200) | VALUES.map(msgpack.packb))
-@example(b"\xc7\x0c\xff" + b"\xff" * 12)  # a timestamp that is none
+@example(b"\xc7\x0c\xff" + b"\xff" * 12)  # an invalid timestamp
 @example(b"\xd6\xff\x00\x00\x00\x00")
-def test_any_bytes_get_an_answer(bench: Bench, data: bytes) -> None:
-    _, answer = bench.control.begin(data, 0)
+def test_any_bytes_get_a_reply(bench: Bench, data: bytes) -> None:
+    _, answer = bench.control.start_request(data, 0)
     assert isinstance(answer, dict)
     assert answer["v"] == 1
     msgpack.packb(answer)
@@ -142,7 +145,7 @@ def test_any_bytes_get_an_answer(bench: Bench, data: bytes) -> None:
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=5))
-def test_any_parts_from_any_socket_leave_the_endpoint_at_work(bench: Bench, parts: list[bytes]) -> None:
+def test_any_parts_from_any_socket_leave_the_endpoint_working(bench: Bench, parts: list[bytes]) -> None:
     with bench.asker(zmq.DEALER) as stranger:
         stranger.send_multipart(parts)
         if parts[0] == b"" and len(parts) > 1:
@@ -150,7 +153,7 @@ def test_any_parts_from_any_socket_leave_the_endpoint_at_work(bench: Bench, part
     assert bench.ask({"command": "quick"})["ok"]
 
 
-def test_a_long_command_keeps_nobody_waiting_and_answers_when_it_is_done(bench: Bench) -> None:
+def test_long_command_blocks_no_other_client_and_replies_when_done(bench: Bench) -> None:
     with bench.asker() as patient:
         patient.send(msgpack.packb({"v": 1, "command": "long"}))
         while not bench.jobs:
@@ -163,13 +166,13 @@ def test_a_long_command_keeps_nobody_waiting_and_answers_when_it_is_done(bench: 
     bench.jobs.clear()
 
 
-def test_jobs_are_bounded_and_outlive_the_client_that_asked(bench: Bench) -> None:
-    askers = [bench.asker() for _ in range(MOST_JOBS)]
+def test_jobs_are_bounded_and_outlive_their_client(bench: Bench) -> None:
+    askers = [bench.asker() for _ in range(MAX_JOBS)]
     for asker in askers:
         asker.send(msgpack.packb({"v": 1, "command": "long"}))
-    while len(bench.jobs) < MOST_JOBS:
+    while len(bench.jobs) < MAX_JOBS:
         bench.poll()
-    assert "under way" in bench.ask({"command": "quick"})["error"]
+    assert "in progress" in bench.ask({"command": "quick"})["error"]
     for asker in askers:
         asker.close()
     for job in bench.jobs:
@@ -179,7 +182,7 @@ def test_jobs_are_bounded_and_outlive_the_client_that_asked(bench: Bench) -> Non
     bench.jobs.clear()
 
 
-def test_a_flood_is_answered_a_few_at_a_time(bench: Bench) -> None:
+def test_flood_is_answered_a_few_requests_per_poll(bench: Bench) -> None:
     with bench.asker(zmq.DEALER) as flood:
         for _ in range(50):
             flood.send_multipart([b"", msgpack.packb({"v": 1, "command": "quick"})])
@@ -191,14 +194,14 @@ def test_a_flood_is_answered_a_few_at_a_time(bench: Bench) -> None:
             while flood.poll(2):
                 flood.recv_multipart()
                 arrived += 1
-            assert arrived <= 4  # two polls' worth, should one be slow
+            assert arrived <= 4  # of two polls, if one is slow
             answers += arrived
 
 
-def test_who_waits_while_the_daemon_stops_is_told() -> None:
+def test_waiting_client_gets_an_error_when_the_daemon_stops() -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    control = Control(context, "tcp://127.0.0.1:*")
-    control.commands["long"] = lambda _, __: Later()
+    control = ControlServer.open(context, "tcp://127.0.0.1:*")
+    control.commands["long"] = lambda _, __: PendingJob()
     with context.socket(zmq.REQ) as asker:
         asker.connect(control.endpoint)
         asker.send(msgpack.packb({"v": 1, "command": "long"}))
@@ -206,5 +209,5 @@ def test_who_waits_while_the_daemon_stops_is_told() -> None:
             control.poll(0)
         control.close()
         assert asker.poll(10_000)
-        assert "stops" in msgpack.unpackb(asker.recv())["error"]
+        assert "stopping" in msgpack.unpackb(asker.recv())["error"]
     context.destroy(0)

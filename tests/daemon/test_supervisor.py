@@ -1,4 +1,4 @@
-"""The daemon's side of the slow half: it does what is said whole or not at all, and never waits for it."""
+"""The daemon's side of supervision: messages are applied whole or not at all, without blocking."""
 
 from __future__ import annotations
 
@@ -14,41 +14,50 @@ import numpy as np
 import pytest
 
 from handtouch import wire
+from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.config import Behaviour
-from handtouch.daemon.pipeline import Pipeline
-from handtouch.daemon.process import Process
-from handtouch.daemon.supervisor import Supervisor
-from handtouch.supervise.link import Alive, Calibrate, Finding, Judged, Word, write_word
+from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.supervisor_client import SupervisorClient
+from handtouch.daemon.supervisor_process import SupervisorProcess
+from handtouch.supervisor.ipc import (
+    CalibrationAssessment,
+    CalibrationUpdate,
+    WorkerMessage,
+    WorkerStatus,
+    pack_worker_message,
+)
 from handtouch.wire import PadState
+from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.faults import FaultKind
 
 PERIOD_NS = 5_000_000
 SECOND_NS = 1_000_000_000
-GUM = Finding(kind="stuck contact", cause="chewing gum", evidence="60 s", remedy="wipe it", since_ns=1)
+GUM = Diagnosis(kind=FaultKind.GUM, cause="chewing gum", evidence="60 s", remedy="wipe it", since_ns=1)
 
 
-class Said:
-    """Stands for a process whose words are the test's."""
+class FakeProcess:
+    """A stand-in for the process, with messages from the test."""
 
     def __init__(self) -> None:
         self.waiting: list[bytes] = []
         self.sent: list[bytes] = []
-        self.pid, self.state, self.restarts, self.dropped, self.why = 1, "running", 0, 0, ""
+        self.pid, self.state, self.restarts, self.dropped, self.exit_reason = 1, "running", 0, 0, ""
 
-    def step(self, now_ns: int) -> bool:  # noqa: ARG002
+    def poll(self, now_ns: int) -> bool:  # noqa: ARG002
         return False
 
     def send(self, message: bytes) -> bool:
         self.sent.append(message)
         return True
 
-    def words(self, now_ns: int) -> list[bytes]:  # noqa: ARG002
-        said, self.waiting = self.waiting, []
-        return said
+    def receive(self, now_ns: int) -> list[bytes]:  # noqa: ARG002
+        received, self.waiting = self.waiting, []
+        return received
 
 
 class Nodes:
-    """A master that knows the serial numbers that it is told."""
+    """A master with given serial numbers."""
 
     def __init__(self, serials: list[int | None]) -> None:
         self.serials = serials
@@ -57,13 +66,13 @@ class Nodes:
         return [type("Status", (), {"serial": serial}) for serial in self.serials]
 
 
-class Listener:
+class LastMessages:
     """Keeps the last message of each topic."""
 
     def __init__(self) -> None:
         self.last: dict[str, Any] = {}
 
-    def wants(self, topic: str) -> bool:
+    def has_subscriber(self, topic: str) -> bool:
         return topic.startswith(("contact/", "hand/"))
 
     def send(self, message: Any) -> None:
@@ -73,25 +82,27 @@ class Listener:
 
 class Rig:
     def __init__(self, bench: Any) -> None:
-        self.heard = Listener()
-        self.pipeline = Pipeline(type(bench.model)(bench.deployment), PERIOD_NS, 0.6, self.heard)
+        self.published = LastMessages()
+        self.pipeline = Pipeline(type(bench.model)(bench.deployment), PERIOD_NS, 0.6, self.published)
         self.pipeline.node_state[:] = PadState.CLEAR
-        self.nodes, self.process = Nodes([11, 12, 13]), Said()
+        self.nodes, self.process = Nodes([11, 12, 13]), FakeProcess()
         arguments: tuple[Any, ...] = (bench.deployment, self.pipeline, self.nodes, "", self.process)
-        self.supervisor = Supervisor(*arguments)
+        self.supervisor = SupervisorClient(*arguments)
         self.t_ns = SECOND_NS
         self.touched = False
-        """whether somebody touches the first pad"""
+        """True while the first pad is touched"""
         self._counts = bench.counts(0, 0.4, 0.6, 1e-3).astype("<i2").tobytes()
-        self.swap(0, None, 11)  # the first time that anybody is known
+        self.swap(0, None, 11)  # the first known node
 
     def swap(self, pad: int, before: int | None, after: int | None) -> None:
         self.nodes.serials[pad] = after
-        self.supervisor.note([SerialChanged(pad, self.t_ns, before, after)], self.t_ns)
+        self.supervisor.handle_node_events([SerialChanged(pad, self.t_ns, before, after)], self.t_ns)
 
-    def hear(self, *words: Word | bytes) -> None:
-        """Until the next words are taken."""
-        self.process.waiting = [word if isinstance(word, bytes) else write_word(word) for word in words]
+    def receive(self, *messages: WorkerMessage | bytes) -> None:
+        """Deliver messages to the supervisor client."""
+        self.process.waiting = [
+            message if isinstance(message, bytes) else pack_worker_message(message) for message in messages
+        ]
         while self.process.waiting:
             self.step()
         for _ in range(10):
@@ -99,18 +110,18 @@ class Rig:
 
     def step(self) -> None:
         self.t_ns += PERIOD_NS
-        self.pipeline.begin(self.t_ns, self.t_ns)
+        self.pipeline.begin_cycle(self.t_ns, self.t_ns)
         for pad in range(3):
             counts = self._counts if self.touched and pad == 0 else b"\0" * 8
-            self.pipeline.slab.write(pad, counts, self.t_ns + 1000)
-        self.pipeline.advance(self.t_ns + PERIOD_NS)
-        self.supervisor.step(self.t_ns)
+            self.pipeline.slab.write_pdo(pad, counts, self.t_ns + 1000)
+        self.pipeline.tick_if_due(self.t_ns + PERIOD_NS)
+        self.supervisor.process_tick(self.t_ns)
 
     def contact(self) -> Any:
-        return self.heard.last["contact/h/plane"]
+        return self.published.last["contact/h/plane"]
 
     def frame(self) -> Any:
-        return self.heard.last["hand/h"]
+        return self.published.last["hand/h"]
 
 
 @pytest.fixture
@@ -118,202 +129,232 @@ def rig(bench: Any) -> Rig:
     return Rig(bench)
 
 
-def calibrate(pad: int, serial: int, **changes: Any) -> Calibrate:
+def calibrate(pad: int, serial: int, **changes: Any) -> CalibrationUpdate:
     gains = {"gains": (1.1, 1.0, 1.0, 0.9), "covariance": tuple((1e-4 * np.eye(4)).ravel().tolist())}
-    return Calibrate(**{"pad": pad, "serial": serial, "name": f"{serial}-1", **gains, **changes})
+    return CalibrationUpdate(
+        **{"pad": pad, "serial": serial, "calibration_id": f"{serial}-1", **gains, **changes}
+    )
 
 
-def test_a_calibration_is_applied_whole(rig: Rig) -> None:
-    rig.hear(calibrate(1, 12, offset_counts=(3.0, 4.0, 5.0, 6.0), offset_std=(0.5,) * 4))
+def test_calibration_is_applied_whole(rig: Rig) -> None:
+    rig.receive(calibrate(1, 12, offset_counts=(3.0, 4.0, 5.0, 6.0), offset_std=(0.5,) * 4))
     model = rig.pipeline.model
     assert model.gains[1].tolist() == [1.1, 1.0, 1.0, 0.9]
-    assert model.calibration[1] == "12-1"
+    assert model.calibration_ids[1] == "12-1"
     assert np.diag(model.gain_covariance[1]).tolist() == [1e-4] * 4
-    assert rig.pipeline.tick.baseline.expected[1].tolist() == [3.0, 4.0, 5.0, 6.0]
-    assert rig.supervisor.changed >= {1}
+    assert rig.pipeline.tick.baseline.expected_counts[1].tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert rig.supervisor.changed_pads >= {1}
 
 
-def test_what_a_person_gave_is_told_to_the_slow_half_until_it_knows_better(rig: Rig) -> None:
-    def told() -> list[dict[str, Any]]:
-        return [m for m in map(msgpack.unpackb, rig.process.sent) if m["kind"] == "put"]
+def test_manual_calibration_is_sent_until_a_better_one_is_estimated(rig: Rig) -> None:
+    def sent() -> list[dict[str, Any]]:
+        return [m for m in map(msgpack.unpackb, rig.process.sent) if m["kind"] == "manual_calibration"]
 
-    rig.pipeline.model.calibrate(1, np.array([1.1, 1.0, 1.0, 0.9]), "bench-1")
-    rig.supervisor.put(1, {"gains"})
-    assert told()[-1]["given"] == ["gains"]
-    word = Calibrate.model_validate(told()[-1]["word"])
-    assert (word.serial, word.name, word.gains) == (12, "bench-1", (1.1, 1.0, 1.0, 0.9))
+    rig.pipeline.model.set_gains_and_law(1, np.array([1.1, 1.0, 1.0, 0.9]), "bench-1")
+    rig.supervisor.register_manual_calibration(1, {"gains"})
+    assert sent()[-1]["given"] == ["gains"]
+    update = CalibrationUpdate.model_validate_json(sent()[-1]["update"])
+    assert (update.serial, update.calibration_id, update.gains) == (12, "bench-1", (1.1, 1.0, 1.0, 0.9))
     assert np.diag(rig.pipeline.model.gain_covariance[1]) == pytest.approx([0.01**2 * 0.75] * 4)
-    rig.swap(0, 11, 11)  # as after a new start of the slow half, which applies what is stored first
-    rig.hear(calibrate(1, 12), word)
-    assert (len(told()), rig.pipeline.model.calibration[1]) == (2, "bench-1")
-    rig.hear(calibrate(1, 12))  # contacts have told more
+    rig.swap(0, 11, 11)  # as after a restart of the process, which applies stored calibrations first
+    rig.receive(calibrate(1, 12), update)
+    assert (len(sent()), rig.pipeline.model.calibration_ids[1]) == (2, "bench-1")
+    rig.receive(calibrate(1, 12))  # estimated from contacts
     rig.swap(0, 11, 11)
-    assert len(told()) == 2
+    assert len(sent()) == 2
 
 
 @pytest.mark.parametrize(
-    ("word", "counter"),
+    ("message", "counter"),
     [
-        (b"\xc1 no word", "malformed"),
+        (b"\xc1 malformed", "malformed"),
         (calibrate(3, 13), "malformed"),  # no such pad
         (calibrate(1, 12, offset_counts=(2e4, 0.0, 0.0, 0.0)), "malformed"),  # beyond half the range
-        (calibrate(1, 99), "late"),  # another unit's
-        (Judged(pad=1, serial=99, trust="trusted"), "late"),
+        (calibrate(1, 99), "late"),  # of another node
+        (CalibrationAssessment(pad=1, serial=99, calibration_state=CalibrationState.CALIBRATED), "late"),
     ],
 )
-def test_what_makes_no_sense_is_counted_and_changes_nothing(
-    rig: Rig, word: Word | bytes, counter: str
+def test_invalid_message_is_counted_and_changes_nothing(
+    rig: Rig, message: WorkerMessage | bytes, counter: str
 ) -> None:
-    rig.hear(word)
-    assert rig.supervisor.figures()[counter] == 1
+    rig.receive(message)
+    assert rig.supervisor.statistics()[counter] == 1
     assert (rig.pipeline.model.gains == 1).all()
-    assert rig.pipeline.model.calibration == rig.pipeline.model.nominal
+    assert rig.pipeline.model.calibration_ids == rig.pipeline.model.default_calibration_ids
 
 
-def test_a_swapped_unit_is_in_quarantine_before_anybody_says_so(rig: Rig) -> None:
-    rig.hear(calibrate(0, 11))
+def test_replaced_node_is_quarantined_at_once(rig: Rig) -> None:
+    rig.receive(calibrate(0, 11))
     rig.swap(0, 11, 21)
     model = rig.pipeline.model
     assert model.quarantined.tolist() == [True, False, False]
     assert model.gains[0].tolist() == [1.0] * 4
-    assert model.calibration[0] == model.nominal[0]
-    assert rig.supervisor.told(0)["trust"] == "quarantined"
-    rig.hear(calibrate(0, 11))  # said of the one before
+    assert model.calibration_ids[0] == model.default_calibration_ids[0]
+    assert rig.supervisor.health_fields(0)["calibration_state"] == "quarantined"
+    rig.receive(calibrate(0, 11))  # about the previous node
     assert rig.supervisor.late == 1
     assert model.gains[0].tolist() == [1.0] * 4
-    rig.hear(calibrate(0, 21), Judged(pad=0, serial=21, trust="trusted"))
+    rig.receive(
+        calibrate(0, 21),
+        CalibrationAssessment(pad=0, serial=21, calibration_state=CalibrationState.CALIBRATED),
+    )
     assert model.quarantined.tolist() == [False] * 3
-    assert rig.supervisor.told(0) == {
-        "trust": "trusted", "calibration": "21-1", "calibrating": "", "findings": (),
+    assert rig.supervisor.health_fields(0) == {
+        "calibration_state": "calibrated", "calibration_id": "21-1",
+        "calibration_progress": "", "diagnoses": (),
     }  # fmt: skip
 
 
-def test_a_unit_without_a_number_is_a_swap_too(rig: Rig) -> None:
+def test_node_without_serial_number_counts_as_replaced(rig: Rig) -> None:
     rig.swap(0, 11, None)
     assert rig.pipeline.model.quarantined[0]
 
 
-def test_a_finding_is_told_with_all_its_words_and_its_end_too(rig: Rig, caplog: Any) -> None:
-    caplog.set_level("INFO", "handtouch.supervise")
-    rig.hear(Judged(pad=2, serial=13, trust="nominal", findings=(GUM,)))
-    assert rig.supervisor.told(2)["findings"][0]["remedy"] == "wipe it"
-    assert "chewing gum (60 s): wipe it" in caplog.text
-    rig.hear(Judged(pad=2, serial=13, trust="nominal"))
-    assert rig.supervisor.told(2)["findings"] == ()
-    assert "stuck contact: over" in caplog.text
+def test_diagnosis_is_published_and_logged_and_its_end_too(rig: Rig, caplog: Any) -> None:
+    caplog.set_level("INFO", "handtouch.supervisor")
+    rig.receive(
+        CalibrationAssessment(pad=2, serial=13, calibration_state=CalibrationState.DEFAULT, diagnoses=(GUM,))
+    )
+    assert rig.supervisor.health_fields(2)["diagnoses"][0]["remedy"] == "wipe it"
+    assert "chewing gum (60 s); wipe it" in caplog.text
+    rig.receive(CalibrationAssessment(pad=2, serial=13, calibration_state=CalibrationState.DEFAULT))
+    assert rig.supervisor.health_fields(2)["diagnoses"] == ()
+    assert "gum: cleared" in caplog.text
 
 
-def test_a_fault_takes_force_and_certainty_and_gives_them_back(rig: Rig) -> None:
-    rig.hear(calibrate(2, 13))
+def test_fault_invalidates_force_and_position_until_it_ends(rig: Rig) -> None:
+    rig.receive(calibrate(2, 13))
     before = rig.pipeline.model.gain_covariance[2].copy()
-    broken = GUM.model_copy(update={"location": False, "strength": False})
-    rig.hear(Judged(pad=2, serial=13, trust="trusted", findings=(broken,)))
+    broken = replace(GUM, position_valid=False, force_valid=False)
+    rig.receive(
+        CalibrationAssessment(
+            pad=2, serial=13, calibration_state=CalibrationState.CALIBRATED, diagnoses=(broken,)
+        )
+    )
     assert rig.pipeline.model.quarantined[2]
     assert rig.pipeline.model.gain_covariance[2].max() > 100 * before.max()
-    rig.hear(Judged(pad=2, serial=13, trust="trusted"))
+    rig.receive(CalibrationAssessment(pad=2, serial=13, calibration_state=CalibrationState.CALIBRATED))
     assert not rig.pipeline.model.quarantined[2]
     assert (rig.pipeline.model.gain_covariance[2] == before).all()
 
 
-def test_contacts_say_of_what_findings_make_of_them_while_those_last(rig: Rig) -> None:
-    spoiled = {"location": False, "strength": False}
-    rig.hear(calibrate(0, 11), Judged(pad=0, serial=11, trust="trusted"))
+def test_contacts_carry_the_effects_of_diagnoses_while_they_last(rig: Rig) -> None:
+    rig.receive(
+        calibrate(0, 11),
+        CalibrationAssessment(pad=0, serial=11, calibration_state=CalibrationState.CALIBRATED),
+    )
     rig.touched = True
-    rig.hear(Judged(pad=0, serial=11, trust="trusted", findings=(GUM,)))
-    assert rig.contact().location == rig.contact().strength == "valid"
-    assert (rig.contact().findings, rig.frame().doubtful) == ((), b"")
-    torn = GUM.model_copy(update={"kind": "torn corner", **spoiled})
-    rig.hear(Judged(pad=0, serial=11, trust="trusted", findings=(GUM, torn)))
+    rig.receive(
+        CalibrationAssessment(
+            pad=0, serial=11, calibration_state=CalibrationState.CALIBRATED, diagnoses=(GUM,)
+        )
+    )
+    assert rig.contact().position_status == rig.contact().force_status == "valid"
+    assert (rig.contact().diagnoses, rig.frame().position_status[0]) == ((), wire.PositionStatus.VALID)
+    torn = replace(GUM, kind=FaultKind.TORN_CORNER, position_valid=False, force_valid=False)
+    rig.receive(
+        CalibrationAssessment(
+            pad=0, serial=11, calibration_state=CalibrationState.CALIBRATED, diagnoses=(GUM, torn)
+        )
+    )
     contact = rig.contact()
-    assert (contact.location, contact.strength, contact.force_n) == ("doubtful", "invalid", None)
+    assert (contact.position_status, contact.force_status, contact.force_n) == ("unreliable", "invalid", None)
     assert contact.position_m is not None
-    assert contact.findings == ("torn corner",)
-    assert rig.frame().doubtful == b"\1\0\0"
-    rig.hear(Judged(pad=0, serial=11, trust="trusted"))
+    assert contact.diagnoses == ("torn_corner",)
+    assert rig.frame().position_status == bytes([wire.PositionStatus.UNRELIABLE, 0, 0])
+    rig.receive(CalibrationAssessment(pad=0, serial=11, calibration_state=CalibrationState.CALIBRATED))
     contact = rig.contact()
-    assert (contact.location, contact.strength, contact.findings) == ("valid", "valid", ())
+    assert (contact.position_status, contact.force_status, contact.diagnoses) == ("valid", "valid", ())
     rig.swap(0, 11, 21)
-    rig.hear()
+    rig.receive()
     rig.step()
     contact = rig.contact()
-    assert (contact.location, contact.strength, contact.findings) == ("valid", "invalid", ("swapped unit",))
+    assert (contact.position_status, contact.force_status, contact.diagnoses) == (
+        "valid",
+        "invalid",
+        ("node_replaced",),
+    )
 
 
-def test_a_fading_sheet_rests_tells_so_and_wakes_when_the_hand_is_touched(bench: Any, caplog: Any) -> None:
-    caplog.set_level("INFO", "handtouch.supervise")
+def test_excitation_of_a_fading_sheet_is_off_until_the_hand_is_touched(bench: Any, caplog: Any) -> None:
+    caplog.set_level("INFO", "handtouch.supervisor")
     sheet = bench.deployment.sheets["s"].model_copy(update={"behaviour": Behaviour()})
-    scene = bench.deployment.scene.model_copy(update={"rest_after_s": 1.0})
+    scene = bench.deployment.scene.model_copy(update={"excitation_off_after_s": 1.0})
     fading = bench.deployment.model_copy(update={"sheets": {"s": sheet}, "scene": scene})
     rig = Rig(replace(bench, deployment=fading))
-    rested: list[int] = []
-    rig.supervisor.rested = rested.append
-    rig.pipeline.tick.strength.assume(1, 2.0, 0.1)
+    switched: list[int] = []
+    rig.supervisor._on_excitation_changed = switched.append
+    rig.pipeline.tick.sheet_force.set_back_force(1, 2.0, 0.1)
     for _ in range(450):
         rig.step()
-    assert rig.supervisor.turns.resting.tolist() == [False, True, False]
-    (finding,) = rig.supervisor.told(1)["findings"]
-    assert finding["kind"] == "fading sheet"
-    assert "2.00 N" in finding["evidence"]
-    assert "touch another pad" in finding["remedy"]
-    assert 1 in rig.supervisor.changed
-    assert "h/round: rests without potential" in caplog.text
+    assert rig.supervisor.excitation.off.tolist() == [False, True, False]
+    (diagnosis,) = rig.supervisor.health_fields(1)["diagnoses"]
+    assert diagnosis["kind"] == "sheet_adapted"
+    assert "2.00 N" in diagnosis["evidence"]
+    assert "touch another pad" in diagnosis["remedy"]
+    assert 1 in rig.supervisor.changed_pads
+    assert "h/round: excitation off" in caplog.text
     rig.touched = True
-    rig.hear()
+    rig.receive()
     rig.step()
-    assert not rig.supervisor.turns.resting.any()
-    assert rig.supervisor.told(1)["findings"] == ()
-    assert "h/round: is awake again" in caplog.text
-    assert len(rested) == 2
+    assert not rig.supervisor.excitation.off.any()
+    assert rig.supervisor.health_fields(1)["diagnoses"] == ()
+    assert "h/round: excitation on again" in caplog.text
+    assert len(switched) == 2
 
 
-def test_its_state_is_told(rig: Rig) -> None:
-    rig.hear(Alive(t_ns=rig.t_ns - SECOND_NS, word="3 nominal", store="the store is damaged"))
-    figures = rig.supervisor.figures()
-    assert figures["word"] == "3 nominal"
-    assert figures["store"] == "the store is damaged"
-    assert figures["lag_s"] >= 1.0
+def test_state_of_the_process_is_published(rig: Rig) -> None:
+    rig.receive(
+        WorkerStatus(
+            processed_ns=rig.t_ns - SECOND_NS, summary="3 nominal", store_error="the store is damaged"
+        )
+    )
+    statistics = rig.supervisor.statistics()
+    assert statistics["summary"] == "3 nominal"
+    assert statistics["store_error"] == "the store is damaged"
+    assert statistics["lag_s"] >= 1.0
 
 
 # The process itself -----------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def process() -> Iterator[Process]:
-    made = Process(lambda: b"this is no deployment")
+def process() -> Iterator[SupervisorProcess]:
+    made = SupervisorProcess(lambda: b"not a deployment")
     yield made
     made.close()
 
 
-def until(process: Process, state: str, t_ns: int) -> int:
+def until(process: SupervisorProcess, state: str, t_ns: int) -> int:
     for _ in range(3000):
-        process.step(t_ns)
-        process.words(t_ns)
+        process.poll(t_ns)
+        process.receive(t_ns)
         if process.state == state:
             return t_ns
         time.sleep(0.01)
     raise AssertionError(f"never {state}: {process.state}")
 
 
-def test_one_that_dies_is_started_again_after_growing_pauses(process: Process) -> None:
+def test_exited_process_is_restarted_after_growing_delays(process: SupervisorProcess) -> None:
     process.start(0)
-    pauses = []
+    delays = []
     now_ns = 0
     for _ in range(3):
         until(process, "running", now_ns)
         os.kill(process.pid or 0, signal.SIGKILL)
         until(process, "waiting", now_ns)
-        pause_ns = 0
+        delay_ns = 0
         while process.state == "waiting":
             now_ns += SECOND_NS // 2
-            pause_ns += SECOND_NS // 2
-            process.step(now_ns)
-        pauses.append(pause_ns / SECOND_NS)
-    assert pauses == [1.0, 2.0, 4.0]
+            delay_ns += SECOND_NS // 2
+            process.poll(now_ns)
+        delays.append(delay_ns / SECOND_NS)
+    assert delays == [1.0, 2.0, 4.0]
     assert process.restarts == 3
 
 
-def test_one_that_is_not_there_takes_nothing_and_says_nothing(process: Process) -> None:
+def test_stopped_process_neither_takes_nor_sends_messages(process: SupervisorProcess) -> None:
     assert process.state == "stopped"
     assert process.pid is None
     assert not process.send(b"x")
-    assert process.words(0) == []
+    assert process.receive(0) == []

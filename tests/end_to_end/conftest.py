@@ -18,8 +18,8 @@ from typing import Any
 
 import pytest
 
-from handtouch import shipped
 from handtouch.client import Subscriber, connect, request
+from handtouch.config import shipped
 from tests.starter import Started, Starter, find_port, own_endpoints
 
 START_S = 90.0
@@ -147,7 +147,7 @@ class Rig:
     def wait_operational(self, count: int = 15) -> dict[str, Any]:
         return self.wait(
             f"{count} nodes operational",
-            lambda status: sum(pad["node"] == "operational" for pad in status["pads"]) == count,
+            lambda status: sum(pad["node_state"] == "operational" for pad in status["pads"]) == count,
         )
 
     def all_printed(self) -> str:

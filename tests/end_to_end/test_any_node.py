@@ -1,4 +1,4 @@
-"""Nodes that nobody here built, by their EDS: wide channels, several PDOs, odd wiring; places are right."""
+"""Nodes of other vendors by EDS: wide channels, several PDOs, unusual wiring; positions are correct."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from handtouch.simulate.truth import read
+from handtouch.simulate.truth import read_records
 
 from .conftest import PERIOD_MS
 
@@ -30,7 +30,7 @@ NODES = {
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_a_touch_is_found_whatever_the_node(rig: Any, name: str) -> None:
+def test_touch_is_detected_with_nodes_of_any_vendor(rig: Any, name: str) -> None:
     eds, keys = NODES[name]
     text = rig.config.read_text()
     text = text.replace("drive_v = 5.0", f'eds = "{EDS / eds}"\n{keys}drive_v = 5.0', 1)
@@ -45,11 +45,11 @@ def test_a_touch_is_found_whatever_the_node(rig: Any, name: str) -> None:
     with rig.subscribe("contact/*/*") as messages:
         found = [messages.recv(30) for _ in range(60)]
     rig.end("simulate")
-    places = {(true.link, true.t_ns): true.position_m for true in read(truth)}
+    places = {(true.link, true.t_ns): true.position_m for true in read_records(truth)}
     errors = [
         np.linalg.norm(np.subtract(contact.position_m, places[contact.link, stamp]))
         for contact in found
-        if contact.event == "update" and contact.location == "valid"
+        if contact.event == "update" and contact.position_status == "valid"
         for stamp in [_nearest(places, contact)]
         if stamp is not None
     ]
@@ -57,7 +57,7 @@ def test_a_touch_is_found_whatever_the_node(rig: Any, name: str) -> None:
     assert np.median(errors) < 0.3e-3
 
 
-def test_guarded_nodes_are_asked_in_time_though_sync_comes_seldom(rig: Any) -> None:
+def test_guarded_nodes_are_polled_in_time_with_slow_sync(rig: Any) -> None:
     """Each would say so, and stop its samples, after 0.75 s without being asked."""
     eds, keys = NODES["unsigned between other objects, mapping fixed, guarded"]
     text = rig.config.read_text().replace("drive_v = 5.0", f'eds = "{EDS / eds}"\n{keys}drive_v = 5.0', 1)
@@ -68,7 +68,7 @@ def test_guarded_nodes_are_asked_in_time_though_sync_comes_seldom(rig: Any) -> N
     before = rig.wait_operational()
     after = rig.wait("two more", lambda s: s["service"]["ticks"] >= before["service"]["ticks"] + 2)
     for pad in after["pads"]:
-        assert pad["node"] == "operational", pad
+        assert pad["node_state"] == "operational", pad
         assert pad["reboots"] == 0
         assert not pad["emergencies"], pad
 

@@ -1,4 +1,4 @@
-"""Several buses and hands, and somebody else's SYNC; all in one process, on virtual buses."""
+"""Several buses and hands, and SYNC of another producer; in one process, on virtual buses."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from typing import Any
 import can
 import pytest
 
-from handtouch import shipped
+from handtouch.cli.demo import in_process_deployment
 from handtouch.client import connect
-from handtouch.config import Deployment, load
-from handtouch.daemon.daemon import Daemon
-from handtouch.demo import in_process
-from handtouch.simulate.run import SimulatedHand
+from handtouch.config import Deployment, load, shipped
+from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.world import World
 
 PERIOD_S = 0.02
@@ -56,16 +55,16 @@ def _deployment(hands: int, sync: str = "producer") -> Deployment:
             "daemon": shipped_one.daemon.model_copy(update={"sync_period_ms": PERIOD_S * 1e3}),
         }
     )
-    made = in_process(made)
+    made = in_process_deployment(made)
     buses = tuple(bus.model_copy(update={"sync": sync}) for bus in made.buses)
     return made.model_copy(update={"buses": buses})
 
 
 @contextmanager
-def _running(deployment: Deployment) -> Iterator[Daemon]:
+def _running(deployment: Deployment) -> Iterator[HandtouchDaemon]:
     stop = threading.Event()
     nodes = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), World.ideal_parts(), record=False)
-    with nodes, Daemon(deployment) as daemon:
+    with nodes, HandtouchDaemon.open(deployment) as daemon:
         nodes.start()
         thread = threading.Thread(target=daemon.run, args=(stop,))
         thread.start()
@@ -76,8 +75,8 @@ def _running(deployment: Deployment) -> Iterator[Daemon]:
             thread.join()
 
 
-def _events(daemon: Daemon, ends: int) -> Counter[tuple[str, str]]:
-    """(hand, event) of contacts, until so many have ended on every hand."""
+def _events(daemon: HandtouchDaemon, ends: int) -> Counter[tuple[str, str]]:
+    """Count (hand, event) of contacts until `ends` have ended on every hand."""
     got: Counter[tuple[str, str]] = Counter()
     end_s = time.monotonic() + LONGEST_S
     hands = {hand.name for hand in daemon.deployment.hands}
@@ -86,20 +85,20 @@ def _events(daemon: Daemon, ends: int) -> Counter[tuple[str, str]]:
             assert time.monotonic() < end_s, got
             message = messages.recv(0.2)
             if message is not None:
-                got[message.hand, message.reason or message.event] += 1
+                got[message.hand, message.end_reason or message.event] += 1
     return got
 
 
-def test_two_hands_on_two_buses_are_served_by_one_daemon() -> None:
+def test_one_daemon_serves_two_hands_on_two_buses() -> None:
     with _running(_deployment(hands=2)) as daemon:
         got = _events(daemon, ends=2)
-        status = daemon.report.status()
+        status = daemon.reporter.status(time.monotonic_ns())
     for hand in ("left", "right"):
         assert got[hand, "begin"] >= 1
         assert got[hand, "update"] > 10
     for bus in status["service"]["buses"].values():
         assert bus["samples"] > 0
-        assert bus["foreign"] == 0
+        assert bus["unknown_frames"] == 0
     assert status["service"]["hands"] == {
         "left": ["index_middle", "index_distal"],
         "right": ["index_middle", "index_distal"],
@@ -107,13 +106,13 @@ def test_two_hands_on_two_buses_are_served_by_one_daemon() -> None:
 
 
 @pytest.mark.parametrize("hands", [1, 2])
-def test_somebody_elses_sync_is_followed(hands: int) -> None:
+def test_sync_of_another_producer_is_followed(hands: int) -> None:
     deployment = _deployment(hands, sync="consumer")
-    over = threading.Event()
+    stopped = threading.Event()
 
     def produce() -> None:
         buses: list[Any] = [can.Bus(interface="virtual", channel=bus.channel) for bus in deployment.buses]
-        while not over.wait(PERIOD_S):
+        while not stopped.wait(PERIOD_S):
             for bus in buses:
                 bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         for bus in buses:
@@ -124,14 +123,14 @@ def test_somebody_elses_sync_is_followed(hands: int) -> None:
     try:
         with _running(deployment) as daemon:
             _events(daemon, ends=2)
-            before = daemon.report.status()
+            before = daemon.reporter.status(time.monotonic_ns())
             _events(daemon, ends=1)
-            after = daemon.report.status()
+            after = daemon.reporter.status(time.monotonic_ns())
     finally:
-        over.set()
+        stopped.set()
         other.join()
     ticks = after["service"]["ticks"] - before["service"]["ticks"]
     syncs = (after["service"]["t_ns"] - before["service"]["t_ns"]) * 1e-9 / PERIOD_S
-    assert 0.6 * syncs < ticks < 1.3 * syncs  # one a period, however many buses bring the SYNC
+    assert 0.6 * syncs < ticks < 1.3 * syncs  # one tick per period, for any number of buses with SYNC
     for earlier, later in zip(before["pads"], after["pads"], strict=True):
-        assert later["missed"] - earlier["missed"] < 0.2 * ticks
+        assert later["missed_samples"] - earlier["missed_samples"] < 0.2 * ticks

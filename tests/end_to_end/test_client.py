@@ -1,4 +1,4 @@
-"""What a subscriber of the real daemon can tell: no contact, a silent sensor and a dead daemon apart."""
+"""Subscribers of the real daemon: no contact, a stale sensor and a disconnected daemon differ."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _is(kind: type[Any], **values: Any) -> Callable[[Any], bool]:
     return lambda m: isinstance(m, kind) and all(getattr(m, name) == value for name, value in values.items())
 
 
-def test_no_contact_a_silent_sensor_and_a_dead_daemon_are_told_apart(rig: Any) -> None:
+def test_no_contact_a_stale_sensor_and_a_disconnected_daemon_differ(rig: Any) -> None:
     rig.simulate()
     rig.start("run")
     rig.wait_operational()
@@ -49,33 +49,33 @@ def test_no_contact_a_silent_sensor_and_a_dead_daemon_are_told_apart(rig: Any) -
             states.update(zip(message.links, columns(message)["state"].tolist(), strict=True))
 
     with rig.subscribe(*EVERYTHING) as messages:
-        # no contact: it was released, its pad is sampled, and the daemon lives
+        # no contact: it was released, its pad is sampled, and the daemon is alive
         ended = _until(rig, messages, _is(wire.Contact, event="end"), note)
-        assert ended.reason == "released"
+        assert ended.end_reason == "released"
         frame = _until(
             rig, messages, lambda m: isinstance(m, wire.HandFrame) and m.seq > 0 and m.t_ns >= ended.t_ns
         )
         assert columns(frame)["state"][frame.links.index(ended.link)] == wire.PadState.CLEAR
         assert messages.alive
 
-        # a silent sensor: pads of frozen nodes are stale, then lost, contacts end so, and the daemon lives
+        # stale sensor: pads of stopped nodes become stale, then lost, their contacts end, the daemon is alive
         _until(rig, messages, _is(wire.Contact, event="begin"), note)
         rig.processes["simulate"].send_signal(signal.SIGSTOP)
         try:
             ended = _until(rig, messages, _is(wire.Contact, event="end"), note)
-            if ended.reason == "released":  # in its last moment
+            if ended.end_reason == "released":  # just before the nodes stopped
                 ended = None
             _until(rig, messages, _is(wire.Health, state="stale"), note)
             _until(rig, messages, _is(wire.Health, state="lost"), note)
             _until(rig, messages, lambda _: set(states.values()) == {int(wire.PadState.LOST)}, note)
-            assert ended is None or ended.reason in ("stale", "lost")
+            assert ended is None or ended.end_reason in ("stale", "lost")
             _until(rig, messages, _is(wire.Service), note)
             assert messages.alive
         finally:
             rig.processes["simulate"].send_signal(signal.SIGCONT)
-        run = _until(rig, messages, _is(wire.Contact, event="begin"), note).run  # all is well again
+        session = _until(rig, messages, _is(wire.Contact, event="begin"), note).session  # recovered
 
-        # a dead daemon: nothing comes, not even its heartbeat, and nothing says that the contact ended
+        # disconnected daemon: no messages, not even its heartbeat, and no end of the contact
         rig.end("run", signal.SIGKILL)
         end_s = time.monotonic() + LONGEST_S
         while messages.alive:
@@ -89,15 +89,15 @@ def test_no_contact_a_silent_sensor_and_a_dead_daemon_are_told_apart(rig: Any) -
         rig.start("run")
         back = _until(rig, messages, _is(wire.Contact, event="update"), note)
         assert messages.alive
-        assert back.run > run
-        assert messages.gaps == 0
-        assert messages.malformed == 0
+        assert back.session != session
+        assert messages.lost_messages == 0
+        assert messages.malformed_messages == 0
 
 
 @pytest.mark.parametrize("stream", ["live", "complete"])
-def test_a_late_joiner_is_told_the_present_at_once_and_nobody_else_twice(working: Any, stream: str) -> None:
+def test_a_late_subscriber_gets_the_current_state_once(working: Any, stream: str) -> None:
     endpoint = working.endpoints[stream]
-    told, repeated = set[type[Any]](), set[type[Any]]()
+    received, retained = set[type[Any]](), set[type[Any]]()
     with connect(*EVERYTHING, endpoint=endpoint, queue=100_000) as early:
         seen: dict[str, list[int]] = defaultdict(list)
 
@@ -105,9 +105,9 @@ def test_a_late_joiner_is_told_the_present_at_once_and_nobody_else_twice(working
             seen[wire.topic_of(message)].append(message.seq)
 
         end_s = time.monotonic() + LONGEST_S
-        # of a topic with a message at every tick, the next one mostly comes before the repeat is made
-        while not (told >= {wire.Contact, wire.HandFrame} and repeated >= {wire.Health, wire.Service}):
-            assert time.monotonic() < end_s, (told, repeated)
+        # of a topic with a message per tick, the next one mostly precedes the retained one
+        while not (received >= {wire.Contact, wire.HandFrame} and retained >= {wire.Health, wire.Service}):
+            assert time.monotonic() < end_s, (received, retained)
             _until(working, early, lambda m: isinstance(m, wire.Contact) and m.event != "end", note)
             with connect(*EVERYTHING, endpoint=endpoint) as late:  # the same prefixes
                 first: dict[str, Any] = {}
@@ -115,13 +115,13 @@ def test_a_late_joiner_is_told_the_present_at_once_and_nobody_else_twice(working
                     message = late.recv(LONGEST_S)
                     assert message is not None, working.all_printed()
                     first.setdefault(wire.topic_of(message), message)
-                    told.add(type(message))
-                    if message.repeat:
+                    received.add(type(message))
+                    if message.retained:
                         assert not isinstance(message, wire.Contact) or message.event == "update"
-                        repeated.add(type(message))
-                assert late.gaps == 0
+                        retained.add(type(message))
+                assert late.lost_messages == 0
         _until(working, early, _is(wire.Service), note)
-        assert early.gaps == 0
+        assert early.lost_messages == 0
     for topic, seqs in seen.items():
         assert seqs == list(range(seqs[0], seqs[0] + len(seqs))), topic
 

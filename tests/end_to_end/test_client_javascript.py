@@ -60,7 +60,7 @@ class Reader:
         return summary
 
     def messages(self) -> list[Any]:
-        """What it took for news, as (topic, payload)."""
+        """Return the new messages that it printed, as (topic, payload)."""
         return [(line["topic"], line["payload"]) for line in self.lines if "topic" in line]
 
     def kill(self) -> None:
@@ -84,7 +84,7 @@ def _in_order(values: tuple[Any, ...], lines: list[Any]) -> bool:
 
 def _plain(message: wire.Message) -> Any:
     """A message as the reader prints it."""
-    plain = wire.plain(message)
+    plain = wire.to_map(message)
     if isinstance(message, wire.HandFrame | wire.Raw):
         plain |= {name: array.tolist() for name, array in columns(message).items()}
     return json.loads(json.dumps(_without_nan(plain)))
@@ -112,17 +112,17 @@ def test_javascript_and_python_read_the_same_from_the_daemon(rig: Any, program: 
             while ends < 2 or services < 4:
                 message = messages.recv(LONGEST_S)
                 assert message is not None, rig.all_printed()
-                if not message.repeat:
+                if not message.retained:
                     python[wire.topic_of(message)][message.seq] = _plain(message)
                 ends += isinstance(message, wire.Contact) and message.event == "end"
                 services += isinstance(message, wire.Service)
         summary = reader.end()
     finally:
         reader.kill()
-    assert summary == {"gaps": 0, "repeats": summary["repeats"], "restarts": 0, "malformed": 0}
+    assert summary == {"gaps": 0, "retained": summary["retained"], "restarts": 0, "malformed": 0}
     javascript: dict[str, dict[int, Any]] = defaultdict(dict)
     for topic, payload in reader.messages():
-        if not payload["repeat"]:
+        if not payload["retained"]:
             javascript[topic][payload["seq"]] = payload
     compared = dict.fromkeys(("contact", "hand", "health", "raw", "service"), 0)
     for topic, messages_of in python.items():
@@ -132,18 +132,23 @@ def test_javascript_and_python_read_the_same_from_the_daemon(rig: Any, program: 
                 compared[topic.split("/")[0]] += 1
     assert all(count >= 3 for count in compared.values()), compared
     assert compared["contact"] > 20
-    touched = [frame for frame in javascript["hand/right"].values() if 1 in frame["state"]]
-    assert touched
-    assert all(math.dist(frame["normal"][frame["state"].index(1)], (0, 0, 0)) > 0.99 for frame in touched)
+    normals = [
+        frame["normal"][row]
+        for frame in javascript["hand/right"].values()
+        for row, state in enumerate(frame["state"])
+        if (state, frame["position_status"][row]) == (wire.PadState.TOUCHED, wire.PositionStatus.VALID)
+    ]
+    assert len(normals) > 20
+    assert all(math.dist(normal, (0, 0, 0)) > 0.99 for normal in normals)
 
 
-def _service(seq: int, run: int = 1, repeat: bool = False) -> wire.Service:
+def _service(seq: int, session: int = 1, retained: bool = False) -> wire.Service:
     values: dict[str, Any] = dict.fromkeys(wire.Service.__dataclass_fields__, 0)
-    values |= {name: {} for name in ("hands", "tick_us", "loop", "refused", "process", "buses", "drops")}
-    values |= {"v": 1, "run": run, "seq": seq, "t_ns": 2**62 + seq, "wall_offset_ns": -(2**60)}
+    values |= {name: {} for name in ("hands", "tick_us", "loop", "rejected", "process", "buses", "drops")}
+    values |= {"v": 1, "session": session, "seq": seq, "t_ns": 2**62 + seq, "wall_offset_ns": -(2**60)}
     values |= {"version": "x", "uptime_s": 1.0, "period_s": 0.1, "rate_hz": 0.0, "subscriptions": ()}
     values |= {"inputs": {}, "supervisor": None}
-    return wire.Service(**{**values, "repeat": repeat})
+    return wire.Service(**{**values, "retained": retained})
 
 
 def _health(seq: int) -> wire.Health:
@@ -161,13 +166,14 @@ def publisher(endpoints: dict[str, str]) -> Iterator[Any]:
         yield socket
 
 
-def test_javascript_and_python_count_the_same_gaps_repeats_and_restarts(
+def test_javascript_and_python_count_the_same_gaps_retained_messages_and_restarts(
     publisher: Any, endpoints: dict[str, str], program: list[str]
 ) -> None:
     good = [
-        _service(3), _service(4), _service(7), _service(7, repeat=True), _service(5, repeat=True),
-        _service(9, repeat=True), _service(10), _service(2, run=2), _service(2, run=2, repeat=True),
-        _service(3, run=2),
+        _service(3), _service(4), _service(7), _service(7, retained=True), _service(5, retained=True),
+        _service(9, retained=True), _service(10), _service(2, session=2),
+        _service(2, session=2, retained=True),
+        _service(3, session=2),
     ]  # fmt: skip
     encoded = [wire.encode(message) for message in good]
     malformed = [
@@ -179,32 +185,34 @@ def test_javascript_and_python_count_the_same_gaps_repeats_and_restarts(
         [b"service/x", encoded[0][1]],
         [b"service", encoded[0][1], b""],
     ]
-    others = [wire.encode(_health(1)), wire.encode(_health(9))]  # nobody asked for these
+    unsubscribed = [wire.encode(_health(1)), wire.encode(_health(9))]  # not subscribed
     reader = Reader(program, endpoints["live"], "service")
     try:
         with connect("service", endpoint=endpoints["live"]) as messages:
-            first = wire.encode(_service(1, run=7))
+            first = wire.encode(_service(1, session=7))
             while messages.recv(0.05) is None or {"alive": True} not in reader.lines:
                 publisher.send_multipart(first)
             while messages.recv(0.2) is not None:
                 pass
-            assert messages.gaps == 0
-            for parts in [*encoded[:4], *malformed, *others, *encoded[4:]]:
+            assert messages.lost_messages == 0
+            for parts in [*encoded[:4], *malformed, *unsubscribed, *encoded[4:]]:
                 publisher.send_multipart(parts)
             python = [message for _ in range(7) if (message := messages.recv(LONGEST_S)) is not None]
             assert messages.recv(0) is None
-            counted = {"gaps": messages.gaps, "malformed": messages.malformed}
+            counted = {"gaps": messages.lost_messages, "malformed": messages.malformed_messages}
         reader.wait({"topic": "service", "payload": _plain(good[-1])})
         reader.wait({"alive": True}, {"alive": False})
         summary = reader.end()
     finally:
         reader.kill()
-    assert [(message.run, message.seq) for message in python] == [
+    assert [(message.session, message.seq) for message in python] == [
         (1, 3), (1, 4), (1, 7), (1, 9), (1, 10), (2, 2), (2, 3),
     ]  # fmt: skip
     assert counted["gaps"] == 2 + 1
-    assert [payload for _, payload in reader.messages() if payload["run"] != 7] == list(map(_plain, python))
+    assert [payload for _, payload in reader.messages() if payload["session"] != 7] == list(
+        map(_plain, python)
+    )
     assert summary["gaps"] == counted["gaps"]
-    assert summary["repeats"] == 3
+    assert summary["retained"] == 3
     assert summary["restarts"] == 2
     assert (summary["malformed"], counted["malformed"]) == (6, 6)

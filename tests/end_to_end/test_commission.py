@@ -1,6 +1,6 @@
-"""`handtouch commission` as a process, on a bus with a hand that is wired quite otherwise than its file says.
+"""`handtouch commission` as a process, on a bus with a hand wired differently from its deployment file.
 
-Run as a program, this file is that hand's nodes: it presses what it is told to on standard input.
+Run as a program, this file simulates that hand's nodes and makes the presses read from standard input.
 """
 
 from __future__ import annotations
@@ -27,22 +27,28 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.canbus.bus.port import open_bus
-from handtouch.canbus.device import DeviceBus
-from handtouch.canbus.objects.channels import ELECTRODES
-from handtouch.simulate.hand import VirtualHand
+from handtouch.config.channels import ELECTRODES
+from handtouch.device import DeviceBus
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
 
-ASKED = {"anywhere": (0.5, 0.5), "x0": (0.15, 0.5), "xa": (0.85, 0.5), "y0": (0.5, 0.15), "yb": (0.5, 0.85)}
-HOW_HARD = {"hard": (0.8, 4.0), "gently": (0.3, 0.5)}  # N; the hard ones are too hard for some pads
-OFF = 0.15  # of a side: how far from the place asked for this person presses
+REQUESTED = {
+    "anywhere": (0.5, 0.5),
+    "x0": (0.15, 0.5),
+    "xa": (0.85, 0.5),
+    "y0": (0.5, 0.15),
+    "yb": (0.5, 0.85),
+}
+FORCE_RANGES_N = {"hard": (0.8, 4.0), "gently": (0.3, 0.5)}  # the hard presses saturate some pads
+MAX_OFFSET = 0.15  # greatest offset of a press from its requested position, of a side
 PROMPT = re.compile(r"\[\d+/\d+\] right/(\w+): press (?:it (anywhere)|near electrode (\w+))")
 
 pytestmark = pytest.mark.timeout(400)
 
 
 class PressableHand:
-    """The nodes of a deployment; `press` and `release` say what the next samples show."""
+    """The nodes of a deployment; `press` and `release` determine the next samples."""
 
     def __init__(self, deployment: config.Deployment, seed: int) -> None:
         chance = random.Random(seed)
@@ -50,8 +56,10 @@ class PressableHand:
         touches: list[dict[str, Any]] = []
         self._times: dict[tuple[str, str, str], float] = {}
         for pad in pads:
-            for near, hard in itertools.product(ASKED, HOW_HARD):
-                place = [min(max(c + chance.uniform(-OFF, OFF), 0.03), 0.97) for c in ASKED[near]]
+            for near, hard in itertools.product(REQUESTED, FORCE_RANGES_N):
+                place = [
+                    min(max(c + chance.uniform(-MAX_OFFSET, MAX_OFFSET), 0.03), 0.97) for c in REQUESTED[near]
+                ]
                 self._times[pad.link, near, hard] = len(touches) + 0.5
                 touches.append(
                     {
@@ -59,7 +67,7 @@ class PressableHand:
                         "from_s": float(len(touches)),
                         "duration_s": 0.95,
                         "path": [place],
-                        "force_n": [chance.uniform(*HOW_HARD[hard])],
+                        "force_n": [chance.uniform(*FORCE_RANGES_N[hard])],
                     }
                 )
         scenario = Scenario.model_validate({"touch": touches})
@@ -69,7 +77,7 @@ class PressableHand:
         self.nodes = DeviceBus(self._bus, self._sample)
         for pad in pads:
             device = self.nodes.add(pad.node_id, serial=pad.serial)
-            device.wired = tuple(map(ELECTRODES.index, pad.electrodes))
+            device.wiring = tuple(map(ELECTRODES.index, pad.electrodes))
         self.nodes.start()
 
     def press(self, link: str, near: str, hard: str) -> None:
@@ -95,7 +103,7 @@ def serve(path: str, bus: str, seed: str) -> None:
 
 
 def scramble(text: str, seed: int) -> tuple[str, str]:
-    """A deployment file that is wrong in many places, and the right one: the same text otherwise."""
+    """Return a deployment file with many wrong keys, and the correct one."""
     chance = random.Random(seed)
     head, *blocks = re.split(r"(?m)^(?=\[\[hand\.pad\]\])", text)
     kind = 'node = "four_channel" # the kind\n'
@@ -106,13 +114,13 @@ def scramble(text: str, seed: int) -> tuple[str, str]:
     for number, block in enumerate(blocks):
         block = block.replace('node = "four_channel"\n', kind)
         block = block.replace(f"= {ids[number]}\n", f"= {ids[number]} # as printed on it\n")
-        guessed = number % 3 == 0  # somebody wrote an order down
+        guessed = number % 3 == 0  # the file has some order
         order, guess = chance.sample(ELECTRODES, 4), chance.sample(ELECTRODES, 4)
-        told = guessed or order != list(ELECTRODES)
-        right.append(block.replace(kind, kind + _key(order)) if told else block)
+        stated = guessed or order != list(ELECTRODES)
+        right.append(block.replace(kind, kind + _key(order)) if stated else block)
         block = block.replace(f"= {ids[number]} ", f"= {other_ids[number]} ")
         block = block.replace(f"serial = {serials[number]}", f"serial = {other_serials[number]}")
-        if number % 5 == 1:  # nobody wrote the serial number down
+        if number % 5 == 1:  # the file has no serial number
             block = re.sub(r"serial = \d+\n", "", block)
         wrong.append(block.replace(kind, kind + _key(guess)) if guessed else block)
     return "".join(wrong), "".join(right)
@@ -123,12 +131,12 @@ def _key(order: list[str]) -> str:
 
 
 def first_pads(text: str, count: int) -> str:
-    """The deployment without its other pads."""
+    """Return the deployment with its first pads only."""
     return "".join(re.split(r"(?m)^(?=\[\[hand\.pad\]\])", text)[: count + 1])
 
 
 class Presser:
-    """The nodes in a process of their own, and somebody who reads what commissioning prints and presses."""
+    """The nodes in a separate process, and a simulated user who follows the printed prompts."""
 
     def __init__(self, rig: Any, truth: Path, seed: int) -> None:
         self._how = "hard"
@@ -138,11 +146,11 @@ class Presser:
         assert self._nodes.stdout.readline() == "ready\n"
 
     def follow(self, line: str) -> None:
-        """Do what a printed line asks for."""
+        """Follow a prompt."""
         if prompt := PROMPT.search(line):
             self.do(f"{prompt[1]} {prompt[2] or prompt[3]} {self._how}")
         elif "let go" in line:
-            self._how = "gently" if "more gently" in line else "hard"
+            self._how = "gently" if "more lightly" in line else "hard"
             self.do("release")
 
     def do(self, command: str) -> None:
@@ -169,7 +177,7 @@ def pressed(rig: Any, truth: str, seed: int = 5) -> Iterator[Presser]:
 
 
 def commission(rig: Any, presser: Presser, *arguments: str, stop_at: str = "") -> tuple[int, str]:
-    """Exit status and what was printed; it is interrupted at a line with `stop_at`."""
+    """Return exit status and output; interrupted at a line with `stop_at`."""
     command = rig.command("commission", str(rig.config), "--bus", rig.bus[0], *arguments)
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -188,26 +196,28 @@ def commission(rig: Any, presser: Presser, *arguments: str, stop_at: str = "") -
 
 
 def commission_in_terminal(rig: Any, presser: Presser, *arguments: str) -> tuple[int, str]:
-    """The same under a pseudo-terminal; Enter is the answer to every question."""
+    """Do the same on a pseudo-terminal, answering every question with Enter."""
     ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 400, 0, 0))  # so that no line is broken
+    fcntl.ioctl(
+        theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 400, 0, 0)
+    )  # so that lines aren't wrapped
     command = rig.command("commission", str(rig.config), "--bus", rig.bus[0], *arguments)
     process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs)
     os.close(theirs)
     printed = rest = ""
-    with contextlib.suppress(OSError):  # how a pseudo-terminal ends
+    with contextlib.suppress(OSError):  # at the end of a pseudo-terminal
         while data := os.read(ours, 4096):
             printed += data.decode(errors="replace")
             *lines, rest = (rest + data.decode(errors="replace")).split("\n")
             for line in lines:
                 presser.follow(line)
-                if "Enter: they are swapped" in line:
+                if "Enter: accept as swapped" in line:
                     os.write(ours, b"\n")
     os.close(ours)
     return process.wait(), printed
 
 
-def test_a_hand_wired_at_random_is_found_out_pad_by_pad_and_only_its_lines_change(rig: Any) -> None:
+def test_randomly_wired_hand_is_commissioned_and_only_its_lines_change(rig: Any) -> None:
     wrong, right = scramble(first_pads(rig.config.read_text(), 6), seed=1)
     rig.config.write_text(wrong)
     truth, folder = config.parse(right), rig.folder
@@ -222,12 +232,12 @@ def test_a_hand_wired_at_random_is_found_out_pad_by_pad_and_only_its_lines_chang
     shown = [line for line in printed.splitlines() if re.match(r"[-+](?!--|\+\+)", line)]
     assert shown
     assert all(re.match(r"[-+](node_id|serial|electrodes) = ", line) for line in shown), printed
-    assert rig.config.read_text() == right  # to the letter: comments, order, hexadecimal numbers
+    assert rig.config.read_text() == right  # identical: comments, order, hexadecimal numbers
     assert (folder / "hand.toml.bak").read_text() == wrong
     assert not (folder / "hand.toml.commissioned").exists()
 
 
-def test_what_is_done_is_kept_when_it_is_interrupted_and_the_rest_is_done_later(rig: Any) -> None:
+def test_interrupted_commissioning_is_resumed(rig: Any) -> None:
     wrong, right = scramble(first_pads(rig.config.read_text(), 3), seed=2)
     rig.config.write_text(wrong)
     with pressed(rig, right) as presser:
@@ -246,14 +256,14 @@ def test_what_is_done_is_kept_when_it_is_interrupted_and_the_rest_is_done_later(
     assert not (rig.folder / "hand.toml.commissioned").exists()
 
 
-def test_a_swap_is_asked_about_in_a_terminal_and_a_dry_run_writes_nothing(rig: Any) -> None:
+def test_swap_is_confirmed_on_a_terminal_and_dry_run_writes_nothing(rig: Any) -> None:
     wrong, right = scramble(first_pads(rig.config.read_text(), 3), seed=6)
     assert config.parse(wrong).hands[0].pads[0].node_id != config.parse(right).hands[0].pads[0].node_id
     rig.config.write_text(wrong)
     with pressed(rig, right) as presser:
         status, printed = commission_in_terminal(rig, presser, "--dry-run", "--link", "thumb_proximal")
     assert status == 0, printed
-    assert "they are swapped" in printed
+    assert "accept as swapped" in printed
     assert "█" in printed  # live feedback
     assert "+node_id = 0x11 # as printed on it" in printed
     assert "Nothing was written" in printed
@@ -261,14 +271,14 @@ def test_a_swap_is_asked_about_in_a_terminal_and_a_dry_run_writes_nothing(rig: A
     assert {path.name for path in rig.folder.glob("hand.toml*")} == {"hand.toml"}
 
 
-def test_it_leaves_the_buses_to_a_daemon_that_runs(rig: Any) -> None:
+def test_commissioning_is_refused_while_a_daemon_runs(rig: Any) -> None:
     rig.config.write_text(first_pads(rig.config.read_text(), 1))
     rig.start("run")
     rig.status()
     command = rig.command("commission", str(rig.config), "--bus", rig.bus[0])
     done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
     assert done.returncode == 1
-    assert "a daemon answers at" in done.stderr
+    assert "a daemon is running at" in done.stderr
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The main job: a hand is touched, contacts appear on the wire; and what happens when things go wrong.
+"""From touches on simulated nodes to contacts on the wire, and behaviour under faults.
 
 The nodes (`handtouch simulate`), the daemon (`handtouch run`) and the subscriber are processes of their own
 that meet on a udp_multicast bus and on ZeroMQ.
@@ -22,7 +22,7 @@ import pytest
 import zmq
 
 from handtouch import wire
-from handtouch.simulate.truth import Truth, read
+from handtouch.simulate.truth import GroundTruth, read_records
 
 LONGEST_S = 60.0
 PERIOD_MS = 20.0
@@ -31,7 +31,7 @@ PERIOD_MS = 20.0
 def _contacts(
     rig: Any, enough: Callable[[list[wire.Contact]], bool], longest_s: float = LONGEST_S
 ) -> list[wire.Contact]:
-    """Contacts as a subscriber gets them until there are enough."""
+    """Receive contact messages until `enough` returns True."""
     got: list[wire.Contact] = []
     end_s = time.monotonic() + longest_s
     with rig.subscribe("contact/*/*") as messages:
@@ -40,8 +40,8 @@ def _contacts(
             message = messages.recv(0.1)
             if message is not None:
                 got.append(message)
-        assert messages.gaps == 0
-        assert messages.malformed == 0
+        assert messages.lost_messages == 0
+        assert messages.malformed_messages == 0
     return got
 
 
@@ -50,7 +50,7 @@ def _ends(count: int) -> Callable[[list[wire.Contact]], bool]:
 
 
 def _times(contacts: list[wire.Contact]) -> dict[int, list[int]]:
-    """When each contact was told of, ns."""
+    """Return the sample times [ns] of each contact."""
     times: dict[int, list[int]] = {}
     for contact in contacts:
         times.setdefault(contact.id, []).append(contact.t_ns)
@@ -58,7 +58,7 @@ def _times(contacts: list[wire.Contact]) -> dict[int, list[int]]:
 
 
 def _steady(times_ns: list[int]) -> set[int]:
-    """Times whose neighbours are a period away: this machine did not pause there, between SYNC and stamp."""
+    """Return the times whose neighbours are a period away, so that the machine did not pause there."""
     steps = np.diff(np.unique(times_ns)) * 1e-6 / PERIOD_MS
     regular = np.abs(steps - 1) < 0.4
     return set(np.unique(times_ns)[1:-1][regular[1:] & regular[:-1]].tolist())
@@ -69,7 +69,7 @@ def _row(status: dict[str, Any], link: str) -> dict[str, Any]:
 
 
 def _send(rig: Any, can_id: int, data: bytes) -> None:
-    """Put a frame on the rig's bus, as a stranger."""
+    """Send a frame on the rig's bus from an unknown node."""
     port = int(rig.bus[0].split("port=")[1])
     script = (
         "import can, sys\n"
@@ -79,7 +79,7 @@ def _send(rig: Any, can_id: int, data: bytes) -> None:
     subprocess.run([*rig.command()[:-2], "-c", script], check=True, timeout=LONGEST_S)
 
 
-def test_a_touch_is_published_where_and_as_hard_as_it_is(rig: Any) -> None:
+def test_contacts_have_the_position_and_force_of_touches(rig: Any) -> None:
     truth_file = rig.folder / "truth.jsonl"
     rig.simulate("--truth", str(truth_file))
     rig.start("run")
@@ -95,7 +95,7 @@ def test_a_touch_is_published_where_and_as_hard_as_it_is(rig: Any) -> None:
         life.setdefault(contact.id, []).append(contact)
     whole = [c for c in life.values() if c[0].event == "begin" and c[-1].event == "end"]
     assert len(whole) >= 2
-    reasons = {messages[-1].reason for messages in whole}
+    reasons = {messages[-1].end_reason for messages in whole}
     assert "released" in reasons <= {"released", "stale"}  # stale: this machine paused for three periods
     for messages in whole:
         assert [c.event for c in messages[1:-1]] == ["update"] * (len(messages) - 2)
@@ -103,17 +103,17 @@ def test_a_touch_is_published_where_and_as_hard_as_it_is(rig: Any) -> None:
         assert messages[-1].duration_s > 0
         assert messages[-1].peak_force_n == pytest.approx(max(c.force_n or 0 for c in messages))
 
-    truth: dict[str, list[Truth]] = {}
-    for row in read(truth_file):
+    truth: dict[str, list[GroundTruth]] = {}
+    for row in read_records(truth_file):
         truth.setdefault(row.link, []).append(row)
     sampled = {link: _steady([row.t_ns for row in rows]) for link, rows in truth.items()}
-    told = {number: _steady(times) for number, times in _times(contacts).items()}
+    steady = {number: _steady(times) for number, times in _times(contacts).items()}
     errors = []
     for contact in contacts:
         if contact.event == "end" or contact.position_m is None or contact.force_n is None:
             continue
         nearest = min(truth[contact.link], key=lambda row: abs(row.t_ns - contact.t_ns))
-        if contact.t_ns not in told[contact.id] or nearest.t_ns not in sampled[contact.link]:
+        if contact.t_ns not in steady[contact.id] or nearest.t_ns not in sampled[contact.link]:
             continue
         assert abs(nearest.t_ns - contact.t_ns) < PERIOD_MS * 1e6 / 2
         assert contact.covariance_m2 is not None
@@ -140,20 +140,20 @@ def test_asyncio_subscribers_get_the_same_contacts(working: Any) -> None:
     assert len({contact.seq for contact in contacts if contact.link == contacts[0].link}) > 1
 
 
-def test_a_frame_of_the_wrong_length_and_one_from_a_stranger_are_counted_and_dropped(working: Any) -> None:
+def test_frames_of_wrong_length_or_unknown_id_are_counted_and_dropped(working: Any) -> None:
     before = working.status()["service"]["buses"]["can0"]
     _send(working, 0x280 + 0x11, b"\x01\x02\x03")
     _send(working, 0x280 + 0x7F, bytes(8))
     working.wait(
         "counted",
         lambda status: (
-            status["service"]["buses"]["can0"]["short"] == before["short"] + 1
-            and status["service"]["buses"]["can0"]["foreign"] == before["foreign"] + 1
+            status["service"]["buses"]["can0"]["wrong_length"] == before["wrong_length"] + 1
+            and status["service"]["buses"]["can0"]["unknown_frames"] == before["unknown_frames"] + 1
         ),
     )
 
 
-def test_a_node_that_vanishes_is_stale_then_lost_and_comes_back_without_a_restart(rig: Any) -> None:
+def test_disconnected_node_is_stale_then_lost_and_recovers_without_restart(rig: Any) -> None:
     rig.simulate()
     rig.start("run")
     rig.wait_operational()
@@ -174,13 +174,13 @@ def test_a_node_that_vanishes_is_stale_then_lost_and_comes_back_without_a_restar
     _contacts(rig, _ends(1))
 
 
-def test_missing_nodes_are_reported_and_the_rest_of_the_hand_works(rig: Any) -> None:
+def test_missing_nodes_are_reported_and_the_other_nodes_work(rig: Any) -> None:
     text = rig.config.read_text()
     others = rig.folder / "fewer.toml"
     cut = text.index('[[hand.pad]]\nlink = "thumb_middle"')
     upto = text.index("[[hand.pad]]", cut + 10)
     others.write_text(text[:cut] + text[upto:])
-    buses = [word for bus in rig.bus for word in ("--bus", bus)]
+    buses = [argument for bus in rig.bus for argument in ("--bus", bus)]
     rig.processes["simulate"] = subprocess.Popen(
         rig.command("simulate", str(others), "--scenario", str(rig.scenario), *buses),
         stdout=subprocess.DEVNULL,
@@ -189,12 +189,12 @@ def test_missing_nodes_are_reported_and_the_rest_of_the_hand_works(rig: Any) -> 
     status = rig.wait_operational(14)
     missing = _row(status, "thumb_middle")
     assert missing["state"] == "starting"
-    assert missing["node"] == "absent"
+    assert missing["node_state"] == "absent"
     assert missing["reason"]
     _contacts(rig, _ends(1))
 
 
-def test_a_subscriber_that_stalls_or_dies_is_noticed_by_nobody(working: Any) -> None:
+def test_stalled_or_killed_subscriber_affects_no_other(working: Any) -> None:
     context = zmq.Context()
     stalled = context.socket(zmq.SUB)
     stalled.setsockopt(zmq.RCVHWM, 1)
@@ -212,7 +212,7 @@ def test_a_subscriber_that_stalls_or_dies_is_noticed_by_nobody(working: Any) -> 
     contacts += _contacts(working, _ends(1))
     after = working.status()["service"]
     late = [service["loop"]["late"].get("send", 0) for service in (before, after)]
-    # pauses of the machine may fall into the sending; who waited for a subscriber would be late every time
+    # machine pauses may delay sending; a daemon that waits for a subscriber would be late every time
     assert late[1] - late[0] <= 2 + 0.1 * (after["ticks"] - before["ticks"])
     stalled.close(0)
     context.term()
@@ -230,7 +230,7 @@ def test_sigterm_ends_contacts_and_stops_the_configured_nodes(rig: Any) -> None:
         while (message := messages.recv(1.0)) is not None:
             if message.link == begun.link:
                 last = message
-        assert (last.event, last.reason) == ("end", "stopped")
+        assert (last.event, last.end_reason) == ("end", "stopped")
     assert "Traceback" not in rig.all_printed()
     rig.start("run")  # which finds the nodes stopped, and wakes them
     rig.wait_operational()
@@ -251,7 +251,7 @@ def test_after_sigkill_a_restart_finds_the_nodes_running_and_does_not_reset_them
     _contacts(rig, _ends(1))
 
 
-def test_a_config_error_ends_the_start_with_status_2_before_the_bus_is_touched(rig: Any) -> None:
+def test_config_error_exits_with_status_2_before_the_bus_is_opened(rig: Any) -> None:
     rig.config.write_text(rig.config.read_text().replace("gap_mm = 0.8", "gap_mm = 80.0", 1))
     done = subprocess.run(
         rig.command("run", str(rig.config), "--bus", "can0=no_such_interface:can9"),
@@ -265,7 +265,7 @@ def test_a_config_error_ends_the_start_with_status_2_before_the_bus_is_touched(r
     assert "Traceback" not in done.stderr
 
 
-def test_a_bus_that_is_not_there_ends_the_start_with_status_1_and_a_remedy(rig: Any) -> None:
+def test_missing_bus_exits_with_status_1_and_a_remedy(rig: Any) -> None:
     done = subprocess.run(
         rig.command("run", str(rig.config), "--bus", "can0=socketcan:can77"),
         capture_output=True,
@@ -278,7 +278,7 @@ def test_a_bus_that_is_not_there_ends_the_start_with_status_1_and_a_remedy(rig: 
 
 
 @pytest.mark.parametrize("request_bytes", [b"", b"\xc1", b"\x80", b"\x93\x01\x02\x03"])
-def test_a_malformed_request_gets_an_error_and_the_tick_goes_on(working: Any, request_bytes: bytes) -> None:
+def test_malformed_request_gets_an_error_and_ticks_continue(working: Any, request_bytes: bytes) -> None:
     import msgpack
 
     with zmq.Context() as context, context.socket(zmq.REQ) as socket:
@@ -293,21 +293,22 @@ def test_a_malformed_request_gets_an_error_and_the_tick_goes_on(working: Any, re
     working.wait("ticking on", lambda status: status["service"]["ticks"] > ticks)
 
 
-def test_status_tells_people_and_programs_how_the_hand_fares(rig: Any) -> None:
+def test_status_prints_text_and_json(rig: Any) -> None:
     rig.simulate()
     rig.start("run")
     rig.wait_operational()
-    ask = rig.command("status", "--endpoint", rig.endpoints["control"])
+    command = rig.command("status", "--endpoint", rig.endpoints["control"])
     end_s = time.monotonic() + LONGEST_S
-    while (told := subprocess.run(ask, capture_output=True, text=True, timeout=LONGEST_S)).returncode != 0:
-        assert time.monotonic() < end_s, told.stdout  # a pause of the machine makes a pad stale for a moment
-    assert re.search(r"bus can0: \w+, load", told.stdout)
-    assert "right/thumb_distal" in told.stdout
-    assert told.stdout.count("operational") == 15
-    answer = json.loads(subprocess.run([*ask, "--json"], capture_output=True, timeout=LONGEST_S).stdout)
+    options: dict[str, Any] = {"capture_output": True, "text": True, "timeout": LONGEST_S}
+    while (done := subprocess.run(command, **options)).returncode != 0:
+        assert time.monotonic() < end_s, done.stdout  # a pause of the machine makes a pad stale for a moment
+    assert re.search(r"bus can0: \w+, load", done.stdout)
+    assert "right/thumb_distal" in done.stdout
+    assert done.stdout.count("operational") == 15
+    answer = json.loads(subprocess.run([*command, "--json"], capture_output=True, timeout=LONGEST_S).stdout)
     assert {pad["state"] for pad in answer["pads"]} <= {"clear", "touched", "stale"}  # paused
     rig.end("simulate")
     rig.wait("lost", lambda status: _row(status, "palm_heel")["state"] == "lost")
-    told = subprocess.run(ask, capture_output=True, text=True, timeout=LONGEST_S)
-    assert told.returncode == 1
-    assert "heartbeat" in told.stdout
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S)
+    assert done.returncode == 1
+    assert "heartbeat" in done.stdout

@@ -1,4 +1,4 @@
-"""The demo: one command, no hardware, and a summary of how near it came to the truth."""
+"""The demo: one command, no hardware, and a summary of its accuracy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 
-def test_the_demo_finds_touches_within_the_noise_bound_and_ends_by_itself() -> None:
+def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "handtouch", "demo", "--seconds", "9"],
         capture_output=True,
@@ -23,9 +23,9 @@ def test_the_demo_finds_touches_within_the_noise_bound_and_ends_by_itself() -> N
     total = done.stdout.splitlines()[-1].split()
     assert total[0] == "all"
     assert int(total[1]) > 20
-    ratio, invented = float(total[4]), int(total[-1])
-    assert ratio < 2.5  # a few weak samples carry it in so short a time; the whole session stays below 1.5
-    assert invented == 0
+    ratio, false_positives = float(total[4]), int(total[-1])
+    assert ratio < 2.5  # dominated by a few weak samples in so short a time; below 1.5 in the whole session
+    assert false_positives == 0
 
 
 STUCK = """
@@ -45,26 +45,26 @@ force_n = [0.8]
 """
 
 
-def test_a_scenario_with_a_fault_has_it_told_in_words_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_demo_reports_fault_of_scenario_and_leaves_no_files(tmp_path: Path) -> None:
     (tmp_path / "stuck.toml").write_text(STUCK)
     home = {**os.environ, "HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path / "state")}
     command = ["--seconds", "150", "--scenario", str(tmp_path / "stuck.toml")]
     rest = _interrupted_at(r"right/ring_distal.*channel xa", *command, env=home)
-    assert re.search(r"^found right/ring_distal: channel xa", rest, re.MULTILINE)
+    assert re.search(r"^diagnosis: right/ring_distal: channel xa", rest, re.MULTILINE)
     assert not (tmp_path / "state").exists()
 
 
-def test_ctrl_c_ends_the_demo_with_its_summary() -> None:
-    assert "touches missed invented" in _interrupted_at(" begin ")
+def test_ctrl_c_ends_demo_with_summary() -> None:
+    assert "touches missed  false" in _interrupted_at(" begin ")
 
 
-def _interrupted_at(said: str, *options: str, env: dict[str, str] | None = None) -> str:
-    """What a demo with these options says after a Ctrl-C, which it gets once a line matches `said`."""
+def _interrupted_at(pattern: str, *options: str, env: dict[str, str] | None = None) -> str:
+    """Interrupt a demo once a line matches `pattern`; return the rest of its output."""
     command = [sys.executable, "-m", "handtouch", "demo", "--plain", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as demo:
         assert demo.stdout is not None
         try:
-            assert any(re.search(said, line) for line in demo.stdout)
+            assert any(re.search(pattern, line) for line in demo.stdout)
             demo.send_signal(signal.SIGINT)
             rest = demo.stdout.read()
             assert demo.wait(30) == 0
@@ -73,7 +73,7 @@ def _interrupted_at(said: str, *options: str, env: dict[str, str] | None = None)
     return rest
 
 
-def test_two_demos_run_side_by_side() -> None:
+def test_two_demos_run_concurrently() -> None:
     command = [sys.executable, "-m", "handtouch", "demo", "--plain", "--seconds", "2"]
     demos = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
     end_s = time.monotonic() + 100

@@ -1,4 +1,4 @@
-"""A fault of each kind is told with its cause, disturbs nobody else, and is over when it is taken back."""
+"""A fault of each kind is reported with its cause, affects no other pad, and ends when it is removed."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ def test_campaign_of_one_fault_of_each_kind_leaves_nothing_behind(tmp_path: Path
     (results,) = json.loads((tmp_path / "faults.json").read_text()).values()
     # those that fell into a pause of the machine are void
     assert len(results["kinds"]) == results["faults"] > KINDS / 2
-    assert all(row["told"] in (None, row["number"]) for row in results["kinds"])
+    assert all(row["reported"] in (None, row["number"]) for row in results["kinds"])
     assert results["samples_sent"] > 5000
     assert results["samples_lost"] == len(results["exceptions"]) == results["exit_status"] == 0

@@ -1,4 +1,4 @@
-"""Beyond one hand: hands on several buses, daemons side by side, robots on a Zenoh network."""
+"""Several hands on several buses, several daemons, robots on a Zenoh network."""
 
 from __future__ import annotations
 
@@ -24,27 +24,28 @@ pytest.importorskip("zenoh", reason="needs the extra zenoh")
 
 REMOTE = """
 import json, sys, threading, zenoh
-turn = threading.Lock()
+lock = threading.Lock()
 config = zenoh.Config()
 for key, value in (("mode", '"peer"'), ("scouting/multicast/enabled", "false"),
                    ("listen/endpoints", json.dumps(sys.argv[1:]))):
     config.insert_json5(key, value)
-def tell(what, **values):
-    with turn:
+def report(what, **values):
+    with lock:
         print(json.dumps({"what": what, **values}), flush=True)
 with zenoh.open(config) as session:
-    session.declare_subscriber("lab/**", lambda sample: tell("sample", key=str(sample.key_expr),
+    session.declare_subscriber("lab/**", lambda sample: report("sample", key=str(sample.key_expr),
         encoding=str(sample.encoding), payload=bytes(sample.payload).hex()))
-    session.liveliness().declare_subscriber("lab/**", lambda sample: tell(
-        "alive" if sample.kind == zenoh.SampleKind.PUT else "gone", key=str(sample.key_expr)), history=True)
-    tell("ready")
+    session.liveliness().declare_subscriber("lab/**", lambda sample: report(
+        "alive" if sample.kind == zenoh.SampleKind.PUT else "disconnected",
+        key=str(sample.key_expr)), history=True)
+    report("ready")
     for line in sys.stdin:
-        asked = json.loads(line)
-        payload = bytes.fromhex(asked["payload"]) if "payload" in asked else None
-        for reply in session.get(asked["get"], payload=payload, timeout=10.0):
+        query = json.loads(line)
+        payload = bytes.fromhex(query["payload"]) if "payload" in query else None
+        for reply in session.get(query["get"], payload=payload, timeout=10.0):
             if reply.ok is not None:
-                tell("reply", key=str(reply.ok.key_expr), payload=bytes(reply.ok.payload).hex())
-        tell("answered")
+                report("reply", key=str(reply.ok.key_expr), payload=bytes(reply.ok.payload).hex())
+        report("answered")
 """
 
 
@@ -54,7 +55,7 @@ def named(rig: Rig, hand: str) -> Rig:
 
 
 class Remote:
-    """A Zenoh subscriber in a process of its own that knows nothing of handtouch."""
+    """A Zenoh subscriber in a process of its own, without handtouch."""
 
     def __init__(self, prefix: list[str], *listen: str) -> None:
         self.process = subprocess.Popen(
@@ -68,33 +69,33 @@ class Remote:
         self.next("ready")
 
     def next(self, what: str, key: str = "") -> dict[str, Any]:
-        """Read on to the next line about something."""
+        """Read up to the next line of a kind."""
         assert self.process.stdout is not None
         end_s = time.monotonic() + START_S
         while time.monotonic() < end_s:
-            told: dict[str, Any] = json.loads(self.process.stdout.readline())
-            if told["what"] == "sample":
-                self.samples.append(told)
-            elif told["what"] == "alive":
-                self.alive.add(told["key"])
-            elif told["what"] == "gone":
-                self.alive.discard(told["key"])
-            if told["what"] == what and told.get("key", "").startswith(key):
-                return told
+            line: dict[str, Any] = json.loads(self.process.stdout.readline())
+            if line["what"] == "sample":
+                self.samples.append(line)
+            elif line["what"] == "alive":
+                self.alive.add(line["key"])
+            elif line["what"] == "disconnected":
+                self.alive.discard(line["key"])
+            if line["what"] == what and line.get("key", "").startswith(key):
+                return line
         raise AssertionError(f"no {what} {key}; {len(self.samples)} samples, alive: {self.alive}")
 
     def get(self, selector: str, payload: bytes | None = None) -> dict[str, bytes]:
         assert self.process.stdin is not None
-        asked = {"get": selector} | ({} if payload is None else {"payload": payload.hex()})
-        self.process.stdin.write(json.dumps(asked) + "\n")
+        query = {"get": selector} | ({} if payload is None else {"payload": payload.hex()})
+        self.process.stdin.write(json.dumps(query) + "\n")
         self.process.stdin.flush()
         replies = {}
         assert self.process.stdout is not None
-        while (told := json.loads(self.process.stdout.readline()))["what"] != "answered":
-            if told["what"] == "reply":
-                replies[told["key"]] = bytes.fromhex(told["payload"])
-            elif told["what"] == "sample":
-                self.samples.append(told)
+        while (line := json.loads(self.process.stdout.readline()))["what"] != "answered":
+            if line["what"] == "reply":
+                replies[line["key"]] = bytes.fromhex(line["payload"])
+            elif line["what"] == "sample":
+                self.samples.append(line)
         return replies
 
     def close(self) -> None:
@@ -188,7 +189,7 @@ def test_two_hands_on_two_buses_are_served_by_one_daemon(rig: Rig, free_port: in
     assert all(bus["samples"] > 0 for bus in rig.status()["service"]["buses"].values())
 
 
-def test_daemons_side_by_side_keep_to_their_own_endpoints_and_buses(
+def test_two_daemons_use_separate_endpoints_and_buses(
     short_path: Path, network: list[str], free_port: int
 ) -> None:
     left = named(rig_in(short_path / "left", network, free_port), "left")
@@ -207,7 +208,7 @@ def test_daemons_side_by_side_keep_to_their_own_endpoints_and_buses(
             timeout=START_S,
         )
         assert again.returncode == 1
-        assert "another daemon has it" in again.stderr
+        assert "another daemon is using it" in again.stderr
         assert left.end("run") == 0
         ticks = right.status()["service"]["ticks"]
         right.wait("ticking on", lambda status: status["service"]["ticks"] > ticks)
@@ -216,7 +217,7 @@ def test_daemons_side_by_side_keep_to_their_own_endpoints_and_buses(
         right.end_all()
 
 
-def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_follows_their_restarts(
+def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_tracks_restarts(
     short_path: Path, networks: tuple[list[str], list[list[str]]], free_port: int
 ) -> None:
     middle, prefixes = networks
@@ -258,7 +259,7 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_follows_their_res
             assert msgpack.unpackb(answer)["ok"] is ok
 
         assert robots[0].end("run") == 0
-        remote.next("gone", "lab/robot1/hand")
+        remote.next("disconnected", "lab/robot1/hand")
         assert remote.get("lab/robot1/hand/**") == {}
         robots[0].start("run")
         remote.next("alive", "lab/robot1/hand")
@@ -269,7 +270,7 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_follows_their_res
             remote.next("sample", f"lab/robot{number}/hand/service")
         for robot in robots:
             assert robot.end("bridge") == 0
-            assert " 0 lost before" in robot.printed("bridge")
+            assert " 0 lost" in robot.printed("bridge")
     finally:
         for robot in robots:
             robot.end_all()
@@ -277,7 +278,7 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_follows_their_res
             remote.close()
 
 
-def test_commands_stay_away_from_the_network_unless_asked_for(rig: Rig, free_port: int) -> None:
+def test_control_is_not_forwarded_unless_enabled(rig: Rig, free_port: int) -> None:
     rig.start("run")
     rig.status()
     listen = f"tcp/127.0.0.1:{free_port}"
@@ -291,21 +292,21 @@ def test_commands_stay_away_from_the_network_unless_asked_for(rig: Rig, free_por
 
 
 @pytest.mark.parametrize(
-    ("arguments", "why"),
+    ("arguments", "error"),
     [
-        (["--connect", "tcp/127.0.0.1:7447"], "whom to carry"),
-        (["--endpoint", "left=ipc:///tmp/x"], "where is the Zenoh network"),
+        (["--connect", "tcp/127.0.0.1:7447"], "no daemon to bridge"),
+        (["--endpoint", "left=ipc:///tmp/x"], "no Zenoh network given"),
         (["--endpoint", "ipc:///tmp/x", "--connect", "tcp/127.0.0.1:1"], "NAME=ENDPOINT"),
         (
             ["--endpoint", "a=ipc:///x", "--endpoint", "a=ipc:///y", "--connect", "tcp/127.0.0.1:1"],
             "another name",
         ),
         (["--endpoint", "a=ipc:///x", "--control", "--connect", "tcp/127.0.0.1:1"], "deployment files"),
-        (["--endpoint", "a=ipc:///x", "--connect", "nonsense"], "Zenoh can't be opened"),
+        (["--endpoint", "a=ipc:///x", "--connect", "nonsense"], "can't open Zenoh"),
         (["--endpoint", "a=nonsense", "--connect", "tcp/127.0.0.1:1"], "no ZeroMQ endpoint"),
     ],
 )
-def test_a_bridge_that_cannot_be_is_refused_with_the_remedy(arguments: list[str], why: str) -> None:
+def test_wrong_options_of_a_bridge_are_rejected_with_the_remedy(arguments: list[str], error: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "handtouch", "bridge", *arguments],
         capture_output=True,
@@ -314,5 +315,5 @@ def test_a_bridge_that_cannot_be_is_refused_with_the_remedy(arguments: list[str]
         check=False,
     )
     assert done.returncode == 2
-    assert why in done.stderr
+    assert error in done.stderr
     assert "Traceback" not in done.stderr

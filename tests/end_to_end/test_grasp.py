@@ -1,4 +1,4 @@
-"""A hand grasps a ball in MuJoCo: the daemon tells what MuJoCo did, on the links and in the palm."""
+"""A hand grasps a ball in MuJoCo: reported contacts agree with MuJoCo, on the links and in the palm."""
 
 from __future__ import annotations
 
@@ -8,51 +8,51 @@ import numpy as np
 import pytest
 
 from handtouch import wire
-from handtouch.simulate.grasp import THINGS
-from handtouch.simulate.score import score
-from handtouch.simulate.truth import read
+from handtouch.simulate.grasp import GRASP_OBJECTS
+from handtouch.simulate.score import score_contacts
+from handtouch.simulate.truth import read_records
 
-LEAST = 150
-"""Samples of contacts that are enough; some five pads touch at a time, 50 times a second."""
+MIN_SAMPLES = 150
+"""Number of contact samples to wait for; about five pads touch at a time, at 50 Hz."""
 
 
 @pytest.fixture
 def grasping(rig: Any) -> Any:
-    """The daemon, and nodes whose pads a ball presses again and again."""
-    pytest.importorskip("mujoco", reason="the extra isn't here: pip install 'handtouch[mujoco]'")
+    """A daemon, and nodes whose pads grasp a ball repeatedly."""
+    pytest.importorskip("mujoco", reason="the extra isn't installed: pip install 'handtouch[mujoco]'")
     text = rig.config.read_text()
-    scene = '[scene]\noutputs = ["location", "strength", "palm"]\n\n[touch]'
+    scene = '[scene]\noutputs = ["position", "force", "palm"]\n\n[touch]'
     rig.config.write_text(text.replace("[touch]", scene, 1))
     rig.start("simulate", "--grasp", "ball", "--truth", str(rig.folder / "truth"))
     rig.start("run")
     return rig
 
 
-def test_a_grasp_is_told_as_mujoco_has_it_on_the_links_and_on_one_ball_in_the_palm(grasping: Any) -> None:
-    told: list[wire.Contact] = []
+def test_reported_grasp_agrees_with_mujoco_on_links_and_in_palm(grasping: Any) -> None:
+    contacts: list[wire.Contact] = []
     with grasping.subscribe("contact/*/*") as messages:
-        while sum(contact.palm == "valid" for contact in told) < LEAST:
+        while sum(contact.palm_status == "valid" for contact in contacts) < MIN_SAMPLES:
             message = messages.recv(120)
             assert message is not None, grasping.all_printed()
-            told.append(message)
+            contacts.append(message)
     assert grasping.end("simulate") == 0, grasping.all_printed()
-    found = score(told, read(grasping.folder / "truth"))
-    assert len({contact.link for contact in told}) >= 4
-    assert found.total.samples > LEAST / 2, found
-    assert found.total.invented == 0, found
+    found = score_contacts(contacts, read_records(grasping.folder / "truth"))
+    assert len({contact.link for contact in contacts}) >= 4
+    assert found.total.samples > MIN_SAMPLES / 2, found
+    assert found.total.false_positives == 0, found
     assert found.total.median_error_m < 50e-6, found
-    _on_one_ball(told)
+    _check_common_centre(contacts)
 
 
-def _on_one_ball(told: list[wire.Contact]) -> None:
-    """All contacts of one moment have the same centre, a radius in from the pads."""
-    radius_m = THINGS["ball"].drawn(1).size_m[0]
+def _check_common_centre(contacts: list[wire.Contact]) -> None:
+    """Check that all contacts of one sample have the same centre, a radius inward from the pads."""
+    radius_m = GRASP_OBJECTS["ball"].randomised(1).size_m[0]
     centres: dict[int, list[Any]] = {}
-    for contact in told:
+    for contact in contacts:
         if contact.event == "update" and contact.palm_position_m is not None:
-            inward = np.array(contact.palm_normal)  # of the ball: out of the pad
+            inward = np.array(contact.palm_normal)  # for the ball: out of the pad
             centres.setdefault(contact.t_ns, []).append(contact.palm_position_m + radius_m * inward)
-    together = [np.array(of) for of in centres.values() if len(of) > 2]
-    assert len(together) > 20
-    spread = [np.linalg.norm(of - of.mean(axis=0), axis=1).max() for of in together]
-    assert np.median(spread) < 1e-3  # skins give way by half a millimetre
+    groups = [np.array(group) for group in centres.values() if len(group) > 2]
+    assert len(groups) > 20
+    spread = [np.linalg.norm(group - group.mean(axis=0), axis=1).max() for group in groups]
+    assert np.median(spread) < 1e-3  # skins deform by half a millimetre

@@ -1,4 +1,4 @@
-"""Perception in a real daemon: it costs nothing until somebody subscribes; then it tells, and asks."""
+"""Percepts of a real daemon: no cost without subscribers; estimates and action requests with one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from handtouch import connect, wire
-from handtouch.simulate.gripper_client import Gripper
+from handtouch.simulate.gripper_client import GripperClient
 
 PERIOD_MS, LONGEST_S = 20.0, 60.0
 HELD_N, SLOWLY_M_S = 0.5, 0.0004
@@ -21,8 +21,8 @@ STIFFNESS_N_M = 6000.0
 
 
 @pytest.fixture(scope="module")
-def asked(network: list[str]) -> Iterator[Any]:
-    """A gripper of two fingers and its daemon, as the examples have them."""
+def setup(network: list[str]) -> Iterator[Any]:
+    """A gripper of two fingers and its daemon, as in the examples."""
     examples = str(Path(__file__).parents[2] / "examples")
     sys.path.insert(0, examples)
     with (
@@ -34,81 +34,86 @@ def asked(network: list[str]) -> Iterator[Any]:
 
 
 class Controller:
-    """Moves the gripper, which tells where its joints are, and hears what the daemon perceives."""
+    """Moves the gripper, which sends its joint states, and receives the daemon's percepts."""
 
-    def __init__(self, gripper: Gripper, percepts: Any) -> None:
+    def __init__(self, gripper: GripperClient, percepts: Any) -> None:
         self.gripper, self._percepts = gripper, percepts
-        self.told: list[wire.Percept] = []
-        self.asks: list[wire.Percept] = []
+        self.estimates: list[wire.Percept] = []
+        self.requests: list[wire.Percept] = []
 
     def step(self, speed_m_s: float = 0.0) -> None:
-        """One command to both fingers, and what has come meanwhile."""
+        """Command both fingers once and receive pending percepts."""
         self.gripper.move(thumb=speed_m_s, index=speed_m_s)
         end_s = time.monotonic() + 0.01
         while (left_s := end_s - time.monotonic()) > 0:
             percept = self._percepts.recv(left_s)
             if percept is not None:
-                (self.asks if percept.kind == "ask" else self.told).append(percept)
+                (self.requests if percept.kind == "action_request" else self.estimates).append(percept)
 
     def press(self, force_n: float, speed_m_s: float) -> None:
-        """Close, or open at a speed below 0, until the block is pressed so."""
+        """Close, or open at a negative speed, until the block is pressed at this force."""
         end_s, sign = time.monotonic() + LONGEST_S, 1 if speed_m_s > 0 else -1
-        while sign * (self.gripper.look().truth["index_force_n"] - force_n) < 0:
+        while sign * (self.gripper.read_state().truth["index_force_n"] - force_n) < 0:
             assert time.monotonic() < end_s
             self.step(speed_m_s)
 
     @property
     def known(self) -> dict[str, wire.Percept]:
         """Stiffness by link."""
-        return {p.link: p for p in self.told if p.kind == "hardness" and p.state == "estimated"}
+        return {p.link: p for p in self.estimates if p.kind == "stiffness" and p.state == "estimated"}
 
     def answer(self, question: str) -> int:
-        """Do what is asked to settle a question, whenever it is asked, until both pads know; how often."""
+        """Execute requests of a question until both stiffnesses are known; return their number."""
         end_s, seen, answers = time.monotonic() + LONGEST_S, 0, 0
         while len(self.known) < 2:
-            assert time.monotonic() < end_s, {(p.kind, p.link, p.question, p.reason) for p in self.told}
+            assert time.monotonic() < end_s, {(p.kind, p.link, p.question, p.reason) for p in self.estimates}
             self.step()
-            fresh, seen = [p for p in self.asks[seen:] if p.question == question], len(self.asks)
+            fresh, seen = [p for p in self.requests[seen:] if p.question == question], len(self.requests)
             if fresh and fresh[-1].expires_ns > time.monotonic_ns():
                 assert fresh[-1].label == "squeeze"
-                assert fresh[-1].values["bits"] > 0.5
+                assert fresh[-1].values["expected_information_bits"] > 0.5
                 self.press(HELD_N + fresh[-1].values["force_n"], SLOWLY_M_S)
                 self.press(1.2 * HELD_N, -SLOWLY_M_S)
                 answers += 1
         return answers
 
 
-def perceived_s(live: str) -> float:
-    """Time that the daemon has spent on perception so far."""
+def percept_time_s(live: str) -> float:
+    """Return the time that the daemon has spent on percepts so far."""
     with connect("service", endpoint=live) as messages:
-        while not isinstance(message := messages.recv(), wire.Service) or message.repeat:
+        while not isinstance(message := messages.recv(), wire.Service) or message.retained:
             pass
-    return float(message.loop["stages"]["perceive"]["sum_s"])
+    return float(message.loop["stages"]["percepts"]["sum_s"])
 
 
-def test_a_question_is_asked_answered_by_a_squeeze_and_not_asked_again(asked: Any) -> None:
-    """And perception costs nothing before somebody subscribes."""
+def test_question_is_answered_by_a_squeeze_and_not_posed_again(setup: Any) -> None:
+    """Percepts take no time before a client subscribes."""
     pytest.importorskip("pinocchio")  # links in the palm
-    with Gripper(asked.robot, timeout_s=LONGEST_S) as gripper:
-        gripper.reset("block", lasting_n_m=STIFFNESS_N_M, relaxing_n_m=0.0)
-        assert perceived_s(asked.live) == 0.0
-        with connect("percept/*/*", endpoint=asked.live, queue=100_000) as percepts:
+    with GripperClient(setup.robot, timeout_s=LONGEST_S) as gripper:
+        gripper.reset("block", equilibrium_stiffness_n_m=STIFFNESS_N_M, relaxing_stiffness_n_m=0.0)
+        assert percept_time_s(setup.live) == 0.0
+        with connect("percept/*/*", endpoint=setup.live, queue=100_000) as percepts:
             hand = Controller(gripper, percepts)
             hand.press(HELD_N, 0.003)
-            assert hand.answer("how hard") >= 1
+            assert hand.answer("stiffness_class") >= 1
             settled = hand.known
-            for hardness in settled.values():
-                assert hardness.values["depth_by"] == "joints"
-                told, truth = hardness.values, STIFFNESS_N_M / 2  # two sides, one after the other
-                assert told["low_n_per_m"] / 1.1 < truth < told["high_n_per_m"] * 1.1
-                assert told["stiffness_n_per_m"] == pytest.approx(truth, rel=0.4)  # steps are this machine's
-                assert hardness.label == "medium"
-            end_ns = max(p.t_ns for p in settled.values()) + 3 * 10**9  # an ask expires after 2 s
-            while not hand.told or hand.told[-1].t_ns < end_ns:
+            for stiffness in settled.values():
+                assert stiffness.values["indentation_source"] == "joints"
+                values, truth = stiffness.values, STIFFNESS_N_M / 2  # two sides in series
+                assert values["low_n_per_m"] / 1.1 < truth < values["high_n_per_m"] * 1.1
+                assert values["stiffness_n_per_m"] == pytest.approx(
+                    truth, rel=0.4
+                )  # steps depend on the machine
+                assert stiffness.label == "medium"
+            end_ns = max(p.t_ns for p in settled.values()) + 3 * 10**9  # an request expires after 2 s
+            while not hand.estimates or hand.estimates[-1].t_ns < end_ns:
                 hand.step()
-            for ask in hand.asks:
-                known = settled.get(ask.link)
-                if known is not None and (ask.question, ask.contact) == ("how hard", known.contact):
-                    assert ask.t_ns <= known.t_ns
-            assert {"motion", "hardness"} <= {percept.kind for percept in hand.told}
-        assert perceived_s(asked.live) > 0.0
+            for request in hand.requests:
+                known = settled.get(request.link)
+                if known is not None and (request.question, request.contact_id) == (
+                    "stiffness_class",
+                    known.contact_id,
+                ):
+                    assert request.t_ns <= known.t_ns
+            assert {"motion", "stiffness"} <= {percept.kind for percept in hand.estimates}
+        assert percept_time_s(setup.live) > 0.0

@@ -1,4 +1,4 @@
-"""A running daemon is recorded while people meddle with it; replay tells the same contacts, bit for bit."""
+"""A recording of a daemon with scenes, calibrations and reloads is replayed bit for bit."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pytest
 
 from handtouch import Robot
 from handtouch.client import request
-from handtouch.record.read import Recording
+from handtouch.record.recording import Recording
 
 LONGEST_S = 90.0
 
 
-def test_a_daemon_that_is_meddled_with_is_replayed_bit_for_bit(rig: Any) -> None:
+def test_a_recording_with_control_requests_is_replayed_bit_for_bit(rig: Any) -> None:
     pytest.importorskip("pinocchio")
     rig.simulate()
     rig.start("run")
@@ -27,7 +27,7 @@ def test_a_daemon_that_is_meddled_with_is_replayed_bit_for_bit(rig: Any) -> None
         rig.command("record", str(rig.config), "-o", str(out)), stderr=subprocess.PIPE, text=True
     )
 
-    def ask(command: str, **arguments: Any) -> None:
+    def send_request(command: str, **arguments: Any) -> None:
         request(command, endpoint=rig.endpoints["control"], timeout_s=LONGEST_S, **arguments)
 
     def begun() -> int:
@@ -35,7 +35,7 @@ def test_a_daemon_that_is_meddled_with_is_replayed_bit_for_bit(rig: Any) -> None
         return int(status["service"]["contacts"])
 
     with Robot(rig.endpoints["inputs"]) as robot:
-        assert robot.connected(LONGEST_S)
+        assert robot.wait_connected(LONGEST_S)
 
         def wait_for_contacts(count: int) -> None:
             first, end_s = begun(), time.monotonic() + LONGEST_S
@@ -45,25 +45,26 @@ def test_a_daemon_that_is_meddled_with_is_replayed_bit_for_bit(rig: Any) -> None
                 time.sleep(0.01)
 
         rig.wait("recorded", lambda status: "tick" in status["service"]["subscriptions"])
-        ask("scene", outputs=["location", "strength", "palm", "base"])
+        send_request("scene", outputs=["position", "force", "palm", "base"])
         wait_for_contacts(2)
-        ask("calibrate", pad="palm_heel", name="other", gains=[1.1, 1.0, 1.0, 1.0])
-        ask("tare", pads=["thumb_*"])
-        ask("snapshot")
+        send_request("calibrate", pad="palm_heel", name="other", gains=[1.1, 1.0, 1.0, 1.0])
+        send_request("tare", pads=["thumb_*"])
+        send_request("snapshot")
         wait_for_contacts(2)
-        ask("disable", pads=["index_distal"])
-        ask("reload")
+        send_request("disable", pads=["index_distal"])
+        send_request("reload")
         wait_for_contacts(1)
     assert rig.end("run") == 0
     recorder.send_signal(signal.SIGINT)
-    _, told = recorder.communicate(timeout=LONGEST_S)
+    _, err = recorder.communicate(timeout=LONGEST_S)
     replayed = subprocess.run(
         rig.command("replay", str(out), "--report", str(report)), capture_output=True, text=True, check=False
     )
-    assert replayed.returncode == 0, replayed.stderr + told
-    found = json.loads(report.read_text())
-    assert found["same"] == found["compared"] > 20
+    assert replayed.returncode == 0, replayed.stderr + err
+    outcome = json.loads(report.read_text())
+    assert outcome["equal"] == outcome["compared"] > 20
     contacts = [entry.payload for entry in Recording(out).read("contact")]
-    assert {"other"} < {contact["calibration"] for contact in contacts}
-    assert any(contact.get("base") == "valid" or contact.get("palm") == "valid" for contact in contacts)
-    assert {"off", "stopped"} & {contact["reason"] for contact in contacts}
+    assert {"other"} < {contact["calibration_id"] for contact in contacts}
+    frames = [(contact.get("palm_status"), contact.get("base_status")) for contact in contacts]
+    assert any("valid" in statuses for statuses in frames)
+    assert {"off", "stopped"} & {contact["end_reason"] for contact in contacts}

@@ -1,4 +1,4 @@
-"""`handtouch scan` as a process: on a bus with the nodes of a whole hand, and beside the daemon."""
+"""`handtouch scan` as a process: on a bus with the nodes of a whole hand, and during a running daemon."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 from handtouch import config
 
-LONGEST_S = 90.0
+TIMEOUT_S = 90.0
 SHEET = """
 [sheet.firm]
 ohm_per_square = 2400.0
@@ -27,59 +27,63 @@ contact_radius_std_mm = 0.5
 pytestmark = pytest.mark.timeout(240)
 
 
-def _scan(rig: Any, *words: str) -> tuple[int, str]:
-    buses = [word for bus in rig.bus for word in ("--bus", bus)]
+def _scan(rig: Any, *arguments: str) -> tuple[int, str]:
+    buses = [argument for bus in rig.bus for argument in ("--bus", bus)]
     done = subprocess.run(
-        rig.command("scan", *words, *buses), capture_output=True, text=True, timeout=LONGEST_S, check=False
+        rig.command("scan", *arguments, *buses),
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
     )
     assert done.returncode in (0, 1), done.stderr
     return done.returncode, done.stdout
 
 
-def _until_well(rig: Any, *words: str) -> str:
+def _scan_until_ok(rig: Any, *arguments: str) -> str:
     """Scan again until the nodes have all started."""
-    end_s = time.monotonic() + LONGEST_S
+    end_s = time.monotonic() + TIMEOUT_S
     while True:
-        status, said = _scan(rig, *words)
+        status, output = _scan(rig, *arguments)
         if status == 0:
-            return said
-        assert time.monotonic() < end_s, said
+            return output
+        assert time.monotonic() < end_s, output
 
 
-def test_an_unknown_bus_becomes_a_deployment_that_check_accepts(rig: Any) -> None:
+def test_scan_of_an_unknown_bus_makes_a_valid_deployment(rig: Any) -> None:
     rig.simulate()
-    _until_well(rig, str(rig.config))
-    text = json.loads(_until_well(rig, "--json"))["fragment"]
+    _scan_until_ok(rig, str(rig.config))
+    text = json.loads(_scan_until_ok(rig, "--json"))["fragment"]
     path = Path(rig.folder) / "made.toml"
     path.write_text(re.sub(r"(?m)^# (.* # FILL IN)", r"\1", text) + SHEET)
-    wanted = {(pad.node_id, pad.serial) for pad in config.load(rig.config).hands[0].pads}
-    assert {(pad.node_id, pad.serial) for pad in config.load(path).hands[0].pads} == wanted
+    expected = {(pad.node_id, pad.serial) for pad in config.load(rig.config).hands[0].pads}
+    assert {(pad.node_id, pad.serial) for pad in config.load(path).hands[0].pads} == expected
     check = subprocess.run(rig.command("check", str(path)), capture_output=True, text=True, check=False)
-    assert check.returncode in (0, 1), check.stderr  # the made-up geometry may be doubted
+    assert check.returncode in (0, 1), check.stderr  # the example geometry may cause warnings
     assert "15 pads" in check.stdout
 
 
-def test_a_scan_beside_the_daemon_disturbs_nothing(rig: Any) -> None:
+def test_scan_does_not_disturb_a_running_daemon(rig: Any) -> None:
     rig.simulate()
     rig.start("run")
     before = rig.wait_operational()
-    status, said = _scan(rig, str(rig.config), "--seconds", "0.5", "--json")
-    assert status == 0, said
-    report = json.loads(said)["buses"][0]
+    status, output = _scan(rig, str(rig.config), "--seconds", "0.5", "--json")
+    assert status == 0, output
+    report = json.loads(output)["buses"][0]
     assert [node["state"] for node in report["nodes"]] == ["operational"] * 15
     sync = next(stream for stream in report["traffic"] if stream["identifier"] == 0x80)
     assert sync["rate_hz"] > 5
-    assert {stream["what"] for stream in report["traffic"]} >= {"SYNC", "TPDO2 of node 17"}
+    assert {stream["source"] for stream in report["traffic"]} >= {"SYNC", "TPDO2 of node 17"}
     after = rig.status()
     for old, new in zip(before["pads"], after["pads"], strict=True):
-        assert new["node"] == "operational"
+        assert new["node_state"] == "operational"
         assert new["reboots"] == old["reboots"]
 
 
-UNNAMED = """
+UNCONFIGURED_NODES = """
 import sys, threading
 import numpy as np
-from handtouch.canbus.device import DeviceBus
+from handtouch.device import DeviceBus
 from handtouch.canbus.bus.port import open_bus
 from handtouch.config import Bus
 bus = Bus(name="can0", interface="udp_multicast", channel="239.74.163.2", options={"port": int(sys.argv[1])})
@@ -92,10 +96,13 @@ sys.stdin.read()
 """
 
 
-def test_eight_nodes_without_an_id_get_one_each(network: list[str], free_port: int) -> None:
+def test_eight_unconfigured_nodes_get_node_ids(network: list[str], free_port: int) -> None:
     python = [*network, sys.executable]
     with subprocess.Popen(
-        [*python, "-c", UNNAMED, str(free_port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [*python, "-c", UNCONFIGURED_NODES, str(free_port)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as host:
         assert host.stdin is not None
         assert host.stdout is not None
@@ -104,7 +111,7 @@ def test_eight_nodes_without_an_id_get_one_each(network: list[str], free_port: i
             bus = f"can0=udp_multicast:239.74.163.2,port={free_port}"
             scan = [*python, "-m", "handtouch", "scan", "--bus", bus, "--seconds", "0.1", "--json"]
             done = subprocess.run(
-                [*scan, "--assign", "0x11"], capture_output=True, text=True, timeout=LONGEST_S, check=False
+                [*scan, "--assign", "0x11"], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
             )
             assert done.returncode == 0, done.stdout + done.stderr
             report = json.loads(done.stdout)["buses"][0]
@@ -120,4 +127,4 @@ def test_eight_nodes_without_an_id_get_one_each(network: list[str], free_port: i
 @pytest.mark.socketcan
 def test_scan_on_socketcan_finds_the_hand(vcan_rig: Any) -> None:
     vcan_rig.simulate()
-    _until_well(vcan_rig, str(vcan_rig.config))
+    _scan_until_ok(vcan_rig, str(vcan_rig.config))

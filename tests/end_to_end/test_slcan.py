@@ -19,8 +19,8 @@ import pytest
 
 from handtouch.canbus.bus import receivers
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.slab import Slab
 from handtouch.config import Bus
+from handtouch.core.slab import Slab
 
 LONGEST_S = 60.0
 FRAMES = b"tTrR"
@@ -149,7 +149,7 @@ def contacts(rig: Any, ends: int) -> Counter[str]:
             assert time.monotonic() < end_s, (events, rig.all_printed())
             message = messages.recv(0.5)
             if message is not None:
-                events[message.reason or message.event] += 1
+                events[message.end_reason or message.event] += 1
     return events
 
 
@@ -160,12 +160,12 @@ def test_hand_works_over_slcan(rig: Any, hub: Hub) -> None:
     assert events["begin"] >= 1
     assert events["update"] > 10
     bus = rig.status()["service"]["buses"]["can0"]
-    assert (bus["state"], bus["problem"], bus["foreign"], bus["overflow"]) == ("active", "", 0, 0)
-    assert (bus["sync"]["by"], bus["sync"]["others"]) == ("loop", 0)
+    assert (bus["state"], bus["problem"], bus["unknown_frames"], bus["overflow"]) == ("active", "", 0, 0)
+    assert (bus["sync"]["by"], bus["sync"]["other_syncs"]) == ("loop", 0)
 
 
 @pytest.mark.timeout(240)
-def test_garbled_lines_are_counted_and_an_adapter_may_be_pulled_out(rig: Any, hub: Hub) -> None:
+def test_garbled_lines_are_counted_and_unplugged_adapter_recovers(rig: Any, hub: Hub) -> None:
     start(rig, hub)
     before = rig.status()["service"]["buses"]["can0"]
     robot = hub.adapters[1]
@@ -181,8 +181,8 @@ def test_garbled_lines_are_counted_and_an_adapter_may_be_pulled_out(rig: Any, hu
 
     with hub.lock:
         robot.unplug()
-    told = rig.wait("down", lambda status: status["service"]["buses"]["can0"]["state"] == "down")
-    assert "plug the adapter in" in told["service"]["buses"]["can0"]["problem"]
+    status = rig.wait("down", lambda status: status["service"]["buses"]["can0"]["state"] == "down")
+    assert "plug the adapter in" in status["service"]["buses"]["can0"]["problem"]
     with hub.lock:
         robot.plug()
     rig.wait_operational()
@@ -209,9 +209,7 @@ GARBAGE = [
 
 
 @pytest.mark.parametrize("garbage", GARBAGE)
-def test_no_line_however_garbled_stops_a_port_or_takes_the_next_frame_with_it(
-    hub: Hub, garbage: bytes
-) -> None:
+def test_garbled_lines_neither_stop_a_port_nor_lose_the_next_frame(hub: Hub, garbage: bytes) -> None:
     nodes, robot = hub.adapters
     slab = Slab(1)
     port = port_on(robot, slab)
@@ -226,7 +224,7 @@ def test_no_line_however_garbled_stops_a_port_or_takes_the_next_frame_with_it(
             assert time.monotonic() < end_s, port.counters
             select.select([port], [], [], 0.1)
             assert all(0 <= can_id < 0x800 for can_id, _, _ in port.drain())
-        assert slab.read()[0].tolist() == [1, 2, 3, 4]
+        assert slab.unpack_counts()[0].tolist() == [1, 2, 3, 4]
         assert port.send(0x701, bytes(1), remote=True)
         got = stranger.recv(5.0)
         assert got is not None
@@ -234,8 +232,8 @@ def test_no_line_however_garbled_stops_a_port_or_takes_the_next_frame_with_it(
     port.close()
 
 
-def test_adapter_that_takes_nothing_more_costs_no_more_than_a_moment_and_is_told(tmp_path: Path) -> None:
-    """Its terminal's buffer is full: nobody reads at the other end."""
+def test_blocked_adapter_delays_sending_only_briefly_and_is_reported(tmp_path: Path) -> None:
+    """The adapter's terminal buffer is full: the other end doesn't read."""
     adapter = Adapter(tmp_path / "tty")
     port = Port.open(
         Bus(name="palm", interface="slcan", channel=str(adapter.path), options={"sleep_after_open": 0}),
@@ -255,11 +253,9 @@ def test_adapter_that_takes_nothing_more_costs_no_more_than_a_moment_and_is_told
     port.close()
 
 
-def test_pulling_out_an_adapter_again_and_again_leaks_no_descriptor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_repeated_unplugging_leaks_no_descriptor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """python-can's slcan leaves its terminal open when closing it fails."""
-    monkeypatch.setattr(receivers, "_RETRY_FIRST_S", 0.01)
+    monkeypatch.setattr(receivers, "_MIN_RETRY_S", 0.01)
     with Hub(Adapter(tmp_path / "tty")) as hub:
         adapter = hub.adapters[0]
         port = port_on(adapter, Slab(1))
@@ -270,7 +266,7 @@ def test_pulling_out_an_adapter_again_and_again_leaks_no_descriptor(
                 adapter.plug()
             end_s = time.monotonic() + 20
             while port.counters.frames <= number or adapter.output:
-                assert time.monotonic() < end_s, port.look(time.monotonic_ns()).problem
+                assert time.monotonic() < end_s, port.update_state(time.monotonic_ns()).problem
                 select.select([port], [], [], 0.05)
                 port.drain()
                 if adapter.is_open and port.counters.frames <= number and not adapter.output:

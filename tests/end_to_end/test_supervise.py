@@ -1,5 +1,5 @@
-"""The supervisor at work in a daemon: a swapped unit calibrates itself and is trusted again, faults are named
-in words, and when the slow half is killed nobody who listens to contacts notices."""
+"""Supervision in a daemon: a replaced node is calibrated by contacts, faults are diagnosed, and killing the
+supervisor process does not affect contacts."""
 
 from __future__ import annotations
 
@@ -16,56 +16,29 @@ import numpy as np
 import pytest
 
 from handtouch import wire
+from handtouch.calibration.store import Store
+from handtouch.cli.demo import in_process_deployment
 from handtouch.client import connect
 from handtouch.config import parse
-from handtouch.daemon.daemon import Daemon
-from handtouch.demo import in_process
-from handtouch.simulate.run import SimulatedHand
+from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.simulate.scenario import Scenario
-from handtouch.simulate.truth import Truth
+from handtouch.simulate.simulated_hand import SimulatedHand
+from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.world import World
-from handtouch.supervise.store import Store
+from tests.deployments import deployment_text, pad_text
 
 PERIOD_MS = 5.0
-LONGEST_S = 60.0
-"""Nothing waits so long when all is well."""
-DEPLOYMENT = f"""
-[daemon]
-sync_period_ms = {PERIOD_MS}
-window = 0.9
-store = "calibrations.db"
-
-[[bus]]
-name = "can0"
-interface = "virtual"
-channel = "x"
-
-[node.n]
-drive_v = 5.0
-full_scale_ma = 10.0
-noise_counts = 2.0
-
-[sheet.s]
-ohm_per_square = 2400.0
-contact_ohm_mm2 = 20000.0
-alpha = 1.5
-contact_radius_mm = 2.0
-contact_radius_std_mm = 0.2
-
-[[hand]]
-name = "h"
-"""
-PAD = """
-[[hand.pad]]
-link = "{link}"
-bus = "can0"
-node_id = {node_id}
-serial = {serial}
-node = "n"
-sheet = "s"
-surface = {{ kind = "plane", length_mm = 24.0, width_mm = 20.0 }}
-gap_mm = 0.6
-"""
+MAX_WAIT_S = 60.0
+"""Upper limit of every wait."""
+DEPLOYMENT = deployment_text(
+    daemon=f'sync_period_ms = {PERIOD_MS}\nsample_window_fraction = 0.9\nstore = "calibrations.db"',
+    channel="x",
+    noise_counts=2.0,
+    contact_radius_mm=2.0,
+    contact_radius_std_mm=0.2,
+    touch="",
+)
+SURFACE = '{ kind = "plane", length_mm = 24.0, width_mm = 20.0 }'
 LINKS = ("swapped", "other", "broken")
 SCENARIO = """
 repeat = true
@@ -110,9 +83,9 @@ force_n = [1.5]
 
 @dataclass
 class Bench:
-    """A daemon at work, and all that it said since."""
+    """A running daemon, and the messages that it has published."""
 
-    daemon: Daemon
+    daemon: HandtouchDaemon
     hand: SimulatedHand
     store: Path
     contacts: list[wire.Contact] = field(default_factory=list)
@@ -128,38 +101,42 @@ class Bench:
                     self.contacts.append(message)
                 elif isinstance(message, wire.Health):
                     self.health.append(message)
-                self.malformed = messages.malformed
+                self.malformed = messages.malformed_messages
 
     def wait(self, what: str, met: Callable[[], Any]) -> Any:
-        end_s = time.monotonic() + LONGEST_S
+        end_s = time.monotonic() + MAX_WAIT_S
         while not (found := met()):
-            assert time.monotonic() < end_s, f"never {what}: {self.daemon.report.status()}"
+            assert time.monotonic() < end_s, (
+                f"never {what}: {self.daemon.reporter.status(time.monotonic_ns())}"
+            )
             time.sleep(0.05)
         return found
 
     @property
     def figures(self) -> dict[str, Any]:
         assert self.daemon.supervisor is not None
-        return self.daemon.supervisor.figures()
+        return self.daemon.supervisor.statistics()
 
-    def told(self, link: str, trust: str, after_ns: int = 0) -> wire.Health | None:
-        """The first that health said so of a pad since then."""
-        said = (h for h in self.health if (h.link, h.trust) == (link, trust) and h.t_ns > after_ns)
-        return next(said, None)
+    def find_health(self, link: str, state: str, after_ns: int = 0) -> wire.Health | None:
+        """Return the first health message of a pad in this calibration state since then."""
+        matches = (
+            h for h in self.health if (h.link, h.calibration_state) == (link, state) and h.t_ns > after_ns
+        )
+        return next(matches, None)
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     folder = tmp_path_factory.mktemp("supervised")
-    pads = "".join(PAD.format(link=link, node_id=k + 1, serial=1001 + k) for k, link in enumerate(LINKS))
-    deployment = in_process(parse(DEPLOYMENT + pads))
+    pads = "".join(pad_text(link, k + 1, SURFACE, f"serial = {1001 + k}") for k, link in enumerate(LINKS))
+    deployment = in_process_deployment(parse(DEPLOYMENT + pads))
     settings = deployment.daemon.model_copy(update={"supervise": True})
     deployment = deployment.model_copy(update={"daemon": settings})
     stop = threading.Event()
     hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), World.ideal_parts())
-    with hand, Daemon(deployment, beside=folder) as daemon:
+    with hand, HandtouchDaemon.open(deployment, folder=folder) as daemon:
         for number, device in enumerate(hand.devices.values()):
-            device.swap(1001 + number)
+            device.replace_device(1001 + number)
         hand.start()
         made = Bench(daemon, hand, folder / "calibrations.db")
         threads = [
@@ -176,109 +153,115 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
                 thread.join()
 
 
-def _errors_mm(contacts: list[wire.Contact], truth: list[Truth]) -> list[float]:
-    """Distance of each located contact on the swapped pad from where the touch was at that time."""
-    there = sorted((t.t_ns, t.position_m) for t in truth if t.link == "swapped")
-    times = np.array([t_ns for t_ns, _ in there])
+def _errors_mm(contacts: list[wire.Contact], truth: list[GroundTruth]) -> list[float]:
+    """Return the position error of each contact on the swapped pad, against the ground truth."""
+    truth_of_pad = sorted((t.t_ns, t.position_m) for t in truth if t.link == "swapped")
+    times = np.array([t_ns for t_ns, _ in truth_of_pad])
     errors = []
     for contact in contacts:
         if contact.link != "swapped" or contact.position_m is None or contact.event != "update":
             continue
         nearest = int(np.abs(times - contact.t_ns).argmin())
         if abs(int(times[nearest]) - contact.t_ns) < 0.4e6 * PERIOD_MS:
-            errors.append(1e3 * float(np.linalg.norm(np.subtract(contact.position_m, there[nearest][1]))))
+            errors.append(
+                1e3 * float(np.linalg.norm(np.subtract(contact.position_m, truth_of_pad[nearest][1])))
+            )
     return errors
 
 
-def test_a_swapped_unit_is_told_calibrates_itself_and_is_trusted_again(bench: Bench) -> None:
-    told = bench.wait("quarantined", lambda: bench.told("swapped", "quarantined"))
-    assert told.serial == 2002
-    finding = bench.wait(
-        "told why", lambda: next((f for h in bench.health for f in h.findings if h.link == "swapped"), None)
+def test_replaced_node_is_quarantined_and_calibrated_by_contacts(bench: Bench) -> None:
+    quarantine = bench.wait("quarantined", lambda: bench.find_health("swapped", "quarantined"))
+    assert quarantine.serial == 2002
+    diagnosis = bench.wait(
+        "diagnosed", lambda: next((f for h in bench.health for f in h.diagnoses if h.link == "swapped"), None)
     )
-    assert finding["kind"] == "swapped unit"
-    assert "serial 1001 was here, 2002 is" in finding["cause"]
-    assert "touch the pad all over" in finding["remedy"]
-    trusted = bench.wait("trusted", lambda: bench.told("swapped", "trusted", told.t_ns))
-    assert trusted.findings == ()
-    assert trusted.calibration.startswith("2002-")
-    end_ns = trusted.t_ns + 2_000_000_000
+    assert diagnosis["kind"] == "node_replaced"
+    assert "serial 1001 -> 2002" in diagnosis["cause"]
+    assert "touch the pad all over" in diagnosis["remedy"]
+    calibrated = bench.wait("calibrated", lambda: bench.find_health("swapped", "calibrated", quarantine.t_ns))
+    assert calibrated.diagnoses == ()
+    assert calibrated.calibration_id.startswith("2002-")
+    end_ns = calibrated.t_ns + 2_000_000_000
     bench.wait("touched since", lambda: bench.contacts[-1].t_ns > end_ns)
     contacts, truth = list(bench.contacts), bench.hand.truth
-    quarantined = [c for c in contacts if told.t_ns < c.t_ns < trusted.t_ns and c.link == "swapped"]
-    unknown = [c for c in quarantined if c.calibration.startswith("nominal-")]
-    since = [c for c in contacts if c.t_ns > trusted.t_ns + 200_000_000]
+    quarantined = [c for c in contacts if quarantine.t_ns < c.t_ns < calibrated.t_ns and c.link == "swapped"]
+    unknown = [c for c in quarantined if c.calibration_id.startswith("nominal-")]
+    since = [c for c in contacts if c.t_ns > calibrated.t_ns + 200_000_000]
     before_mm, after_mm = _errors_mm(unknown, truth), _errors_mm(since, truth)
     assert np.median(after_mm) < 0.5 * np.median(before_mm)
-    assert all(c.strength == "invalid" and c.force_n is None for c in quarantined)
-    assert any(c.strength == "valid" for c in since if c.link == "swapped")
-    # the stated covariance knew of it
+    assert all(c.force_status == "invalid" and c.force_n is None for c in quarantined)
+    assert any(c.force_status == "valid" for c in since if c.link == "swapped")
+    # the published covariance covered the error
     wide = [float(np.sqrt(np.trace(np.reshape(c.covariance_m2, (3, 3))))) for c in unknown if c.covariance_m2]
     assert 0.3 < np.median(before_mm) / (1e3 * np.median(wide)) < 3
     with Store(bench.store) as store:
-        kept = store.newest(2002)
-    assert kept is not None
-    assert kept.provenance.method == "gains from contacts"
+        stored = store.newest(2002)
+    assert stored is not None
+    assert stored.provenance.method == "gains from contacts"
 
 
-def test_a_fault_is_named_in_words_while_it_lasts(bench: Bench) -> None:
+def test_fault_is_diagnosed_while_it_lasts(bench: Bench) -> None:
     def found() -> tuple[wire.Health, dict[str, Any]] | None:
-        told = ((h, f) for h in bench.health if h.link == "broken" for f in h.findings)
-        return next((pair for pair in told if pair[1]["kind"] == "stuck channel"), None)
+        pairs = ((h, f) for h in bench.health if h.link == "broken" for f in h.diagnoses)
+        return next((pair for pair in pairs if pair[1]["kind"] == "stuck_channel"), None)
 
-    health, finding = bench.wait("named", found)
-    assert "channel xa" in finding["cause"]
-    assert finding["remedy"]
-    assert finding["evidence"]
-    assert health.trust == "nominal"
-    bench.wait("over", lambda: any(h.t_ns > health.t_ns and not h.findings for h in bench.health))
-    others = [f["kind"] for h in bench.health for f in h.findings if h.link != "broken"]
-    assert set(others) <= {"swapped unit"}
+    health, diagnosis = bench.wait("named", found)
+    assert "channel xa" in diagnosis["cause"]
+    assert diagnosis["remedy"]
+    assert diagnosis["evidence"]
+    assert health.calibration_state == "default"
+    bench.wait("over", lambda: any(h.t_ns > health.t_ns and not h.diagnoses for h in bench.health))
+    others = [f["kind"] for h in bench.health for f in h.diagnoses if h.link != "broken"]
+    assert set(others) <= {"node_replaced"}
 
 
-def test_killing_the_slow_half_costs_no_contact_and_no_tick(bench: Bench) -> None:
-    bench.wait("at work", lambda: bench.figures["lag_s"] is not None)
+def test_killing_the_supervisor_process_affects_no_contact_and_no_tick(bench: Bench) -> None:
+    bench.wait("running", lambda: bench.figures["lag_s"] is not None)
     pid, restarts = bench.figures["pid"], bench.figures["restarts"]
     seen, since_ns = len(bench.contacts), time.monotonic_ns()
     periods = bench.daemon.pipeline.ticks + bench.daemon.sync.overruns
     os.kill(pid, signal.SIGKILL)
-    bench.wait("started again", lambda: bench.figures["restarts"] > restarts and bench.figures["pid"])
-    bench.wait("at work again", lambda: bench.figures["lag_s"] is not None)
+    bench.wait("restarted", lambda: bench.figures["restarts"] > restarts and bench.figures["pid"])
+    bench.wait("running again", lambda: bench.figures["lag_s"] is not None)
     assert bench.figures["pid"] != pid
-    assert bench.figures["died_of"] == "killed by signal 9"
-    gone = (time.monotonic_ns() - since_ns) // round(PERIOD_MS * 1e6)
-    # a busy machine overruns some, whether anybody is killed or not; nothing else is missing
-    assert bench.daemon.pipeline.ticks + bench.daemon.sync.overruns - periods >= gone - 2
+    assert bench.figures["exit_reason"] == "signal 9"
+    elapsed = (time.monotonic_ns() - since_ns) // round(PERIOD_MS * 1e6)
+    # a busy machine overruns some anyway; nothing else is missing
+    assert bench.daemon.pipeline.ticks + bench.daemon.sync.overruns - periods >= elapsed - 2
     seqs: dict[str, list[int]] = {}
     for contact in bench.contacts[seen:]:
         seqs.setdefault(contact.link, []).append(contact.seq)
     assert bench.malformed == 0
     for link, numbers in seqs.items():
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), link
-    bench.wait("contacts go on", lambda: bench.contacts[-1].t_ns > since_ns + 1_000_000_000)
-    assert bench.daemon.report.status()["pads"][0]["trust"] == "trusted"
+    bench.wait("contacts continue", lambda: bench.contacts[-1].t_ns > since_ns + 1_000_000_000)
+    assert bench.daemon.reporter.status(time.monotonic_ns())["pads"][0]["calibration_state"] == "calibrated"
 
 
-def test_another_unit_is_refused_where_the_deployment_says_so(tmp_path: Path) -> None:
-    made_of = "".join(PAD.format(link=link, node_id=k + 1, serial=1001 + k) for k, link in enumerate(LINKS))
-    deployment = in_process(parse(DEPLOYMENT + made_of))
-    settings = deployment.daemon.model_copy(update={"supervise": True, "another_unit": "refuse"})
+def _first_pad(daemon: HandtouchDaemon) -> dict[str, Any]:
+    """Return the health of the first pad."""
+    return dict(daemon.reporter.status(time.monotonic_ns())["pads"][0])
+
+
+def test_replaced_node_is_refused_if_configured(tmp_path: Path) -> None:
+    made_of = "".join(pad_text(link, k + 1, SURFACE, f"serial = {1001 + k}") for k, link in enumerate(LINKS))
+    deployment = in_process_deployment(parse(DEPLOYMENT + made_of))
+    settings = deployment.daemon.model_copy(update={"supervise": True, "on_node_replaced": "refuse"})
     deployment = deployment.model_copy(update={"daemon": settings})
     stop = threading.Event()
     hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), World.ideal_parts())
-    with hand, Daemon(deployment, beside=tmp_path) as daemon:
-        next(iter(hand.devices.values())).swap(2002)
+    with hand, HandtouchDaemon.open(deployment, folder=tmp_path) as daemon:
+        next(iter(hand.devices.values())).replace_device(2002)
         hand.start()
         made = Bench(daemon, hand, tmp_path / "calibrations.db")
         thread = threading.Thread(target=daemon.run, args=(stop,))
         thread.start()
         try:
-            pads = daemon.report.status
-            made.wait("refused", lambda: pads()["pads"][0]["node"] == "faulted")
-            pad = pads()["pads"][0]
+            made.wait("refused", lambda: _first_pad(daemon)["node_state"] == "faulted")
+            pad = _first_pad(daemon)
         finally:
             stop.set()
             thread.join()
-    assert (pad["link"], pad["trust"]) == ("swapped", "nominal")
+    assert (pad["link"], pad["calibration_state"]) == ("swapped", "default")
     assert "1001" in pad["reason"]
     assert "2002" in pad["reason"]

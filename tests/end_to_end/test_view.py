@@ -1,4 +1,4 @@
-"""The page in a real browser, with real daemon and nodes: what touches the hand is seen where it is."""
+"""The page in a real browser, with real daemon and nodes: contacts are drawn at their positions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from handtouch import Robot, config, shipped
-from handtouch.hand.kinematics import Kinematics
-from handtouch.hand.pads import mount_of, surface_of
-from handtouch.hand.urdf import read
+from handtouch import Robot, config
+from handtouch.config import shipped
+from handtouch.hand.kinematics import HandKinematics
+from handtouch.hand.pads import mount_transform, pad_surface
+from handtouch.hand.urdf import read_urdf
 
 TOUCHES = {"index_distal": (0.5, 0.5), "palm_fingers": (0.25, 0.7)}
 """Link -> fractions of its pad."""
@@ -57,7 +58,7 @@ class Browser:
         return self.ask(evaluate=expression)
 
     def picture(self, path: Path) -> NDArray[np.float64]:
-        """What is seen, (rows, columns, 3), 0 to 255."""
+        """Return a screenshot, (rows, columns, 3), 0 to 255."""
         self.ask(screenshot=str(path))
         return np.asarray(imread(path)[:, :, :3] * 255.0, np.float64)
 
@@ -81,7 +82,7 @@ def browser(javascript: Path, chromium: str) -> Iterator[Browser]:
 
 
 def start_view(rig: Any, port: int) -> str:
-    """`handtouch view`; the URL that it tells."""
+    """Start `handtouch view` and return the URL that it prints."""
     with (rig.folder / "view.txt").open("a") as output:
         command = [sys.executable, "-m", "handtouch", "view", "--key", "", "--port", str(port)]
         rig.processes["view"] = subprocess.Popen(
@@ -98,34 +99,34 @@ def start_view(rig: Any, port: int) -> str:
 
 
 def expected_m(link: str) -> NDArray[np.float64]:
-    """Where a touch is in the base: its place on the pad, mounted, and the joints by Pinocchio."""
+    """Return the position of a touch in the base frame: on the mounted pad, with joints by Pinocchio."""
     deployment = config.load(shipped.path("utah_mit.toml"))
     pad = next(pad for pad in deployment.hands[0].pads if pad.link == link)
-    surface, (rotation, at) = surface_of(pad), mount_of(pad)
+    surface, (rotation, at) = pad_surface(pad), mount_transform(pad)
     x, y = TOUCHES[link]
-    robot = read(shipped.path("utah_mit.urdf"))
-    kinematics = Kinematics(robot, [link], "palm", robot.root)
-    kinematics.move(np.array([ANGLES.get(name, 0.0) for name in kinematics.joints]))
-    pose = kinematics.in_base(0)
+    robot = read_urdf(shipped.path("utah_mit.urdf"))
+    kinematics = HandKinematics(robot, [link], "palm", robot.root)
+    kinematics.set_joint_positions(np.array([ANGLES.get(name, 0.0) for name in kinematics.joints]))
+    pose = kinematics.pose_in_base(0)
     on_link = rotation @ surface.point(x * surface.a, y * surface.b) + at
     return np.asarray(pose.rotation @ on_link + pose.translation_m)
 
 
-def seen_at(browser: Browser, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def pixel_of(browser: Browser, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixel of a point of the world."""
-    told = browser.evaluate(
-        "(() => { const { view, projection } = handtouch.hand.lookAround();"
+    camera = browser.evaluate(
+        "(() => { const { view, projection } = handtouch.hand.cameraMatrices();"
         "const box = document.getElementById('hand').getBoundingClientRect();"
         "return { view: [...view], projection: [...projection], size: [box.width, box.height] } })()"
     )
-    view, projection = (np.reshape(told[name], (4, 4)).T for name in ("view", "projection"))
+    view, projection = (np.reshape(camera[name], (4, 4)).T for name in ("view", "projection"))
     clip = projection @ view @ [*point_m, 1.0]
     x, y = clip[:2] / clip[3]
-    return np.asarray(np.array([(x + 1) / 2, (1 - y) / 2]) * told["size"])
+    return np.asarray(np.array([(x + 1) / 2, (1 - y) / 2]) * camera["size"])
 
 
 def middle_of(picture: NDArray[np.float64], colour: tuple[int, ...], near: NDArray[np.float64]) -> Any:
-    """Number of pixels of a colour within 12 of a place, and how far the nearest of them is from it."""
+    """Return the number of pixels of a colour within 12 px of a point, and the nearest one's distance."""
     rows, columns = np.nonzero(np.abs(picture - colour).max(axis=2) < 12)
     far = np.hypot(columns - near[0], rows - near[1])
     return np.count_nonzero(far < 12), far.min() if len(far) else np.inf
@@ -137,8 +138,8 @@ def hue_of(picture: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(colour / np.linalg.norm(colour))
 
 
-@pytest.mark.timeout(300)  # a browser that draws in software, on a machine that does other things too
-def test_touches_are_seen_where_they_are_and_the_page_outlives_its_daemon(
+@pytest.mark.timeout(300)  # the browser renders in software, on a machine under load
+def test_contacts_are_drawn_at_their_positions_and_the_page_survives_restarts(
     rig: Any, browser: Browser, free_port: int, tmp_path: Path
 ) -> None:
     rig.scenario.write_text(SCENARIO)
@@ -150,15 +151,15 @@ def test_touches_are_seen_where_they_are_and_the_page_outlives_its_daemon(
         while not browser.evaluate("Boolean(handtouch.state.joints.right?.index_mcp)"):
             robot.send_joints("right", ANGLES)
             time.sleep(0.05)
-    touched = " && ".join(f"handtouch.state.contacts['right/{link}']?.at" for link in TOUCHES)
-    well = "Object.values(handtouch.state.pads).every((pad) => pad.look === 'clear')"
-    browser.wait(f"{touched} && {well}")
+    touched = " && ".join(f"handtouch.state.contacts['right/{link}']?.position_m" for link in TOUCHES)
+    all_clear = "Object.values(handtouch.state.pads).every((pad) => pad.status === 'clear')"
+    browser.wait(f"{touched} && {all_clear}")
     drawn = browser.evaluate("handtouch.counts.frames")
     browser.wait(f"handtouch.counts.frames > {drawn + 1}")
     picture = browser.picture(tmp_path / "touched.png")
 
     for link in TOUCHES:
-        count, nearest = middle_of(picture, ORANGE, seen_at(browser, expected_m(link)))
+        count, nearest = middle_of(picture, ORANGE, pixel_of(browser, expected_m(link)))
         assert count > 20, link
         assert nearest < 2.5, link
     left, top, wide, high = browser.evaluate("handtouch.pads.boxes['right/palm_fingers']")
@@ -174,14 +175,14 @@ def test_touches_are_seen_where_they_are_and_the_page_outlives_its_daemon(
 
     rig.processes["run"].kill()
     rig.processes.pop("run").wait()
-    browser.wait("document.getElementById('trouble').textContent.includes('silent')")
+    browser.wait("document.getElementById('trouble').textContent.includes('daemon disconnected')")
     assert browser.evaluate("Object.values(handtouch.state.contacts).every((contact) => !contact)")
     rig.start("run")
     browser.wait(f"document.getElementById('trouble').hidden && {touched}")
-    assert "started anew" in browser.evaluate("JSON.stringify(handtouch.state.messages)")
+    assert "daemon restarted" in browser.evaluate("JSON.stringify(handtouch.state.messages)")
 
     rig.end("simulate")
-    browser.wait("handtouch.state.pads['right/palm_heel'].look === 'lost'")
+    browser.wait("handtouch.state.pads['right/palm_heel'].status === 'lost'")
     drawn = browser.evaluate("handtouch.counts.frames")
     browser.wait(f"handtouch.counts.frames > {drawn}")
     red = np.array(RED) / np.linalg.norm(RED)
@@ -192,5 +193,5 @@ def test_touches_are_seen_where_they_are_and_the_page_outlives_its_daemon(
     assert rig.end("view") == 0
     browser.wait("!handtouch.state.connected")
     start_view(rig, free_port)
-    browser.wait("handtouch.state.connected && handtouch.state.pads['right/palm_heel'].look === 'lost'")
+    browser.wait("handtouch.state.connected && handtouch.state.pads['right/palm_heel'].status === 'lost'")
     assert browser.ask(errors=True) == []

@@ -1,4 +1,4 @@
-"""What a running daemon tells those who watch it: figures for Prometheus, from first tick to last."""
+"""Prometheus metrics of a running daemon, from first tick to last."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SCRAPE = "import sys, urllib.request; print(urllib.request.urlopen(sys.argv[1], 
 
 
 def scrape(rig: Any, port: int) -> dict[str, list[Any]]:
-    """Samples by name, as somebody on the daemon's own network reads them."""
+    """Return samples by name, read in the daemon's network."""
     url = f"http://127.0.0.1:{port}/metrics"
     command = [*rig.command()[:-3], sys.executable, "-c", SCRAPE, url]
     done = subprocess.run(command, capture_output=True, text=True, timeout=START_S, check=False)
@@ -26,7 +26,7 @@ def scrape(rig: Any, port: int) -> dict[str, list[Any]]:
     return found
 
 
-def test_prometheus_sees_pads_ticks_and_where_the_time_goes(rig: Any, free_port: int) -> None:
+def test_metrics_of_pads_ticks_and_stages(rig: Any, free_port: int) -> None:
     text = rig.config.read_text()
     rig.config.write_text(text.replace("[daemon]\n", f'[daemon]\nmetrics = "127.0.0.1:{free_port}"\n', 1))
     rig.simulate()
@@ -45,6 +45,6 @@ def test_prometheus_sees_pads_ticks_and_where_the_time_goes(rig: Any, free_port:
     for stage in ("wait", "receive", "tick", "send"):
         (total,) = [s.value for s in found["stage_seconds_sum"] if s.labels["stage"] == stage]
         assert 0 < total <= status["loop"]["stages"][stage]["sum_s"]
-    assert sum(figures["sum_s"] for figures in status["loop"]["stages"].values()) <= status["uptime_s"]
+    assert sum(histogram["sum_s"] for histogram in status["loop"]["stages"].values()) <= status["uptime_s"]
     assert rig.end("run") == 0
-    assert scrape(rig, free_port) == {}  # the process is gone with its daemon
+    assert scrape(rig, free_port) == {}  # the server process ends with the daemon

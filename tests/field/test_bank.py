@@ -1,4 +1,4 @@
-"""A bank of pads gives what each pad's own estimate gives, all at once, and says what its tables cost."""
+"""A bank agrees with each pad's own estimate, and reports the error of its tables."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def contacts(count: int, seed: int, margin: float) -> tuple[IndexArray, FloatArr
     return index, x, y, fractions
 
 
-def test_tables_are_as_accurate_as_they_say() -> None:
+def test_tables_are_as_accurate_as_reported() -> None:
     index, x, y, fractions = contacts(2000, 1, 0.03)
     error = np.abs(BANK.fractions(index, x, y) - fractions).max(axis=0)
     assert (error <= 1.5 * BANK.table_error[index]).all()
     assert BANK.table_error.max() < 1e-6
 
 
-def test_conformal_radius_is_the_models() -> None:
+def test_conformal_radius_equals_the_models() -> None:
     index, x, y, _ = contacts(300, 2, 0.03)
     expected = []
     for i, u, v in zip(index, x, y, strict=True):
@@ -53,7 +53,7 @@ def test_conformal_radius_is_the_models() -> None:
 
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-3, 1e-2])
-def test_it_agrees_with_each_pads_own_estimate(noise: float) -> None:
+def test_bank_agrees_with_single_estimates(noise: float) -> None:
     index, _, _, fractions = contacts(60, 3, 0.08)
     currents = 2e-3 * (fractions + noise * np.random.default_rng(4).normal(size=fractions.shape))
     found = BANK.estimate(index, currents, 2e-3 * noise)
@@ -72,7 +72,7 @@ def test_it_agrees_with_each_pads_own_estimate(noise: float) -> None:
 
 
 @pytest.mark.parametrize(("noise", "limit"), [(1e-5, 1.05), (1e-4, 1.05), (1e-3, 1.05), (3e-3, 1.05)])
-def test_error_is_the_least_possible(noise: float, limit: float) -> None:
+def test_error_reaches_the_cramer_rao_bound(noise: float, limit: float) -> None:
     index, x, y, fractions = contacts(5000, 5, 0.05)
     currents = fractions + noise * np.random.default_rng(6).normal(size=fractions.shape)
     found = BANK.estimate(index, currents, noise)
@@ -88,7 +88,7 @@ def test_error_is_the_least_possible(noise: float, limit: float) -> None:
 
 
 @pytest.mark.parametrize("strength", [0.0, 1.0, 3.0])
-def test_it_agrees_with_each_pads_own_estimate_on_hardly_more_than_noise(strength: float) -> None:
+def test_bank_agrees_with_single_estimates_near_the_noise(strength: float) -> None:
     generator = np.random.default_rng(10)
     for model in MODELS:
         place = generator.uniform(0.05, 0.95, (2, 500)) * [[model.a], [model.b]]
@@ -102,7 +102,7 @@ def test_it_agrees_with_each_pads_own_estimate_on_hardly_more_than_noise(strengt
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 3.0, 100.0]), st.floats(0.01, 100.0))
-def test_a_covariance_is_positive_semidefinite_whatever_the_noise_of_each_channel(
+def test_covariance_is_positive_semidefinite_for_any_channel_noise(
     seed: int, strength: float, uneven: float
 ) -> None:
     generator = np.random.default_rng(seed)
@@ -115,7 +115,7 @@ def test_a_covariance_is_positive_semidefinite_whatever_the_noise_of_each_channe
     assert np.linalg.eigvalsh(correlation).min(initial=0.0) > -1e-12
 
 
-def test_a_start_changes_nothing_and_an_unknown_one_is_found() -> None:
+def test_start_makes_no_difference_and_nan_is_replaced() -> None:
     index, x, y, fractions = contacts(200, 7, 0.1)
     currents = fractions + 1e-4 * np.random.default_rng(8).normal(size=fractions.shape)
     cold = BANK.estimate(index, currents, 1e-4)
@@ -133,7 +133,7 @@ readings = st.lists(st.floats(width=64, allow_nan=True, allow_infinity=True), mi
     st.lists(readings, min_size=1, max_size=5),
     st.sampled_from([0.0, 1e-300, 1e-9, 1.0, np.inf, np.nan, -1.0]),
 )
-def test_any_reading_gives_an_answer_on_the_pad_or_nan(rows: list[list[float]], noise: float) -> None:
+def test_any_reading_gives_a_point_on_the_pad_or_nan(rows: list[list[float]], noise: float) -> None:
     good = BANK.fractions(np.array([0]), np.array([0.021]), np.array([0.013]))
     currents = np.concatenate([np.array(rows).T, good], axis=1)
     levels = np.full(currents.shape, noise)
@@ -167,7 +167,7 @@ def test_a_whole_hand_is_tabulated_in_a_second() -> None:
     assert time.perf_counter() - begin < 1.5
 
 
-def test_empty_calls_and_foreign_models() -> None:
+def test_empty_calls_and_unsupported_models() -> None:
     assert BANK.estimate(np.zeros(0, dtype=int), np.zeros((4, 0)), 1.0).x.shape == (0,)
     three = [Electrode("x0", 0.0, 1.0), Electrode("xa", 0.0, 1.0), Electrode("y0", 0.1, 0.9)]
     with pytest.raises(ValueError, match="four channels"):

@@ -1,4 +1,4 @@
-"""The maximum-likelihood estimate reaches the Cramer-Rao bound and says honestly how sure it is."""
+"""The maximum-likelihood estimate reaches the Cramer-Rao bound, with a valid covariance."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.field import ForwardModel, LocatorBank, Rectangle, estimate
+from handtouch.field import (
+    ForwardModel,
+    LocatorBank,
+    Rectangle,
+    estimate,
+)
 from handtouch.field.model import FloatArray
 
 
@@ -26,7 +31,7 @@ def bound(pad: ForwardModel, x: FloatArray, y: FloatArray, noise: FloatArray) ->
 
 @pytest.mark.parametrize("aspect", [1.0, 1.77])
 @pytest.mark.parametrize(("noise", "limit"), [(1e-5, 1.05), (1e-3, 1.05), (3e-3, 1.05), (1e-2, 1.15)])
-def test_error_is_the_least_possible(aspect: float, noise: float, limit: float) -> None:
+def test_error_reaches_the_cramer_rao_bound(aspect: float, noise: float, limit: float) -> None:
     pad = Rectangle(aspect, 1.0)
     x, y = scatter(pad, 20_000, 7)
     levels = np.full(4, noise)
@@ -36,7 +41,7 @@ def test_error_is_the_least_possible(aspect: float, noise: float, limit: float) 
     assert np.sqrt(((found.x - x) ** 2 + (found.y - y) ** 2).mean() / expected.mean()) < limit
 
 
-def test_unequal_noise_is_weighed_and_the_covariance_is_calibrated() -> None:
+def test_unequal_noise_is_weighted_and_covariance_is_calibrated() -> None:
     pad = Rectangle(1.2, 1.0)
     x, y = scatter(pad, 10_000, 1, margin=0.1)
     levels = np.array([3e-4, 1e-3, 2e-4, 2e-3])
@@ -49,7 +54,7 @@ def test_unequal_noise_is_weighed_and_the_covariance_is_calibrated() -> None:
     assert found.converged.all()
 
 
-def test_covariance_is_the_inverse_information() -> None:
+def test_covariance_equals_the_inverse_information() -> None:
     pad = Rectangle(3.0, 1.0)
     x, y = scatter(pad, 200, 3)
     levels = np.array([1e-4, 2e-4, 3e-4, 4e-4])
@@ -60,7 +65,9 @@ def test_covariance_is_the_inverse_information() -> None:
 
 
 @given(st.floats(0.3, 3.0), st.floats(0.02, 0.98), st.floats(0.02, 0.98), st.floats(1e-9, 1e6))
-def test_without_noise_it_is_the_inverse(aspect: float, u: float, v: float, total: float) -> None:
+def test_estimate_without_noise_equals_the_exact_inverse(
+    aspect: float, u: float, v: float, total: float
+) -> None:
     pad = Rectangle(aspect, 1.0)
     found = pad.estimate(total * pad.fractions(u * aspect, v), 1e-7 * total)
     assert found.x == pytest.approx(u * aspect, abs=1e-8)
@@ -77,7 +84,7 @@ def test_without_noise_it_is_the_inverse(aspect: float, u: float, v: float, tota
     ),
     st.floats(1e-12, 10),
 )
-def test_any_reading_gives_an_answer_on_the_pad_or_nan(readings: list[list[float]], noise: float) -> None:
+def test_any_reading_gives_a_point_on_the_pad_or_nan(readings: list[list[float]], noise: float) -> None:
     pad = Rectangle(1.4, 1.0)
     centre = pad.fractions(0.7, 0.5)
     with np.errstate(all="raise"):
@@ -87,7 +94,7 @@ def test_any_reading_gives_an_answer_on_the_pad_or_nan(readings: list[list[float
     assert found.x[-1] == pytest.approx(0.7, abs=1e-5)
 
 
-def test_a_channel_of_infinite_noise_is_left_out() -> None:
+def test_channel_of_infinite_noise_is_excluded() -> None:
     pad = Rectangle(1.0, 1.0)
     currents = pad.fractions(0.3, 0.6)
     currents[2] = 77.0
@@ -96,7 +103,7 @@ def test_a_channel_of_infinite_noise_is_left_out() -> None:
     assert found.y == pytest.approx(0.6, abs=1e-6)
 
 
-def test_what_the_currents_do_not_hold_has_infinite_variance() -> None:
+def test_unobservable_coordinate_has_infinite_variance() -> None:
     found = Rectangle(1500.0, 1.0).estimate([0.0, 0.0, 0.5, 0.5], 1e-3)
     assert np.isnan(found.x)
     assert found.y == pytest.approx(0.5)
@@ -107,7 +114,7 @@ def test_what_the_currents_do_not_hold_has_infinite_variance() -> None:
     assert not nothing.converged
 
 
-def test_a_start_saves_the_search_and_changes_nothing() -> None:
+def test_start_saves_the_search_and_makes_no_difference() -> None:
     pad = Rectangle(1.0, 1.3)
     x, y = scatter(pad, 500, 5)
     currents = pad.fractions(x, y) + 1e-3 * np.random.default_rng(6).normal(size=(4, 500))
@@ -122,7 +129,7 @@ def test_wrong_number_of_channels_is_named() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-290, 1e-120, 1e120, 1e290])
-def test_units_do_not_matter(scale: float) -> None:
+def test_units_make_no_difference(scale: float) -> None:
     currents = Rectangle(1.5, 1.0).fractions([0.4, 1.2], [0.3, 0.6]) + 1e-3
     plain = Rectangle(1.5, 1.0).estimate(currents, 1e-3)
     with np.errstate(all="raise"):
@@ -135,7 +142,7 @@ def test_units_do_not_matter(scale: float) -> None:
 
 
 @pytest.mark.parametrize("contacts", [1, 4, 5])
-def test_noise_of_one_dimension_is_that_of_the_channels(contacts: int) -> None:
+def test_one_dimensional_noise_is_per_channel(contacts: int) -> None:
     pad = Rectangle(1.5, 1.0)
     noise = np.array([1e-3, 2e-3, 1e-4, 3e-3])
     x, y = np.linspace(0.3, 1.2, contacts), np.linspace(0.7, 0.4, contacts)
@@ -151,7 +158,7 @@ def test_noise_of_one_dimension_is_that_of_the_channels(contacts: int) -> None:
     np.testing.assert_allclose(in_bank.covariance, found.covariance, rtol=1e-2, atol=1e-9)
 
 
-def test_no_positive_total_is_no_place() -> None:
+def test_no_positive_total_is_no_position() -> None:
     for currents in ([-1.0] * 4, [0.0] * 4):
         found = Rectangle(1.0, 1.0).estimate(currents, 1e-2)
         assert np.isnan(found.x)
@@ -160,7 +167,7 @@ def test_no_positive_total_is_no_place() -> None:
         assert np.isinf(found.covariance[1, 1])
 
 
-def test_a_dead_channel_left_out_by_infinite_noise_spoils_nothing() -> None:
+def test_excluded_dead_channel_has_no_effect() -> None:
     pad = Rectangle(1.0, 1.0)
     currents = pad.fractions(0.4, 0.6)
     currents[1] = np.nan

@@ -1,7 +1,7 @@
 """Curved pads, gaps and spreading against finite elements that know nothing of conformal maps.
 
 The elements (scikit-fem, bilinear) solve the current's continuity on the surface itself, in arc length u and
-angle: radius(u) is all they are told of its shape. A current is injected at a node and the reactions of
+angle: radius(u) is their only knowledge of its shape. A current is injected at a node and the reactions of
 grounded nodes are what the electrodes collect.
 """
 
@@ -21,7 +21,12 @@ from skfem.helpers import grad
 
 from handtouch.field.network import SIDES, ElectrodeNetwork
 from handtouch.field.rectangle import Rectangle
-from handtouch.field.surface import Cone, Revolution, Sphere, Surface
+from handtouch.field.surface import (
+    ConeSurface,
+    RevolutionSurface,
+    SphereSurface,
+    Surface,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,8 +39,8 @@ class Shape(NamedTuple):
     arc: float
 
 
-CONE = Shape(Cone(0.006, 0.011, 0.02, 2.0), lambda u: 0.006 + 0.25 * u, 2.0)
-SPHERE = Shape(Sphere(0.01, -0.2, 1.1, 2.0), lambda u: 0.01 * np.cos(u / 0.01 - 0.2), 2.0)
+CONE = Shape(ConeSurface(0.006, 0.011, 0.02, 2.0), lambda u: 0.006 + 0.25 * u, 2.0)
+SPHERE = Shape(SphereSurface(0.01, -0.2, 1.1, 2.0), lambda u: 0.01 * np.cos(u / 0.01 - 0.2), 2.0)
 SHAPES = pytest.mark.parametrize("shape", [CONE, SPHERE], ids=["cone", "sphere"])
 INSIDE = ((0.5, 0.5), (0.25, 0.625), (0.75, 0.875))  # of the length, of the arc; on every mesh
 
@@ -99,7 +104,7 @@ def mapped(shape: Shape, at: tuple[float, float]) -> tuple[float, float]:
 
 
 @SHAPES
-def test_elements_converge_to_the_conformal_answer_with_the_square_of_their_size(shape: Shape) -> None:
+def test_elements_converge_quadratically_to_the_conformal_solution(shape: Shape) -> None:
     rectangle = Rectangle(shape.surface.a, shape.surface.b)
     exact = np.stack([rectangle.side_fractions(*mapped(shape, at)) for at in INSIDE])
     errors = [
@@ -112,7 +117,7 @@ def test_elements_converge_to_the_conformal_answer_with_the_square_of_their_size
 
 
 @SHAPES
-def test_taking_it_for_nearly_rectangular_is_wrong_and_stays_wrong(shape: Shape) -> None:
+def test_rectangular_approximation_has_an_error_that_refinement_keeps(shape: Shape) -> None:
     """Its length by its mid-length arc: off by more than fifty times the error of a 64 x 64 mesh."""
     flat = Rectangle(*shape.surface.extent_m)
     shortcut = np.stack([flat.side_fractions(at[0] * flat.a, at[1] * flat.b) for at in INSIDE])
@@ -121,7 +126,7 @@ def test_taking_it_for_nearly_rectangular_is_wrong_and_stays_wrong(shape: Shape)
 
 
 @SHAPES
-def test_location_from_the_elements_currents_is_where_they_were_injected(shape: Shape) -> None:
+def test_location_from_element_currents_is_the_injection_point(shape: Shape) -> None:
     rectangle = Rectangle(shape.surface.a, shape.surface.b)
     for at in INSIDE:
         where = rectangle.locate(collected(shape, 64, at))
@@ -131,9 +136,9 @@ def test_location_from_the_elements_currents_is_where_they_were_injected(shape: 
         assert np.hypot(u - at[0] * length, v - at[1] * arc) < 4e-4 * length
 
 
-def test_a_spline_profile_is_the_surface_it_says() -> None:
+def test_spline_profile_reproduces_its_surface() -> None:
     latitude = np.linspace(-0.2, 1.1, 41)
-    pad = Revolution(tuple(0.01 * np.sin(latitude)), tuple(0.01 * np.cos(latitude)), 2.0)
+    pad = RevolutionSurface(tuple(0.01 * np.sin(latitude)), tuple(0.01 * np.cos(latitude)), 2.0)
     shape = SPHERE._replace(surface=pad)
     exact = Rectangle(pad.a, pad.b).side_fractions(*mapped(shape, INSIDE[1]))
     assert collected(shape, 64, INSIDE[1]) == pytest.approx(exact, abs=2e-4)
@@ -156,7 +161,7 @@ def test_gaps_on_a_curved_pad(shape: Shape) -> None:
 
 
 @pytest.mark.parametrize("at", [(0.5, 0.5), (0.25, 0.125), (0.5, 0.0625), (0.125, 0.125)])
-def test_spreading_radius_is_that_of_an_injected_disc(at: tuple[float, float]) -> None:
+def test_spreading_radius_equals_that_of_an_injected_disc(at: tuple[float, float]) -> None:
     """A uniform disc of radius A has the mean potential (ln(R / A) + 1/4) / 2 pi."""
     pad = ElectrodeNetwork(1.0, 1.0, 0.2, 1000.0)
     nodes = np.linspace(0, 1, 161)

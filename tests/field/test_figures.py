@@ -1,4 +1,4 @@
-"""The drawn figures exist, are pictures, and say what theory says."""
+"""`handtouch figures` draws the paper's theoretical figures."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 
-from handtouch import figures
+from handtouch.cli import main
+from handtouch.field import figures
 
 
-def test_all_theoretical_figures_of_the_paper_are_drawn(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert figures.run(tmp_path / "new") == 0
+def test_all_theoretical_figures_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["figures", "--out", str(tmp_path / "new")]) == 0
     drawn = [Path(line) for line in capsys.readouterr().out.split()]
     assert [path.name for path in drawn] == [f"figure_{n}.png" for n in range(2, 8)]
     for path in drawn:
@@ -22,7 +21,7 @@ def test_all_theoretical_figures_of_the_paper_are_drawn(
         assert path.stat().st_size > 20_000
 
 
-def test_without_matplotlib_the_extra_is_named(
+def test_missing_matplotlib_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     real = builtins.__import__
@@ -33,22 +32,22 @@ def test_without_matplotlib_the_extra_is_named(
         return real(name, *rest, **more)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
-    assert figures.run(tmp_path) == 1
+    assert main(["figures", "--out", str(tmp_path)]) == 1
     assert "handtouch[figures]" in capsys.readouterr().err
 
 
-def test_where_nothing_can_be_written_one_line_says_so(
+def test_unwritable_folder_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("")
-    assert figures.run(tmp_path / "file" / "folder") == 1
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1
-    assert "folder" in said
+    assert main(["figures", "--out", str(tmp_path / "file" / "folder")]) == 1
+    errors = capsys.readouterr().err
+    assert len(errors.splitlines()) == 1
+    assert "folder" in errors
 
 
-def test_the_cut_off_sum_of_fig_7_is_a_contact_radius() -> None:
-    """Up to the ripple of 45 terms, eq. 2 cut off differs from ln(R / A) / 2 pi by a constant."""
+def test_truncation_of_eq_2_acts_as_a_contact_radius() -> None:
+    """Up to the ripple of 45 terms, truncated eq. 2 differs from ln(R / A) / 2 pi by a constant."""
     import numpy as np
 
     from handtouch.field import Rectangle

@@ -1,4 +1,4 @@
-"""No floating-point warning leaves a function of networks, surfaces or strength, underflow included."""
+"""No floating-point warning leaves networks, surfaces or contact laws, underflow included."""
 
 from __future__ import annotations
 
@@ -9,10 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from handtouch.field.contact_law import ContactLaw, contact_stack_resistance
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.sandwich import Sandwich
-from handtouch.field.strength import ContactLaw, contact_stack_resistance
-from handtouch.field.surface import Anisotropic, Cone, Cylinder, Plane, Prism, Revolution, Sphere
+from handtouch.field.surface import (
+    AnisotropicSurface,
+    ConeSurface,
+    CylinderSurface,
+    PlaneSurface,
+    PrismSurface,
+    RevolutionSurface,
+    SphereSurface,
+)
 
 ODD = [0.0, -0.0, 5e-324, 1e-300, 1e-160, 0.3, 0.7, 1.0, -0.1, 1e160, 1e300, math.inf, -math.inf, math.nan]
 X, Y = (v.ravel() for v in np.meshgrid(ODD, ODD))
@@ -23,15 +31,15 @@ FIXED, SIZED = ContactLaw(2e-2, 1.5, 2e-3, 3e-4), ContactLaw(2e-2, 1.5, 2e-3, 3e
 PAIR = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
 
 SURFACES: list[Callable[[], Any]] = [
-    lambda: Plane(1.3, 1.0),
-    lambda: Cylinder(0.5, 1.3, 2.0),
-    lambda: Cone(0.6, 0.4, 1.3, 2.0),
-    lambda: Sphere(1.0, -0.3, 1.0, 2.0),
-    lambda: Revolution((0.0, 0.5, 1.3), (0.5, 0.6, 0.4), 2.0),
-    lambda: Prism(1.3, (0.0, 0.5, 1.0), (0.0, 0.2, 0.0)),
-    lambda: Prism(1.0, (0.0, 1e-310, 1.0), (0.0, 0.0, 1e-320)),
-    lambda: Anisotropic(Plane(1.3, 1.0), 3.0),
-    lambda: Anisotropic(Plane(1e300, 1.0), 1e300),
+    lambda: PlaneSurface(1.3, 1.0),
+    lambda: CylinderSurface(0.5, 1.3, 2.0),
+    lambda: ConeSurface(0.6, 0.4, 1.3, 2.0),
+    lambda: SphereSurface(1.0, -0.3, 1.0, 2.0),
+    lambda: RevolutionSurface((0.0, 0.5, 1.3), (0.5, 0.6, 0.4), 2.0),
+    lambda: PrismSurface(1.3, (0.0, 0.5, 1.0), (0.0, 0.2, 0.0)),
+    lambda: PrismSurface(1.0, (0.0, 1e-310, 1.0), (0.0, 0.0, 1e-320)),
+    lambda: AnisotropicSurface(PlaneSurface(1.3, 1.0), 3.0),
+    lambda: AnisotropicSurface(PlaneSurface(1e300, 1.0), 1e300),
 ]
 NETWORKS: list[Callable[[], ElectrodeNetwork]] = [
     lambda: ElectrodeNetwork(1.3, 1.0, 0.05, 2400.0, (0.0, 336.0, 0.0, 1e-310)),
@@ -59,13 +67,13 @@ def warnings_are_errors() -> Any:
 
 
 @pytest.mark.parametrize("make", SURFACES)
-def test_surfaces_are_silent(make: Callable[[], Any]) -> None:
+def test_surfaces_raise_no_floating_point_warnings(make: Callable[[], Any]) -> None:
     for name in ("point", "tangents", "normal", "scales", "from_rectangle", "to_rectangle"):
         getattr(make(), name)(X, Y)
 
 
 @pytest.mark.parametrize("make", NETWORKS)
-def test_networks_are_silent(make: Callable[[], ElectrodeNetwork]) -> None:
+def test_networks_raise_no_floating_point_warnings(make: Callable[[], ElectrodeNetwork]) -> None:
     pad = make()
     for name in ("currents", "fractions_with_jacobian", "spreading_radius", "series_resistance"):
         getattr(pad, name)(X, Y)
@@ -74,10 +82,10 @@ def test_networks_are_silent(make: Callable[[], ElectrodeNetwork]) -> None:
 
 
 @pytest.mark.parametrize("name", WEIGHINGS)
-def test_strength_is_silent(name: str) -> None:
+def test_forces_raise_no_floating_point_warnings(name: str) -> None:
     WEIGHINGS[name]()
 
 
-def test_a_fixed_radius_does_not_depend_on_the_force() -> None:
+def test_fixed_radius_does_not_depend_on_the_force() -> None:
     assert list(FIXED.radius([0.0, 1.0, math.inf])) == [2e-3] * 3
     assert np.isnan(FIXED.radius(math.nan))

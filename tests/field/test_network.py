@@ -1,4 +1,4 @@
-"""Laws of pads with corner gaps, divided sides and resistors, and the independent reference values."""
+"""Pads with corner gaps, divided sides and resistors against theory and independent reference values."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_conductances_grow_with_the_logarithm_of_a_closing_gap() -> None:
 
 
 @given(aspect=aspects, gap=gaps)
-def test_conductances_are_symmetric_and_nothing_flows_between_equals(aspect: float, gap: float) -> None:
+def test_conductances_are_symmetric_with_zero_row_sums(aspect: float, gap: float) -> None:
     g = network(aspect, gap).conductance
     assert np.abs(g - g.T).max() < 1e-13
     assert np.abs(g.sum(axis=0)).max() < 1e-13
@@ -73,9 +73,7 @@ def test_conductances_are_symmetric_and_nothing_flows_between_equals(aspect: flo
 
 @given(aspect=aspects, gap=st.floats(0.0, 0.3), series=resistances, s=inner, t=inner)
 @example(aspect=0.5, gap=7.5e-162, series=[0.0] * 4, s=0.5, t=0.5)
-def test_all_the_current_arrives_somewhere(
-    aspect: float, gap: float, series: list[float], s: float, t: float
-) -> None:
+def test_current_is_conserved(aspect: float, gap: float, series: list[float], s: float, t: float) -> None:
     pad = network(aspect, gap, series if gap >= 1e-3 else (0.0,) * 4)
     fractions = pad.currents(s * aspect, t)
     assert fractions.sum() == pytest.approx(1.0, abs=1e-13)
@@ -109,7 +107,7 @@ def test_potentials_are_harmonic(aspect: float, gap: float, s: float, t: float) 
 
 
 @given(aspect=aspects, gap=gaps, series=resistances, s=inner, t=inner)
-def test_jacobian_is_the_derivative(
+def test_jacobian_equals_the_derivative(
     aspect: float, gap: float, series: list[float], s: float, t: float
 ) -> None:
     pad = network(aspect, gap, series)
@@ -123,7 +121,7 @@ def test_jacobian_is_the_derivative(
 
 
 @given(aspect=aspects, gap=st.floats(0.0, 0.3), series=resistances, s=inner, t=inner)
-def test_location_survives_the_way_there_and_back(
+def test_locate_inverts_the_currents(
     aspect: float, gap: float, series: list[float], s: float, t: float
 ) -> None:
     pad = network(aspect, gap, series if gap >= 1e-3 else (0.0,) * 4)
@@ -135,9 +133,7 @@ def test_location_survives_the_way_there_and_back(
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize(("aspect", "error"), [(5.0, 1e-10), (8.0, 2e-9), (10.0, 2e-8), (14.0, 2e-5)])
-def test_long_pads_are_located_as_well_as_the_near_currents_hold_them(
-    aspect: float, error: float, turned: bool
-) -> None:
+def test_long_pads_are_located_from_the_near_currents(aspect: float, error: float, turned: bool) -> None:
     a, b = (1.0, aspect) if turned else (aspect, 1.0)
     s, t = np.random.default_rng(5).uniform(0.03, 0.97, (2, 1000))
     for gap in (0.01, 0.1):
@@ -147,7 +143,7 @@ def test_long_pads_are_located_as_well_as_the_near_currents_hold_them(
         assert np.abs(where.residual).max() < 1e-12
 
 
-def test_a_coordinate_that_is_not_held_leaves_the_other_alone() -> None:
+def test_unobservable_coordinate_does_not_affect_the_other() -> None:
     s, t = np.random.default_rng(6).uniform(0.03, 0.97, (2, 1000))
     pad = ElectrodeNetwork(20.0, 1.0, 0.1, SHEET)
     where = pad.locate(pad.currents(20 * s, t))
@@ -157,7 +153,7 @@ def test_a_coordinate_that_is_not_held_leaves_the_other_alone() -> None:
     assert np.abs(where.y - t).max() < 1e-12
 
 
-def test_an_iteration_that_does_not_settle_gives_no_place() -> None:
+def test_diverging_iteration_gives_nan() -> None:
     """Gaps of 45 %: small electrodes, where Newton's method from the ideal place may go round."""
     pad = network(1.0, 0.45)
     s, t = np.random.default_rng(7).uniform(0.0, 1.0, (2, 5000))
@@ -167,14 +163,14 @@ def test_an_iteration_that_does_not_settle_gives_no_place() -> None:
     assert np.hypot(where.x - s, where.y - t)[known].max() < 1e-7
 
 
-def test_currents_of_no_point_have_no_place() -> None:
+def test_currents_of_no_point_have_no_location() -> None:
     where = network(1.0, 0.05).locate(np.array([[0.0, 0.3], [0.3, -1e-3], [0.4, 0.3], [0.3, 0.4]]))
     assert np.isnan(where.x).all()
     assert np.isnan(where.y).all()
 
 
 @pytest.mark.parametrize("aspect", [0.05, 0.7, 1.0, 4.0, 40.0])
-def test_without_gaps_it_is_the_ideal_rectangle(aspect: float) -> None:
+def test_network_without_gaps_equals_the_ideal_rectangle(aspect: float) -> None:
     pad, ideal = network(aspect, 0.0), Rectangle(aspect, 1.0)
     x, y = np.meshgrid(aspect * np.linspace(0.001, 0.999, 23), np.linspace(0.001, 0.999, 23))
     fractions, jacobian = pad.fractions_with_jacobian(x, y)
@@ -184,14 +180,14 @@ def test_without_gaps_it_is_the_ideal_rectangle(aspect: float) -> None:
     assert pad.spreading_radius(x, y) == pytest.approx(ideal.conformal_radius(x, y), rel=1e-12)
 
 
-def test_closing_gaps_tend_to_the_ideal_rectangle() -> None:
+def test_small_gaps_approach_the_ideal_rectangle() -> None:
     """With the square of the gap, the way the corner's potential falls off."""
     ideal = Rectangle(1.5, 1.0).side_fractions(0.4, 0.3)
     errors = [np.abs(network(1.5, gap).currents(0.4, 0.3) - ideal).max() for gap in (0.02, 0.01)]
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.05)
 
 
-def test_locate_agrees_with_the_ideal_one_on_what_is_no_point() -> None:
+def test_locate_agrees_with_the_ideal_pad_for_non_points() -> None:
     """Two contacts: with gaps closing, the same place and residual as `Rectangle.locate`."""
     pair = Rectangle(1.0, 1.0).side_fractions(np.array([0.5, 0.7]), 0.5).mean(axis=1)
     ideal, nearly = Rectangle(1.0, 1.0).locate(pair), network(1.0, 1e-5).locate(pair)
@@ -208,17 +204,17 @@ def test_resistors_obey_ohm(gap: float, series: list[float], s: float, t: float)
     )
     lift = ideal @ (np.array(series) * measured)
     assert pad.series_resistance(s * 1.3, t) == pytest.approx(lift, rel=1e-10, abs=1e-9)
-    assert measured @ pad.series_form @ measured == pytest.approx(lift, rel=1e-10, abs=1e-9)
+    assert measured @ pad.series_quadratic_form @ measured == pytest.approx(lift, rel=1e-10, abs=1e-9)
 
 
-def test_switching_resistors_is_building_with_them() -> None:
+def test_switched_resistors_equal_built_ones() -> None:
     bare = network(1.3, 0.05)
-    switched = bare.with_series(PAPER)
+    switched = bare.with_series_ohm(PAPER)
     assert (switched.currents(0.4, 0.3) == network(1.3, 0.05, PAPER).currents(0.4, 0.3)).all()
     assert (bare.currents(0.4, 0.3) == network(1.3, 0.05).currents(0.4, 0.3)).all()
 
 
-def test_a_floating_electrode_is_the_limit_of_a_great_resistor() -> None:
+def test_floating_electrode_is_the_limit_of_a_large_resistor() -> None:
     floating, nearly = network(1.3, 0.05, (0, math.inf, 0, 0)), network(1.3, 0.05, (0, 1e13, 0, 0))
     assert floating.currents(0.4, 0.3) == pytest.approx(nearly.currents(0.4, 0.3), abs=1e-8)
     assert floating.currents(0.4, 0.3)[1] == 0
@@ -227,7 +223,7 @@ def test_a_floating_electrode_is_the_limit_of_a_great_resistor() -> None:
         floating.locate([0.25] * 4)
 
 
-def test_resistors_straighten_the_log_ratio_fourfold() -> None:
+def test_resistors_linearise_the_log_ratio_fourfold() -> None:
     """Paper 4.2, 336 ohm on 2.4 kohm per square: deviation of x_obs from its line 0.069 -> 0.017."""
     x = 6.25 + np.linspace(-5.5, 5.5, 45)
 
@@ -243,7 +239,7 @@ def test_resistors_straighten_the_log_ratio_fourfold() -> None:
 class TestArrangements:
     """Electrodes anywhere on the boundary."""
 
-    def test_pieces_that_touch_collect_what_the_whole_side_did(self) -> None:
+    def test_touching_pieces_collect_the_current_of_the_whole_side(self) -> None:
         whole = network(1.2, 0.05)
         pieces = [Electrode("x0", 0.05, 0.4), Electrode("x0", 0.4, 0.95), Electrode("xa", 0.05, 0.95)]
         pieces += [Electrode("y0", 0.05, 1.15), Electrode("yb", 0.05, 1.15)]
@@ -254,7 +250,7 @@ class TestArrangements:
 
     @given(s=inner, t=inner, cut=st.floats(0.2, 0.8), gap=st.floats(1e-4, 0.1))
     @settings(max_examples=30)
-    def test_many_pieces_locate_too(self, s: float, t: float, cut: float, gap: float) -> None:
+    def test_divided_sides_locate(self, s: float, t: float, cut: float, gap: float) -> None:
         pieces = [
             Electrode(side, start, stop)
             for side in SIDES
@@ -267,7 +263,7 @@ class TestArrangements:
         assert math.hypot(where.x - s, where.y - t) < 1e-9
         assert abs(where.residual) < 1e-10
 
-    def test_the_order_given_is_the_order_of_the_channels(self) -> None:
+    def test_channels_keep_the_given_order(self) -> None:
         four = [Electrode(side, 0.05, 0.95) for side in SIDES]
         forth = ElectrodeNetwork.from_electrodes(1.0, 1.0, four, SHEET, (0, 1, 2, 3))
         back = ElectrodeNetwork.from_electrodes(1.0, 1.0, four[::-1], SHEET, (3, 2, 1, 0))
@@ -275,7 +271,7 @@ class TestArrangements:
         assert back.conductance[::-1, ::-1] == pytest.approx(forth.conductance, abs=1e-13)
         assert forth.currents(0.2, 0.4) == pytest.approx(network(1.0, 0.05, (0, 1, 2, 3)).currents(0.2, 0.4))
 
-    def test_a_mirrored_pad_has_mirrored_currents(self) -> None:
+    def test_mirrored_pad_has_mirrored_currents(self) -> None:
         pad = ElectrodeNetwork(1.2, 1.0, (0.02, 0.1, 0.05, 0.2), SHEET)
         mirrored = ElectrodeNetwork(1.2, 1.0, (0.1, 0.02, 0.05, 0.2), SHEET)
         turned = ElectrodeNetwork(1.0, 1.2, (0.05, 0.2, 0.02, 0.1), SHEET)
@@ -294,7 +290,7 @@ class TestArrangements:
         with pytest.raises(ValueError, match="every side"):
             pad.locate([0.5, 0.5])
 
-    def test_eight_pieces_tell_a_noisy_contact_better_than_four(self) -> None:
+    def test_eight_pieces_locate_a_noisy_contact_better_than_four(self) -> None:
         pieces = [Electrode(side, *ends) for side in SIDES for ends in ((0.05, 0.47), (0.53, 0.95))]
         eight = ElectrodeNetwork.from_electrodes(1.0, 1.0, pieces, SHEET)
         errors = []
@@ -306,7 +302,7 @@ class TestArrangements:
 
 
 class TestSpreading:
-    def test_gaps_only_enlarge_the_spreading_radius(self) -> None:
+    def test_gaps_enlarge_the_spreading_radius(self) -> None:
         x, y = np.meshgrid(np.linspace(0.02, 0.98, 25), np.linspace(0.02, 0.98, 25))
         ideal = Rectangle(1.0, 1.0).conformal_radius(x, y)
         small, large = (network(1.0, gap).spreading_radius(x, y) / ideal for gap in (0.05, 0.2))
@@ -314,7 +310,7 @@ class TestSpreading:
         assert (large >= small).all()
         assert small[12, 12] == pytest.approx(1.0, abs=1e-4)
 
-    def test_between_bare_sides_it_is_that_of_greens_function_in_closed_form(self) -> None:
+    def test_spreading_radius_between_bare_sides_equals_greens_function(self) -> None:
         """A strip of width pi between two electrodes: a cosine series, its logarithm summed."""
         length = 5.0
         pad = ElectrodeNetwork.from_electrodes(
@@ -325,14 +321,14 @@ class TestSpreading:
         expected = length / 2 - np.log(2 * np.sin(y)) + 2 * series.sum(axis=0)
         assert np.log(pad.spreading_radius(length / 2, y)) == pytest.approx(expected, abs=1e-12)
 
-    def test_a_resistor_lifts_the_whole_pad(self) -> None:
+    def test_resistor_raises_the_whole_pads_potential(self) -> None:
         """Four equal resistors far above the sheet: all current passes them in parallel."""
         pad = network(1.0, 0.05, (1e7,) * 4)
         assert pad.series_resistance(0.3, 0.6) == pytest.approx(1e7 / 4, rel=1e-3)
 
 
 class TestArguments:
-    def test_it_is_a_forward_model(self) -> None:
+    def test_network_is_a_forward_model(self) -> None:
         assert isinstance(network(1.0, 0.05), ForwardModel)
 
     def test_shapes_broadcast(self) -> None:
@@ -347,7 +343,7 @@ class TestArguments:
         assert pad.currents(0.3, 0.6).shape == (4,)
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -0.1, 1.1, 1e300])
-    def test_what_is_off_the_pad_is_nan_in_its_own_element(self, bad: float) -> None:
+    def test_point_off_the_pad_is_nan_in_its_own_element(self, bad: float) -> None:
         pad = network(1.0, 0.05, PAPER)
         x, y = np.array([0.3, bad, 0.7]), np.array([0.6, 0.6, 0.2])
         values, jacobian = pad.fractions_with_jacobian(x, y)
@@ -371,7 +367,7 @@ class TestArguments:
         assert where.x[[0, 2]] == pytest.approx([0.3, 0.7])
         assert where.y[[0, 2]] == pytest.approx([0.6, 0.2])
 
-    def test_corners_and_ends_of_electrodes_are_points_like_others(self) -> None:
+    def test_corners_and_ends_of_electrodes_are_valid_points(self) -> None:
         for gap in (0.0, 0.05):
             pad = network(1.0, gap)
             x, y = np.array([0.0, 1.0, gap, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 1 - gap, 0.0])
@@ -380,7 +376,7 @@ class TestArguments:
             assert pad.spreading_radius(0.5, 0.0) == 0
 
     @pytest.mark.parametrize("scale", [1e-300, 1e-150, 1e-3, 1e150, 1e300])
-    def test_the_unit_of_length_and_of_current_is_any(self, scale: float) -> None:
+    def test_units_of_length_and_current_make_no_difference(self, scale: float) -> None:
         pad = ElectrodeNetwork(1.5 * scale, scale, 0.05 * scale, SHEET, PAPER)
         small = network(1.5, 0.05, PAPER)
         assert pad.currents(0.4 * scale, 0.3 * scale) == pytest.approx(small.currents(0.4, 0.3), abs=1e-14)
@@ -388,7 +384,7 @@ class TestArguments:
         assert where.x / scale == pytest.approx(0.4)
         assert where.total / scale == pytest.approx(1.0)
 
-    def test_inputs_of_any_kind_are_read_and_left_alone(self) -> None:
+    def test_inputs_of_any_kind_are_accepted_and_not_modified(self) -> None:
         pad = network(2.0, 0.05)
         x = np.linspace(0.1, 1.9, 20)[::2]
         x.setflags(write=False)
@@ -415,7 +411,7 @@ class TestArguments:
             ({"gap": 0.0, "series_ohm": PAPER}, "gap"),
         ],
     )
-    def test_what_cannot_be_is_refused_by_name(self, change: dict[str, Any], name: str) -> None:
+    def test_invalid_parameters_are_rejected_by_name(self, change: dict[str, Any], name: str) -> None:
         plain: dict[str, Any] = {
             "a": 1.0,
             "b": 1.0,
@@ -436,11 +432,11 @@ class TestArguments:
             ([Electrode("x0", 0.1, 0.1 + 1e-9), Electrode("xa", 0.1, 0.9)], "too short"),
         ],
     )
-    def test_electrodes_that_cannot_be_are_refused(self, electrodes: list[Electrode], name: str) -> None:
+    def test_impossible_electrodes_are_rejected(self, electrodes: list[Electrode], name: str) -> None:
         with pytest.raises(ValueError, match=name):
             ElectrodeNetwork.from_electrodes(1.0, 1.0, electrodes, SHEET)
 
-    def test_currents_of_another_pad_are_refused(self) -> None:
+    def test_currents_of_another_pad_are_rejected(self) -> None:
         with pytest.raises(ValueError, match="4 channels"):
             network(1.0, 0.05).locate([0.5, 0.5])
         with pytest.raises(ValueError, match="gap 0"):

@@ -1,4 +1,4 @@
-"""Rectangle keeps to 25-digit references, to potential theory and to its own inverse."""
+"""Rectangle agrees with 25-digit references, with potential theory and with its own inverse."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_location_matches_the_reference() -> None:
         found = Rectangle(case["a"], case["b"]).locate(currents)
         for axis, side, pair in (("x", "a", currents[:2]), ("y", "b", currents[2:])):
             if max(pair) == 0:
-                assert math.isnan(getattr(found, axis)), "nothing tells this coordinate, so nothing is told"
+                assert math.isnan(getattr(found, axis)), "the currents don't determine this coordinate"
             else:
                 assert getattr(found, axis) == pytest.approx(case[axis], abs=1e-12 * case[side])
                 other = found.y if axis == "x" else found.x
@@ -67,7 +67,7 @@ def test_location_matches_the_reference() -> None:
 
 
 @given(aspects, logarithmic_places, logarithmic_places)
-def test_a_located_point_is_where_it_was(aspect: float, u: float, v: float) -> None:
+def test_locate_inverts_the_currents(aspect: float, u: float, v: float) -> None:
     pad = Rectangle(aspect, 1.0)
     x, y = u * aspect, v
     currents = pad.side_fractions(x, y)
@@ -97,7 +97,7 @@ def test_mirrored_and_transposed_pads_agree(aspect: float, u: float, v: float) -
 
 
 @given(st.floats(0.2, 5), st.floats(0.02, 0.98), st.floats(0.02, 0.98))
-def test_jacobian_is_the_derivative(aspect: float, u: float, v: float) -> None:
+def test_jacobian_equals_the_derivative(aspect: float, u: float, v: float) -> None:
     pad, h = Rectangle(aspect, 1.0), 1e-6
     x, y = u * aspect, v
     fractions, jacobian = pad.fractions_with_jacobian(x, y)
@@ -164,8 +164,8 @@ def test_nan_stays_in_its_own_element() -> None:
     assert np.isnan(found.x[1:3]).all()
 
 
-def test_two_contacts_leave_the_residual_of_the_paper() -> None:
-    """Eqs. 14-15: the pair at 0.5 and 0.7 is told from a point by 1.1913 against 1.0915."""
+def test_two_contacts_leave_the_papers_residual() -> None:
+    """Eqs. 14-15: the pair at 0.5 and 0.7 differs from a point by 1.1913 against 1.0915."""
     pad = Rectangle(1.0, 1.0)
     pair = pad.side_fractions([0.5, 0.7], [0.5, 0.5]).mean(axis=1)
     assert pair == pytest.approx([0.184708, 0.358951, 0.228171, 0.228171], abs=1e-6)
@@ -176,7 +176,7 @@ def test_two_contacts_leave_the_residual_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-290, 1e-150, 1.0, 1e150, 1e290])
-def test_units_do_not_matter(scale: float) -> None:
+def test_units_make_no_difference(scale: float) -> None:
     pad, scaled = Rectangle(1.5, 1.0), Rectangle(1.5 * scale, scale)
     x, y = np.array([0.7, 1e-9, 0.3]), np.array([0.2, 0.5, 1e-12])
     f = scaled.side_fractions(x * scale, y * scale)
@@ -191,7 +191,7 @@ def test_scalars_in_scalars_out_and_shapes_broadcast() -> None:
     pad = Rectangle(1, 1)
     found = pad.locate(np.array([3, 1, 2, 2], dtype=np.int32))
     assert float(found.x) < 0.5
-    assert found.y == 0.5
+    assert found.y == pytest.approx(0.5, abs=2e-16)  # processors differ in the last bit of a logarithm
     assert isinstance(found.total, float)
     assert pad.side_fractions(np.full((3, 1), 0.5), np.linspace(0.1, 0.9, 5)).shape == (4, 3, 5)
     assert pad.locate(np.zeros((4, 0))).x.shape == (0,)

@@ -1,4 +1,4 @@
-"""What is left over by a point tells other contacts from it, at the false-alarm rate asked for."""
+"""The residual of a point fit detects other contacts at the configured false-alarm rate."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_direction_and_extent_of_a_small_pair(angle: float) -> None:
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2])
 @pytest.mark.parametrize("pad", [SQUARE, Rectangle(1.77, 1.0), ElectrodeNetwork(1.5, 1.0, 0.03, 2400.0)])
-def test_false_alarms_come_at_the_rate_asked_for(noise: float, pad: Rectangle | ElectrodeNetwork) -> None:
+def test_false_alarms_occur_at_the_configured_rate(noise: float, pad: Rectangle | ElectrodeNetwork) -> None:
     count = 40_000
     generator = np.random.default_rng(11)
     x, y = generator.uniform(0.05, 0.95, (2, count)) * np.array([[pad.a], [pad.b]])
@@ -53,24 +53,24 @@ def test_false_alarms_come_at_the_rate_asked_for(noise: float, pad: Rectangle | 
     assert (~seen.is_point).sum() == (np.abs(seen.score) > -ndtri(1e-3 / 2)).sum()
 
 
-def test_the_residual_scatters_as_predicted() -> None:
+def test_residual_scatters_as_predicted() -> None:
     generator = np.random.default_rng(12)
     levels = np.array([1e-3, 2e-3, 5e-4, 1e-3])[:, None]
     currents = 3 * SQUARE.side_fractions(0.4, 0.3)[:, None] + levels * generator.normal(size=(4, 20_000))
     found = SQUARE.estimate(currents, levels)
     seen = point_test(SQUARE, currents, levels, found=found)
-    assert found.residual.std() == pytest.approx(seen.deviation.mean(), rel=0.03)
+    assert found.residual.std() == pytest.approx(seen.residual_std.mean(), rel=0.03)
     assert seen.score == pytest.approx(np.sign(found.residual) * np.sqrt(found.chi_squared), abs=0.05)
 
 
-def test_contacts_at_the_resolvable_separation_are_told_apart() -> None:
+def test_contacts_at_the_resolvable_separation_are_distinguished() -> None:
     noise, place = 1e-3, (0.45, 0.6)
     distance = float(resolvable_separation(SQUARE, *place, noise, false_alarm=1e-2, detection=0.9))
     x = [place[0] - distance / 2, place[0] + distance / 2]
     pair = SQUARE.side_fractions(x, [place[1]] * 2).mean(axis=1)
     currents = pair[:, None] + noise * np.random.default_rng(13).normal(size=(4, 4000))
-    told = ~point_test(SQUARE, currents, noise, false_alarm=1e-2).is_point
-    assert told.mean() == pytest.approx(0.9, abs=0.02)
+    detected = ~point_test(SQUARE, currents, noise, false_alarm=1e-2).is_point
+    assert detected.mean() == pytest.approx(0.9, abs=0.02)
 
 
 def test_separation_grows_as_the_fourth_root_of_variance() -> None:
@@ -79,13 +79,13 @@ def test_separation_grows_as_the_fourth_root_of_variance() -> None:
     assert resolvable_separation(SQUARE, [0.01, 0.5], [0.5, 0.5], 1e-2).tolist()[0] == math.inf
 
 
-def test_bad_arguments_are_named() -> None:
+def test_invalid_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="false_alarm"):
         point_test(SQUARE, [0.25] * 4, 1e-3, false_alarm=0)
     assert math.isnan(point_test(SQUARE, [math.nan, 1, 1, 1], 1e-3).score)
 
 
-def test_what_has_no_location_is_not_called_more_than_a_point() -> None:
+def test_contact_without_location_counts_as_a_point() -> None:
     pad = Rectangle(1.0, 1.0)
     rng = np.random.default_rng(5)
     x, y = rng.random((2, 40_000))  # up to the edges, where some estimates are lost

@@ -1,4 +1,4 @@
-"""Where the description of a hand is that nobody here described."""
+"""Path of a third-party hand's URDF."""
 
 from __future__ import annotations
 

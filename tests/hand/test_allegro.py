@@ -1,4 +1,4 @@
-"""The worked example of the documentation: a hand that nobody here described."""
+"""The worked example of the documentation: a third-party hand."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from handtouch.check import run
+from handtouch.cli.check_text import run
 from handtouch.config import ConfigError, load
-from handtouch.hand.robot import Robots, check, doubts
+from handtouch.hand.robot_models import RobotModels, check_urdfs, unchecked_items
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hand.md").read_text()
 
@@ -24,23 +24,25 @@ def written(folder: Path, allegro: Path) -> Path:
     return path
 
 
-def test_the_example_fits_the_hand(tmp_path: Path, allegro: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_documented_example_fits_the_hand(
+    tmp_path: Path, allegro: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = written(tmp_path, allegro)
-    assert run(path, json=False, schema=False) == 0, capsys.readouterr()
-    deployment = check(load(path), str(path))
-    assert not list(doubts(deployment))
-    (kinematics,) = Robots(deployment).kinematics
+    assert run(path, as_json=False, schema=False) == 0, capsys.readouterr()
+    deployment = check_urdfs(load(path), str(path))
+    assert not list(unchecked_items(deployment))
+    (kinematics,) = RobotModels(deployment).kinematics
     assert kinematics.joints == ("joint_0.0", "joint_1.0", "joint_2.0", "joint_3.0")
-    kinematics.move(np.zeros(4))
-    straight = kinematics.in_palm(2)
-    # the lengths of the phalanges as its maker tells them, spread by 5 degrees
+    kinematics.set_joint_positions(np.zeros(4))
+    straight = kinematics.pose_in_palm(2)
+    # phalanx lengths published by the maker, spread by 5 degrees
     assert straight.translation_m[2] == pytest.approx(0.1355 * math.cos(math.radians(5)) - 0.0015, abs=1e-4)
-    kinematics.move(np.array([0.0, 1.0, 1.0, 1.0]))
-    assert kinematics.in_palm(2).translation_m[0] > 0.04  # it closes towards the palm's side, x
+    kinematics.set_joint_positions(np.array([0.0, 1.0, 1.0, 1.0]))
+    assert kinematics.pose_in_palm(2).translation_m[0] > 0.04  # it closes towards the palm's side, x
 
 
-def test_a_pad_that_faces_into_this_hand_is_told(tmp_path: Path, allegro: Path) -> None:
+def test_pad_facing_into_the_hand_is_reported(tmp_path: Path, allegro: Path) -> None:
     path = written(tmp_path, allegro)
     path.write_text(path.read_text().replace("rpy_deg = [180.0, -102.5, 0.0]", "rpy_deg = [0.0, -77.5, 0.0]"))
     with pytest.raises(ConfigError, match=r"index_tip.*rpy_deg.*faces into the body"):
-        check(load(path), str(path))
+        check_urdfs(load(path), str(path))

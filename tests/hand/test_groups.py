@@ -1,4 +1,4 @@
-"""Contacts that one object may bridge are one group, whose name lasts."""
+"""Contacts that one object may bridge form a group with a lasting id."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from handtouch.hand.groups import Groups
+from handtouch.hand.groups import ContactGroups
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def groups(n: int = 4, hand: tuple[int, ...] | None = None) -> Groups:
-    return Groups(np.full(n, 0.02), np.array(hand or [0] * n))
+def groups(n: int = 4, hand: tuple[int, ...] | None = None) -> ContactGroups:
+    return ContactGroups(np.full(n, 0.02), np.array(hand or [0] * n))
 
 
 def step(
-    made: Groups, ids: list[int], x_m: list[float], normals: list[NDArray[np.float64]] | None = None
+    made: ContactGroups, ids: list[int], x_m: list[float], normals: list[NDArray[np.float64]] | None = None
 ) -> list[int]:
     places = np.stack([[x, 0.0, 0.0] for x in x_m])
-    made.step(np.array(ids, dtype=np.uint32), places, np.stack(normals or [UP] * len(ids)))
-    return made.id.tolist()
+    made.update_groups(np.array(ids, dtype=np.uint32), places, np.stack(normals or [UP] * len(ids)))
+    return made.group_id.tolist()
 
 
-def test_near_contacts_are_a_group_and_others_are_by_themselves() -> None:
+def test_near_contacts_form_a_group() -> None:
     assert step(groups(), [5, 7, 0, 9], [0.0, 0.015, np.nan, 0.1]) == [5, 5, 0, 9]
 
 
-def test_a_chain_of_contacts_is_one_group() -> None:
+def test_chain_of_contacts_is_one_group() -> None:
     assert step(groups(), [5, 7, 8, 9], [0.0, 0.015, 0.03, 0.045]) == [5] * 4
 
 
-def test_pads_that_face_each_other_grip_two_sides() -> None:
+def test_facing_pads_are_separate_groups() -> None:
     assert step(groups(2), [5, 7], [0.0, 0.005], [UP, -UP]) == [5, 7]
 
 
-def test_hands_have_groups_of_their_own() -> None:
+def test_groups_do_not_span_hands() -> None:
     assert step(groups(2, (0, 1)), [5, 7], [0.0, 0.0]) == [5, 7]
 
 
-def test_a_group_keeps_its_name_when_the_contact_that_gave_it_ends() -> None:
+def test_group_keeps_its_id_when_the_contact_that_gave_it_ends() -> None:
     made = groups(3)
     assert step(made, [5, 7, 8], [0.0, 0.015, 0.03]) == [5, 5, 5]
     assert step(made, [0, 7, 8], [np.nan, 0.015, 0.03]) == [0, 5, 5]
     assert step(made, [9, 7, 8], [0.1, 0.015, 0.03]) == [9, 5, 5]
 
 
-def test_what_falls_apart_has_two_names_and_what_joins_one() -> None:
+def test_split_groups_have_two_ids_and_joined_ones_one() -> None:
     made = groups(2)
     assert step(made, [5, 7], [0.0, 0.015]) == [5, 5]
     assert step(made, [5, 7], [0.0, 0.024]) == [5, 5]  # joined until a quarter farther
@@ -58,20 +58,20 @@ def test_what_falls_apart_has_two_names_and_what_joins_one() -> None:
     assert step(made, [5, 7], [0.0, 0.01]) == [5, 5]
 
 
-def test_the_link_in_between_ends_and_parts_the_group() -> None:
+def test_end_of_a_connecting_contact_splits_the_group() -> None:
     made = groups(3)
     assert step(made, [5, 6, 7], [0.0, 0.018, 0.036]) == [5, 5, 5]
     assert step(made, [5, 0, 7], [0.0, np.nan, 0.036]) == [5, 0, 7]
 
 
-def test_while_places_are_unknown_groups_stay_as_they_were() -> None:
+def test_unknown_positions_leave_groups_unchanged() -> None:
     made = groups(2)
     step(made, [5, 7], [0.0, 0.015])
     assert step(made, [5, 7], [np.nan, np.nan]) == [5, 5]
 
 
 @given(st.lists(st.lists(st.tuples(st.booleans(), st.floats(0, 0.1)), min_size=5, max_size=5), max_size=8))
-def test_names_are_never_shared_by_parts_that_are_apart(story: list[list[tuple[bool, float]]]) -> None:
+def test_separate_groups_never_share_an_id(story: list[list[tuple[bool, float]]]) -> None:
     made, ids, following = groups(5), [0] * 5, 1
     for moment in story:
         for pad, (touching, _) in enumerate(moment):

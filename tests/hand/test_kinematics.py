@@ -1,4 +1,4 @@
-"""Kinematics agree with products of transforms, for the shipped hand and one that nobody here described."""
+"""Kinematics agree with products of transforms, for the shipped hand and a third-party one."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from handtouch import shipped
+from handtouch.config import shipped
 from handtouch.hand import urdf
-from handtouch.hand.kinematics import Kinematics
+from handtouch.hand.kinematics import HandKinematics
 
 FloatArray = NDArray[np.float64]
 WITH_MIMIC = """
@@ -36,10 +36,10 @@ WITH_MIMIC = """
 """
 
 
-def pose(robot: urdf.Description, link: str, position: dict[str, float]) -> FloatArray:
+def pose(robot: urdf.RobotDescription, link: str, position: dict[str, float]) -> FloatArray:
     """Homogeneous transform (4, 4) from a link to the root."""
     found = np.eye(4)
-    for joint in robot.chain(link):
+    for joint in robot.joint_chain(link):
         step = np.eye(4)
         step[:3, :3], step[:3, 3] = joint.rotation, joint.translation_m
         move = np.eye(4)
@@ -56,81 +56,81 @@ def pose(robot: urdf.Description, link: str, position: dict[str, float]) -> Floa
 @pytest.fixture(scope="module", params=["shipped", "allegro", "mimic"])
 def hand(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, allegro: Path
-) -> tuple[urdf.Description, Kinematics]:
+) -> tuple[urdf.RobotDescription, HandKinematics]:
     path = {"shipped": shipped.path("utah_mit.urdf"), "allegro": allegro}.get(request.param)
     if path is None:
         path = tmp_path_factory.mktemp("urdf") / "mimic.urdf"
         path.write_text(WITH_MIMIC)
-    robot = urdf.read(path)
+    robot = urdf.read_urdf(path)
     palm = {"shipped": "palm", "allegro": "palm_link", "mimic": "palm"}[request.param]
-    return robot, Kinematics(robot, list(robot.bodies), palm, robot.root)
+    return robot, HandKinematics(robot, list(robot.bodies), palm, robot.root)
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_poses_are_the_products_of_the_joints_transforms(
-    hand: tuple[urdf.Description, Kinematics], seed: int
+def test_poses_equal_products_of_joint_transforms(
+    hand: tuple[urdf.RobotDescription, HandKinematics], seed: int
 ) -> None:
     robot, kinematics = hand
     position = np.random.default_rng(seed).uniform(-1.5, 1.5, len(kinematics.joints))
-    kinematics.move(position)
+    kinematics.set_joint_positions(position)
     by_name = dict(zip(kinematics.joints, position.tolist(), strict=True))
     palm = pose(robot, "palm" if "palm" in robot.bodies else "palm_link", by_name)
     for number, link in enumerate(robot.bodies):
         in_base = pose(robot, link, by_name)
         for expected, found in (
-            (in_base, kinematics.in_base(number)),
-            (np.linalg.solve(palm, in_base), kinematics.in_palm(number)),
+            (in_base, kinematics.pose_in_base(number)),
+            (np.linalg.solve(palm, in_base), kinematics.pose_in_palm(number)),
         ):
             np.testing.assert_allclose(found.rotation, expected[:3, :3], atol=1e-12)
             np.testing.assert_allclose(found.translation_m, expected[:3, 3], atol=1e-12)
 
 
-def test_slopes_are_finite_differences(hand: tuple[urdf.Description, Kinematics]) -> None:
+def test_jacobians_equal_finite_differences(hand: tuple[urdf.RobotDescription, HandKinematics]) -> None:
     _, kinematics = hand
-    m, link = len(kinematics.joints), len(kinematics.palm_needs) - 1
+    m, link = len(kinematics.joints), len(kinematics.palm_joint_mask) - 1
     position, point = np.random.default_rng(3).uniform(-1, 1, m), np.array([0.01, -0.02, 0.03])
 
     def at(joints: FloatArray, in_base: bool) -> FloatArray:
-        kinematics.move(joints)
-        found = kinematics.in_base(link) if in_base else kinematics.in_palm(link)
+        kinematics.set_joint_positions(joints)
+        found = kinematics.pose_in_base(link) if in_base else kinematics.pose_in_palm(link)
         return np.asarray(found.rotation @ point + found.translation_m)
 
     for in_base in (False, True):
-        kinematics.move(position)
-        slope = kinematics.slope(link, point, in_base)
+        kinematics.set_joint_positions(position)
+        slope = kinematics.point_jacobian(link, point, in_base)
         step = 1e-6 * np.eye(m)
         expected = (
             np.stack([at(position + d, in_base) - at(position - d, in_base) for d in step], axis=1) / 2e-6
         )
         np.testing.assert_allclose(slope, expected, atol=1e-8)
-        needs = (kinematics.base_needs if in_base else kinematics.palm_needs)[link]
+        needs = (kinematics.base_joint_mask if in_base else kinematics.palm_joint_mask)[link]
         assert not np.abs(slope[:, ~needs]).max(initial=0.0) > 0
 
 
-def test_the_shipped_hand_has_sixteen_joints_and_closes_over_its_palm() -> None:
-    robot = urdf.read(shipped.path("utah_mit.urdf"))
+def test_shipped_hand_has_sixteen_joints_and_closes_over_its_palm() -> None:
+    robot = urdf.read_urdf(shipped.path("utah_mit.urdf"))
     tips = ["thumb_distal", "index_distal", "middle_distal", "ring_distal"]
-    kinematics = Kinematics(robot, [*tips, "palm_heel"], "palm", "base")
+    kinematics = HandKinematics(robot, [*tips, "palm_heel"], "palm", "base")
     assert len(kinematics.joints) == 16
-    assert kinematics.palm_needs.sum(axis=1).tolist() == [4, 4, 4, 4, 0]
+    assert kinematics.palm_joint_mask.sum(axis=1).tolist() == [4, 4, 4, 4, 0]
     closed = np.array([0.0 if name.endswith("abduction") else 0.9 for name in kinematics.joints])
     for number, tip in enumerate(tips):
-        kinematics.move(np.zeros(16))
-        open_hand = kinematics.in_palm(number).translation_m.copy()
-        kinematics.move(closed)
-        found = kinematics.in_palm(number).translation_m
+        kinematics.set_joint_positions(np.zeros(16))
+        open_hand = kinematics.pose_in_palm(number).translation_m.copy()
+        kinematics.set_joint_positions(closed)
+        found = kinematics.pose_in_palm(number).translation_m
         assert found[2] > 0.02, tip  # out of the palm
         assert abs(found[0]) < abs(open_hand[0]) + 0.01
-    kinematics.move(closed)
-    thumb, index = kinematics.in_palm(0).translation_m, kinematics.in_palm(1).translation_m
+    kinematics.set_joint_positions(closed)
+    thumb, index = kinematics.pose_in_palm(0).translation_m, kinematics.pose_in_palm(1).translation_m
     assert math.dist(thumb, index) < 0.1
 
 
-def test_joints_that_mimic_follow_and_are_not_asked_for(tmp_path: Path) -> None:
+def test_mimicking_joints_follow_and_need_no_state(tmp_path: Path) -> None:
     path = tmp_path / "r.urdf"
     path.write_text(WITH_MIMIC)
-    kinematics = Kinematics(urdf.read(path), ["follow"], "palm", "base")
+    kinematics = HandKinematics(urdf.read_urdf(path), ["follow"], "palm", "base")
     assert kinematics.joints == ("wrist", "turn", "slide")
     assert kinematics.continuous.tolist() == [False, True, False]
-    assert kinematics.palm_needs.tolist() == [[False, True, True]]
+    assert kinematics.palm_joint_mask.tolist() == [[False, True, True]]

@@ -2,15 +2,15 @@
 //
 // Each line of standard input is one command as JSON, each line of standard output its answer: {"value"} or
 // {"error"}. Commands: {"open": URL}, {"evaluate": "expression"}, {"wait": "expression"} until it is true,
-// {"screenshot": FILE}, {"errors": true} what the page complained about. The end of the input ends the browser.
+// {"screenshot": FILE}, {"errors": true} for errors of the page. The end of the input closes the browser.
 
 import { createInterface } from "node:readline";
 import { chromium } from "playwright-core";
 
-const PATIENCE_MS = 60_000;
+const TIMEOUT_MS = 60_000;
 const browser = await chromium.launch({
   executablePath: process.argv[2],
-  timeout: PATIENCE_MS,
+  timeout: TIMEOUT_MS,
   args: [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
@@ -18,26 +18,26 @@ const browser = await chromium.launch({
   ],
 });
 const page = await browser.newPage({ viewport: { width: 1024, height: 640 }, bypassCSP: true });
-page.setDefaultTimeout(PATIENCE_MS);
+page.setDefaultTimeout(TIMEOUT_MS);
 const errors = [];
 page.on("pageerror", (error) => errors.push(String(error)));
 page.on("console", (message) => {
   if (message.type() === "error" && !message.text().includes("net::ERR_")) errors.push(message.text());
 });
 
-async function obey(command) {
+async function execute(command) {
   if (command.open) return void (await page.goto(command.open));
   if (command.evaluate) return page.evaluate(command.evaluate);
   if (command.wait) return void (await page.waitForFunction(command.wait, null, { polling: 50 }));
   if (command.screenshot) return void (await page.screenshot({ path: command.screenshot }));
   if (command.errors) return errors;
-  throw new Error("no such command");
+  throw new Error("unknown command");
 }
 
 for await (const line of createInterface({ input: process.stdin })) {
   let answer;
   try {
-    answer = { value: (await obey(JSON.parse(line))) ?? null };
+    answer = { value: (await execute(JSON.parse(line))) ?? null };
   } catch (error) {
     answer = { error: String(error) };
   }

@@ -1,15 +1,15 @@
-// Follows a handtouch daemon, by docs/wire.md: node reader.mjs ENDPOINT TOPIC...
+// Subscriber of a handtouch daemon, written from docs/wire.md: node reader.mjs ENDPOINT TOPIC...
 //
-// A TOPIC that ends with a slash stands for all topics below it. Every message is printed as one line of
-// JSON, {"topic", "payload"}, with columns as arrays, what isn't known as null, and integers of any size.
-// {"alive": false} and {"alive": true} tell when the daemon falls silent and is heard again. When standard
-// input ends, {"summary"} tells what was counted, and the program ends.
+// A TOPIC that ends with a slash includes all topics below it. Every message is printed as one line of
+// JSON, {"topic", "payload"}, with columns as arrays, unknown values as null, and integers of any size.
+// {"alive": false} and {"alive": true} report that the daemon disconnected and connected again. At the end of
+// standard input, {"summary"} is printed with all counters, and the program ends.
 
 import { decode } from "@msgpack/msgpack";
 import { Subscriber } from "zeromq";
 
 const VERSION = 1;
-const SILENCE_MS = 1500;
+const SERVICE_TIMEOUT_MS = 1500;
 const PARTS = { contact: 3, hand: 2, health: 3, raw: 2, service: 1 };
 
 const uint8 = { bytes: 1, read: (view, at) => view.getUint8(at) };
@@ -21,45 +21,44 @@ const float32 = { bytes: 4, read: (view, at) => view.getFloat32(at, true) };
 const COLUMNS = {
   hand: {
     state: [uint8, 1],
-    contact: [uint32, 1],
+    contact_id: [uint32, 1],
     sample_ns: [int64, 1],
-    current_a: [float32, 1],
+    total_current_a: [float32, 1],
     position_m: [float32, 3],
     normal: [float32, 3],
     covariance_m2: [float32, 9],
     pad_m: [float32, 2],
+    position_status: [uint8, 1],
     force_n: [float32, 1],
     force_std_n: [float32, 1],
-    saturated: [uint8, 1],
+    force_status: [uint8, 1],
     residual: [float32, 1],
     residual_std: [float32, 1],
   },
   raw: { counts: [int64, 4], sample_ns: [int64, 1], fresh: [uint8, 1] },
 };
 
-// columns that are there only where there is something to tell
+// columns that are present only where a scene requests them
 const OPTIONAL = {
   hand: {
     group: [uint32, 1],
-    palm: [uint8, 1],
+    palm_status: [uint8, 1],
     palm_position_m: [float32, 3],
     palm_normal: [float32, 3],
     palm_covariance_m2: [float32, 9],
-    base: [uint8, 1],
+    base_status: [uint8, 1],
     base_position_m: [float32, 3],
     base_normal: [float32, 3],
     base_covariance_m2: [float32, 9],
     joints_age_s: [float32, 1],
-    unestimated: [uint8, 1],
-    doubtful: [uint8, 1],
   },
 };
 
 function columnOf(bytes, [type, elements], rows) {
   if (!(bytes instanceof Uint8Array) || bytes.length !== rows * elements * type.bytes) {
-    throw new Error("a column doesn't fit its links");
+    throw new Error("a column doesn't match its links");
   }
-  // the bytes lie anywhere in the message, so no typed array could look at them in place
+  // the bytes are not aligned in the message, so a typed array can't view them in place
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const element = (index) => type.read(view, index * type.bytes);
   if (elements === 1) return Array.from({ length: rows }, (_, row) => element(row));
@@ -75,7 +74,7 @@ function read(parts) {
   if (PARTS[kind] !== topic.split("/").length) throw new Error("no such topic");
   const payload = decode(parts[1], { useBigInt64: true });
   if (payload?.v !== VERSION) throw new Error("another version");
-  for (const key of ["run", "seq"]) {
+  for (const key of ["session", "seq"]) {
     if (!["number", "bigint"].includes(typeof payload[key])) throw new Error(`no ${key}`);
   }
   for (const [name, shape] of Object.entries(COLUMNS[kind] ?? {})) {
@@ -87,25 +86,25 @@ function read(parts) {
   return { topic, payload };
 }
 
-class Follower {
+class SequenceTracker {
   gaps = 0;
-  repeats = 0;
+  retained = 0;
   restarts = 0;
-  #run = null;
+  #session = null;
   #seq = new Map();
 
-  // whether a message is news
-  take({ topic, payload }) {
-    if (this.#run !== null && payload.run !== this.#run) {
+  // returns true for a new message
+  accept({ topic, payload }) {
+    if (this.#session !== null && payload.session !== this.#session) {
       this.restarts += 1;
       this.#seq.clear();
     }
-    this.#run = payload.run;
+    this.#session = payload.session;
     const seq = Number(payload.seq);
     const last = this.#seq.get(topic);
     if (last !== undefined) {
-      if (payload.repeat && seq <= last) {
-        this.repeats += 1;
+      if (payload.retained && seq <= last) {
+        this.retained += 1;
         return false;
       }
       this.gaps += Math.max(0, seq - last - 1);
@@ -115,39 +114,39 @@ class Follower {
   }
 }
 
-const MARK = "an integer: "; // JSON.stringify knows no big ones
+const MARK = "an integer: "; // JSON.stringify doesn't support BigInt
 function print(value) {
   const text = JSON.stringify(value, (_, item) => (typeof item === "bigint" ? `${MARK}${item}` : item));
   process.stdout.write(text.replaceAll(new RegExp(`"${MARK}(-?\\d+)"`, "g"), "$1") + "\n");
 }
 
 const [endpoint, ...topics] = process.argv.slice(2);
-const wanted = (topic) => topics.some((t) => (t.endsWith("/") ? topic.startsWith(t) : topic === t));
+const subscribed = (topic) => topics.some((t) => (t.endsWith("/") ? topic.startsWith(t) : topic === t));
 const socket = new Subscriber({ receiveHighWaterMark: 100_000, linger: 0, heartbeatInterval: 500 });
 socket.connect(endpoint);
 socket.subscribe(...topics, "service");
 
-const follower = new Follower();
+const tracker = new SequenceTracker();
 let malformed = 0;
 let alive = false;
-let heardMs = 0;
+let receivedMs = 0;
 const watch = setInterval(() => {
-  if (alive && performance.now() - heardMs > SILENCE_MS) print({ alive: (alive = false) });
+  if (alive && performance.now() - receivedMs > SERVICE_TIMEOUT_MS) print({ alive: (alive = false) });
 }, 50);
 process.stdin.resume();
 process.stdin.on("end", () => socket.close());
 
 for await (const parts of socket) {
-  heardMs = performance.now();
+  receivedMs = performance.now();
   if (!alive) print({ alive: (alive = true) });
-  if (!wanted(parts[0].toString("utf8"))) continue;
+  if (!subscribed(parts[0].toString("utf8"))) continue;
   try {
     const message = read(parts);
-    if (follower.take(message)) print(message);
+    if (tracker.accept(message)) print(message);
   } catch {
     malformed += 1;
   }
 }
 clearInterval(watch);
-const { gaps, repeats, restarts } = follower;
-print({ summary: { gaps, repeats, restarts, malformed } });
+const { gaps, retained, restarts } = tracker;
+print({ summary: { gaps, retained, restarts, malformed } });

@@ -1,4 +1,4 @@
-"""What a contact does, in words and probabilities: it sticks, slides, rolls, leaves; and what that costs."""
+"""Motion of contacts: sticking, sliding, rolling and lift-off with probabilities."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.percept.ask import Action, Question
-from handtouch.percept.motion import CLASSES, Motion
-from handtouch.percept.percept import Perceiver
-from handtouch.percept.stream import KINDS, Percept, Sample, Stream
+from handtouch.percept.action_request import CandidateAction, Question
+from handtouch.percept.motion import MOTION_CLASSES, MotionEstimator
+from handtouch.percept.pipeline import PerceptPipeline
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
+from handtouch.wire import PERCEPT_KINDS
 
 FloatArray = NDArray[np.float64]
 PERIOD_NS, NOISE_M = 5_000_000, 8e-6
@@ -23,35 +24,38 @@ class Held:
     """Contacts at places on pads, moved along x, on links that move in the palm."""
 
     def __init__(self, pads: int = 1, seed: int = 1, joints_m: float = 0.0) -> None:
-        """joints_m: deviation that joints put into places in the palm, as they tell."""
+        """joints_m: deviation of positions in the palm from joints, as reported."""
         self._joints_m = joints_m
-        self.stream = Stream(pads)
-        self.motion = Motion(self.stream, PERIOD_NS)
-        self.perceiver = Perceiver(self.stream, [self.motion])
-        wanted = np.zeros((len(KINDS), pads), dtype=np.bool_)
-        wanted[KINDS.index("motion")] = True
-        self.perceiver.want(wanted, np.ones(pads, dtype=np.bool_))
+        self.stream = ContactBuffer(pads)
+        self.motion = MotionEstimator(self.stream, PERIOD_NS)
+        self.perceiver = PerceptPipeline(self.stream, [self.motion])
+        requested = np.zeros((len(PERCEPT_KINDS), pads), dtype=np.bool_)
+        requested[PERCEPT_KINDS.index("motion")] = True
+        self.perceiver.set_requested(requested, np.ones(pads, dtype=np.bool_))
         self.asks: list[str] = []
         self._rng = np.random.default_rng(seed)
         self._k = 0
 
     def feel(
         self, seconds: float, along_m: Way, force: Way = lambda _: 2.0, links_m: Sequence[Way] = ()
-    ) -> list[Percept]:
-        """What is told of it. along_m: the first pad's centroid; links_m: of links, along x in the palm."""
-        told = []
+    ) -> list[PerceptEstimate]:
+        """Play contacts and return the percepts of the first pad.
+
+        along_m: the first pad's centroid; links_m: of links, along x in the palm.
+        """
+        percepts = []
         pads = np.arange(self.stream.size)
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             t_s, self._k = self._k * PERIOD_NS * 1e-9, self._k + 1
             t_ns = np.full(len(pads), 10**9 + self._k * PERIOD_NS)
-            sample = Sample(pads, t_ns, (pads + 1).astype(np.uint32))
+            sample = ContactSamples(pads, t_ns, (pads + 1).astype(np.uint32))
             place = NOISE_M * self._rng.standard_normal((len(pads), 2))
             place[0, 0] += along_m(t_s)
             sample["pad_m"] = place
             sample["pad_noise_m2"] = np.tile(NOISE_M**2 * np.eye(2), (len(pads), 1, 1))
             sample["covariance_m2"] = np.tile(NOISE_M**2 * np.eye(3), (len(pads), 1, 1))
             sample["force_n"] = np.full(len(pads), force(t_s))
-            sample["current_a"] = 1e-3 * sample["force_n"]
+            sample["total_current_a"] = 1e-3 * sample["force_n"]
             if links_m:
                 on_link = np.hstack([place, np.zeros((len(pads), 1))])
                 sample["position_m"] = on_link
@@ -62,10 +66,10 @@ class Held:
                 sample["palm_normal"] = np.tile([0.0, 0.0, 1.0], (len(pads), 1))
                 sample["palm_rotation"] = np.tile(np.eye(3), (len(pads), 1, 1))
                 sample["palm_joints_m2"] = np.full(len(pads), self._joints_m**2)
-            found, asks = self.perceiver.step(sample, np.zeros(0, np.intp), int(t_ns[0]))
-            told += [percept for percept in found if percept.pad == 0]
-            self.asks += [ask.action.do for ask in asks]
-        return told
+            found, asks = self.perceiver.process_tick(sample, np.zeros(0, np.intp), int(t_ns[0]))
+            percepts += [percept for percept in found if percept.pad == 0]
+            self.asks += [ask.action.kind for ask in asks]
+        return percepts
 
 
 def still(_: float) -> float:
@@ -76,54 +80,54 @@ def ramp(from_s: float, speed: float) -> Way:
     return lambda t_s: speed * max(0.0, t_s - from_s)
 
 
-def test_a_firm_contact_sticks_and_says_so_twenty_times_a_second() -> None:
-    told = Held().feel(2.0, still)
-    assert {percept.label for percept in told} == {"sticking"}
-    assert 38 <= len(told) <= 42
-    assert told[-1].probabilities["sticking"] > 0.95
-    assert told[-1].evidence["samples"] == (told[-1].t_ns - 10**9) / PERIOD_NS
+def test_firm_contact_is_reported_sticking_twenty_times_a_second() -> None:
+    percepts = Held().feel(2.0, still)
+    assert {percept.label for percept in percepts} == {"sticking"}
+    assert 38 <= len(percepts) <= 42
+    assert percepts[-1].probabilities["sticking"] > 0.95
+    assert percepts[-1].evidence["samples"] == (percepts[-1].estimate_ns - 10**9) / PERIOD_NS
 
 
 def test_probabilities_sum_to_one() -> None:
     for percept in Held().feel(1.5, ramp(1.0, 10e-3)):
-        assert set(percept.probabilities) == set(CLASSES)
+        assert set(percept.probabilities) == set(MOTION_CLASSES)
         assert sum(percept.probabilities.values()) == pytest.approx(1.0)
 
 
-def test_a_slip_is_told_at_once_with_its_velocity_and_way() -> None:
-    told = Held().feel(1.2, ramp(1.0, 20e-3))
-    first = next(percept for percept in told if percept.label == "sliding")
-    assert first.at_once
-    assert (first.t_ns - 10**9) * 1e-9 < 1.03
-    last = told[-1]
+def test_slip_is_reported_at_once_with_velocity_and_distance() -> None:
+    percepts = Held().feel(1.2, ramp(1.0, 20e-3))
+    first = next(percept for percept in percepts if percept.label == "sliding")
+    assert first.urgent
+    assert (first.estimate_ns - 10**9) * 1e-9 < 1.03
+    last = percepts[-1]
     assert last.values["velocity_m_per_s"] == pytest.approx([20e-3, 0.0], abs=4e-3)
-    since_s = last.t_ns * 1e-9 - 2.0
-    assert last.values["slipped_m"] == pytest.approx(since_s * 20e-3, rel=0.2)
+    since_s = last.estimate_ns * 1e-9 - 2.0
+    assert last.values["slip_distance_m"] == pytest.approx(since_s * 20e-3, rel=0.2)
 
 
-def test_what_has_slipped_and_rests_sticks_again() -> None:
-    told = Held().feel(2.5, lambda t_s: min(20e-3 * max(0.0, t_s - 1.0), 4e-3))
-    labels = [percept.label for percept in told]
+def test_contact_at_rest_after_slip_sticks_again() -> None:
+    percepts = Held().feel(2.5, lambda t_s: min(20e-3 * max(0.0, t_s - 1.0), 4e-3))
+    labels = [percept.label for percept in percepts]
     assert "sliding" in labels
     assert labels[-10:] == ["sticking"] * 10
-    assert told[-1].evidence["slips"] == 1
+    assert percepts[-1].evidence["slips"] == 1
 
 
-def test_a_force_that_falls_away_is_a_lift_off() -> None:
-    told = Held().feel(1.08, still, force=lambda t_s: 2.0 - 20.0 * max(0.0, t_s - 1.0))
-    assert told[-1].label == "lift-off"
+def test_vanishing_force_is_lift_off() -> None:
+    percepts = Held().feel(1.08, still, force=lambda t_s: 2.0 - 20.0 * max(0.0, t_s - 1.0))
+    assert percepts[-1].label == "lift-off"
 
 
-def test_a_contact_that_ends_has_lifted_off() -> None:
+def test_ended_contact_has_lifted_off() -> None:
     held = Held()
     held.feel(0.5, still)
-    none = Sample(np.zeros(0, np.intp), np.zeros(0, np.int64), np.zeros(0, np.uint32))
-    (last,), _ = held.perceiver.step(none, np.array([0]), 2 * 10**9)
+    none = ContactSamples(np.zeros(0, np.intp), np.zeros(0, np.int64), np.zeros(0, np.uint32))
+    (last,), _ = held.perceiver.process_tick(none, np.array([0]), 2 * 10**9)
     assert (last.label, last.contact) == ("lift-off", 1)
-    assert held.stream.contact[0] == 0
+    assert held.stream.contact_id[0] == 0
 
 
-def test_what_may_be_a_slow_slip_is_asked_to_be_held_still() -> None:
+def test_possible_slow_slip_poses_a_hold_question() -> None:
     held = Held()
     held.feel(2.0, ramp(1.0, 1.5e-3))
     assert "hold" in held.asks
@@ -133,34 +137,34 @@ def test_what_may_be_a_slow_slip_is_asked_to_be_held_still() -> None:
 
 
 def test_ripple_and_tremor_are_sticking() -> None:
-    told = Held().feel(
+    percepts = Held().feel(
         3.0,
         lambda t_s: 5e-5 * np.sin(2 * np.pi * 3 * t_s) + 1e-5 * np.sin(2 * np.pi * 7 * t_s),
         force=lambda t_s: 2.0 + 0.5 * np.sin(2 * np.pi * 3 * t_s),
     )
-    assert {percept.label for percept in told} == {"sticking"}
+    assert {percept.label for percept in percepts} == {"sticking"}
 
 
-def test_joints_tell_rolling_from_sliding() -> None:
+def test_joint_states_distinguish_rolling_from_sliding() -> None:
     """A centroid runs over the pad, and two fingers hold the object still: its link stands or moves."""
     held = [still, still, still]
     rolls = Held(3).feel(1.3, ramp(1.0, 15e-3), links_m=held)[-1]
     assert rolls.label == "rolling"
-    assert rolls.values["object"] == "grasp"
+    assert rolls.values["object_reference"] == "grasp"
     slides = Held(3).feel(1.3, ramp(1.0, 15e-3), links_m=[ramp(1.0, -15e-3), still, still])[-1]
     assert slides.label == "sliding"
     assert slides.probabilities["sliding"] > 0.95
-    relative = slides.values["relative_m_per_s"]
+    relative = slides.values["relative_velocity_m_per_s"]
     assert relative == pytest.approx([-15e-3, 0.0, 0.0], abs=3e-3)
 
 
-def test_a_hand_that_carries_the_object_along_does_not_slide() -> None:
+def test_moving_hand_with_its_object_does_not_slide() -> None:
     carried = Held(3).feel(1.5, still, links_m=[ramp(1.0, 30e-3)] * 3)
     assert {percept.label for percept in carried} == {"sticking"}
 
 
 @pytest.mark.parametrize("joints_m", [0.2e-3, 0.0])
-def test_noise_of_encoders_is_no_sliding_where_joints_tell_it(joints_m: float) -> None:
+def test_reported_encoder_noise_is_not_sliding(joints_m: float) -> None:
     """Each sample's angles put a fingertip 0.2 mm off: 6 mm/s over 50 ms, that nothing moves with."""
     rng = np.random.default_rng(8)
     shaken = [lambda _: float(0.2e-3 * rng.standard_normal())] * 4
@@ -168,7 +172,7 @@ def test_noise_of_encoders_is_no_sliding_where_joints_tell_it(joints_m: float) -
     assert ("sliding" in labels) == (joints_m == 0.0)  # taken for as good as none, it is one
 
 
-def test_a_thing_that_is_dragged_under_still_centroids_slides_in_spite_of_that_noise() -> None:
+def test_object_dragged_under_resting_centroids_slides_despite_noise() -> None:
     rng = np.random.default_rng(9)
 
     def noise(_: float) -> float:
@@ -176,12 +180,12 @@ def test_a_thing_that_is_dragged_under_still_centroids_slides_in_spite_of_that_n
 
     pulled = ramp(1.0, -100e-3)
     links = [lambda t_s: pulled(t_s) + noise(t_s), *[noise] * 4]
-    told = Held(5, joints_m=0.2e-3).feel(1.3, still, links_m=links)
-    first = next(percept for percept in told if percept.label == "sliding")
-    assert 1.0 < (first.t_ns - 10**9) * 1e-9 < 1.15
+    percepts = Held(5, joints_m=0.2e-3).feel(1.3, still, links_m=links)
+    first = next(percept for percept in percepts if percept.label == "sliding")
+    assert 1.0 < (first.estimate_ns - 10**9) * 1e-9 < 1.15
 
 
-def test_evidence_about_the_threshold_does_not_chatter() -> None:
+def test_evidence_near_the_threshold_does_not_chatter() -> None:
     """R that goes up and down about even odds, a few samples each: one alarm, until it is gone for long."""
     held = Held()
     held.feel(1.0, still)
@@ -189,33 +193,35 @@ def test_evidence_about_the_threshold_does_not_chatter() -> None:
     even = -math.log(0.05 * PERIOD_NS * 1e-9)
     alarms, before = 0, False
     for k in range(200):
-        motion.test.log_odds[0] = even + (0.8 if k % 6 < 3 else -1.5 if k < 100 else -9.0) if k < 106 else 0.0
-        motion._weigh(pad, one)
-        now = bool(motion._look(pad)[0] == CLASSES.index("incipient"))
+        motion.slip_test.log_odds[0] = (
+            even + (0.8 if k % 6 < 3 else -1.5 if k < 100 else -9.0) if k < 106 else 0.0
+        )
+        motion._update_slip_log_odds(pad, one)
+        now = bool(motion._quick_classify(pad)[0] == MOTION_CLASSES.index("incipient"))
         alarms, before = alarms + (now and not before), now
     assert alarms == 1
     assert not before
 
 
-def test_a_single_contact_is_against_an_object_that_stands_still() -> None:
-    told = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[ramp(1.0, -15e-3)])[-1]
-    assert told.values["object"] == "static"
-    assert told.label == "sliding"
+def test_single_contact_assumes_a_static_object() -> None:
+    percepts = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[ramp(1.0, -15e-3)])[-1]
+    assert percepts.values["object_reference"] == "static"
+    assert percepts.label == "sliding"
 
 
-def test_a_centroid_that_runs_on_a_link_at_rest_slides_where_nothing_else_holds_the_object() -> None:
-    told = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[still])[-1]
-    assert told.values["object"] == "static"
-    assert told.label == "sliding"
+def test_moving_centroid_on_a_resting_link_slides_without_other_contacts() -> None:
+    percepts = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[still])[-1]
+    assert percepts.values["object_reference"] == "static"
+    assert percepts.label == "sliding"
 
 
-def test_samples_without_place_or_force_are_survived() -> None:
+def test_samples_without_position_or_force_are_tolerated() -> None:
     held = Held()
     held.feel(0.5, still)
     t_ns = 10**9 + round(0.501e9)
-    sample = Sample(np.array([0]), np.array([t_ns]), np.array([1], np.uint32))
-    held.perceiver.step(sample, np.zeros(0, np.intp), t_ns)
-    assert held.feel(0.5, still)[-1].label in CLASSES
+    sample = ContactSamples(np.array([0]), np.array([t_ns]), np.array([1], np.uint32))
+    held.perceiver.process_tick(sample, np.zeros(0, np.intp), t_ns)
+    assert held.feel(0.5, still)[-1].label in MOTION_CLASSES
 
 
 class Slow:
@@ -226,56 +232,60 @@ class Slow:
     kind = "shape"
 
     def __init__(self) -> None:
-        self.wanted = np.zeros(2, dtype=np.bool_)
+        self.requested = np.zeros(2, dtype=np.bool_)
         self.fitted: list[int] = []
         self.stepped = 0
 
-    def step(self, stream: Stream, sample: Sample, began: NDArray[np.intp]) -> list[Percept]:
+    def process_samples(
+        self, stream: ContactBuffer, sample: ContactSamples, began: NDArray[np.intp]
+    ) -> list[PerceptEstimate]:
         self.stepped += 1
-        assert self.wanted[sample.pads].all()
+        assert self.requested[sample.pads].all()
         return []
 
-    def due(self, stream: Stream, t_ns: int) -> int | None:
+    def next_pad_to_fit(self, stream: ContactBuffer, t_ns: int) -> int | None:
         return 1
 
-    def fit(self, stream: Stream, pad: int, t_ns: int) -> list[Percept]:
+    def fit_contact(self, stream: ContactBuffer, pad: int, t_ns: int) -> list[PerceptEstimate]:
         self.fitted.append(t_ns)
         return []
 
-    def end(self, stream: Stream, pads: NDArray[np.intp], t_ns: int) -> list[Percept]:
+    def end_contacts(self, stream: ContactBuffer, pads: NDArray[np.intp], t_ns: int) -> list[PerceptEstimate]:
         return []
 
-    def questions(self, t_ns: int) -> list[Question]:
-        tells = Action("squeeze", {"force_ratio": 2.0}, {"flat": (0.0, 1.0), "round": (9.0, 1.0)})
-        return [Question("area", 0, 1, 2, {"flat": 0.5, "round": 0.5}, [tells])]
+    def open_questions(self, t_ns: int) -> list[Question]:
+        action = CandidateAction("squeeze", {"force_ratio": 2.0}, {"flat": (0.0, 1.0), "round": (9.0, 1.0)})
+        return [Question("area", 0, 1, 2, {"flat": 0.5, "round": 0.5}, [action])]
 
 
 @pytest.mark.parametrize("period_ns", [1_000_000, 5_000_000])
-def test_slow_parts_get_one_fit_at_a_time_and_a_hundred_a_second_at_most(period_ns: int) -> None:
-    stream, first, second = Stream(2), Slow(), Slow()
-    perceiver = Perceiver(stream, [first, second])
-    wanted = np.ones((len(KINDS), 2), dtype=np.bool_)
-    perceiver.want(wanted, np.ones(2, dtype=np.bool_))
+def test_fits_run_one_at_a_time_and_at_most_a_hundred_per_second(period_ns: int) -> None:
+    stream, first, second = ContactBuffer(2), Slow(), Slow()
+    perceiver = PerceptPipeline(stream, [first, second])
+    requested = np.ones((len(PERCEPT_KINDS), 2), dtype=np.bool_)
+    perceiver.set_requested(requested, np.ones(2, dtype=np.bool_))
     for k in range(1, 1 + 10**9 // period_ns):
-        sample = Sample(np.array([1]), np.array([k * period_ns]), np.array([2], np.uint32))
-        perceiver.step(sample, np.zeros(0, np.intp), k * period_ns)
+        sample = ContactSamples(np.array([1]), np.array([k * period_ns]), np.array([2], np.uint32))
+        perceiver.process_tick(sample, np.zeros(0, np.intp), k * period_ns)
     together = sorted(first.fitted + second.fitted)
     assert 90 <= len(together) <= 100
     assert len(set(together)) == len(together)
     assert abs(len(first.fitted) - len(second.fitted)) <= 1
 
 
-def test_a_part_sees_only_the_pads_that_it_is_wanted_for() -> None:
+def test_estimator_processes_only_its_requested_pads() -> None:
     slow = Slow()
-    perceiver = Perceiver(Stream(2), [slow])
-    wanted = np.zeros((len(KINDS), 2), dtype=np.bool_)
-    wanted[KINDS.index("shape"), 1] = True
-    perceiver.want(wanted, np.zeros(2, dtype=np.bool_))
-    both = Sample(np.array([0, 1]), np.array([1, 1]), np.array([1, 2], np.uint32))
-    _, asks = perceiver.step(both, np.zeros(0, np.intp), 1)
-    only = Sample(np.array([0]), np.array([2]), np.array([1], np.uint32))
-    perceiver.step(only, np.zeros(0, np.intp), 2)
+    perceiver = PerceptPipeline(ContactBuffer(2), [slow])
+    requested = np.zeros((len(PERCEPT_KINDS), 2), dtype=np.bool_)
+    requested[PERCEPT_KINDS.index("shape"), 1] = True
+    perceiver.set_requested(requested, np.zeros(2, dtype=np.bool_))
+    both = ContactSamples(np.array([0, 1]), np.array([1, 1]), np.array([1, 2], np.uint32))
+    _, asks = perceiver.process_tick(both, np.zeros(0, np.intp), 1)
+    only = ContactSamples(np.array([0]), np.array([2]), np.array([1], np.uint32))
+    perceiver.process_tick(only, np.zeros(0, np.intp), 2)
     assert slow.stepped == 1
-    assert asks == []  # nobody listens to questions
-    perceiver.want(wanted, np.ones(2, dtype=np.bool_))
-    assert [ask.action.do for ask in perceiver.step(both, np.zeros(0, np.intp), 10**9)[1]] == ["squeeze"]
+    assert asks == []  # action requests aren't requested
+    perceiver.set_requested(requested, np.ones(2, dtype=np.bool_))
+    assert [ask.action.kind for ask in perceiver.process_tick(both, np.zeros(0, np.intp), 10**9)[1]] == [
+        "squeeze"
+    ]

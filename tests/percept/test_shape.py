@@ -1,4 +1,4 @@
-"""Shapes by their evidence: the right class, sizes with deviations that hold, and "not enough yet"."""
+"""Shapes by their evidence: the right class, sizes with valid deviations, undetermined otherwise."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch.field import LocatorBank, Rectangle
-from handtouch.percept.ask import expected_bits
-from handtouch.percept.classify import Verdict, classify, classifying
-from handtouch.percept.percept import Perceiver
-from handtouch.percept.primitives import CLASSES, SIZES
-from handtouch.percept.shape import Shape, pair_distance, point_or_more
-from handtouch.percept.stream import KINDS, Percept, Sample, Stream
+from handtouch.percept.action_request import expected_information_bits
+from handtouch.percept.classify import ShapeClassification, classify_shape, classify_shape_stepwise
+from handtouch.percept.pipeline import PerceptPipeline
+from handtouch.percept.primitives import SHAPE_CLASSES, SIZE_PARAMETERS
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
+from handtouch.percept.shape import ShapeEstimator, pair_distance, spot_probabilities
+from handtouch.wire import PERCEPT_KINDS
 
 FloatArray = NDArray[np.float64]
 Touches = tuple[FloatArray, FloatArray, FloatArray]
@@ -46,162 +47,168 @@ def touches(kind: str, n: int, seed: int, radius: float = 0.02, patch: float = 1
     return points @ turn.T + away, -normal @ turn.T, 0.5e-3**2 * turn @ across @ turn.T
 
 
-@pytest.mark.parametrize("kind", CLASSES)
-def test_twenty_touches_tell_the_class_and_size(kind: str) -> None:
+@pytest.mark.parametrize("kind", SHAPE_CLASSES)
+def test_twenty_touches_give_class_and_size(kind: str) -> None:
     for seed in range(8):
-        found = classify(*touches(kind, 20, seed))
+        found = classify_shape(*touches(kind, 20, seed))
         assert found.label == kind
-        if SIZES[kind]:
+        if SIZE_PARAMETERS[kind]:
             fit = found.fits[kind]
             assert abs(fit.radius_m - 0.02) < 4 * fit.radius_std_m < 0.008
 
 
-@pytest.mark.parametrize("kind", CLASSES)
-def test_few_touches_are_not_enough_yet(kind: str) -> None:
+@pytest.mark.parametrize("kind", SHAPE_CLASSES)
+def test_few_touches_are_undetermined(kind: str) -> None:
     for n in (1, 2):
-        found = classify(*touches(kind, n, 3))
-        assert (found.state, found.label, found.contacts) == ("unestimated", "", n)
-    wrong = [classify(*touches(kind, 3, seed)).label not in ("", kind) for seed in range(20)]
+        found = classify_shape(*touches(kind, n, 3))
+        assert (found.state, found.label, found.contacts) == ("undetermined", "", n)
+    wrong = [classify_shape(*touches(kind, 3, seed)).label not in ("", kind) for seed in range(20)]
     assert np.mean(wrong) <= 0.25
 
 
-def test_touches_in_a_row_on_a_plane_make_no_edge() -> None:
+def test_touches_in_a_row_on_a_plane_are_not_an_edge() -> None:
     points, normals, covariances = touches("flat", 30, 5)
     row = points[0] + np.linspace(0, 0.03, 30)[:, None] * np.cross(normals[0], [0.3, 0.5, 0.8])
     even = np.tile(normals[0], (30, 1)) + 0.02 * np.random.default_rng(1).normal(size=(30, 3))
-    found = classify(row, even, covariances)
+    found = classify_shape(row, even, covariances)
     assert found.probabilities["edge"] < 1e-3
     assert found.label == "flat"
 
 
-def test_a_shape_that_is_none_of_them_is_none() -> None:
+def test_shape_outside_the_classes_is_invalid() -> None:
     chance = np.random.default_rng(4)
     normals = chance.normal(size=(20, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    found = classify(0.03 * chance.normal(size=(20, 3)), normals, np.tile(1e-7 * np.eye(3), (20, 1, 1)))
+    found = classify_shape(0.03 * chance.normal(size=(20, 3)), normals, np.tile(1e-7 * np.eye(3), (20, 1, 1)))
     assert (found.state, found.label) == ("invalid", "")
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "sphere"])
-def test_an_object_that_moves_a_little_between_touches_keeps_its_class_and_says_so(kind: str) -> None:
+def test_slightly_moving_object_keeps_its_class_and_is_marked_as_moving(kind: str) -> None:
     for seed in range(4):
         points, normals, covariances = touches(kind, 20, seed)
-        rests = classify(points, normals, covariances)
+        rests = classify_shape(points, normals, covariances)
         points = points + np.random.default_rng(seed).normal(0.0, 2e-3, (20, 3))
-        moved = classify(points, normals, covariances)
-        assert (rests.state, rests.label, rests.moves) == ("estimated", kind, False)
-        assert (moved.state, moved.label, moved.moves) == ("estimated", kind, True)
+        moved = classify_shape(points, normals, covariances)
+        assert (rests.state, rests.label, rests.object_moves) == ("estimated", kind, False)
+        assert (moved.state, moved.label, moved.object_moves) == ("estimated", kind, True)
         fits = rests.fits[kind], moved.fits[kind]
         assert abs(fits[1].radius_m - 0.02) < 3 * fits[1].radius_std_m
         assert fits[1].radius_std_m > fits[0].radius_std_m
 
 
-def test_a_few_touches_that_fit_nothing_are_not_explained_by_motion() -> None:
+def test_few_misfitting_touches_are_not_explained_by_motion() -> None:
     points, normals, covariances = touches("sphere", 5, 1)
     points = points + np.random.default_rng(2).normal(0.0, 4e-3, (5, 3))
-    found = classify(points, normals, covariances)
-    assert (found.state, found.moves) == ("invalid", False)
+    found = classify_shape(points, normals, covariances)
+    assert (found.state, found.object_moves) == ("invalid", False)
 
 
-def test_what_has_moved_is_not_taken_to_rest_again() -> None:
-    found: list[Verdict] = []
+def test_moved_object_is_not_assumed_at_rest_again() -> None:
+    found: list[ShapeClassification] = []
 
     def pieces() -> Generator[None, None, None]:
-        found.append((yield from classifying(*touches("sphere", 12, 1), moved=True)))
+        found.append((yield from classify_shape_stepwise(*touches("sphere", 12, 1), moved=True)))
 
     for _ in pieces():
         assert not found
-    assert (found[0].label, found[0].moves) == ("sphere", True)
+    assert (found[0].label, found[0].object_moves) == ("sphere", True)
 
 
-def test_where_the_object_lies_makes_no_difference() -> None:
+def test_pose_of_the_object_makes_no_difference() -> None:
     points, normals, covariances = touches("cylinder", 12, 6)
     turn, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))
-    plain = classify(points, normals, covariances)
-    moved = classify(points @ turn.T + 0.2, normals @ turn.T, turn @ covariances @ turn.T)
+    plain = classify_shape(points, normals, covariances)
+    moved = classify_shape(points @ turn.T + 0.2, normals @ turn.T, turn @ covariances @ turn.T)
     assert moved.fits["cylinder"].radius_m == pytest.approx(plain.fits["cylinder"].radius_m, rel=1e-3)
     assert moved.probabilities == pytest.approx(plain.probabilities, abs=0.02)
     axis = turn @ plain.fits["cylinder"].direction
     assert abs(axis @ moved.fits["cylinder"].direction) == pytest.approx(1, abs=1e-3)
 
 
-def test_an_uncertain_touch_counts_less() -> None:
+def test_uncertain_touch_is_down_weighted() -> None:
     points, normals, covariances = touches("sphere", 20, 2)
     points[0] += 0.01
     loose = covariances.copy()
     loose[0] = 0.02**2 * np.eye(3)
-    off = abs(classify(points, normals, loose).fits["sphere"].radius_m - 0.02)
-    assert off < 0.5 * abs(classify(points, normals, covariances).fits["sphere"].radius_m - 0.02)
+    off = abs(classify_shape(points, normals, loose).fits["sphere"].radius_m - 0.02)
+    assert off < 0.5 * abs(classify_shape(points, normals, covariances).fits["sphere"].radius_m - 0.02)
 
 
-def test_what_is_no_contact_is_refused() -> None:
+def test_invalid_contacts_are_rejected() -> None:
     points, normals, covariances = touches("flat", 4, 1)
     with pytest.raises(ValueError, match="must be"):
-        classify(points, normals[:3], covariances)
+        classify_shape(points, normals[:3], covariances)
     with pytest.raises(ValueError, match="finite"):
-        classify(points * np.nan, normals, covariances)
+        classify_shape(points * np.nan, normals, covariances)
 
 
 def explored(
     kind: str, n: int, seed: int, radius: float = 0.02, drift_m: float = 0.0
-) -> tuple[list[Percept], Shape, Verdict]:
+) -> tuple[list[PerceptEstimate], ShapeEstimator, ShapeClassification]:
     """The part on a stream: one pad touches n places, 60 samples each."""
-    stream, part = Stream(1), Shape(1)
-    perceiver = Perceiver(stream, [part])
-    perceiver.want(np.ones((len(KINDS), 1), np.bool_), np.ones(1, np.bool_))
+    stream, part = ContactBuffer(1), ShapeEstimator(1)
+    perceiver = PerceptPipeline(stream, [part])
+    perceiver.set_requested(np.ones((len(PERCEPT_KINDS), 1), np.bool_), np.ones(1, np.bool_))
     points, normals, covariances = touches(kind, n, seed, radius)
     points = points + drift_m * np.arange(n)[:, None] * [0.6, 0.0, 0.8]
-    told: list[Percept] = []
+    percepts: list[PerceptEstimate] = []
     t_ns = 0
     for contact in range(n):
         for _ in range(60):
             t_ns += 10_000_000
-            sample = Sample(np.zeros(1, np.intp), np.array([t_ns]), np.array([contact + 1], np.uint32))
+            sample = ContactSamples(
+                np.zeros(1, np.intp), np.array([t_ns]), np.array([contact + 1], np.uint32)
+            )
             sample["palm_position_m"], sample["palm_normal"] = points[contact], normals[contact]
             sample["palm_covariance_m2"] = covariances[contact]
             sample["residual"], sample["residual_std"] = np.zeros(1), np.full(1, 0.01)
-            told += perceiver.step(sample, np.zeros(0, np.intp), t_ns)[0]
-    return [p for p in told if p.pad < 0], part, classify(points, normals, covariances)
+            percepts += perceiver.process_tick(sample, np.zeros(0, np.intp), t_ns)[0]
+    return [p for p in percepts if p.pad < 0], part, classify_shape(points, normals, covariances)
 
 
-def test_the_part_gathers_touches_and_tells_what_the_fit_tells() -> None:
-    told, _, expected = explored("sphere", 12, 3)
-    assert told[0].state == "unestimated"
-    assert (told[-1].state, told[-1].label) == ("estimated", "sphere")
-    assert told[-1].evidence == {"contacts": 12, "pads": 1}
-    assert told[-1].values["radius_m"] == pytest.approx(expected.fits["sphere"].radius_m, rel=0.1)
-    assert told[-1].probabilities["sphere"] == pytest.approx(expected.probabilities["sphere"], abs=0.05)
+def test_estimator_collects_touches_and_agrees_with_the_fit() -> None:
+    percepts, _, expected = explored("sphere", 12, 3)
+    assert percepts[0].state == "undetermined"
+    assert (percepts[-1].state, percepts[-1].label) == ("estimated", "sphere")
+    assert percepts[-1].evidence == {"contacts": 12, "pads": 1}
+    assert percepts[-1].values["radius_m"] == pytest.approx(expected.fits["sphere"].radius_m, rel=0.1)
+    assert percepts[-1].probabilities["sphere"] == pytest.approx(expected.probabilities["sphere"], abs=0.05)
 
 
-def test_what_drifts_through_the_hand_keeps_its_shape_as_older_touches_count_less() -> None:
+def test_drifting_object_keeps_its_shape() -> None:
     for seed in range(3):
-        told, _, at_once = explored("sphere", 14, seed, drift_m=0.9e-3)
-        assert at_once.state == "invalid" or at_once.moves
-        assert (told[-1].state, told[-1].label, told[-1].values["object"]) == ("estimated", "sphere", "rests")
+        percepts, _, at_once = explored("sphere", 14, seed, drift_m=0.9e-3)
+        assert at_once.state == "invalid" or at_once.object_moves
+        assert (percepts[-1].state, percepts[-1].label, percepts[-1].values["object_moves"]) == (
+            "estimated",
+            "sphere",
+            False,
+        )
 
 
-def test_flat_or_a_large_cylinder_is_a_question_that_sliding_answers() -> None:
-    told, part, _ = explored("flat", 2, 1)
-    assert told[-1].state == "unestimated"
-    (question,) = part.questions(10**9)
-    assert question.hypotheses == told[-1].probabilities
-    assert {action.do for action in question.actions} == {"slide"}
-    bits = max(expected_bits(question, action) for action in question.actions)
+def test_flat_or_large_cylinder_poses_a_slide_question() -> None:
+    percepts, part, _ = explored("flat", 2, 1)
+    assert percepts[-1].state == "undetermined"
+    (question,) = part.open_questions(10**9)
+    assert question.hypotheses == percepts[-1].probabilities
+    assert {action.kind for action in question.actions} == {"slide"}
+    bits = max(expected_information_bits(question, action) for action in question.actions)
     assert 0.0 < bits <= 2.0
-    assert all(action.amount["distance_m"] == 5e-3 for action in question.actions)
+    assert all(action.parameters["distance_m"] == 5e-3 for action in question.actions)
 
 
 @pytest.mark.parametrize(("residual", "label"), [(0.0, "point"), (0.1, "along x"), (-0.1, "along y")])
-def test_one_pads_residual_tells_a_point_from_what_is_long(residual: float, label: str) -> None:
+def test_residual_distinguishes_points_from_elongated_contacts(residual: float, label: str) -> None:
     noise = np.random.default_rng(1).normal(size=64)
-    chances = point_or_more(residual + 0.01 * noise, np.full(64, 0.01))
+    chances = spot_probabilities(residual + 0.01 * noise, np.full(64, 0.01))
     assert chances[label] > 0.9
-    weak = point_or_more(0.02 + 0.05 * noise[:1], np.full(1, 0.05))
+    weak = spot_probabilities(0.02 + 0.05 * noise[:1], np.full(1, 0.05))
     assert max(weak.values()) < 0.9
 
 
 @pytest.mark.parametrize("along_y", [False, True])
-def test_the_distance_of_two_points_follows_from_the_residual(along_y: bool) -> None:
+def test_distance_of_two_points_follows_from_the_residual(along_y: bool) -> None:
     pad = Rectangle(1.0, 1.0)
     bank = LocatorBank([pad])
     half = np.array([0.0, 0.05] if along_y else [0.05, 0.0])

@@ -1,4 +1,4 @@
-"""What goes into a recording: every message once and in order, losses counted, files that stand alone."""
+"""Content of recordings: every message once and in order, losses counted, files complete in themselves."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ import pytest
 from mcap.reader import make_reader
 
 from handtouch import wire
-from handtouch.record.read import Recording
-from handtouch.record.recorder import Limits, Recorder
-from handtouch.record.schemas import FOXGLOVE, schema_of
+from handtouch.record.recorder import MessageRecorder, RotationLimits
+from handtouch.record.recording import Recording
+from handtouch.record.schemas import FOXGLOVE_SCHEMAS, schema_of
 
-from .conftest import RUN, WALL_NS, Session, health, service
+from .conftest import SESSION, WALL_NS, RecordingSession, health, service
 
 SECOND_NS = 1_000_000_000
 
 
-def test_every_message_is_kept_as_it_was_sent_in_its_order(session: Session) -> None:
+def test_every_message_is_recorded_as_sent_and_in_order(session: RecordingSession) -> None:
     session.hand.stroke(60)
     session.recorder.finish()
-    sent = [(wire.topic_of(m), msgpack.unpackb(wire.encode(m)[1])) for m in session.hand.taken.messages]
+    sent = [(wire.topic_of(m), msgpack.unpackb(wire.encode(m)[1])) for m in session.hand.sink.messages]
     assert any(topic.startswith("contact/") for topic, _ in sent)
-    kept = [(topic, payload) for topic, _, payload in Recording(session.paths[0]) if topic != "service"]
-    assert kept == sent
+    recorded = [(topic, payload) for topic, _, payload in Recording(session.paths[0]) if topic != "service"]
+    assert recorded == sent
 
 
-def test_times_are_the_daemons_in_utc(recorded: Path) -> None:
+def test_times_are_converted_to_utc(recorded: Path) -> None:
     for _, t_ns, payload in Recording(recorded):
         assert t_ns == payload["t_ns"] + WALL_NS
 
 
-class Names:
-    """A file of which only the topics and times are of interest."""
+class TopicFile:
+    """A file that collects topics and times only."""
 
     size = 0
 
@@ -52,22 +52,22 @@ class Names:
             self.written.append((topic, t_ns))
 
     def flush(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def finish(self, summary: dict[str, str]) -> None:
         assert summary
 
 
-def test_messages_before_the_time_is_known_are_kept_once_it_is() -> None:
-    file = Names()
-    recorder = Recorder(lambda _: file, Limits())
-    recorder.take(health(1, 5), 0)
+def test_messages_before_the_wall_clock_offset_are_recorded_later() -> None:
+    file = TopicFile()
+    recorder = MessageRecorder(lambda _: file, RotationLimits())
+    recorder.add_message(health(1, 5), 0)
     assert file.written == []
-    recorder.take(service(1, 6), 0)
+    recorder.add_message(service(1, 6), 0)
     assert file.written == [("health/h/plane", 5 + WALL_NS), ("service", 6 + WALL_NS)]
 
 
-def test_gaps_are_counted_by_topic_and_told_in_the_file(session: Session) -> None:
+def test_losses_are_counted_by_topic_and_in_the_file(session: RecordingSession) -> None:
     ticks = iter(range(10**6))
     session.lose = lambda topic: topic == b"tick" and next(ticks) in (10, 11, 30)
     session.hand.stroke(50)
@@ -78,29 +78,29 @@ def test_gaps_are_counted_by_topic_and_told_in_the_file(session: Session) -> Non
     assert json.loads(recording.summary["lost"]) == {"tick": 3}
 
 
-def test_the_state_is_asked_for_anew_where_ticks_are_missing(session: Session) -> None:
+def test_the_state_is_requested_after_missing_ticks(session: RecordingSession) -> None:
     session.hand.stroke(5)
     session.recorder.poll(10 * SECOND_NS)
-    assert not session.recorder.asks
+    assert not session.recorder.state_requested
     session.lose = lambda topic: topic == b"tick"
     session.hand.stroke(3)
     session.lose = lambda _: False
     session.hand.stroke(3)
     session.recorder.poll(20 * SECOND_NS)
-    assert session.recorder.asks
+    assert session.recorder.state_requested
 
 
-def test_what_is_repeated_for_others_is_not_kept_twice(session: Session) -> None:
+def test_a_retained_message_is_not_recorded_twice(session: RecordingSession) -> None:
     session.take(health(1, 5))
     message = wire.decode(health(1, 5))
-    session.take(wire.encode(replace(message, repeat=True)))
+    session.take(wire.encode(replace(message, retained=True)))
     assert session.recorder.messages["health"] == 1
     assert not session.recorder.lost
 
 
-def test_another_run_of_the_daemon_is_no_loss_and_has_its_own_time(session: Session) -> None:
-    session.take(service(9, 50, run=RUN + 1))
-    session.take(service(10, 60, run=RUN + 1))
+def test_another_session_of_the_daemon_is_no_loss(session: RecordingSession) -> None:
+    session.take(service(9, 50, session=SESSION + 1))
+    session.take(service(10, 60, session=SESSION + 1))
     session.recorder.finish()
     assert not session.recorder.lost
 
@@ -113,36 +113,36 @@ def test_another_run_of_the_daemon_is_no_loss_and_has_its_own_time(session: Sess
         [b"tick", b"\xc1"],
         [b"tick", msgpack.packb([1])],
         [b"nothing/known", msgpack.packb({"v": 1})],
-        [b"tick", msgpack.packb({"v": 2, "run": 1, "seq": 1, "t_ns": 1, "repeat": False})],
-        [b"tick", msgpack.packb({"v": 1, "run": 1, "seq": "1", "t_ns": 1, "repeat": False})],
-        [b"service", msgpack.packb({"v": 1, "run": 1, "seq": 1, "t_ns": 1, "repeat": False})],
+        [b"tick", msgpack.packb({"v": 2, "session": 1, "seq": 1, "t_ns": 1, "retained": False})],
+        [b"tick", msgpack.packb({"v": 1, "session": 1, "seq": "1", "t_ns": 1, "retained": False})],
+        [b"service", msgpack.packb({"v": 1, "session": 1, "seq": 1, "t_ns": 1, "retained": False})],
     ],
 )
-def test_what_does_not_keep_the_contract_is_counted_and_dropped(session: Session, parts: list[bytes]) -> None:
+def test_a_malformed_message_is_counted_and_dropped(session: RecordingSession, parts: list[bytes]) -> None:
     session.take(parts)
     assert session.recorder.malformed == 1
 
 
-def test_a_contact_that_lacks_what_foxglove_shows_is_kept_and_counted(session: Session) -> None:
-    about = {"v": 1, "run": RUN, "seq": 1, "t_ns": 1, "repeat": False}
+def test_a_contact_without_keys_for_foxglove_is_recorded_and_counted(session: RecordingSession) -> None:
+    about = {"v": 1, "session": SESSION, "seq": 1, "t_ns": 1, "retained": False}
     session.take([b"contact/h/plane", msgpack.packb({**about, "event": "begin"})])
     assert session.recorder.malformed == 1
     session.recorder.finish()
     assert [topic for topic, *_ in Recording(session.paths[0])][-1] == "contact/h/plane"
 
 
-def test_a_full_file_is_followed_by_one_that_stands_alone(
+def test_a_full_file_is_followed_by_one_complete_in_itself(
     make_hand: Callable[..., Any], tmp_path: Path
 ) -> None:
-    session = Session(make_hand, tmp_path, Limits(ns=SECOND_NS))
+    session = RecordingSession(make_hand, tmp_path, RotationLimits(max_duration_ns=SECOND_NS))
     session.take(health(1, session.hand.t_ns))
     session.hand.stroke(150)
     session.recorder.poll(session.hand.t_ns)
-    assert not session.recorder.asks
+    assert not session.recorder.state_requested
     session.hand.stroke(100)
     session.recorder.poll(session.hand.t_ns)
-    assert session.recorder.asks
-    session.tell_state()
+    assert session.recorder.state_requested
+    session.send_retained()
     session.hand.stroke(50)
     session.recorder.finish()
     first, second = ([topic for topic, *_ in Recording(path)] for path in session.paths)
@@ -152,7 +152,7 @@ def test_a_full_file_is_followed_by_one_that_stands_alone(
     assert {"config", "state", "service", "health/h/plane"} <= before_ticks
 
 
-def test_foxglove_finds_schemas_of_its_own_and_ours_in_every_channel(recorded: Path) -> None:
+def test_every_channel_has_a_schema_for_foxglove(recorded: Path) -> None:
     with recorded.open("rb") as file:
         summary = make_reader(file).get_summary()
         assert summary is not None
@@ -163,7 +163,7 @@ def test_foxglove_finds_schemas_of_its_own_and_ours_in_every_channel(recorded: P
         for schema, _ in schemas.values():
             assert schema.encoding == "jsonschema"
             assert json.loads(schema.data)["type"] == "object"
-        assert {schema.name for schema, _ in schemas.values()} >= set(FOXGLOVE)
+        assert {schema.name for schema, _ in schemas.values()} >= set(FOXGLOVE_SCHEMAS)
         assert schemas["contact/h/plane"][1] == "json"
         assert schemas["tick"][1] == "msgpack"
         made = [
@@ -172,10 +172,10 @@ def test_foxglove_finds_schemas_of_its_own_and_ours_in_every_channel(recorded: P
             if s and c.topic[0] == "/"
         ]
     for name, message in made:
-        assert message.keys() == FOXGLOVE[name]["properties"].keys()
-    words = [message["message"] for name, message in made if name == "foxglove.Log"]
-    assert any("begin" in text for text in words)
-    assert "lost: its heartbeat timed out" in words
+        assert message.keys() == FOXGLOVE_SCHEMAS[name]["properties"].keys()
+    lines = [message["message"] for name, message in made if name == "foxglove.Log"]
+    assert any("begin" in text for text in lines)
+    assert "lost: its heartbeat timed out" in lines
     scenes = [message for name, message in made if name == "foxglove.SceneUpdate"]
     entity = next(scene["entities"][0] for scene in scenes if scene["entities"])
     assert entity["frame_id"] in {"plane", "round"}

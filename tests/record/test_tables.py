@@ -1,4 +1,4 @@
-"""A recording as tables and as figures: every row that there is, every name with its unit."""
+"""Export of recordings as tables and figures: complete rows, units in every column name."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from handtouch.record import export, plot
-from handtouch.record.read import Recording
-from handtouch.record.tables import split
+from handtouch.cli import main
+from handtouch.record import plot
+from handtouch.record.recording import Recording
+from handtouch.record.tables import component_names
 
 pyarrow = pytest.importorskip("pyarrow")
 
@@ -20,7 +21,7 @@ pyarrow = pytest.importorskip("pyarrow")
 def tables(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tables")
     for kind in ("csv", "parquet"):
-        assert export.run(recorded, folder, kind) == 0
+        assert main(["export", str(recorded), "-o", str(folder), "--format", kind]) == 0
     return folder
 
 
@@ -30,15 +31,15 @@ def _rows(folder: Path, name: str) -> list[dict[str, str]]:
 
 
 def test_every_contact_message_is_a_row_with_its_values(recorded: Path, tables: Path) -> None:
-    contacts = [e for e in Recording(recorded).read("contact") if not e.payload["repeat"]]
+    contacts = [e for e in Recording(recorded).read("contact") if not e.payload["retained"]]
     rows = _rows(tables, "contacts")
     assert len(rows) == len(contacts) > 100
     for row, (_, t_ns, payload) in zip(rows, contacts, strict=True):
         assert int(row["time_ns"]) == t_ns
         assert row["link"] == payload["link"]
         assert float(row["force_n"]) == payload["force_n"]
-        place = [float(row[f"position_{axis}_m"]) for axis in "xyz"]
-        assert place == payload["position_m"]
+        position = [float(row[f"position_{axis}_m"]) for axis in "xyz"]
+        assert position == payload["position_m"]
 
 
 def test_every_tick_has_a_row_of_counts_for_every_pad(recorded: Path, tables: Path) -> None:
@@ -50,7 +51,7 @@ def test_every_tick_has_a_row_of_counts_for_every_pad(recorded: Path, tables: Pa
     assert {row["node_state"] for row in rows} == {"clear", "lost"}
 
 
-def test_hand_frames_are_rows_of_what_is_known(tables: Path) -> None:
+def test_hand_frames_are_rows_with_empty_cells_for_unknown_values(tables: Path) -> None:
     rows = _rows(tables, "hand")
     untouched = [row for row in rows if row["state"] == "clear"]
     touched = [row for row in rows if row["state"] == "touched"]
@@ -58,7 +59,7 @@ def test_hand_frames_are_rows_of_what_is_known(tables: Path) -> None:
     assert float(touched[-1]["position_z_m"]) == pytest.approx(0.0, abs=0.02)
 
 
-def test_health_tells_lists_in_one_cell(tables: Path) -> None:
+def test_lists_of_health_are_one_cell(tables: Path) -> None:
     rows = _rows(tables, "health")
     assert [row["state"] for row in rows] == ["clear", "lost"]
     assert rows[0]["emergencies"] == "low supply; hot"
@@ -87,54 +88,58 @@ def test_parquet_holds_the_same_rows_with_types(tables: Path) -> None:
         ("palm_normal", 3, ["palm_normal_x", "palm_normal_y", "palm_normal_z"]),
     ],
 )
-def test_parts_of_a_vector_keep_its_unit_at_the_end(name: str, length: int, parts: list[str]) -> None:
-    assert split(name, length) == parts
+def test_component_names_of_a_vector_end_with_its_unit(name: str, length: int, parts: list[str]) -> None:
+    assert component_names(name, length) == parts
 
 
-def test_what_cannot_be_exported_is_told_with_status_1(
+def test_an_unreadable_or_empty_recording_is_exported_with_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert export.run(tmp_path / "absent.mcap", tmp_path, "csv") == 1
+    assert main(["export", str(tmp_path / "absent.mcap"), "-o", str(tmp_path)]) == 1
     empty = tmp_path / "empty.mcap"
     empty.write_bytes(b"")
-    assert export.run(empty, tmp_path / "made", "csv") == 1
-    told = capsys.readouterr().err
-    assert "absent.mcap" in told
-    assert "holds no message" in told
+    assert main(["export", str(empty), "-o", str(tmp_path / "made")]) == 1
+    err = capsys.readouterr().err
+    assert "absent.mcap" in err
+    assert "holds no message" in err
 
 
 @pytest.fixture(scope="module")
 def plots(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("matplotlib")
     folder = tmp_path_factory.mktemp("plots")
-    assert plot.run(recorded, folder) == 0
+    assert main(["plot", str(recorded), "-o", str(folder)]) == 0
     return folder
 
 
-def test_figures_are_drawn_as_vectors_and_as_pictures(plots: Path) -> None:
+def test_figures_are_written_as_pdf_and_png(plots: Path) -> None:
     for name in ("timeline", "forces", "pads", "health"):
         assert (plots / f"{name}.pdf").read_bytes().startswith(b"%PDF")
         assert (plots / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_is_drawn_is_what_was_recorded(recorded: Path) -> None:
-    story = plot.read(Recording(recorded))
+def test_plot_data_are_the_recorded_messages(recorded: Path) -> None:
+    data = plot.read_plot_data(Recording(recorded))
     ids = {(e.topic, e.payload["id"]) for e in Recording(recorded).read("contact")}
-    assert sum(map(len, story.touches.values())) == len(ids)
-    assert story.pads["h/plane"] == pytest.approx((30.0, 24.0))
-    reasons = [touch.reason for touches in story.touches.values() for touch in touches.values()]
+    assert sum(map(len, data.contacts.values())) == len(ids)
+    assert data.pads["h/plane"] == pytest.approx((30.0, 24.0))
+    reasons = [c.end_reason for contacts in data.contacts.values() for c in contacts.values()]
     assert {"released", "lost", "stopped"} >= set(reasons) >= {"released", "stopped"}
-    part = plot.read(Recording(recorded), from_s=0.5, to_s=1.0)
-    times = [t for touches in part.touches.values() for touch in touches.values() for t in touch.t_s]
+    part = plot.read_plot_data(Recording(recorded), from_s=0.5, to_s=1.0)
+    times = [
+        t for contacts in part.contacts.values() for contact in contacts.values() for t in contact.times_s
+    ]
     assert 0.5 <= min(times) <= max(times) <= 1.0
 
 
-def test_nothing_to_draw_is_told(tmp_path: Path, recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert plot.run(recorded, tmp_path, from_s=1e6) == 1
+def test_a_plot_without_data_is_status_1(
+    tmp_path: Path, recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plot", str(recorded), "-o", str(tmp_path), "--from", "1e6"]) == 1
     assert "holds no message of a daemon in that time" in capsys.readouterr().err
 
 
-def test_the_summary_is_readable_without_any_of_this(recorded: Path) -> None:
+def test_the_summary_counts_the_messages(recorded: Path) -> None:
     recording = Recording(recorded)
     entries: list[Any] = list(recording)
     assert int(recording.summary["messages"]) == len(entries)

@@ -1,4 +1,4 @@
-"""Laws of creep: it lags on loading, not on release; steps add up; the inverse is exact."""
+"""Creep: lag under load but not on release, additive steps, exact inverse."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ seeds = st.integers(0, 2**32)
 
 @given(creeps, st.floats(0.1, 10.0), st.floats(1e-3, 100.0), st.integers(2, 50))
 def test_steps_add_up(creep: Creep, load: float, time_s: float, steps: int) -> None:
-    """n steps of dt under one load are one step of n dt, from any state."""
-    many, once = creep.start(1), creep.start(1)
+    """n steps of dt under one load equal one step of n dt, from any state."""
+    many, once = creep.initial_state(1), creep.initial_state(1)
     for state in (many, once):
-        creep.at(0.3).forward(state, np.array([0.5]))
-    stride, whole = creep.at(time_s / steps), creep.at(time_s)
+        creep.discretise(0.3).forward(state, np.array([0.5]))
+    stride, whole = creep.discretise(time_s / steps), creep.discretise(time_s)
     for _ in range(steps):
         reading = stride.forward(many, np.array([load]))
     np.testing.assert_allclose(reading, whole.forward(once, np.array([load])), rtol=1e-12)
@@ -31,13 +31,12 @@ def test_steps_add_up(creep: Creep, load: float, time_s: float, steps: int) -> N
 
 @given(creeps, seeds)
 def test_the_inverse_is_exact(creep: Creep, seed: int) -> None:
-    """Any loads, any intervals, loading, unloading in part and release: the load comes back to 1e-9 and so
-    does the state."""
+    """Load and state are recovered to 1e-9 for loading, partial unloading and release at any intervals."""
     draws = np.random.default_rng(seed)
-    there, back = creep.start(5), creep.start(5)
+    there, back = creep.initial_state(5), creep.initial_state(5)
     for _ in range(60):
         load = draws.uniform(0, 10, 5) * (draws.random(5) < 0.8)
-        step = creep.at(10 ** draws.uniform(-4, 2))
+        step = creep.discretise(10 ** draws.uniform(-4, 2))
         found = step.inverse(back, step.forward(there, load))
         np.testing.assert_allclose(found, load, atol=1e-9)
     np.testing.assert_allclose(back, there, atol=1e-9)
@@ -45,42 +44,44 @@ def test_the_inverse_is_exact(creep: Creep, seed: int) -> None:
 
 @given(creeps, st.floats(0.1, 10.0))
 def test_a_step_of_load_is_the_response(creep: Creep, time_s: float) -> None:
-    reading = creep.at(time_s).forward(creep.start(1), np.array([2.0]))
+    reading = creep.discretise(time_s).forward(creep.initial_state(1), np.array([2.0]))
     np.testing.assert_allclose(reading, 2 * creep.response(time_s), rtol=1e-12)
 
 
 @given(creeps, st.floats(0.0, 0.9))
 def test_release_is_abrupt(creep: Creep, rest: float) -> None:
-    """A load taken off in part reads at once as if what is left had pressed since ever."""
-    state = creep.start(1)
-    creep.at(1e9).forward(state, np.array([1.0]))
-    reading = creep.at(1e-9).forward(state, np.array([rest]))
+    """After a partial release the reading is at once that of the final state under the remaining load."""
+    state = creep.initial_state(1)
+    creep.discretise(1e9).forward(state, np.array([1.0]))
+    reading = creep.discretise(1e-9).forward(state, np.array([rest]))
     np.testing.assert_allclose(reading, creep.total * rest, rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize(
     ("exponent", "modes", "error"), [(0.05, 4, 0.034), (0.05, 7, 0.0034), (0.1, 8, 0.0034)]
 )
-def test_a_power_law_is_met(exponent: float, modes: int, error: float) -> None:
-    """From 1 ms to 1 h, as near as docs/theory.md says."""
+def test_a_power_law_is_approximated(exponent: float, modes: int, error: float) -> None:
+    """From 1 ms to 1 h, within the error stated in docs/theory.md."""
     creep = Creep.power_law(exponent, modes=modes)
     assert creep.power_law_error(exponent, np.geomspace(1e-3, 3600, 2000)) < error
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "parameters",
     [(0.0, (1.0,), (1.0,)), (1.0, (1.0,), ()), (1.0, (-1.0,), (1.0,)), (1.0, (1.0, 1.0), (2.0, 1.0))],
 )
-def test_what_is_no_creep_is_refused(arguments: tuple[float, tuple[float, ...], tuple[float, ...]]) -> None:
+def test_invalid_parameters_are_rejected(
+    parameters: tuple[float, tuple[float, ...], tuple[float, ...]],
+) -> None:
     with pytest.raises(ValueError, match=r"must|weights"):
-        Creep(*arguments)
+        Creep(*parameters)
 
 
-def test_an_exponent_out_of_range_is_refused() -> None:
+def test_an_exponent_out_of_range_is_rejected() -> None:
     with pytest.raises(ValueError, match="exponent"):
         Creep.power_law(1.5)
 
 
-def test_too_few_modes_are_refused() -> None:
+def test_too_few_modes_are_rejected() -> None:
     with pytest.raises(ValueError, match="too few"):
         Creep.power_law(0.2, modes=2)

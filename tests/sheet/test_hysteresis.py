@@ -1,4 +1,4 @@
-"""Laws of hysteresis: wiping-out, congruency, no rate, nothing at rest, an exact inverse."""
+"""Hysteresis: wiping-out, congruency, rate independence, zero without load, exact inverse."""
 
 from __future__ import annotations
 
@@ -12,66 +12,68 @@ from handtouch.sheet import PrandtlIshlinskii
 
 FloatArray = npt.NDArray[np.float64]
 
-sheets = st.builds(PrandtlIshlinskii.of_loop, st.floats(0.01, 0.3), st.floats(1.0, 20.0), st.integers(1, 12))
+sheets = st.builds(
+    PrandtlIshlinskii.from_width, st.floats(0.01, 0.3), st.floats(1.0, 20.0), st.integers(1, 12)
+)
 seeds = st.integers(0, 2**32)
 
 
-def follow(sheet: PrandtlIshlinskii, loads: npt.ArrayLike, state: FloatArray | None = None) -> FloatArray:
-    """Readings of one pad."""
-    state = sheet.start(1) if state is None else state
-    return np.array([sheet.step(state, np.array([load]))[0] for load in np.asarray(loads, np.float64)])
+def readings(sheet: PrandtlIshlinskii, loads: npt.ArrayLike, state: FloatArray | None = None) -> FloatArray:
+    """Return the readings of one pad."""
+    state = sheet.initial_state(1) if state is None else state
+    return np.array([sheet.apply_to(state, np.array([load]))[0] for load in np.asarray(loads, np.float64)])
 
 
 @given(sheets, seeds)
-def test_the_inverse_is_exact_whatever_the_history(sheet: PrandtlIshlinskii, seed: int) -> None:
+def test_the_inverse_is_exact_for_any_history(sheet: PrandtlIshlinskii, seed: int) -> None:
     loads = np.random.default_rng(seed).uniform(0, 20, 200)
     loads[::7] = 0
-    np.testing.assert_allclose(follow(sheet.inverse, follow(sheet, loads)), loads, atol=1e-9)
+    np.testing.assert_allclose(readings(sheet.inverse, readings(sheet, loads)), loads, atol=1e-9)
 
 
 @given(sheets, seeds)
 def test_a_larger_loop_wipes_out_a_smaller(sheet: PrandtlIshlinskii, seed: int) -> None:
-    """After 0 - low - high, loops between low and high have left no trace."""
+    """After 0 - low - high, loops between low and high have no effect."""
     draws = np.random.default_rng(seed)
     low, high = np.sort(draws.uniform(0, 20, 2))
-    plain, looped = sheet.start(1), sheet.start(1)
-    follow(sheet, [high, low, high], plain)
-    follow(sheet, [high, low, *draws.uniform(low, high, 20), low, high], looped)
+    plain, looped = sheet.initial_state(1), sheet.initial_state(1)
+    readings(sheet, [high, low, high], plain)
+    readings(sheet, [high, low, *draws.uniform(low, high, 20), low, high], looped)
     np.testing.assert_allclose(plain, looped, atol=1e-12)
 
 
 @given(sheets, seeds)
 def test_loops_between_the_same_loads_are_congruent(sheet: PrandtlIshlinskii, seed: int) -> None:
-    """Whatever came before, minor loops differ by a constant only."""
+    """Minor loops differ by a constant only, for any history."""
     draws = np.random.default_rng(seed)
     low, high = np.sort(draws.uniform(0, 20, 2))
     path = [*np.linspace(low, high, 9), *np.linspace(high, low, 9)]
     loops = []
     for _ in range(2):
-        state = sheet.start(1)
-        follow(sheet, [*draws.uniform(0, 20, 15), low], state)
-        follow(sheet, path, state)
-        loops.append(follow(sheet, path, state))
+        state = sheet.initial_state(1)
+        readings(sheet, [*draws.uniform(0, 20, 15), low], state)
+        readings(sheet, path, state)
+        loops.append(readings(sheet, path, state))
     first, second = (loop - loop[0] for loop in loops)
     np.testing.assert_allclose(first, second, atol=1e-9)
 
 
 @given(sheets, seeds)
 def test_a_released_sheet_reads_nothing(sheet: PrandtlIshlinskii, seed: int) -> None:
-    assert follow(sheet, [*np.random.default_rng(seed).uniform(0, 20, 20), 0.0])[-1] == 0
+    assert readings(sheet, [*np.random.default_rng(seed).uniform(0, 20, 20), 0.0])[-1] == 0
 
 
 @given(sheets, seeds)
-def test_how_finely_a_path_is_sampled_does_not_matter(sheet: PrandtlIshlinskii, seed: int) -> None:
+def test_sampling_of_a_path_does_not_matter(sheet: PrandtlIshlinskii, seed: int) -> None:
     turns = np.random.default_rng(seed).uniform(0, 20, 10)
     fine = np.interp(np.linspace(0, 9, 9 * 16 + 1), np.arange(10), turns)
-    np.testing.assert_allclose(follow(sheet, fine)[::16], follow(sheet, turns), atol=1e-9)
+    np.testing.assert_allclose(readings(sheet, fine)[::16], readings(sheet, turns), atol=1e-9)
 
 
 @given(st.floats(0.01, 0.3), st.floats(1.0, 20.0), st.integers(1, 12))
-def test_the_loop_is_as_wide_as_asked_and_right_at_full_load(width: float, full: float, plays: int) -> None:
-    sheet = PrandtlIshlinskii.of_loop(width, full, plays)
-    loading, top, unloading = follow(sheet, [full / 2, full, full / 2])
+def test_the_loop_has_the_given_width_and_unit_gain(width: float, full: float, plays: int) -> None:
+    sheet = PrandtlIshlinskii.from_width(width, full, plays)
+    loading, top, unloading = readings(sheet, [full / 2, full, full / 2])
     assert top == pytest.approx(full, rel=1e-12)
     assert unloading - loading == pytest.approx(width * full, rel=1e-9)
 
@@ -80,7 +82,7 @@ def test_the_loop_is_as_wide_as_asked_and_right_at_full_load(width: float, full:
     ("base", "widths", "weights"),
     [(0.0, (1.0,), (1.0,)), (1.0, (2.0, 1.0), (0.1, 0.1)), (1.0, (1.0,), (-1.5,)), (1.0, (1.0,), ())],
 )
-def test_what_does_not_rise_is_refused(
+def test_an_operator_that_does_not_rise_is_rejected(
     base: float, widths: tuple[float, ...], weights: tuple[float, ...]
 ) -> None:
     with pytest.raises(ValueError, match=r"rise|weights"):

@@ -1,4 +1,4 @@
-"""A small hand with a pad of every kind of surface, with gaps, resistors, and two buses."""
+"""Small hand with pads of several surfaces, with gaps, resistors, and two buses."""
 
 from __future__ import annotations
 
@@ -80,11 +80,11 @@ _channels = itertools.count()
 
 @pytest.fixture
 def deployment_text() -> str:
-    """The small hand's file, on virtual buses that no other test has."""
+    """Deployment file of the small hand, on virtual buses of its own."""
     return FILE.format(channel=f"simulate-{next(_channels)}")
 
 
 @pytest.fixture
 def deployment(deployment_text: str) -> config.Deployment:
-    """The small hand."""
+    """Deployment of the small hand."""
     return config.parse(deployment_text)

@@ -1,4 +1,4 @@
-"""Faults obey the laws of the sheet and its wires; what is many at once is the same one by one."""
+"""Faults obey the laws of the sheet and its wires; counts at many times equal single samples."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from handtouch import config, shipped
-from handtouch.hand import network_of
-from handtouch.simulate.episodes import CASES, episode, size_mm
+from handtouch import config
+from handtouch.config import shipped
+from handtouch.hand import electrode_network
+from handtouch.simulate.episodes import HARD_CASES, draw_episode, pad_size_mm
 from handtouch.simulate.faults import (
     FAULTS,
     DeadElectrode,
@@ -30,24 +31,24 @@ from handtouch.simulate.faults import (
     SwappedCables,
     TornCorner,
 )
-from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.world import World
 
 CALM = dataclasses.replace(World.ideal_parts(3), noise_counts=0.0)
-FULL_MA = 0.02  # fine enough that rounding is out of the way
+FULL_MA = 0.02  # fine enough that rounding doesn't matter
 HELD = np.array([10.0])
 AT: dict[str, object] = {"link": "flat", "from_s": 5.0}
 Kind = TypeVar("Kind", bound=Fault)
 
 
 def on_flat(kind: type[Kind], **own: object) -> Kind:
-    """A fault of the flat pad from 5 s on."""
+    """Return a fault of the flat pad from 5 s on."""
     return kind.model_validate(AT | own)
 
 
 def press(*places: tuple[float, float], link: str = "flat", force_n: float = 1.0) -> Scenario:
-    """Long, steady touches, all at once."""
+    """Return long, constant, simultaneous touches."""
     return Scenario.model_validate(
         {
             "touch": [
@@ -61,7 +62,7 @@ def press(*places: tuple[float, float], link: str = "flat", force_n: float = 1.0
 FAR = Scenario.model_validate(
     {"touch": [{"link": "tip", "from_s": 0.0, "duration_s": 1.0, "path": ((0.5, 0.5),), "force_n": (1.0,)}]}
 )
-"""Nothing ever touches the flat pad."""
+"""A scenario without touches of the flat pad."""
 
 
 def currents(
@@ -71,7 +72,7 @@ def currents(
     t_s: float = 10.0,
     full_ma: float = FULL_MA,
 ) -> NDArray[np.float64]:
-    """Of the flat pad, in counts, hardly rounded: a fine converter."""
+    """Return counts of the flat pad, with a converter too fine for rounding to matter."""
     node = deployment.nodes["plain"]
     fine = deployment.model_copy(
         update={"nodes": {"plain": node.model_copy(update={"full_scale_ma": full_ma})}}
@@ -81,7 +82,7 @@ def currents(
 
 
 @pytest.mark.parametrize("electrode", range(4))
-def test_a_dead_electrode_leaves_all_current_to_the_other_three(
+def test_dead_electrode_leaves_all_current_to_the_other_three(
     deployment: config.Deployment, electrode: int
 ) -> None:
     name = ("x0", "xa", "y0", "yb")[electrode]
@@ -90,15 +91,15 @@ def test_a_dead_electrode_leaves_all_current_to_the_other_three(
     others = np.delete(np.arange(4), electrode)
     assert abs(left[electrode]) <= 1
     assert (left[others] > whole[others]).all()
-    assert 0.85 * whole.sum() < left.sum() <= whole.sum()  # a little less: there is more sheet in its way
-    conductance = network_of(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
+    assert 0.85 * whole.sum() < left.sum() <= whole.sum()  # a little less, through more sheet
+    conductance = electrode_network(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
     taken = conductance[electrode, others] / -conductance[electrode, electrode]
     shares = (whole[others] + taken * whole[electrode]) / whole.sum()  # Kirchhoff at the floating electrode
     assert shares.sum() == pytest.approx(1, abs=1e-3)
     np.testing.assert_allclose(left[others] / left.sum(), shares, atol=1e-3)
 
 
-def test_swapped_cables_permute_the_channels(deployment: config.Deployment) -> None:
+def test_swapped_cables_permute_channels(deployment: config.Deployment) -> None:
     whole = currents(deployment, press((0.3, 0.6), force_n=0.05))
     swapped = currents(
         deployment, press((0.3, 0.6), force_n=0.05), on_flat(SwappedCables, order=("y0", "xa", "yb", "x0"))
@@ -106,7 +107,7 @@ def test_swapped_cables_permute_the_channels(deployment: config.Deployment) -> N
     np.testing.assert_array_equal(swapped, whole[[2, 1, 3, 0]])
 
 
-def test_electrodes_that_are_shorted_together_share_evenly(deployment: config.Deployment) -> None:
+def test_shorted_electrodes_share_current_evenly(deployment: config.Deployment) -> None:
     whole = currents(deployment, press((0.2, 0.6), force_n=0.05))
     fault = on_flat(ShortedElectrode, electrode="x0", to="yb", short_ohm=1e-3)
     shorted = currents(deployment, press((0.2, 0.6), force_n=0.05), fault)
@@ -115,20 +116,20 @@ def test_electrodes_that_are_shorted_together_share_evenly(deployment: config.De
     np.testing.assert_allclose(shorted[[1, 2]], whole[[1, 2]], atol=0.05 * whole.sum())
 
 
-def test_an_electrode_shorted_to_the_layer_saturates_and_drives_its_neighbours_untouched(
+def test_electrode_shorted_to_layer_saturates_and_drives_neighbours_without_contact(
     deployment: config.Deployment,
 ) -> None:
     hand = VirtualHand(deployment, FAR, CALM, faults=(on_flat(ShortedElectrode, electrode="x0"),))
     counts = hand.counts(0, HELD)[0]
     assert counts[0] == 32767
-    conductance = network_of(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
+    conductance = electrode_network(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
     drive = counts[1:] * 10e-3 / 32767 * 2400.0 / -conductance[0, 1:]
     assert np.ptp(drive) < 1e-2 * drive.mean()  # one potential drives all three
     assert 4.5 < drive.mean() < 5.0  # all of the supply but what the short takes
 
 
 @pytest.mark.parametrize("corner", ["x0y0", "x0yb", "xay0", "xayb"])
-def test_a_tear_without_length_is_no_tear(deployment: config.Deployment, corner: str) -> None:
+def test_tear_of_zero_length_changes_nothing(deployment: config.Deployment, corner: str) -> None:
     whole = currents(deployment, press((0.4, 0.6), force_n=0.05))
     torn = currents(
         deployment,
@@ -138,7 +139,7 @@ def test_a_tear_without_length_is_no_tear(deployment: config.Deployment, corner:
     np.testing.assert_array_equal(torn, whole)
 
 
-def test_a_tear_takes_current_from_the_electrodes_that_it_frees_and_keeps_the_rest(
+def test_tear_reduces_current_of_freed_electrodes_only(
     deployment: config.Deployment,
 ) -> None:
     scenario = press((0.4, 0.5), force_n=0.05)
@@ -154,20 +155,20 @@ def test_a_tear_takes_current_from_the_electrodes_that_it_frees_and_keeps_the_re
     assert lost[-1] > 0.05 * whole.sum()
 
 
-def test_what_is_torn_off_feels_nothing(deployment: config.Deployment) -> None:
+def test_torn_off_area_senses_nothing(deployment: config.Deployment) -> None:
     tear = on_flat(TornCorner, corner="xayb", along_x_mm=16, along_y_mm=10)
     np.testing.assert_array_equal(currents(deployment, press((0.9, 0.9)), tear), 0)
 
 
 def residual(deployment: config.Deployment, counts: NDArray[np.float64]) -> float:
-    """What is left of the four currents when a point is fitted to them, in parts of their sum."""
-    network = network_of(deployment.hands[0].pads[0], deployment.sheets["firm"])
+    """Return the residual of a point contact fitted to the four currents, relative to their sum."""
+    network = electrode_network(deployment.hands[0].pads[0], deployment.sheets["firm"])
     found = network.estimate(counts, 1.0)
     expected = network.fractions(found.x, found.y)
     return float(np.abs(counts / counts.sum() - expected / expected.sum()).max())
 
 
-def test_a_leak_has_a_residual_and_a_point_has_none(deployment: config.Deployment) -> None:
+def test_leak_has_a_residual_and_point_contact_has_none(deployment: config.Deployment) -> None:
     point = currents(deployment, press((0.5, 0.5), force_n=0.05))
     wet = on_flat(Moisture, place=(0.5, 0.5), radius_mm=10, leak_ohm=4e5, grow_s=0.1)
     leak = currents(deployment, FAR, wet)
@@ -175,7 +176,7 @@ def test_a_leak_has_a_residual_and_a_point_has_none(deployment: config.Deploymen
     assert residual(deployment, leak) > 20 * residual(deployment, point)
 
 
-def test_a_small_leak_is_its_conductance_and_dries_as_it_should(deployment: config.Deployment) -> None:
+def test_small_leak_has_its_conductance_and_dries(deployment: config.Deployment) -> None:
     wet = Moisture(
         link="flat",
         from_s=0.0,
@@ -193,7 +194,7 @@ def test_a_small_leak_is_its_conductance_and_dries_as_it_should(deployment: conf
     )
 
 
-def test_gum_is_a_contact_at_its_place_that_stays(deployment: config.Deployment) -> None:
+def test_gum_is_a_lasting_contact_at_its_position(deployment: config.Deployment) -> None:
     gum = on_flat(Gum, place=(0.3, 0.6), radius_mm=2.0, force_n=0.05, press_n=0, relax=0.0)
     before = currents(deployment, FAR, gum, t_s=4.9)
     np.testing.assert_array_equal(before, 0)
@@ -203,7 +204,7 @@ def test_gum_is_a_contact_at_its_place_that_stays(deployment: config.Deployment)
     np.testing.assert_allclose(later, currents(deployment, Scenario.model_validate(touch)), atol=1)
 
 
-def test_two_contacts_take_from_each_other_and_far_ones_less(deployment: config.Deployment) -> None:
+def test_contacts_reduce_each_others_current_less_when_far_apart(deployment: config.Deployment) -> None:
     def lost(apart: float) -> float:
         one, other = (0.5 - apart / 2, 0.5), (0.5 + apart / 2, 0.5)
         first, second, both = (
@@ -224,7 +225,7 @@ def test_greens_function_is_symmetric(deployment: config.Deployment) -> None:
     np.testing.assert_array_equal(hand.counts(0, HELD), turned.counts(0, HELD))
 
 
-def test_channels_drift_jump_stick_and_saturate_as_told(deployment: config.Deployment) -> None:
+def test_offset_gain_stuck_and_saturated_channels_follow_the_scenario(deployment: config.Deployment) -> None:
     scenario = press((0.4, 0.6), force_n=0.05)
     whole = currents(deployment, scenario)
     np.testing.assert_array_equal(
@@ -240,7 +241,7 @@ def test_channels_drift_jump_stick_and_saturate_as_told(deployment: config.Deplo
     assert np.ptp(counts[110:, 1]) > 0
 
 
-def test_warmth_conducts_better_and_goes_again(deployment: config.Deployment) -> None:
+def test_heat_raises_conductance_and_fades(deployment: config.Deployment) -> None:
     scenario = press((0.4, 0.6), force_n=0.05)
     heat = Heat(link="flat", from_s=5.0, until_s=500.0, warmer_by_k=20.0, time_s=10.0)
     whole = currents(deployment, scenario).sum()
@@ -249,27 +250,25 @@ def test_warmth_conducts_better_and_goes_again(deployment: config.Deployment) ->
     assert after == pytest.approx(whole, rel=1e-3)
 
 
-@pytest.mark.parametrize("name", [*FAULTS, *CASES])
-def test_many_at_once_are_the_same_one_by_one(deployment: config.Deployment, name: str) -> None:
+@pytest.mark.parametrize("name", [*FAULTS, *HARD_CASES])
+def test_counts_at_many_times_equal_single_samples(deployment: config.Deployment, name: str) -> None:
     pad = deployment.hands[0].pads[0]
-    played = episode(name, 2, pad, 20.0)
-    assert (played.fault is None) == (name in CASES)
-    hand = VirtualHand(deployment, played.scenario, World.drifting(2), "near", played.acting)
+    played = draw_episode(name, 2, pad, 20.0)
+    assert (played.fault is None) == (name in HARD_CASES)
+    hand = VirtualHand(deployment, played.scenario, World.with_drift(2), "near", played.active_faults)
     times = np.linspace(0.0, 20.0, 41)
     np.testing.assert_array_equal(hand.counts(0, times), [hand.sample(t)[0] for t in times])
 
 
 @pytest.mark.parametrize("name", [name for name in FAULTS if name != "swapped_cables"])
-def test_a_fault_changes_nothing_before_it_begins_and_something_after(
-    deployment: config.Deployment, name: str
-) -> None:
+def test_fault_acts_only_after_its_begin(deployment: config.Deployment, name: str) -> None:
     pad = deployment.hands[0].pads[0]
-    played = episode(name, 4, pad, 40.0)
+    played = draw_episode(name, 4, pad, 40.0)
     assert played.fault is not None
     times = np.linspace(0.0, 40.0, 400)
     sick, well = (
         VirtualHand(deployment, played.scenario, CALM, "near", faults).counts(0, times)
-        for faults in (played.acting, ())
+        for faults in (played.active_faults, ())
     )
     before = times < played.fault.from_s
     np.testing.assert_array_equal(sick[before], well[before])
@@ -277,10 +276,10 @@ def test_a_fault_changes_nothing_before_it_begins_and_something_after(
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 10_000), st.sampled_from([*FAULTS, *CASES]))
-def test_every_episode_is_a_valid_scenario_and_its_seed_makes_it(seed: int, name: str) -> None:
+@given(st.integers(0, 10_000), st.sampled_from([*FAULTS, *HARD_CASES]))
+def test_episodes_are_valid_scenarios_and_reproducible_by_seed(seed: int, name: str) -> None:
     pad = config.load(shipped.path("utah_mit.toml")).hands[0].pads[0]
-    one, again = episode(name, seed, pad), episode(name, seed, pad)
+    one, again = draw_episode(name, seed, pad), draw_episode(name, seed, pad)
     assert one == again
     assert one.name == name
     assert all(touch.until_s <= one.duration_s + 1e-9 for touch in one.scenario.touches)
@@ -288,8 +287,8 @@ def test_every_episode_is_a_valid_scenario_and_its_seed_makes_it(seed: int, name
         assert one.fault.from_s < one.duration_s / 2
 
 
-def test_sides_of_a_pad_are_those_of_its_surface(deployment: config.Deployment) -> None:
-    assert size_mm(deployment.hands[0].pads[0]) == pytest.approx((40.0, 25.0))
+def test_pad_size_is_that_of_its_surface(deployment: config.Deployment) -> None:
+    assert pad_size_mm(deployment.hands[0].pads[0]) == pytest.approx((40.0, 25.0))
 
 
 @pytest.mark.parametrize(
@@ -301,14 +300,14 @@ def test_sides_of_a_pad_are_those_of_its_surface(deployment: config.Deployment) 
         lambda: Offset(link="flat", from_s=5.0, until_s=4.0, electrode="x0", counts=3.0),
     ],
 )
-def test_a_fault_that_makes_no_sense_is_refused(wrong: object) -> None:
+def test_inconsistent_fault_is_rejected(wrong: object) -> None:
     with pytest.raises(ValidationError):
         wrong()  # type: ignore[operator]
 
 
-def test_the_shipped_scenario_of_faults_suits_the_shipped_hand() -> None:
+def test_shipped_fault_scenario_fits_shipped_hand() -> None:
     hand = config.load(shipped.path("utah_mit.toml"))
     played = Scenario.load(shipped.path("utah_mit_faults.toml"))
     played.check_links(pad.link for pad in hand.hands[0].pads)
     assert {type(fault) for fault in played.faults} == {Gum, Moisture, DeadElectrode, TornCorner}
-    assert played.swaps[0].serial == 4711
+    assert played.node_replacements[0].serial == 4711

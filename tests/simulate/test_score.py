@@ -1,4 +1,4 @@
-"""The score finds the errors that were put in, and tells missed from invented."""
+"""The score recovers known errors, and separates missed touches from false positives."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.simulate.score import score
-from handtouch.simulate.truth import Truth, Vector
+from handtouch.simulate.score import score_contacts
+from handtouch.simulate.truth import GroundTruth, Vector
 
 PERIOD = 5_000_000
 
@@ -24,14 +24,14 @@ class Contact:
     hand: str = "right"
 
 
-def touch(link: str, start: int, samples: int, number: int = 0) -> list[Truth]:
-    blank = Truth(
+def touch(link: str, start: int, samples: int, number: int = 0) -> list[GroundTruth]:
+    blank = GroundTruth(
         0, "right", link, number, 0, 0, (0.01, 0.02, 0.03), (0, 0, 1), 1.0, 2e-3, (0, 0, 0, 0), 1e-5
     )
     return [replace(blank, t_ns=(start + k) * PERIOD) for k in range(samples)]
 
 
-def follow(truth: list[Truth], error: NDArray[np.float64], force_error: float = 0.0) -> list[Contact]:
+def follow(truth: list[GroundTruth], error: NDArray[np.float64], force_error: float = 0.0) -> list[Contact]:
     return [
         Contact(
             record.link,
@@ -44,30 +44,30 @@ def follow(truth: list[Truth], error: NDArray[np.float64], force_error: float = 
     ]
 
 
-def test_known_errors_are_found_again() -> None:
+def test_known_errors_are_recovered() -> None:
     truth = touch("tip", 1000, 4000)
     noise = np.random.default_rng(1).normal(0, 1e-5 / np.sqrt(2), (4000, 3)) * [1, 1, 0]
-    total = score(follow(truth, noise + np.array([3e-5, 0, 0]), 0.25), truth).total
+    total = score_contacts(follow(truth, noise + np.array([3e-5, 0, 0]), 0.25), truth).total
     assert total.samples == 4000
     assert total.bias_m == pytest.approx(3e-5, rel=0.02)
     assert total.scatter_m == pytest.approx(1e-5, rel=0.05)
     assert total.rms_error_m == pytest.approx(np.hypot(3e-5, 1e-5), rel=0.02)
-    assert total.ratio == pytest.approx(np.hypot(3, 1), rel=0.02)
-    assert total.force_rms_n == pytest.approx(0.25)
-    assert (total.touches, total.missed, total.invented) == (1, 0, 0)
-    assert total.worst_error_m >= total.median_error_m > 0
+    assert total.bound_ratio == pytest.approx(np.hypot(3, 1), rel=0.02)
+    assert total.rms_force_error_n == pytest.approx(0.25)
+    assert (total.touches, total.missed, total.false_positives) == (1, 0, 0)
+    assert total.max_error_m >= total.median_error_m > 0
 
 
-def test_bias_is_that_of_each_touch_and_scatter_what_is_left() -> None:
+def test_bias_is_per_touch_and_scatter_the_remainder() -> None:
     first, second = touch("tip", 0, 100, 0), touch("tip", 500, 100, 1)
     error = np.tile([1e-4, 0, 0], (100, 1))
     contacts = follow(first, error) + follow(second, -error)
-    total = score(contacts, first + second).total
+    total = score_contacts(contacts, first + second).total
     assert total.bias_m == pytest.approx(1e-4)
     assert total.scatter_m == pytest.approx(0, abs=1e-9)
 
 
-def test_touches_without_contact_are_missed_and_contacts_without_touch_invented() -> None:
+def test_touches_without_contact_are_missed_and_contacts_without_touch_false_positives() -> None:
     truth = touch("tip", 1000, 50, 0) + touch("tip", 2000, 50, 1) + touch("flat", 1000, 50, 2)
     error = np.zeros((50, 3))
     contacts = follow(truth[:50], error)
@@ -75,42 +75,42 @@ def test_touches_without_contact_are_missed_and_contacts_without_touch_invented(
         Contact("tip", 3000 * PERIOD, "begin", (0.0, 0.0, 0.0)),
         Contact("round", 1000 * PERIOD, "begin", None),
     ]
-    found = score(contacts, truth)
+    found = score_contacts(contacts, truth)
     tallies = {tally.name: tally for tally in found.links}
-    assert (tallies["tip"].touches, tallies["tip"].missed, tallies["tip"].invented) == (2, 1, 1)
-    assert (tallies["flat"].touches, tallies["flat"].missed, tallies["flat"].invented) == (1, 1, 0)
-    assert (tallies["round"].touches, tallies["round"].missed, tallies["round"].invented) == (0, 0, 1)
-    assert (found.total.touches, found.total.missed, found.total.invented) == (3, 2, 2)
+    assert (tallies["tip"].touches, tallies["tip"].missed, tallies["tip"].false_positives) == (2, 1, 1)
+    assert (tallies["flat"].touches, tallies["flat"].missed, tallies["flat"].false_positives) == (1, 1, 0)
+    assert (tallies["round"].touches, tallies["round"].missed, tallies["round"].false_positives) == (0, 0, 1)
+    assert (found.total.touches, found.total.missed, found.total.false_positives) == (3, 2, 2)
 
 
-def test_a_touch_that_repeats_counts_each_time() -> None:
+def test_repeated_touch_counts_each_time() -> None:
     truth = touch("tip", 0, 10) + touch("tip", 100, 10)
-    assert score([], truth).total.missed == 2
+    assert score_contacts([], truth).total.missed == 2
 
 
-def test_samples_match_within_half_a_period_and_ends_not_at_all() -> None:
+def test_samples_match_within_half_a_period_and_ends_never() -> None:
     truth = touch("tip", 0, 10)
     error = np.zeros((10, 3))
     contacts = follow(truth, error)
     late = [replace(contact, t_ns=contact.t_ns + PERIOD * 100) for contact in contacts]
     ends = [replace(contact, event="end", position_m=(9.0, 9.0, 9.0)) for contact in contacts]
     unplaced = [replace(contact, event="update", position_m=None) for contact in contacts]
-    total = score(contacts + late[1:] + ends + unplaced, truth).total
+    total = score_contacts(contacts + late[1:] + ends + unplaced, truth).total
     assert total.samples == 10
-    assert total.invented == 0
+    assert total.false_positives == 0
     shifted = [replace(contact, t_ns=contact.t_ns + round(0.4 * PERIOD)) for contact in contacts]
-    assert score(shifted, truth).total.samples == 10
+    assert score_contacts(shifted, truth).total.samples == 10
 
 
-def test_two_hands_are_kept_apart() -> None:
+def test_hands_are_scored_separately() -> None:
     truth = touch("tip", 0, 5) + [replace(record, hand="left") for record in touch("tip", 0, 5)]
-    found = score([replace(c, hand="left") for c in follow(truth[:5], np.zeros((5, 3)))], truth)
+    found = score_contacts([replace(c, hand="left") for c in follow(truth[:5], np.zeros((5, 3)))], truth)
     assert {tally.name: tally.missed for tally in found.links} == {"right/tip": 1, "left/tip": 0}
 
 
-def test_the_table_has_a_line_for_each_link_and_for_all() -> None:
+def test_table_has_a_line_per_link_and_a_total() -> None:
     truth = touch("tip", 0, 10) + touch("flat", 0, 10)
-    lines = str(score(follow(truth[:10], np.full((10, 3), 1e-5)), truth)).splitlines()
+    lines = str(score_contacts(follow(truth[:10], np.full((10, 3), 1e-5)), truth)).splitlines()
     assert [line.split()[0] for line in lines[1:]] == ["link", "tip", "flat", "all"]
     assert len({len(line) for line in lines[1:]}) == 1
-    assert score([], []).total.samples == 0
+    assert score_contacts([], []).total.samples == 0

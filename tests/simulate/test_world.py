@@ -1,4 +1,4 @@
-"""What drifts, drifts as slowly as told; a real sheet acts on a held force as its model says."""
+"""Drift stays within its rate; sheet behaviour acts on a held force as in its model."""
 
 from __future__ import annotations
 
@@ -10,28 +10,34 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handtouch import config
-from handtouch.sheet import S1, S2, Fluctuation, SheetModel, SheetTrack
+from handtouch.sheet import (
+    S1,
+    S2,
+    Fluctuation,
+    SheetHistory,
+    SheetModel,
+)
 from handtouch.simulate import noise
-from handtouch.simulate.built import BuiltPad
 from handtouch.simulate.faults import Gum
-from handtouch.simulate.hand import VirtualHand
 from handtouch.simulate.scenario import Scenario
-from handtouch.simulate.world import Climate, World
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.virtual_pad import VirtualPad
+from handtouch.simulate.world import ElectronicsDrift, World
 
 
 def calm(model: SheetModel) -> SheetModel:
-    """Without chance."""
+    """Return the model without fluctuation."""
     return dataclasses.replace(model, fluctuation=Fluctuation())
 
 
 def world(model: SheetModel, **other: float) -> World:
-    """Nothing but the sheets differs from the file."""
+    """Return a world that differs from the file only in its sheets."""
     ideal = World.ideal_parts(3)
-    return dataclasses.replace(ideal, noise_counts=0.0, sheet=model, sheet_spread=0.0, **other)  # type: ignore[arg-type]
+    return dataclasses.replace(ideal, noise_counts=0.0, sheet=model, sheet_relative_std=0.0, **other)  # type: ignore[arg-type]
 
 
 def presses(*touches: tuple[float, float, float], **other: object) -> Scenario:
-    """(begin, duration, force) of touches on the flat pad."""
+    """Return a scenario of touches (begin, duration, force) on the flat pad."""
     return Scenario.model_validate(
         {
             "touch": [
@@ -43,58 +49,56 @@ def presses(*touches: tuple[float, float, float], **other: object) -> Scenario:
     )
 
 
-def built(deployment: config.Deployment, scenario: Scenario, of: World) -> BuiltPad:
-    return BuiltPad.of(deployment, "right", deployment.hands[0].pads[0], scenario, of, ())
+def built(deployment: config.Deployment, scenario: Scenario, of: World) -> VirtualPad:
+    return VirtualPad.build(deployment, "right", deployment.hands[0].pads[0], scenario, of, ())
 
 
 @pytest.mark.parametrize("model", [S1, S2])
-def test_a_held_force_reads_as_the_model_of_the_sheet_has_it(
-    deployment: config.Deployment, model: SheetModel
-) -> None:
+def test_held_force_reads_as_in_sheet_model(deployment: config.Deployment, model: SheetModel) -> None:
     scenario = presses((1.0, 3.0, 2.0), (6.0, 30.0, 1.0), (37.0, 5.0, 3.0))
     pad = built(deployment, scenario, world(calm(model)))
-    track = SheetTrack(
-        calm(model), 1, lambda t: [sum(touch.force(t) for touch in scenario.touches)], step_s=1e-3
+    track = SheetHistory(
+        calm(model), 1, lambda t: [sum(touch.force_at(t) for touch in scenario.touches)], step_s=1e-3
     )
     times = np.concatenate([np.arange(1.2, 4, 0.3), np.arange(6.3, 35.5, 1.3), np.arange(37.2, 41.8, 0.4)])
-    expected = [track.factor(t)[0] for t in times]
-    np.testing.assert_allclose(pad.yields(times), expected, atol=0.015)
+    expected = [track.load_ratio(t)[0] for t in times]
+    np.testing.assert_allclose(pad.force_ratio(times), expected, atol=0.015)
 
 
-def test_a_fading_sheet_reads_less_and_rests_without_potential(deployment: config.Deployment) -> None:
+def test_sheet_adapts_under_load_and_recovers_without_excitation(deployment: config.Deployment) -> None:
     scenario = presses(*((20.0 * k, 15.0, 2.0) for k in range(400)))
     hand = VirtualHand(deployment, scenario, world(calm(S1)))
     fresh = hand.counts(0, [10.0])[0].sum()
     tired = hand.counts(0, [3010.0])[0].sum()
     under_potential = hand.counts(0, [7990.0])[0].sum()
-    hand.switch(0, 3020.0, False)
-    hand.switch(0, 7900.0, True)
+    hand.switch_excitation(0, 3020.0, False)
+    hand.switch_excitation(0, 7900.0, True)
     rested = hand.counts(0, [7990.0])[0].sum()
     assert hand.counts(0, [3010.0])[0].sum() == tired
     assert 0 <= under_potential < tired < 0.7 * fresh
     assert rested > 1.2 * tired
 
 
-def test_asking_in_any_order_gives_the_same_answer(deployment: config.Deployment) -> None:
+def test_results_do_not_depend_on_order_of_requests(deployment: config.Deployment) -> None:
     scenario = presses((1.0, 3.0, 2.0), (6.0, 3.0, 1.0), repeat=True)
-    of = dataclasses.replace(World.drifting(5), sheet=S1)
+    of = dataclasses.replace(World.with_drift(5), sheet=S1)
     times = np.random.default_rng(1).uniform(0, 60, 300)
     whole = VirtualHand(deployment, scenario, of).counts(0, times)
     alone = VirtualHand(deployment, scenario, of)
     np.testing.assert_array_equal(whole, [alone.sample(t)[0] for t in times])
 
 
-def test_presses_differ_as_much_as_the_sheet_says(deployment: config.Deployment) -> None:
+def test_presses_vary_as_in_sheet_model(deployment: config.Deployment) -> None:
     scenario = presses(*((2.0 * k, 1.5, 1.0) for k in range(600)))
     only = dataclasses.replace(calm(S1), fluctuation=Fluctuation(press_std=0.072))
     slow = dataclasses.replace(only, adaptation=dataclasses.replace(S1.adaptation, time_s=1e9))
     pad = built(deployment, scenario, world(slow))
-    factors = pad.yields(np.arange(1.2, 1200.0, 2.0))
+    factors = pad.force_ratio(np.arange(1.2, 1200.0, 2.0))
     assert np.log(factors).std() == pytest.approx(0.072, rel=0.1)
-    assert np.ptp(pad.yields(np.linspace(0.9, 1.3, 20))) < 0.05
+    assert np.ptp(pad.force_ratio(np.linspace(0.9, 1.3, 20))) < 0.05
 
 
-def test_gum_tires_the_sheet_as_a_touch_does(deployment: config.Deployment) -> None:
+def test_gum_adapts_the_sheet_like_a_touch(deployment: config.Deployment) -> None:
     gum = Gum(link="flat", from_s=5.0, place=(0.3, 0.6), force_n=1.0, press_n=0, relax=0.0)
     hand = VirtualHand(deployment, presses((0.0, 1.0, 1.0)), world(calm(S1)), faults=(gum,))
     first, later = hand.counts(0, [10.0, 4000.0]).sum(1)
@@ -103,55 +107,61 @@ def test_gum_tires_the_sheet_as_a_touch_does(deployment: config.Deployment) -> N
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 1000), st.floats(0, 1e6), st.floats(1e-3, 1e3))
-def test_a_wander_is_never_steeper_than_its_rate(seed: int, t_s: float, dt_s: float) -> None:
-    keys = np.array([noise.key(seed, "a"), noise.key(seed, "b")])
-    before, after = noise.wander(keys, [t_s, t_s + dt_s]).T
+def test_random_walk_never_exceeds_its_rate(seed: int, t_s: float, dt_s: float) -> None:
+    keys = np.array([noise.stream_key(seed, "a"), noise.stream_key(seed, "b")])
+    before, after = noise.random_walk(keys, [t_s, t_s + dt_s]).T
     assert (np.abs(after - before) <= dt_s * (1 + 1e-6) + 1e-9).all()
 
 
-def test_zeros_wander_each_on_its_own_and_warmth_is_common() -> None:
-    of = World(seed=3, drift_counts_per_s=0.1)
+def test_zeros_drift_independently_and_temperature_is_common() -> None:
+    of = World(seed=3, zero_drift_counts_per_s=0.1)
     times = np.arange(0, 86_400, 60.0)
-    zeros = Climate(of, [("right", "flat"), ("right", "tip")]).zero(times).reshape(len(times), 8)
+    zeros = (
+        ElectronicsDrift(of, [("right", "flat"), ("right", "tip")]).zero_counts(times).reshape(len(times), 8)
+    )
     assert (zeros[0] == 0).all()
     assert zeros.std(0).min() > 3
     assert np.abs(np.diff(zeros, axis=0)).max() <= 6.0
     assert np.abs(np.corrcoef(zeros.T) - np.eye(8)).max() < 0.9
-    warm = World(seed=3, warmth_k_per_s=0.01, offset_counts_per_k=2.0)
-    zeros = Climate(warm, [("right", "flat"), ("right", "tip")]).zero(times).reshape(len(times), 8)
+    warm = World(seed=3, temperature_drift_k_per_s=0.01, offset_counts_per_k=2.0)
+    zeros = (
+        ElectronicsDrift(warm, [("right", "flat"), ("right", "tip")])
+        .zero_counts(times)
+        .reshape(len(times), 8)
+    )
     assert np.linalg.matrix_rank(zeros, tol=1e-6 * np.abs(zeros).max()) == 1
-    one, other = (Climate(warm, [("right", link)]) for link in ("flat", "tip"))
-    np.testing.assert_array_equal(one.warmer_k(times), other.warmer_k(times))
+    one, other = (ElectronicsDrift(warm, [("right", link)]) for link in ("flat", "tip"))
+    np.testing.assert_array_equal(one.temperature_rise_k(times), other.temperature_rise_k(times))
 
 
 def test_noise_is_normal_and_white() -> None:
-    keys = np.array([noise.key(1, "right", "flat", name) for name in ("x0", "xa", "y0", "yb")])
-    drawn = noise.normal(keys, 5_000_000 * np.arange(50_000)[:, None])
+    keys = np.array([noise.stream_key(1, "right", "flat", name) for name in ("x0", "xa", "y0", "yb")])
+    drawn = noise.standard_normal(keys, 5_000_000 * np.arange(50_000)[:, None])
     np.testing.assert_allclose(drawn.mean(0), 0, atol=0.02)
     np.testing.assert_allclose(np.cov(drawn.T), np.eye(4), atol=0.03)
     np.testing.assert_allclose([(drawn[1:] * drawn[:-1]).mean(0)], 0, atol=0.02)
     np.testing.assert_allclose((drawn**4).mean(0), 3, atol=0.15)
 
 
-def test_a_new_node_has_the_gains_of_its_serial_number(deployment: config.Deployment) -> None:
+def test_replaced_node_has_gains_by_serial_number(deployment: config.Deployment) -> None:
     swap = {"link": "flat", "at_s": 50.0, "serial": 77}
     scenario = presses((0.0, 1000.0, 2.0), swap=(swap,))
     of = dataclasses.replace(World(seed=4, noise_counts=0.0), gap_tolerance_mm=0, resistor_tolerance=0)
     hand = VirtualHand(deployment, scenario, of)
     before, after = hand.counts(0, [20.0, 60.0])
     parts = of.parts("right", deployment.hands[0].pads[0])
-    expected = np.array(of.gain_of(77)) / np.array(parts.gain)
+    expected = np.array(of.replacement_gain(77)) / np.array(parts.gain)
     np.testing.assert_allclose(after / before, expected, atol=3 / before.min())
-    assert of.gain_of(77) != of.gain_of(78)
+    assert of.replacement_gain(77) != of.replacement_gain(78)
     given_gains = presses((0.0, 1000.0, 2.0), swap=(swap | {"gain": (1.0, 1.1, 0.9, 1.0)},))
     ideal = dataclasses.replace(World.ideal_parts(4), noise_counts=0.0)
     before, after = VirtualHand(deployment, given_gains, ideal).counts(0, [20.0, 60.0])
     np.testing.assert_allclose(after / before, [1.0, 1.1, 0.9, 1.0], atol=3 / before.min())
 
 
-def test_sheets_of_a_hand_differ_and_keep_their_nature() -> None:
-    models = [World(seed=2, sheet=S1).model("right", link) for link in ("flat", "round", "tip")]
+def test_sheets_of_a_hand_differ_and_remain_stable() -> None:
+    models = [World(seed=2, sheet=S1).sheet_model("right", link) for link in ("flat", "round", "tip")]
     times = [float(model.adaptation.time_s) for model in models if model is not None]  # type: ignore[arg-type]
     assert len(set(times)) == 3
     assert all(model is not None and model.adaptation.share == 1.0 for model in models)
-    assert World(seed=2).model("right", "flat") is None
+    assert World(seed=2).sheet_model("right", "flat") is None

@@ -17,11 +17,10 @@ import can
 import numpy as np
 import pytest
 
-from handtouch import shipped
 from handtouch.canbus.bus.receivers import grow_receive_buffer
-from handtouch.canbus.device import DeviceBus
 from handtouch.client import request
-from handtouch.config import load
+from handtouch.config import load, shipped
+from handtouch.device import DeviceBus
 from tests.starter import Starter
 
 pytestmark = [pytest.mark.socketcan, pytest.mark.timeout(280)]
@@ -31,7 +30,7 @@ LONGEST_S = 60.0
 RATES = (500, 1000, 2000, 4000, 8000, 16000)
 FLOOD_S = 2.0
 UNUSED = 0x1F0  # TPDO1 of an id that no node has
-HEARD_BY_NODES = [  # as a node's controller is set: NMT, SYNC, SDO requests, node guarding
+NODE_FILTERS = [  # as a node's controller is set: NMT, SYNC, SDO requests, node guarding
     {"can_id": can_id, "can_mask": mask, "extended": False}
     for can_id, mask in ((0x000, 0x7FF), (0x080, 0x7FF), (0x600, 0x780), (0x700, 0x780))
 ]
@@ -55,7 +54,7 @@ class Hand:
         self.printed, self._log = folder / "daemon.txt", folder / "witness.log"
         with self._log.open("w") as file:
             self._witness = subprocess.Popen(["candump", "-L", "vcan0,280:780"], stdout=file)
-        self._bus = can.Bus("vcan0", interface="socketcan", can_filters=HEARD_BY_NODES, ignore_config=True)
+        self._bus = can.Bus("vcan0", interface="socketcan", can_filters=NODE_FILTERS, ignore_config=True)
         noise = np.random.default_rng(1)
         self._devices = DeviceBus(
             self._bus, lambda _: np.rint(noise.standard_normal((len(self.nodes), 4))).astype(np.int64)
@@ -82,7 +81,7 @@ class Hand:
         return status
 
     def wait_operational(self) -> dict[str, Any]:
-        return self.wait("operational", lambda s: all(p["node"] == "operational" for p in s["pads"]))
+        return self.wait("operational", lambda s: all(p["node_state"] == "operational" for p in s["pads"]))
 
     def undisturbed_since(self, before: dict[str, Any]) -> None:
         """No node had to be started again, and no frame was lost.
@@ -170,19 +169,19 @@ def test_flood_of_unused_identifiers_costs_no_sample_and_is_counted_to_the_frame
         hand = Hand(Path(folder), vcan_starter)
         try:
             before = hand.wait_operational()
-            foreign = hand.counters()["foreign"]
+            foreign = hand.counters()["unknown_frames"]
             start_s = time.monotonic()
             generator, count = cangen(rate, 2 * FLOOD_S)
             generator.wait(LONGEST_S)
             took_s = time.monotonic() - start_s
             generator, more = cangen(100, 1.0, "-e")  # 29-bit ones
             generator.wait(LONGEST_S)
-            hand.wait("counted", lambda _: hand.counters()["foreign"] >= foreign + count + more)
+            hand.wait("counted", lambda _: hand.counters()["unknown_frames"] >= foreign + count + more)
             hand.undisturbed_since(before)
             seen = hand.witnessed()
             figures = hand.counters()
-            assert figures["foreign"] == foreign + count + more
-            assert (figures["samples"], figures["short"]) == (seen[8], 0)
+            assert figures["unknown_frames"] == foreign + count + more
+            assert (figures["samples"], figures["wrong_length"]) == (seen[8], 0)
             print(f"bare receiver: {rate} frames/s; flood: {count / took_s:.0f} frames/s, {seen[8]} samples")
         finally:
             assert hand.end() == 0, hand.printed.read_text()
@@ -190,7 +189,7 @@ def test_flood_of_unused_identifiers_costs_no_sample_and_is_counted_to_the_frame
 
 def test_frames_of_wrong_lengths_are_counted_and_change_nothing(hand: Hand) -> None:
     before = hand.wait_operational()
-    short = hand.counters()["short"]
+    short = hand.counters()["wrong_length"]
     frames = []
     for node_id in hand.nodes[:5]:
         samples = [f"{0x280 + node_id:03X}#{data}" for data in ("", "01", "01020304050607")]
@@ -198,16 +197,16 @@ def test_frames_of_wrong_lengths_are_counted_and_change_nothing(hand: Hand) -> N
         others = [f"{0x580 + node_id:03X}#43181001", f"{0x080 + node_id:03X}#00"]
         frames += samples + beats + others
     cansend(*frames)
-    hand.wait("counted", lambda _: hand.counters()["short"] == short + len(frames))
+    hand.wait("counted", lambda _: hand.counters()["wrong_length"] == short + len(frames))
     hand.undisturbed_since(before)
     seen = hand.witnessed()
     assert hand.counters()["samples"] == seen[8]
     assert seen[0] == seen[1] == seen[7] == 5
 
 
-def test_error_frames_are_told_by_their_causes_and_change_nothing_else(hand: Hand) -> None:
+def test_error_frames_are_counted_by_cause_and_change_nothing_else(hand: Hand) -> None:
     before = hand.wait_operational()
-    told = {
+    expected = {
         "20000004#0001000000000000": "controller receive overflow",
         "20000088#0000080300000000": "bit error",
         "20000008#0000000800000000": "CRC error",
@@ -216,12 +215,12 @@ def test_error_frames_are_told_by_their_causes_and_change_nothing_else(hand: Han
         "20000040#0000000000000000": "bus-off",
         "20000100#0000000000000000": "restarted",
     }
-    cansend(*told)
-    hand.wait("told", lambda _: hand.counters()["errors"] == len(told))
+    cansend(*expected)
+    hand.wait("expected", lambda _: hand.counters()["error_frames"] == len(expected))
     figures = hand.counters()
-    assert set(told.values()) <= set(figures["causes"])
+    assert set(expected.values()) <= set(figures["causes"])
     hand.wait("active again", lambda _: hand.counters()["state"] == "active")
     hand.undisturbed_since(before)
-    assert hand.counters()["foreign"] == 0
+    assert hand.counters()["unknown_frames"] == 0
     seen = hand.witnessed()
     assert hand.counters()["samples"] == seen[8]

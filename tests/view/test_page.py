@@ -1,4 +1,4 @@
-"""What the page is told: the deployment's geometry, contacts and health as they change, and only changes."""
+"""The page in the browser: geometry of the deployment, contacts, health and percepts, and its HTTP server."""
 
 from __future__ import annotations
 
@@ -19,14 +19,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch import config, shipped, wire
-from handtouch.field.surface import Cone, Cylinder, Plane, Sphere, Surface
-from handtouch.hand.kinematics import Kinematics
-from handtouch.hand.urdf import Shape, read
-from handtouch.view.page.layout import describe
+from handtouch import config, wire
+from handtouch.config import shipped
+from handtouch.field.surface import (
+    ConeSurface,
+    CylinderSurface,
+    PlaneSurface,
+    SphereSurface,
+    Surface,
+)
+from handtouch.hand.kinematics import HandKinematics
+from handtouch.hand.urdf import BodyShape, read_urdf
 from handtouch.view.page.meshes import body_mesh, outline_m, pad_mesh
-from handtouch.view.page.picture import Board, Picture
-from handtouch.view.page.serve import PageServer
+from handtouch.view.page.model import PageModel, VersionedValues
+from handtouch.view.page.scene_graph import scene_of
+from handtouch.view.page.server import PageServer
 
 DEPLOYMENT = config.load(shipped.path("utah_mit.toml"))
 FILES = {hand.urdf: Path(hand.urdf).read_bytes() for hand in DEPLOYMENT.hands if hand.urdf}
@@ -38,28 +45,34 @@ def frame(contacts: dict[int, int], run: int = 1, state: dict[int, int] | None =
     """A hand frame; `contacts`: row -> id."""
     n = len(LINKS)
     values: dict[str, NDArray[Any]] = {
-        name: np.full((n, elements), np.nan if kind == "<f4" else 0, dtype=kind)
-        for name, (kind, elements) in wire.COLUMNS[wire.HandFrame].items()
+        name: np.full((n, column.elements), np.nan if column.dtype == "<f4" else 0, dtype=column.dtype)
+        for name, column in wire.COLUMNS[wire.HandFrame].items()
     }
     for row, number in contacts.items():
-        values["state"][row], values["contact"][row], values["force_n"][row] = 1, number, 1.25
+        values["state"][row], values["contact_id"][row], values["force_n"][row] = 1, number, 1.25
         values["position_m"][row], values["normal"][row] = (0.01, 0.0, 0.009), (0.0, 0.0, 1.0)
         values["covariance_m2"][row] = np.diag([4e-10, 1e-10, 0.0]).ravel()
         values["pad_m"][row] = (0.004, 0.003)
+        values["position_status"][row], values["force_status"][row] = 1, 1
     for row, number in (state or {}).items():
         values["state"][row] = number
-    told = {name: column.tobytes() for name, column in values.items()}
-    for name in ("group", "palm", "base", "joints_age_s", "unestimated"):
-        told |= {key: b"" for key in told if key == name or key.startswith(f"{name}_")}
-    return wire.HandFrame(1, run, 1, 10**9, 1, "right", LINKS, **told, repeat=False)
+    data = {name: column.tobytes() for name, column in values.items()}
+    data |= {key: b"" for key in data if key.startswith(("group", "palm_", "base_", "joints_age_s"))}
+    return wire.HandFrame(1, run, 1, 10**9, 1, "right", LINKS, **data, retained=False)
 
 
 def health(state: str = "clear", run: int = 1, **changed: Any) -> wire.Health:
     values: dict[str, Any] = dict.fromkeys(wire.Health.__dataclass_fields__, 0)
-    values |= {"v": 1, "run": run, "hand": "right", "link": "index_distal", "bus": "can0", "state": state}
-    values |= {"node": "operational", "pace": "sync", "reason": "", "serial": None, "age_s": None}
-    values |= {"emergencies": (), "repeat": False, "rate_hz": 200.0, "trust": "trusted", "calibration": ""}
-    return wire.Health(**{**values, "calibrating": "", "findings": (), **changed})
+    values |= {"v": 1, "session": run, "hand": "right", "link": "index_distal", "bus": "can0", "state": state}
+    values |= {"node_state": "operational", "sampling": "sync", "reason": "", "serial": None, "age_s": None}
+    values |= {
+        "emergencies": (),
+        "retained": False,
+        "rate_hz": 200.0,
+        "calibration_state": "calibrated",
+        "calibration_id": "",
+    }
+    return wire.Health(**{**values, "calibration_progress": "", "diagnoses": (), **changed})
 
 
 def deployed(deployment: config.Deployment = DEPLOYMENT, run: int = 1) -> wire.Config:
@@ -67,8 +80,8 @@ def deployed(deployment: config.Deployment = DEPLOYMENT, run: int = 1) -> wire.C
     return wire.Config(1, run, 1, 0, text, dict(FILES), {}, False)
 
 
-def said(picture: Picture) -> list[str]:
-    lines = picture.board.since(0).get("messages", ())
+def message_lines(model: PageModel) -> list[str]:
+    lines = model.values.changes_since(0).get("messages", ())
     return [f"{', '.join(line['links'])}: {line['text']}" for line in lines]
 
 
@@ -84,8 +97,10 @@ def said(picture: Picture) -> list[str]:
         ("capsule", (0.1, 0.5), np.pi * 0.005 + 4 / 3 * np.pi * 1e-3),
     ],
 )
-def test_bodies_are_closed_and_face_outward(kind: str, size_m: tuple[float, ...], volume: float) -> None:
-    mesh = body_mesh(Shape(kind, size_m, np.eye(3), np.array([1.0, 2.0, 3.0])), Path())
+def test_body_meshes_are_closed_with_outward_normals(
+    kind: str, size_m: tuple[float, ...], volume: float
+) -> None:
+    mesh = body_mesh(BodyShape(kind, size_m, np.eye(3), np.array([1.0, 2.0, 3.0])), Path())
     assert mesh is not None
     a, b, c = mesh.corners_m.reshape(-1, 3, 3).transpose(1, 0, 2)
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(volume, rel=0.02)  # Gauss
@@ -97,13 +112,13 @@ def test_bodies_are_closed_and_face_outward(kind: str, size_m: tuple[float, ...]
 @pytest.mark.parametrize(
     "surface",
     [
-        Plane(0.03, 0.02),
-        Cylinder(0.012, 0.03, 2.0),
-        Cone(0.012, 0.009, 0.03, 2.0),
-        Sphere(0.011, -0.5, 0.9, 2.0),
+        PlaneSurface(0.03, 0.02),
+        CylinderSurface(0.012, 0.03, 2.0),
+        ConeSurface(0.012, 0.009, 0.03, 2.0),
+        SphereSurface(0.011, -0.5, 0.9, 2.0),
     ],
 )
-def test_an_unrolled_pad_keeps_lengths_along_and_across(surface: Surface) -> None:
+def test_an_unrolled_pad_preserves_length_and_area(surface: Surface) -> None:
     mesh, outline = pad_mesh(surface, np.eye(3), np.zeros(3)), outline_m(surface)
     a, b, c = mesh.corners_m.reshape(-1, 3, 3).transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
@@ -113,35 +128,35 @@ def test_an_unrolled_pad_keeps_lengths_along_and_across(surface: Surface) -> Non
     assert np.ptp(x) == pytest.approx(float(surface.from_rectangle(surface.a, surface.b / 2)[0]))
 
 
-def test_links_stand_where_the_kinematics_put_them() -> None:
-    scene = describe(DEPLOYMENT, FILES)
-    robot = read(shipped.path("utah_mit.urdf"))
-    kinematics = Kinematics(robot, LINKS, "palm", robot.root)
-    kinematics.move(np.zeros(len(kinematics.joints)))
+def test_link_poses_agree_with_the_kinematics() -> None:
+    scene = scene_of(DEPLOYMENT, FILES)
+    robot = read_urdf(shipped.path("utah_mit.urdf"))
+    kinematics = HandKinematics(robot, LINKS, "palm", robot.root)
+    kinematics.set_joint_positions(np.zeros(len(kinematics.joints)))
     for number, pad in enumerate(scene["pads"]):
         rotation, at, node = np.eye(3), np.zeros(3), pad["node"]
         while node >= 0:
-            told = scene["nodes"][node]
-            turn = np.reshape(told["turn"], (3, 3))
-            rotation, at, node = turn @ rotation, turn @ at + told["at"], told["parent"]
-        pose = kinematics.in_base(number)
+            graph_node = scene["nodes"][node]
+            turn = np.reshape(graph_node["rotation"], (3, 3))
+            rotation, at, node = turn @ rotation, turn @ at + graph_node["translation"], graph_node["parent"]
+        pose = kinematics.pose_in_base(number)
         assert np.allclose(rotation, pose.rotation)
         assert np.allclose(at, pose.translation_m)
     moved = {node["joint"].split("/")[1] for node in scene["nodes"] if "joint" in node}
     assert moved == set(kinematics.joints)
 
 
-def test_without_a_urdf_pads_stand_side_by_side_and_face_the_viewer() -> None:
-    scene = describe(DEPLOYMENT, {})
+def test_without_a_urdf_pads_are_side_by_side_and_face_the_viewer() -> None:
+    scene = scene_of(DEPLOYMENT, {})
     assert not scene["bodies"]
     boxes = []
     for pad in scene["pads"]:
         corners = np.frombuffer(base64.b64decode(pad["corners"]), "<f4").reshape(-1, 3)
         normals = np.frombuffer(base64.b64decode(pad["normals"]), "<f4").reshape(-1, 3)
         node = scene["nodes"][pad["node"]]
-        turn = np.reshape(node["turn"], (3, 3))
+        turn = np.reshape(node["rotation"], (3, 3))
         assert (normals @ turn.T).mean(axis=0) @ [0.0, -1.0, 0.0] > 0.7
-        seen = (corners @ turn.T + node["at"])[:, [0, 2]]
+        seen = (corners @ turn.T + node["translation"])[:, [0, 2]]
         boxes.append((seen.min(axis=0), seen.max(axis=0)))
     for k, (low, high) in enumerate(boxes):
         for other_low, other_high in boxes[:k]:
@@ -149,153 +164,165 @@ def test_without_a_urdf_pads_stand_side_by_side_and_face_the_viewer() -> None:
     assert sorted(k for column in scene["columns"] for k in column) == list(range(15))
 
 
-# what is told -----------------------------------------------------------------------------------------------
+# the model --------------------------------------------------------------------------------------------------
 
 
-def test_only_changes_are_told() -> None:
-    board = Board()
-    board.put("a", 1)
-    board.put("b", 2)
-    seen = board.changes
-    board.put("a", 1)
-    assert board.since(seen) == {}
-    board.put("b", 3)
-    assert board.since(seen) == {"b": 3}
-    assert board.since(0) == {"a": 1, "b": 3}
+def test_only_changed_values_are_returned() -> None:
+    values = VersionedValues()
+    values.set_value("a", 1)
+    values.set_value("b", 2)
+    seen = values.version
+    values.set_value("a", 1)
+    assert values.changes_since(seen) == {}
+    values.set_value("b", 3)
+    assert values.changes_since(seen) == {"b": 3}
+    assert values.changes_since(0) == {"a": 1, "b": 3}
 
 
-def test_a_contact_is_told_with_its_ellipse_and_then_that_it_ended() -> None:
-    picture = Picture()
-    picture.take(frame({DISTAL: 7}))
-    picture.step(True)
-    contact = picture.board.since(0)["contact/right/index_distal"]
+def test_a_contact_has_its_ellipse_until_it_ends() -> None:
+    model = PageModel()
+    model.add_message(frame({DISTAL: 7}))
+    model.update_values(True)
+    contact = model.values.changes_since(0)["contact/right/index_distal"]
     assert (contact["id"], contact["force_n"], contact["pad_m"]) == (7, 1.25, [0.004, 0.003])
-    lengths = [np.linalg.norm(axis) for axis in contact["axes"]]
+    lengths = [np.linalg.norm(axis) for axis in contact["axes_m"]]
     assert lengths == pytest.approx([2.4477 * 2e-5, 2.4477 * 1e-5], rel=1e-2)
-    assert abs(contact["axes"][0][0]) == pytest.approx(lengths[0])  # along the greater variance
-    picture.take(frame({}))
-    picture.step(True)
-    assert picture.board.since(0)["contact/right/index_distal"] is None
-    seen = picture.board.changes
-    picture.take(frame({}))
-    picture.step(True)
-    assert picture.board.since(seen) == {}
+    assert abs(contact["axes_m"][0][0]) == pytest.approx(lengths[0])  # along the greater variance
+    model.add_message(frame({}))
+    model.update_values(True)
+    assert model.values.changes_since(0)["contact/right/index_distal"] is None
+    seen = model.values.version
+    model.add_message(frame({}))
+    model.update_values(True)
+    assert model.values.changes_since(seen) == {}
 
 
-def test_a_touch_between_two_updates_is_seen_once() -> None:
-    picture = Picture()
-    picture.take(frame({}))
-    picture.step(True)
+def test_a_contact_between_two_updates_is_shown_once() -> None:
+    model = PageModel()
+    model.add_message(frame({}))
+    model.update_values(True)
     for contacts in ({}, {DISTAL: 3}, {}):
-        picture.take(frame(contacts))
-    picture.step(True)
-    assert picture.board.since(0)["contact/right/index_distal"]["id"] == 3
-    picture.take(frame({}))
-    picture.step(True)
-    assert picture.board.since(0)["contact/right/index_distal"] is None
+        model.add_message(frame(contacts))
+    model.update_values(True)
+    assert model.values.changes_since(0)["contact/right/index_distal"]["id"] == 3
+    model.add_message(frame({}))
+    model.update_values(True)
+    assert model.values.changes_since(0)["contact/right/index_distal"] is None
 
 
-def test_health_colours_the_pad_and_is_told_in_words() -> None:
-    picture = Picture()
-    picture.take(frame({}, state={DISTAL: 5}))
-    picture.take(health("starting"))
-    picture.step(True)
-    assert said(picture) == []  # a start is nothing to tell
+def test_health_sets_the_status_of_a_pad_and_appends_messages() -> None:
+    model = PageModel()
+    model.add_message(frame({}, state={DISTAL: 5}))
+    model.add_message(health("starting"))
+    model.update_values(True)
+    assert message_lines(model) == []  # no message for a node that starts
     gum = {"kind": "gum", "cause": "chewing gum", "evidence": "pressed for 60 s", "remedy": "clean it"}
-    picture.take(health(findings=(gum,)))
-    picture.take(frame({}))
-    picture.step(True)
-    assert picture.board.since(0)["pad/right/index_distal"]["look"] == "doubted"
-    assert said(picture) == ["index_distal: chewing gum (pressed for 60 s): clean it"]
-    picture.take(health("lost", reason="no heartbeat: look at its plug"))
-    picture.take(frame({}, state={DISTAL: int(wire.PadState.LOST)}))
-    picture.step(True)
-    assert picture.board.since(0)["pad/right/index_distal"]["look"] == "lost"
-    picture.take(health("lost", reason="no heartbeat: look at its plug"))  # once is enough
-    picture.take(health())
-    assert said(picture)[1:] == [
-        "index_distal: lost: no heartbeat: look at its plug",
-        "index_distal: well again",
+    model.add_message(health(diagnoses=(gum,)))
+    model.add_message(frame({}))
+    model.update_values(True)
+    assert model.values.changes_since(0)["pad/right/index_distal"]["status"] == "unreliable"
+    assert message_lines(model) == ["index_distal: chewing gum (pressed for 60 s): clean it"]
+    model.add_message(health("lost", reason="no heartbeat; check its plug"))
+    model.add_message(frame({}, state={DISTAL: int(wire.PadState.LOST)}))
+    model.update_values(True)
+    assert model.values.changes_since(0)["pad/right/index_distal"]["status"] == "lost"
+    model.add_message(health("lost", reason="no heartbeat; check its plug"))  # reported once
+    model.add_message(health())
+    assert message_lines(model)[1:] == [
+        "index_distal: lost: no heartbeat; check its plug",
+        "index_distal: recovered",
     ]
 
 
-def test_what_befalls_many_pads_at_once_is_one_line() -> None:
-    picture = Picture()
+def test_the_same_fault_of_several_pads_is_one_message() -> None:
+    model = PageModel()
     for link in LINKS[:3]:
-        picture.take(health("lost", link=link, reason="unplugged"))
-    assert said(picture) == [f"{', '.join(LINKS[:3])}: lost: unplugged"]
-    picture.take(health("lost", link=LINKS[3], reason="unplugged", t_ns=2 * 10**9))
-    assert said(picture)[1:] == [f"{LINKS[3]}: lost: unplugged"]
+        model.add_message(health("lost", link=link, reason="unplugged"))
+    assert message_lines(model) == [f"{', '.join(LINKS[:3])}: lost: unplugged"]
+    model.add_message(health("lost", link=LINKS[3], reason="unplugged", t_ns=2 * 10**9))
+    assert message_lines(model)[1:] == [f"{LINKS[3]}: lost: unplugged"]
 
 
-def test_a_daemon_that_is_silent_or_another_takes_its_contacts_along() -> None:
-    picture = Picture()
+def test_contacts_are_cleared_when_the_daemon_disconnects_or_restarts() -> None:
+    model = PageModel()
     for message in (deployed(), frame({DISTAL: 7})):
-        picture.take(message)
-    picture.step(True)
-    picture.step(False)
-    assert picture.board.since(0)["contact/right/index_distal"] is None
-    seen = picture.board.changes
+        model.add_message(message)
+    model.update_values(True)
+    model.update_values(False)
+    assert model.values.changes_since(0)["contact/right/index_distal"] is None
+    seen = model.values.version
     for message in (deployed(run=2), frame({}, run=2)):
-        picture.take(message)
-    picture.step(True)
-    assert ": the daemon was started anew" in said(picture)
-    assert "scene" not in picture.board.since(seen)  # the same hand needn't be built again
+        model.add_message(message)
+    model.update_values(True)
+    assert ": daemon restarted" in message_lines(model)
+    assert "scene" not in model.values.changes_since(seen)  # the same hand is not sent again
     hand = DEPLOYMENT.hands[0]
     fewer = DEPLOYMENT.model_copy(update={"hands": (hand.model_copy(update={"pads": hand.pads[:4]}),)})
-    picture.take(deployed(fewer, run=2))
-    assert len(picture.board.since(seen)["scene"]["pads"]) == 4
+    model.add_message(deployed(fewer, run=2))
+    assert len(model.values.changes_since(seen)["scene"]["pads"]) == 4
 
 
 def percept(kind: str, label: str, **changed: Any) -> wire.Percept:
-    values: dict[str, Any] = {"v": 1, "run": 1, "seq": 1, "t_ns": 10**9, "hand": "right", "kind": kind}
-    values |= {"link": "index_distal", "contact": 7, "state": "estimated", "label": label, "confidence": 0.93}
-    values |= {"probabilities": {}, "values": {}, "evidence": {}, "reason": "", "repeat": False}
+    values: dict[str, Any] = {"v": 1, "session": 1, "seq": 1, "t_ns": 10**9, "hand": "right", "kind": kind}
+    values |= {
+        "link": "index_distal",
+        "contact_id": 7,
+        "state": "estimated",
+        "label": label,
+        "confidence": 0.93,
+    }
+    values |= {"probabilities": {}, "values": {}, "evidence": {}, "reason": "", "retained": False}
     return wire.Percept(**{**values, **changed})
 
 
-def test_what_is_felt_is_told_in_words_beside_its_pad_as_long_as_the_contact_lasts() -> None:
-    picture = Picture()
-    picture.take(frame({DISTAL: 7}))
-    picture.take(percept("motion", "sliding", values={"slipped_m": 4e-4}))
-    picture.take(percept("hardness", "medium", values={"stiffness_n_per_m": 2100.0}))
-    picture.take(percept("texture", "", state="unestimated", reason="it has to slide"))
-    picture.take(percept("shape", "sphere", link="", contact=0, values={"radius_m": 0.012}))
-    question = {"values": {"force_ratio": 1.5, "bits": 0.8}, "question": "hardness", "expires_ns": 2 * 10**9}
-    picture.take(percept("ask", "squeeze", state="open", confidence=None, **question))
-    picture.step(True)
-    told = picture.board.since(0)
-    assert told["felt/right/index_distal"] == {
-        "short": ["sliding", "medium"],
-        "lines": ["sliding 95%, slipped 0.4 mm", "medium 95%, stiffness 2.1 N/mm"],
-        "asks": ["hardness? squeeze (force ratio 1.5)"],
+def test_percepts_are_shown_at_their_pad_while_the_contact_lasts() -> None:
+    model = PageModel()
+    model.add_message(frame({DISTAL: 7}))
+    model.add_message(percept("motion", "sliding", values={"slip_distance_m": 4e-4}))
+    model.add_message(percept("stiffness", "medium", values={"stiffness_n_per_m": 2100.0}))
+    model.add_message(percept("texture", "", state="undetermined", reason="it has to slide"))
+    model.add_message(percept("shape", "sphere", link="", contact_id=0, values={"radius_m": 0.012}))
+    question = {
+        "values": {"force_ratio": 1.5, "expected_information_bits": 0.8},
+        "question": "stiffness",
+        "expires_ns": 2 * 10**9,
+    }
+    model.add_message(percept("action_request", "squeeze", state="open", confidence=None, **question))
+    model.update_values(True)
+    values = model.values.changes_since(0)
+    assert values["percepts/right/index_distal"] == {
+        "labels": ["sliding", "medium"],
+        "lines": ["sliding 95%, slip distance 0.4 mm", "medium 95%, stiffness 2.1 N/mm"],
+        "requests": ["stiffness? squeeze (force ratio 1.5)"],
         "missing": ["texture: it has to slide"],
     }
-    assert told["felt/right/"]["lines"] == ["shape sphere 95%, radius 12 mm"]
+    assert values["percepts/right/"]["lines"] == ["shape sphere 95%, radius 12 mm"]
     later = replace(frame({DISTAL: 7}), t_ns=2 * 10**9)
-    picture.take(later)
-    picture.step(True)
-    assert picture.board.since(0)["felt/right/index_distal"]["asks"] == []  # expired
-    picture.take(replace(frame({DISTAL: 8}), t_ns=2 * 10**9))
-    picture.step(True)
-    assert picture.board.since(0)["felt/right/index_distal"] is None  # another contact
+    model.add_message(later)
+    model.update_values(True)
+    assert model.values.changes_since(0)["percepts/right/index_distal"]["requests"] == []  # expired
+    model.add_message(replace(frame({DISTAL: 8}), t_ns=2 * 10**9))
+    model.update_values(True)
+    assert model.values.changes_since(0)["percepts/right/index_distal"] is None  # another contact
 
 
-def test_a_silent_daemon_takes_what_was_felt_along() -> None:
-    picture = Picture()
-    picture.take(frame({DISTAL: 7}))
-    picture.take(percept("motion", "sliding"))
-    picture.step(True)
-    assert picture.board.since(0)["felt/right/index_distal"]
-    picture.step(False)
-    assert picture.board.since(0)["felt/right/index_distal"] is None
+def test_percepts_are_cleared_when_the_daemon_disconnects() -> None:
+    model = PageModel()
+    model.add_message(frame({DISTAL: 7}))
+    model.add_message(percept("motion", "sliding"))
+    model.update_values(True)
+    assert model.values.changes_since(0)["percepts/right/index_distal"]
+    model.update_values(False)
+    assert model.values.changes_since(0)["percepts/right/index_distal"] is None
 
 
-def test_a_urdf_that_cannot_be_read_is_told_and_pads_are_shown_all_the_same() -> None:
-    picture = Picture()
-    picture.take(wire.Config(1, 1, 1, 0, deployed().deployment, dict.fromkeys(FILES, b"<robot/>"), {}, False))
-    assert len(picture.board.since(0)["scene"]["pads"]) == 15
-    assert "has no link" in said(picture)[0]
+def test_an_unreadable_urdf_is_reported_and_pads_are_still_shown() -> None:
+    model = PageModel()
+    model.add_message(
+        wire.Config(1, 1, 1, 0, deployed().deployment, dict.fromkeys(FILES, b"<robot/>"), {}, False)
+    )
+    assert len(model.values.changes_since(0)["scene"]["pads"]) == 15
+    assert "has no link" in message_lines(model)[0]
 
 
 # the server -------------------------------------------------------------------------------------------------
@@ -303,7 +330,7 @@ def test_a_urdf_that_cannot_be_read_is_told_and_pads_are_shown_all_the_same() ->
 
 @pytest.fixture
 def server() -> Iterator[PageServer]:
-    opened = PageServer(Board(), "127.0.0.1", 0)
+    opened = PageServer(VersionedValues(), "127.0.0.1", 0).start()
     yield opened
     opened.close()
 
@@ -315,55 +342,55 @@ def changes(url: str) -> Iterator[dict[str, Any]]:
                 yield json.loads(line[6:])
 
 
-def test_the_page_and_all_that_it_names_are_served_and_nothing_else(server: PageServer) -> None:
+def test_only_the_files_of_the_page_are_served(server: PageServer) -> None:
     with urllib.request.urlopen(server.url) as page:
         text = page.read().decode()
     assert "main.js" in text
-    assert "//" not in text.replace("<!doctype html>", "")  # nothing from elsewhere
+    assert "//" not in text.replace("<!doctype html>", "")  # nothing from other hosts
     for name in ("main.js", "hand.js", "style.css", "icon.svg"):
         assert urllib.request.urlopen(server.url + name).status == 200
-    for name in ("picture.py", "../picture.py", "static/main.js", "nothing.js"):
+    for name in ("model.py", "../model.py", "static/main.js", "nothing.js"):
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(server.url + name)
 
 
-def test_a_page_from_elsewhere_that_was_led_here_gets_nothing(server: PageServer) -> None:
+def test_requests_with_another_host_header_are_rejected(server: PageServer) -> None:
     request = urllib.request.Request(server.url, headers={"Host": "evil.example"})
     with pytest.raises(urllib.error.HTTPError, match="421"):
         urllib.request.urlopen(request)
 
 
-def test_each_page_gets_what_is_there_and_then_the_changes(server: PageServer) -> None:
-    server.board.put("a", 1)
+def test_each_page_receives_the_current_values_and_then_changes(server: PageServer) -> None:
+    server.values.set_value("a", 1)
     first = changes(server.url)
     assert next(first) == {"a": 1}
-    with server.changed:
-        server.board.put("b", 2)
-    server.tell()
+    with server.condition:
+        server.values.set_value("b", 2)
+    server.notify_pages()
     assert next(first) == {"b": 2}
     late = changes(server.url)
     assert next(late) == {"a": 1, "b": 2}
-    assert server.seen == 2
+    assert server.pages_opened == 2
     first.close()  # type: ignore[attr-defined]
     late.close()  # type: ignore[attr-defined]
 
 
-def test_a_page_that_does_not_read_holds_up_nobody(server: PageServer) -> None:
-    with socket.create_connection(("127.0.0.1", int(server.url.split(":")[2].rstrip("/")))) as lazy:
-        lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+def test_a_page_that_does_not_read_delays_no_other(server: PageServer) -> None:
+    with socket.create_connection(("127.0.0.1", int(server.url.split(":")[2].rstrip("/")))) as stalled:
+        stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         host = server.url.removeprefix("http://").rstrip("/")
-        lazy.sendall(f"GET /changes HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        stalled.sendall(f"GET /changes HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
         other = changes(server.url)
         for number in range(60):
-            with server.changed:
-                server.board.put("much", str(number) * 50_000)
-            server.tell()
+            with server.condition:
+                server.values.set_value("much", str(number) * 50_000)
+            server.notify_pages()
             while next(other)["much"] != str(number) * 50_000:
                 pass
         other.close()  # type: ignore[attr-defined]
 
 
-def test_a_taken_port_is_told_with_a_remedy(server: PageServer) -> None:
+def test_a_port_in_use_is_reported_with_a_remedy(server: PageServer) -> None:
     port = server.url.split(":")[2].rstrip("/")
     command = [sys.executable, "-m", "handtouch", "view", "--key", "", "--port", port]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
@@ -373,9 +400,9 @@ def test_a_taken_port_is_told_with_a_remedy(server: PageServer) -> None:
     assert "--port 0" in done.stderr
 
 
-def test_threads_of_pages_end_with_the_server() -> None:
-    opened = PageServer(Board(), "127.0.0.1", 0)
-    opened.board.put("a", 1)
+def test_page_threads_end_with_the_server() -> None:
+    opened = PageServer(VersionedValues(), "127.0.0.1", 0).start()
+    opened.values.set_value("a", 1)
     stream = changes(opened.url)
     next(stream)
     opened.close()

@@ -1,4 +1,4 @@
-"""The live page and the lines tell who is touched where, how hard, how sure; and how the nodes fare."""
+"""The live table and the lines show contacts with position, force and uncertainty, and the state of nodes."""
 
 from __future__ import annotations
 
@@ -8,32 +8,90 @@ import pytest
 from rich.console import Console
 
 from handtouch import wire
-from handtouch.view import status
-from handtouch.view.lines import finding_text, line, location_std_m
+from handtouch.cli import status
+from handtouch.view.displays import LineDisplay
+from handtouch.view.message_lines import diagnosis_text, message_line, position_std_m
 from handtouch.view.terminal import HandView
-from handtouch.view.watch import LineDisplay
 
 CONTACT = wire.Contact(
-    v=1, run=1, seq=1, repeat=False, t_ns=12_000_000_000, event="begin", id=7, hand="right",
-    link="thumb_tip", frame="thumb_tip",
-    begin_ns=11_500_000_000, duration_s=0.5, age_s=0.001, position_m=(0.0123, -0.004, 0.0056),
-    normal=(0.0, 0.0, 1.0), covariance_m2=(4e-10, 0, 0, 0, 3e-10, 0, 0, 0, 2e-10), pad_m=(0.01, 0.02),
-    location="valid", force_n=1.234, force_std_n=0.056, peak_force_n=2.5, strength="valid", current_a=1e-3,
-    residual=0.0, residual_std=1e-4, on_n=0.06, off_n=0.03, calibration="nominal", reason="",
-)  # fmt: skip
+    v=1,
+    session=1,
+    seq=1,
+    retained=False,
+    t_ns=12_000_000_000,
+    event="begin",
+    id=7,
+    hand="right",
+    link="thumb_tip",
+    frame="thumb_tip",
+    begin_ns=11_500_000_000,
+    duration_s=0.5,
+    age_s=0.001,
+    position_m=(0.0123, -0.004, 0.0056),
+    normal=(0.0, 0.0, 1.0),
+    covariance_m2=(4e-10, 0, 0, 0, 3e-10, 0, 0, 0, 2e-10),
+    pad_m=(0.01, 0.02),
+    position_status="valid",
+    force_n=1.234,
+    force_std_n=0.056,
+    peak_force_n=2.5,
+    force_status="valid",
+    total_current_a=1e-3,
+    residual=0.0,
+    residual_std=1e-4,
+    begin_threshold_n=0.06,
+    end_threshold_n=0.03,
+    calibration_id="nominal",
+    end_reason="",
+)
 HEALTH = wire.Health(
-    v=1, run=1, seq=1, repeat=False, t_ns=12_000_000_000, hand="right", link="thumb_tip", bus="can0",
-    node_id=19, state="clear", node="operational", since_ns=0, pace="sync", reason="", serial=1003,
-    rate_hz=200.0, samples=10, missed=0, age_s=0.001,
-    reboots=0, heartbeats_missed=0, emergencies=(),
-)  # fmt: skip
+    v=1,
+    session=1,
+    seq=1,
+    retained=False,
+    t_ns=12_000_000_000,
+    hand="right",
+    link="thumb_tip",
+    bus="can0",
+    node_id=19,
+    state="clear",
+    node_state="operational",
+    node_state_since_ns=0,
+    sampling="sync",
+    reason="",
+    serial=1003,
+    rate_hz=200.0,
+    samples=10,
+    missed_samples=0,
+    age_s=0.001,
+    reboots=0,
+    heartbeats_missed=0,
+    emergencies=(),
+)
 SERVICE = wire.Service(
-    v=1, run=1, seq=1, repeat=False, t_ns=12_000_000_000, wall_offset_ns=0, version="0", pid=1,
-    uptime_s=3.0, period_s=0.005,
-    hands={"right": ["thumb_tip"]}, ticks=600, overruns=0, rate_hz=200.0,
-    tick_us={"p50": 250.0, "p99": 400.0, "max": 500.0}, buses={"can0": {"load": 0.43}}, drops={},
-    loop={}, contacts=0, refused={}, process={}, subscriptions=(),
-)  # fmt: skip
+    v=1,
+    session=1,
+    seq=1,
+    retained=False,
+    t_ns=12_000_000_000,
+    wall_offset_ns=0,
+    version="0",
+    pid=1,
+    uptime_s=3.0,
+    period_s=0.005,
+    hands={"right": ["thumb_tip"]},
+    ticks=600,
+    overruns=0,
+    rate_hz=200.0,
+    tick_us={"p50": 250.0, "p99": 400.0, "max": 500.0},
+    buses={"can0": {"load": 0.43}},
+    drops={},
+    loop={},
+    contacts=0,
+    rejected={},
+    process={},
+    subscriptions=(),
+)
 
 
 def _page(view: HandView, alive: bool = True, width: int = 120, height: int = 40) -> str:
@@ -51,7 +109,7 @@ def _view(*messages: wire.Message) -> HandView:
     return view
 
 
-def test_the_page_shows_a_touch_with_place_force_and_their_uncertainty() -> None:
+def test_the_table_shows_a_contact_with_position_force_and_uncertainty() -> None:
     page = _page(_view(HEALTH, SERVICE, CONTACT))
     assert "12.30   -4.00    5.60" in page
     assert "0.030" in page  # mm: root of the summed variances
@@ -62,80 +120,85 @@ def test_the_page_shows_a_touch_with_place_force_and_their_uncertainty() -> None
     assert "can0 43 %" in page
 
 
-def test_an_ended_contact_leaves_the_table_and_is_told_below_it() -> None:
-    page = _page(_view(HEALTH, CONTACT, replace(CONTACT, event="end", reason="released", seq=2)))
+def test_an_ended_contact_moves_from_the_table_to_the_events() -> None:
+    page = _page(_view(HEALTH, CONTACT, replace(CONTACT, event="end", end_reason="released", seq=2)))
     assert "12.30   -4.00    5.60" not in page
     assert "#7 released after 0.50 s, peak 2.50 N" in page
 
 
-def test_a_lost_node_shows_with_its_reason() -> None:
-    lost = replace(HEALTH, seq=2, state="lost", node="absent", reason="lost: no heartbeat for 350 ms")
+def test_a_lost_node_is_shown_with_its_reason() -> None:
+    lost = replace(HEALTH, seq=2, state="lost", node_state="absent", reason="lost: no heartbeat for 350 ms")
     page = _page(_view(HEALTH, lost))
     assert "lost" in page
     assert "no heartbeat for 350 ms" in page
     assert "0/1 nodes operational" in _page(_view(HEALTH, SERVICE, lost))
 
 
-def test_a_silent_daemon_is_told_apart_from_an_untouched_hand() -> None:
-    assert "silent" in _page(_view(HEALTH, SERVICE), alive=False)
-    assert "silent" not in _page(_view(HEALTH, SERVICE))
+def test_a_disconnected_daemon_differs_from_an_untouched_hand() -> None:
+    assert "disconnected" in _page(_view(HEALTH, SERVICE), alive=False)
+    assert "disconnected" not in _page(_view(HEALTH, SERVICE))
 
 
 @pytest.mark.parametrize(
     ("contact", "text"),
     [
         (CONTACT, "at (  12.30,   -4.00,    5.60) mm +- 0.030"),
-        (replace(CONTACT, strength="saturated", force_std_n=None), "> 1.23 N (saturated)"),
-        (replace(CONTACT, strength="invalid", force_n=None), "strength invalid"),
-        (replace(CONTACT, position_m=None, covariance_m2=None), "location invalid"),
-        (replace(CONTACT, event="end", reason="lost"), "lost after 0.50 s, peak 2.50 N"),
+        (replace(CONTACT, force_status="lower_bound", force_std_n=None), "> 1.23 N (saturated)"),
+        (replace(CONTACT, force_status="invalid", force_n=None), "force invalid"),
+        (
+            replace(CONTACT, position_m=None, covariance_m2=None, position_status="invalid"),
+            "position invalid",
+        ),
+        (replace(CONTACT, event="end", end_reason="lost"), "lost after 0.50 s, peak 2.50 N"),
     ],
 )
-def test_a_line_says_what_is_known_and_what_is_not(contact: wire.Contact, text: str) -> None:
-    assert text in line(contact)
+def test_a_contact_line_shows_values_or_their_status(contact: wire.Contact, text: str) -> None:
+    assert text in message_line(contact)
 
 
 def test_every_kind_of_message_has_a_line() -> None:
     frame = wire.HandFrame(
         **{**dict.fromkeys(wire.COLUMNS[wire.HandFrame], b""), "state": b"\1\0"},
-        v=1, run=1, seq=1, t_ns=1, tick=5, hand="right", links=("a", "b"), repeat=False,
+        v=1, session=1, seq=1, t_ns=1, tick=5, hand="right", links=("a", "b"), retained=False,
     )  # fmt: skip
     raw = wire.Raw(1, 1, 1, 1, 5, "right", ("a", "b"), b"", b"", b"\1\1", False)
-    assert "1 of 2 touched" in line(frame)
-    assert "2 fresh" in line(raw)
-    assert "600" not in line(HEALTH)
-    assert "serial 1003" in line(HEALTH)
-    assert "200 ticks/s" in line(SERVICE)
+    assert "1 of 2 touched" in message_line(frame)
+    assert "2 fresh" in message_line(raw)
+    assert "600" not in message_line(HEALTH)
+    assert "serial 1003" in message_line(HEALTH)
+    assert "200 ticks/s" in message_line(SERVICE)
 
 
-def test_what_rests_is_told_but_is_no_news() -> None:
-    assert "operational (event)" in line(replace(HEALTH, pace="event"))
-    pads = [replace(HEALTH, link=f"pad_{n}", state="off", node="stopped", pace="off") for n in range(40)]
+def test_pads_that_are_off_are_listed_after_faults() -> None:
+    assert "operational (event)" in message_line(replace(HEALTH, sampling="event"))
+    pads = [
+        replace(HEALTH, link=f"pad_{n}", state="off", node_state="stopped", sampling="off") for n in range(40)
+    ]
     page = _page(_view(*pads, replace(HEALTH, link="last", state="lost")), height=20)
     assert "lost" in page
     assert "last" in page
 
 
-def test_a_location_without_covariance_has_no_standard_deviation() -> None:
-    assert location_std_m(replace(CONTACT, covariance_m2=None)) != location_std_m(CONTACT)
+def test_a_position_without_covariance_has_no_standard_deviation() -> None:
+    assert position_std_m(replace(CONTACT, covariance_m2=None)) != position_std_m(CONTACT)
 
 
-def test_plain_lines_leave_out_what_only_repeats_itself(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plain_lines_omit_repetitions(capsys: pytest.CaptureFixture[str]) -> None:
     display = LineDisplay()
-    display.take(HEALTH)
-    display.take(replace(HEALTH, seq=2, samples=20))
-    display.take(replace(HEALTH, seq=3, state="stale", reason="no samples"))
+    display.show_message(HEALTH)
+    display.show_message(replace(HEALTH, seq=2, samples=20))
+    display.show_message(replace(HEALTH, seq=3, state="stale", reason="no samples"))
     for k in range(20):
-        display.take(replace(CONTACT, event="update", t_ns=CONTACT.t_ns + k * 5_000_000))
+        display.show_message(replace(CONTACT, event="update", t_ns=CONTACT.t_ns + k * 5_000_000))
     printed = capsys.readouterr().out.splitlines()
     assert len([text for text in printed if "health" in text]) == 2
     assert len([text for text in printed if "update" in text]) == 1
 
 
-def test_json_lines_hold_every_message_whole(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_lines_contain_every_message_completely(capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
-    LineDisplay(as_json=True).take(CONTACT)
+    LineDisplay(as_json=True).show_message(CONTACT)
     assert json.loads(capsys.readouterr().out)["force_n"] == 1.234
 
 
@@ -147,7 +210,7 @@ def _hand(pads: int, touched: int) -> HandView:
 
 
 @pytest.mark.parametrize(("width", "height"), [(160, 50), (120, 30), (100, 24), (80, 24), (60, 24), (40, 10)])
-def test_the_page_fits_any_terminal_and_names_who_is_touched(width: int, height: int) -> None:
+def test_the_table_fits_any_terminal_and_lists_touched_pads(width: int, height: int) -> None:
     lines = _page(_hand(15, 2), width=width, height=height).splitlines()
     assert len(lines) <= height
     assert all(len(text) <= width for text in lines)
@@ -160,46 +223,49 @@ def test_the_page_fits_any_terminal_and_names_who_is_touched(width: int, height:
         assert "12.30   -4.00    5.60" in text
 
 
-def test_where_there_is_no_room_for_all_the_touched_pads_come_first() -> None:
+def test_touched_pads_come_first_in_a_small_terminal() -> None:
     page = _page(_hand(40, 3), width=100, height=20)
     assert all(f"middle_proximal_{k} " in page for k in (37, 38, 39))
     assert "more" in page
 
 
 GUM = {
-    "kind": "stuck contact", "cause": "chewing gum, 10 mm from x0", "evidence": "it stands for 60 s",
+    "kind": "gum", "cause": "chewing gum, 10 mm from x0", "evidence": "it stands for 60 s",
     "remedy": "wipe it off", "since_ns": 1, "confidence": 0.99, "pad_m": [0.01, 0.02], "size_m": 0.006,
 }  # fmt: skip
 
 
-def test_what_the_supervisor_found_is_told_once_with_place_and_remedy(
+def test_a_diagnosis_is_shown_once_with_position_and_remedy(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    found = replace(HEALTH, trust="quarantined", findings=(GUM,))
+    found = replace(HEALTH, calibration_state="quarantined", diagnoses=(GUM,))
     assert "chewing gum, 10 mm from x0 (it stands" in _page(_view(HEALTH, found), width=200)
-    assert "trusted again" in _page(_view(HEALTH, found, replace(HEALTH, trust="trusted")))
+    assert "calibrated again" in _page(_view(HEALTH, found, replace(HEALTH, calibration_state="calibrated")))
     display = LineDisplay()
     for message in (HEALTH, found, found):
-        display.take(message)
+        display.show_message(message)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2
     assert "quarantined" in lines[1]
     assert lines[1].endswith("(it stands for 60 s): wipe it off")
 
 
-def test_a_finding_of_another_version_without_all_its_keys_is_told_too() -> None:
-    assert finding_text({"kind": "new thing"}) == "new thing"
+def test_a_diagnosis_with_missing_keys_is_shown() -> None:
+    assert diagnosis_text({"kind": "new thing"}) == "new thing"
 
 
-def test_status_tells_findings_the_slow_half_and_the_store(capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_shows_diagnoses_the_supervisor_and_the_store(capsys: pytest.CaptureFixture[str]) -> None:
     figures = {
-        "state": "running", "pid": 7, "restarts": 1, "died_of": "killed by signal 9", "lag_s": 0.31,
-        "dropped": 0, "malformed": 0, "late": 0, "word": "3 trusted", "store": "it is damaged",
+        "state": "running", "pid": 7, "restarts": 1, "exit_reason": "killed by signal 9", "lag_s": 0.31,
+        "dropped": 0, "malformed": 0, "late": 0, "summary": "3 calibrated",
+        "store_error": "it is damaged",
     }  # fmt: skip
-    answer = {"service": {"supervisor": figures}, "pads": [asdict(replace(HEALTH, findings=(GUM,)))]}
-    status._show_supervisor(answer, Console(width=200))
-    told = capsys.readouterr().out
-    assert "supervisor running, process 7, 0.3 s behind, 1 restarts (died last: killed by signal 9)" in told
-    assert "calibration store: it is damaged" in told
-    assert "right/thumb_tip: chewing gum, 10 mm from x0 (it stands" in told
-    assert not status._is_well({"state": "clear", "trust": "quarantined"})
+    answer = {"service": {"supervisor": figures}, "pads": [asdict(replace(HEALTH, diagnoses=(GUM,)))]}
+    status._print_supervisor(answer, Console(width=200))
+    printed = capsys.readouterr().out
+    assert (
+        "supervisor running, process 7, 0.3 s behind, 1 restarts (last exit: killed by signal 9)" in printed
+    )
+    assert "calibration store: it is damaged" in printed
+    assert "right/thumb_tip: chewing gum, 10 mm from x0 (it stands" in printed
+    assert not status._is_ok({"state": "clear", "calibration_state": "quarantined"})

@@ -1,8 +1,8 @@
-"""CANopen: the master's side, which boots and watches the nodes of a hand, and a simulated node's side."""
+"""CANopen master: CAN buses, SYNC, and the boot-up and supervision of a hand's nodes."""
 
 import logging
 
-# Both libraries log every time-out and every failed attempt to open a bus; here these are counted and told as
-# reasons. The application's own logging still gets them if it asks.
+# Both libraries log every timeout and every failed attempt to open a bus; handtouch counts these and reports
+# them as reasons. An application can still enable the libraries' logging.
 logging.getLogger("can").addHandler(logging.NullHandler())
 logging.getLogger("canopen").addHandler(logging.NullHandler())

@@ -1,4 +1,4 @@
-"""Mistakes in a deployment file, in the words of the file: place, value, and what would be right.
+"""Errors in a deployment file, each with its location in the file, the value and a remedy.
 
 Public names: `Problem`, `ConfigError`, `problems_of`. The definitions of the tables are in
 `handtouch.config.tables`.
@@ -15,28 +15,41 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 Tables = Mapping[str, type[BaseModel]]
-"""Definition of each table by its dotted path; "*" stands for a name that the user chose."""
+"""Model of each table by its dotted path; "*" stands for a name chosen by the user."""
 
-_UNITS = ("_mm", "_ms", "_deg", "_n", "_v", "_ma", "_ohm", "_bit_s", "_mm2", "_kpa", "_counts", "_samples")
-_OTHER_UNITS = frozenset(
+_UNIT_SUFFIXES = (
+    "_mm",
+    "_ms",
+    "_deg",
+    "_n",
+    "_v",
+    "_ma",
+    "_ohm",
+    "_bit_s",
+    "_mm2",
+    "_kpa",
+    "_counts",
+    "_samples",
+)
+_UNUSED_UNITS = frozenset(
     {"m", "cm", "um", "in", "s", "us", "hz", "khz", "rad", "kn", "mv", "a", "ua", "kohm", "pa", "mpa"}
 )
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One mistake: where it is, what stands there, and what would be right."""
+    """One error: its location in the file, the value there, and the remedy."""
 
-    place: str
+    location: str
     value: str
     remedy: str
 
     def __str__(self) -> str:
-        return f"{self.place}{self.value}: {self.remedy}"
+        return f"{self.location}{self.value}: {self.remedy}"
 
 
 class ConfigError(ValueError):
-    """A deployment file that can't be used; `problems` holds every mistake found, `str` a line for each."""
+    """A deployment file that can't be used; `problems` holds every error found, `str` one line for each."""
 
     def __init__(self, file: str, problems: tuple[Problem, ...]) -> None:
         super().__init__("\n".join(f"{file}: {problem}" for problem in problems))
@@ -47,16 +60,16 @@ class ConfigError(ValueError):
 def problems_of(
     raw: Mapping[str, Any], error: ValidationError, tables: Tables, kinds: Tables
 ) -> tuple[Problem, ...]:
-    """Every mistake that pydantic found in a file's tables; `kinds` are the definitions by `kind`."""
-    found = [_Mistake(raw, item, tables, kinds) for item in error.errors()]
-    slips = {(mistake.section, mistake.meant) for mistake in found if mistake.meant}
-    told = (mistake.tell() for mistake in found if (mistake.section, mistake.key) not in slips)
-    return tuple(dict.fromkeys(problem for problem in told if problem))
+    """Return the errors that pydantic found in a file's tables; `kinds` are the models by their `kind`."""
+    found = [_ValidationMistake(raw, item, tables, kinds) for item in error.errors()]
+    misspelled = {(mistake.section, mistake.closest_key) for mistake in found if mistake.closest_key}
+    problems = (mistake.to_problem() for mistake in found if (mistake.section, mistake.key) not in misspelled)
+    return tuple(dict.fromkeys(problem for problem in problems if problem))
 
 
-_WITH_KINDS = (["surface"], ["fault"])  # tables that one of several definitions holds for, by their `kind`
-_SCALARS = ("str", "int", "float", "bool")  # how pydantic marks the alternatives of a union of plain values
-_PLAIN = (
+_KIND_TABLES = (["surface"], ["fault"])  # tables that follow one of several models, by their key `kind`
+_SCALAR_TYPES = ("str", "int", "float", "bool")  # pydantic's marks for the alternatives of a scalar union
+_MESSAGE_REPLACEMENTS = (
     ("Input should be ", "must be "),
     ("Value error, ", ""),
     ("a valid dictionary", "a table of keys"),
@@ -67,87 +80,99 @@ _PLAIN = (
 )
 
 
-class _Mistake:
-    """One of pydantic's findings, located in the file."""
+class _ValidationMistake:
+    """One of pydantic's errors, located in the file."""
 
     def __init__(self, raw: Mapping[str, Any], error: Any, tables: Tables, kinds: Tables) -> None:
         loc = tuple(error["loc"])
-        self.kind: str = error["type"]
-        self.union = loc[-1] in _SCALARS if loc else False
+        self.error_type: str = error["type"]
+        self.is_scalar_union = loc[-1] in _SCALAR_TYPES if loc else False
         self.error = error
         self.kinds = kinds
-        path, self.section, self.shown, self.table = _locate(raw, loc[:-1] if self.union else loc)
+        path, self.section, self.key_path, self.table = _locate(
+            raw, loc[:-1] if self.is_scalar_union else loc
+        )
         self.path, self.tables = path, tables
         self.key = path[-1] if path else ""
-        self.model = _model(path[:-1], self.table, tables, kinds)
-        known = list(_keys(self.model))
-        self.meant = _near(self.key, known) if self.kind == "extra_forbidden" else None
+        self.model = _table_model(path[:-1], self.table, tables, kinds)
+        known = list(_key_descriptions(self.model))
+        self.closest_key = _closest_key(self.key, known) if self.error_type == "extra_forbidden" else None
 
     @property
-    def place(self) -> str:
-        return ": ".join(part for part in (self.section, self.shown) if part) or "top level"
+    def location(self) -> str:
+        return ": ".join(part for part in (self.section, self.key_path) if part) or "top level"
 
-    def tell(self) -> Problem | None:
-        """The mistake in the words of the file; None where another one says the same."""
-        value = f" = {_show(self.error['input'])}"
+    def to_problem(self) -> Problem | None:
+        """Return the error in terms of the file; None where another one already covers it."""
+        value = f" = {_format_input(self.error['input'])}"
         context = self.error.get("ctx", {})
-        if self.kind == "extra_forbidden":
-            return self._unknown(value)
-        if self.kind == "missing":
-            return Problem(self.place, "", f"is missing{self._header() or self._meaning()}")
-        if self.kind.startswith("union_tag"):
+        if self.error_type == "extra_forbidden":
+            return self._unknown_key_problem(value)
+        if self.error_type == "missing":
+            return Problem(
+                self.location, "", f"is missing{self._table_header_hint() or self._key_description()}"
+            )
+        if self.error_type.startswith("union_tag"):
             given = self.error["input"].get("kind") if isinstance(self.error["input"], dict) else None
-            at, value = (".kind", f" = {_show(given)}") if given is not None else ("", value)
-            return Problem(self.place + at, value, "needs " + _either(f'kind = "{k}"' for k in self.kinds))
-        if self.kind == "too_short" and len(self.error["input"]) >= context["min_length"]:
-            return None  # a list is also called too short when all its entries are wrong
-        if self.kind == "string_pattern_mismatch":
-            remedy = "a name starts with a letter and holds letters, digits, _ and - only"
-        elif self.union:
+            at, value = (".kind", f" = {_format_input(given)}") if given is not None else ("", value)
+            return Problem(
+                self.location + at, value, "needs " + _join_alternatives(f'kind = "{k}"' for k in self.kinds)
+            )
+        if self.error_type == "too_short" and len(self.error["input"]) >= context["min_length"]:
+            return None  # pydantic also calls a list too short when all its entries are invalid
+        if self.error_type == "string_pattern_mismatch":
+            remedy = "must start with a letter and hold only letters, digits, _ and -"
+        elif self.is_scalar_union:
             remedy = "must be a string or a number"
         else:
             remedy = str(self.error["msg"])
-            for theirs, ours in _PLAIN:
+            for theirs, ours in _MESSAGE_REPLACEMENTS:
                 remedy = remedy.replace(theirs, ours)
-        if self.kind == "tuple_type" and isinstance(self.error["input"], dict):
+        if self.error_type == "tuple_type" and isinstance(self.error["input"], dict):
             return Problem(f"[{self.key}]", "", f"must be a list of tables: write [[{self.key}]]")
-        if self.kind == "value_error":  # of a whole table; it says itself what is wrong
-            return Problem(self.place, "", remedy)
-        if self.kind == "model_type":
+        if self.error_type == "value_error":  # of a whole table; the message is complete
+            return Problem(self.location, "", remedy)
+        if self.error_type == "model_type":
             remedy = "must be a table of keys"
-        return Problem(self.place, value, remedy + self._meaning())
+        return Problem(self.location, value, remedy + self._key_description())
 
-    def _unknown(self, value: str) -> Problem:
+    def _unknown_key_problem(self, value: str) -> Problem:
         if not self.section and isinstance(self.error["input"], dict | list):
             remedy = (
-                f"did you mean [{self.meant}]?" if self.meant else f"known: {', '.join(_keys(self.model))}"
+                f"did you mean [{self.closest_key}]?"
+                if self.closest_key
+                else f"known: {', '.join(_key_descriptions(self.model))}"
             )
             return Problem(f"[{self.key}]", "", f"unknown table; {remedy}")
-        if not self.meant:
-            return Problem(self.place, value, f"unknown key; known here: {', '.join(_keys(self.model))}")
-        unit = " Keys carry their unit" if _without_unit(self.key) == _without_unit(self.meant) else ""
+        if not self.closest_key:
+            return Problem(
+                self.location, value, f"unknown key; known here: {', '.join(_key_descriptions(self.model))}"
+            )
+        unit = " Keys carry their unit" if _without_unit(self.key) == _without_unit(self.closest_key) else ""
         return Problem(
-            self.place, value, f'unknown key; did you mean "{self.meant}"?{unit}{self._meaning(self.meant)}'
+            self.location,
+            value,
+            f'unknown key; did you mean "{self.closest_key}"?{unit}{self._key_description(self.closest_key)}',
         )
 
-    def _header(self) -> str:
-        """How the file writes the table that is missing; empty where it is a plain key."""
+    def _table_header_hint(self) -> str:
+        """Return a hint at the header of a missing table; empty for a plain key."""
         path = ".".join(self.path)
         header = (
             f"[[{path}]]" if path in self.tables else f"[{path}.NAME]" if f"{path}.*" in self.tables else ""
         )
         return f"; it is a table of its own, under a line {header}" if header else ""
 
-    def _meaning(self, key: str = "") -> str:
+    def _key_description(self, key: str = "") -> str:
         key = key or self.key
-        meaning = _keys(self.model).get(key, "")
+        meaning = _key_descriptions(self.model).get(key, "")
         return f" ({key}: {meaning})" if meaning else ""
 
 
 def _locate(
     raw: Mapping[str, Any], loc: tuple[str | int, ...]
 ) -> tuple[list[str], str, str, Mapping[str, Any]]:
-    """Follow pydantic's location to (keys, section as the file writes it, rest, innermost table)."""
+    """Translate pydantic's location into (keys, section header, remaining keys, innermost table)."""
     here: Any = raw
     table: Mapping[str, Any] = raw
     path: list[str] = []
@@ -164,7 +189,7 @@ def _locate(
                 shown[-1] += f"[{step}]"
             continue
         if step == "[key]" or (
-            isinstance(here, dict) and here.get("kind") == step and path[-1:] in _WITH_KINDS
+            isinstance(here, dict) and here.get("kind") == step and path[-1:] in _KIND_TABLES
         ):
             continue  # pydantic's own marks, not keys of the file
         if isinstance(here, dict):
@@ -177,43 +202,43 @@ def _locate(
     return path, section, ".".join(shown), table
 
 
-def _model(
+def _table_model(
     path: list[str], table: Mapping[str, Any], tables: Tables, kinds: Tables
 ) -> type[BaseModel] | None:
-    """The definition that the table at a path must follow."""
-    if path[-1:] in _WITH_KINDS:
+    """Return the model of the table at a path."""
+    if path[-1:] in _KIND_TABLES:
         return kinds.get(str(table.get("kind")))
     return tables.get(".".join(path)) or tables.get(".".join([*path[:-1], "*"]))
 
 
-def _keys(model: type[BaseModel] | None) -> dict[str, str]:
-    """Keys of a table as the file spells them, with their meaning."""
+def _key_descriptions(model: type[BaseModel] | None) -> dict[str, str]:
+    """Return the keys of a table as spelled in the file, with their descriptions."""
     fields = model.model_fields if model else {}
     return {field.alias or name: field.description or "" for name, field in fields.items()}
 
 
-def _near(key: str, candidates: list[str]) -> str | None:
-    """The candidate that differs from the key by a forgotten unit or a slip of the pen."""
+def _closest_key(key: str, candidates: list[str]) -> str | None:
+    """Return the candidate that differs from the key by a missing unit or a misspelling."""
     for candidate in candidates:
-        if any(candidate == key + unit or key == candidate + unit for unit in _UNITS):
+        if any(candidate == key + unit or key == candidate + unit for unit in _UNIT_SUFFIXES):
             return candidate
     return next(iter(difflib.get_close_matches(key, candidates, n=1, cutoff=0.6)), None)
 
 
 def _without_unit(key: str) -> str:
-    """The quantity that a key names; what follows its last _ counts as a unit, known here or not."""
-    known = next((unit for unit in sorted(_UNITS, key=len, reverse=True) if key.endswith(unit)), "")
+    """Return a key without its unit."""
+    known = next((unit for unit in sorted(_UNIT_SUFFIXES, key=len, reverse=True) if key.endswith(unit)), "")
     if known:
         return key.removesuffix(known)
     stem, _, last = key.rpartition("_")
-    return stem if last in _OTHER_UNITS else key
+    return stem if last in _UNUSED_UNITS else key
 
 
-def _either(alternatives: Iterator[str]) -> str:
+def _join_alternatives(alternatives: Iterator[str]) -> str:
     *most, last = alternatives
     return f"{', '.join(most)} or {last}"
 
 
-def _show(value: object) -> str:
+def _format_input(value: object) -> str:
     text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else text[:57] + "..."

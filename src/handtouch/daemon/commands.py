@@ -1,95 +1,99 @@
-"""What the control endpoint can be asked for; each command checks its arguments before it touches anything.
+"""Commands of the control endpoint; each validates its arguments before it changes anything.
 
-Public names: `Commands`.
+Public name: `ControlCommands`.
 """
 
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from handtouch import wire
+from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LawParameters
 from handtouch.config import Deployment, Table
-from handtouch.config.tables import Output, Wants
-from handtouch.daemon.control import Command, Job, RefusedError, Reply
-from handtouch.daemon.logs import set_level
-from handtouch.daemon.pacer import Pacer
-from handtouch.daemon.pipeline import Pipeline
-from handtouch.daemon.reload import Fresh, Reload
-from handtouch.daemon.report import Report
-from handtouch.daemon.scene import Demand, select
-from handtouch.daemon.tare import Tare
-from handtouch.supervise.calibration import LEAST_GAIN, MOST_GAIN, Law
+from handtouch.config.files import deployment_files
+from handtouch.config.tables import Output, SceneRequest
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.scene import Demand, select_pads
+from handtouch.daemon.arguments import parse_arguments
+from handtouch.daemon.control import (
+    Command,
+    Job,
+    RefusedError,
+    Reply,
+)
+from handtouch.daemon.reload import DeploymentChange, ReloadJob
+from handtouch.daemon.sampling import SamplingController
+from handtouch.daemon.status_reporter import StatusReporter
+from handtouch.daemon.tare import TareJob
+from handtouch.host.build import build_info
+from handtouch.host.logs import set_level
 
 _log = logging.getLogger("handtouch.control")
 
-Patterns = Annotated[
+PadPatterns = Annotated[
     tuple[Annotated[str, Field(max_length=200)], ...], Field(strict=False, min_length=1, max_length=1000)
 ]
-Who = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=64)]
-Calibration = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
-Gain = Annotated[float, Field(ge=LEAST_GAIN, le=MOST_GAIN)]
+ClientName = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=64)]
+CalibrationId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
+Gain = Annotated[float, Field(ge=MIN_GAIN, le=MAX_GAIN)]
 Offset = Annotated[float, Field(ge=-1e9, le=1e9)]
 Resistance = Annotated[float, Field(ge=1e-3, le=1e12)]
 
 
-class _Nothing(Table):
+class _NoArguments(Table):
     pass
 
 
-class _Pads(Table):
-    pads: Patterns
+class _PadArguments(Table):
+    pads: PadPatterns
 
 
-class _Switch(_Pads):
-    name: Who = "control"
+class _SwitchArguments(_PadArguments):
+    name: ClientName = "control"
 
 
-class _Scene(Table):
+class _SceneArguments(Table):
     links: Annotated[tuple[str, ...], Field(strict=False, max_length=1000)] | None = None
     outputs: Annotated[tuple[Output, ...], Field(strict=False, max_length=10)] | None = None
     tolerance_mm: Annotated[float, Field(ge=0, le=10)] | None = None
     rate_hz: Annotated[float, Field(ge=0)] | None = None  # 0: every SYNC
-    name: Who | None = None
+    name: ClientName | None = None
     lease_s: Annotated[float, Field(ge=0.1, le=3600)] = 10.0
     reset: bool = False
 
 
-class _Law(Table):
+class _LawArguments(Table):
     contact_ohm_mm2: Resistance
     alpha: Annotated[float, Field(ge=0.1, le=10)]
     ohm_per_square: Resistance
 
 
-class _Calibrate(Table):
+class _CalibrateArguments(Table):
     pad: Annotated[str, Field(max_length=200)]
-    name: Calibration | None = None
+    name: CalibrationId | None = None
     gains: Annotated[tuple[Gain, Gain, Gain, Gain], Field(strict=False)] | None = None
     offset_counts: Annotated[tuple[Offset, Offset, Offset, Offset], Field(strict=False)] | None = None
-    law: _Law | None = None
+    law: _LawArguments | None = None
 
 
-class _Reload(Table):
-    trial: bool = False
+class _ReloadArguments(Table):
+    dry_run: bool = False
 
 
-class _Log(Table):
+class _LogArguments(Table):
     level: Literal["debug", "info", "warning", "error"]
 
 
-_T = TypeVar("_T", bound=Table)
+class ControlCommands:
+    """The daemon's commands, by name in `by_name`; they run in the hot thread, between two ticks.
 
-
-class Commands:
-    """The commands of a daemon, by name in `by_name`; they run in the hot thread, between two ticks.
-
-    `read` reads the deployment again, None where it came from no file.
+    `read` reads the deployment file again; None if the deployment has no file.
     """
 
     def __init__(
@@ -97,15 +101,15 @@ class Commands:
         deployment: Deployment,
         read: Callable[[], Deployment] | None,
         pipeline: Pipeline,
-        report: Report,
+        reporter: StatusReporter,
         demand: Demand,
-        pacer: Pacer,
+        sampling: SamplingController,
     ) -> None:
         self.deployment = deployment
-        self._read, self._pipeline, self._report = read, pipeline, report
-        self._demand, self._pacer = demand, pacer
-        self._names = demand.scenes.names
-        self._reload: Reload | None = None
+        self._read_deployment, self._pipeline, self._reporter = read, pipeline, reporter
+        self._demand, self._sampling = demand, sampling
+        self._pad_names = demand.scenes.names
+        self._reload_job: ReloadJob | None = None
         self.by_name: dict[str, Command] = {
             "status": self._status,
             "snapshot": self._snapshot,
@@ -115,175 +119,178 @@ class Commands:
             "enable": self._enable,
             "disable": self._disable,
             "reload": self._reload_file,
-            "log": self._log_level,
+            "log": self._set_log_level,
         }
 
     def _status(self, arguments: dict[str, Any], now_ns: int) -> Reply:
-        _checked(_Nothing, arguments)
-        return {**self._report.status(), "scene": self._told_scene(now_ns)}
+        parse_arguments(_NoArguments, arguments)
+        return {**self._reporter.status(now_ns), "scene": self._scene_reply(now_ns)}
 
     def _snapshot(self, arguments: dict[str, Any], now_ns: int) -> Reply:
-        """All that can be said of the hands now, wanted by somebody or not."""
-        _checked(_Nothing, arguments)
-        tick, wanted = self._pipeline.tick, self._demand.wanted
+        """Return all hands and contacts now, computed whether requested or not."""
+        parse_arguments(_NoArguments, arguments)
+        tick, requested = self._pipeline.tick, self._demand.requested
         tick.solve_all()
-        made = {topic: make(now_ns) for topic, make in self._pipeline.messages.present().items()}
-        self._pipeline.want(wanted)
-        told = {topic: wire.plain(message) for topic, message in made.items() if message is not None}
+        messages = {
+            topic: make(now_ns) for topic, make in self._pipeline.messages.retained_messages().items()
+        }
+        self._pipeline.apply_demand(requested)
+        maps = {topic: wire.to_map(message) for topic, message in messages.items() if message is not None}
         return {
-            "hands": {topic[len("hand/") :]: m for topic, m in told.items() if topic.startswith("hand/")},
-            "contacts": [message for topic, message in told.items() if topic.startswith("contact/")],
+            "hands": {topic[len("hand/") :]: m for topic, m in maps.items() if topic.startswith("hand/")},
+            "contacts": [message for topic, message in maps.items() if topic.startswith("contact/")],
         }
 
     def _scene(self, arguments: dict[str, Any], now_ns: int) -> Reply:
-        asked = _checked(_Scene, arguments)
+        request = parse_arguments(_SceneArguments, arguments)
         keys = ("links", "outputs", "tolerance_mm", "rate_hz")
-        given = {key: value for key in keys if (value := getattr(asked, key)) is not None}
+        given = {key: value for key in keys if (value := getattr(request, key)) is not None}
         if given.get("rate_hz") == 0:
             given["rate_hz"] = None
-        if given and asked.reset:
-            raise RefusedError("reset takes no other change; ask for one after the other")
+        if given and request.reset:
+            raise RefusedError("reset can't be combined with other changes; send two requests")
         scenes = self._demand.scenes
         try:
-            if asked.name is not None:
-                if asked.reset:
-                    scenes.leave(asked.name)
+            if request.name is not None:
+                if request.reset:
+                    scenes.remove_client(request.name)
                 else:
-                    known = scenes.held_by(asked.name) or Wants()
-                    lease_ns = round(asked.lease_s * 1e9)
-                    scenes.hold(asked.name, known.model_copy(update=given), lease_ns, now_ns)
-            elif asked.reset:
+                    known = scenes.client_scene(request.name) or SceneRequest()
+                    lease_ns = round(request.lease_s * 1e9)
+                    scenes.set_client_scene(request.name, known.model_copy(update=given), lease_ns, now_ns)
+            elif request.reset:
                 scenes.set_base(None)
             elif given:
                 kept = {key: getattr(scenes.base, key) for key in keys}
-                scenes.set_base(Wants(**{**kept, **given}))
+                scenes.set_base(SceneRequest(**{**kept, **given}))
         except ValueError as error:
             raise RefusedError(str(error)) from error
-        self._demand.step(now_ns)
-        return self._told_scene(now_ns)
+        self._demand.update(now_ns)
+        return self._scene_reply(now_ns)
 
-    def _told_scene(self, now_ns: int) -> Reply:
-        return {"scenes": self._demand.scenes.tell(now_ns), "pads": self._demand.tell()}
+    def _scene_reply(self, now_ns: int) -> Reply:
+        return {"scenes": self._demand.scenes.describe(now_ns), "pads": self._demand.describe_pads()}
 
     def _tare(self, arguments: dict[str, Any], now_ns: int) -> Job:
-        chosen = self._chosen(_checked(_Pads, arguments).pads)
-        return Tare(self._names, chosen, self._pipeline.tick, self._pacer, now_ns, self._tared)
+        selected = self._select_pads(parse_arguments(_PadArguments, arguments).pads)
+        return TareJob(self._pad_names, selected, self._pipeline.tick, self._sampling, now_ns, self._on_tared)
 
-    def _tared(self, pad: int) -> None:
-        if self._report.supervisor is not None:
-            self._report.supervisor.put(pad, {"offset_counts"})
+    def _on_tared(self, pad: int) -> None:
+        if self._reporter.supervisor is not None:
+            self._reporter.supervisor.register_manual_calibration(pad, {"offset_counts"})
 
     def _calibrate(self, arguments: dict[str, Any], now_ns: int) -> Reply:  # noqa: ARG002
-        """Change what is given of a pad's calibration, and tell all of it."""
-        asked = _checked(_Calibrate, arguments)
-        pads = np.flatnonzero(self._chosen([asked.pad]))
+        """Change the given parts of a pad's calibration, and return the whole calibration."""
+        request = parse_arguments(_CalibrateArguments, arguments)
+        pads = np.flatnonzero(self._select_pads([request.pad]))
         if len(pads) != 1:
-            raise RefusedError(f"pad = {asked.pad!r} names {len(pads)} pads; a calibration is of one")
+            raise RefusedError(f"pad = {request.pad!r} matches {len(pads)} pads; name exactly one")
         (pad,) = pads.tolist()
         model = self._pipeline.model
-        before = model.calibration[pad]
-        if asked.model_fields_set > {"pad"}:
-            if asked.name is None:
-                raise RefusedError("name is missing: contacts tell the calibration by it")
-            self._put(pad, asked, asked.name)
-            _log.info("%s: calibration %s -> %s", "/".join(self._names[pad]), before, asked.name)
-        hand, link = self._names[pad]
+        before = model.calibration_ids[pad]
+        if request.model_fields_set > {"pad"}:
+            if request.name is None:
+                raise RefusedError("name is missing: contacts are published with it as calibration_id")
+            self._apply_calibration(pad, request, request.name)
+            _log.info("%s: calibration %s -> %s", "/".join(self._pad_names[pad]), before, request.name)
+        hand, link = self._pad_names[pad]
         law = model.law(pad)
         return {
             "hand": hand,
             "link": link,
-            "before": before,
-            "now": model.calibration[pad],
-            "nominal": model.nominal[pad],
+            "previous_calibration_id": before,
+            "calibration_id": model.calibration_ids[pad],
+            "default_calibration_id": model.default_calibration_ids[pad],
             "gains": model.gains[pad].tolist(),
-            "offset_counts": self._pipeline.tick.baseline.expected[pad].tolist(),
-            "law": {key: getattr(law, key) for key in _Law.model_fields},
+            "offset_counts": self._pipeline.tick.baseline.expected_counts[pad].tolist(),
+            "law": {key: getattr(law, key) for key in _LawArguments.model_fields},
         }
 
-    def _put(self, pad: int, asked: _Calibrate, name: str) -> None:
+    def _apply_calibration(self, pad: int, request: _CalibrateArguments, name: str) -> None:
         model = self._pipeline.model
-        offsets, largest = asked.offset_counts, float(model.largest_counts[pad]) / 2
-        if offsets is not None and max(map(abs, offsets)) > largest:
-            raise RefusedError(f"offset_counts = {list(offsets)}: beyond half the range, {largest:.0f}")
+        offsets, max_counts = request.offset_counts, float(model.max_counts[pad]) / 2
+        if offsets is not None and max(map(abs, offsets)) > max_counts:
+            raise RefusedError(
+                f"offset_counts = {list(offsets)}: larger than half the range, {max_counts:.0f} counts"
+            )
         law = model.laws[pad]
-        if asked.law is not None:
-            law = Law(**asked.law.model_dump(), covariance=((0.0,) * 3,) * 3)
-        model.calibrate(pad, model.gains[pad] if asked.gains is None else asked.gains, name, law)
-        self._pipeline.adopt(model, np.array([pad]))
+        if request.law is not None:
+            law = LawParameters(**request.law.model_dump(), covariance=((0.0,) * 3,) * 3)
+        model.set_gains_and_law(pad, model.gains[pad] if request.gains is None else request.gains, name, law)
+        self._pipeline.replace_model(model, np.array([pad]))
         if offsets is not None:
-            self._pipeline.tick.assume(pad, offsets)
-        if self._report.supervisor is not None:
+            self._pipeline.tick.set_baseline(pad, offsets)
+        if self._reporter.supervisor is not None:
             parts = ("gains", "law", "offset_counts")
-            self._report.supervisor.put(pad, {part for part in parts if getattr(asked, part) is not None})
+            self._reporter.supervisor.register_manual_calibration(
+                pad, {part for part in parts if getattr(request, part) is not None}
+            )
 
     def _disable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
-        asked = _checked(_Switch, arguments)
-        pads = np.flatnonzero(self._chosen(asked.pads)).tolist()
-        self._demand.disable(pads, asked.name)
-        _log.info("%s: disabled by %s", ", ".join("/".join(self._names[pad]) for pad in pads), asked.name)
-        return self._switched(now_ns)
+        request = parse_arguments(_SwitchArguments, arguments)
+        pads = np.flatnonzero(self._select_pads(request.pads)).tolist()
+        self._demand.disable(pads, request.name)
+        _log.info(
+            "%s: disabled by %s", ", ".join("/".join(self._pad_names[pad]) for pad in pads), request.name
+        )
+        return self._disabled_reply(now_ns)
 
     def _enable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
-        asked = _checked(_Switch, arguments)
-        pads = np.flatnonzero(self._chosen(asked.pads)).tolist()
+        request = parse_arguments(_SwitchArguments, arguments)
+        pads = np.flatnonzero(self._select_pads(request.pads)).tolist()
         self._demand.enable(pads)
-        _log.info("%s: enabled by %s", ", ".join("/".join(self._names[pad]) for pad in pads), asked.name)
-        return self._switched(now_ns)
+        _log.info(
+            "%s: enabled by %s", ", ".join("/".join(self._pad_names[pad]) for pad in pads), request.name
+        )
+        return self._disabled_reply(now_ns)
 
-    def _switched(self, now_ns: int) -> Reply:
-        self._demand.step(now_ns)
-        return {"disabled": {"/".join(self._names[pad]): by for pad, by in self._demand.disabled_by.items()}}
+    def _disabled_reply(self, now_ns: int) -> Reply:
+        self._demand.update(now_ns)
+        return {
+            "disabled": {"/".join(self._pad_names[pad]): by for pad, by in self._demand.disabled_by.items()}
+        }
 
     def _reload_file(self, arguments: dict[str, Any], now_ns: int) -> Job:  # noqa: ARG002
-        asked = _checked(_Reload, arguments)
-        if self._read is None:
+        request = parse_arguments(_ReloadArguments, arguments)
+        if self._read_deployment is None:
             raise RefusedError("this daemon was not started from a deployment file")
-        if self._reload is not None and not self._reload.done:
-            raise RefusedError("another one is under way; ask again when it is done")
-        self._reload = Reload(self.deployment, self._read, self._adopt, asked.trial)
-        return self._reload
+        if self._reload_job is not None and not self._reload_job.done:
+            raise RefusedError("another reload is in progress; retry when it has finished")
+        self._reload_job = ReloadJob(
+            self.deployment, self._read_deployment, self._apply_reload, request.dry_run
+        )
+        return self._reload_job
 
-    def _adopt(self, fresh: Fresh) -> None:
-        """Take over what the file says now: all of it, between two ticks."""
-        if fresh.model is not None:
-            fresh.model.take_over(self._pipeline.model)
-            self._pipeline.adopt(fresh.model, np.array(sorted(fresh.pads), dtype=np.intp))
-        if fresh.deployment.daemon.log_level != self.deployment.daemon.log_level:
-            set_level(fresh.deployment.daemon.log_level)
-        self.deployment = fresh.deployment
-        if self._report.supervisor is not None and fresh.pads:
-            self._report.supervisor.adopt(fresh.deployment, time.monotonic_ns())
-        self._pipeline.journal.serve(fresh.deployment, now_ns=time.monotonic_ns())
-        self._demand.scenes.set_file(fresh.deployment.scene)
-        self._pacer.set_idle(fresh.deployment.scene)
-        changed = [*fresh.tables, *("/".join(self._names[pad]) for pad in fresh.pads)]
-        _log.info("deployment read again; changed: %s", ", ".join(changed) or "nothing")
+    def _apply_reload(self, change: DeploymentChange, now_ns: int) -> None:
+        """Apply a reloaded deployment completely, between two ticks."""
+        if change.model is not None:
+            change.model.copy_calibrations(self._pipeline.model)
+            self._pipeline.replace_model(
+                change.model, np.array(sorted(change.changed_keys_of_pad), dtype=np.intp)
+            )
+        if change.deployment.daemon.log_level != self.deployment.daemon.log_level:
+            set_level(change.deployment.daemon.log_level)
+        self.deployment = change.deployment
+        if self._reporter.supervisor is not None and change.changed_keys_of_pad:
+            self._reporter.supervisor.restart_with(change.deployment, now_ns)
+        files = deployment_files(change.deployment)
+        self._pipeline.journal.publish_config(change.deployment, files, build_info(), now_ns)
+        self._demand.scenes.set_file(change.deployment.scene)
+        self._sampling.set_idle_settings(change.deployment.scene)
+        changed = [
+            *change.changed_tables,
+            *("/".join(self._pad_names[pad]) for pad in change.changed_keys_of_pad),
+        ]
+        _log.info("deployment reloaded; changed: %s", ", ".join(changed) or "nothing")
 
-    def _log_level(self, arguments: dict[str, Any], now_ns: int) -> Reply:  # noqa: ARG002
-        asked = _checked(_Log, arguments)
+    def _set_log_level(self, arguments: dict[str, Any], now_ns: int) -> Reply:  # noqa: ARG002
+        request = parse_arguments(_LogArguments, arguments)
         before = logging.getLevelName(logging.getLogger("handtouch").getEffectiveLevel()).lower()
-        set_level(asked.level)
-        return {"before": before, "now": asked.level}
+        set_level(request.level)
+        return {"previous_level": before, "level": request.level}
 
-    def _chosen(self, patterns: Sequence[str]) -> NDArray[np.bool_]:
+    def _select_pads(self, patterns: Sequence[str]) -> NDArray[np.bool_]:
         try:
-            return select(patterns, self._names)
+            return select_pads(patterns, self._pad_names)
         except ValueError as error:
             raise RefusedError(str(error)) from error
-
-
-def _checked(kind: type[_T], arguments: dict[str, Any]) -> _T:
-    """The arguments, if they are of that kind. Raises RefusedError naming every mistake."""
-    try:
-        return kind.model_validate(arguments)
-    except ValidationError as error:
-        known = ", ".join(kind.model_fields) or "none"
-        raise RefusedError(
-            "; ".join(
-                f"{'.'.join(map(str, item['loc']))} = {item['input']!r:.60}: {item['msg']}"
-                if item["type"] != "missing"
-                else f"{'.'.join(map(str, item['loc']))} is missing"
-                for item in error.errors(include_url=False)[:5]
-            )
-            + f" (arguments: {known})"
-        ) from error

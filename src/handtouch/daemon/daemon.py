@@ -1,6 +1,6 @@
-"""The daemon: owns buses, sockets and the clock, and drives the pipeline in one hot loop.
+"""The daemon: opens buses and endpoints, reads the clock, and runs the pipeline in one loop.
 
-Public names: `Daemon`, `run`.
+Public names: `HandtouchDaemon`, `run`, `StartError`.
 """
 
 from __future__ import annotations
@@ -8,13 +8,14 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import secrets
 import select
 import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,177 +23,215 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
+from handtouch import wire
+from handtouch.calibration.store import store_path
+from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import BusError, Port
-from handtouch.canbus.bus.router import SYNC_ID
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.master import Master
-from handtouch.canbus.nodes.spec import NodeSpec, checked, node_specs
-from handtouch.canbus.objects.eds import EdsError
+from handtouch.canbus.nodes.spec import NodeSpec, check_nodes, node_specs
+from handtouch.client.keys import KeyFileError
 from handtouch.config import ConfigError, Deployment, load, with_bus
-from handtouch.daemon import histogram, logs, realtime
-from handtouch.daemon.commands import Commands
-from handtouch.daemon.control import Control
-from handtouch.daemon.cycle import BusyPoll
-from handtouch.daemon.gravity import Gravity
-from handtouch.daemon.inputs import Inputs
-from handtouch.daemon.joints import JointTeller
-from handtouch.daemon.metrics import PATH, Exporter
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.notify import Notifier, Pulse
-from handtouch.daemon.pacer import Pacer
-from handtouch.daemon.perceive import Perceiving
-from handtouch.daemon.pipeline import Pipeline
-from handtouch.daemon.publisher import Publisher
-from handtouch.daemon.rehearsal import Rehearsal
-from handtouch.daemon.report import Report
-from handtouch.daemon.scene import Demand, Needs, Scenes, Wanted
-from handtouch.daemon.security import Gate
-from handtouch.daemon.supervisor import Supervisor
-from handtouch.hand.joints import JointStates
-from handtouch.hand.robot import Robots, served
-from handtouch.keys import KeysError
-from handtouch.signals import stop_on_signals
-from handtouch.supervise.store import store_path
+from handtouch.config.eds import EdsError
+from handtouch.config.files import deployment_files
+from handtouch.core.cache_warming import CacheWarmer
+from handtouch.core.cycle import BusyPoll
+from handtouch.core.gravity import GravityTracker
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.scene import (
+    ActiveScenes,
+    Demand,
+    RequestedOutputs,
+    SceneRequirements,
+)
+from handtouch.daemon import stage_timer
+from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.commands import ControlCommands
+from handtouch.daemon.control import ControlServer, open_control_socket
+from handtouch.daemon.inputs import InputReceiver
+from handtouch.daemon.joint_messages import JointPublisher
+from handtouch.daemon.metrics import MetricsExporter
+from handtouch.daemon.metrics_page import METRICS_PATH
+from handtouch.daemon.percepts import PerceptPublisher
+from handtouch.daemon.publisher import Publisher, RetainedMessages
+from handtouch.daemon.sampling import SamplingController
+from handtouch.daemon.status_reporter import StatusReporter
+from handtouch.daemon.supervisor_client import SupervisorClient
+from handtouch.hand.joints import JointStateBuffer
+from handtouch.hand.robot_models import RobotModels, drop_invalid_urdfs
+from handtouch.host import logs, realtime
+from handtouch.host.build import build_info
+from handtouch.host.process import process_statistics
+from handtouch.host.signals import stop_on_signals
+from handtouch.host.systemd import ServiceWatchdog, SystemdNotifier
 
 _log = logging.getLogger("handtouch.daemon")
 
-_COLD_NS = 1_000_000
-"""After a rest of that length others have had the caches: a tick would take several times as long."""
-_BEFORE_SYNC_NS, _BEFORE_TICK_NS = 400_000, 250_000
-"""When all is rehearsed, and the tick once more: the nearer, the more of it is still in the caches."""
+_CACHE_COLD_AFTER_NS = 1_000_000
+"""After this idle time other processes have replaced the caches, and a tick takes several times as long"""
+_REHEARSE_BEFORE_SYNC_NS, _REHEARSE_BEFORE_TICK_NS = 400_000, 250_000
+"""When to warm all caches before SYNC, and those of the tick once more before the samples arrive"""
 _NEVER_NS = 1 << 62
-_HOUSE_NS = 4_000_000
-"""Least time between two looks at nodes, buses, health and requests: a tick every millisecond needn't."""
-_CARRIERS = 3
-"""Threads that a message goes through, each waking the next: ZeroMQ's here and there, and the subscriber."""
-_GIL_SWITCH_S = 0.0005  # a thread that boots a node or builds a model lets the hot one in after so long
+_BACKGROUND_PERIOD_NS = 4_000_000
+"""Least period of polling nodes, buses, health and requests, which is longer than a tick's at high rates"""
+_MESSAGE_PATH_THREADS = 3
+"""Threads that a message passes, each waking the next: ZeroMQ's on both sides, and the subscriber's"""
+_GIL_SWITCH_INTERVAL_S = 0.0005  # limits how long a thread that boots a node or builds a model holds the GIL
+_SESSION_BITS = 48  # exact in every language's numbers
 
 
-class Daemon:
-    """A deployment at work: `open` it, `run` it in one thread until told to stop, `close` it.
+class StartError(Exception):
+    """The daemon can't start; `permanent` if a restart can't help, as with a wrong configuration."""
 
-    `read` reads the deployment anew when control asks for it. Raises BusError or OSError, each naming what is
-    missing and a remedy, when a bus or an endpoint can't be opened; KeysError for keys that can't be used.
-    `beside`: folder of the deployment's file, where its calibration store may be.
+    def __init__(self, error: Exception, *, permanent: bool) -> None:
+        super().__init__(str(error))
+        self.permanent = permanent
+
+
+@dataclass(frozen=True)
+class _Resources:
+    """Endpoints, buses and pipeline of a daemon, and the stack that closes them."""
+
+    stack: ExitStack
+    authenticator: Authenticator
+    publisher: Publisher
+    retained_messages: RetainedMessages
+    control_socket: tuple[zmq.Socket[bytes], str]
+    inputs: InputReceiver
+    pipeline: Pipeline
+    ports: dict[str, Port]
+
+
+class HandtouchDaemon:
+    """The running service of a deployment: `open` it, `run` it in one thread, `close` it.
+
+    `read` reads the deployment file again for the command `reload`. `folder` is the deployment file's, where
+    the calibration store is by default. `on_message` gets every health and service message.
     """
 
     def __init__(
         self,
         deployment: Deployment,
-        model: PadModel | None = None,
+        resources: _Resources,
+        robots: RobotModels,
+        now_ns: int,
         read: Callable[[], Deployment] | None = None,
-        beside: Path | None = None,
+        folder: Path | None = None,
+        on_message: Callable[[wire.Health | wire.Service], None] | None = None,
     ) -> None:
         self.deployment = deployment
-        self._rehearse_ns = _NEVER_NS
+        self.authenticator, self.publisher = resources.authenticator, resources.publisher
+        self.inputs, self.ports, self.pipeline = resources.inputs, resources.ports, resources.pipeline
+        self._stack = resources.stack
+        self._next_rehearsal_ns = _NEVER_NS
         self._rehearsed = False  # since the last tick
-        self._house_ns = 0  # when to look after the rest again
-        settings = deployment.daemon
-        period_ns = round(settings.sync_period_ms * 1e6)
+        self._next_background_ns = 0
+        settings, pipeline, inputs, publisher = deployment.daemon, self.pipeline, self.inputs, self.publisher
+        period_ns, session = pipeline.cycle.period_ns, publisher.session
         self._busy_poll = BusyPoll(round(settings.busy_poll_us * 1e3))
-        robots = Robots(deployment)
-        with ExitStack() as opened:
-            self._open_endpoints(opened, robots)
-            self._connect(model or PadModel(deployment), period_ns, robots)
-            self.ports: dict[str, Port] = {}
-            for bus in deployment.buses:
-                self.ports[bus.name] = port = Port.open(bus, self.pipeline.slab)
-                opened.callback(port.close)
-            self._opened = opened.pop_all()
-        self.master = Master(self.ports, self._specs(), period_ns)
+        pipeline.transforms.joints_at = inputs.joints_at
+        self.joint_publisher = JointPublisher(robots, inputs.joints_at, publisher, session)
+        self.gravity = GravityTracker(robots, pipeline.model.size, inputs.joints_at, inputs.gravity_direction)
+        self.rehearsal = CacheWarmer(pipeline, publisher)
+        self.percepts = PerceptPublisher(pipeline, publisher, session, inputs.commanded_joints_at)
+        self.master = Master(self.ports, self._node_specs(), period_ns)
         self.sync = Sync(list(self.ports.values()), period_ns)
-        self._watch_over(beside)
-        self._serve(read, period_ns, robots)
-
-    def _open_endpoints(self, opened: ExitStack, robots: Robots) -> None:
-        settings = self.deployment.daemon
-        context = opened.enter_context(zmq.Context())
-        self.gate = Gate(context, Path(settings.keys) if settings.keys else None)
-        opened.callback(self.gate.close)
-        self.publisher = Publisher(context, settings.live, settings.complete, self.gate)
-        opened.callback(self.publisher.close)
-        self.control = Control(context, settings.control, self.gate)
-        opened.callback(self.control.close)
-        self.inputs = self._open_inputs(context, robots)
-        opened.callback(self.inputs.close)
-
-    def _connect(self, model: PadModel, period_ns: int, robots: Robots) -> None:
-        """From samples and what robots tell to messages."""
-        publisher, inputs, window = self.publisher, self.inputs, self.deployment.daemon.window
-        self.pipeline = pipeline = Pipeline(model, period_ns, window, publisher, publisher.run, robots)
-        pipeline.frames.joints_at = inputs.joints_at
-        inputs.refer = pipeline.told.refer
-        self.joints = JointTeller(robots, inputs.joints_at, publisher)
-        self.gravity = Gravity(robots, model.size, inputs.joints_at, inputs.down_at)
-        self.rehearsal = Rehearsal(pipeline, publisher)
-        self.perceiving = Perceiving(pipeline, publisher, publisher.run)
-        self.perceiving.commands_at = inputs.commands_at
-        publisher.present.update(pipeline.messages.present())
-        publisher.present.update(pipeline.journal.present())
-        pipeline.journal.serve(self.deployment, time.monotonic_ns())
-
-    def _watch_over(self, beside: Path | None) -> None:
-        """Nodes, buses and pads."""
-        settings = self.deployment.daemon
-        self.report = Report(
-            self.deployment,
-            self.pipeline,
+        self.supervisor = self._build_supervisor(folder)
+        self.reporter = StatusReporter(
+            deployment,
+            pipeline,
             self.master,
             self.ports,
             self.sync,
-            self.publisher,
-            self.gate,
-            self.control,
+            publisher,
+            started_ns=now_ns,
+            wall_offset_ns=lambda: time.time_ns() - time.monotonic_ns(),
+            process_statistics=process_statistics,
+            refusals=self._refusals,
+            input_statistics=inputs.statistics,
+            supervisor=self.supervisor,
+            on_message=on_message,
         )
-        self.report.inputs = self.inputs.figures
-        self.publisher.present.update(self.report.present())
-        self.supervisor: Supervisor | None = None
-        if settings.supervise:
-            store = str(store_path(settings.store, beside))
-            self.supervisor = Supervisor(self.deployment, self.pipeline, self.master, store)
-            self.supervisor.rested = self._rest
-            self._opened.callback(self.supervisor.close)
-        self.report.supervisor = self.supervisor
+        scenes = ActiveScenes(deployment.scene, pad_names(deployment))
+        self.sampling = SamplingController(
+            deployment, scenes.requirements.pads, pipeline, self.master, self.sync
+        )
+        self.demand = Demand(scenes, publisher, 1e9 / period_ns, self._apply_demand)
+        self.demand.transformable[:] = False
+        for rows in robots.pad_rows:
+            self.demand.transformable[rows] = True
+        commands = ControlCommands(deployment, read, pipeline, self.reporter, self.demand, self.sampling)
+        self.control = ControlServer(*resources.control_socket, commands.by_name)
+        self._stack.callback(self.control.close)
+        for source in (pipeline.messages, pipeline.journal, self.reporter):
+            resources.retained_messages.update(source.retained_messages())
+        files = deployment_files(deployment)
+        pipeline.journal.publish_config(deployment, files, build_info(), now_ns)
+        self.demand.update(now_ns)
 
-    def _serve(self, read: Callable[[], Deployment] | None, period_ns: int, robots: Robots) -> None:
-        """What scenes want, and control."""
-        scenes = Scenes(self.deployment.scene, pad_names(self.deployment))
-        self.pacer = Pacer(self.deployment, scenes.needs.pads, self.pipeline, self.master, self.sync)
-        self.demand = Demand(scenes, self.publisher, 1e9 / period_ns, self._apply)
-        self.demand.placeable[:] = False
-        for rows in robots.rows:
-            self.demand.placeable[rows] = True
-        self.demand.step(time.monotonic_ns())
-        commands = Commands(self.deployment, read, self.pipeline, self.report, self.demand, self.pacer)
-        self.control.commands.update(commands.by_name)
+    @classmethod
+    def open(
+        cls,
+        deployment: Deployment,
+        model: PadModel | None = None,
+        read: Callable[[], Deployment] | None = None,
+        folder: Path | None = None,
+        on_message: Callable[[wire.Health | wire.Service], None] | None = None,
+    ) -> HandtouchDaemon:
+        """Open endpoints and buses.
 
-    def __enter__(self) -> Daemon:
+        Raises BusError or OSError naming what can't be opened and a remedy, KeyFileError for unusable keys.
+        """
+        robots = RobotModels(deployment)
+        with ExitStack() as stack:
+            resources = _open_resources(stack, deployment, model or PadModel(deployment), robots)
+            daemon = cls(deployment, resources, robots, time.monotonic_ns(), read, folder, on_message)
+            stack.pop_all()
+        return daemon
+
+    def __enter__(self) -> HandtouchDaemon:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """Give buses and endpoints back."""
-        self._opened.close()
+        """Close buses and endpoints."""
+        self._stack.close()
 
-    def _specs(self) -> list[NodeSpec]:
-        """Of all nodes; where a replacement is welcome, any serial number is that no other pad's node has."""
+    def _node_specs(self) -> list[NodeSpec]:
+        """Return the specs of all nodes; if replacing nodes is allowed, without serial numbers."""
         specs, settings = node_specs(self.deployment), self.deployment.daemon
-        if not settings.supervise or settings.another_unit == "refuse":
+        if not settings.supervise or settings.on_node_replaced == "refuse":
             return specs
         known = {spec.serial for spec in specs if spec.serial}
-        return [replace(spec, serial=None, foreign=frozenset(known - {spec.serial})) for spec in specs]
+        return [
+            replace(spec, serial=None, serials_of_other_pads=frozenset(known - {spec.serial}))
+            for spec in specs
+        ]
 
-    def _open_inputs(self, context: zmq.Context[zmq.Socket[bytes]], robots: Robots) -> Inputs:
-        parts = zip(robots.hands, robots.joint_names, robots.kinematics, strict=True)
-        states = {hand: JointStates(names, kinematics.continuous) for hand, names, kinematics in parts}
-        return Inputs(context, self.deployment.daemon.inputs, self.gate, states, pad_names(self.deployment))
+    def _build_supervisor(self, folder: Path | None) -> SupervisorClient | None:
+        settings = self.deployment.daemon
+        if not settings.supervise:
+            return None
+        supervisor = SupervisorClient(
+            self.deployment,
+            self.pipeline,
+            self.master,
+            str(store_path(settings.store, folder)),
+            on_excitation_changed=self._apply_excitation,
+        )
+        self._stack.callback(supervisor.close)
+        return supervisor
 
-    def run(self, stop: threading.Event, alive: Callable[[int], None] = lambda _: None) -> None:
-        """Serve until `stop` is set; `alive` is called after every tick, with the time in ns.
+    def _refusals(self) -> dict[str, int]:
+        return {**self.authenticator.refused, "request": self.control.refused}
 
-        At the end contacts end and nodes are stopped.
+    def run(self, stop: threading.Event, on_tick: Callable[[int], None] = lambda _: None) -> None:
+        """Serve until `stop` is set, then end all contacts and stop the nodes.
+
+        `on_tick` is called after every tick with the time [ns].
         """
         if self.supervisor is not None:
             self.supervisor.start(time.monotonic_ns())
@@ -200,226 +239,263 @@ class Daemon:
         gc.collect()
         gc.freeze()
         try:
-            self._loop(stop, alive)
+            self._loop(stop, on_tick)
         finally:
             now_ns = time.monotonic_ns()
             self.sync.stop()
-            self.pipeline.end(now_ns)
+            self.pipeline.end_session(now_ns)
             self.master.stop(now_ns)
             if self.supervisor is not None:
                 self.supervisor.close()
             gc.unfreeze()
 
-    def _loop(self, stop: threading.Event, alive: Callable[[int], None]) -> None:
+    def _loop(self, stop: threading.Event, on_tick: Callable[[int], None]) -> None:
         pipeline, cycle, ports = self.pipeline, self.pipeline.cycle, list(self.ports.values())
         by_descriptor = {port.fileno(): port for port in ports}
         descriptors = list(by_descriptor)
-        queues = all(port.is_queue for port in ports)  # to look into all costs less than to wake once more
+        # with local queues, draining all ports costs less than another wake-up
+        queues = all(port.has_local_queue for port in ports)
         busy_poll = self._busy_poll
-        sync, pacer, master, stages = self.sync, self.pacer, self.master, self.report.stages
-        pipeline.stepped = self._stepped
+        sync, sampling, master, stages = self.sync, self.sampling, self.master, self.reporter.stage_timer
+        pipeline.on_tick_computed = self._on_tick_computed
         sync.start(time.monotonic_ns())
         stages.start(time.monotonic_ns())
         while not stop.is_set():
             now_ns = time.monotonic_ns()
             if (sync_ns := sync.poll(now_ns)) is not None:
-                self._begin(sync_ns, now_ns)
-            wake_ns = min(sync.wake_ns, master.wake_ns)  # nodes may not be able to wait for a slow SYNC
+                self._begin_cycle(sync_ns, now_ns)
+            wake_ns = min(sync.wake_ns, master.wake_ns)  # node time-outs may come before a slow SYNC
             if not cycle.ticked:
-                sleep_ns = busy_poll.sleep_ns(cycle.t_ns, now_ns)
-                wake_ns = min(wake_ns, cycle.t_ns + cycle.window_ns, now_ns + sleep_ns)
-            wait_s = max(0, min(wake_ns, self._rehearse_ns) - now_ns) * 1e-9
+                sleep_ns = busy_poll.max_sleep_ns(cycle.sync_ns, now_ns)
+                wake_ns = min(wake_ns, cycle.sync_ns + cycle.window_ns, now_ns + sleep_ns)
+            wait_s = max(0, min(wake_ns, self._next_rehearsal_ns) - now_ns) * 1e-9
             readable = select.select(descriptors, (), (), wait_s)[0]
             woke_ns = time.monotonic_ns()
-            stages.slept(wake_ns, woke_ns)
-            # one that is gone shows nothing, and is opened again from `drain`
-            every = queues or not readable or woke_ns >= self._house_ns
-            self._receive(ports if every else [by_descriptor[ready] for ready in readable])
+            stages.record_wait(wake_ns, woke_ns)
+            # a disconnected port is never readable; `drain` reopens it
+            drain_all = queues or not readable or woke_ns >= self._next_background_ns
+            self._receive_frames(ports if drain_all else [by_descriptor[ready] for ready in readable])
             now_ns = time.monotonic_ns()
-            stages.lap(histogram.RECEIVE, now_ns)
-            ticked = pipeline.advance(now_ns)
-            if ticked is None and pacer.slow and pipeline.slab.fresh_count:
-                ticked = pipeline.tick_now(now_ns)
+            stages.lap(stage_timer.RECEIVE, now_ns)
+            ticked = pipeline.tick_if_due(now_ns)
+            if ticked is None and sampling.slow_sync and pipeline.slab.fresh_count:
+                ticked = pipeline.tick_without_sync(now_ns)
             if ticked is not None:
                 sent = self.publisher.release()
                 sent_ns = time.monotonic_ns()
-                stages.lap(histogram.SEND, sent_ns)
-                self.report.ticked(now_ns, sent_ns)
+                stages.lap(stage_timer.SEND, sent_ns)
+                self.reporter.record_tick(now_ns, sent_ns)
                 if sent:
-                    self._make_way()
-                busy_poll.ticked(cycle.t_ns, int(pipeline.slab.t_ns.max()))
-                if self.perceiving.wanted:
-                    self.perceiving.step(ticked)
-                    stages.lap(histogram.PERCEIVE, time.monotonic_ns())
-                self._after_tick(alive)
+                    self._yield_processor()
+                busy_poll.update_usual_latency(cycle.sync_ns, int(pipeline.slab.arrival_ns.max()))
+                if self.percepts.enabled:
+                    self.percepts.process_tick(ticked)
+                    stages.lap(stage_timer.PERCEIVE, time.monotonic_ns())
+                self._after_tick(on_tick)
             elif now_ns >= master.wake_ns:
                 master.poll(now_ns)
-            elif now_ns >= self._rehearse_ns:
+            elif now_ns >= self._next_rehearsal_ns:
                 self._rehearse()
 
-    def _stepped(self) -> None:
-        self.report.stages.lap(histogram.TICK, time.monotonic_ns())
+    def _on_tick_computed(self) -> None:
+        self.reporter.stage_timer.lap(stage_timer.TICK, time.monotonic_ns())
         self.publisher.hold()
 
-    def _make_way(self) -> None:
-        """Let those run that carry and take the messages, where they wait for this very processor."""
-        for _ in range(_CARRIERS):
+    def _yield_processor(self) -> None:
+        """Let the threads run that transport messages, if they wait for this CPU."""
+        for _ in range(_MESSAGE_PATH_THREADS):
             os.sched_yield()
-        self.report.stages.lap(histogram.WAIT, time.monotonic_ns())
+        self.reporter.stage_timer.lap(stage_timer.WAIT, time.monotonic_ns())
 
-    def _begin(self, sync_ns: int, now_ns: int) -> None:
-        """A SYNC was sent or seen: a new period."""
-        self.report.stages.begin(self.sync.overruns, not self.pipeline.cycle.ticked)
-        self.inputs.poll(now_ns)  # before the journal tells what the next tick starts from
-        if (gravity := self.gravity.step(now_ns)) is not None:
-            self.pipeline.told.turn(gravity)
-        self.pipeline.begin(sync_ns, now_ns)
+    def _begin_cycle(self, sync_ns: int, now_ns: int) -> None:
+        """Begin a cycle at a SYNC that was sent or received."""
+        self.reporter.stage_timer.begin_period(self.sync.overruns, not self.pipeline.cycle.ticked)
+        self.inputs.poll(now_ns)  # before the journal records the inputs of the next tick
+        if (gravity := self.gravity.update_directions(now_ns)) is not None:
+            self.pipeline.external_inputs.set_gravity(gravity)
+        self.pipeline.begin_cycle(sync_ns, now_ns)
         self.publisher.release()
-        tick_ns = self._busy_poll.expected_ns(sync_ns)
-        if self._rehearsed and tick_ns - sync_ns > _COLD_NS:
-            self._rehearse_ns = tick_ns - _BEFORE_TICK_NS
-        self.report.stages.lap(histogram.SYNC, time.monotonic_ns())
+        tick_ns = self._busy_poll.expected_arrival_ns(sync_ns)
+        if self._rehearsed and tick_ns - sync_ns > _CACHE_COLD_AFTER_NS:
+            self._next_rehearsal_ns = tick_ns - _REHEARSE_BEFORE_TICK_NS
+        self.reporter.stage_timer.lap(stage_timer.SYNC, time.monotonic_ns())
 
     def _rehearse(self) -> None:
-        """A SYNC is about to come, or the last samples are."""
-        self._rehearse_ns = _NEVER_NS
+        """Warm the caches before the next SYNC, or before the last samples of a cycle."""
+        self._next_rehearsal_ns = _NEVER_NS
         if self.pipeline.cycle.ticked:
-            self.rehearsal.all()
+            self.rehearsal.warm_all()
             self._rehearsed = True
         else:
-            self.rehearsal.tick()
-        self.report.stages.lap(histogram.REHEARSE, time.monotonic_ns())
+            self.rehearsal.warm_tick()
+        self.reporter.stage_timer.lap(stage_timer.REHEARSE, time.monotonic_ns())
 
-    def _receive(self, ports: list[Port]) -> None:
+    def _receive_frames(self, ports: list[Port]) -> None:
         for port in ports:
-            for can_id, data, t_ns in port.drain():
-                if can_id == SYNC_ID:
+            for can_id, data, arrival_ns in port.drain():
+                if can_id == cia301.SYNC:
                     now_ns = time.monotonic_ns()
-                    if (sync_ns := self.sync.seen(port.name, t_ns, now_ns)) is not None:
-                        self._begin(sync_ns, now_ns)
+                    if (sync_ns := self.sync.handle_sync(port.name, arrival_ns, now_ns)) is not None:
+                        self._begin_cycle(sync_ns, now_ns)
                 else:
-                    self.master.handle(port.name, can_id, data, t_ns)
+                    self.master.handle_frame(port.name, can_id, data, arrival_ns)
 
-    def _apply(self, wanted: Wanted, needs: Needs, enabled: NDArray[np.bool_], now_ns: int) -> None:
-        """Do what is wanted now, and no more."""
-        self.pipeline.want(wanted)
-        self.perceiving.want(wanted)
-        self.pipeline.frames_every = self.demand.frames_every
-        self._raw = needs.raw
+    def _apply_demand(
+        self, requested: RequestedOutputs, needs: SceneRequirements, enabled: NDArray[np.bool_], now_ns: int
+    ) -> None:
+        """Apply the outputs that scenes and subscriptions request."""
+        self.pipeline.apply_demand(requested)
+        self.percepts.set_requested(requested)
+        self.pipeline.ticks_per_hand_frame = self.demand.ticks_per_hand_frame
+        self._raw_pads = needs.raw
         if self.supervisor is None:
-            self.pacer.set_needs(needs.pads & enabled, needs.raw, now_ns)
+            self.sampling.set_needed_pads(needs.pads & enabled, needs.raw, now_ns)
         else:
-            self.supervisor.needed = needs.pads & enabled
-            self._rest(now_ns)
-        self.report.set_disabled(self.demand.disabled_by)
+            self.supervisor.set_needed_pads(needs.pads & enabled)
+            self._apply_excitation(now_ns)
+        self.reporter.set_disabled(self.demand.disabled_by)
 
-    def _rest(self, now_ns: int) -> None:
-        """What the scenes hold, but for the pads that rest."""
+    def _apply_excitation(self, now_ns: int) -> None:
+        """Sample the pads that scenes need and whose excitation is on."""
         assert self.supervisor is not None
-        self.pacer.set_needs(self.supervisor.needed & ~self.supervisor.turns.resting, self._raw, now_ns)
+        self.sampling.set_needed_pads(self.supervisor.active_pads, self._raw_pads, now_ns)
 
-    def _after_tick(self, alive: Callable[[int], None]) -> None:
-        """What may wait until the contacts are out."""
+    def _after_tick(self, on_tick: Callable[[int], None]) -> None:
+        """Do what can wait until the contacts are sent."""
         self._rehearsed = False
-        before_sync_ns = self.pipeline.cycle.t_ns + self.sync.period_ns - _BEFORE_SYNC_NS
-        lap = self.report.stages.lap
-        self.pipeline.settle()
+        before_sync_ns = self.pipeline.cycle.sync_ns + self.sync.period_ns - _REHEARSE_BEFORE_SYNC_NS
+        lap = self.reporter.stage_timer.lap
+        self.pipeline.prepare_next_tick()
         now_ns = time.monotonic_ns()
-        lap(histogram.SETTLE, now_ns)
-        self.pacer.step(now_ns)
+        lap(stage_timer.SETTLE, now_ns)
+        self.sampling.update_sampling(now_ns)
         if self.supervisor is not None:
-            self.supervisor.step(now_ns)
-            lap(histogram.SUPERVISE, time.monotonic_ns())
-        if now_ns >= self._house_ns:
-            self._house_ns = now_ns + _HOUSE_NS
-            self._keep_house(now_ns)
-        alive(now_ns)
+            self.supervisor.process_tick(now_ns)
+            lap(stage_timer.SUPERVISE, time.monotonic_ns())
+        if now_ns >= self._next_background_ns:
+            self._next_background_ns = now_ns + _BACKGROUND_PERIOD_NS
+            self._run_background_tasks(now_ns)
+        on_tick(now_ns)
         now_ns = time.monotonic_ns()
-        lap(histogram.REQUESTS, now_ns)
-        waited_for = self.publisher.subscriptions and before_sync_ns - now_ns > _COLD_NS
-        self._rehearse_ns = before_sync_ns if waited_for else _NEVER_NS
+        lap(stage_timer.REQUESTS, now_ns)
+        warming_pays = self.publisher.subscriptions and before_sync_ns - now_ns > _CACHE_COLD_AFTER_NS
+        self._next_rehearsal_ns = before_sync_ns if warming_pays else _NEVER_NS
 
-    def _keep_house(self, now_ns: int) -> None:
-        lap = self.report.stages.lap
+    def _run_background_tasks(self, now_ns: int) -> None:
+        lap = self.reporter.stage_timer.lap
         self.master.poll(now_ns)
         for port in self.ports.values():
-            port.look(now_ns)
-        lap(histogram.NODES, time.monotonic_ns())
-        self.report.poll(now_ns)
-        lap(histogram.REPORT, time.monotonic_ns())
-        self.joints.step(now_ns)
-        self.gate.poll(now_ns)
-        self.publisher.take_subscriptions(now_ns)
-        self.demand.step(now_ns)
+            port.update_state(now_ns)
+        lap(stage_timer.NODES, time.monotonic_ns())
+        self.reporter.poll(now_ns)
+        lap(stage_timer.REPORT, time.monotonic_ns())
+        self.joint_publisher.publish_joints(now_ns)
+        self.authenticator.poll(now_ns)
+        self.publisher.poll_subscriptions(now_ns)
+        self.demand.update(now_ns)
         self.control.poll(now_ns)
 
 
 def pad_names(deployment: Deployment) -> list[tuple[str, str]]:
-    """Hand and link of every pad, in the order of the deployment."""
-    return [(hand.name, pad.link) for hand in deployment.hands for pad in hand.pads]
+    """Return hand and link of every pad, in the order of the deployment."""
+    return [(entry.hand, entry.pad.link) for entry in deployment.pads]
 
 
-def run(config_path: Path, buses: tuple[str, ...] = ()) -> int:
-    """`handtouch run`: serve a deployment until SIGINT or SIGTERM; exit status 0, 1 (no bus), 2 (config)."""
+def run(config_path: Path, buses: tuple[str, ...] = ()) -> None:
+    """Serve a deployment until SIGINT or SIGTERM. Raises StartError."""
     try:
-        deployment = _read(config_path, buses)
+        deployment = _read_deployment(config_path, buses)
     except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+        raise StartError(error, permanent=True) from error
     stop = stop_on_signals()
-    said = logs.start(deployment.daemon.log_level)
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master tells it in words of its own
+    log_handler = logs.start_logging(deployment.daemon.log_level)
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master logs these events itself
     try:
-        return _serve(deployment, stop, partial(_read, config_path, buses), config_path.parent)
+        _serve(deployment, stop, partial(_read_deployment, config_path, buses), config_path.parent)
     finally:
-        said.close()
-
-
-def _read(config_path: Path, buses: tuple[str, ...]) -> Deployment:
-    """The deployment in a file, with other buses; hands that don't fit their URDFs go without. Raises
-    ConfigError."""
-    deployment = load(config_path)
-    for bus in buses:
-        deployment = with_bus(deployment, bus)
-    deployment = checked(deployment, str(config_path))  # a mistake must show before a bus is touched
-    deployment, problems = served(deployment, str(config_path))
-    for problem in problems:
-        _log.error("%s: %s; until then that hand has no palm and base frame", config_path, problem)
-    return deployment
+        log_handler.close()
 
 
 def _serve(
-    deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment], beside: Path
-) -> int:
+    deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment], folder: Path
+) -> None:
     settings = deployment.daemon
-    sys.setswitchinterval(_GIL_SWITCH_S)
-    notifier = Notifier()
-    with ExitStack() as opened:
-        opened.callback(notifier.close)
+    sys.setswitchinterval(_GIL_SWITCH_INTERVAL_S)
+    with ExitStack() as stack:
+        notifier = stack.enter_context(closing(SystemdNotifier.open()))
         try:
-            daemon = opened.enter_context(Daemon(deployment, read=read, beside=beside))
+            exporter = None
             if settings.metrics is not None:
-                exporter = opened.enter_context(closing(Exporter(settings.metrics)))
-                daemon.report.listener = exporter.take
-                _log.info("metrics http://%s%s", exporter.address, PATH)
-        except (KeysError, EdsError) as error:  # no restart mends it
-            print(error, file=sys.stderr)
-            return 2
+                exporter = stack.enter_context(closing(MetricsExporter.open(settings.metrics)))
+            on_message = exporter.send if exporter is not None else None
+            daemon = HandtouchDaemon.open(deployment, read=read, folder=folder, on_message=on_message)
+            stack.enter_context(daemon)
+        except (KeyFileError, EdsError) as error:
+            raise StartError(error, permanent=True) from error
         except (BusError, OSError) as error:
-            print(error, file=sys.stderr)
-            return 1
-        _announce(daemon)
-        for refused in realtime.apply(settings):
+            raise StartError(error, permanent=False) from error
+        _log_endpoints(daemon)
+        if exporter is not None:
+            _log.info("metrics: http://%s%s", exporter.address, METRICS_PATH)
+        for refused in realtime.apply_realtime_settings(settings):
             _log.warning("%s", refused)
         watchdog_ns = int(os.environ.get("WATCHDOG_USEC", "0")) * 1000
-        daemon.run(stop, Pulse(notifier, watchdog_ns, daemon.report.summary).ticked)
+        daemon.run(stop, ServiceWatchdog(notifier, watchdog_ns, daemon.reporter.summary).notify_tick)
         notifier.send("STOPPING=1")
-    return 0
 
 
-def _announce(daemon: Daemon) -> None:
-    where = ", ".join(f"{name} {endpoint}" for name, endpoint in daemon.publisher.endpoints.items())
+def _open_resources(
+    stack: ExitStack, deployment: Deployment, model: PadModel, robots: RobotModels
+) -> _Resources:
+    """Open endpoints, then buses; the returned stack closes them, `stack` only if opening fails."""
+    settings = deployment.daemon
+    period_ns = round(settings.sync_period_ms * 1e6)
+    opened = stack.enter_context(ExitStack())
+    context = opened.enter_context(zmq.Context())
+    authenticator = Authenticator.open(context, Path(settings.keys) if settings.keys else None)
+    opened.callback(authenticator.close)
+    session = secrets.randbits(_SESSION_BITS)
+    retained: RetainedMessages = {}
+    publisher = Publisher.open(
+        context, settings.live, settings.complete, authenticator, session, retained_messages=retained
+    )
+    opened.callback(publisher.close)
+    control_socket = open_control_socket(context, settings.control, authenticator)
+    opened.callback(control_socket[0].close)
+    pipeline = Pipeline(model, period_ns, settings.sample_window_fraction, publisher, session, robots)
+    parts = zip(robots.hands, robots.joint_names, robots.kinematics, strict=True)
+    joints = {hand: JointStateBuffer(names, kinematics.continuous) for hand, names, kinematics in parts}
+    inputs = InputReceiver.open(
+        context,
+        settings.inputs,
+        authenticator,
+        joints,
+        pad_names(deployment),
+        pipeline.external_inputs.add_force_reference,
+    )
+    opened.callback(inputs.close)
+    ports: dict[str, Port] = {}
+    for bus in deployment.buses:
+        ports[bus.name] = port = Port.open(bus, pipeline.slab)
+        opened.callback(port.close)
+    return _Resources(opened, authenticator, publisher, retained, control_socket, inputs, pipeline, ports)
+
+
+def _read_deployment(config_path: Path, buses: tuple[str, ...]) -> Deployment:
+    """Read a deployment, with other buses if given; drop URDFs that don't fit. Raises ConfigError."""
+    deployment = load(config_path)
+    for bus in buses:
+        deployment = with_bus(deployment, bus)
+    deployment = check_nodes(deployment, str(config_path))  # report mistakes before a bus is opened
+    deployment, problems = drop_invalid_urdfs(deployment, str(config_path))
+    for problem in problems:
+        _log.error("%s: %s; palm and base frame of that hand are unavailable", config_path, problem)
+    return deployment
+
+
+def _log_endpoints(daemon: HandtouchDaemon) -> None:
+    endpoints = {**daemon.publisher.endpoints, "control": daemon.control.endpoint}
     hands = ", ".join(f"{hand.name} ({len(hand.pads)} pads)" for hand in daemon.deployment.hands)
     buses = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in daemon.deployment.buses)
-    _log.info("hand %s on bus %s", hands, buses)
-    _log.info("%s, control %s", where, daemon.control.endpoint)
+    _log.info("hands: %s; buses: %s", hands, buses)
+    _log.info("endpoints: %s", ", ".join(f"{name} {endpoint}" for name, endpoint in endpoints.items()))

@@ -1,7 +1,8 @@
-"""The inputs endpoint: what the robot tells, joint states and forces from other sensors.
+"""Inputs endpoint: joint states, joint commands and reference forces that robots send to the daemon.
 
-Public names: `Inputs`, `CAUSES`. The daemon binds a SUB socket, robots connect with PUB: they never
-wait for the daemon. What is malformed or belongs to nothing here is counted, told now and then, and dropped.
+Public names: `InputReceiver`, `DROP_CAUSES`. The daemon binds a SUB socket and robots connect with PUB, so
+they never wait for the daemon. Malformed messages and messages that match no hand, joint or pad are counted,
+logged at a limited rate, and dropped.
 """
 
 from __future__ import annotations
@@ -15,119 +16,142 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from handtouch.daemon.publisher import bind
-from handtouch.daemon.security import Gate, ready
-from handtouch.hand.joints import Joints, JointStates
-from handtouch.inputs import Input, InputError, JointCommand, JointState, LinkForces, decode
-from handtouch.supervise.strength import ForceReference
+from handtouch.core.sheet_force import ForceReference
+from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.cause_counter import CauseCounter
+from handtouch.daemon.endpoints import bind_endpoint, is_readable
+from handtouch.hand.joints import JointSnapshot, JointStateBuffer
+from handtouch.wire import WireError
+from handtouch.wire.inputs import InputMessage, JointCommand, JointState, LinkForces, decode
 
-CAUSES = {
-    "malformed": "that doesn't keep the contract",
-    "unknown_hand": "of a hand that isn't served here",
-    "no_urdf": "joint states of a hand that has no URDF",
-    "unknown_joints": "that tells none of the joints of its hand",
-    "unknown_link": "with a link that carries no pad",
-    "clock": "whose t_ns is not of this machine's monotonic clock",
-    "late": "not newer than the one before of the same names",
-    "flood": "that had to wait: more come than are read in a period",
+DROP_CAUSES = {
+    "malformed": "message is malformed",
+    "unknown_hand": "hand is not in the deployment",
+    "no_urdf": "joint states of a hand without URDF",
+    "unknown_joints": "none of the joints belongs to the hand",
+    "unknown_link": "link has no pad",
+    "clock": "t_ns is not of this host's monotonic clock",
+    "late": "t_ns is not newer than in the previous message with these names",
+    "flood": "more messages than are read in one period; the others are read later",
 }
-"""Why a message, or a part of it, was of no use: name of the counter -> words."""
+"""Causes of dropped messages or parts of them: name of the counter -> description."""
 
-_QUEUE = 64
-_PER_POLL = 32
-_AHEAD_NS, _BEHIND_NS = 1_000_000_000, 10_000_000_000
-_TOLD_AGAIN_NS = 10_000_000_000
+_QUEUE_MESSAGES = 64
+_MAX_MESSAGES_PER_POLL = 32
+_MAX_AHEAD_NS, _MAX_AGE_NS = 1_000_000_000, 10_000_000_000
 _log = logging.getLogger("handtouch.inputs")
 
 
-class Inputs:
-    """Takes what robots tell; `poll` it once a period, before the samples come.
+class InputReceiver:
+    """Receives robots' messages; `poll` it once per cycle, before samples arrive. Created by `open`.
 
-    `joints` (hand -> states) of the hands with a URDF; `pads` (hand, link) of all. Forces are handed
-    to `refer`. `received` and `dropped` count messages by topic and by cause (`CAUSES`), `problem` is the
-    last one in words. Raises OSError naming the endpoint when it can't be bound.
+    `joints` (hand -> states) are of the hands with a URDF, `pads` (hand, link) of all. Forces are passed to
+    `on_force_reference`. `received` counts messages by topic, `dropped` by cause (`DROP_CAUSES`).
     """
 
     def __init__(
         self,
+        socket: zmq.Socket[bytes],
+        endpoint: str,
+        joints: Mapping[str, JointStateBuffer],
+        pads: Sequence[tuple[str, str]],
+        on_force_reference: Callable[[ForceReference], object] = lambda _: None,
+    ) -> None:
+        self.endpoint = endpoint
+        self.received: Counter[str] = Counter()
+        self._socket = socket
+        self._drops = CauseCounter(_log, "input dropped", DROP_CAUSES)
+        self._on_force_reference = on_force_reference
+        self._joints = joints
+        self._commanded_joints = {hand: states.empty_copy() for hand, states in joints.items()}
+        self._gravity_by_hand: dict[str, NDArray[np.float64]] = {}  # from the newest joint state
+        self._row_by_pad = {name: pad for pad, name in enumerate(pads)}
+        self._hands = {hand for hand, _ in pads}
+        self._newest_sample_ns: dict[str, int] = {}
+
+    @classmethod
+    def open(
+        cls,
         context: zmq.Context[zmq.Socket[bytes]],
         endpoint: str,
-        gate: Gate,
-        joints: Mapping[str, JointStates],
+        authenticator: Authenticator,
+        joints: Mapping[str, JointStateBuffer],
         pads: Sequence[tuple[str, str]],
-    ) -> None:
-        self.received: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()
-        self.problem = ""
-        self.refer: Callable[[ForceReference], object] = lambda _: None
-        self._joints = joints
-        self._commands = {hand: states.like() for hand, states in joints.items()}
-        self._down: dict[str, NDArray[np.float64]] = {}  # by hand, as last told
-        self._pads = {name: pad for pad, name in enumerate(pads)}
-        self._hands = {hand for hand, _ in pads}
-        self._told: dict[str, tuple[int, int]] = {}
-        self._newest_ns: dict[str, int] = {}
-        self._socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
-        self._socket.subscribe("joints/")
-        self._socket.subscribe("command/")
-        self._socket.subscribe("force/")
-        try:
-            self.endpoint = bind(self._socket, endpoint, "the inputs endpoint", gate, "inputs")
-        except OSError:
-            self._socket.close()
-            raise
+        on_force_reference: Callable[[ForceReference], object] = lambda _: None,
+    ) -> InputReceiver:
+        """Bind the endpoint. Raises OSError naming it and a remedy."""
+        socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVHWM, _QUEUE_MESSAGES)
+        for prefix in ("joints/", "command/", "force/"):
+            socket.subscribe(prefix)
+        bound = bind_endpoint(socket, endpoint, "the inputs endpoint", authenticator, "inputs")
+        return cls(socket, bound, joints, pads, on_force_reference)
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Dropped messages by cause."""
+        return self._drops.counts
+
+    @property
+    def problem(self) -> str:
+        """Text of the problem logged last, empty before the first."""
+        return self._drops.last_problem
 
     def poll(self, now_ns: int) -> None:
-        """Take what has come, a bounded number of messages."""
-        for _ in range(_PER_POLL):
-            if not ready(self._socket):
+        """Process the waiting messages, a bounded number of them."""
+        for _ in range(_MAX_MESSAGES_PER_POLL):
+            if not is_readable(self._socket):
                 return
-            self.take(self._socket.recv_multipart(zmq.NOBLOCK), now_ns)
-        self._drop("flood", "", now_ns)
+            self.process_message(self._socket.recv_multipart(zmq.NOBLOCK), now_ns)
+        self._drops.add("flood", "", now_ns)
 
-    def take(self, parts: Sequence[bytes], now_ns: int) -> None:
-        """Take one message, whatever its bytes."""
+    def process_message(self, parts: Sequence[bytes], now_ns: int) -> None:
+        """Process one message; drop and count it if it is invalid."""
         try:
             message = decode(parts)
-        except InputError as error:
-            self._drop("malformed", str(error), now_ns)
+        except WireError as error:
+            self._drops.add("malformed", str(error), now_ns)
             return
         topic = parts[0].decode()
         if message.hand not in self._hands:
-            self._drop("unknown_hand", f"{topic}; there are {', '.join(sorted(self._hands))}", now_ns)
+            self._drops.add(
+                "unknown_hand", f"{topic}; the hands are {', '.join(sorted(self._hands))}", now_ns
+            )
             return
         t_ns = now_ns if message.t_ns is None else message.t_ns
-        if not -_BEHIND_NS <= t_ns - now_ns <= _AHEAD_NS:
-            off = (
-                f"{topic}: t_ns is {(t_ns - now_ns) * 1e-9:.3g} s off; leave it nil if there is no such clock"
-            )
-            self._drop("clock", off, now_ns)
+        if not -_MAX_AGE_NS <= t_ns - now_ns <= _MAX_AHEAD_NS:
+            off_s = (t_ns - now_ns) * 1e-9
+            detail = f"{topic}: t_ns is {off_s:.3g} s off; send nil if the sender doesn't have this clock"
+            self._drops.add("clock", detail, now_ns)
             return
-        if self._keep(message, t_ns, now_ns):
+        if self._store_message(message, t_ns, now_ns):
             self.received[topic] += 1
-            self._newest_ns[topic] = t_ns
+            self._newest_sample_ns[topic] = t_ns
 
-    def joints_at(self, hand: str, t_ns: int) -> Joints | None:
-        """The joints of a hand at a time."""
+    def joints_at(self, hand: str, t_ns: int) -> JointSnapshot | None:
+        """Return the joint state of a hand at a time, None without URDF."""
         states = self._joints.get(hand)
-        return None if states is None else states.at(t_ns)
+        return None if states is None else states.interpolate(t_ns)
 
-    def commands_at(self, hand: str, t_ns: int) -> Joints | None:
-        """Where the joints of a hand were told to be at a time, None where nobody ever told."""
-        states = self._commands.get(hand)
-        return states.at(t_ns) if states is not None and f"command/{hand}" in self._newest_ns else None
+    def commanded_joints_at(self, hand: str, t_ns: int) -> JointSnapshot | None:
+        """Return the commanded joint state of a hand at a time, None if no command was received."""
+        states = self._commanded_joints.get(hand)
+        return (
+            states.interpolate(t_ns)
+            if states is not None and f"command/{hand}" in self._newest_sample_ns
+            else None
+        )
 
-    def down_at(self, hand: str) -> NDArray[np.float64] | None:
-        """Which way gravity points in the base of a hand (3,), as joint states told last, None: never."""
-        return self._down.get(hand)
+    def gravity_direction(self, hand: str) -> NDArray[np.float64] | None:
+        """Return the direction of gravity (3,) in a hand's base, None if no joint state had it."""
+        return self._gravity_by_hand.get(hand)
 
-    def figures(self, now_ns: int) -> dict[str, Any]:
-        """For `service`."""
+    def statistics(self, now_ns: int) -> dict[str, Any]:
+        """Return the counters for the `service` message."""
         return {
             "received": dict(self.received),
-            "age_s": {topic: (now_ns - t_ns) * 1e-9 for topic, t_ns in self._newest_ns.items()},
+            "age_s": {topic: (now_ns - t_ns) * 1e-9 for topic, t_ns in self._newest_sample_ns.items()},
             "dropped": dict(self.dropped),
             "problem": self.problem,
         }
@@ -136,53 +160,41 @@ class Inputs:
         """Close the endpoint."""
         self._socket.close()
 
-    def _keep(self, message: Input, t_ns: int, now_ns: int) -> bool:
+    def _store_message(self, message: InputMessage, t_ns: int, now_ns: int) -> bool:
         if isinstance(message, LinkForces):
-            return self._keep_forces(message, t_ns, now_ns)
-        told = isinstance(message, JointState)
-        topic = f"{'joints' if told else 'command'}/{message.hand}"
-        states = (self._joints if told else self._commands).get(message.hand)
+            return self._forward_forces(message, t_ns, now_ns)
+        measured = isinstance(message, JointState)
+        topic = f"{'joints' if measured else 'command'}/{message.hand}"
+        states = (self._joints if measured else self._commanded_joints).get(message.hand)
         if states is None:
-            self._drop("no_urdf", topic, now_ns)
+            self._drops.add("no_urdf", topic, now_ns)
             return False
-        return self._keep_joints(message, states, topic, t_ns, now_ns)
+        return self._store_joints(message, states, topic, t_ns, now_ns)
 
-    def _keep_joints(
-        self, message: JointState | JointCommand, states: JointStates, topic: str, t_ns: int, now_ns: int
+    def _store_joints(
+        self, message: JointState | JointCommand, states: JointStateBuffer, topic: str, t_ns: int, now_ns: int
     ) -> bool:
-        late, names, position = states.late, message.names, message.position_rad
+        late, names, position = states.late_count, message.names, message.position_rad
         if isinstance(message, JointState):
-            kept = states.take(t_ns, names, position, message.velocity_rad_s, message.position_std_rad)
+            kept = states.add_state(t_ns, names, position, message.velocity_rad_s, message.position_std_rad)
             if kept and message.gravity is not None:
-                self._down[message.hand] = message.gravity
+                self._gravity_by_hand[message.hand] = message.gravity
         else:
-            kept = states.take(t_ns, names, position)
-        if not kept and states.late > late:
-            self._drop("late", topic, now_ns)
+            kept = states.add_state(t_ns, names, position)
+        if not kept and states.late_count > late:
+            self._drops.add("late", topic, now_ns)
         elif not kept:
-            said = f"{topic} tells {', '.join(message.names[:4])}; the URDF has " + ", ".join(states.names)
-            self._drop("unknown_joints", said, now_ns)
+            detail = f"{topic} has {', '.join(message.names[:4])}; the URDF has " + ", ".join(states.names)
+            self._drops.add("unknown_joints", detail, now_ns)
         return kept
 
-    def _keep_forces(self, message: LinkForces, t_ns: int, now_ns: int) -> bool:
-        pads = [self._pads.get((message.hand, link)) for link in message.links]
+    def _forward_forces(self, message: LinkForces, t_ns: int, now_ns: int) -> bool:
+        pads = [self._row_by_pad.get((message.hand, link)) for link in message.links]
         for link, pad in zip(message.links, pads, strict=True):
             if pad is None:
-                self._drop("unknown_link", f"force/{message.hand}: {link!r:.80}", now_ns)
+                self._drops.add("unknown_link", f"force/{message.hand}: {link!r:.80}", now_ns)
         known = np.array([pad is not None for pad in pads])
         if known.any():
             rows = np.array([pad for pad in pads if pad is not None], dtype=np.intp)
-            self.refer(ForceReference(rows, message.force_n[known], message.std_n[known], t_ns))
+            self._on_force_reference(ForceReference(rows, message.force_n[known], message.std_n[known], t_ns))
         return bool(known.any())
-
-    def _drop(self, cause: str, detail: str, now_ns: int) -> None:
-        """Count, and tell: the first at once, then from time to time with the number since."""
-        self.dropped[cause] += 1
-        last_ns, last_count = self._told.get(cause, (now_ns - _TOLD_AGAIN_NS, 0))
-        if now_ns - last_ns >= _TOLD_AGAIN_NS:
-            count = self.dropped[cause] - last_count
-            self.problem = f"a message {CAUSES[cause]}" + (f": {detail}" if detail else "")
-            _log.warning(
-                "inputs: %s%s", self.problem, f"; {count} such since it was last told" if count > 1 else ""
-            )
-            self._told[cause] = now_ns, self.dropped[cause]

@@ -1,104 +1,126 @@
-"""Sends messages on the live and the complete stream, to whoever subscribed; encodes nothing for nobody."""
+"""Publisher of the live and the complete stream; encodes only topics that have a subscriber.
+
+Public names: `Publisher`, `RetainedMessages`.
+"""
 
 from __future__ import annotations
 
-import socket as stdlib_socket
-import time
 from collections import Counter
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Mapping
 
 import zmq
 
 from handtouch import wire
-from handtouch.daemon.security import Gate, ready
+from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.endpoints import bind_endpoint, is_readable
 
-LIVE_QUEUE = 64
-"""Messages kept for a slow subscriber of the live stream: a few ticks, the newest matter."""
-COMPLETE_QUEUE = 20_000
-"""Messages kept on the complete stream: seconds."""
-_SUBSCRIPTIONS_PER_POLL = 100
-_REPEATS_PER_POLL = 16
-"""Late joiners, however many, cost a tick no more than that."""
+LIVE_QUEUE_MESSAGES = 64
+"""Messages queued for a slow subscriber of the live stream: a few ticks, as the newest matter most."""
+COMPLETE_QUEUE_MESSAGES = 20_000
+"""Messages queued on the complete stream: several seconds."""
+_MAX_SUBSCRIPTIONS_PER_POLL = 100
+_MAX_RETAINED_PER_POLL = 16
+"""Retained messages sent per poll, so that many late subscribers don't delay a tick."""
+
+RetainedMessages = dict[str, Callable[[int], wire.OutgoingMessage | None]]
+"""topic -> function that returns its retained message at a time [ns], None if there is none"""
 
 
 class Publisher:
-    """Two XPUB sockets with the same topics; never blocks, counts what a full queue drops.
+    """Two XPUB sockets with the same topics; never blocks, counts messages dropped by full queues.
 
-    `endpoints` (stream -> endpoint as bound, with its real port), `drops` (stream -> messages that a full
-    queue of some subscriber couldn't take), `subscriptions` (prefixes that somebody asked for), `run` (tells
-    this publisher's life from others: when it began, in seconds since 1970), `present` (topic -> a function
-    that makes, at a time in ns, what to repeat of it for those who subscribe late, if anything).
-
-    Whoever connects passes the `gate`. Raises OSError naming the endpoint when it can't be bound.
+    `endpoints` (stream -> endpoint as bound, with its real port), `drops` (stream -> messages that the full
+    queue of a subscriber dropped), `subscriptions` (subscribed prefixes), `session` (identifies this session
+    of the daemon in every message), `retained_messages` (sent to late subscribers; the owner of the mapping
+    may add topics). Created by `open`.
     """
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], live: str, complete: str, gate: Gate | None = None
+        self,
+        sockets: Mapping[str, zmq.Socket[bytes]],
+        endpoints: Mapping[str, str],
+        session: int,
+        retained_messages: RetainedMessages | None = None,
     ) -> None:
-        gate = gate or Gate(context)
-        self.run = int(time.time())
-        self.present: dict[str, Callable[[int], wire.Outgoing | None]] = {}
+        self.session = session
+        self.retained_messages: RetainedMessages = {} if retained_messages is None else retained_messages
         self.drops: Counter[str] = Counter(live=0, complete=0)
         self.subscriptions: frozenset[bytes] = frozenset()
-        self.endpoints: dict[str, str] = {}
-        self._sockets: dict[str, zmq.Socket[bytes]] = {}
-        self._asked: dict[str, set[bytes]] = {}
-        self._repeats: dict[tuple[str, str], None] = {}  # (stream, topic) that somebody waits for, in order
-        self._wanted: dict[str, bool] = {}
+        self.endpoints = dict(endpoints)
+        self._sockets = dict(sockets)
+        self._prefixes: dict[str, set[bytes]] = {stream: set() for stream in sockets}
+        self._pending_retained: dict[tuple[str, str], None] = {}  # (stream, topic), in order of subscription
+        self._is_subscribed: dict[str, bool] = {}
         self._held: list[list[bytes]] | None = None
-        for stream, endpoint, queue in (("live", live, LIVE_QUEUE), ("complete", complete, COMPLETE_QUEUE)):
+
+    @classmethod
+    def open(
+        cls,
+        context: zmq.Context[zmq.Socket[bytes]],
+        live: str,
+        complete: str,
+        authenticator: Authenticator | None = None,
+        session: int = 0,
+        retained_messages: RetainedMessages | None = None,
+    ) -> Publisher:
+        """Bind both streams. Raises OSError naming the endpoint that can't be bound and a remedy."""
+        authenticator = authenticator or Authenticator(context)
+        sockets: dict[str, zmq.Socket[bytes]] = {}
+        endpoints: dict[str, str] = {}
+        for stream, endpoint, queue in (
+            ("live", live, LIVE_QUEUE_MESSAGES),
+            ("complete", complete, COMPLETE_QUEUE_MESSAGES),
+        ):
             socket: zmq.Socket[bytes] = context.socket(zmq.XPUB)
-            self._sockets[stream] = socket
-            self._asked[stream] = set()
             socket.setsockopt(zmq.SNDHWM, queue)
-            socket.setsockopt(zmq.LINGER, 200)  # so that the ends of contacts still leave at shutdown
+            socket.setsockopt(zmq.LINGER, 200)  # the ends of contacts are still sent at shutdown
             socket.setsockopt(zmq.XPUB_NODROP, 1)
-            socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # who asks for what others have wants the present, too
+            socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # every new subscriber gets the retained messages
             socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
             socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
             try:
-                self.endpoints[stream] = bind(socket, endpoint, f"the {stream} stream", gate, "read")
+                endpoints[stream] = bind_endpoint(
+                    socket, endpoint, f"the {stream} stream", authenticator, "read"
+                )
             except OSError:
-                self.close()
+                for bound in sockets.values():
+                    bound.close()
                 raise
+            sockets[stream] = socket
+        return cls(sockets, endpoints, session, retained_messages)
 
-    def take_subscriptions(self, now_ns: int) -> None:
-        """Read what subscribers asked for or gave up; repeat the present for those who come late."""
-        if self._repeats:  # asked for at the tick before: what nobody heard until then is computed by now
-            self._repeat(now_ns)
+    def poll_subscriptions(self, now_ns: int) -> None:
+        """Read subscription changes; send retained messages to new subscribers, from the next poll on."""
+        if self._pending_retained:  # by now a tick has computed what nothing was subscribed to before
+            self._send_retained(now_ns)
         for stream, socket in self._sockets.items():
-            for _ in range(_SUBSCRIPTIONS_PER_POLL):  # who asks without end must not stop the tick
-                if not ready(socket):
+            for _ in range(_MAX_SUBSCRIPTIONS_PER_POLL):  # a flood of requests must not stop the tick
+                if not is_readable(socket):
                     break
                 request = socket.recv(zmq.NOBLOCK)
+                prefix = request[1:]
                 if request[:1] == b"\x01":
-                    self._asked[stream].add(request[1:])
-                    self._repeats.update(
-                        {
-                            (stream, topic): None
-                            for topic in self.present
-                            if topic.encode().startswith(request[1:])
-                        }
-                    )
+                    self._prefixes[stream].add(prefix)
+                    topics = (topic for topic in self.retained_messages if topic.encode().startswith(prefix))
+                    self._pending_retained.update({(stream, topic): None for topic in topics})
                 elif request[:1] == b"\x00":
-                    self._asked[stream].discard(request[1:])
+                    self._prefixes[stream].discard(prefix)
                 else:
-                    continue  # not a subscription: nobody has anything else to say here
-                self.subscriptions = frozenset().union(*self._asked.values())
-                self._wanted.clear()
+                    continue  # not a subscription: subscribers can send nothing else
+                self.subscriptions = frozenset().union(*self._prefixes.values())
+                self._is_subscribed.clear()
 
-    def wants(self, topic: str) -> bool:
-        """Whether anybody subscribed to a prefix of the topic."""
-        wanted = self._wanted.get(topic)
-        if wanted is None:
-            wanted = any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
-            self._wanted[topic] = wanted
-        return wanted
+    def has_subscriber(self, topic: str) -> bool:
+        """Return True if any client subscribed to a prefix of the topic."""
+        subscribed = self._is_subscribed.get(topic)
+        if subscribed is None:
+            subscribed = any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
+            self._is_subscribed[topic] = subscribed
+        return subscribed
 
-    def send(self, message: wire.Outgoing) -> None:
-        """Send to those who subscribed."""
-        if not self.wants(wire.topic_of(message)):
+    def send(self, message: wire.OutgoingMessage) -> None:
+        """Send a message if its topic has a subscriber."""
+        if not self.has_subscriber(wire.topic_of(message)):
             return
         parts = wire.encode(message)
         if self._held is None:
@@ -107,35 +129,35 @@ class Publisher:
             self._held.append(parts)
 
     def hold(self) -> None:
-        """Keep what is sent until `release`: ZeroMQ's thread is woken once, not for every message."""
+        """Queue messages until `release`, so that ZeroMQ's thread is woken once and not by every message."""
         if self._held is None:
             self._held = []
 
     def release(self) -> bool:
-        """Send what was held, on the live stream first; whether there was anything."""
+        """Send the held messages, on the live stream first; return True if there were any."""
         held, self._held = self._held, None
         if held:
             self._send_all(held)
         return bool(held)
 
     def close(self) -> None:
-        """Close both streams; what is queued has 0.2 s to leave."""
+        """Close both streams; queued messages have 0.2 s to be sent."""
         for socket in self._sockets.values():
             socket.close()
 
     def _send_all(self, messages: list[list[bytes]]) -> None:
         for stream, socket in self._sockets.items():
-            asked = tuple(self._asked[stream])
+            prefixes = tuple(self._prefixes[stream])
             for parts in messages:
-                if parts[0].startswith(asked):
+                if parts[0].startswith(prefixes):
                     self._try_send(stream, socket, parts)
 
-    def _repeat(self, now_ns: int) -> None:
+    def _send_retained(self, now_ns: int) -> None:
         sent = 0
-        while self._repeats and sent < _REPEATS_PER_POLL:
-            stream, topic = next(iter(self._repeats))
-            del self._repeats[stream, topic]
-            if (message := self.present[topic](now_ns)) is not None:
+        while self._pending_retained and sent < _MAX_RETAINED_PER_POLL:
+            stream, topic = next(iter(self._pending_retained))
+            del self._pending_retained[stream, topic]
+            if (message := self.retained_messages[topic](now_ns)) is not None:
                 self._try_send(stream, self._sockets[stream], wire.encode(message))
                 sent += 1
 
@@ -143,40 +165,8 @@ class Publisher:
         try:
             socket.send_multipart(parts, zmq.NOBLOCK)
         except zmq.Again:
-            # XPUB_NODROP tells that one queue is full, but then sends to nobody: the others still get theirs
+            # XPUB_NODROP reports that one queue is full, but sends to no subscriber: send again without it
             self.drops[stream] += 1
             socket.setsockopt(zmq.XPUB_NODROP, 0)
             socket.send_multipart(parts, zmq.NOBLOCK)
             socket.setsockopt(zmq.XPUB_NODROP, 1)
-
-
-def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str, gate: Gate, right: str) -> str:
-    """Bind and return the endpoint with its real port; OSError names purpose, endpoint and remedy.
-
-    The gate lets in those with the right ("read", "control"; "inputs" asks for control, too).
-    """
-    _check_file(endpoint, purpose)
-    gate.guard(socket, endpoint, right)
-    try:
-        socket.bind(endpoint)
-    except zmq.ZMQError as error:
-        raise OSError(
-            f"{purpose} can't be opened at {endpoint}: {error.strerror}; is another daemon running there? "
-            "`handtouch doctor CONFIG` tells, and [daemon] in the deployment sets another endpoint"
-        ) from error
-    return socket.getsockopt_string(zmq.LAST_ENDPOINT)
-
-
-def _check_file(endpoint: str, purpose: str) -> None:
-    """ZeroMQ takes an ipc endpoint away from whoever has it, and doesn't say that its folder is missing."""
-    if not endpoint.startswith("ipc:///"):
-        return
-    path = Path(endpoint.removeprefix("ipc://"))
-    if not path.parent.is_dir():
-        raise OSError(f"{purpose} can't be opened at {endpoint}: there is no folder {path.parent}; create it")
-    with stdlib_socket.socket(stdlib_socket.AF_UNIX) as probe:
-        if probe.connect_ex(str(path)) == 0:
-            raise OSError(
-                f"{purpose} can't be opened at {endpoint}: another daemon has it; stop that one, or set "
-                "another endpoint in [daemon] of the deployment"
-            )

@@ -1,7 +1,8 @@
-"""Reload: the deployment file read again while the hand is served; what is unchanged goes on undisturbed.
+"""Reload: read the deployment file again at run time; pads that don't change are not disturbed.
 
-Public names: `Reload`, `Fresh`, `changes`, `fixed`. Reading and building take a second, so a thread does them
-(it makes the loop no later than a process of its own would); the result is taken over between two ticks.
+Public names: `ReloadJob`, `DeploymentChange`, `find_changes`, `find_restart_changes`. Reading and building
+take a second, so a thread does them (a process would delay the loop just as much); the result is applied
+between two ticks.
 """
 
 from __future__ import annotations
@@ -13,80 +14,80 @@ from dataclasses import dataclass
 from typing import Any
 
 from handtouch.canbus.nodes.spec import node_specs
-from handtouch.canbus.objects.eds import EdsError
 from handtouch.config import ConfigError, Deployment, Table
+from handtouch.config.eds import EdsError
+from handtouch.core.pad_model import PadModel
 from handtouch.daemon.control import RefusedError
-from handtouch.daemon.model import PadModel
 
 _log = logging.getLogger("handtouch.control")
-_RESTART = "restart the daemon for that"
+_RESTART_REMEDY = "restart the daemon to apply that"
 
 
 @dataclass(frozen=True)
-class Fresh:
-    """What the file says now: which pads (by number) and tables it changes, and a model if pads change."""
+class DeploymentChange:
+    """The new deployment, changed keys of each pad (by row), changed tables, and a model if pads change."""
 
     deployment: Deployment
-    pads: dict[int, list[str]]
-    tables: list[str]
+    changed_keys_of_pad: dict[int, list[str]]
+    changed_tables: list[str]
     model: PadModel | None
 
 
-class Reload:
-    """Reads a deployment with `read` and hands it to `adopt`, unless it is a `trial`."""
+class ReloadJob:
+    """Reads a deployment with `read`; passes it to `apply` with the time [ns], unless it is a `dry_run`."""
 
     def __init__(
         self,
         present: Deployment,
         read: Callable[[], Deployment],
-        adopt: Callable[[Fresh], None],
-        trial: bool,
+        apply: Callable[[DeploymentChange, int], None],
+        dry_run: bool,
     ) -> None:
-        self._adopt, self._trial, self._present = adopt, trial, present
+        self._apply, self._dry_run, self._current = apply, dry_run, present
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="reload")
-        self._coming: Future[Fresh] = self._worker.submit(_prepare, present, read, trial)
+        self._future: Future[DeploymentChange] = self._worker.submit(_prepare, present, read, dry_run)
         self._worker.shutdown(wait=False)
 
     @property
     def done(self) -> bool:
-        """Whether another may begin."""
-        return self._coming.done()
+        """True once reading has finished."""
+        return self._future.done()
 
-    def poll(self, now_ns: int) -> dict[str, Any] | None:  # noqa: ARG002
-        """What changes, once it is known and taken over. Raises RefusedError."""
-        if not self._coming.done():
+    def poll(self, now_ns: int) -> dict[str, Any] | None:
+        """Return the changes once they are applied. Raises RefusedError."""
+        if not self._future.done():
             return None
         try:
-            fresh = self._coming.result()
+            change = self._future.result()
         except (ConfigError, EdsError) as error:
-            raise RefusedError(f"nothing is changed:\n{error}") from error
-        if not self._trial:
-            self._adopt(fresh)
-        names = [f"{hand.name}/{pad.link}" for hand in fresh.deployment.hands for pad in hand.pads]
+            raise RefusedError(f"nothing changed:\n{error}") from error
+        if not self._dry_run:
+            self._apply(change, now_ns)
+        names = change.deployment.pad_names
         return {
-            "applied": not self._trial,
-            "tables": fresh.tables,
-            "pads": {names[pad]: what for pad, what in fresh.pads.items()},
+            "applied": not self._dry_run,
+            "tables": change.changed_tables,
+            "pads": {names[pad]: what for pad, what in change.changed_keys_of_pad.items()},
         }
 
 
-def _prepare(present: Deployment, read: Callable[[], Deployment], trial: bool) -> Fresh:
+def _prepare(present: Deployment, read: Callable[[], Deployment], dry_run: bool) -> DeploymentChange:
     deployment = read()
-    if obstacles := fixed(present, deployment):
-        raise RefusedError("nothing is changed: " + "; ".join(obstacles) + f"; {_RESTART}")
-    pads, tables = changes(present, deployment)
-    return Fresh(deployment, pads, tables, PadModel(deployment) if pads and not trial else None)
+    if obstacles := find_restart_changes(present, deployment):
+        raise RefusedError("nothing changed: " + "; ".join(obstacles) + f"; {_RESTART_REMEDY}")
+    pads, tables = find_changes(present, deployment)
+    return DeploymentChange(deployment, pads, tables, PadModel(deployment) if pads and not dry_run else None)
 
 
-def changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]], list[str]]:
-    """What differs: number of each changed pad -> its keys and tables, and the names of changed tables.
+def find_changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]], list[str]]:
+    """Return the changed keys and tables of each changed pad (by row), and the names of changed tables.
 
-    Raises nothing: both are checked deployments with the same pads.
+    Both are valid deployments with the same pads.
     """
     pairs = list(zip(_pads(old), _pads(new), strict=True))
     pads: dict[int, list[str]] = {}
     for number, (before, after) in enumerate(pairs):
-        what = _keys(before, after)
+        what = _changed_keys(before, after)
         what += [f"node.{after.node}"] * (old.nodes[before.node] != new.nodes[after.node])
         what += [f"sheet.{after.sheet}"] * (old.sheets[before.sheet] != new.sheets[after.sheet])
         if (before.touch or old.touch) != (after.touch or new.touch) and "touch" not in what:
@@ -101,30 +102,34 @@ def changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]], lis
     return pads, tables
 
 
-def fixed(old: Deployment, new: Deployment) -> list[str]:
-    """What differs and can't change while the daemon runs, in words."""
-    told = [f"[daemon] {key} differs" for key in _keys(old.daemon, new.daemon) if key != "log_level"]
+def find_restart_changes(old: Deployment, new: Deployment) -> list[str]:
+    """Return a text for each difference that needs a restart of the daemon."""
+    differences = [
+        f"[daemon] {key} differs" for key in _changed_keys(old.daemon, new.daemon) if key != "log_level"
+    ]
     if old.buses != new.buses:
-        told.append("[[bus]] differs")
+        differences.append("[[bus]] differs")
     for before, after in zip(old.hands, new.hands, strict=False):
-        told += [f"[[hand]] {after.name}: {key} differs" for key in _keys(before, after) if key != "pads"]
+        differences += [
+            f"[[hand]] {after.name}: {key} differs" for key in _changed_keys(before, after) if key != "pads"
+        ]
     names = [[(hand.name, pad.link) for hand in d.hands for pad in hand.pads] for d in (old, new)]
     if names[0] != names[1]:
-        told.append("the pads or their order differ")
-    elif not told:  # nodes depend on the period
+        differences.append("the pads or their order differ")
+    elif not differences:  # nodes depend on the period
         specs = zip(node_specs(old), node_specs(new), strict=True)
-        told += [
+        differences += [
             f"the node of {after.name} differs in its id, bus, identity, wiring or supervision"
             for before, after in specs
             if before != after
         ]
-    return told
+    return differences
 
 
 def _pads(deployment: Deployment) -> list[Any]:
-    return [pad for hand in deployment.hands for pad in hand.pads]
+    return [entry.pad for entry in deployment.pads]
 
 
-def _keys(old: Table, new: Table) -> list[str]:
-    """Keys of a table whose values differ."""
+def _changed_keys(old: Table, new: Table) -> list[str]:
+    """Return the keys of a table whose values differ."""
     return [key for key in type(new).model_fields if getattr(old, key) != getattr(new, key)]

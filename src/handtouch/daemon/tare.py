@@ -1,6 +1,6 @@
-"""Tare: what the channels of a pad read that nothing touches, measured over a second and then taken off.
+"""Tare: measure the offsets of unloaded pads over one second and set their baselines to them.
 
-Public names: `Tare`. A job of the control endpoint: it looks at every tick, and never waits.
+Public names: `TareJob`. A job of the control endpoint that reads every tick and never blocks.
 """
 
 from __future__ import annotations
@@ -11,103 +11,107 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.objects.channels import ELECTRODES
-from handtouch.daemon.model import PadModel
-from handtouch.daemon.pacer import Pacer
-from handtouch.daemon.tick import Tick
+from handtouch.config.channels import ELECTRODES
+from handtouch.core.pad_model import PadModel
+from handtouch.core.tick import TickProcessor
+from handtouch.daemon.sampling import SamplingController
 from handtouch.wire import PadState
 
-_SECOND_NS = 1_000_000_000
-_LEAST_SAMPLES = 8
-_NOISY = 3.0
-"""Times its noise that a channel may scatter."""
-_OFF = 3.0
-"""Standard deviations that a mean may be from the baseline, besides what drift may have done."""
+_MIN_DURATION_NS = 1_000_000_000
+_MIN_SAMPLES = 8
+_MAX_STD_PER_NOISE = 3.0
+"""Largest standard deviation of a channel, in multiples of its noise"""
+_MAX_OFFSET_SIGMA = 3.0
+"""Largest offset of a mean from the baseline, in standard deviations"""
 
 
-class Tare:
-    """Measures the pads `chosen` (n,) and tares those that prove to be unloaded."""
+class TareJob:
+    """Measures the `selected` pads (n,) and tares those that are unloaded."""
 
     def __init__(
         self,
         names: list[tuple[str, str]],
-        chosen: NDArray[np.bool_],
-        tick: Tick,
-        pacer: Pacer,
+        selected: NDArray[np.bool_],
+        tick: TickProcessor,
+        pacer: SamplingController,
         now_ns: int,
-        tared: Callable[[int], None] = lambda _: None,
+        on_tared: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """tared: is called with the row of each pad that was tared."""
-        self._names, self._chosen, self._tick, self._pacer = names, chosen, tick, pacer
-        self._tared = tared
-        self._end_ns = now_ns + max(_SECOND_NS, 10 * int(tick.period_ns.max()))
-        self._samples = tick.samples.copy()
+        """Start measuring; `on_tared` is called with the row of each tared pad."""
+        self._names, self._selected, self._tick, self._sampling = names, selected, tick, pacer
+        self._on_tared = on_tared
+        self._end_ns = now_ns + max(_MIN_DURATION_NS, 10 * int(tick.max_sample_period_ns.max()))
+        self._samples = tick.sample_counts.copy()
         self._count = np.zeros(len(names), dtype=np.int64)
         self._sum = np.zeros((len(names), 4))
-        self._squares = np.zeros((len(names), 4))
-        self._first = tick.counts.astype(np.float64)  # sums are of what differs from it: no digits are lost
+        self._sum_of_squares = np.zeros((len(names), 4))
+        self._reference_counts = tick.counts.astype(
+            np.float64
+        )  # sums are of differences from it, to keep precision
         self._touched = np.zeros(len(names), dtype=np.bool_)
-        pacer.attend(chosen, now_ns)
+        pacer.request_full_rate(selected, now_ns)
 
     def poll(self, now_ns: int) -> dict[str, Any] | None:
-        """Take in the tick's samples; after a second, the result of every pad."""
-        tick, chosen = self._tick, self._chosen
-        self._pacer.attend(chosen, now_ns)
-        new = chosen & (tick.samples != self._samples)
-        self._samples[:] = tick.samples
+        """Add the tick's samples; after a second, return the result of every pad."""
+        tick, selected = self._tick, self._selected
+        self._sampling.request_full_rate(selected, now_ns)
+        new = selected & (tick.sample_counts != self._samples)
+        self._samples[:] = tick.sample_counts
         self._count += new
-        differs = np.where(new[:, None], tick.counts - self._first, 0.0)
-        self._sum += differs
-        self._squares += differs**2
+        difference = np.where(new[:, None], tick.counts - self._reference_counts, 0.0)
+        self._sum += difference
+        self._sum_of_squares += difference**2
         self._touched |= tick.contacts.touching
         if now_ns < self._end_ns:
             return None
-        return {"pads": [self._finish(pad, tick.model) for pad in np.flatnonzero(chosen).tolist()]}
+        return {"pads": [self._finish_pad(pad, tick.model) for pad in np.flatnonzero(selected).tolist()]}
 
-    def _finish(self, pad: int, model: PadModel) -> dict[str, Any]:
+    def _finish_pad(self, pad: int, model: PadModel) -> dict[str, Any]:
         hand, link = self._names[pad]
-        before = self._tick.baseline.expected[pad].copy()
-        told = {
+        before = self._tick.baseline.expected_counts[pad].copy()
+        result = {
             "hand": hand,
             "link": link,
             "samples": int(self._count[pad]),
             "offset_counts": before.tolist(),
         }
         count = int(self._count[pad])
-        if count < _LEAST_SAMPLES:
+        if count < _MIN_SAMPLES:
             state = PadState(int(self._tick.columns.state[pad])).name.lower()
-            why = f"{count} samples came in a second, it takes {_LEAST_SAMPLES}; the pad is {state}"
-            return {**told, "tared": False, "reason": why}
+            why = f"{count} samples in one second, at least {_MIN_SAMPLES} needed; the pad is {state}"
+            return {**result, "tared": False, "reason": why}
         part = self._sum[pad] / count
-        mean = self._first[pad] + part
-        std = np.sqrt(np.maximum(self._squares[pad] / count - part**2, 0.0))
-        told |= {"mean_counts": mean.tolist(), "std_counts": std.tolist()}
-        if why := self._trouble(pad, model, mean, std):
-            return {**told, "tared": False, "reason": why}
-        self._tick.assume(pad, mean, std / np.sqrt(count))
-        self._tick.forget(np.array([pad]))
-        self._tared(pad)
-        return {**told, "tared": True, "reason": "", "offset_counts": mean.tolist()}
+        mean = self._reference_counts[pad] + part
+        std = np.sqrt(np.maximum(self._sum_of_squares[pad] / count - part**2, 0.0))
+        result |= {"mean_counts": mean.tolist(), "std_counts": std.tolist()}
+        if why := self._refusal_reason(pad, model, mean, std):
+            return {**result, "tared": False, "reason": why}
+        self._tick.set_baseline(pad, mean, std / np.sqrt(count))
+        self._tick.discard_solutions(np.array([pad]))
+        self._on_tared(pad)
+        return {**result, "tared": True, "reason": "", "offset_counts": mean.tolist()}
 
-    def _trouble(self, pad: int, model: PadModel, mean: NDArray[np.float64], std: NDArray[np.float64]) -> str:
-        """Why the pad can't be tared; empty if it can."""
+    def _refusal_reason(
+        self, pad: int, model: PadModel, mean: NDArray[np.float64], std: NDArray[np.float64]
+    ) -> str:
+        """Return why the pad can't be tared; empty if it can."""
         if self._touched[pad]:
-            return "it was touched; take the load off and tare again"
+            return "touched during the measurement; remove the load and tare again"
         noise = float(model.noise_counts[pad])
         worst = int(np.argmax(std))
-        if std[worst] > _NOISY * noise:
+        if std[worst] > _MAX_STD_PER_NOISE * noise:
             return (
-                f"channel {ELECTRODES[worst]} scatters by {std[worst]:.1f} counts, its noise is {noise:.1f}: "
-                "something moves on it or disturbs it"
+                f"channel {ELECTRODES[worst]}: standard deviation {std[worst]:.1f} counts, noise "
+                f"{noise:.1f}: varying load or electrical interference; remove it and tare again"
             )
-        # whatever adds up to less than what ends a contact could be no contact that is to be kept
+        # an offset below the end threshold can't hide a contact
         baseline = self._tick.baseline
-        moved = np.abs(mean - baseline.expected[pad]).sum()
-        allowed = model.off_counts[pad] + _OFF * np.hypot(noise, baseline.std[pad])
+        moved = np.abs(mean - baseline.expected_counts[pad]).sum()
+        allowed = model.end_threshold_counts[pad] + _MAX_OFFSET_SIGMA * np.hypot(noise, baseline.std[pad])
         if moved > allowed:
             return (
-                f"its channels are {moved:.0f} counts from their baseline, noise and drift explain "
-                f"{allowed:.0f}: take the load off; if there is none, look at the pad, and give its offsets "
-                "by `handtouch calibrate`"
+                f"offset of {moved:.0f} counts from the baseline, noise and drift explain {allowed:.0f}: "
+                "remove the load; if there is none, inspect the pad and set its offsets with "
+                "`handtouch calibrate`"
             )
         return ""

@@ -33,11 +33,11 @@ class DiscMap:
 
     def __init__(self, a: float, b: float) -> None:
         shorter, longer = min(a, b), max(a, b)
-        turn = 1.0 if a <= b else -1j  # lays the shorter side along the real axis
+        turn = 1.0 if a <= b else -1j  # rotates the shorter side onto the real axis
         self._centre = complex(a / 2, b / 2)
         self._rate = turn * math.pi / (2 * shorter)
-        self._places = np.array([0, a, complex(a, b), complex(0, b)])
-        below_real = ((self._places - self._centre) * turn).imag < 0
+        self._corner_points = np.array([0, a, complex(a, b), complex(0, b)])
+        below_real = ((self._corner_points - self._centre) * turn).imag < 0
         self._raised = np.where(below_real, 1j, -1j)  # corner's factor exp(-+iv), as an exponent of v
         q = math.exp(-math.pi * longer / shorter)
         self._first, third = _theta_polynomials(q)
@@ -45,10 +45,10 @@ class DiscMap:
         self._images = images * (-1.0) ** np.arange(images.size)  # the same with the sign of cos 2v changed
         self._scale = np.ones(4, np.complex128)
         self._scale = 1 / self.defects(np.asarray(a / 2), np.asarray(b / 2))
-        at_corners = self.defects(self._places.real, self._places.imag)  # [seen from, corner]
-        self.turns = angle_of(at_corners)
-        self.corners = 1 - at_corners[0]
-        v = self._rate * (self._places[0] - self._centre)
+        at_corners = self.defects(self._corner_points.real, self._corner_points.imag)  # [seen from, corner]
+        self.corner_angles = angle_of(at_corners)
+        self.corner_images = 1 - at_corners[0]
+        v = self._rate * (self._corner_points[0] - self._centre)
         first_corner = (
             np.tan(v)
             * np.polyval(images[::-1], np.cos(2 * v))
@@ -62,13 +62,13 @@ class DiscMap:
         column = (4,) + (1,) * z.ndim
         v = self._rate * (z - self._centre)
         below = _polynomial(self._images, np.cos(2 * v)) * np.cos(v)
-        sine = np.sin(self._rate * (z - self._places.reshape(column)))
+        sine = np.sin(self._rate * (z - self._corner_points.reshape(column)))
         theta = sine * _polynomial(self._first, 1 - 2 * sine * sine)
         raised = np.exp(self._raised.reshape(column) * v)
         return np.asarray(self._scale.reshape(column) * raised * theta * theta / below)
 
     def derivative(self, defects: ComplexArray) -> ComplexArray:
-        """D zeta / d(x + iy) where the defects are given."""
+        """Return d zeta / d(x + iy) where the defects are given."""
         roots = np.sqrt(defects)
         return np.asarray(self._growth * (roots[0] * roots[1]) * (roots[2] * roots[3]))
 
@@ -89,25 +89,29 @@ class CirclePoints:
     def __init__(self, disc: DiscMap, defects: ComplexArray) -> None:
         self.corner = np.argmin(np.abs(defects), axis=0)
         self.angle = angle_of(np.take_along_axis(defects, self.corner[None], axis=0)[0])
-        self._turns = disc.turns
+        self._turns = disc.corner_angles
         self._constant = -np.expm1(-1j * self.angle)
         self._slope = np.exp(-1j * self.angle)
-        self.inverse = self._slope * np.conj(disc.corners[self.corner])
+        self.inverse = self._slope * np.conj(disc.corner_images[self.corner])
 
     def factors(self, defects: ComplexArray) -> ComplexArray:
-        """1 - zeta / e for places (4, ...), shape (n, ...)."""
+        """Return 1 - zeta / e for points (4, ...), shape (n, ...)."""
         column = (-1,) + (1,) * (defects.ndim - 1)
         return np.asarray(self._constant.reshape(column) + self._slope.reshape(column) * defects[self.corner])
 
     def angle_to(self, corner: npt.NDArray[np.intp] | int, angle: FloatArray) -> FloatArray:
-        """Angle in (-pi, pi] from each point (n, 1) to places given by their corner and angle from there."""
+        """Return the angle in (-pi, pi] from each point (n, 1) to points given by corner and angle from
+        there.
+        """
         ahead = angle - self.angle[:, None] + self._turns[self.corner[:, None], np.asarray(corner)]
         ahead = np.where(ahead > np.pi, ahead - 2 * np.pi, ahead)
         return np.asarray(np.where(ahead <= -np.pi, ahead + 2 * np.pi, ahead))
 
 
 def angle_of(defect: ComplexArray) -> FloatArray:
-    """The angle t of a point of the circle whose defect is 1 - exp(it), small ones to their last digit."""
+    """Return the angle t of a point of the circle whose defect is 1 - exp(it), small ones to their last
+    digit.
+    """
     size = np.abs(defect)
     small = -np.sign(defect.imag) * 2 * np.arcsin(np.minimum(size, 1.0) / 2)
     return np.asarray(np.where(size < 1, small, np.angle(1 - defect)))

@@ -26,17 +26,17 @@ from handtouch.field._disc import CirclePoints
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
-_TERMS = (8, 16, 32, 64, 128, 256, 512)  # tried in turn
-_CLOSED = 1e-280  # rad: a gap of 1e-140 of a side, next to denormals
-_NEGLIGIBLE, _ROUNDING = 1e-14, 1e-9
+_TERM_COUNTS = (8, 16, 32, 64, 128, 256, 512)  # tried in turn
+_MIN_GAP_RAD = 1e-280  # rad: a gap of 1e-140 of a side, next to denormals
+_MAX_TAIL, _MAX_ROUNDING_TAIL = 1e-14, 1e-9
 
 
 class ElectrodePotentials:
     """Unit potentials phi_i of m electrodes: phi_i is 1 on electrode i and 0 on the others.
 
-    `ends`, `starts`: where electrode j ends and where the next one starts, counter-clockwise; a gap may be
-    zero. `inside`: any place on electrode 0. Places are given by their defects from the corners, shape (4,
-    ...). Raises ValueError when electrodes are so short beside the gaps that 512 terms per gap do not
+    `ends`, `starts`: points where electrode j ends and where the next one starts, counter-clockwise; a gap
+    may be zero. `inside`: any point on electrode 0. Points are given by their defects from the corners, shape
+    (4, ...). Raises ValueError when electrodes are so short beside the gaps that 512 terms per gap don't
     suffice.
     """
 
@@ -45,7 +45,7 @@ class ElectrodePotentials:
         self._ends = (ends, starts)
         width = np.diagonal(ends.angle_to(starts.corner, starts.angle))
         width = np.where(width < 0, width + 2 * np.pi, width)
-        self._half = np.where(width > _CLOSED, width / 2, 0.0)
+        self._half = np.where(width > _MIN_GAP_RAD, width / 2, 0.0)
         self._kappa = np.exp(0.5j * self._half)
         # d K / d zeta = this / (s1 s2 D^2); the difference of the ends is formed without cancellation
         self._slope = self._kappa * ends.inverse * np.expm1(-2j * self._half)
@@ -56,7 +56,7 @@ class ElectrodePotentials:
         self._offset = identity[0] - self.potentials(inside)
 
     def potentials(self, defects: ComplexArray) -> FloatArray:
-        """Unit potentials at places, shape (m, ...)."""
+        """Return the unit potentials at points, shape (m, ...)."""
         flat = defects.reshape(4, -1)
         first, last = self._roots(flat)
         total = first + last
@@ -67,7 +67,9 @@ class ElectrodePotentials:
         return np.asarray(values.reshape((self.count, *defects.shape[1:])))
 
     def potentials_and_slope(self, defects: ComplexArray) -> tuple[FloatArray, ComplexArray]:
-        """Unit potentials and d Phi / d zeta, both (m, ...); the slope is infinite at electrodes' ends."""
+        """Return unit potentials and d Phi / d zeta, both (m, ...); the slope is infinite at electrodes'
+        ends.
+        """
         flat = defects.reshape(4, -1)
         first, last = self._roots(flat)
         total = first + last
@@ -88,7 +90,7 @@ class ElectrodePotentials:
         return values.reshape(shape), slope.reshape(shape)
 
     def log_spread(self, defects: ComplexArray) -> FloatArray:
-        """Log of the factor by which the gaps enlarge the disc's conformal radius at zeta.
+        """Return ln of the factor by which the gaps enlarge the disc's conformal radius at zeta.
 
         2 pi times the regular part of Green's function, gaps insulated, less that of the closed circle.
         """
@@ -104,27 +106,29 @@ class ElectrodePotentials:
         return np.asarray(spread.reshape(defects.shape[1:]))
 
     def _roots(self, flat: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """s1 and kappa s2 of every gap, each (m, points)."""
+        """Return s1 and kappa s2 of every gap, each (m, points)."""
         first, last = (np.sqrt(ends.factors(flat)) for ends in self._ends)
         return first, self._kappa[:, None] * last
 
     def _solve(self) -> None:
-        """Set coefficients (m, terms * m), conductances (m, m), gaps' influence on each other."""
+        """Solve for coefficients (m, terms * m), conductances (m, m), and the gaps' influence on each
+        other.
+        """
         previous = np.inf
-        for terms in _TERMS:
+        for terms in _TERM_COUNTS:
             unknowns, stream, response = self._collocate(terms)
             by_order = np.abs(unknowns.reshape(self.count, terms, -1)).max(axis=(0, 2))
             tail = by_order[3 * terms // 4 :].max()
-            # convergence squares the tail; one that stands still is rounding, larger on long pads
-            if tail < _NEGLIGIBLE or (tail < _ROUNDING and tail > previous / 10):
+            # the tail converges quadratically; a constant one is rounding, larger on long pads
+            if tail < _MAX_TAIL or (tail < _MAX_ROUNDING_TAIL and tail > previous / 10):
                 break
             previous = tail
         else:
             raise ValueError(
-                f"electrodes: one is too short beside the gaps next to it; "
+                f"electrodes: one is too short compared with its neighbouring gaps; "
                 f"{terms} terms per gap leave {tail:.1e}"
             )
-        self.terms = int(np.flatnonzero(by_order > max(tail, _NEGLIGIBLE / 100)).max(initial=-1)) + 1
+        self.terms = int(np.flatnonzero(by_order > max(tail, _MAX_TAIL / 100)).max(initial=-1)) + 1
         kept = self.terms * self.count
         self.coefficients = unknowns[:, :kept]
         self._mutual = (response - np.eye(response.shape[0]))[:kept, :kept] * np.repeat(
@@ -133,7 +137,9 @@ class ElectrodePotentials:
         self.conductance = np.roll(stream, 1, axis=1) - stream if (self._half > 0).all() else None
 
     def _collocate(self, terms: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Coefficients (m, terms * m), stream function on the gaps (m, m), and inverse of the system."""
+        """Return coefficients (m, terms * m), stream function on the gaps (m, m), and inverse of the
+        system.
+        """
         gaps = self.count
         polar = (np.arange(terms + 1) + 0.5) * np.pi / (terms + 1)
         project = np.cos(np.outer(np.arange(terms + 1), polar)) * (2 / (terms + 1))
@@ -159,12 +165,12 @@ class ElectrodePotentials:
         return unknowns.T, stream.T, np.asarray(response, np.float64)
 
     def _roots_on(self, gap: int, nodes: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """`_roots` on a gap at nodes in (-1, 1), from angles that keep their small differences."""
+        """Return `_roots` on a gap at nodes in (-1, 1), from angles that keep their small differences."""
         half = self._half[gap]
         aside = 2 * np.arctan(nodes * np.tan(half / 2))
         corner, angle = int(self._ends[0].corner[gap]), self._ends[0].angle[gap] + half + aside
         first, last = (_boundary_root(ends.angle_to(corner, angle)) for ends in self._ends)
-        # on the gap itself from the angles as they are: their sums would cost digits of a small gap
+        # on the gap itself from the angles directly: their sums would lose digits of a small gap
         first[gap], last[gap] = _boundary_root(half + aside), _boundary_root(aside - half)
         return first, self._kappa[:, None] * last
 

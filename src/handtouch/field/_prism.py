@@ -1,18 +1,25 @@
-"""Prisms: a strip folded along straight lines, as a surface that a sensor may cover."""
+"""Prisms: a strip folded along straight lines, as a sensor surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field._conformal import FloatArray, Surface, check_lengths, pair
+from handtouch.field.surface_base import (
+    FloatArray,
+    Surface,
+    broadcast_finite,
+    check_lengths,
+    surface_key,
+)
 
 
 @dataclass(frozen=True)
-class Prism(Surface):
+class PrismSurface(Surface):
     """A patch of a prism, a strip bent along lines parallel to x; developable, so rectangle units are metres.
 
     `length_m`: along x. `aside_m`, `up_m`: corners of the cross-section from electrode y0 to yb, at least
@@ -20,9 +27,17 @@ class Prism(Surface):
     the later face.
     """
 
-    length_m: float
-    aside_m: tuple[float, ...]
-    up_m: tuple[float, ...]
+    kind: ClassVar[str] = "prism"
+    length_m: float = surface_key("length_mm", "along the folds, from electrode x0 to electrode xa")
+    aside_m: tuple[float, ...] = surface_key(
+        "section_aside_mm",
+        "corners of the cross-section from electrode y0 to electrode yb: coordinate across the pad",
+        above=None,
+        is_list=True,
+    )
+    up_m: tuple[float, ...] = surface_key(
+        "section_up_mm", "height of the same corners; the outside is up", above=None, is_list=True
+    )
 
     @np.errstate(all="ignore")
     def __post_init__(self) -> None:
@@ -33,6 +48,13 @@ class Prism(Surface):
             raise ValueError(f"up_m must have as many finite points as aside_m, {len(self.aside_m)}")
         if not (self._faces[0] > 0).all():
             raise ValueError("aside_m and up_m name the same corner twice running")
+
+    def grid_lines(self, cells: int) -> tuple[FloatArray, FloatArray]:
+        x, y = super().grid_lines(cells)
+        return x, np.union1d(y, np.cumsum(self._faces[0])[:-1])
+
+    def describe_side(self, side: str) -> str:  # noqa: ARG002
+        return "the edge"
 
     @property
     def a(self) -> float:
@@ -54,7 +76,7 @@ class Prism(Surface):
         return widths, steps / np.where(widths > 0, widths, 1.0)
 
     def _face(self, y: FloatArray) -> tuple[npt.NDArray[np.intp], FloatArray]:
-        """Index of the face that holds y, and the distance into it."""
+        """Return the index of the face that holds y, and the distance into it."""
         starts = np.concatenate([[0.0], np.cumsum(self._faces[0])[:-1]])
         index = np.clip(np.searchsorted(starts, y, side="right") - 1, 0, starts.size - 1)
         return index, np.asarray(y - starts[index])
@@ -70,30 +92,33 @@ class Prism(Surface):
         middle = np.array(self.b / 2)
         return self._section(middle), self._faces[1][:, self._face(middle)[0]]
 
-    def _turned(self, aside: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _into_pad_frame(self, aside: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
         cos, sin = self._centre[1]
         return np.asarray(cos * aside + sin * up), np.asarray(cos * up - sin * aside)
 
     def from_rectangle(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        x, y = pair(x, y)
+        x, y = broadcast_finite(x, y)
         return +x, +y
 
     def to_rectangle(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        u, v = pair(u, v)
+        u, v = broadcast_finite(u, v)
         return +u, +v
 
     @np.errstate(all="ignore")
     def point(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        x, y = pair(x, y)
+        x, y = broadcast_finite(x, y)
         aside, up = self._section(y)
         return np.stack(
-            [x - self.length_m / 2, *self._turned(aside - self._centre[0][0], up - self._centre[0][1])]
+            [
+                x - self.length_m / 2,
+                *self._into_pad_frame(aside - self._centre[0][0], up - self._centre[0][1]),
+            ]
         )
 
     @np.errstate(all="ignore")
     def tangents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        x, y = pair(x, y)
-        cos, sin = self._turned(*self._faces[1][:, self._face(y)[0]])
+        x, y = broadcast_finite(x, y)
+        cos, sin = self._into_pad_frame(*self._faces[1][:, self._face(y)[0]])
         zero, one = np.zeros_like(x), np.ones_like(x)
         return np.stack([np.stack([one, zero, zero]), np.stack([zero, cos, sin])])
 
@@ -103,5 +128,5 @@ class Prism(Surface):
         return np.stack([zero, -sin, cos])
 
     def scales(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        x, _ = pair(x, y)
+        x, _ = broadcast_finite(x, y)
         return np.ones((2, *x.shape))

@@ -1,4 +1,4 @@
-"""Distance from a side, given how its current compares with the opposite one's: Landen's transformation."""
+"""Distance from a side, given the ratio of its current to the opposite one: Landen's transformation."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from handtouch.field._separable import SideRatio
 from handtouch.field.model import FloatArray
 
-_MODULUS_FLOOR = 1e-15  # a smaller modulus changes the inverse by less than rounding
-_TRIGONOMETRIC = 6e-9  # a complementary modulus below this leaves an arctangent
-LOGARITHMIC_DEPTH = 12.0  # depth / length from which the modulus is below _MODULUS_FLOOR
+_MIN_MODULUS = 1e-15  # a smaller modulus changes the inverse by less than rounding
+_MAX_TRIGONOMETRIC_MODULUS = 6e-9  # a complementary modulus below this leaves an arctangent
+LOGARITHMIC_DEPTH = 12.0  # depth / length from which the modulus is below _MIN_MODULUS
 
 
 def landen_moduli(k: float, k_complement: float) -> list[tuple[float, float]]:
-    """(k, k') of every step of the descending Landen transformation, until k no longer matters."""
+    """Return (k, k') of every step of the descending Landen transformation, until k is negligible."""
     steps = []
-    while k > _MODULUS_FLOOR:
+    while k > _MIN_MODULUS:
         steps.append((k, k_complement))
         k, k_complement = k * k / (1 + k_complement) ** 2, 2 * math.sqrt(k_complement) / (1 + k_complement)
     return steps
@@ -33,7 +33,7 @@ class RatioInverse:
 
     @cached_property
     def _trigonometric(self) -> bool:
-        return all(pair.moduli[1] < _TRIGONOMETRIC for pair in self._pairs)
+        return all(pair.moduli[1] < _MAX_TRIGONOMETRIC_MODULUS for pair in self._pairs)
 
     @cached_property
     def _first(self) -> FloatArray:
@@ -42,7 +42,7 @@ class RatioInverse:
 
     @cached_property
     def _steps(self) -> list[tuple[FloatArray, FloatArray]]:
-        """k^2 and (1 + k')^2 of each step, for each pair; a pair that is done early takes idle steps."""
+        """k^2 and (1 + k')^2 of each step, for each pair; a pair that finishes early takes idle steps."""
         chains = [landen_moduli(*pair.moduli) for pair in self._pairs]
         longest = max(map(len, chains))
         chains = [chain + [(1.0, 0.0)] * (longest - len(chain)) for chain in chains]
@@ -61,7 +61,9 @@ class RatioInverse:
         return scales
 
     def __call__(self, ratio: FloatArray) -> FloatArray:
-        """Distance to the nearer side, for `ratio` >= 1 of its T to the opposite one; shape (pairs, n)."""
+        """Return the distance to the nearer side, for `ratio` >= 1 of its T to the opposite one; (pairs,
+        n).
+        """
         squared = self._first / ratio  # sc(kappa d; k')^2
         if self._trigonometric:
             return np.asarray(np.arctan(np.sqrt(squared)) * self._scale)
@@ -71,14 +73,14 @@ class RatioInverse:
 
 
 def distance_in_strip(pair: SideRatio, near: FloatArray, across: FloatArray) -> FloatArray:
-    """Distance to the nearer side of a pair more than LOGARITHMIC_DEPTH times as deep as long.
+    """Return the distance to the nearer side of a pair more than LOGARITHMIC_DEPTH times as deep as long.
 
     `near` is the T of that side, `across` the distance to the nearer long side. The other end of such a strip
-    is out of sight, so this end alone decides: sinh(pi d / length) = sin(pi across / length) / T. NaN where
-    the current of this end has underflowed as well.
+    collects no measurable current, so this end alone decides: sinh(pi d / length) = sin(pi across / length) /
+    T. NaN where the current of this end has underflowed as well.
     """
     shift = math.pi / pair.length
-    across = np.where(np.isnan(across), pair.length / 2, across)  # unknown only on the end itself
+    across = np.where(np.isnan(across), pair.length / 2, across)  # NaN only on the end itself
     sine = np.sin(shift * across)
     log_sinh = np.log(sine) - np.log(near)
     distance = np.where(log_sinh > 20, log_sinh + math.log(2), np.arcsinh(sine / near))

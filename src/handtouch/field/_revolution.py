@@ -5,20 +5,27 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from handtouch.field._conformal import FloatArray, Meridian, Revolved, check_arc
+from handtouch.field.surface_base import (
+    FloatArray,
+    Meridian,
+    SweptSurface,
+    arc_key,
+    check_arc,
+    surface_key,
+)
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-_STEPS = 128  # table steps per spline segment
+_STEPS_PER_SEGMENT = 128  # table steps per spline segment
 
 
 @dataclass(frozen=True)
-class Revolution(Revolved):
+class RevolutionSurface(SweptSurface):
     """A patch of any surface of revolution, its profile a smooth curve (cubic spline) through given points.
 
     `axial_m`, `radius_m`: the points of the profile from electrode x0 to xa, at least two, no two the same,
@@ -26,9 +33,17 @@ class Revolution(Revolved):
     1e-12 of the profile's length.
     """
 
-    axial_m: tuple[float, ...]
-    radius_m: tuple[float, ...]
-    arc_rad: float
+    kind: ClassVar[str] = "revolution"
+    axial_m: tuple[float, ...] = surface_key(
+        "profile_axial_mm",
+        "points of the profile from electrode x0 to electrode xa: coordinate along the axis",
+        above=None,
+        is_list=True,
+    )
+    radius_m: tuple[float, ...] = surface_key(
+        "profile_radius_mm", "radii at the same points, joined by a smooth curve", is_list=True
+    )
+    arc_rad: float = arc_key()
 
     def __post_init__(self) -> None:
         check_arc(self.arc_rad)
@@ -41,7 +56,7 @@ class Revolution(Revolved):
             raise ValueError("radius_m must be positive and finite at every point")
         if (np.hypot(np.diff(axial), np.diff(radius)) == 0).any():
             raise ValueError("axial_m and radius_m name the same point twice running")
-        _ = self._profile  # built here, so that a curve that cannot be is refused here
+        _ = self._profile  # built here to reject an impossible curve at once
 
     @cached_property
     def _profile(self) -> SplineProfile:
@@ -100,14 +115,14 @@ class SplineProfile:
     @np.errstate(all="ignore")
     def __init__(self, axial: FloatArray, radius: FloatArray) -> None:
         forward = 1.0 if axial[-1] >= axial[0] else -1.0
-        # a power of two brings any unit near 1, so that no square or quotient leaves the range of doubles
+        # a power of two scales any unit to near 1, so that no square or quotient leaves the range of doubles
         self._unit = math.ldexp(1.0, math.frexp(float(np.abs([axial, radius]).max()))[1])
         points = np.stack([forward * axial, radius], axis=1) / self._unit
         knots = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        from scipy.interpolate import CubicSpline  # here and below: a daemon's start does without
+        from scipy.interpolate import CubicSpline  # lazy, here and below: slow to import
 
         self._spline = CubicSpline(knots, points)
-        steps = np.linspace(0, 1, _STEPS, endpoint=False)
+        steps = np.linspace(0, 1, _STEPS_PER_SEGMENT, endpoint=False)
         self._nodes = np.append((knots[:-1, None] + np.diff(knots)[:, None] * steps).ravel(), knots[-1])
         if not self._spline(self._nodes)[:, 1].min() > 0:
             raise ValueError(
@@ -136,26 +151,26 @@ class SplineProfile:
         return float(self._log(self._nodes[-1]))
 
     def curve(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Axial position, radius, and cosine and sine of the slope at t; NaN outside the profile."""
+        """Return axial position, radius, and cosine and sine of the slope at t; NaN outside the profile."""
         axial, radius = np.moveaxis(self._spline(t, extrapolate=False), -1, 0)
         forward, outward = np.moveaxis(self._spline(t, 1, extrapolate=False), -1, 0)
         speed = np.hypot(forward, outward)
         return self._unit * axial, self._unit * radius, forward / speed, outward / speed
 
     def arc_length(self, t: FloatArray) -> FloatArray:
-        """Arc length from the start to t."""
+        """Return the arc length from the start to t."""
         return np.asarray(self._unit * self._arc(t))
 
     def conformal(self, t: FloatArray) -> FloatArray:
-        """Integral of ds / r from the start to t."""
+        """Return the integral of ds / r from the start to t."""
         return np.asarray(self._log(t))
 
     def at_arc_length(self, length: FloatArray) -> FloatArray:
-        """T where the arc length is as given."""
+        """Return t at the given arc length."""
         return _solve(self._arc, self._from_arc, length / self._unit)
 
     def at_conformal(self, value: FloatArray) -> FloatArray:
-        """T where the conformal coordinate is as given."""
+        """Return t at the given conformal coordinate."""
         return _solve(self._log, self._from_log, value)
 
     def _speed(self, t: FloatArray) -> FloatArray:
@@ -175,10 +190,10 @@ def _hermite(x: FloatArray, y: FloatArray, slope: FloatArray) -> CubicHermiteSpl
 
 
 def _solve(table: CubicHermiteSpline, inverse: CubicHermiteSpline, value: FloatArray) -> FloatArray:
-    """Table's argument for a value: a start from the inverse table, one Newton step to rounding error."""
+    """Return the table's argument for a value: a start from the inverse table, then one Newton step."""
     first, last = inverse.x[0], inverse.x[-1]
-    slack = 1e-12 * (last - first)  # the end itself, as its rounding may leave it
+    slack = 1e-12 * (last - first)  # rounding of the end itself
     inside = (value >= first - slack) & (value <= last + slack)
     value = np.where(inside, np.clip(value, first, last), np.nan)
-    start = inverse(value)
+    start = np.clip(inverse(value), table.x[0], table.x[-1])  # rounding may lead out of the table
     return np.clip(start - (table(start) - value) / table(start, 1), table.x[0], table.x[-1])

@@ -42,14 +42,14 @@ def theta_four(nome: float) -> float:
 
 @dataclass(frozen=True)
 class SideRatio:
-    """G(d) = root * sqrt(T0 / T1) at distance d from side 0; sides `depth` apart and `length` long."""
+    """Ratio G(d) = root * sqrt(T0 / T1) at distance d from side 0; sides `depth` apart and `length` long."""
 
     depth: float
     length: float
 
     @cached_property
     def deep(self) -> bool:
-        """Whether the series in exp(-2 pi depth / length) is the one that converges faster."""
+        """True if the series in exp(-2 pi depth / length) converges faster than the other one."""
         return 2 * self.depth > self.length
 
     @cached_property
@@ -86,11 +86,13 @@ class SideRatio:
         return self.wavenumber * math.sqrt(self.moduli[0])
 
     def __call__(self, distance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """G at `distance` from side 0 and at the mirrored distance; infinite on side 0, zero on side 1."""
+        """Return G at `distance` from side 0 and at the mirrored distance; infinite on side 0, zero on side
+        1.
+        """
         return self._deep_pair(distance) if self.deep else self._shallow_pair(distance)
 
     def _deep_pair(self, near: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Ratio of theta functions of imaginary argument, scaled so that nothing overflows."""
+        """Evaluate a ratio of theta functions of imaginary argument, scaled so that nothing overflows."""
         unit = -math.pi / self.length
         far = self.depth - near
         decay, decay_far = np.exp(unit * near), np.exp(unit * far)
@@ -101,7 +103,7 @@ class SideRatio:
         return decay * quotient, decay_far / quotient
 
     def _images(self, image: FloatArray, image_far: FloatArray) -> FloatArray:
-        """sum_n (-1)^n q^(n^2) far^n (1 - near^(2n+1)) / (1 - near), the images beyond the first."""
+        """Return sum_n (-1)^n q^(n^2) far^n (1 - near^(2n+1)) / (1 - near), the images beyond the first."""
         q = self.nome
         geometric: FloatArray | float = 1.0
         total: FloatArray = np.ones_like(image)
@@ -119,7 +121,7 @@ class SideRatio:
         return total
 
     def _shallow_pair(self, near: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Ratio of theta functions of real argument."""
+        """Evaluate a ratio of theta functions of real argument."""
         p2, p6, p12 = (self.nome ** (n * (n + 1)) for n in _TERM_ORDERS)
         unit = math.pi / (2 * self.depth)
         far = self.depth - near

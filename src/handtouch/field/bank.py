@@ -1,4 +1,7 @@
-"""LocatorBank: maximum-likelihood contacts on all the pads of a hand, of any models, in one pass."""
+"""Maximum-likelihood contacts on all the pads of a hand, of any forward models, in one pass.
+
+Public names: `LocatorBank`, `TableTangent`.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +12,45 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch.field._bank_table import (
-    COLUMNS,
     GRIDS,
-    RATIO_CELLS,
-    RATIO_SPAN,
-    TERMS,
+    POLYNOMIAL_TERMS,
+    RATIO_TABLE_CELLS,
+    RATIO_TABLE_SPAN,
+    TABLE_COLUMNS,
     PadTable,
     log_ratios,
     tabulate,
 )
-from handtouch.field.estimate import CORNER, LOST, PointEstimate, best_direction, covariance_of
+from handtouch.field.estimate import (
+    CORNER_RADIUS_FACTOR,
+    MAX_STD_SIDES,
+    PointEstimate,
+    estimate_covariance,
+    most_likely_direction,
+)
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
 IndexArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-_STEPS = 10
-_SEARCH_STEPS = 20
-_GUESSES = np.stack(np.meshgrid(*[(np.arange(9) + 0.5) / 9] * 2), axis=-1).reshape(-1, 2)  # sides
-_SETTLED = 1e-2  # squared Newton decrement, in variances: the step then taken leaves far less
-_LONGEST_STEP = 1.0  # in w, where places are 1 / (1 + exp(-w)) of a side
-_WITH_SLOPES = np.hstack([np.eye(TERMS), np.diag(np.arange(1.0, TERMS), 1)])  # powers and their derivatives
+_MAX_STEPS = 10
+_MAX_SEARCH_STEPS = 20
+_SEARCH_GRID = np.stack(np.meshgrid(*[(np.arange(9) + 0.5) / 9] * 2), axis=-1).reshape(-1, 2)  # sides
+_MAX_SETTLED_DECREMENT = 1e-2  # squared Newton decrement, in variances: the last step leaves far less
+_MAX_STEP = 1.0  # in w, where positions are 1 / (1 + exp(-w)) of a side
+_WITH_SLOPES = np.hstack(
+    [np.eye(POLYNOMIAL_TERMS), np.diag(np.arange(1.0, POLYNOMIAL_TERMS), 1)]
+)  # powers and their derivatives
 
 
 class LocatorBank:
-    """Tables of one forward model for each pad, read for many contacts at once.
+    """Tables of one forward model for each pad, evaluated for many contacts at once.
 
     models: one for each pad, with channels x0, xa, y0, yb; pads that share a model object share its table.
     tolerance: of a tabulated fraction; finer tables, of 6 to 24 MB a model, are tried until all meet it.
-    sides: (pads, 2), a and b of each.
-    table_error: (pads,), the largest error of a tabulated fraction, as measured between the nodes, at 3 % of
-        a side and farther from the edges. edge_error: the same up to the edges.
+    sides: (pads, 2), a and b of each. table_error: (pads,), the largest error of a tabulated fraction, as
+    measured between the nodes, at 3 % of a side and farther from the edges. edge_error: the same up to the
+    edges.
 
     Contacts are kept 0.15 % of a side inside the edges, where the tables end. Raises ValueError for a model
     with other channels.
@@ -52,30 +63,32 @@ class LocatorBank:
             if channels != 4:
                 raise ValueError(f"a bank takes models with four channels, one has {channels}")
         for grid in GRIDS:
-            tables = [PadTable.of(model, grid) for model in distinct]
-            if all(table.error < tolerance for table in tables):
+            tables = [PadTable.from_model(model, grid) for model in distinct]
+            if all(table.max_error < tolerance for table in tables):
                 break
         order = {id(model): i for i, model in enumerate(distinct)}
         self._model = np.array([order[id(model)] for model in models], dtype=np.intp)
         self._grid = grid
-        self._top = np.nextafter(float(grid.cells), 0)
-        self._table = np.empty((len(tables) * grid.cells**2, TERMS, COLUMNS * TERMS))
+        self._max_coordinate = np.nextafter(float(grid.cells), 0)
+        self._table = np.empty(
+            (len(tables) * grid.cells**2, POLYNOMIAL_TERMS, TABLE_COLUMNS * POLYNOMIAL_TERMS)
+        )
         workspace = None
         for table, part in zip(tables, self._table.reshape(len(tables), -1), strict=True):
             workspace = tabulate(table.values, part, workspace)
-        self._starts = np.stack([table.starts for table in tables]).reshape(-1)
-        self._guesses = np.stack([m.fractions(*(_GUESSES * (m.a, m.b)).T).T for m in distinct])
+        self._start_tables = np.stack([table.starts for table in tables]).reshape(-1)
+        self._search_fractions = np.stack([m.fractions(*(_SEARCH_GRID * (m.a, m.b)).T).T for m in distinct])
         self.sides = np.array([(model.a, model.b) for model in distinct])[self._model]
-        self._shortest = self.sides.min(axis=1) ** 2
-        self.table_error = np.array([table.error for table in tables])[self._model]
-        self.edge_error = np.array([table.edge_error for table in tables])[self._model]
+        self._shortest_side2 = self.sides.min(axis=1) ** 2
+        self.table_error = np.array([table.max_error for table in tables])[self._model]
+        self.edge_error = np.array([table.max_edge_error for table in tables])[self._model]
 
     def fractions(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the measured fractions (4, n) of points (n,) on the pads `index` (n,)."""
         index = np.asarray(index, dtype=np.intp)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
-            return np.ascontiguousarray(self._read(self._first_row(index), s)[:, 0, :4].T)
+            return np.ascontiguousarray(self._read_tables(self._first_row(index), s)[:, 0, :4].T)
 
     def conformal_radius(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the radius R (n,) that gives a contact of radius A the resistance sheet / 2 pi ln(R / A).
@@ -86,18 +99,18 @@ class LocatorBank:
         index = np.asarray(index, dtype=np.intp)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
-            return np.exp(self._read(self._first_row(index), s)[:, 0, 4])
+            return np.exp(self._read_tables(self._first_row(index), s)[:, 0, 4])
 
-    def tangent(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> Tangent:
-        """Return value and slopes of all that is tabulated, at points (n,) of the pads `index` (n,)."""
+    def tangent(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> TableTangent:
+        """Return values and slopes of all tabulated quantities, at points (n,) of the pads `index` (n,)."""
         index = np.asarray(index, dtype=np.intp)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
-            rows = self._read(self._first_row(index), s)
-            side = self._grid.place(s)
+            rows = self._read_tables(self._first_row(index), s)
+            side = self._grid.fraction(s)
             point = self.sides.take(index, axis=0) * side
             slopes = rows[:, 1:3] / self._grid.width
-            return Tangent(
+            return TableTangent(
                 point, point * (1 - side), rows[:, 0, :4], slopes[:, :, :4], rows[:, 0, 4], slopes[:, :, 4]
             )
 
@@ -119,15 +132,17 @@ class LocatorBank:
             weight = np.empty_like(data)
             np.divide(1.0, channel_noise(noise, data.shape), out=weight)
             if not weight.all():
-                data = np.where(weight == 0, 0.0, data)  # whatever a channel that is left out reads
+                data = np.where(weight == 0, 0.0, data)  # readings of excluded channels
             s = self._start(index, data, weight, start)
             sides = self.sides.take(index, axis=0)
-            of = _Readings(index, self._first_row(index), sides, data.T, weight.T)
-            found = self._iterate(of, s)
+            readings = _BankReadings(index, self._first_row(index), sides, data.T, weight.T)
+            found = self._iterate(readings, s)
             if not np.logical_and.reduce(found.converged):
-                left = np.flatnonzero(~found.converged & np.isfinite(of.data * of.weight).all(axis=1))
+                left = np.flatnonzero(
+                    ~found.converged & np.isfinite(readings.data * readings.weight).all(axis=1)
+                )
                 if left.size:
-                    found.put(left, self._search(of.some(left)))
+                    found.assign(left, self._search(readings.select(left)))
             return found
 
     # Details ----------------------------------------------------------------------------------------------
@@ -136,14 +151,16 @@ class LocatorBank:
         return np.asarray(self._model.take(index) * self._grid.cells**2)
 
     def _coordinates(self, index: IndexArray, point: FloatArray) -> FloatArray:
-        """Cells (n, 2) of points (n, 2), clamped to the tables."""
+        """Return cells (n, 2) of points (n, 2), clamped to the tables."""
         s = self._grid.coordinate(point / self.sides.take(index, axis=0))
-        return np.asarray(np.minimum(np.maximum(s, 0.0), self._top))
+        return np.asarray(np.minimum(np.maximum(s, 0.0), self._max_coordinate))
 
     def _start(
         self, index: IndexArray, data: FloatArray, weight: FloatArray, start: ArrayLike | None
     ) -> FloatArray:
-        """Where to begin, in cells (n, 2): the last place, or what the ratios of opposite currents say."""
+        """Return the start in cells (n, 2): the given point, or an estimate from the ratios of opposite
+        currents.
+        """
         if start is not None:
             s = self._coordinates(index, np.asarray(start, dtype=np.float64).T)
             fresh = np.isnan(s).any(axis=1)
@@ -152,107 +169,114 @@ class LocatorBank:
             s[fresh] = self._start(index[fresh], data[:, fresh], weight[:, fresh], None)
             return s
         ratios = log_ratios(np.maximum(data, 0.3 / weight))
-        ratios = np.where(np.isnan(ratios), 0.0, ratios)  # a channel is left out: from the middle
-        position = (RATIO_SPAN - ratios) * (RATIO_CELLS / (2 * RATIO_SPAN))
-        position = np.minimum(np.maximum(position, 0.0), RATIO_CELLS - 1e-9).T
+        ratios = np.where(np.isnan(ratios), 0.0, ratios)  # a channel is excluded: start at the centre
+        position = (RATIO_TABLE_SPAN - ratios) * (RATIO_TABLE_CELLS / (2 * RATIO_TABLE_SPAN))
+        position = np.minimum(np.maximum(position, 0.0), RATIO_TABLE_CELLS - 1e-9).T
         cell = position.astype(np.intp)
         position -= cell
-        cell += (2 * self._model.take(index))[:, None] * (RATIO_CELLS + 1)
-        cell[:, 1] += RATIO_CELLS + 1
-        low = self._starts.take(cell, mode="clip")
-        return np.asarray(low + position * (self._starts.take(cell + 1, mode="clip") - low))
+        cell += (2 * self._model.take(index))[:, None] * (RATIO_TABLE_CELLS + 1)
+        cell[:, 1] += RATIO_TABLE_CELLS + 1
+        low = self._start_tables.take(cell, mode="clip")
+        return np.asarray(low + position * (self._start_tables.take(cell + 1, mode="clip") - low))
 
     def _basis(self, first_row: IndexArray, s: FloatArray) -> tuple[FloatArray, IndexArray]:
-        """Powers within the cell and their slopes, (n, x or y, value or slope, TERMS), and table rows."""
+        """Return powers within the cell and their slopes, (n, x or y, value or slope, TERMS), and table
+        rows.
+        """
         cell = s.astype(np.intp)
-        powers = np.empty((len(s), 2, TERMS))
+        powers = np.empty((len(s), 2, POLYNOMIAL_TERMS))
         powers[:, :, 0] = 1.0
         powers[:, :, 1:] = (s - cell)[:, :, None]
         np.multiply.accumulate(powers, axis=2, out=powers)
-        basis = np.matmul(powers.reshape(-1, TERMS), _WITH_SLOPES).reshape(-1, 2, 2, TERMS)
+        basis = np.matmul(powers.reshape(-1, POLYNOMIAL_TERMS), _WITH_SLOPES).reshape(
+            -1, 2, 2, POLYNOMIAL_TERMS
+        )
         return basis, first_row + cell[:, 1] * self._grid.cells + cell[:, 0]
 
-    def _read(self, first_row: IndexArray, s: FloatArray) -> FloatArray:
-        """Columns, their slopes along x, along y and their cross slope by cell: (n, 4, COLUMNS)."""
+    def _read_tables(self, first_row: IndexArray, s: FloatArray) -> FloatArray:
+        """Return columns, their slopes along x, along y and their cross slope by cell: (n, 4, COLUMNS)."""
         basis, row = self._basis(first_row, s)
         table = self._table.take(row, axis=0, mode="clip")
-        by_y = np.matmul(basis[:, 1], table).reshape(-1, 2, TERMS, COLUMNS)
-        rows: FloatArray = np.matmul(basis[:, 0, None], by_y).reshape(-1, 4, COLUMNS)
+        by_y = np.matmul(basis[:, 1], table).reshape(-1, 2, POLYNOMIAL_TERMS, TABLE_COLUMNS)
+        rows: FloatArray = np.matmul(basis[:, 0, None], by_y).reshape(-1, 4, TABLE_COLUMNS)
         return rows
 
-    def _linearise(self, of: _Readings, s: FloatArray) -> _Normal:
-        """Whitened normal equations at s cells."""
-        rows = self._read(of.first_row, s)[:, :, :4]
-        rows[:, 3] = of.data
-        rows *= of.weight[:, None]
+    def _linearise(self, readings: _BankReadings, s: FloatArray) -> _NormalEquations:
+        """Return the whitened normal equations at s cells."""
+        rows = self._read_tables(readings.first_row, s)[:, :, :4]
+        rows[:, 3] = readings.data
+        rows *= readings.weight[:, None]
         gram = np.matmul(rows, rows.swapaxes(1, 2))
         mixing = gram[:, 1:3, :1] / gram[:, :1, :1]
-        return _Normal(rows, gram, mixing, gram[:, 1:3] - mixing * gram[:, :1])
+        return _NormalEquations(rows, gram, mixing, gram[:, 1:3] - mixing * gram[:, :1])
 
-    def _iterate(self, of: _Readings, s: FloatArray) -> PointEstimate:
-        """Gauss-Newton on the cell coordinates, the total eliminated, all contacts in step."""
-        longest = _LONGEST_STEP / self._grid.width
-        for _ in range(_STEPS):
-            at = self._linearise(of, s)
-            step, decrement = at.step(s, self._top)
+    def _iterate(self, readings: _BankReadings, s: FloatArray) -> PointEstimate:
+        """Run Gauss-Newton on the cell coordinates with the total eliminated, all contacts in parallel."""
+        longest = _MAX_STEP / self._grid.width
+        for _ in range(_MAX_STEPS):
+            at = self._linearise(readings, s)
+            step, decrement = at.gauss_newton_step(s, self._max_coordinate)
             np.minimum(np.maximum(step, -longest, out=step), longest, out=step)
             step += s
-            np.minimum(np.maximum(step, 0.0, out=step), self._top, out=step)
+            np.minimum(np.maximum(step, 0.0, out=step), self._max_coordinate, out=step)
             s, step = step, step - s
-            unsettled = decrement > _SETTLED
+            unsettled = decrement > _MAX_SETTLED_DECREMENT
             if not np.logical_or.reduce(unsettled):
                 break
-        return self._result(of, s, step, at, decrement, ~unsettled)
+        return self._result(readings, s, step, at, decrement, ~unsettled)
 
-    def _search(self, of: _Readings) -> PointEstimate:
-        """From the most likely of a grid of points, in steps halved until the likelihood rises.
+    def _search(self, readings: _BankReadings) -> PointEstimate:
+        """Search from the most likely point of a grid, halving steps until the likelihood rises.
 
-        For contacts hardly above their noise: Gauss-Newton alone leads some of them off the pad.
+        For contacts barely above their noise: Gauss-Newton alone leads some of them off the pad.
         """
-        weighted, squared = of.data * of.weight * of.weight, of.weight * of.weight
-        fractions = self._guesses.take(self._model.take(of.pad), axis=0)
+        weighted, squared = (
+            readings.data * readings.weight * readings.weight,
+            readings.weight * readings.weight,
+        )
+        fractions = self._search_fractions.take(self._model.take(readings.pad), axis=0)
         along = np.matmul(fractions, weighted[:, :, None])[:, :, 0]
         norm = np.matmul(fractions * fractions, squared[:, :, None])[:, :, 0]
         best = np.argmax(np.square(np.maximum(along, 0.0)) / norm, axis=1)
-        s = self._grid.coordinate(_GUESSES[best])
-        at = self._linearise(of, s)
+        s = self._grid.coordinate(_SEARCH_GRID[best])
+        at = self._linearise(readings, s)
         damping, settled = np.ones(len(s)), np.zeros(len(s), dtype=np.bool_)
-        longest = _LONGEST_STEP / self._grid.width
-        for _ in range(_SEARCH_STEPS):
-            step, decrement = at.step(s, self._top)
+        longest = _MAX_STEP / self._grid.width
+        for _ in range(_MAX_SEARCH_STEPS):
+            step, decrement = at.gauss_newton_step(s, self._max_coordinate)
             step = np.minimum(np.maximum(step, -longest), longest) * damping[:, None]
-            trial = np.minimum(np.maximum(s + step, 0.0), self._top)
-            new = self._linearise(of, trial)
+            trial = np.minimum(np.maximum(s + step, 0.0), self._max_coordinate)
+            new = self._linearise(readings, trial)
             better = (new.cost() <= at.cost()) & (new.total() > 0) | ~(at.total() > 0)
             still = settled | ~better
-            settled |= better & (decrement <= _SETTLED)
+            settled |= better & (decrement <= _MAX_SETTLED_DECREMENT)
             s = np.where(still[:, None], s, trial)
-            at = at.where(still, new)
+            at = at.select_where(still, new)
             damping = np.where(better, np.minimum(1.0, 4 * damping), damping / 4)
             if settled.all():
                 break
-        return self._result(of, s, np.zeros_like(s), at, np.zeros(len(s)), settled)
+        return self._result(readings, s, np.zeros_like(s), at, np.zeros(len(s)), settled)
 
     def _result(
         self,
-        of: _Readings,
+        readings: _BankReadings,
         s: FloatArray,
         step: FloatArray,
-        at: _Normal,
+        at: _NormalEquations,
         decrement: FloatArray,
         settled: BoolArray,
     ) -> PointEstimate:
-        """The estimate at s, a last step away from where the model was read."""
+        """Return the estimate at s, one last step away from where the model was evaluated."""
         total = at.total()
         step_x, step_y = step.T
         chi_squared = at.gram[:, 3, 3] - total * at.gram[:, 0, 3] - decrement
         np.maximum(chi_squared, 0.0, out=chi_squared)
-        pair = at.rows[:, :3, 0] / of.weight[:, :1] + at.rows[:, :3, 1] / of.weight[:, 1:2]
+        pair = at.rows[:, :3, 0] / readings.weight[:, :1] + at.rows[:, :3, 1] / readings.weight[:, 1:2]
         total *= 1 - at.mixing[:, 0, 0] * step_x - at.mixing[:, 1, 0] * step_y
-        residual = (of.data[:, 0] + of.data[:, 1]) / total
+        residual = (readings.data[:, 0] + readings.data[:, 1]) / total
         residual -= pair[:, 0] + pair[:, 1] * step_x + pair[:, 2] * step_y
-        fraction = self._grid.place(s)
-        point = of.sides * fraction
+        fraction = self._grid.fraction(s)
+        point = readings.sides * fraction
         covariance = at.covariance(total, (self._grid.width * (1 - fraction)) * point)
         found = total > 0
         if not np.logical_and.reduce(found):
@@ -260,53 +284,62 @@ class LocatorBank:
         estimate = PointEstimate(
             point[:, 0], point[:, 1], total, residual, chi_squared, covariance, settled & found
         )
-        self._leave_corner(of, point, estimate)
-        _forget_lost(point, of.sides, covariance)
+        self._move_out_of_corners(readings, point, estimate)
+        _mark_unobservable(point, readings.sides, covariance)
         return estimate
 
-    def _leave_corner(self, of: _Readings, point: FloatArray, found: PointEstimate) -> None:
-        """As in `estimate`: out to where currents tell, in place, with all that is found there."""
-        nearest = np.minimum(point, of.sides - point)
+    def _move_out_of_corners(self, readings: _BankReadings, point: FloatArray, found: PointEstimate) -> None:
+        """Move points out of corners, in place, to where the currents carry information, as in `estimate`."""
+        nearest = np.minimum(point, readings.sides - point)
         distance = nearest[:, 0] ** 2 + nearest[:, 1] ** 2
-        shortest = self._shortest.take(of.pad)
+        shortest = self._shortest_side2.take(readings.pad)
         if not np.logical_or.reduce(distance < 0.0625 * shortest):
             return
-        noise = 2 / np.sqrt((of.weight * of.weight).sum(axis=1))
-        radius = shortest * np.minimum(CORNER * CORNER * noise / found.total, 0.0625)
+        noise = 2 / np.sqrt((readings.weight * readings.weight).sum(axis=1))
+        radius = shortest * np.minimum(
+            CORNER_RADIUS_FACTOR * CORNER_RADIUS_FACTOR * noise / found.total, 0.0625
+        )
         which = np.flatnonzero(distance < radius)
         if not which.size:
             return
-        of = of.some(which)
-        far = 2 * point[which] > of.sides
-        corner, inward = np.where(far, of.sides, 0.0).T, np.where(far, -1.0, 1.0).T * np.sqrt(radius[which])
+        readings = readings.select(which)
+        far = 2 * point[which] > readings.sides
+        corner, inward = (
+            np.where(far, readings.sides, 0.0).T,
+            np.where(far, -1.0, 1.0).T * np.sqrt(radius[which]),
+        )
 
         def linearised(place: FloatArray) -> tuple[FloatArray, FloatArray]:
-            at, scale = self._linearise_at(of, place.T)
+            at, scale = self._linearise_at(readings, place.T)
             slopes = at.slopes() * (at.total()[:, None] / scale)[:, :, None]
-            return at.misfit().T, np.moveaxis(slopes, 0, -1)
+            return at.residuals().T, np.moveaxis(slopes, 0, -1)
 
-        angle = best_direction(linearised, corner, inward, np.arctan2(nearest[which, 1], nearest[which, 0]))
+        angle = most_likely_direction(
+            linearised, corner, inward, np.arctan2(nearest[which, 1], nearest[which, 0])
+        )
         point[which] = (corner + inward * np.stack([np.cos(angle), np.sin(angle)])).T
-        at, scale = self._linearise_at(of, point[which])
+        at, scale = self._linearise_at(readings, point[which])
         total = at.total()
         found.total[which], found.chi_squared[which] = total, at.cost()
-        found.residual[which] = (at.misfit()[:, :2] / of.weight[:, :2]).sum(axis=1) / total
+        found.residual[which] = (at.residuals()[:, :2] / readings.weight[:, :2]).sum(axis=1) / total
         found.covariance[which] = at.covariance(total, scale)
         found.converged[which] = total > 0
 
-    def _linearise_at(self, of: _Readings, point: FloatArray) -> tuple[_Normal, FloatArray]:
-        """Normal equations at points (n, 2), and lengths of a cell there, (n, 2)."""
-        s = self._coordinates(of.pad, point)
-        fraction = self._grid.place(s)
-        return self._linearise(of, s), of.sides * fraction * (1 - fraction) * self._grid.width
+    def _linearise_at(
+        self, readings: _BankReadings, point: FloatArray
+    ) -> tuple[_NormalEquations, FloatArray]:
+        """Return the normal equations at points (n, 2), and lengths of a cell there, (n, 2)."""
+        s = self._coordinates(readings.pad, point)
+        fraction = self._grid.fraction(s)
+        return self._linearise(readings, s), readings.sides * fraction * (1 - fraction) * self._grid.width
 
 
-class Tangent(NamedTuple):
-    """The tables of n pads at a point of each, with slopes along x and y per `reach`.
+class TableTangent(NamedTuple):
+    """Tables of n pads linearised at a point of each, with slopes along x and y per `reach`.
 
-    point (n, 2): x and y, kept inside the tables. reach (n, 2): the length over which all varies, a quarter
-    of a side in the middle, the distance near an edge. fractions (n, 4), slopes (n, 2, 4). log_radius (n,),
-    radius_slopes (n, 2): of `conformal_radius`.
+    point (n, 2): x and y, kept inside the tables. reach (n, 2): the length over which all quantities vary, a
+    quarter of a side in the middle, the distance near an edge. fractions (n, 4), slopes (n, 2, 4). log_radius
+    (n,), radius_slopes (n, 2): of `conformal_radius`.
     """
 
     point: FloatArray
@@ -318,8 +351,10 @@ class Tangent(NamedTuple):
     radius_slopes: FloatArray
 
 
-class _Readings(NamedTuple):
-    """What was measured: on which pads (n,), whose tables begin at rows (n,), with sides (n, 2); (n, 4)."""
+class _BankReadings(NamedTuple):
+    """Measured currents (n, 4) and weights, with their pads (n,), the tables' first rows (n,), sides (n,
+    2).
+    """
 
     pad: IndexArray
     first_row: IndexArray
@@ -327,19 +362,19 @@ class _Readings(NamedTuple):
     data: FloatArray
     weight: FloatArray
 
-    def some(self, which: IndexArray) -> _Readings:
-        """Those of the contacts `which`."""
-        return _Readings(
+    def select(self, which: IndexArray) -> _BankReadings:
+        """Return those of the contacts `which`."""
+        return _BankReadings(
             self.pad[which], self.first_row[which], self.sides[which], self.data[which], self.weight[which]
         )
 
 
-class _Normal(NamedTuple):
+class _NormalEquations(NamedTuple):
     """Least squares at one point of each contact, in cells.
 
     rows: whitened fractions, their slopes along x and y, and the data, (n, 4, 4). gram: their products.
-    mixing: what of the slopes the total absorbs, per total, (n, 2, 1). reduced: products of the rest of the
-    slopes with the fractions (zero), the slopes and the data, (n, 2, 4).
+    mixing: the part of the slopes that the total absorbs, per total, (n, 2, 1). reduced: products of the rest
+    of the slopes with the fractions (zero), the slopes and the data, (n, 2, 4).
     """
 
     rows: FloatArray
@@ -347,33 +382,35 @@ class _Normal(NamedTuple):
     mixing: FloatArray
     reduced: FloatArray
 
-    def where(self, keep: BoolArray, other: _Normal) -> _Normal:
-        """These where `keep` (n,), else the others."""
-        return _Normal(
+    def select_where(self, keep: BoolArray, other: _NormalEquations) -> _NormalEquations:
+        """Return these where `keep` (n,), else the others."""
+        return _NormalEquations(
             *(np.where(keep[:, None, None], mine, its) for mine, its in zip(self, other, strict=True))
         )
 
     def slopes(self) -> FloatArray:
-        """Slopes of the fractions by cell, less what the total absorbs, (n, 2, 4)."""
+        """Return the slopes of the fractions by cell, less the part that the total absorbs, (n, 2, 4)."""
         return self.rows[:, 1:3] - self.mixing * self.rows[:, :1]
 
-    def misfit(self) -> FloatArray:
-        """What the best total leaves of the data, (n, 4)."""
+    def residuals(self) -> FloatArray:
+        """Return the residuals of the data with the best total, (n, 4)."""
         return self.rows[:, 3] - self.total()[:, None] * self.rows[:, 0]
 
     def cost(self) -> FloatArray:
-        """Squared misfits at this point with the best total, (n,)."""
+        """Return the sum of squared residuals at this point with the best total, (n,)."""
         return np.asarray(self.gram[:, 3, 3] - self.total() * self.gram[:, 0, 3])
 
     def total(self) -> FloatArray:
-        """The best total at this point, (n,)."""
+        """Return the best total at this point, (n,)."""
         return np.asarray(self.gram[:, 0, 3] / self.gram[:, 0, 0])
 
-    def step(self, s: FloatArray, top: float) -> tuple[FloatArray, FloatArray]:
-        """Gauss-Newton step (n, 2) and squared decrement; coordinates held by the table's end stay."""
+    def gauss_newton_step(self, s: FloatArray, top: float) -> tuple[FloatArray, FloatArray]:
+        """Return the Gauss-Newton step (n, 2) and squared decrement; coordinates at a table's end are
+        fixed.
+        """
         reduced = self.reduced
         if np.fmin.reduce(s, axis=None, initial=top) <= 0 or np.fmax.reduce(s, axis=None, initial=0) >= top:
-            reduced = _held_back(reduced, s, top)
+            reduced = _hold_at_table_ends(reduced, s, top)
         xx, xy, yy = reduced[:, 0, 1], reduced[:, 0, 2], reduced[:, 1, 2]
         gradient = reduced[:, :, 3]
         gradient_x, gradient_y = gradient[:, 0], gradient[:, 1]
@@ -386,8 +423,10 @@ class _Normal(NamedTuple):
         return step, decrement
 
     def covariance(self, total: FloatArray, scale: FloatArray) -> FloatArray:
-        """Inverse Fisher information of (x, y, total), (n, 3, 3); scale: lengths of a cell, (n, 2)."""
-        by_cell = covariance_of(
+        """Return the inverse Fisher information of (x, y, total), (n, 3, 3); scale: lengths of a cell, (n,
+        2).
+        """
+        by_cell = estimate_covariance(
             np.moveaxis(self.slopes() * total[:, None, None], 0, -1),
             self.mixing[:, :, 0].T * total,
             self.rows[:, 0].T,
@@ -397,8 +436,8 @@ class _Normal(NamedTuple):
         return np.where(by_cell == 0, 0.0, by_cell * units[:, :, None] * units[:, None])
 
 
-def _held_back(reduced: FloatArray, s: FloatArray, top: float) -> FloatArray:
-    """The normal equations without the coordinates that would leave the table."""
+def _hold_at_table_ends(reduced: FloatArray, s: FloatArray, top: float) -> FloatArray:
+    """Return the normal equations without the coordinates that would leave the table."""
     gradient = reduced[:, :, 3]
     held = ((s <= 0) & (gradient < 0)) | ((s >= top) & (gradient > 0))
     reduced = np.where(held[:, :, None], 0.0, reduced)
@@ -408,10 +447,10 @@ def _held_back(reduced: FloatArray, s: FloatArray, top: float) -> FloatArray:
     return reduced
 
 
-def _forget_lost(point: FloatArray, sides: FloatArray, covariance: FloatArray) -> None:
-    """Make NaN, with infinite variance, the coordinates that the currents do not hold; in place."""
+def _mark_unobservable(point: FloatArray, sides: FloatArray, covariance: FloatArray) -> None:
+    """Set coordinates that the currents don't determine to NaN, with infinite variance; in place."""
     variance = covariance.reshape(-1, 9)[:, :5:4]
-    limit = LOST * sides
+    limit = MAX_STD_SIDES * sides
     held = (variance >= 0) & (variance <= limit * limit)
     if np.logical_and.reduce(held, axis=None):
         return

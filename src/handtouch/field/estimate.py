@@ -14,31 +14,38 @@ from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 BoolArray = NDArray[np.bool_]
 
 _MAX_STEPS = 40
-_SETTLED = 1e-6  # squared Newton decrement, in variances: the step then taken leaves far less
-_SMALLEST_STEP = 1e-14  # of a side: rounding
-_EDGE = 1e-9  # of a side: how near to an edge an estimate may come
-_LONGEST_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
-LOST = 1e3  # sides: a coordinate less certain than this is not known at all
-CORNER = 0.7  # shorter sides, times the root of the relative noise: how near a corner currents tell anything
-_ARC_STEPS = 6  # of the search for a direction from a corner
-_GRAZING = 0.02  # rad: an estimate near a corner keeps this far from its sides
-_GUESSED_AT_ONCE = 8192  # contacts, to bound memory
-_GRID = 9  # points a side of the search that finds a start without a closed form
+_MAX_SETTLED_DECREMENT = 1e-6  # squared Newton decrement, in variances: the last step leaves far less
+_MIN_STEP = 1e-14  # of a side
+_MIN_EDGE_DISTANCE = 1e-9  # of a side, of an estimate from an edge
+_MAX_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
+MAX_STD_SIDES = 1e3  # a coordinate with a larger deviation is reported as unknown
+CORNER_RADIUS_FACTOR = 0.7
+"""Radius about a corner within which currents carry no information, in shorter sides times the root of the
+relative noise."""
+_ARC_ITERATIONS = 6  # of the search for the direction from a corner
+_MIN_CORNER_ANGLE_RAD = 0.02  # of an estimate near a corner from its sides
+_GUESS_BATCH = 8192  # contacts at once, to bound memory
+_GUESS_GRID = 9  # points per side of the search for a start
 
 
 @dataclass(frozen=True)
 class PointEstimate:
-    """The most likely point contact; arrays of one shape (...), or scalars.
+    """Most likely point contact; arrays of one shape (...), or scalars.
 
     x, y: position in the unit of the pad, on the pad; NaN, with infinite variance and no covariances, where
-        the currents do not hold it: a standard deviation beyond a thousand sides, or no positive total.
-    total: the current injected, in the unit of the currents; where no place makes it positive, that of a
-        contact at the centre.
-    residual: signed excess of (x0 + xa) over that of this point, divided by the total; NaN for a model
-        with other channels than x0, xa, y0, yb, where one of the two is left out, and without a location.
-    chi_squared: sum of squared misfits in standard deviations; channels - 3 degrees of freedom for a point.
-    covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate. Near the edges,
-        within a few standard deviations of them, it is too confident.
+    the currents don't determine it: a standard deviation beyond a thousand sides, or no positive total.
+
+    total: the current injected, in the unit of the currents; where no position makes it positive, that of a
+    contact at the centre.
+
+    residual: signed excess of (x0 + xa) over that of this point, divided by the total; NaN for a model with
+    other channels than x0, xa, y0, yb, where one of the two is excluded, and without a position.
+
+    chi_squared: sum of squared residuals in standard deviations; channels - 3 degrees of freedom for a point.
+
+    covariance: of (x, y, total), shape (..., 3, 3): the Cramer-Rao bound at the estimate. Within a few
+    standard deviations of an edge it is too small.
+
     converged: False where the iteration stopped before the maximum, or found no positive total.
     """
 
@@ -50,7 +57,7 @@ class PointEstimate:
     covariance: FloatArray
     converged: BoolArray
 
-    def put(self, index: NDArray[np.intp], other: PointEstimate) -> None:
+    def assign(self, index: NDArray[np.intp], other: PointEstimate) -> None:
         """Overwrite some of the elements of arrays (n,)."""
         for name in self.__dataclass_fields__:
             getattr(self, name)[index] = getattr(other, name)
@@ -78,18 +85,18 @@ def estimate(
     sigma = channel_noise(noise, currents.shape).reshape(channels, -1)
     with np.errstate(all="ignore"):
         sigma = np.where(sigma > 0, sigma, np.nan)
-        flat = np.where(np.isinf(sigma), 0.0, flat)  # whatever a channel that is left out reads
+        flat = np.where(np.isinf(sigma), 0.0, flat)  # readings of excluded channels
         # Currents and noise each in a unit of their own, so that squares stay in range.
         unit = np.ldexp(1.0, np.frexp(np.abs(flat).max(axis=0, initial=0.0))[1])
         exponent = np.frexp(sigma.min(axis=0, initial=np.inf))[1]
-        fit = _Fit(model, flat / unit, np.ldexp(sigma, -exponent), np.ldexp(1.0, exponent) / unit)
+        fit = _LikelihoodFit(model, flat / unit, np.ldexp(sigma, -exponent), np.ldexp(1.0, exponent) / unit)
         if start is None:
-            begin = fit.guess()
+            begin = fit.initial_positions()
         else:
             begin = (
                 np.broadcast_to(np.asarray(start, dtype=np.float64), (2, *shape)).reshape(2, -1) / fit.sides
             )
-        result = fit.run(begin, unit)
+        result = fit.maximise(begin, unit)
     return PointEstimate(
         x=result.x.reshape(shape)[()],
         y=result.y.reshape(shape)[()],
@@ -102,12 +109,12 @@ def estimate(
 
 
 @dataclass(frozen=True)
-class _Linear:
+class _WhitenedModel:
     """The model at one point of each element, whitened; total eliminated.
 
     total: its best value, (n,). misfit: whitened residuals, (channels, n). fractions: whitened. slopes: their
     derivatives by x and y, (2, channels, n), less `mixing` times the fractions, which the total absorbs.
-    cost: sum of squared misfits.
+    cost: sum of squared residuals.
     """
 
     total: FloatArray
@@ -117,18 +124,18 @@ class _Linear:
     mixing: FloatArray
     cost: FloatArray
 
-    def pick(self, index: NDArray[np.intp] | BoolArray) -> _Linear:
-        """Some of the elements."""
-        return _Linear(*(getattr(self, k)[..., index] for k in self.__dataclass_fields__))
+    def select(self, index: NDArray[np.intp] | BoolArray) -> _WhitenedModel:
+        """Return some of the elements."""
+        return _WhitenedModel(*(getattr(self, k)[..., index] for k in self.__dataclass_fields__))
 
-    def put(self, index: NDArray[np.intp] | BoolArray, other: _Linear) -> None:
+    def assign(self, index: NDArray[np.intp] | BoolArray, other: _WhitenedModel) -> None:
         """Overwrite some of the elements."""
         for k in self.__dataclass_fields__:
             getattr(self, k)[..., index] = getattr(other, k)
 
 
-class _Fit:
-    """Many independent fits of one model at once; arrays are (..., n), places in sides of the pad.
+class _LikelihoodFit:
+    """Many independent fits of one model at once; arrays are (..., n), positions in sides of the pad.
 
     noise: standard deviations of the currents (channels, n), in units of `noise_unit` (n,).
     """
@@ -142,21 +149,21 @@ class _Fit:
         self.sides = np.array([[model.a], [model.b]])
         self.aspect = self.sides / self.sides.min()
 
-    def guess(self) -> FloatArray:
-        """A start from the currents alone, shape (2, n): the most likely of a grid of points."""
-        side = (np.arange(_GRID) + 0.5) / _GRID
+    def initial_positions(self) -> FloatArray:
+        """Return a start from the currents alone, shape (2, n): the most likely of a grid of points."""
+        side = (np.arange(_GUESS_GRID) + 0.5) / _GUESS_GRID
         x, y = (place.ravel() for place in np.meshgrid(side, side))
         table = self.model.fractions(self.model.a * x, self.model.b * y).T
         begin = np.empty((2, self.data.shape[1]))
-        for first in range(0, self.data.shape[1], _GUESSED_AT_ONCE):
-            some = slice(first, first + _GUESSED_AT_ONCE)
+        for first in range(0, self.data.shape[1], _GUESS_BATCH):
+            some = slice(first, first + _GUESS_BATCH)
             weight, data = self.weight[:, some], self.data[:, some]
             along, norm = table @ (weight * data), (table * table) @ (weight * weight)
             best = np.argmax(np.maximum(along, 0.0) ** 2 / norm, axis=0)
             begin[:, some] = x[best], y[best]
         return begin
 
-    def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> _Linear:
+    def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> _WhitenedModel:
         """Evaluate the model at `point`, shape (2, n), for the elements `index`."""
         f, jacobian = self.model.fractions_with_jacobian(*(point * self.sides))
         weight, data = self.weight[:, index], self.data[:, index]
@@ -167,13 +174,17 @@ class _Fit:
         misfit = data - total * f
         mixing = (slopes * f).sum(1) / norm
         slopes = slopes - mixing[:, None] * f
-        return _Linear(total, misfit, f, slopes, mixing, (misfit * misfit).sum(0))
+        return _WhitenedModel(total, misfit, f, slopes, mixing, (misfit * misfit).sum(0))
 
-    def step(self, at: _Linear, point: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gauss-Newton step (2, n) and squared decrement (n,); coordinates held by an edge stay."""
+    def gauss_newton_step(self, at: _WhitenedModel, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the Gauss-Newton step (2, n) and squared decrement (n,); coordinates at an edge are
+        fixed.
+        """
         slopes = at.slopes * at.total
         gradient = (slopes * at.misfit).sum(1)
-        held = ((point <= _EDGE) & (gradient < 0)) | ((point >= 1 - _EDGE) & (gradient > 0))
+        held = ((point <= _MIN_EDGE_DISTANCE) & (gradient < 0)) | (
+            (point >= 1 - _MIN_EDGE_DISTANCE) & (gradient > 0)
+        )
         slopes = np.where(held[:, None], 0.0, slopes)
         sx, sy = slopes
         xx = (sx * sx).sum(0)
@@ -186,46 +197,52 @@ class _Fit:
         decrement = np.where(xx > 0, along_x**2 / xx, 0.0) + np.where(yy > 0, along_y**2 / yy, 0.0)
         step = np.stack([dx, dy])
         length = np.maximum((np.abs(step) * self.aspect).max(0), 1e-300)
-        return step * np.minimum(1.0, _LONGEST_STEP / length), decrement
+        return step * np.minimum(1.0, _MAX_STEP / length), decrement
 
-    def run(self, begin: FloatArray, unit: FloatArray) -> PointEstimate:
-        """Iterate every element to its maximum; elements that have settled are left alone."""
-        point = np.clip(begin, _EDGE, 1 - _EDGE)
+    def maximise(self, begin: FloatArray, unit: FloatArray) -> PointEstimate:
+        """Iterate every element to its maximum; converged elements are left alone."""
+        point = np.clip(begin, _MIN_EDGE_DISTANCE, 1 - _MIN_EDGE_DISTANCE)
         known = np.isfinite(self.data).all(0) & np.isfinite(self.weight).all(0)
         point = np.where(known, np.where(np.isfinite(point), point, 0.5), np.nan)
         best = self.linearise(point, slice(None))
         converged = np.zeros(point.shape[1], dtype=np.bool_)
         damping = np.ones(point.shape[1])
-        settled = _SETTLED * self.noise_unit**2
+        settled = _MAX_SETTLED_DECREMENT * self.noise_unit**2
         active = np.flatnonzero(known)
         for _ in range(_MAX_STEPS):
             if not active.size:
                 break
-            here, at = point[:, active], best.pick(active)
-            step, decrement = self.step(at, here)
-            trial = np.clip(here + damping[active] * step, _EDGE, 1 - _EDGE)
+            here, at = point[:, active], best.select(active)
+            step, decrement = self.gauss_newton_step(at, here)
+            trial = np.clip(here + damping[active] * step, _MIN_EDGE_DISTANCE, 1 - _MIN_EDGE_DISTANCE)
             new = self.linearise(trial, active)
             accept = (new.cost <= at.cost) & (new.total > 0) | (at.total <= 0)
             point[:, active[accept]] = trial[:, accept]
-            best.put(active[accept], new.pick(accept))
+            best.assign(active[accept], new.select(accept))
             damping[active] = np.where(accept, np.minimum(1.0, 4 * damping[active]), damping[active] / 4)
-            moved = (np.abs(trial - here) > _SMALLEST_STEP).any(0)
+            moved = (np.abs(trial - here) > _MIN_STEP).any(0)
             done = (accept & (decrement < settled[active])) | ~moved
             converged[active[done]] = best.total[active[done]] > 0
             active = active[~done]
-        moved_out = np.concatenate([self.leave_corner(point, best, converged), self.give_up(point, best)])
+        moved_out = np.concatenate(
+            [self.move_out_of_corners(point, best, converged), self.centre_invalid_points(point, best)]
+        )
         if moved_out.size:
-            best.put(moved_out, self.linearise(point[:, moved_out], moved_out))
-        return self.result(point, best, converged, unit)
+            best.assign(moved_out, self.linearise(point[:, moved_out], moved_out))
+        return self.build_estimate(point, best, converged, unit)
 
-    def leave_corner(self, point: FloatArray, at: _Linear, converged: BoolArray) -> NDArray[np.intp]:
-        """Move points too near a corner out, in place, to where currents begin to tell; their indices.
+    def move_out_of_corners(
+        self, point: FloatArray, at: _WhitenedModel, converged: BoolArray
+    ) -> NDArray[np.intp]:
+        """Move points out of corners, in place, to where currents carry information; return their indices.
 
         Near a corner the two far currents vanish with the square of its distance r, so that all r up to
         sqrt(noise) sides are equally likely, and only the direction from the corner is known.
         """
         noise = self.noise_unit / np.sqrt((self.weight * self.weight).mean(0))
-        radius = np.minimum(CORNER * np.sqrt(noise / at.total), 0.25)  # in shorter sides; NaN for no contact
+        radius = np.minimum(
+            CORNER_RADIUS_FACTOR * np.sqrt(noise / at.total), 0.25
+        )  # in shorter sides; NaN for no contact
         far = point > 0.5
         offset = np.where(far, 1 - point, point) * self.aspect
         index = np.flatnonzero(np.hypot(*offset) < radius)
@@ -237,28 +254,30 @@ class _Fit:
                 new = self.linearise(place, index)
                 return new.misfit, new.slopes * new.total
 
-            angle = best_direction(linearised, corner, inward, np.arctan2(*offset[::-1, index]))
+            angle = most_likely_direction(linearised, corner, inward, np.arctan2(*offset[::-1, index]))
             point[:, index] = corner + inward * np.stack([np.cos(angle), np.sin(angle)])
             converged[index] = at.total[index] > 0
         return index
 
-    def give_up(self, point: FloatArray, at: _Linear) -> NDArray[np.intp]:
-        """Move points without a positive total to the centre, in place; their indices."""
+    def centre_invalid_points(self, point: FloatArray, at: _WhitenedModel) -> NDArray[np.intp]:
+        """Move points without a positive total to the centre, in place; return their indices."""
         index = np.flatnonzero(at.total <= 0)
         point[:, index] = 0.5
         return index
 
-    def result(self, point: FloatArray, at: _Linear, converged: BoolArray, unit: FloatArray) -> PointEstimate:
-        """Covariance and residual at the points reached, in the units of the pad and the currents."""
+    def build_estimate(
+        self, point: FloatArray, at: _WhitenedModel, converged: BoolArray, unit: FloatArray
+    ) -> PointEstimate:
+        """Return covariance and residual at the points reached, in the units of the pad and the currents."""
         found = at.total > 0
         if len(self.currents) == 4:
             residual = (at.misfit[:2] / self.weight[:2]).sum(0) / at.total
             residual[~found] = np.nan
         else:
             residual = np.full_like(at.total, math.nan)
-        least = (self.noise_unit / LOST) ** 2
+        least = (self.noise_unit / MAX_STD_SIDES) ** 2
         slopes = np.where(found, at.slopes * at.total, 0.0)
-        covariance = covariance_of(slopes, at.mixing * at.total, at.fractions, least)
+        covariance = estimate_covariance(slopes, at.mixing * at.total, at.fractions, least)
         held = np.isfinite(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]).T
         x, y = np.where(held, point * self.sides, np.nan)
         units = np.stack([*np.broadcast_to(self.sides, point.shape), unit], axis=1) * self.noise_unit[:, None]
@@ -267,40 +286,41 @@ class _Fit:
         return PointEstimate(x, y, at.total * unit, residual, chi_squared, covariance, converged)
 
 
-def best_direction(
+def most_likely_direction(
     linearised: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     corner: FloatArray,
     inward: FloatArray,
     angle: FloatArray,
 ) -> FloatArray:
-    """The most likely direction (n,) from a corner, at a given distance from it.
+    """Return the most likely direction (n,) from a corner, at a given distance from it.
 
-    linearised: places (2, n) to whitened misfits (channels, n) and slopes (2, channels, n). corner: places.
-    inward: (2, n), the distance, signed into the pad. angle: where to begin, 0 along x to pi / 2 along y.
+    linearised: function of points (2, n) that returns whitened residuals (channels, n) and slopes (2,
+    channels, n). corner: points. inward: (2, n), the distance, signed into the pad. angle: start value, 0
+    along x to pi / 2 along y.
     """
-    for _ in range(_ARC_STEPS):
-        angle = np.clip(angle, _GRAZING, math.pi / 2 - _GRAZING)
+    for _ in range(_ARC_ITERATIONS):
+        angle = np.clip(angle, _MIN_CORNER_ANGLE_RAD, math.pi / 2 - _MIN_CORNER_ANGLE_RAD)
         cosine, sine = np.cos(angle), np.sin(angle)
         misfit, slopes = linearised(corner + inward * np.stack([cosine, sine]))
         tangent = slopes[1] * (inward[1] * cosine) - slopes[0] * (inward[0] * sine)
         angle = angle + np.clip((tangent * misfit).sum(0) / (tangent * tangent).sum(0), -0.3, 0.3)
-    return np.clip(angle, _GRAZING, math.pi / 2 - _GRAZING)
+    return np.clip(angle, _MIN_CORNER_ANGLE_RAD, math.pi / 2 - _MIN_CORNER_ANGLE_RAD)
 
 
-def covariance_of(
+def estimate_covariance(
     slopes: FloatArray, mixing: FloatArray, fractions: FloatArray, least: FloatArray
 ) -> FloatArray:
-    """Inverse Fisher information of (x, y, total), shape (n, 3, 3), x and y in sides.
+    """Return the inverse Fisher information of (x, y, total), shape (n, 3, 3), x and y in sides.
 
-    slopes, mixing: as in `_Linear`, times the total. fractions: whitened. least: information per side^2 (n,)
-    that a coordinate needs; with less, it has infinite variance and no covariances.
+    slopes, mixing: as in `_WhitenedModel`, times the total. fractions: whitened. least: information per
+    side^2 (n,) that a coordinate needs; with less, it has infinite variance and no covariances.
 
-    A factor F of the covariance is found first, and the covariance is F F^T: positive semidefinite whatever
-    cancels.
+    A factor F of the covariance is computed first, and the covariance is F F^T: positive semidefinite despite
+    cancellation.
     """
     sx, sy = slopes
     xx, yy, xy = (sx * sx).sum(0), (sy * sy).sum(0), (sx * sy).sum(0)
-    # Each variance from what the other coordinate cannot explain: no difference of products.
+    # Each variance from the part that the other coordinate can't explain: no difference of products.
     free_x, free_y = ((sx - (xy / yy) * sy) ** 2).sum(0), ((sy - (xy / xx) * sx) ** 2).sum(0)
     free_x, free_y = np.where(yy > least, free_x, xx), np.where(xx > least, free_y, yy)
     held_x, held_y = free_x > least, free_y > least

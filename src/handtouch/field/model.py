@@ -1,4 +1,4 @@
-"""What every forward model of a pad offers, so that estimators and banks work with any of them."""
+"""Interface of forward models: estimators and banks work with any pad that implements it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ FloatArray = NDArray[np.float64]
 
 @runtime_checkable
 class ForwardModel(Protocol):
-    """A point contact at (x, y) of a pad 0 <= x <= a, 0 <= y <= b, to the fractions its channels measure.
+    """Maps a point contact at (x, y) of a pad 0 <= x <= a, 0 <= y <= b to the fractions its channels
+    measure.
 
-    Channels are ordered x0, xa, y0, yb; a model with other electrodes has as many channels as electrodes.
-    The fractions are those *measured* (corner gaps and series resistors included), per unit of the current
-    that the contact would inject into a grounded sheet; they need not sum to one.
+    Channels are ordered x0, xa, y0, yb; a model with other electrodes has as many channels as electrodes. The
+    fractions are those *measured* (corner gaps and series resistors included), per unit of the current that
+    the contact would inject into a grounded sheet; they need not sum to one.
     """
 
     @property
@@ -42,10 +43,10 @@ class ForwardModel(Protocol):
 
 
 def channel_noise(noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Standard deviations for currents of shape (channels, ...), broadcast to it.
+    """Return standard deviations for currents of shape (channels, ...), broadcast to it.
 
-    noise: one for all, one a channel (channels,), or whatever broadcasts against the currents. One dimension
-    as long as there are channels always means one a channel; for one a contact give (1, n).
+    noise: one for all, one per channel (channels,), or any array that broadcasts against the currents. One
+    dimension as long as there are channels always means one per channel; for one per contact give (1, n).
     """
     sigma = np.asarray(noise, dtype=np.float64)
     if sigma.ndim == 1 and len(shape) > 1 and len(sigma) == shape[0]:

@@ -1,11 +1,11 @@
-"""Pads with their electrodes as they are built: bare corners, divided sides, resistors to ground.
+"""Pads with real electrodes: bare corners, divided sides, series resistors to ground.
 
 Public names: `ElectrodeNetwork`, `Electrode`.
 
 By reciprocity the current that a point contact sends to grounded electrode i is the potential phi_i there
-when electrode i alone is at 1 and the bare boundary insulates; `_electrodes` has those potentials to
-rounding error. Resistors R mix the currents: (1 + G R / sheet) I = phi, G the conductance matrix for one
-ohm per square.
+when electrode i alone is at 1 and the bare boundary insulates; `_electrodes` computes those potentials to
+rounding error. Resistors R mix the currents: (1 + G R / sheet) I = phi, G the conductance matrix for one ohm
+per square.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ ComplexArray = npt.NDArray[np.complex128]
 Side = Literal["x0", "xa", "y0", "yb"]
 
 SIDES: tuple[Side, ...] = ("x0", "xa", "y0", "yb")
-LONGEST_ASPECT = 50.0
-_STEPS = 45
-_SETTLED = 1e-8  # of a side; Newton's next step would be its square
-_LEAST = 1e-12  # where both fractions of a coordinate are smaller they do not hold it
-_SMALL = 1e-5  # a smaller fraction is left out where the opposite side has ten times as much
-_ROUNDING = 2e-15  # of a fraction, at most: steps that come from it say nothing
-_FLOOR = 1e-17  # what starts the search where a fraction is rounding
+MAX_ASPECT_RATIO = 50.0
+_MAX_STEPS = 45
+_MAX_SETTLED_STEP = 1e-8  # of a side; Newton's next step would be its square
+_MIN_OBSERVABLE_FRACTION = 1e-12  # with both fractions smaller, a coordinate isn't observable
+_MIN_USED_FRACTION = 1e-5  # smaller ones are excluded where the opposite side has ten times as much
+_FRACTION_ROUNDING = 2e-15  # upper bound: smaller steps are rounding
+_FRACTION_FLOOR = 1e-17  # start value where a fraction is rounding
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ class Electrode:
 class ElectrodeNetwork:
     """A resistive rectangle [0, a] x [0, b] with any electrodes on its boundary; a `ForwardModel`.
 
-    The plain case is four electrodes that leave `gap` bare from each corner along each side: one number, or
+    The usual case is four electrodes that leave `gap` bare from each corner along each side: one number, or
     one for each side in the order x0, xa, y0, yb; 0 <= gap < half a side, in the unit of a and b.
     `series_ohm` are the resistors from the electrodes to ground; infinity leaves one floating. Any other
-    arrangement is made by `from_electrodes`; channels are in the order in which electrodes are given.
+    arrangement is made by `from_electrodes`; channels are in the order of the given electrodes.
 
     Fractions are accurate to a few 1e-16 for sides within 50:1 of each other, which is the limit. Arguments
     broadcast; points off the pad or NaN give NaN.
 
-    Raises ValueError for sides, gaps, resistances or an arrangement that cannot be, named.
+    Raises ValueError naming impossible sides, gaps, resistances or arrangements.
     """
 
     def __init__(
@@ -92,11 +92,11 @@ class ElectrodeNetwork:
         network._build(a, b, list(electrodes), sheet_ohm_per_square, series)
         return network
 
-    def with_series(self, series_ohm: Sequence[float]) -> ElectrodeNetwork:
-        """The same pad with its resistors switched to others; costs microseconds."""
+    def with_series_ohm(self, series_ohm: Sequence[float]) -> ElectrodeNetwork:
+        """Return the same pad with other series resistors; costs microseconds."""
         network = self.__class__.__new__(self.__class__)
         network.__dict__.update(self.__dict__)
-        network._connect(series_ohm)
+        network._set_series_resistors(series_ohm)
         return network
 
     @property
@@ -113,34 +113,40 @@ class ElectrodeNetwork:
     def conductance(self) -> FloatArray:
         """Currents into the electrodes per unit of their voltages (m, m), for one ohm per square.
 
-        Symmetric; rows sum to zero. Raises ValueError if electrodes touch: they conduct without limit.
+        Symmetric; rows sum to zero. Raises ValueError if electrodes touch: their conductance is infinite.
         """
         if self._potentials.conductance is None:
-            raise ValueError("gap: electrodes that touch (gap 0) conduct without limit")
-        return self._potentials.conductance[np.ix_(self._place, self._place)]
+            raise ValueError("gap: electrodes that touch (gap 0) have infinite conductance")
+        return self._potentials.conductance[np.ix_(self._ring_position, self._ring_position)]
 
     def ideal_fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """What each electrode would collect were it grounded directly, shape (m, ...), summing to 1."""
+        """Return the fractions that directly grounded electrodes would collect, shape (m, ...), summing to
+        1.
+        """
         with np.errstate(all="ignore"):  # NaN in gives NaN out
-            return np.asarray(self._potentials.potentials(self._to_disc(x, y))[self._place])
+            return np.asarray(self._potentials.potentials(self._to_disc(x, y))[self._ring_position])
 
     @np.errstate(all="ignore")
     def fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Measured fractions of the contact's current, resistors included, shape (m, ...), summing to 1."""
+        """Return the measured fractions of the contact's current, resistors included; (m, ...), summing to
+        1.
+        """
         return self._mixed(self.ideal_fractions(x, y))
 
     def currents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """`fractions`, by its other name."""
+        """Return `fractions`, by its other name."""
         return self.fractions(x, y)
 
     @np.errstate(all="ignore")
     def fractions_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """`fractions` (m, ...), their derivatives by (x, y) (m, 2, ...), unbounded at electrodes' ends."""
+        """Return `fractions` (m, ...) and derivatives by (x, y) (m, 2, ...), unbounded at electrodes'
+        ends.
+        """
         ideal, jacobian = self._ideal_with_jacobian(self._to_disc(x, y))
         return self._mixed(ideal), self._mixed(jacobian) / self._unit
 
     def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """R of a place: the sheet's resistance there is sheet / (2 pi) ln(R / A) to a contact of radius A.
+        """Return R: the sheet's resistance to a contact of radius A at (x, y) is sheet / (2 pi) ln(R / A).
 
         Electrodes at ground, in the unit of a and b, shape (...). It is the conformal radius, enlarged by the
         gaps: ln R is 2 pi times the regular part of Green's function, so it is exact for small contacts. Zero
@@ -153,15 +159,16 @@ class ElectrodeNetwork:
 
     @np.errstate(all="ignore")
     def series_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """What the resistors add between a contact and ground [ohm], shape (...): sum of phi_i V_i."""
+        """Return the resistance [ohm] that resistors add between a contact and ground: sum of phi_i V_i."""
         ideal = self.ideal_fractions(x, y)
-        return np.asarray(np.einsum("i...,ij,j...->...", ideal, self._lift, ideal))
+        return np.asarray(np.einsum("i...,ij,j...->...", ideal, self._voltage_per_current, ideal))
 
     @property
-    def series_form(self) -> FloatArray:
-        """What `series_resistance` is of measured fractions f: f @ series_form @ f [ohm], shape (m, m).
+    def series_quadratic_form(self) -> FloatArray:
+        """Matrix Q (m, m) of the form f @ Q @ f [ohm] that gives `series_resistance` from measured fractions
+        f.
 
-        Raises ValueError where an electrode floats: its voltage does not follow from the currents.
+        Raises ValueError where an electrode floats: its voltage doesn't follow from the currents.
         """
         if self._unmix is None:
             raise ValueError(
@@ -171,15 +178,15 @@ class ElectrodeNetwork:
 
     @np.errstate(all="ignore")
     def locate(self, currents: npt.ArrayLike) -> Location:
-        """The point contact that sends `currents` (m, ...), the exact inverse of `currents`.
+        """Return the point contact that sends `currents` (m, ...), the exact inverse of `currents`.
 
         x follows from the currents of sides x0 and xa, y from those of y0 and yb, resistors undone, as in
-        `Rectangle.locate`, to which this tends for small gaps; the residual is what is left. Where the far
+        `Rectangle.locate`, to which this tends for small gaps; the residual is the remainder. Where the far
         side's fraction is below 1e-5 and a tenth of the near one's, the near side decides alone, so the error
         is rounding over the near fraction: for gaps of 10 %, 3 % or farther from the edges, 1e-12 of the
         short side up to 3:1, 1e-10 at 5:1, 1e-8 at 10:1. NaN for a coordinate whose sides both have less than
-        1e-12 (mid-length of a pad of 20:1), for both where no point of the pad fits or the iteration does
-        not settle. Raises ValueError if a side has no electrode, or an electrode floats: see `estimate`.
+        1e-12 (mid-length of a pad of 20:1), for both where no point of the pad fits or the iteration doesn't
+        converge. Raises ValueError if a side has no electrode, or an electrode floats: see `estimate`.
         """
         currents = np.asarray(currents, np.float64)
         self._check_channels(currents)
@@ -197,7 +204,9 @@ class ElectrodeNetwork:
     def estimate(
         self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None
     ) -> PointEstimate:
-        """The maximum-likelihood contact from all noisy currents (m, ...); see `handtouch.field.estimate`."""
+        """Return the maximum-likelihood contact from all noisy currents (m, ...); see
+        `handtouch.field.estimate`.
+        """
         return estimate(self, currents, noise, start)
 
     @np.errstate(all="ignore")
@@ -210,28 +219,30 @@ class ElectrodeNetwork:
         series_ohm: Sequence[float],
     ) -> None:
         self._rectangle = Rectangle(a, b)
-        if max(a / b, b / a) > LONGEST_ASPECT:
-            raise ValueError(f"a and b must be within {LONGEST_ASPECT:g}:1 of each other, got {a} and {b}")
+        if max(a / b, b / a) > MAX_ASPECT_RATIO:
+            raise ValueError(f"a and b must be within {MAX_ASPECT_RATIO:g}:1 of each other, got {a} and {b}")
         if not (sheet_ohm_per_square > 0 and math.isfinite(sheet_ohm_per_square)):
             raise ValueError(f"sheet_ohm_per_square must be positive and finite, got {sheet_ohm_per_square}")
         self.electrodes = tuple(electrodes)
         self.sheet_ohm_per_square = float(sheet_ohm_per_square)
         order = _counter_clockwise(self.electrodes, a, b)
-        self._place = np.argsort(order)
-        # a power of two brings any unit near 1, so that no product leaves the range of doubles
+        self._ring_position = np.argsort(order)
+        # a power of two scales any unit to near 1, so that no product leaves the range of doubles
         self._unit = math.ldexp(1.0, math.frexp(max(self.a, self.b))[1])
         self._disc = DiscMap(self.a / self._unit, self.b / self._unit)
-        ends = np.array([_ends(self.electrodes[i], a, b) for i in order]) / self._unit  # (m, 2 ends, x and y)
+        ends = (
+            np.array([_electrode_ends(self.electrodes[i], a, b) for i in order]) / self._unit
+        )  # (m, 2 ends, x and y)
         starts = CirclePoints(self._disc, self._disc.defects(*np.roll(ends[:, 0], -1, axis=0).T))
         stops = CirclePoints(self._disc, self._disc.defects(*ends[:, 1].T))
         self._potentials = ElectrodePotentials(stops, starts, self._disc.defects(*ends[0].mean(axis=0)))
         sums = np.array([[float(e.side == side) for e in self.electrodes] for side in SIDES])
         self._side_sums = sums if sums.any(axis=1).all() else None
-        self._connect(series_ohm)
+        self._set_series_resistors(series_ohm)
 
     @np.errstate(all="ignore")
-    def _connect(self, series_ohm: Sequence[float]) -> None:
-        """Matrices of the resistors: currents from phi and back, and voltages per ampere from phi."""
+    def _set_series_resistors(self, series_ohm: Sequence[float]) -> None:
+        """Compute the resistors' matrices: currents from phi and back, and voltages per ampere from phi."""
         resistance = np.asarray(series_ohm, np.float64)
         count = len(self.electrodes)
         if resistance.shape != (count,) or not (resistance >= 0).all():
@@ -239,11 +250,11 @@ class ElectrodeNetwork:
         self.series_ohm = tuple(float(r) for r in resistance)
         self._mix: FloatArray = np.eye(count)
         self._unmix: FloatArray | None = np.eye(count)
-        self._lift: FloatArray = np.zeros((count, count))
+        self._voltage_per_current: FloatArray = np.zeros((count, count))
         if not resistance.any():
             return
         if not np.isfinite(resistance).any():
-            raise ValueError("series_ohm: at least one electrode must have a way to ground")
+            raise ValueError("series_ohm: at least one electrode must be connected to ground")
         # unknowns: the current of a connected electrode, the voltage over `sheet` of a floating one
         connected = np.isfinite(resistance)
         drop = np.where(connected, resistance, self.sheet_ohm_per_square)
@@ -251,10 +262,10 @@ class ElectrodeNetwork:
         solution = np.asarray(np.linalg.inv(system), np.float64)
         self._mix = solution * connected[:, None]
         self._unmix = system if connected.all() else None
-        self._lift = drop[:, None] * solution
+        self._voltage_per_current = drop[:, None] * solution
 
     def _to_disc(self, x: npt.ArrayLike, y: npt.ArrayLike) -> ComplexArray:
-        """Defects (4, ...), NaN off the pad."""
+        """Return defects (4, ...), NaN off the pad."""
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         on_pad = (x >= 0) & (x <= self.a) & (y >= 0) & (y <= self.b)
         with np.errstate(all="ignore"):
@@ -265,12 +276,12 @@ class ElectrodeNetwork:
         return np.asarray(np.tensordot(self._mix, ideal, axes=1)) if any(self.series_ohm) else ideal
 
     def _ideal_with_jacobian(self, defects: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Potentials (m, ...) and their derivatives (m, 2, ...) by coordinates in `_unit`."""
+        """Return potentials (m, ...) and their derivatives (m, 2, ...) by coordinates in `_unit`."""
         with np.errstate(all="ignore"):
             values, slope = self._potentials.potentials_and_slope(defects)
             slope = slope * self._disc.derivative(defects)
         # phi = Im Phi: d/dx = Im Phi', d/dy = Im(i Phi') = Re Phi'
-        return values[self._place], np.stack([slope.imag, slope.real], axis=1)[self._place]
+        return values[self._ring_position], np.stack([slope.imag, slope.real], axis=1)[self._ring_position]
 
     def _check_channels(self, currents: FloatArray) -> None:
         if currents.shape[:1] != (len(self.electrodes),):
@@ -279,23 +290,26 @@ class ElectrodeNetwork:
             )
 
     def _newton(self, sums: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """x and y (n,) where side sums (4, n) are as measured, from where a pad without gaps has them.
+        """Return x and y (n,) where the side sums (4, n) are as measured, starting at the pad without
+        gaps.
 
-        A coordinate whose two sums are below rounding is NaN; one where only the far sum is, or is nearly,
+        A coordinate whose two sums are below rounding is NaN; one where only the far sum is, or nearly,
         follows from the near sum alone.
         """
-        held, weights = _weights(measured)
-        start = self._rectangle.locate(np.where(np.abs(measured) < _LEAST, _FLOOR, measured))
+        held, weights = _side_weights(measured)
+        start = self._rectangle.locate(
+            np.where(np.abs(measured) < _MIN_OBSERVABLE_FRACTION, _FRACTION_FLOOR, measured)
+        )
         sides = np.array([[self.a], [self.b]]) / self._unit
         inset = 1e-9 * sides
         far = sides - inset
         at = np.where(held, np.stack([start.x, start.y]) / self._unit, sides / 2)
         at = np.clip(at, inset, far)
-        wanted = _weighted(weights, _log_tangents(measured)[0])
+        target = _weighted_difference(weights, _log_tangents(measured)[0])
         settled = np.zeros(at.shape[1], bool)
-        rounding = _ROUNDING / np.maximum(measured[::2], measured[1::2]) * sides.min()
-        enough = _SETTLED * sides + np.where(held, rounding, 0.0)
-        for step_number in range(_STEPS):
+        rounding = _FRACTION_ROUNDING / np.maximum(measured[::2], measured[1::2]) * sides.min()
+        enough = _MAX_SETTLED_STEP * sides + np.where(held, rounding, 0.0)
+        for step_number in range(_MAX_STEPS):
             moving = np.flatnonzero(~settled & np.isfinite(at).all(axis=0))
             if moving.size == 0:
                 break
@@ -303,50 +317,54 @@ class ElectrodeNetwork:
             logs, slopes = _log_tangents(sums @ values)
             rates = slopes[:, None] * np.tensordot(sums, jacobian, axes=1)
             active, known = weights[:, moving], held[:, moving]
-            rates_of = [_weighted(active, rates[:, axis]) for axis in range(2)]
+            rates_of = [_weighted_difference(active, rates[:, axis]) for axis in range(2)]
             xx, yx = (np.where(known[i], rates_of[0][i], 1.0 - i) for i in range(2))
             xy, yy = (np.where(known[i], rates_of[1][i], float(i)) for i in range(2))
-            miss_x, miss_y = np.where(known, wanted[:, moving] - _weighted(active, logs), 0.0)
+            miss_x, miss_y = np.where(known, target[:, moving] - _weighted_difference(active, logs), 0.0)
             step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - yx * miss_x]) / (xx * yy - xy * yx)
-            if step_number > _STEPS / 3:  # it may go round in circles
+            if step_number > _MAX_STEPS / 3:  # the iteration may oscillate
                 step *= np.where((np.abs(step) > sides / 100).any(axis=0), 0.5, 1.0)
             new = np.clip(at[:, moving] + np.clip(step, -far / 4, far / 4), inset, far)
             settled[moving] = (np.abs(new - at[:, moving]) < enough[:, moving]).all(axis=0)
             at[:, moving] = new
         on_edge = (held & ((at == inset) | (at == far))).any(axis=0)
         at[:, on_edge | ~settled] = np.nan
-        # a sum that was left out must be as small there as it was measured
+        # an excluded sum must be as small there as measured
         left_out = (weights == 0) & (
-            sums @ self._ideal_with_jacobian(self._disc.defects(*at))[0] > 10 * _SMALL
+            sums @ self._ideal_with_jacobian(self._disc.defects(*at))[0] > 10 * _MIN_USED_FRACTION
         )
         at = np.where(held & ~left_out.any(axis=0), at, np.nan) * self._unit
         return at[0], at[1]
 
 
-def _weights(sides: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:
-    """Which coordinates the sums of sides hold (2, n), and by what each sum counts (4, n): 0 or 1."""
+def _side_weights(sides: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+    """Return which coordinates the side sums determine (2, n), and the weight, 0 or 1, of each sum (4, n)."""
     weights = []
     for near, far in ((0, 1), (1, 0), (2, 3), (3, 2)):
-        vain = (sides[near] < _SMALL) & (sides[near] < sides[far] / 10)
-        weights.append(np.where(vain & (sides[near] > -_LEAST), 0.0, 1.0))
+        unused = (sides[near] < _MIN_USED_FRACTION) & (sides[near] < sides[far] / 10)
+        weights.append(np.where(unused & (sides[near] > -_MIN_OBSERVABLE_FRACTION), 0.0, 1.0))
     least = np.maximum(np.abs(sides[::2]), np.abs(sides[1::2]))
-    return ~(least < _LEAST), np.stack(weights)
+    return ~(least < _MIN_OBSERVABLE_FRACTION), np.stack(weights)
 
 
-def _weighted(weights: FloatArray, sides: FloatArray) -> FloatArray:
-    """Far side less near side of either pair, (2, n), without those of weight 0."""
+def _weighted_difference(weights: FloatArray, sides: FloatArray) -> FloatArray:
+    """Return far side less near side of either pair, (2, n), without those of weight 0."""
     counted = np.where(weights > 0, sides, 0.0)
     return np.asarray(counted[1::2] - counted[::2])
 
 
 def _log_tangents(sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """ln tan(pi f / 2) of every side (4, n), NaN where f holds no digits, and its derivative by f."""
-    sides = np.where(sides > _LEAST / 100, sides, np.nan)
+    """Return ln tan(pi f / 2) of every side (4, n), NaN where f has no digits left, and its derivative by
+    f.
+    """
+    sides = np.where(sides > _MIN_OBSERVABLE_FRACTION / 100, sides, np.nan)
     return np.log(np.tan(np.pi / 2 * sides)), np.pi / np.sin(np.pi * sides)
 
 
 def _counter_clockwise(electrodes: Sequence[Electrode], a: float, b: float) -> list[int]:
-    """Order of the electrodes counter-clockwise from corner (0, 0), checked to be on the pad and apart."""
+    """Return the order of the electrodes counter-clockwise from corner (0, 0); check that they don't
+    overlap.
+    """
     if len(electrodes) < 2:
         raise ValueError(f"electrodes: at least two are needed, got {len(electrodes)}")
     for electrode in electrodes:
@@ -369,8 +387,8 @@ def _counter_clockwise(electrodes: Sequence[Electrode], a: float, b: float) -> l
     return sorted(range(len(electrodes)), key=place)
 
 
-def _ends(electrode: Electrode, a: float, b: float) -> list[tuple[float, float]]:
-    """The two ends of an electrode, counter-clockwise."""
+def _electrode_ends(electrode: Electrode, a: float, b: float) -> list[tuple[float, float]]:
+    """Return the two ends of an electrode, counter-clockwise."""
     start, stop = electrode.start, electrode.stop
     return {
         "y0": [(start, 0.0), (stop, 0.0)],

@@ -1,4 +1,6 @@
-"""Rectangle: the ideal pad, four electrodes along its whole sides; exact both ways, in double precision."""
+"""The ideal pad: a rectangle with four electrodes along its whole sides, exact both ways in double
+precision.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +17,21 @@ from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.model import FloatArray
 
 _HALF_PI = math.pi / 2
-_SAFE_SCALE = 1e100  # sides within this factor of 1 need no scaling against overflow
-_ON_EDGE = 1e-300  # of a side: closer to an edge is on it
-_NEAREST = 1e-140  # of a side: closer to an edge, derivatives are taken here
+_MAX_UNSCALED_SIDE = 1e100  # sides within this factor of 1 need no scaling against overflow
+_MIN_EDGE_DISTANCE = 1e-300  # of a side: closer points are on the edge
+_MIN_DERIVATIVE_DISTANCE = 1e-140  # of a side: derivatives of closer points are taken here
 
 
 @dataclass(frozen=True)
 class Location:
-    """The exact inverse of four currents; arrays of one shape (...), or scalars.
+    """Exact inverse of four currents; arrays of one shape (...), or scalars.
 
-    x, y: position, in the unit of the pad; NaN where the currents no longer hold it.
+    x, y: position, in the unit of the pad; NaN where the currents don't determine it.
+
     total: sum of the four currents.
-    residual: signed excess of (x0 + xa) over that of a point at (x, y), divided by the total. Positive is
-        elongated along x. It vanishes for a point (paper, eqs. 14-15).
+
+    residual: signed excess of (x0 + xa) over that of a point at (x, y), divided by the total; positive for a
+    contact elongated along x. It vanishes for a point (paper, eqs. 14-15).
     """
 
     x: FloatArray
@@ -40,10 +44,10 @@ class Location:
 class Rectangle:
     """A pad 0 <= x <= a, 0 <= y <= b with a grounded electrode along each whole side.
 
-    a, b: lengths of the sides, any one unit. ValueError unless both are positive and finite.
+    a, b: lengths of the sides, in any common unit. ValueError unless both are positive and finite.
 
-    Everything is even-handed between the sides and accurate for aspect ratios from 1e-3 to 1e3, down to
-    1e-12 of a side from edges and corners. Points that are NaN or off the pad give NaN in their own element.
+    All sides are treated alike; accurate for aspect ratios from 1e-3 to 1e3, down to 1e-12 of a side from
+    edges and corners. Points that are NaN or off the pad give NaN in their own element.
     """
 
     a: float
@@ -70,7 +74,7 @@ class Rectangle:
             return np.asarray(np.arctan2(*self._tangents(ratio_x, ratio_y)) / _HALF_PI)
 
     def fractions(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Return `side_fractions`: an ideal pad measures them as they are."""
+        """Return `side_fractions`, which an ideal pad measures unchanged."""
         return self.side_fractions(x, y)
 
     def fractions_with_jacobian(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -81,7 +85,7 @@ class Rectangle:
         x, y = self._on_pad(x, y)
         with np.errstate(all="ignore"):
             x, y = (
-                np.clip(s, _NEAREST * side, np.nextafter(side, 0))
+                np.clip(s, _MIN_DERIVATIVE_DISTANCE * side, np.nextafter(side, 0))
                 for s, side in zip((x, y), self._sides, strict=True)
             )
             ratios = self._ratios(x, y)
@@ -112,9 +116,9 @@ class Rectangle:
     def locate(self, currents: ArrayLike) -> Location:
         """Return the point contact whose currents x0, xa, y0, yb are `currents`, shape (4, ...), any unit.
 
-        x follows from x0 and xa as fractions of the total, y from y0 and yb, and what is left over is the
-        residual. An element with a negative or NaN current is NaN (`estimate` takes noise), as is a
-        coordinate of which the currents hold nothing: both of its currents underflowed, or zero.
+        x follows from x0 and xa as fractions of the total, y from y0 and yb; the remainder is the residual.
+        An element with a negative or NaN current is NaN (`estimate` handles noise), as is a coordinate that
+        the currents don't determine: both of its currents underflowed, or zero.
         """
         currents = np.asarray(currents, dtype=np.float64)
         if currents.shape[:1] != (4,):
@@ -139,9 +143,9 @@ class Rectangle:
 
     @cached_property
     def _unit(self) -> float:
-        """Power of two that brings extreme sides near 1, so that no intermediate leaves double range."""
+        """Power of two that scales extreme sides to near 1, so that no intermediate leaves double range."""
         largest = max(self.a, self.b)
-        if 1 / _SAFE_SCALE < largest < _SAFE_SCALE:
+        if 1 / _MAX_UNSCALED_SIDE < largest < _MAX_UNSCALED_SIDE:
             return 1.0
         return math.ldexp(1.0, min(1000, -math.frexp(largest)[1]))
 
@@ -164,7 +168,7 @@ class Rectangle:
         """Per axis: numerator factor, delta and slope of the algebra in `_separable`.
 
         Ratios along the longer axis keep the factor `root`, which may underflow, and those along the shorter
-        one are divided by it; the factors here make up for that.
+        one are divided by it; the factors here compensate for that.
         """
         long = self._long
         root = self._pairs[long].root
@@ -179,7 +183,7 @@ class Rectangle:
 
     @cached_property
     def _inverse(self) -> RatioInverse:
-        """One for both axes, or, for a strip, one for its shorter axis."""
+        """Inverse for both axes or, on a strip, for its shorter axis."""
         short = self._pairs[1 - self._long]
         return RatioInverse((short,) if self._is_strip else self._pairs)
 
@@ -188,23 +192,28 @@ class Rectangle:
         return self._sides[self._long] > LOGARITHMIC_DEPTH * self._sides[1 - self._long]
 
     def _on_pad(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """x and y as float64 of one shape, NaN off the pad, scaled by `_unit`."""
+        """Return x and y as float64 of one shape, NaN off the pad, scaled by `_unit`."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         with np.errstate(all="ignore"):
             on = (x >= 0) & (x <= self.a) & (y >= 0) & (y <= self.b)
-            # So near an edge that a ratio could overflow is on it, and so is -0.0.
-            x, y = np.where(x > _ON_EDGE * self.a, x, 0.0), np.where(y > _ON_EDGE * self.b, y, 0.0)
+            # Points so near an edge that a ratio could overflow are on it, and so is -0.0.
+            x, y = (
+                np.where(x > _MIN_EDGE_DISTANCE * self.a, x, 0.0),
+                np.where(y > _MIN_EDGE_DISTANCE * self.b, y, 0.0),
+            )
             return np.where(on, x, np.nan) * self._unit, np.where(on, y, np.nan) * self._unit
 
     def _ratios(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Ratios G of the two sides of either pair, shape (2, ...) each; the short axis' without its root."""
+        """Return the ratios G of the two sides of either pair, (2, ...) each; the short axis' without its
+        root.
+        """
         with np.errstate(all="ignore"):
             ratios = [np.stack(pair(s)) for pair, s in zip(self._pairs, (x, y), strict=True)]
             ratios[1 - self._long] /= self._pairs[1 - self._long].root
             return ratios[0], ratios[1]
 
     def _tangents(self, ratio_x: FloatArray, ratio_y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Numerators and denominators of tan(pi f / 2), shape (4, ...) each."""
+        """Return numerators and denominators of tan(pi f / 2), shape (4, ...) each."""
         numerator, delta, _ = self._coupling
         sum_x, sum_y = ratio_x[0] + ratio_x[1], ratio_y[0] + ratio_y[1]
         below_x, below_y = sum_y + np.hypot(sum_y, delta[1]), sum_x + np.hypot(sum_x, delta[0])
@@ -216,7 +225,9 @@ class Rectangle:
     def _log_slopes(
         self, ratio_x: FloatArray, ratio_y: FloatArray
     ) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Per axis: how fast ln T falls with distance from its own side, and rises in the other pair."""
+        """Return per axis how fast ln T falls with distance from its own side, and rises in the other
+        pair.
+        """
         _, delta, slope = self._coupling
         ratios = (ratio_x, ratio_y)
         across = [slope[i] * np.hypot(ratios[i][0] + ratios[i][1], delta[i]) for i in range(2)]
@@ -224,7 +235,7 @@ class Rectangle:
         return across, along
 
     def _invert(self, tangents: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x, y and the fraction expected in the pair x0, xa, from T of shape (2 pairs, 2 sides, n)."""
+        """Return x, y and the fraction expected in the pair x0, xa, from T of shape (2 pairs, 2 sides, n)."""
         ratio = tangents[:, 0] / tangents[:, 1]
         mirrored = ratio < 1
         ratio = np.where(mirrored, 1 / ratio, ratio)
@@ -253,9 +264,11 @@ class Rectangle:
 
 
 def _half_angle_tangents(pairs: FloatArray, total: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """T = tan(pi f / 2) of every current, shape (2 pairs, 2 sides, n), and the fraction in the first pair."""
+    """Return T = tan(pi f / 2) of every current, (2 pairs, 2 sides, n), and the fraction in the first
+    pair.
+    """
     fractions = np.where(pairs >= 0, np.abs(pairs), np.nan) / total  # -0.0 is not negative
     sums = fractions[:, 0] + fractions[:, 1]
-    rest = fractions[:, ::-1] + sums[::-1, None]  # not 1 - f: what is left beside a large f keeps its digits
+    rest = fractions[:, ::-1] + sums[::-1, None]  # not 1 - f: the rest of a large f keeps its digits
     tangents = np.tan(_HALF_PI * np.minimum(fractions, rest))
     return np.where(fractions > rest, 1 / tangents, tangents), sums[0]

@@ -1,48 +1,69 @@
-"""Surfaces that a sensor may cover, each with the conformal map that makes it a rectangle.
+"""Sensor surfaces, each with the conformal map that makes it a rectangle.
 
-Public names: `Surface` and its kinds `Plane`, `Prism`, `Cylinder`, `Cone`, `Sphere`, `Revolution`;
-`Anisotropic` wraps any of them.
+Public names: `Surface` and its kinds `PlaneSurface`, `PrismSurface`, `CylinderSurface`, `ConeSurface`,
+`SphereSurface`, `RevolutionSurface`; `AnisotropicSurface` wraps any of them; `SURFACES` is their registry.
 
-The currents of a sensor do not change under a conformal map, so a pad is solved on its rectangle [0, a] x
-[0, b] and only the result is carried to the surface. For a surface of revolution of radius r(u) at arc
-length u the rectangle is x = r_mid * integral du / r(u), y = r_mid * angle, where r_mid is the radius half
-way along the profile: there, at the centre of the pad, a rectangle unit is a metre. The isotropic sheet
-resistance stays as it is; a contact of radius A becomes one of radius A / `scale`.
+The currents of a sensor don't change under a conformal map, so a pad is solved on its rectangle [0, a] x [0,
+b] and only the result is carried to the surface. For a surface of revolution of radius r(u) at arc length u
+the rectangle is x = r_mid * integral du / r(u), y = r_mid * angle, where r_mid is the radius half way along
+the profile: there, at the centre of the pad, a rectangle unit is a metre. The isotropic sheet resistance
+stays unchanged; a contact of radius A becomes one of radius A / `scale`.
 
 Coordinates
+
     x, y   on the rectangle; electrode x0 lies at x = 0, xa at x = a, y0 at y = 0, yb at y = b
     u, v   metres along the surface: u along the profile from x0, v along the parallel at that u from y0
     pad frame   metres; origin on the surface at u = u_max / 2, half way round; z is the outward normal
                 there, x points towards electrode xa, y = z cross x towards yb
-Arguments broadcast. Outside the patch the surface is continued as far as it exists; beyond that the answer
-is NaN.
+
+Arguments broadcast. Outside the patch the surface is continued as far as it exists; beyond that the result is
+NaN.
+
+To add a shape, write a dataclass here that sets `kind` and declares its fields by `surface_key`; the
+deployment file, its checks and its schema follow. The simulator's independent geometry is in
+`handtouch.simulate.pad_geometry`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field._conformal import (
+from handtouch.field._prism import PrismSurface
+from handtouch.field._revolution import RevolutionSurface
+from handtouch.field.surface_base import (
+    SURFACES,
     FloatArray,
     Meridian,
-    Revolved,
     Surface,
+    SweptSurface,
+    arc_key,
     check_arc,
     check_lengths,
     ratio_or_one,
+    surface_key,
 )
-from handtouch.field._prism import Prism
-from handtouch.field._revolution import Revolution
 
-__all__ = ["Anisotropic", "Cone", "Cylinder", "Plane", "Prism", "Revolution", "Sphere", "Surface"]
+__all__ = [
+    "SURFACES",
+    "AnisotropicSurface",
+    "ConeSurface",
+    "CylinderSurface",
+    "PlaneSurface",
+    "PrismSurface",
+    "RevolutionSurface",
+    "SphereSurface",
+    "Surface",
+]
 
 
-class _Straight(Revolved):
+class _DevelopableSurface(SweptSurface):
     """A plane or a cylinder: the conformal coordinate is the arc length."""
 
     @property
@@ -65,14 +86,15 @@ class _Straight(Revolved):
 
 
 @dataclass(frozen=True)
-class Plane(_Straight):
+class PlaneSurface(_DevelopableSurface):
     """A flat rectangle; rectangle units are metres.
 
     `width_m` runs along x, from electrode x0 to xa; `height_m` along y.
     """
 
-    width_m: float
-    height_m: float
+    kind: ClassVar[str] = "plane"
+    width_m: float = surface_key("length_mm", "from electrode x0 to electrode xa")
+    height_m: float = surface_key("width_mm", "from electrode y0 to electrode yb")
 
     def __post_init__(self) -> None:
         check_lengths(width_m=self.width_m, height_m=self.height_m)
@@ -89,14 +111,18 @@ class Plane(_Straight):
     def _curvature(self) -> float:
         return 0.0
 
+    def describe_side(self, side: str) -> str:  # noqa: ARG002
+        return "the edge"
+
 
 @dataclass(frozen=True)
-class Cylinder(_Straight):
+class CylinderSurface(_DevelopableSurface):
     """A patch of a cylinder: x along the axis, y around it; developable, so rectangle units are metres."""
 
-    radius_m: float
-    length_m: float
-    arc_rad: float
+    kind: ClassVar[str] = "cylinder"
+    radius_m: float = surface_key("radius_mm", "radius of the sensing surface")
+    length_m: float = surface_key("length_mm", "along the axis, from electrode x0 to electrode xa")
+    arc_rad: float = arc_key()
 
     def __post_init__(self) -> None:
         check_lengths(radius_m=self.radius_m, length_m=self.length_m)
@@ -116,7 +142,7 @@ class Cylinder(_Straight):
 
 
 @dataclass(frozen=True)
-class Cone(Revolved):
+class ConeSurface(SweptSurface):
     """A patch of a cone between two of its circles; log(radius) and the angle are its rectangle.
 
     `near_radius_m`, `far_radius_m`: radius of the circle at electrode x0 and at xa. `slant_m`: length
@@ -124,10 +150,20 @@ class Cone(Revolved):
     near| = slant a flat ring.
     """
 
-    near_radius_m: float
-    far_radius_m: float
-    slant_m: float
-    arc_rad: float
+    kind: ClassVar[str] = "cone"
+    near_radius_m: float = surface_key("near_radius_mm", "radius of the circle at electrode x0")
+    far_radius_m: float = surface_key("far_radius_mm", "radius of the circle at electrode xa")
+    slant_m: float = surface_key("slant_mm", "along the surface, from electrode x0 to electrode xa")
+    arc_rad: float = arc_key()
+
+    @classmethod
+    def check_keys(cls, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        least = abs(values["far_radius_mm"] - values["near_radius_mm"])
+        if values["slant_mm"] < least:
+            yield (
+                "slant_mm",
+                f"is too short for a cone; must be at least the difference of the two radii, {least:.4g}",
+            )
 
     def __post_init__(self) -> None:
         check_lengths(near_radius_m=self.near_radius_m, far_radius_m=self.far_radius_m, slant_m=self.slant_m)
@@ -174,7 +210,7 @@ class Cone(Revolved):
 
     def _conformal(self, u: FloatArray) -> FloatArray:
         growth = u * (self._slope / self.near_radius_m)
-        with np.errstate(invalid="ignore", divide="ignore"):  # at or beyond the apex: no such point
+        with np.errstate(invalid="ignore", divide="ignore"):  # no point at or beyond the apex
             logarithm = np.where(growth > -1, np.log1p(growth), np.nan)
         return np.asarray(u * (self._mid_radius / self.near_radius_m) * ratio_or_one(logarithm, growth))
 
@@ -192,16 +228,28 @@ class Cone(Revolved):
 
 
 @dataclass(frozen=True)
-class Sphere(Revolved):
+class SphereSurface(SweptSurface):
     """A patch of a sphere between two parallels and two meridians; Mercator's coordinate is its x.
 
     `from_rad`, `to_rad`: latitudes of electrodes x0 and xa, inside (-pi/2, pi/2), either one the northern.
     """
 
-    radius_m: float
-    from_rad: float
-    to_rad: float
-    arc_rad: float
+    kind: ClassVar[str] = "sphere"
+    radius_m: float = surface_key("radius_mm", "radius of the sensing surface")
+    from_rad: float = surface_key("from_deg", "latitude of electrode x0", above=-90.0, below=90.0)
+    to_rad: float = surface_key("to_deg", "latitude of electrode xa", above=-90.0, below=90.0)
+    arc_rad: float = arc_key()
+
+    @classmethod
+    def check_keys(cls, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        if values["to_deg"] <= values["from_deg"]:
+            yield "to_deg", f"must be above from_deg = {values['from_deg']}"
+
+    def describe_side(self, side: str) -> str:
+        if side not in ("x0", "xa"):
+            return "the side"
+        here, there = (self.to_rad, self.from_rad) if side == "xa" else (self.from_rad, self.to_rad)
+        return "the tip" if abs(here) > abs(there) else "the rim"
 
     def __post_init__(self) -> None:
         check_lengths(radius_m=self.radius_m)
@@ -228,7 +276,7 @@ class Sphere(Revolved):
 
     @cached_property
     def _start(self) -> float:
-        # the pole that the pad points to is called the north one
+        # the pole that x points to is taken as the north pole
         return self.from_rad if self.to_rad > self.from_rad else -self.from_rad
 
     @cached_property
@@ -247,13 +295,15 @@ class Sphere(Revolved):
     def _middle(self) -> float:
         return float(self._conformal(np.array(self.extent_m[0] / 2)))
 
-    def _climb(self, x: FloatArray) -> FloatArray:
-        """Latitude above electrode x0's: differences are formed before the functions, so none cancels."""
+    def _latitude_above_start(self, x: FloatArray) -> FloatArray:
+        """Return the latitude above electrode x0's; differences are formed before the functions, so none
+        cancels.
+        """
         half = x / (2 * self._mid_radius)
         return np.asarray(2 * np.arctan(np.sinh(half) / np.cosh(half + math.asinh(math.tan(self._start)))))
 
     def _arc_length(self, x: FloatArray) -> FloatArray:
-        return self.radius_m * self._climb(x)
+        return self.radius_m * self._latitude_above_start(x)
 
     def _conformal(self, u: FloatArray) -> FloatArray:
         half = u / (2 * self.radius_m)
@@ -264,7 +314,7 @@ class Sphere(Revolved):
         return np.asarray(np.where(np.abs(latitude) < np.pi / 2, self._mid_radius * mercator, np.nan))
 
     def _meridian(self, x: FloatArray) -> Meridian:
-        latitude = self._start + self._climb(x)
+        latitude = self._start + self._latitude_above_start(x)
         half = (latitude - self._mid_latitude) / 2
         mean = (latitude + self._mid_latitude) / 2
         cosine, sine = np.cos(latitude), np.sin(latitude)
@@ -275,9 +325,8 @@ class Sphere(Revolved):
 
 
 @dataclass(frozen=True)
-class Anisotropic(Surface):
-    """A surface whose sheet conducts worse along x than along y, or better: x of the rectangle is stretched
-    to suit.
+class AnisotropicSurface(Surface):
+    """A surface whose sheet conducts differently along x and y; the rectangle is stretched along x.
 
     `resistivity_ratio` is rho_x / rho_y; the rectangle then belongs to an isotropic sheet of sqrt(rho_x
     rho_y) / w ohm per square (paper 3.3).
@@ -305,8 +354,19 @@ class Anisotropic(Surface):
     def extent_m(self) -> tuple[float, float]:
         return self.surface.extent_m
 
+    @property
+    def is_swept(self) -> bool:
+        return self.surface.is_swept
+
+    def grid_lines(self, cells: int) -> tuple[FloatArray, FloatArray]:
+        x, y = self.surface.grid_lines(cells)
+        return x * self._stretch, y
+
+    def describe_side(self, side: str) -> str:
+        return self.surface.describe_side(side)
+
     def from_rectangle(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        return self.surface.from_rectangle(self._relaxed(x), y)
+        return self.surface.from_rectangle(self._unstretched(x), y)
 
     @np.errstate(all="ignore")
     def to_rectangle(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -314,19 +374,19 @@ class Anisotropic(Surface):
         return np.asarray(x * self._stretch), y
 
     def point(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        return self.surface.point(self._relaxed(x), y)
+        return self.surface.point(self._unstretched(x), y)
 
     def tangents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        return self.surface.tangents(self._relaxed(x), y)
+        return self.surface.tangents(self._unstretched(x), y)
 
     def normal(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        return self.surface.normal(self._relaxed(x), y)
+        return self.surface.normal(self._unstretched(x), y)
 
     @np.errstate(all="ignore")
     def scales(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        along, around = self.surface.scales(self._relaxed(x), y)
+        along, around = self.surface.scales(self._unstretched(x), y)
         return np.stack([along / self._stretch, around])
 
-    def _relaxed(self, x: npt.ArrayLike) -> FloatArray:
+    def _unstretched(self, x: npt.ArrayLike) -> FloatArray:
         with np.errstate(all="ignore"):
             return np.asarray(np.asarray(x, np.float64) / self._stretch)

@@ -1,9 +1,9 @@
-"""Links and mounts: a point on a pad -> the link's frame.
+"""Hands: pads on links, robot descriptions (URDF), kinematics, joint states and contact groups.
 
-Public names: `surface_of`, `mount_of`, `network_of`, `Placement`, `Placed`.
+Public names: `pad_surface`, `mount_transform`, `electrode_network`, `PadGeometry`, `LinkContacts`.
 """
 
-from handtouch.hand.pads import mount_of, network_of, surface_of
-from handtouch.hand.placement import Placed, Placement
+from handtouch.hand.pad_geometry import LinkContacts, PadGeometry
+from handtouch.hand.pads import electrode_network, mount_transform, pad_surface
 
-__all__ = ["Placed", "Placement", "mount_of", "network_of", "surface_of"]
+__all__ = ["LinkContacts", "PadGeometry", "electrode_network", "mount_transform", "pad_surface"]

@@ -1,6 +1,6 @@
-"""Which contacts of a hand one object may bridge: those that lie close together and don't face each other.
+"""Groups of contacts that one object may bridge: close together, and not facing each other.
 
-Public names: `Groups`.
+Public names: `ContactGroups`.
 """
 
 from __future__ import annotations
@@ -9,71 +9,74 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-_APART = 1.25
-"""Of the distance that joins two contacts: what parts them, so that groups don't flicker."""
-_FACING = -0.5
-"""Cosine of the angle between outward normals, 120 degrees: beyond it two pads grip something."""
+_SPLIT_DISTANCE_RATIO = 1.25
+"""Distance that splits two contacts over the distance that joins them: hysteresis against flicker."""
+_MIN_NORMAL_COSINE = -0.5
+"""Cosine of the angle between outward normals, 120 degrees: beyond it two pads grip an object."""
 
 
-class Groups:
-    """Groups of the contacts on n pads; `within_m` (n,) apart joins two of one `hand` (n,), by number.
+class ContactGroups:
+    """Groups of the contacts on n pads; contacts of one `hand` (n,) within `within_m` (n,) are joined.
 
-    `id` (n,) uint32: of a group, the contact id of one that is or was in it; of a contact by itself, its own;
-    0 without contact. A group keeps its id as long as anything of it is left; where it falls apart, the part
-    with the contact that gave the id keeps it, else the one with the oldest contact.
+    `group_id` (n,) uint32: the contact id of one that is or was in the group; a single contact's own id; 0
+    without contact. A group keeps its id as long as any of it remains; if it splits, the component with the
+    contact that gave the id keeps it, else the one with the oldest contact.
     """
 
     def __init__(self, within_m: FloatArray, hand: NDArray[np.intp]) -> None:
         n = len(hand)
-        self.id = np.zeros(n, dtype=np.uint32)
-        self._within2, self._hand = within_m**2, hand
+        self.group_id = np.zeros(n, dtype=np.uint32)
+        self._join_distance2, self._hand = within_m**2, hand
         self._joined = np.zeros((n, n), dtype=np.bool_)
-        self._contact = np.zeros(n, dtype=np.uint32)
+        self._contact_id = np.zeros(n, dtype=np.uint32)
 
-    def step(self, contact: NDArray[np.uint32], position_m: FloatArray, normal: FloatArray) -> None:
-        """Contact ids (n,), 0 for none; places and normals (n, 3) in the hand's frame, NaN if not known.
+    def update_groups(self, contact: NDArray[np.uint32], position_m: FloatArray, normal: FloatArray) -> None:
+        """Update the groups from contact ids (n,), 0 for none, and positions and normals (n, 3).
 
-        Two contacts of which one isn't known stay joined, or apart, as they were.
+        In the hand's frame, NaN if unknown. Two contacts, one of which is unknown, stay joined or separate as
+        before.
         """
-        new = np.flatnonzero(contact != self._contact)
+        new = np.flatnonzero(contact != self._contact_id)
         if len(new):
             self._joined[new] = self._joined[:, new] = False
-            self.id[new] = contact[new]
-            self._contact[new] = contact[new]
+            self.group_id[new] = contact[new]
+            self._contact_id[new] = contact[new]
         here = np.flatnonzero(contact)
         if len(here) > 1:
-            self._join(here, position_m[here], normal[here], changed=len(new) > 0)
+            self._update_joined(here, position_m[here], normal[here], changed=len(new) > 0)
 
-    def _join(
+    def _update_joined(
         self, here: NDArray[np.intp], position_m: FloatArray, normal: FloatArray, changed: bool
     ) -> None:
         before = self._joined.take(here, axis=0).take(here, axis=1)
         apart = position_m[:, None] - position_m
         distance2 = np.einsum("ijk,ijk->ij", apart, apart)
-        limit2 = self._within2.take(here) * np.where(before, _APART**2, 1.0)
-        near = (distance2 <= limit2) & (normal @ normal.T >= _FACING)
+        limit2 = self._join_distance2.take(here) * np.where(before, _SPLIT_DISTANCE_RATIO**2, 1.0)
+        near = (distance2 <= limit2) & (normal @ normal.T >= _MIN_NORMAL_COSINE)
         hand = self._hand.take(here)
         near &= hand[:, None] == hand
         joined = np.where(np.isnan(distance2), before, near)
         joined.flat[:: len(here) + 1] = False
         if changed or np.count_nonzero(joined != before):
             self._joined[np.ix_(here, here)] = joined
-            self._name(here, joined)
+            self._assign_group_ids(here, joined)
 
-    def _name(self, here: NDArray[np.intp], joined: NDArray[np.bool_]) -> None:
-        ids, contacts = self.id[here], self._contact[here]
-        parts = _parts(joined)
+    def _assign_group_ids(self, here: NDArray[np.intp], joined: NDArray[np.bool_]) -> None:
+        ids, contacts = self.group_id[here], self._contact_id[here]
+        components = _connected_components(joined)
         taken: set[int] = set()
-        # a part that has the contact which gave a group its name is first to choose, then the oldest
-        for part in sorted(parts, key=lambda p: (not (ids[p] == contacts[p]).any(), contacts[p].min())):
-            free = [name for name in ids[part].tolist() if name not in taken]
-            name = min(free or contacts[part].tolist())
-            taken.add(name)
-            self.id[here[part]] = name
+        # the component with the contact that gave the id chooses first, then the oldest
+        for component in sorted(
+            components, key=lambda p: (not (ids[p] == contacts[p]).any(), contacts[p].min())
+        ):
+            free = [new_id for new_id in ids[component].tolist() if new_id not in taken]
+            new_id = min(free or contacts[component].tolist())
+            taken.add(new_id)
+            self.group_id[here[component]] = new_id
 
 
-def _parts(joined: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Numbers of the nodes of each connected part of a graph (k, k)."""
+def _connected_components(joined: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Return the node numbers of each connected component of a graph (k, k)."""
     reach = joined | np.eye(len(joined), dtype=np.bool_)
     for _ in range(len(joined).bit_length()):
         reach = reach @ reach

@@ -1,7 +1,7 @@
-"""Joint states as a robot tells them, matched in time to samples of touch.
+"""Joint states reported by a robot, interpolated to the times of touch samples.
 
-Public names: `JointStates`, `Joints`. Times are ns of the host's monotonic clock; positions are radians, and
-metres for joints that slide.
+Public names: `JointStateBuffer`, `JointSnapshot`. Times are ns of the host's monotonic clock; positions are
+radians, metres for prismatic joints.
 """
 
 from __future__ import annotations
@@ -15,55 +15,55 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-_KEPT = 64
-"""States of one source: 64 ms of a robot that tells them at 1 kHz."""
-_SOURCES = 16
-_AHEAD_NS = 20_000_000
-"""For so long joints are taken to go on as they moved; after that, to stand where that led."""
+_STATES_PER_SOURCE = 64
+"""States kept of one source: 64 ms at 1 kHz."""
+_MAX_SOURCES = 16
+_MAX_EXTRAPOLATION_NS = 20_000_000
+"""Joints are extrapolated at their velocity for this long; after that they are held."""
 
 
-class Joints(NamedTuple):
+class JointSnapshot(NamedTuple):
     """All joints of a hand at one time."""
 
-    t_ns: int
+    sample_ns: int
     position_rad: FloatArray
-    """(m,) NaN for a joint that nobody told"""
+    """(m,) NaN for a joint without state"""
     age_s: FloatArray
-    """(m,) to the nearest state, before or after; infinite for a joint that nobody told"""
+    """(m,) to the nearest state, before or after; infinite for a joint without state"""
     std_rad: FloatArray
-    """(m,) standard deviation as told, 0 where that wasn't"""
+    """(m,) reported standard deviation, 0 if not reported"""
 
     @classmethod
-    def unknown(cls, t_ns: int, m: int) -> Joints:
-        """Of m joints that nobody told."""
+    def unknown(cls, t_ns: int, m: int) -> JointSnapshot:
+        """Return a snapshot of m joints without state."""
         return cls(t_ns, np.full(m, np.nan), np.full(m, np.inf), np.zeros(m))
 
 
-class _State(NamedTuple):
-    t_ns: int
-    position: FloatArray
-    velocity: FloatArray | None
-    std: FloatArray | None
+class _JointState(NamedTuple):
+    state_ns: int
+    position_rad: FloatArray
+    velocity_rad_per_s: FloatArray | None
+    std_rad: FloatArray | None
 
 
-class JointStates:
-    """States of the joints `names` (m); several sources may each tell some of them, and others besides.
+class JointStateBuffer:
+    """Recent states of the joints `names` (m), from several sources, each of which may report any joints.
 
-    `continuous` (m,) turn without end: the short way round is theirs. `late` counts states older than the one
-    before of the same source, which are of no use.
+    `continuous` (m,) joints have no limits and are interpolated along the shorter way. `late_count` counts
+    states discarded because they were older than the last one of the same source.
     """
 
     def __init__(self, names: Sequence[str], continuous: NDArray[np.bool_] | None = None) -> None:
         self.names = tuple(names)
-        self.late = 0
+        self.late_count = 0
         self._continuous = np.zeros(len(self.names), dtype=np.bool_) if continuous is None else continuous
-        self._sources: dict[tuple[str, ...], tuple[IntArray, IntArray, deque[_State]]] = {}
+        self._sources: dict[tuple[str, ...], tuple[IntArray, IntArray, deque[_JointState]]] = {}
 
-    def like(self) -> JointStates:
-        """Another one of the same joints, of which nothing is told yet."""
-        return JointStates(self.names, self._continuous)
+    def empty_copy(self) -> JointStateBuffer:
+        """Return an empty buffer of the same joints."""
+        return JointStateBuffer(self.names, self._continuous)
 
-    def take(
+    def add_state(
         self,
         t_ns: int,
         names: tuple[str, ...],
@@ -71,67 +71,82 @@ class JointStates:
         velocity_rad_s: FloatArray | None = None,
         std_rad: FloatArray | None = None,
     ) -> bool:
-        """Keep a state, arrays as `names`; whether any of the joints is known here, and the state news."""
+        """Add a state, arrays as `names`; return whether it holds a known joint and is newer than the
+        last.
+        """
         source = self._sources.get(names)
         if source is None:
             known = [name for name in self.names if name in names]
-            ours = np.array([self.names.index(name) for name in known], dtype=np.intp)
-            theirs = np.array([names.index(name) for name in known], dtype=np.intp)
+            columns = np.array([self.names.index(name) for name in known], dtype=np.intp)
+            source_columns = np.array([names.index(name) for name in known], dtype=np.intp)
             if len(known) == 0:
                 return False
-            source = ours, theirs, deque[_State](maxlen=_KEPT)
-            if len(self._sources) >= _SOURCES:
-                self._sources.pop(min(self._sources, key=lambda s: self._sources[s][2][-1].t_ns))
+            source = columns, source_columns, deque[_JointState](maxlen=_STATES_PER_SOURCE)
+            if len(self._sources) >= _MAX_SOURCES:
+                self._sources.pop(min(self._sources, key=lambda s: self._sources[s][2][-1].state_ns))
             self._sources[names] = source
-        _, theirs, states = source
-        if states and t_ns <= states[-1].t_ns:
-            self.late += 1
+        _, source_columns, states = source
+        if states and t_ns <= states[-1].state_ns:
+            self.late_count += 1
             return False
-        velocity = None if velocity_rad_s is None else velocity_rad_s[theirs]
+        velocity = None if velocity_rad_s is None else velocity_rad_s[source_columns]
         states.append(
-            _State(t_ns, position_rad[theirs], velocity, None if std_rad is None else std_rad[theirs])
+            _JointState(
+                t_ns,
+                position_rad[source_columns],
+                velocity,
+                None if std_rad is None else std_rad[source_columns],
+            )
         )
         return True
 
-    def at(self, t_ns: int) -> Joints:
-        """All joints at a time: between two states on the line, beyond the last one a little way further."""
-        found = Joints.unknown(t_ns, len(self.names))
+    def interpolate(self, t_ns: int) -> JointSnapshot:
+        """Return all joints at `sample_ns`: interpolated between states, extrapolated briefly after the last
+        one.
+        """
+        found = JointSnapshot.unknown(t_ns, len(self.names))
         sources = list(self._sources.values())
-        if len(sources) > 1:  # of a joint that several tell, the newest counts
-            sources.sort(key=lambda source: source[2][-1].t_ns)
-        for ours, _, states in sources:
-            position, age_ns, std = self._match(states, t_ns, self._continuous[ours])
-            found.position_rad[ours], found.age_s[ours] = position, age_ns * 1e-9
-            found.std_rad[ours] = 0.0 if std is None else std
+        if len(sources) > 1:  # if several sources report a joint, the newest counts
+            sources.sort(key=lambda source: source[2][-1].state_ns)
+        for columns, _, states in sources:
+            position, age_ns, std = self._interpolate_source(states, t_ns, self._continuous[columns])
+            found.position_rad[columns], found.age_s[columns] = position, age_ns * 1e-9
+            found.std_rad[columns] = 0.0 if std is None else std
         return found
 
-    def _match(
-        self, states: deque[_State], t_ns: int, continuous: NDArray[np.bool_]
+    def _interpolate_source(
+        self, states: deque[_JointState], t_ns: int, continuous: NDArray[np.bool_]
     ) -> tuple[FloatArray, int, FloatArray | None]:
         after = before = states[-1]
         number = len(states) - 1
-        while before.t_ns > t_ns and number > 0:
+        while before.state_ns > t_ns and number > 0:
             number -= 1
             after, before = before, states[number]
-        if before.t_ns >= t_ns:  # the very time, or before all that is kept
-            return before.position, before.t_ns - t_ns, before.std
-        since_ns = t_ns - before.t_ns
+        if before.state_ns >= t_ns:  # exactly this time, or before the oldest kept state
+            return before.position_rad, before.state_ns - t_ns, before.std_rad
+        since_ns = t_ns - before.state_ns
         if after is not before:
-            step = _way(before.position, after.position, continuous)
-            part = since_ns / (after.t_ns - before.t_ns)
-            near = min(since_ns, after.t_ns - t_ns)
-            return before.position + part * step, near, before.std
-        velocity = before.velocity
+            step = _joint_difference(before.position_rad, after.position_rad, continuous)
+            fraction = since_ns / (after.state_ns - before.state_ns)
+            near = min(since_ns, after.state_ns - t_ns)
+            return before.position_rad + fraction * step, near, before.std_rad
+        velocity = before.velocity_rad_per_s
         if velocity is None:
-            velocity = np.zeros(len(before.position))
+            velocity = np.zeros(len(before.position_rad))
             if number > 0:
                 last = states[number - 1]
-                if (apart_ns := before.t_ns - last.t_ns) <= 10 * _AHEAD_NS:
-                    velocity = _way(last.position, before.position, continuous) / (apart_ns * 1e-9)
-        return before.position + velocity * (min(since_ns, _AHEAD_NS) * 1e-9), since_ns, before.std
+                if (apart_ns := before.state_ns - last.state_ns) <= 10 * _MAX_EXTRAPOLATION_NS:
+                    velocity = _joint_difference(last.position_rad, before.position_rad, continuous) / (
+                        apart_ns * 1e-9
+                    )
+        return (
+            before.position_rad + velocity * (min(since_ns, _MAX_EXTRAPOLATION_NS) * 1e-9),
+            since_ns,
+            before.std_rad,
+        )
 
 
-def _way(one: FloatArray, two: FloatArray, continuous: NDArray[np.bool_]) -> FloatArray:
+def _joint_difference(one: FloatArray, two: FloatArray, continuous: NDArray[np.bool_]) -> FloatArray:
     way = two - one
     if np.count_nonzero(continuous):
         way = np.where(continuous, np.remainder(way + np.pi, 2 * np.pi) - np.pi, way)

@@ -1,7 +1,8 @@
-"""Forward kinematics of a hand from its URDF, by Pinocchio: where its links are in the palm and in the base.
+"""Forward kinematics of a hand from its URDF, by Pinocchio: poses of its links in the palm and base
+frames.
 
-Public names: `Kinematics`, `available`. Needs the extra `handtouch[urdf]`; it is imported when the first
-`Kinematics` is made, and takes 0.2 s and some 50 MB.
+Public names: `HandKinematics`, `LinkPose`, `pinocchio_available`. Needs the extra `handtouch[urdf]`;
+Pinocchio is imported by the first `HandKinematics`, and takes 0.2 s and some 50 MB.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.hand.urdf import MOVABLE, Description
+from handtouch.hand.urdf import MOVABLE_JOINT_TYPES, RobotDescription
 
 FloatArray = NDArray[np.float64]
 
 
-def available() -> bool:
-    """Whether Pinocchio is installed."""
+def pinocchio_available() -> bool:
+    """Return whether Pinocchio is installed."""
     return find_spec("pinocchio") is not None
 
 
-class Pose(NamedTuple):
-    """Of a link in another frame."""
+class LinkPose(NamedTuple):
+    """Pose of a link in another frame."""
 
     rotation: FloatArray
     """(3, 3)"""
@@ -32,31 +33,36 @@ class Pose(NamedTuple):
     """(3,)"""
 
 
-class Kinematics:
-    """Poses of `links` (n names, of the URDF) in the links `palm` and `base`: `move` the joints, then ask.
+class HandKinematics:
+    """Poses of `links` (n names of the URDF) in the frames of the links `palm` and `base`.
 
-    `joints` (m names, of the URDF) move some of the links against palm or base; those that mimic others
-    aren't among them. `continuous` (m,) turn without end. `palm_needs`, `base_needs` (n, m): which joints a
-    link's pose in palm or base depends on. Raises KeyError for a link that the URDF lacks.
+    Call `set_joint_positions` before querying poses. `joints` (m names of the URDF) are those that move some
+    link against palm or base; mimicking joints aren't among them. `continuous` (m,) have no limits.
+    `palm_joint_mask`, `base_joint_mask` (n, m): which joints a link's pose in the palm or base frame depends
+    on. Raises KeyError for a link that the URDF lacks.
     """
 
-    def __init__(self, robot: Description, links: Sequence[str], palm: str, base: str) -> None:
+    def __init__(self, robot: RobotDescription, links: Sequence[str], palm: str, base: str) -> None:
         import pinocchio
 
         self._pin = pinocchio
         self._model = pinocchio.buildModelFromXML(robot.path.read_text(encoding="utf-8"))
         self._data = self._model.createData()
-        self._frames = [self._frame(robot, link) for link in links]
-        self._palm, self._base = self._frame(robot, palm), self._frame(robot, base)
-        chains = [[robot.between(link, other) for link in links] for other in (palm, base)]
+        self._frames = [self._frame_id(robot, link) for link in links]
+        self._palm, self._base = self._frame_id(robot, palm), self._frame_id(robot, base)
+        chains = [[robot.joints_between(link, other) for link in links] for other in (palm, base)]
         moving = {
-            j.mimic[0] if j.mimic else j.name for of in chains for c in of for j in c if j.kind in MOVABLE
+            j.mimic[0] if j.mimic else j.name
+            for of in chains
+            for c in of
+            for j in c
+            if j.kind in MOVABLE_JOINT_TYPES
         }
         self.joints = tuple(name for name in robot.joints if name in moving)
         self.continuous = np.array(
             [robot.joints[n].kind == "continuous" for n in self.joints], dtype=np.bool_
         )
-        self.palm_needs, self.base_needs = (
+        self.palm_joint_mask, self.base_joint_mask = (
             np.array(
                 [
                     [any(name in (j.name, j.mimic and j.mimic[0]) for j in chain) for name in self.joints]
@@ -66,14 +72,14 @@ class Kinematics:
             ).reshape(len(links), len(self.joints))
             for of in chains
         )
-        self._map_joints(robot)
+        self._build_joint_map(robot)
 
-    def move(self, position_rad: FloatArray) -> None:
-        """Put the joints at these positions (m,): radians, metres where they slide. NaN counts as 0."""
+    def set_joint_positions(self, position_rad: FloatArray) -> None:
+        """Set the joint positions (m,): radians, metres for prismatic joints. NaN counts as 0."""
         if np.isnan(position_rad).any():
             position_rad = np.nan_to_num(position_rad)
         turned = self._matrix @ position_rad + self._offset
-        q = self._rest.copy()
+        q = self._neutral_q.copy()
         q[self._plain_q] = turned[self._plain_v]
         if len(self._turning_q):
             angle = turned[self._turning_v]
@@ -81,33 +87,37 @@ class Kinematics:
         self._pin.forwardKinematics(self._model, self._data, q)
         self._q = q
         self._jacobians: dict[int, Any] = {}
-        self._here: dict[int, Any] = {}
+        self._frame_placements: dict[int, Any] = {}
 
-    def in_palm(self, link: int) -> Pose:
-        """Where the link of that number is in the frame of the palm."""
-        return self._pose(self._palm, self._frames[link])
+    def pose_in_palm(self, link: int) -> LinkPose:
+        """Return the pose of link number `link` in the palm frame."""
+        return self._relative_pose(self._palm, self._frames[link])
 
-    def in_base(self, link: int) -> Pose:
-        """Where the link of that number is in the frame of the base."""
-        return self._pose(self._base, self._frames[link])
+    def pose_in_base(self, link: int) -> LinkPose:
+        """Return the pose of link number `link` in the base frame."""
+        return self._relative_pose(self._base, self._frames[link])
 
-    def down(self, in_base: FloatArray) -> FloatArray:
-        """A direction (3,) of the base's frame in the frame of each link, (n, 3)."""
-        seen = self._at(self._base).rotation @ in_base
-        return np.array([seen @ self._at(frame).rotation for frame in self._frames])
+    def direction_in_links(self, in_base: FloatArray) -> FloatArray:
+        """Return a direction (3,) of the base frame in the frame of each link, (n, 3)."""
+        reference = self._frame_placement(self._base).rotation @ in_base
+        return np.array([reference @ self._frame_placement(frame).rotation for frame in self._frames])
 
-    def slope(self, link: int, position_m: FloatArray, in_base: bool = False) -> FloatArray:
-        """How a point (3,) of the link moves with each joint, (3, m) [m/rad] in palm or base frame."""
+    def point_jacobian(self, link: int, position_m: FloatArray, in_base: bool = False) -> FloatArray:
+        """Return the derivative (3, m) [m/rad] of a point (3,) of the link by the joints, in palm or base
+        frame.
+        """
         frame, other = self._frames[link], self._base if in_base else self._palm
-        seen = self._at(other)
-        x, y, z = self._at(frame).act(position_m)
-        twist = self._jacobian(frame) - self._jacobian(other)
-        lever = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # a turn's cross product with the place
+        reference = self._frame_placement(other)
+        x, y, z = self._frame_placement(frame).act(position_m)
+        twist = self._frame_jacobian(frame) - self._frame_jacobian(other)
+        lever = np.array(
+            [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+        )  # cross product of a rotation with the position
         moved = twist[:3] + lever @ twist[3:]
-        return np.asarray(seen.rotation.T @ moved @ self._matrix, np.float64)
+        return np.asarray(reference.rotation.T @ moved @ self._matrix, np.float64)
 
-    def _jacobian(self, frame: int) -> Any:
-        """How a frame moves with Pinocchio's coordinates, (6, nv), about the world's origin."""
+    def _frame_jacobian(self, frame: int) -> Any:
+        """Return the Jacobian (6, nv) of a frame by Pinocchio's coordinates, about the world's origin."""
         found = self._jacobians.get(frame)
         if found is None:
             if not self._jacobians:
@@ -116,26 +126,28 @@ class Kinematics:
             self._jacobians[frame] = found
         return found
 
-    def _pose(self, seen_from: int, frame: int) -> Pose:
-        pose = self._at(seen_from).actInv(self._at(frame))
-        return Pose(pose.rotation, pose.translation)
+    def _relative_pose(self, seen_from: int, frame: int) -> LinkPose:
+        pose = self._frame_placement(seen_from).actInv(self._frame_placement(frame))
+        return LinkPose(pose.rotation, pose.translation)
 
-    def _at(self, frame: int) -> Any:
-        here = self._here.get(frame)
-        if here is None:
-            here = self._here[frame] = self._pin.updateFramePlacement(self._model, self._data, frame)
-        return here
+    def _frame_placement(self, frame: int) -> Any:
+        placement = self._frame_placements.get(frame)
+        if placement is None:
+            placement = self._frame_placements[frame] = self._pin.updateFramePlacement(
+                self._model, self._data, frame
+            )
+        return placement
 
-    def _frame(self, robot: Description, link: str) -> int:
+    def _frame_id(self, robot: RobotDescription, link: str) -> int:
         robot.bodies[link]
         return int(self._model.getFrameId(link, self._pin.FrameType.BODY))
 
-    def _map_joints(self, robot: Description) -> None:
-        """Pinocchio's coordinates as a linear map of ours: order, joints that mimic, joints without end."""
+    def _build_joint_map(self, robot: RobotDescription) -> None:
+        """Map `joints` linearly to Pinocchio's coordinates: order, mimicking joints, continuous joints."""
         model = self._model
         self._matrix = np.zeros((model.nv, len(self.joints)))
         self._offset = np.zeros(model.nv)
-        self._rest = self._pin.neutral(model)
+        self._neutral_q = self._pin.neutral(model)
         plain: list[tuple[int, int]] = []
         turning: list[tuple[int, int]] = []
         for number in range(1, model.njoints):
@@ -146,4 +158,4 @@ class Kinematics:
             (plain if kind.nq == 1 else turning).append((kind.idx_q, kind.idx_v))
         self._plain_q, self._plain_v = np.array(plain, dtype=np.intp).reshape(-1, 2).T
         self._turning_q, self._turning_v = np.array(turning, dtype=np.intp).reshape(-1, 2).T
-        self.move(np.zeros(len(self.joints)))
+        self.set_joint_positions(np.zeros(len(self.joints)))

@@ -1,6 +1,7 @@
-"""Which of the shapes do contacts lie on? Fits of all classes compared by their evidence.
+"""Classification of an object's shape: fits of all classes, compared by their evidence.
 
-Public names: `classify`, `classifying` (the same in pieces), `judge`, `Verdict`.
+Public names: `classify_shape`, `classify_shape_stepwise` (the same as a generator), `compare_fits`,
+`ShapeClassification`.
 """
 
 from __future__ import annotations
@@ -12,95 +13,105 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.percept.primitives import CLASSES, Fit, Prior, finished, fitting
+from handtouch.percept.primitives import (
+    SHAPE_CLASSES,
+    PrimitiveFit,
+    ShapePrior,
+    fit_primitive_stepwise,
+    run_to_completion,
+)
 
 FloatArray = NDArray[np.float64]
 
-_MISFIT = 4.0  # standard deviations of chi^2, beyond which a model is none
-_LEAST_CONTACTS, _LEAST_MOVING = 3, 6
+_MAX_MISFIT_SIGMA = 4.0  # of chi^2, beyond which a class is rejected
+_MIN_CONTACTS, _MIN_CONTACTS_MOVING_OBJECT = 3, 6
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """`label` where one class is sure; probabilities and fits by class. state and reason as of a percept.
-    moves: whether it only fits if the object moved a little between touches."""
+class ShapeClassification:
+    """Result of a classification; `label` is empty unless one class is probable enough.
+
+    state, reason: as of a percept. probabilities, fits: by class. object_moves: True if the classes fit only
+    with an object that moves slightly between touches.
+    """
 
     state: str
     label: str
     reason: str
     contacts: int
     probabilities: dict[str, float] = field(default_factory=dict)
-    fits: dict[str, Fit] = field(default_factory=dict)
-    moves: bool = False
+    fits: dict[str, PrimitiveFit] = field(default_factory=dict)
+    object_moves: bool = False
 
 
-def classify(
+def classify_shape(
     points_m: FloatArray,
     normals: FloatArray,
     covariances_m2: FloatArray,
-    prior: Prior | None = None,
-    classes: Iterable[str] = CLASSES,
-) -> Verdict:
-    """Which class contacts (n, 3) with normals (n, 3), outward from the pads, and covariances (n, 3, 3) tell.
+    prior: ShapePrior | None = None,
+    classes: Iterable[str] = SHAPE_CLASSES,
+) -> ShapeClassification:
+    """Classify contact points (n, 3) with normals (n, 3), outward from the pads, and covariances (n, 3, 3).
 
-    All in one frame in which the object rests. Every row should be a touch of its own: a contact that rests
-    tells the same thing each time. Raises ValueError for shapes that don't fit, or what isn't finite.
+    All in one frame in which the object is at rest. Every row should be a separate touch: a contact that
+    doesn't move adds the same information only once. Raises ValueError for shapes that don't match, or for
+    values that aren't finite.
     """
-    return finished(classifying(points_m, normals, covariances_m2, prior, classes))
+    return run_to_completion(classify_shape_stepwise(points_m, normals, covariances_m2, prior, classes))
 
 
-def classifying(
+def classify_shape_stepwise(
     points_m: FloatArray,
     normals: FloatArray,
     covariances_m2: FloatArray,
-    prior: Prior | None = None,
-    classes: Iterable[str] = CLASSES,
+    prior: ShapePrior | None = None,
+    classes: Iterable[str] = SHAPE_CLASSES,
     moved: bool = False,
-) -> Generator[None, None, Verdict]:
-    """`classify` in small pieces, for who has little time at once.
+) -> Generator[None, None, ShapeClassification]:
+    """Classify as `classify_shape`, yielding between small steps so that a caller can bound its time.
 
-    Where no class fits an object at rest, one that moves a little between touches is tried: sizes are then
-    less sure, and the verdict says so. moved: that it does is known, nothing else is tried. Few touches fit
-    anything that moves, so it isn't tried with them.
+    If no class fits an object at rest, an object that moves slightly between touches is tried; sizes are then
+    less certain, and the result says so. moved: motion is known, and only this model is fitted. With few
+    touches the moving model fits anything, so it isn't tried.
     """
-    prior = Prior() if prior is None else prior
-    _check(points_m, normals, covariances_m2)
-    enough, verdict = len(points_m) >= _LEAST_MOVING, None
+    prior = ShapePrior() if prior is None else prior
+    _check_contacts(points_m, normals, covariances_m2)
+    enough, result = len(points_m) >= _MIN_CONTACTS_MOVING_OBJECT, None
     for moves in (True,) if moved and enough else (False, True) if enough else (False,):
-        one, fits = prior.freely() if moves else prior, dict[str, Fit]()
+        one, fits = prior.for_moving_object() if moves else prior, dict[str, PrimitiveFit]()
         for name in classes:
-            fits[name] = yield from fitting(name, points_m, normals, covariances_m2, one)
-        found = replace(judge(fits, len(points_m), one), moves=moves)
-        if verdict is None or found.state != "invalid":
-            verdict = found
-        if verdict.state != "invalid":
+            fits[name] = yield from fit_primitive_stepwise(name, points_m, normals, covariances_m2, one)
+        found = replace(compare_fits(fits, len(points_m), one), object_moves=moves)
+        if result is None or found.state != "invalid":
+            result = found
+        if result.state != "invalid":
             break
-    assert verdict is not None
-    return verdict
+    assert result is not None
+    return result
 
 
-def judge(fits: dict[str, Fit], contacts: int, prior: Prior) -> Verdict:
-    """Compare fits of the same contacts."""
+def compare_fits(fits: dict[str, PrimitiveFit], contacts: int, prior: ShapePrior) -> ShapeClassification:
+    """Compare fits of several classes to the same contacts."""
     scores = np.array(
-        [fits[n].log_evidence + math.log(max(prior.classes[CLASSES.index(n)], 1e-300)) for n in fits]
+        [fits[n].log_evidence + math.log(max(prior.classes[SHAPE_CLASSES.index(n)], 1e-300)) for n in fits]
     )
     weights = np.exp(scores - scores.max())
     probabilities = dict(zip(fits, (weights / weights.sum()).tolist(), strict=True))
     best = max(probabilities, key=probabilities.__getitem__)
     state, label, reason = "estimated", best, ""
-    if contacts < _LEAST_CONTACTS:
-        state, label, reason = "unestimated", "", f"{contacts} of {_LEAST_CONTACTS} contacts"
-    elif fits[best].misfit > _MISFIT:
-        off = fits[best].misfit
-        state, label, reason = "invalid", "", f"none of the shapes: even {best} is {off:.0f} sigma off"
-    elif probabilities[best] < prior.sure:
+    if contacts < _MIN_CONTACTS:
+        state, label, reason = "undetermined", "", f"{contacts} of {_MIN_CONTACTS} contacts"
+    elif fits[best].misfit_sigma > _MAX_MISFIT_SIGMA:
+        off = fits[best].misfit_sigma
+        state, label, reason = "invalid", "", f"no class fits: the best, {best}, misfits by {off:.0f} sigma"
+    elif probabilities[best] < prior.min_probability:
         second = sorted(probabilities, key=probabilities.__getitem__)[-2]
-        state, label, reason = "unestimated", "", f"not enough yet to tell {best} from {second}"
-    return Verdict(state, label, reason, contacts, probabilities, fits)
+        state, label, reason = "undetermined", "", f"can't distinguish {best} from {second} yet"
+    return ShapeClassification(state, label, reason, contacts, probabilities, fits)
 
 
-def _check(points_m: FloatArray, normals: FloatArray, covariances_m2: FloatArray) -> None:
-    """Raise ValueError unless these are contacts."""
+def _check_contacts(points_m: FloatArray, normals: FloatArray, covariances_m2: FloatArray) -> None:
+    """Raise ValueError unless the arrays are finite and of matching shapes."""
     n = len(points_m)
     if points_m.shape != (n, 3) or normals.shape != (n, 3) or covariances_m2.shape != (n, 3, 3) or not n:
         shapes = points_m.shape, normals.shape, covariances_m2.shape

@@ -1,9 +1,9 @@
-"""What shape is it: from where a hand touches in the palm's frame, and from what a pad's currents leave over.
+"""Percept `shape`: of an object, from contact points in the palm frame; of a contact, from its residual.
 
-Points are gathered as contacts come and move; the classes are fitted to them a little at a time. The object
-is taken to rest in the palm's frame as long as anything touches it.
+Points are collected as contacts begin and move; the classes are fitted to them a few steps at a time. The
+object is assumed at rest in the palm frame while anything touches it.
 
-Public names: `Shape`, `point_or_more`, `pair_distance`.
+Public names: `ShapeEstimator`, `spot_probabilities`, `pair_distance`.
 """
 
 from __future__ import annotations
@@ -16,56 +16,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.field.bank import LocatorBank
-from handtouch.percept.ask import Action, Question
-from handtouch.percept.classify import Verdict, classifying
-from handtouch.percept.primitives import CLASSES, SIZES, Prior
-from handtouch.percept.stream import IntArray, Percept, Sample, Stream, Turns
+from handtouch.percept.action_request import CandidateAction, Question
+from handtouch.percept.classify import ShapeClassification, classify_shape_stepwise
+from handtouch.percept.primitives import SHAPE_CLASSES, SIZE_PARAMETERS, ShapePrior
+from handtouch.percept.samples import (
+    ContactBuffer,
+    ContactSamples,
+    FitSchedule,
+    IntArray,
+    PerceptEstimate,
+)
 
 FloatArray = NDArray[np.float64]
 
-PairDistance = Callable[[int, float, float], tuple[float, float]]
-SPOTS = ("point", "along x", "along y")
-"""What one pad's residual tells apart: no more than how far it is longer one way than the other."""
+PairDistanceFunction = Callable[[int, float, float], tuple[float, float]]
+SPOT_CLASSES = ("point", "along x", "along y")
+"""Classes that one pad's residual distinguishes: only whether the contact is longer along x or along y."""
 
-_MOST = 100  # contacts kept of a hand
-_MOVED_M, _TURNED = 2e-3, 0.1  # from one that is kept to the next; radians
-_SETTLED = 8  # samples of a new contact before it counts
-_FORGET_NS = 5_000_000_000  # untouched for so long: the next touch is another object's
-_TURNS_M_PER_S, _TURNS_M = 1.5e-3, 3e-3  # what was touched has moved since, by so much a second, and at most
-_STEPS = 2  # of a fit at a time
-_SPOT_NS = 500_000_000
+_MAX_POINTS = 100  # kept of a hand
+_MIN_POINT_DISTANCE_M, _MIN_NORMAL_CHANGE = 2e-3, 0.1  # from one stored point to the next; radians
+_MIN_SAMPLES = 8  # of a new contact before its points are stored
+_FORGET_TIME_NS = 5_000_000_000  # without touch, before the next object is assumed
+_OBJECT_DRIFT_M_PER_S, _MAX_OBJECT_DRIFT_M = (
+    1.5e-3,
+    3e-3,
+)  # assumed motion of the object since a touch: rate and bound
+_STEPS_PER_FIT = 2
+_SPOT_PERIOD_NS = 500_000_000
 _SPOT_SAMPLES = 64
-_LONG = 0.05  # residuals of contacts that aren't points (1 sigma, prior)
-_TOLERANCE = 3e-3  # residual of a point on a pad whose parts are a little off
-_SLIDE_M = 5e-3
-_COST = 2.0  # sliding disturbs a grasp more than squeezing
+_ELONGATED_RESIDUAL_STD = 0.05  # prior of contacts that aren't points
+_POINT_RESIDUAL_STD = 3e-3  # of a point on a pad within its tolerances
+_REQUESTED_SLIDE_M = 5e-3
+_SLIDE_COST = 2.0  # sliding disturbs a grasp more than squeezing does
 
 
-def point_or_more(residual: FloatArray, residual_std: FloatArray) -> dict[str, float]:
-    """Probabilities of SPOTS from residuals (k,) of one contact and their deviations.
+def spot_probabilities(residual: FloatArray, residual_std: FloatArray) -> dict[str, float]:
+    """Return probabilities of SPOT_CLASSES from residuals (k,) of one contact and their deviations.
 
-    The residual is what x0 and xa take beyond a point's share: above 0 along x. An elongated contact and two
-    points can't be told apart: it is one number.
+    The residual is the excess of x0 and xa over a point's share: positive along x. An elongated contact and
+    two points are indistinguishable: it is one number.
     """
     mean = float(np.mean(residual))
-    own = float(np.mean(np.square(residual_std))) / len(residual) + _TOLERANCE**2
-    wide = own + _LONG**2
+    own = float(np.mean(np.square(residual_std))) / len(residual) + _POINT_RESIDUAL_STD**2
+    wide = own + _ELONGATED_RESIDUAL_STD**2
     point = math.exp(-0.5 * mean * mean / own) / math.sqrt(own)
     more = math.exp(-0.5 * mean * mean / wide) / math.sqrt(wide)
-    z = mean / math.sqrt(own) * math.sqrt(_LONG**2 / wide)
+    z = mean / math.sqrt(own) * math.sqrt(_ELONGATED_RESIDUAL_STD**2 / wide)
     along_x = 0.5 * math.erfc(-z / math.sqrt(2))
     found = np.array([point, more * along_x, more * (1 - along_x)])
     found /= found.sum()
-    return dict(zip(SPOTS, found.tolist(), strict=True))
+    return dict(zip(SPOT_CLASSES, found.tolist(), strict=True))
 
 
 def pair_distance(
     bank: LocatorBank, pad: int, x: float, y: float, residual: float, residual_std: float
 ) -> tuple[float, float]:
-    """How far apart two equal points about (x, y) on a pad would be that leave this residual; its deviation.
+    """Return the distance of two equal points about (x, y) on a pad that leave this residual, and its
+    deviation.
 
-    In the unit of the pad's rectangle; along x where the residual is above 0, else along y. The least size
-    that explains it. The deviation is infinite where the residual isn't told from 0.
+    In the unit of the pad's rectangle; along x if the residual is positive, else along y. This is the
+    smallest extent that explains the residual. The deviation is infinite where the residual doesn't differ
+    significantly from 0.
     """
     at, side = np.array([x, y]), bank.sides[pad]
     axis = 0 if residual >= 0 else 1
@@ -74,162 +85,193 @@ def pair_distance(
     pair = bank.fractions(np.full(2, pad), xs, ys).mean(axis=1, keepdims=True)
     found = bank.estimate(np.array([pad]), pair, 1e-6, start=at[:, None])
     point = bank.fractions(np.array([pad]), found.x, found.y)
-    known = abs(float((pair - point)[:2].sum()))  # goes as the square of the distance
+    known = abs(float((pair - point)[:2].sum()))  # grows as the square of the distance
     distance = 2 * half * math.sqrt(abs(residual) / max(known, 1e-12))
-    sure = abs(residual) > 2 * residual_std
-    return distance, distance / 2 * residual_std / abs(residual) if sure else math.inf
+    determined = abs(residual) > 2 * residual_std
+    return distance, distance / 2 * residual_std / abs(residual) if determined else math.inf
 
 
 @dataclass
-class _Object:
-    """What a hand has touched lately."""
+class _TouchedObject:
+    """Points that a hand touched recently."""
 
     points: list[FloatArray] = field(default_factory=list)
     normals: list[FloatArray] = field(default_factory=list)
     covariances: list[FloatArray] = field(default_factory=list)
-    links: list[int] = field(default_factory=list)
-    times_ns: list[int] = field(default_factory=list)
-    seen_ns: int = 0
-    news: bool = False
-    at_work: Generator[None, None, Verdict] | None = None
-    verdict: Verdict | None = None
+    pads: list[int] = field(default_factory=list)
+    sample_ns: list[int] = field(default_factory=list)
+    last_touch_ns: int = 0
+    has_new_points: bool = False
+    running_fit: Generator[None, None, ShapeClassification] | None = None
+    classification: ShapeClassification | None = None
 
-    def add(self, pad: int, t_ns: int, point: FloatArray, normal: FloatArray, covariance: FloatArray) -> None:
-        self.points = [*self.points[1 - _MOST :], point.copy()]
-        self.normals = [*self.normals[1 - _MOST :], normal.copy()]
-        self.covariances = [*self.covariances[1 - _MOST :], covariance.copy()]
-        self.links = [*self.links[1 - _MOST :], pad]
-        self.times_ns = [*self.times_ns[1 - _MOST :], t_ns]
-        self.news = True
+    def add_point(
+        self, pad: int, now_ns: int, point: FloatArray, normal: FloatArray, covariance: FloatArray
+    ) -> None:
+        self.points = [*self.points[1 - _MAX_POINTS :], point.copy()]
+        self.normals = [*self.normals[1 - _MAX_POINTS :], normal.copy()]
+        self.covariances = [*self.covariances[1 - _MAX_POINTS :], covariance.copy()]
+        self.pads = [*self.pads[1 - _MAX_POINTS :], pad]
+        self.sample_ns = [*self.sample_ns[1 - _MAX_POINTS :], now_ns]
+        self.has_new_points = True
 
 
-class Shape:
-    """Shape of what each hand holds, and of the spot on each pad, as a part of perception."""
+class ShapeEstimator:
+    """Estimates the shape of the object in each hand, and of the contact spot on each pad."""
 
     kind = "shape"
 
-    def __init__(self, pads: int, prior: Prior | None = None, pair_m: PairDistance | None = None) -> None:
-        """pair_m: of a pad, a residual and its deviation: how far apart two points would be, as
-        `pair_distance`, in metres; left out, no size is told of a spot."""
-        self.wanted = np.zeros(pads, dtype=np.bool_)
-        self.prior = Prior() if prior is None else prior
+    def __init__(
+        self, pads: int, prior: ShapePrior | None = None, pair_m: PairDistanceFunction | None = None
+    ) -> None:
+        """pair_m: function of pad, residual and its deviation that returns the distance of two points as
+        `pair_distance`, in metres; default: no extent of a spot is reported.
+        """
+        self.requested = np.zeros(pads, dtype=np.bool_)
+        self.prior = ShapePrior() if prior is None else prior
         self._pair_m = pair_m
-        self._objects: dict[int, _Object] = {}
-        self._kept_m, self._kept_normal = np.full((pads, 3), np.inf), np.zeros((pads, 3))
-        self._kept_of = np.zeros(pads, dtype=np.uint32)
-        self._spots = Turns(pads, _SPOT_NS)
+        self._objects: dict[int, _TouchedObject] = {}
+        self._last_point_m, self._last_normal = np.full((pads, 3), np.inf), np.zeros((pads, 3))
+        self._last_contact_id = np.zeros(pads, dtype=np.uint32)
+        self._spot_schedule = FitSchedule(pads, _SPOT_PERIOD_NS)
 
-    def step(self, stream: Stream, sample: Sample, began: IntArray) -> Sequence[Percept]:  # noqa: ARG002
-        """Keep what is a new place."""
-        place, normal, pads = sample["palm_position_m"], sample["palm_normal"], sample.pads
-        moved = ((place - self._kept_m[pads]) ** 2).sum(axis=1) > _MOVED_M**2
-        moved |= ((normal - self._kept_normal[pads]) ** 2).sum(axis=1) > _TURNED**2
-        fresh = self._kept_of[pads] != sample.contact
-        keep = (moved | fresh) & (stream.count[pads] >= _SETTLED) & np.isfinite(place).all(axis=1)
+    def process_samples(
+        self,
+        buffer: ContactBuffer,
+        sample: ContactSamples,
+        began: IntArray,  # noqa: ARG002
+    ) -> Sequence[PerceptEstimate]:
+        """Store contact points that are new."""
+        position, normal, pads = sample["palm_position_m"], sample["palm_normal"], sample.pads
+        moved = ((position - self._last_point_m[pads]) ** 2).sum(axis=1) > _MIN_POINT_DISTANCE_M**2
+        moved |= ((normal - self._last_normal[pads]) ** 2).sum(axis=1) > _MIN_NORMAL_CHANGE**2
+        fresh = self._last_contact_id[pads] != sample.contact_id
+        keep = (
+            (moved | fresh) & (buffer.sample_count[pads] >= _MIN_SAMPLES) & np.isfinite(position).all(axis=1)
+        )
         for row in np.flatnonzero(keep).tolist():
-            pad, t_ns = int(pads[row]), int(sample.t_ns[row])
-            touched = self._objects.setdefault(int(stream.hand_of[pad]), _Object())
-            if t_ns - touched.seen_ns > _FORGET_NS and touched.points:
-                touched = self._objects[int(stream.hand_of[pad])] = _Object()
-            touched.add(pad, t_ns, place[row], normal[row], sample["palm_covariance_m2"][row])
-            self._kept_m[pad], self._kept_normal[pad] = place[row], normal[row]
-            self._kept_of[pad] = sample.contact[row]
-        for hand in set(stream.hand_of[pads].tolist()) & self._objects.keys():
-            self._objects[hand].seen_ns = int(sample.t_ns.max())
+            pad, now_ns = int(pads[row]), int(sample.sample_ns[row])
+            touched = self._objects.setdefault(int(buffer.hand_index[pad]), _TouchedObject())
+            if now_ns - touched.last_touch_ns > _FORGET_TIME_NS and touched.points:
+                touched = self._objects[int(buffer.hand_index[pad])] = _TouchedObject()
+            touched.add_point(pad, now_ns, position[row], normal[row], sample["palm_covariance_m2"][row])
+            self._last_point_m[pad], self._last_normal[pad] = position[row], normal[row]
+            self._last_contact_id[pad] = sample.contact_id[row]
+        for hand in set(buffer.hand_index[pads].tolist()) & self._objects.keys():
+            self._objects[hand].last_touch_ns = int(sample.sample_ns.max())
         return ()
 
-    def due(self, stream: Stream, t_ns: int) -> int | None:
-        """A pad of a hand whose fit is under way or has news, else one whose spot wasn't told lately."""
+    def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:
+        """Return a pad of a hand with new points or an unfinished fit, else one whose spot is due."""
         for hand, touched in self._objects.items():
-            mine = self.wanted & (stream.hand_of == hand)
-            if (touched.news or touched.at_work is not None) and mine.any():
+            mine = self.requested & (buffer.hand_index == hand)
+            if (touched.has_new_points or touched.running_fit is not None) and mine.any():
                 return int(np.argmax(mine))
-        return self._spots.due(self.wanted & (stream.count >= _SETTLED), t_ns)
+        return self._spot_schedule.next_pad(self.requested & (buffer.sample_count >= _MIN_SAMPLES), now_ns)
 
-    def fit(self, stream: Stream, pad: int, t_ns: int) -> Sequence[Percept]:
-        """A few steps for the hand of a pad, and the pad's own spot."""
-        hand = int(stream.hand_of[pad])
-        found: list[Percept] = []
-        this = (np.arange(stream.size) == pad) & (stream.count >= _SETTLED)
-        if self._spots.due(this, t_ns) is not None:
-            self._spots.took(pad, t_ns)
-            found += self._spot(stream, pad, t_ns)
+    def fit_contact(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
+        """Run a few steps of the fit of the pad's hand, and classify the pad's own spot."""
+        hand = int(buffer.hand_index[pad])
+        found: list[PerceptEstimate] = []
+        this = (np.arange(buffer.size) == pad) & (buffer.sample_count >= _MIN_SAMPLES)
+        if self._spot_schedule.next_pad(this, now_ns) is not None:
+            self._spot_schedule.mark_fitted(pad, now_ns)
+            found += self._classify_spot(buffer, pad, now_ns)
         touched = self._objects.get(hand)
-        if touched is None or not (touched.news or touched.at_work is not None):
+        if touched is None or not (touched.has_new_points or touched.running_fit is not None):
             return found
-        if touched.at_work is None:
-            touched.news = False
-            touched.at_work = self._classifying(touched)
+        if touched.running_fit is None:
+            touched.has_new_points = False
+            touched.running_fit = self._classify_object(touched)
         try:
-            for _ in range(_STEPS):
-                next(touched.at_work)
+            for _ in range(_STEPS_PER_FIT):
+                next(touched.running_fit)
         except StopIteration as done:
-            touched.at_work, touched.verdict = None, done.value
-            found.append(_told(done.value, hand, t_ns, len(set(touched.links))))
+            touched.running_fit, touched.classification = None, done.value
+            found.append(_shape_percept(done.value, hand, now_ns, len(set(touched.pads))))
         return found
 
-    def end(self, stream: Stream, pads: IntArray, t_ns: int) -> Sequence[Percept]:  # noqa: ARG002
-        """Nothing: what was touched stays known for a while."""
+    def end_contacts(self, buffer: ContactBuffer, pads: IntArray, now_ns: int) -> Sequence[PerceptEstimate]:  # noqa: ARG002
+        """Return nothing: touched points are kept for a while."""
         return ()
 
-    def questions(self, t_ns: int) -> Sequence[Question]:
-        """Which of the shapes that are still possible is it?"""
+    def open_questions(self, now_ns: int) -> Sequence[Question]:
+        """Return a question for each object whose class is undetermined."""
         found = []
         for hand, touched in self._objects.items():
-            verdict = touched.verdict
-            here = touched.links[-1] if touched.links else -1
-            if verdict is None or verdict.state != "unestimated" or t_ns - touched.seen_ns > _FORGET_NS:
+            result = touched.classification
+            here = touched.pads[-1] if touched.pads else -1
+            if (
+                result is None
+                or result.state != "undetermined"
+                or now_ns - touched.last_touch_ns > _FORGET_TIME_NS
+            ):
                 continue
-            if verdict.fits and self.wanted[here]:
-                found.append(question(verdict, hand, here, int(self._kept_of[here]), self.prior))
+            if result.fits and self.requested[here]:
+                found.append(shape_question(result, hand, here, int(self._last_contact_id[here]), self.prior))
         return found
 
-    def _classifying(self, touched: _Object) -> Generator[None, None, Verdict]:
-        """Older touches count less: things turn in the hand."""
-        age_s = 1e-9 * (touched.times_ns[-1] - np.array(touched.times_ns))
-        moved_m = np.minimum(_TURNS_M_PER_S * age_s, _TURNS_M)
+    def _classify_object(self, touched: _TouchedObject) -> Generator[None, None, ShapeClassification]:
+        """Classify stepwise; older points get a larger covariance, because objects turn in the hand."""
+        age_s = 1e-9 * (touched.sample_ns[-1] - np.array(touched.sample_ns))
+        moved_m = np.minimum(_OBJECT_DRIFT_M_PER_S * age_s, _MAX_OBJECT_DRIFT_M)
         covariances = np.array(touched.covariances) + (moved_m**2)[:, None, None] * np.eye(3)
         rows = np.array(touched.points), np.array(touched.normals), covariances
-        moved = touched.verdict is not None and touched.verdict.moves  # then it has, for good
-        return (yield from classifying(*rows, self.prior, moved=moved))
+        moved = (
+            touched.classification is not None and touched.classification.object_moves
+        )  # once moved, it stays so
+        return (yield from classify_shape_stepwise(*rows, self.prior, moved=moved))
 
-    def _spot(self, stream: Stream, pad: int, t_ns: int) -> Sequence[Percept]:
-        window = stream.window(pad, _SPOT_SAMPLES)
+    def _classify_spot(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
+        window = buffer.window(pad, _SPOT_SAMPLES)
         residual, std = window["residual"], window["residual_std"]
         known = np.isfinite(residual) & np.isfinite(std)
-        hand, contact = int(stream.hand_of[pad]), int(stream.contact[pad])
+        hand, contact = int(buffer.hand_index[pad]), int(buffer.contact_id[pad])
         if not known.any():
-            reason = "no residual: the place isn't known"
-            return [Percept(self.kind, hand, pad, contact, t_ns, "unestimated", reason=reason)]
-        chances = point_or_more(residual[known], std[known])
-        label = max(chances, key=chances.__getitem__)
-        sure = chances[label] >= self.prior.sure
+            reason = "no residual: the position isn't known"
+            return [PerceptEstimate(self.kind, hand, pad, contact, now_ns, "undetermined", reason=reason)]
+        probabilities = spot_probabilities(residual[known], std[known])
+        label = max(probabilities, key=probabilities.__getitem__)
+        determined = probabilities[label] >= self.prior.min_probability
         count = int(known.sum())
         values: dict[str, float] = {
             "residual": float(residual[known].mean()),
-            "residual_std": math.hypot(float(std[known].mean()) / math.sqrt(count), _TOLERANCE),
+            "residual_std": math.hypot(float(std[known].mean()) / math.sqrt(count), _POINT_RESIDUAL_STD),
         }
-        if sure and label != "point" and self._pair_m is not None:
+        if determined and label != "point" and self._pair_m is not None:
             distance_m, std_m = self._pair_m(pad, *values.values())
             if math.isfinite(distance_m + std_m):
                 values |= {"pair_distance_m": distance_m, "pair_distance_m_std": std_m}
-        reason = "" if sure else "press for longer, or harder: the residual is within its noise"
-        state = "estimated" if sure else "unestimated"
+        reason = "" if determined else "the residual is within its noise: press for longer or harder"
+        state = "estimated" if determined else "undetermined"
         evidence = {"samples": count}
         return [
-            Percept(
-                self.kind, hand, pad, contact, t_ns, state, label * sure, chances, values, evidence, reason
+            PerceptEstimate(
+                self.kind,
+                hand,
+                pad,
+                contact,
+                now_ns,
+                state,
+                label * determined,
+                probabilities,
+                values,
+                evidence,
+                reason,
             )
         ]
 
 
-def question(verdict: Verdict, hand: int, pad: int, contact: int, prior: Prior) -> Question:
-    """What would tell shapes apart: how far the normal turns when a pad slides on, and which way.
+def shape_question(
+    result: ShapeClassification, hand: int, pad: int, contact: int, prior: ShapePrior
+) -> Question:
+    """Return the question of the shape class; the outcome is how far the normal turns during a slide.
 
-    Along the row of touches or across it: a cylinder curves one way only, an edge has no across.
+    Slides along the row of touches or across it: a cylinder curves one way only, an edge has no surface
+    across it.
     """
     noise = prior.normal_std_rad * math.sqrt(2)
-    radius = {name: max(verdict.fits[name].radius_m, 1e-3) for name in CLASSES if SIZES[name]}
+    radius = {name: max(result.fits[name].radius_m, 1e-3) for name in SHAPE_CLASSES if SIZE_PARAMETERS[name]}
     curves = {
         "slide around": {"cylinder": 1.0, "sphere": 1.0, "edge": 0.0, "flat": 0.0},
         "slide along": {"cylinder": 0.0, "sphere": 1.0, "edge": 0.0, "flat": 0.0},
@@ -237,40 +279,40 @@ def question(verdict: Verdict, hand: int, pad: int, contact: int, prior: Prior) 
     actions = []
     for way, bends in curves.items():
         outcomes = {}
-        for name in CLASSES:
-            turn = bends[name] * _SLIDE_M / radius.get(name, math.inf)
+        for name in SHAPE_CLASSES:
+            turn = bends[name] * _REQUESTED_SLIDE_M / radius.get(name, math.inf)
             own = math.hypot(noise, turn * prior.radius_log_std / 2)
             outcomes[name] = turn, (own if name != "edge" else math.hypot(noise, 0.5))
         direction = "across the axis" if way == "slide around" else "along the axis"
-        amount: dict[str, float | str] = {"distance_m": _SLIDE_M, "direction": direction}
-        actions.append(Action("slide", amount, outcomes, _COST, "turn of the normal in rad"))
-    return Question("which shape", hand, pad, contact, verdict.probabilities, actions)
+        amount: dict[str, float | str] = {"distance_m": _REQUESTED_SLIDE_M, "direction": direction}
+        actions.append(CandidateAction("slide", amount, outcomes, _SLIDE_COST, "turn of the normal in rad"))
+    return Question("shape_class", hand, pad, contact, result.probabilities, actions)
 
 
-def _told(verdict: Verdict, hand: int, t_ns: int, pads: int) -> Percept:
+def _shape_percept(result: ShapeClassification, hand: int, now_ns: int, pads: int) -> PerceptEstimate:
     values: dict[str, float | str | Sequence[float] | None] = {}
-    found = verdict.fits.get(verdict.label)
+    found = result.fits.get(result.label)
     if found is not None:
         values = {
             "point_m": found.point.tolist(),
             "covariance": found.covariance.ravel().tolist(),
-            "covariance_of": " ".join(found.names),
-            "object": "moves" if verdict.moves else "rests",
+            "covariance_parameters": " ".join(found.parameter_names),
+            "object_moves": result.object_moves,
         }
-        if verdict.label != "sphere":
+        if result.label != "sphere":
             values["direction"] = found.direction.tolist()
-        if SIZES[verdict.label]:
+        if SIZE_PARAMETERS[result.label]:
             values |= {"radius_m": found.radius_m, "radius_m_std": found.radius_std_m}
-    return Percept(
+    return PerceptEstimate(
         "shape",
         hand,
         -1,
         0,
-        t_ns,
-        verdict.state,
-        verdict.label,
-        verdict.probabilities,
+        now_ns,
+        result.state,
+        result.label,
+        result.probabilities,
         values,
-        {"contacts": verdict.contacts, "pads": pads},
-        verdict.reason,
+        {"contacts": result.contacts, "pads": pads},
+        result.reason,
     )

@@ -1,6 +1,6 @@
-"""Decides what goes into a recording: every message in its order, losses counted, a file that stands alone.
+"""Content of recordings: every message in order, losses counted, each file complete in itself.
 
-Public names: `Recorder`, `Limits`, `Full`. Touches no socket and no clock.
+Public names: `MessageRecorder`, `RotationLimits`, `MessageFile`. Free of sockets and clocks.
 """
 
 from __future__ import annotations
@@ -11,22 +11,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import msgpack
-
 from handtouch import wire
-from handtouch.record.foxglove import Foxglove
+from handtouch.record.foxglove import FoxgloveConverter
 from handtouch.record.schemas import ENCODING
+from handtouch.wire.codec import check_fields, unpack
 
-_FLUSH_NS = 1_000_000_000
-_ASK_AGAIN_NS = 2_000_000_000
-_PARTS = {topic.prefix: topic.parts for topic in wire.TOPICS}
-_LASTING = ("config", "service", "health")
-"""Whose latest message begins every file, so that it explains itself."""
-_MOST_WAITING = 100_000
+_FLUSH_PERIOD_NS = 1_000_000_000
+_STATE_REQUEST_PERIOD_NS = 2_000_000_000
+_TOPIC_OF_PREFIX = {topic.prefix: topic for topic in wire.TOPICS}
+_REPEATED_PREFIXES = ("config", "service", "health")
+"""Topics whose latest message begins every file, so that each can be read alone."""
+_MAX_WAITING_MESSAGES = 100_000
 
 
-class File(Protocol):
-    """Where messages go: `RecordingFile`."""
+class MessageFile(Protocol):
+    """Output of messages: `RecordingFile`."""
 
     @property
     def size(self) -> int: ...
@@ -39,88 +38,91 @@ class File(Protocol):
 
 
 @dataclass(frozen=True)
-class Limits:
-    """When to go on in another file."""
+class RotationLimits:
+    """Limits of a file, after which the next one begins."""
 
-    bytes: int = 1 << 62
-    ns: int = 1 << 62
+    max_bytes: int = 1 << 62
+    max_duration_ns: int = 1 << 62
 
 
-class Recorder:
-    """Takes messages as they come off the wire; times are ns since 1970 UTC, but for `now_ns`, a clock's.
+class MessageRecorder:
+    """Recorder of messages in the order of arrival; times are ns since 1970 UTC, except `now_ns`, monotonic.
 
-    `open_file` opens the next file, once the first message can be dated. `asks` says that the state of the
-    daemon is wanted: unsubscribe from it and subscribe. `lost` counts messages by topic that gaps tell of,
-    `malformed` what doesn't keep the contract. What files raise, is raised.
+    `open_file` opens the next file, when the time of its first message is known. `state_requested`: subscribe
+    to `state` again, to get the daemon's retained state. `lost` counts messages missing in sequences, by
+    topic; `malformed` those that violate the wire contract. Exceptions of files are passed on.
     """
 
-    def __init__(self, open_file: Callable[[int], File], limits: Limits) -> None:
+    def __init__(self, open_file: Callable[[int], MessageFile], limits: RotationLimits) -> None:
         self.lost: Counter[str] = Counter()
         self.malformed = 0
         self.messages: Counter[str] = Counter()
         self.contacts = 0
-        self.bytes = 0
-        """in the files that are done"""
-        self.asks = False
-        self.file: File | None = None
+        self.finished_bytes = 0
+        """in completed files"""
+        self.state_requested = False
+        self.file: MessageFile | None = None
         self._open_file, self._limits = open_file, limits
-        self._foxglove = Foxglove()
-        self._run: int | None = None
-        self._offset_ns: int | None = None
+        self._foxglove = FoxgloveConverter()
+        self._session: int | None = None
+        self._wall_offset_ns: int | None = None
         self._waiting: list[tuple[str, bytes, dict[str, Any]]] = []
-        self._lasting: dict[str, tuple[bytes, int]] = {}
+        self._repeated: dict[str, tuple[bytes, int]] = {}
         self._seq: dict[str, int] = {}
-        self._asked_ns = self._flushed_ns = self._since_ns = 0
+        self._state_requested_ns = self._flushed_ns = self._file_opened_ns = 0
         self._needs_state = True
         self._file_lost = 0
 
     @property
     def size(self) -> int:
         """Bytes written, in all files."""
-        return self.bytes + (self.file.size if self.file else 0)
+        return self.finished_bytes + (self.file.size if self.file else 0)
 
-    def take(self, parts: list[bytes], now_ns: int) -> None:
-        """A message of the wire."""
-        read = _read(parts)
-        if read is None:
+    def add_message(self, parts: list[bytes], now_ns: int) -> None:
+        """Record a received message."""
+        try:
+            topic, payload = _checked_message(parts)
+        except wire.WireError:
             self.malformed += 1
             return
-        topic, payload = read
-        if payload["run"] != self._run:
-            self._begin_run(payload["run"])
+        if payload["session"] != self._session:
+            self._begin_session(payload["session"])
         if not self._is_new(topic, payload):
             return
-        if topic == "service" and self._offset_ns is None:
-            self._offset_ns = payload["wall_offset_ns"]
-        if self._offset_ns is None:
-            self._waiting = [*self._waiting[-_MOST_WAITING:], (topic, parts[1], payload)]
+        if topic == "service" and self._wall_offset_ns is None:
+            self._wall_offset_ns = payload["wall_offset_ns"]
+        if self._wall_offset_ns is None:
+            self._waiting = [*self._waiting[-_MAX_WAITING_MESSAGES:], (topic, parts[1], payload)]
             return
         waiting, self._waiting = self._waiting, []
         for held in waiting:
-            self._keep(*held, now_ns)
-        self._keep(topic, parts[1], payload, now_ns)
+            self._store_message(*held, now_ns)
+        self._store_message(topic, parts[1], payload, now_ns)
 
     def poll(self, now_ns: int) -> None:
-        """Flush, and ask for the state where it is due; call it some times a second."""
+        """Flush, and request the state if it is due; call this about once a second."""
         if self.file is None:
             return
-        if now_ns - self._flushed_ns >= _FLUSH_NS:
+        if now_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
             self._flushed_ns = now_ns
             self.file.flush()
-        full = self.file.size >= self._limits.bytes or now_ns - self._since_ns >= self._limits.ns
-        if (full or self._needs_state) and now_ns - self._asked_ns >= _ASK_AGAIN_NS:
-            self._asked_ns = now_ns
-            self.asks = True
+        full = (
+            self.file.size >= self._limits.max_bytes
+            or now_ns - self._file_opened_ns >= self._limits.max_duration_ns
+        )
+        if (full or self._needs_state) and now_ns - self._state_requested_ns >= _STATE_REQUEST_PERIOD_NS:
+            self._state_requested_ns = now_ns
+            self.state_requested = True
 
     def finish(self) -> None:
-        """End the file, if there is one."""
+        """Complete the present file, if any."""
         if self.file is not None:
             self.file.finish(self.summary())
-            self.bytes += self.file.size
+            self.finished_bytes += self.file.size
             self.file = None
 
     def summary(self) -> dict[str, str]:
-        """What was counted since the beginning, in all files; `lost` is a map of topic to messages."""
+        """Return the counts of all files; `lost` is a map of topic to messages."""
         return {
             "messages": str(sum(self.messages.values())),
             "contacts": str(self.contacts),
@@ -129,53 +131,53 @@ class Recorder:
             "malformed": str(self.malformed),
         }
 
-    def _begin_run(self, run: int) -> None:
-        self._run, self._offset_ns = run, None
+    def _begin_session(self, session: int) -> None:
+        self._session, self._wall_offset_ns = session, None
         self._seq.clear()
-        self._lasting.clear()
+        self._repeated.clear()
         self._waiting.clear()
-        self._foxglove = Foxglove()
+        self._foxglove = FoxgloveConverter()
         self._needs_state = True
 
     def _is_new(self, topic: str, payload: dict[str, Any]) -> bool:
-        """Follow the topic; whether the message is to be kept."""
+        """Track the topic's sequence; return True if the message is to be recorded."""
         last, seq = self._seq.get(topic), payload["seq"]
         self._seq[topic] = max(seq, last or 0)
         if last is None or topic == "state":
             return True
-        if payload["repeat"] and seq <= last:
+        if payload["retained"] and seq <= last:
             return False
         if gap := max(0, seq - last - 1):
             self.lost[topic] += gap
             self._needs_state |= topic in ("tick", "config")
         return True
 
-    def _keep(self, topic: str, data: bytes, payload: dict[str, Any], now_ns: int) -> None:
-        t_ns = payload["t_ns"] + (self._offset_ns or 0)
+    def _store_message(self, topic: str, data: bytes, payload: dict[str, Any], now_ns: int) -> None:
+        t_ns = payload["t_ns"] + (self._wall_offset_ns or 0)
         if self.file is None:
-            self._open(t_ns, now_ns)
+            self._start_file(t_ns, now_ns)
         elif topic == "state" and self._is_full(now_ns):
             self.finish()
-            self._open(t_ns, now_ns)
-            for of, (kept, kept_ns) in self._lasting.items():
-                self._write(of, kept, kept_ns)
+            self._start_file(t_ns, now_ns)
+            for repeated, (kept, kept_ns) in self._repeated.items():
+                self._write(repeated, kept, kept_ns)
         if topic == "state":
             self._needs_state = False
         prefix = topic.split("/")[0]
         if ENCODING[prefix] == "json":
             try:
                 data = json.dumps(payload, separators=(",", ":"), allow_nan=False).encode()
-            except (TypeError, ValueError):  # a later version of the daemon may send anything
+            except (TypeError, ValueError):  # of a later version of the daemon
                 self.malformed += 1
                 return
-        if prefix in _LASTING:
-            self._lasting[topic] = data, t_ns
+        if prefix in _REPEATED_PREFIXES:
+            self._repeated[topic] = data, t_ns
         self.messages[prefix] += 1
         self.contacts += prefix == "contact" and payload.get("event") == "begin"
         self._write(topic, data, t_ns, payload["seq"])
         try:
-            shown = self._foxglove.take(topic, payload, t_ns)
-        except (KeyError, TypeError, ValueError, AttributeError):  # a key of it is not what it should be
+            shown = self._foxglove.convert(topic, payload, t_ns)
+        except (KeyError, TypeError, ValueError, AttributeError):  # an unexpected type
             self.malformed += 1
             return
         for made in shown:
@@ -187,32 +189,35 @@ class Recorder:
 
     def _is_full(self, now_ns: int) -> bool:
         assert self.file is not None
-        return self.file.size >= self._limits.bytes or now_ns - self._since_ns >= self._limits.ns
+        return (
+            self.file.size >= self._limits.max_bytes
+            or now_ns - self._file_opened_ns >= self._limits.max_duration_ns
+        )
 
-    def _open(self, t_ns: int, now_ns: int) -> None:
+    def _start_file(self, t_ns: int, now_ns: int) -> None:
         self.file = self._open_file(t_ns)
-        self._since_ns = self._flushed_ns = now_ns
+        self._file_opened_ns = self._flushed_ns = now_ns
 
 
-_ENVELOPE = {"v": int, "run": int, "seq": int, "t_ns": int, "repeat": bool}
+@dataclass
+class _Envelope:
+    """Keys of every payload, which the recorder needs; the others are recorded unchecked."""
+
+    v: int
+    session: int
+    seq: int
+    t_ns: int
+    retained: bool
 
 
-def _read(parts: list[bytes]) -> tuple[str, dict[str, Any]] | None:
-    """Topic and payload; None for what doesn't keep the contract. Keys that aren't known are kept."""
-    if len(parts) != 2:
-        return None
-    topic = parts[0].decode("utf-8", "replace")
-    prefix, *rest = topic.split("/")
-    if _PARTS.get(prefix) != len(rest):
-        return None
-    try:
-        payload = msgpack.unpackb(parts[1])
-    except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException):
-        return None
-    if not isinstance(payload, dict) or payload.get("v") != wire.SCHEMA_VERSION:
-        return None
-    if not all(type(payload.get(key)) is kind for key, kind in _ENVELOPE.items()):
-        return None
-    if prefix == "service" and type(payload.get("wall_offset_ns")) is not int:
-        return None
-    return topic, payload
+@dataclass
+class _ServiceEnvelope(_Envelope):
+    wall_offset_ns: int
+
+
+def _checked_message(parts: list[bytes]) -> tuple[str, dict[str, Any]]:
+    """Return topic and payload of a message; unknown keys are kept. Raises WireError."""
+    received = unpack(parts, _TOPIC_OF_PREFIX)
+    envelope = _ServiceEnvelope if received.topic.prefix == "service" else _Envelope
+    check_fields(received.name, received.payload, envelope)
+    return received.name, received.payload

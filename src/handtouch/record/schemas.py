@@ -1,10 +1,10 @@
-"""What the channels of a recording hold: JSON schemas of our payloads, and those of Foxglove's that fit.
+"""Schemas of recorded channels: JSON schemas of the wire's payloads, and Foxglove's.
 
-Public names: `schema_of`, `FOXGLOVE`, `ENCODING`.
+Public names: `schema_of`, `FOXGLOVE_SCHEMAS`, `ENCODING`.
 
-Payloads with binary columns are kept as they came, in msgpack; the others as JSON, which Foxglove plots and
-lists by itself. A schema of either is a JSON schema; where the message is msgpack, a "string" with
-`contentEncoding` "binary" is msgpack's bin.
+Payloads with binary columns are stored as received, in msgpack; the others as JSON, which Foxglove plots and
+lists without conversion. Both have JSON schemas; in those of msgpack, a "string" with `contentEncoding`
+"binary" is msgpack's bin.
 """
 
 from __future__ import annotations
@@ -16,18 +16,20 @@ from typing import Any, Union
 
 from handtouch import wire
 
-_BINARY = {
+_BINARY_PREFIXES = {
     topic.prefix
     for topic in wire.TOPICS
     if any(bytes in (hint, *typing.get_args(hint)) for hint in typing.get_type_hints(topic.payload).values())
 }
 ENCODING = {
-    topic.prefix: "msgpack" if topic.prefix in _BINARY | {"config"} else "json"  # it has files, as bytes
+    topic.prefix: "msgpack"
+    if topic.prefix in _BINARY_PREFIXES | {"config"}
+    else "json"  # it has files, as bytes
     for topic in wire.TOPICS
 }
-"""First part of a topic -> how its messages are kept."""
+"""Prefix of a topic -> encoding of its messages."""
 
-_PLAIN: dict[Any, dict[str, Any]] = {
+_SCALAR_SCHEMAS: dict[Any, dict[str, Any]] = {
     int: {"type": "integer"},
     float: {"type": "number"},
     str: {"type": "string"},
@@ -37,15 +39,15 @@ _PLAIN: dict[Any, dict[str, Any]] = {
 
 
 def schema_of(payload: type[Any]) -> dict[str, Any]:
-    """JSON schema of a payload of the wire; columns say the type of their elements and how many a row has."""
-    columns = wire.INPUTS if payload is wire.TickInputs else wire.COLUMNS.get(payload, {})
+    """Return the JSON schema of a payload; a column's description has its type and elements per row."""
+    columns = wire.COLUMNS.get(payload, {})
     hints = typing.get_type_hints(payload)
     properties = {}
     for field in fields(payload):
-        properties[field.name] = told = _of(hints[field.name])
+        properties[field.name] = schema = _schema_of_type(hints[field.name])
         if field.name in columns:
-            kind, elements = columns[field.name]
-            told["description"] = f"column: {elements} x {kind} in each row"
+            column = columns[field.name]
+            schema["description"] = f"column: {column.elements} x {column.dtype} in each row"
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"handtouch.{payload.__name__}",
@@ -55,19 +57,19 @@ def schema_of(payload: type[Any]) -> dict[str, Any]:
     }
 
 
-def _of(hint: Any) -> dict[str, Any]:
+def _schema_of_type(hint: Any) -> dict[str, Any]:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
-        inner = next(_of(argument) for argument in arguments if argument is not type(None))
+        inner = next(_schema_of_type(argument) for argument in arguments if argument is not type(None))
         return {"anyOf": [inner, {"type": "null"}]}
     if origin is tuple:
-        told: dict[str, Any] = {"type": "array", "items": _of(arguments[0])}
+        schema: dict[str, Any] = {"type": "array", "items": _schema_of_type(arguments[0])}
         if arguments[-1] is not Ellipsis:
-            told |= {"minItems": len(arguments), "maxItems": len(arguments)}
-        return told
+            schema |= {"minItems": len(arguments), "maxItems": len(arguments)}
+        return schema
     if origin is dict:
         return {"type": "object"}
-    return dict(_PLAIN[hint])
+    return dict(_SCALAR_SCHEMAS[hint])
 
 
 def _object(title: str = "", **properties: Any) -> dict[str, Any]:
@@ -78,7 +80,7 @@ def _list(items: dict[str, Any]) -> dict[str, Any]:
     return {"type": "array", "items": items}
 
 
-_NUMBER, _TEXT, _TRUTH = _PLAIN[float], _PLAIN[str], _PLAIN[bool]
+_NUMBER, _TEXT, _BOOLEAN = _SCALAR_SCHEMAS[float], _SCALAR_SCHEMAS[str], _SCALAR_SCHEMAS[bool]
 _TIME = _object("time", sec={"type": "integer", "minimum": 0}, nsec={"type": "integer", "minimum": 0})
 _DURATION = _object("duration", sec={"type": "integer"}, nsec={"type": "integer", "minimum": 0})
 _VECTOR = _object("foxglove.Vector3", x=_NUMBER, y=_NUMBER, z=_NUMBER)
@@ -104,12 +106,12 @@ _CYLINDER = _object(
     top_scale=_NUMBER,
     color=_COLOR,
 )
-_WORDS = _object(
+_TEXT_PRIMITIVE = _object(
     "foxglove.TextPrimitive",
     pose=_POSE,
-    billboard=_TRUTH,
+    billboard=_BOOLEAN,
     font_size=_NUMBER,
-    scale_invariant=_TRUTH,
+    scale_invariant=_BOOLEAN,
     color=_COLOR,
     text=_TEXT,
 )
@@ -119,7 +121,7 @@ _ENTITY = _object(
     frame_id=_TEXT,
     id=_TEXT,
     lifetime=_DURATION,
-    frame_locked=_TRUTH,
+    frame_locked=_BOOLEAN,
     metadata=_list(_object("foxglove.KeyValuePair", key=_TEXT, value=_TEXT)),
     arrows=_list(_ARROW),
     cubes=_list(_CUBE),
@@ -127,7 +129,7 @@ _ENTITY = _object(
     cylinders=_list(_CYLINDER),
     lines=_list(_object()),
     triangles=_list(_object()),
-    texts=_list(_WORDS),
+    texts=_list(_TEXT_PRIMITIVE),
     models=_list(_object()),
 )
 _DELETION = _object("foxglove.SceneEntityDeletion", timestamp=_TIME, type={"type": "integer"}, id=_TEXT)
@@ -140,7 +142,7 @@ _TRANSFORM = _object(
     rotation=_QUATERNION,
 )
 
-FOXGLOVE = {
+FOXGLOVE_SCHEMAS = {
     "foxglove.SceneUpdate": _object(
         "foxglove.SceneUpdate", deletions=_list(_DELETION), entities=_list(_ENTITY)
     ),

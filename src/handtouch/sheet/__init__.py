@@ -1,31 +1,44 @@
-"""How resistive sheets behave in time: forwards to simulate, backwards to compensate; no I/O, no clock."""
+"""Sheet behaviour over time: forward models for simulation, inverse ones for compensation. No I/O."""
 
 from handtouch.sheet.adaptation import Adaptation, AdaptationState
-from handtouch.sheet.behaviour import SheetModel, SheetState, SheetStep, SheetTrack, Temperature
-from handtouch.sheet.compensator import Compensator, Doubt
+from handtouch.sheet.behaviour import (
+    SheetHistory,
+    SheetModel,
+    SheetModelState,
+    SheetStep,
+    TemperatureResponse,
+)
+from handtouch.sheet.compensator import ParameterUncertainty, SheetCompensator
 from handtouch.sheet.creep import Creep
 from handtouch.sheet.fluctuation import Fluctuation, FluctuationState
 from handtouch.sheet.hysteresis import PrandtlIshlinskii
-from handtouch.sheet.presets import GRAM_FORCE, S1, S1_BENCH, S2, S2_BENCH, Bench
+from handtouch.sheet.presets import (
+    GRAM_FORCE_N,
+    S1,
+    S1_BENCH,
+    S2,
+    S2_BENCH,
+    BenchCircuit,
+)
 
 __all__ = [
-    "GRAM_FORCE",
+    "GRAM_FORCE_N",
     "S1",
     "S1_BENCH",
     "S2",
     "S2_BENCH",
     "Adaptation",
     "AdaptationState",
-    "Bench",
-    "Compensator",
+    "BenchCircuit",
     "Creep",
-    "Doubt",
     "Fluctuation",
     "FluctuationState",
+    "ParameterUncertainty",
     "PrandtlIshlinskii",
+    "SheetCompensator",
+    "SheetHistory",
     "SheetModel",
-    "SheetState",
+    "SheetModelState",
     "SheetStep",
-    "SheetTrack",
-    "Temperature",
+    "TemperatureResponse",
 ]

@@ -1,10 +1,10 @@
-"""Creep: a reading that lags behind its load and follows a release at once.
+"""Creep: a reading that lags behind a growing load and follows a release immediately.
 
 Public names: `Creep`, `CreepStep`.
 
-A step of load gives load * (instant + sum_i weight_i (1 - exp(-t / time_i))): a chain of Kelvin-Voigt
-elements. Each element holds the load that it has come to feel, never more than what presses now, so a release
-is abrupt. A power law is a sum of such elements whose times lie evenly on a logarithmic scale.
+The response to a step of load is load * (instant + sum_i weight_i (1 - exp(-t / time_i))): a chain of
+Kelvin-Voigt elements. The load on each element never exceeds the present load, so a release is abrupt. A
+power law is a sum of such elements with logarithmically spaced times.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _FIT_PER_DECADE = 40
 
 @dataclass(frozen=True)
 class Creep:
-    """Answer to a unit step of load: instant + sum_i weights_i (1 - exp(-t / times_s_i)).
+    """Response to a unit step of load: instant + sum_i weights_i (1 - exp(-t / times_s_i)).
 
-    times_s: rising. The reading at last is `total` times the load. Raises ValueError for times that don't
-    rise from above 0, weights below 0, or an instant share that isn't positive.
+    times_s: rising. The final reading is `total` times the load. Raises ValueError for times that don't rise
+    from above 0, negative weights, or an instant share that isn't positive.
     """
 
     instant: float
@@ -45,20 +45,20 @@ class Creep:
 
     @classmethod
     def first_order(cls, instant: float, time_s: float) -> Creep:
-        """One element; the reading at last is the load."""
+        """Build one element; the final reading is the load."""
         return cls(instant, (1 - instant,), (time_s,))
 
     @classmethod
     def power_law(
         cls, exponent: float, shortest_s: float = 1e-3, longest_s: float = 3600.0, modes: int = 7
     ) -> Creep:
-        """Elements whose answer is nearest to (t / 1 s)^exponent from `shortest_s` to `longest_s`.
+        """Fit elements to the response (t / 1 s)^exponent from `shortest_s` to `longest_s`.
 
-        Least relative error on a logarithmic scale of time, weights kept above 0 (NNLS); `power_law_error`
-        says how near. exponent: 0 to 1, typically 0.02 to 0.1. Raises ValueError for an exponent out of
-        range, or too many decades for so few modes.
+        Least squares of the relative error on logarithmic time, with weights >= 0 (NNLS); see
+        `power_law_error`. exponent: 0 to 1, typically 0.02 to 0.1. Raises ValueError for an exponent out of
+        range, or too many decades for the modes.
         """
-        from scipy.optimize import nnls  # here: it takes longer to import than most daemons' tables
+        from scipy.optimize import nnls  # slow to import, and rarely needed
 
         if not 0 < exponent < 1:
             raise ValueError(f"exponent must lie between 0 and 1, got {exponent}")
@@ -73,54 +73,54 @@ class Creep:
 
     @property
     def total(self) -> float:
-        """Reading over load, at last."""
+        """Final reading over load."""
         return self.instant + sum(self.weights)
 
     def response(self, t_s: npt.ArrayLike) -> FloatArray:
-        """Reading (...) at times (...) after a unit step of load."""
+        """Return the reading (...) at times (...) after a unit step of load."""
         t = np.asarray(t_s, np.float64)[..., None]
         grown = -np.expm1(-t / np.array(self.times_s)) @ np.array(self.weights)
         return np.asarray(self.instant + grown)
 
     def power_law_error(self, exponent: float, t_s: npt.ArrayLike) -> float:
-        """Greatest relative departure from (t / 1 s)^exponent at the given times."""
+        """Return the largest relative deviation from (t / 1 s)^exponent at the given times."""
         t = np.asarray(t_s, np.float64)
         return float(np.abs(self.response(t) / t**exponent - 1).max())
 
-    def start(self, pads: int) -> FloatArray:
-        """State (1 + modes, pads) of sheets at rest: the load, then what each element feels of it [N]."""
+    def initial_state(self, pads: int) -> FloatArray:
+        """Return the state (1 + modes, pads) of sheets without load: the load, then each element's [N]."""
         return np.zeros((1 + len(self.times_s), pads))
 
-    def at(self, dt_s: float) -> CreepStep:
-        """What one step of `dt_s` needs, computed once."""
+    def discretise(self, dt_s: float) -> CreepStep:
+        """Precompute one step of `dt_s`."""
         return CreepStep(self, dt_s)
 
 
 class CreepStep:
-    """Creep over one interval; n steps of dt under a constant load are one of n dt."""
+    """Creep over one interval; n steps of dt under a constant load equal one of n dt."""
 
     def __init__(self, creep: Creep, dt_s: float) -> None:
         decay = np.exp(-dt_s / np.array(creep.times_s))
         modes, weights = len(decay), np.array(creep.weights)
         self._reading = np.append(creep.instant, weights)
-        # An element goes to decay * state + (1 - decay) * load, or to the load where that is less.
-        self._move = np.column_stack([-np.expm1(-dt_s / np.array(creep.times_s)), np.diag(decay)])
-        # Elements keep their order, the quickest nearest to the load. If the first k feel more than the load
-        # they follow it at once, and reading = slope_k load + sum over the others of weight decay state: one
-        # straight line for each k. The reading is the least of them, so the load is the greatest answer.
+        # An element moves to decay * state + (1 - decay) * load, or to the load where that is less.
+        self._transition = np.column_stack([-np.expm1(-dt_s / np.array(creep.times_s)), np.diag(decay)])
+        # Elements keep their order, the fastest nearest to the load. If the first k exceed the load they
+        # follow it immediately, and reading = slope_k load + sum over the others of weight decay state: one
+        # straight line for each k. The reading is the least of them, so the load is the largest solution.
         others = np.triu(np.ones((modes + 1, modes))) * (weights * decay)
         slope = creep.total - others.sum(1)
-        self._lines = np.column_stack([np.ones(modes + 1), -others]) / slope[:, None]
+        self._inverse_lines = np.column_stack([np.ones(modes + 1), -others]) / slope[:, None]
 
     def forward(self, state: FloatArray, load_n: FloatArray) -> FloatArray:
-        """Reading (n,) at the end of an interval under load (n,) >= 0; `state` is carried on in place."""
+        """Return the reading (n,) at the end of an interval under load (n,) >= 0; update `state` in place."""
         state[0] = load_n
-        np.minimum(self._move @ state, state[0], out=state[1:])
+        np.minimum(self._transition @ state, state[0], out=state[1:])
         return np.asarray(self._reading @ state)
 
     def inverse(self, state: FloatArray, reading_n: FloatArray) -> FloatArray:
-        """The load (n,) whose reading this is; exact. `state` is carried on in place."""
+        """Return the load (n,) of a reading; exact. Update `state` in place."""
         state[0] = reading_n
-        load = np.maximum.reduce(self._lines @ state, out=state[0])
-        np.minimum(self._move @ state, load, out=state[1:])
+        load = np.maximum.reduce(self._inverse_lines @ state, out=state[0])
+        np.minimum(self._transition @ state, load, out=state[1:])
         return np.array(load)

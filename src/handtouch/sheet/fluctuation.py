@@ -1,4 +1,4 @@
-"""What no model undoes: presses differ from one another, and a contact's resistance flickers.
+"""Fluctuations, which no model can compensate: variation between presses, and flicker of the resistance.
 
 Public names: `Fluctuation`, `FluctuationState`.
 """
@@ -20,8 +20,8 @@ class Fluctuation:
 
     press_std: from one press to the next, log-normal, kept while the press lasts. noise_std: of flicker at
     1 N; it goes as force^(-1/2), as the number of conducting spots goes as force. noise_time_s: its
-    correlation time (Ornstein-Uhlenbeck). Raises ValueError for what is negative, or a time that isn't
-    positive.
+    correlation time (Ornstein-Uhlenbeck). Raises ValueError for a negative standard deviation, or a time
+    that isn't positive.
     """
 
     press_std: float = 0.0
@@ -32,37 +32,37 @@ class Fluctuation:
         if not (self.press_std >= 0 and self.noise_std >= 0 and self.noise_time_s > 0):
             raise ValueError(f"standard deviations must be at least 0, times positive, got {self}")
 
-    def start(self, pads: int, seed: int) -> FluctuationState:
-        """Sheets at rest."""
+    def initial_state(self, pads: int, seed: int) -> FluctuationState:
+        """Return the state of sheets without load."""
         return FluctuationState(
             np.random.default_rng(seed), np.zeros(pads, np.bool_), np.ones(pads), np.zeros(pads)
         )
 
-    def step(self, state: FluctuationState, reading_n: FloatArray, dt_s: float) -> FloatArray:
-        """The reading (n,) as it comes; `state` is carried on in place."""
+    def apply_to(self, state: FluctuationState, reading_n: FloatArray, dt_s: float) -> FloatArray:
+        """Return the reading (n,) with fluctuations; update `state` in place."""
         touched = reading_n > 0
         if self.press_std:
             new = touched & ~state.touched
             if count := int(np.count_nonzero(new)):
-                state.press[new] = np.exp(self.press_std * state.draws.standard_normal(count))
+                state.press_factor[new] = np.exp(self.press_std * state.generator.standard_normal(count))
         state.touched[:] = touched
         if not self.noise_std:
-            return reading_n * state.press
+            return reading_n * state.press_factor
         kept = np.exp(-dt_s / self.noise_time_s)
         state.flicker *= kept
-        state.flicker += np.sqrt(1 - kept**2) * state.draws.standard_normal(len(touched))
+        state.flicker += np.sqrt(1 - kept**2) * state.generator.standard_normal(len(touched))
         std = self.noise_std / np.sqrt(np.where(touched, reading_n, 1.0))
-        return reading_n * state.press * np.exp(std * state.flicker)
+        return reading_n * state.press_factor * np.exp(std * state.flicker)
 
 
 @dataclass
 class FluctuationState:
-    """Of n pads; arrays (n,)."""
+    """Fluctuation state of n pads; arrays (n,)."""
 
-    draws: np.random.Generator
+    generator: np.random.Generator
     touched: npt.NDArray[np.bool_]
-    press: FloatArray
-    """Factor of the press in progress."""
+    press_factor: FloatArray
+    """Factor of the present press."""
     flicker: FloatArray
     """Standard normal."""
 

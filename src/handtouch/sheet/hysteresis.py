@@ -1,9 +1,9 @@
-"""Hysteresis without rate: Prandtl-Ishlinskii, a sum of plays, with its exact inverse.
+"""Rate-independent hysteresis: the Prandtl-Ishlinskii operator, a sum of plays, with its exact inverse.
 
 Public name: `PrandtlIshlinskii`.
 
-The plays are one-sided: each trails the load by up to its width while loading and never leads it, so a sheet
-that is let go reads nothing, and reads more while unloading than while loading. Shifted by half a width they
+The plays are one-sided: each trails the load by up to its width while loading and never leads it, so a
+released sheet reads nothing, and reads more while unloading than while loading. Shifted by half a width they
 are the usual symmetric plays, and the usual inverse (Krejci and Kuhnen) holds: again a sum of plays.
 Wiping-out and congruency, which define a Preisach operator, hold for both.
 """
@@ -42,9 +42,9 @@ class PrandtlIshlinskii:
             raise ValueError(f"the reading must rise with the load; slopes are {slopes.tolist()}")
 
     @classmethod
-    def of_loop(cls, width: float, full_n: float, plays: int = 6) -> PrandtlIshlinskii:
-        """Equal plays that read `full_n` right and open a loop 0 - `full_n` - 0 by `width` (a fraction of
-        full_n, below 0.4) half-way."""
+    def from_width(cls, width: float, full_n: float, plays: int = 6) -> PrandtlIshlinskii:
+        """Build equal plays with unit gain at `full_n` and a loop 0 - `full_n` - 0 of `width` half-way (as a
+        fraction of full_n, below 0.4)."""
         share = np.arange(1, plays + 1) / (plays + 1)
         weight = width / float(np.minimum(share, 1 - share).sum())
         base = 1 - weight * plays / 2
@@ -52,7 +52,7 @@ class PrandtlIshlinskii:
 
     @cached_property
     def inverse(self) -> PrandtlIshlinskii:
-        """The operator that undoes this one, whatever the history."""
+        """The inverse operator, for any history."""
         widths, weights = np.array(self.widths_n), np.array(self.weights)
         slopes = np.cumsum((self.base, *self.weights))
         turned = self.base * widths + np.tril(widths[:, None] - widths) @ weights
@@ -60,12 +60,12 @@ class PrandtlIshlinskii:
             float(1 / slopes[0]), tuple(turned.tolist()), tuple(np.diff(1 / slopes).tolist())
         )
 
-    def start(self, pads: int) -> FloatArray:
-        """State (plays, pads) of sheets that were never pressed [N]."""
+    def initial_state(self, pads: int) -> FloatArray:
+        """Return the state (plays, pads) of sheets that were never pressed [N]."""
         return np.zeros((len(self.widths_n), pads))
 
-    def step(self, state: FloatArray, load_n: FloatArray) -> FloatArray:
-        """Reading (n,) under load (n,) >= 0; `state` is carried on in place. Time has no part in it."""
+    def apply_to(self, state: FloatArray, load_n: FloatArray) -> FloatArray:
+        """Return the reading (n,) under load (n,) >= 0; update `state` in place. Rate-independent."""
         widths, weights = self._columns
         np.minimum(state, load_n, out=state)
         np.maximum(state, load_n - widths, out=state)

@@ -1,9 +1,9 @@
-"""The two sheets of the paper, and the bench they were measured on.
+"""The two sheets of the paper, and the bench circuit they were measured with.
 
-Public names: `S1`, `S2`, `S1_BENCH`, `S2_BENCH`, `Bench`, `GRAM_FORCE`.
+Public names: `S1`, `S2`, `S1_BENCH`, `S2_BENCH`, `BenchCircuit`, `GRAM_FORCE_N`.
 
-docs/theory.md says where each number comes from. Of S2 the contact law isn't reported, of S1 only alpha: the
-loads at which layer and sheet resist alike are assumptions.
+docs/theory.md states the source of each number. The paper reports no contact law of S2 and only alpha of S1:
+the loads at which layer and sheet have equal resistance are assumptions.
 """
 
 from __future__ import annotations
@@ -15,43 +15,43 @@ import numpy.typing as npt
 
 from handtouch.field import ContactLaw
 from handtouch.sheet.adaptation import Adaptation
-from handtouch.sheet.behaviour import SheetModel, Temperature
+from handtouch.sheet.behaviour import SheetModel, TemperatureResponse
 from handtouch.sheet.creep import Creep
 from handtouch.sheet.fluctuation import Fluctuation
 
 FloatArray = npt.NDArray[np.float64]
 
-GRAM_FORCE = 1 / 102
-"""Newton, as the paper rounds it."""
+GRAM_FORCE_N = 1 / 102
+"""Newton per gram-force, as the paper rounds it."""
 
-HOUR = 3600.0
+HOUR_S = 3600.0
 
 S1 = SheetModel(
     Adaptation(
-        share=1.0, time_s=3000.0, recovery_s=1.5 * HOUR, threshold_n=2 * GRAM_FORCE, fatigue_s=10_000.0
+        share=1.0, time_s=3000.0, recovery_s=1.5 * HOUR_S, threshold_n=2 * GRAM_FORCE_N, fatigue_s=10_000.0
     ),
     Creep.first_order(0.4, 0.25),
-    temperature=Temperature(gain_per_k=0.01),
+    temperature=TemperatureResponse(gain_per_k=0.01),
     fluctuation=Fluctuation(press_std=0.072, noise_std=0.01),
 )
 S2 = SheetModel(
-    Adaptation(share=0.851, time_s=3000.0, recovery_s=1.5 * HOUR, threshold_n=5 * GRAM_FORCE),
+    Adaptation(share=0.851, time_s=3000.0, recovery_s=1.5 * HOUR_S, threshold_n=5 * GRAM_FORCE_N),
     Creep.first_order(0.4, 0.25),
-    temperature=Temperature(gain_per_k=0.01),
+    temperature=TemperatureResponse(gain_per_k=0.01),
     fluctuation=Fluctuation(press_std=0.171, noise_std=0.01),
 )
 
 
 @dataclass(frozen=True)
-class Bench:
+class BenchCircuit:
     """The paper's circuit: a spacer pressed on the middle of a sheet of 6.2 x 3.5 cm, under potential.
 
-    even_n: load at which the layer resists as much as the sheet [N].
+    equal_resistance_n: load at which the layer has the resistance of the sheet [N].
     """
 
     ohm_per_square: float
     alpha: float
-    even_n: float
+    equal_resistance_n: float
     drive_v: float = 12.0
     radius_m: float = 5.06e-3  # of a disc as large as the spacer: 1 cm^2 less four holes of 2.5 mm
     spreading_radius_m: float = 0.0222  # conformal radius of the middle of the sheet
@@ -61,12 +61,14 @@ class Bench:
         """The contact law of the fresh sheet."""
         area = np.pi * self.radius_m**2
         sheet_ohm = self.ohm_per_square / (2 * np.pi) * np.log(self.spreading_radius_m / self.radius_m)
-        return ContactLaw(sheet_ohm * area, self.alpha, self.radius_m, reference_pa=self.even_n / area)
+        return ContactLaw(
+            sheet_ohm * area, self.alpha, self.radius_m, reference_pa=self.equal_resistance_n / area
+        )
 
     def current(self, apparent_n: npt.ArrayLike) -> FloatArray:
         """Total current [A] at an apparent load [N]."""
         return self.law.current(apparent_n, self.drive_v, self.ohm_per_square, self.spreading_radius_m)
 
 
-S1_BENCH = Bench(2400.0, 1.5, 300 * GRAM_FORCE)
-S2_BENCH = Bench(15_000.0, 1.5, 120 * GRAM_FORCE)
+S1_BENCH = BenchCircuit(2400.0, 1.5, 300 * GRAM_FORCE_N)
+S2_BENCH = BenchCircuit(15_000.0, 1.5, 120 * GRAM_FORCE_N)

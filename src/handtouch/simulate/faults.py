@@ -1,7 +1,8 @@
-"""What can be wrong with a pad, as physics: a fault changes a sheet, its wiring or its channels.
+"""Faults of a pad as physics: each changes the sheet, its wiring, or its channels.
 
-Public names: `Fault` and its kinds, `FAULTS` (by name), `INFLUENCES` (what isn't a fault but acts alike),
-`Acting` (any of them, as a scenario file has it). They are tables, frozen and checked: `[[fault]]`.
+A fault class declares its `kind`, the keys of its `[[fault]]` table, its effects, and how to draw one at
+random; everything else follows from the class. Public names: `Fault` and its subclasses, `FAULTS` (by kind),
+`INFLUENCES` (not faults, but with similar effects), `AnyFault` (any of them, as a scenario file has it).
 """
 
 from __future__ import annotations
@@ -9,315 +10,399 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from handtouch.canbus.objects.channels import ELECTRODES
-from handtouch.config.tables import Electrode, Name, NonNegative, Positive, Table
-from handtouch.simulate.circuit import Wiring
+from handtouch.config.base import Table
+from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import Electrode, Name, NonNegative, Positive
+from handtouch.simulate import draws
+from handtouch.simulate.sheet_circuit import Wiring
+from handtouch.simulate.smoothstep import smoothstep_array
+from handtouch.wire.faults import FaultKind
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
 Corner = Literal["x0y0", "x0yb", "xay0", "xayb"]
+Size = tuple[float, float]
 
+_CORNERS = ("x0y0", "x0yb", "xay0", "xayb")
 _LEAK_POINTS = 13
-_GOLDEN = np.pi * (3 - 5**0.5)
+_GOLDEN_ANGLE_RAD = np.pi * (3 - 5**0.5)
 
 
 @dataclass(frozen=True)
-class Contacts:
-    """What presses on a pad, or leaks into it, over times (n,).
+class FaultContacts:
+    """Contacts or leaks that a fault adds to a pad at n times: k discs with a force or a conductance."""
 
-    Places (k, 2) as fractions of the pad, radii (k,), and either forces (n,) [N] of all k,
-    or conductances (n,) [S] that they share evenly.
-    """
-
-    place: FloatArray
+    position: FloatArray
+    """(k, 2), fractions of the pad."""
     radius_m: FloatArray
+    """(k,)."""
     force_n: FloatArray | None = None
-    siemens: FloatArray | None = None
+    """(n,), the force of each disc."""
+    conductance_s: FloatArray | None = None
+    """(n,) [S], shared evenly by all discs."""
 
 
 class Fault(Table):
-    """What all kinds have in common, and what they may change; a kind overrides what it does change."""
+    """`[[fault]]`: keys of all kinds, and effects; a subclass overrides the effects that it has."""
 
-    link: Name = Field(description="link whose pad it befalls")
-    from_s: NonNegative = Field(description="when it begins, from the start of the scenario")
-    until_s: Positive | None = Field(None, description="when it ends; left out: never")
+    is_influence: ClassVar[bool] = False
+    """True for influences that are no fault, such as heat."""
+    link: Name = Field(description="link of the pad with the fault")
+    from_s: NonNegative = Field(description="begin, in seconds since the start of the scenario")
+    until_s: Positive | None = Field(None, description="end; left out: it lasts")
+
+    @classmethod
+    def fault_kind(cls) -> FaultKind:
+        """Return the class's `kind`."""
+        kind: FaultKind = cls.model_fields["kind"].default
+        return kind
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, link: str, from_s: float, size_mm: Size) -> Self:
+        """Draw a lasting fault of a severity that matters, on a pad with sides `size_mm`."""
+        drawn = cls.draw_keys(rng, size_mm)
+        return cls.model_validate({"link": link, "from_s": from_s, **drawn})
+
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
+        """Draw the keys that are the kind's own."""
+        raise NotImplementedError(f"{cls.__name__} can't be drawn")
 
     @model_validator(mode="after")
-    def _ends_after_it_begins(self) -> Self:
+    def _check_interval(self) -> Self:
         if self.until_s is not None and self.until_s <= self.from_s:
             raise ValueError(f"until_s = {self.until_s} must come after from_s = {self.from_s}")
         return self
 
-    def active(self, times_s: FloatArray) -> BoolArray:
-        """When it is there (n,)."""
+    def is_active(self, times_s: FloatArray) -> BoolArray:
+        """Return whether the fault is active at times (n,)."""
         until = np.inf if self.until_s is None else self.until_s
         return (times_s >= self.from_s) & (times_s < until)
 
-    def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> Contacts | None:  # noqa: ARG002
-        """What it presses or leaks, nothing by default; `size_m` are the sides of the pad at its middle."""
+    def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> FaultContacts | None:  # noqa: ARG002
+        """Return contacts or leaks that the fault adds; `size_m` are the sides of the pad at its middle."""
         return None
 
-    def rewire(self, wiring: Wiring) -> None:
-        """Change the wiring while it is there."""
+    def modify_wiring(self, wiring: Wiring) -> None:
+        """Change the wiring, in place, while the fault is active."""
 
-    def signal(self, counts: FloatArray) -> FloatArray:
-        """What becomes of the counts (n, 4) of amplifiers, before noise and rounding, while it is there."""
+    def distort_counts(self, counts: FloatArray) -> FloatArray:
+        """Return the amplifiers' counts (n, 4), before noise and rounding, while the fault is active."""
         return counts
 
-    def freeze(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
-        """What becomes of the readings (n, 4), in place, while it is there; limits (4, 2)."""
+    def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
+        """Overwrite readings (n, 4) in place while the fault is active; limits (4, 2) of the channels."""
 
-    def warmer_k(self, times_s: FloatArray) -> FloatArray:
-        """How much it warms the pad (n,)."""
+    def temperature_rise_k(self, times_s: FloatArray) -> FloatArray:
+        """Return the temperature rise (n,) that it causes."""
         return np.zeros(len(times_s))
 
     @property
-    def cut(self) -> tuple[Corner, float, float] | None:
-        """The corner that it cuts off, and how much of the sides along x and y [m]."""
+    def cut_corner(self) -> tuple[Corner, float, float] | None:
+        """Corner that is cut off, and the lost lengths of the sides along x and y [m]; None: no cut."""
         return None
 
     @property
-    def permutation(self) -> list[int] | None:
-        """Number of the electrode on each channel, where they are mixed up."""
+    def channel_permutation(self) -> list[int] | None:
+        """Index of the electrode on each channel; None: in order."""
         return None
 
 
 class Gum(Fault):
-    """Something stuck: it comes with a touch that presses it on, and stays as a nearly constant contact."""
+    """Something sticks to the pad: a touch presses it on, then it remains as a nearly constant contact."""
 
-    kind: Literal["gum"] = "gum"
+    kind: Literal[FaultKind.GUM] = FaultKind.GUM
     place: Annotated[tuple[Fraction, Fraction], Field(strict=False)] = Field(
-        description="where (x, y), as fractions of the pad"
+        description="position (x, y), as fractions of the pad"
     )
-    radius_mm: Positive = Field(3.0, description="radius of what sticks")
-    force_n: Positive = Field(0.5, description="force with which it keeps pressing")
-    press_n: NonNegative = Field(1.5, description="force of the touch that brings it; 0: no touch")
-    press_s: Positive = Field(0.8, description="how long that touch lasts")
-    relax: Annotated[float, Field(ge=0, lt=1)] = Field(0.1, description="share of the force that is lost")
-    relax_s: Positive = Field(60.0, description="time constant of that loss")
+    radius_mm: Positive = Field(3.0, description="radius of the stuck object")
+    force_n: Positive = Field(0.5, description="force of the remaining contact")
+    press_n: NonNegative = Field(1.5, description="force of the touch that presses it on; 0: no touch")
+    press_s: Positive = Field(0.8, description="duration of that touch")
+    relax: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.1, description="fraction of the force that is lost by relaxation"
+    )
+    relax_s: Positive = Field(60.0, description="time constant of the relaxation")
 
-    def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> Contacts:  # noqa: ARG002
-        """A disc."""
-        since = np.maximum(times_s - self.from_s, 0.0)
-        stays = self.force_n * (1 - self.relax * -np.expm1(-since / self.relax_s))
-        ramp = _gentle(since / (0.25 * self.press_s))
-        let_go = 1 - _gentle((since - 0.7 * self.press_s) / (0.3 * self.press_s))
-        force = ramp * np.maximum(stays, self.press_n * let_go) * self.active(times_s)
-        return Contacts(np.array([self.place]), np.array([1e-3 * self.radius_mm]), force_n=force)
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
+        """Draw the keys that are the kind's own."""
+        force_n = draws.log_uniform(rng, 0.15, 1.5)
+        return {
+            "place": draws.position(rng),
+            "radius_mm": float(rng.uniform(0.06, 0.16)) * min(size_mm),
+            "force_n": force_n,
+            "press_n": force_n * float(rng.uniform(1.5, 5)),
+            "press_s": float(rng.uniform(0.4, 2)),
+            "relax": float(rng.uniform(0, 0.25)),
+            "relax_s": float(rng.uniform(20, 200)),
+        }
+
+    def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> FaultContacts:  # noqa: ARG002
+        """Return one disc."""
+        elapsed = np.maximum(times_s - self.from_s, 0.0)
+        remaining = self.force_n * (1 - self.relax * -np.expm1(-elapsed / self.relax_s))
+        ramp = smoothstep_array(elapsed / (0.25 * self.press_s))
+        release = 1 - smoothstep_array((elapsed - 0.7 * self.press_s) / (0.3 * self.press_s))
+        force = ramp * np.maximum(remaining, self.press_n * release) * self.is_active(times_s)
+        return FaultContacts(np.array([self.place]), np.array([1e-3 * self.radius_mm]), force_n=force)
 
 
 class Moisture(Fault):
-    """Moisture between the layers: they leak over an area, more and more; after the end it dries."""
+    """Moisture between the layers: a leak over an area that grows, and dries after the end."""
 
-    kind: Literal["moisture"] = "moisture"
+    kind: Literal[FaultKind.MOISTURE] = FaultKind.MOISTURE
     place: Annotated[tuple[Fraction, Fraction], Field(strict=False)] = Field(
-        description="middle of the wet area (x, y), as fractions of the pad"
+        description="centre of the wet area (x, y), as fractions of the pad"
     )
     radius_mm: Positive = Field(8.0, description="radius of the wet area")
-    leak_ohm: Positive = Field(5000.0, description="resistance between the layers over all of it, when wet")
-    grow_s: Positive = Field(30.0, description="time constant with which the leak grows")
-    dry_s: Positive = Field(120.0, description="time constant with which it dries after the end")
+    leak_ohm: Positive = Field(5000.0, description="resistance between the layers over the whole wet area")
+    grow_s: Positive = Field(30.0, description="time constant of the growing leak")
+    dry_s: Positive = Field(120.0, description="time constant of drying after the end")
 
-    def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> Contacts:
-        """Discs spread evenly over the area, as far as the pad reaches."""
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
+        """Draw the keys that are the kind's own."""
+        return {
+            "place": draws.position(rng, 0.2),
+            "radius_mm": float(rng.uniform(0.2, 0.5)) * min(size_mm),
+            "leak_ohm": draws.log_uniform(rng, 2e3, 3e4),
+            "grow_s": draws.log_uniform(rng, 10, 60),
+        }
+
+    def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> FaultContacts:
+        """Return discs spread evenly over the part of the area that lies on the pad."""
         number = np.arange(_LEAK_POINTS) + 0.5
-        out, angle = np.sqrt(number / _LEAK_POINTS), _GOLDEN * number
+        out, angle = np.sqrt(number / _LEAK_POINTS), _GOLDEN_ANGLE_RAD * number
         area = np.stack([out * np.cos(angle), out * np.sin(angle)], axis=1) * 1e-3 * self.radius_mm
-        place = np.array(self.place) + area / size_m
-        inside = ((place > 0.02) & (place < 0.98)).all(1)
+        position = np.array(self.place) + area / size_m
+        inside = ((position > 0.02) & (position < 0.98)).all(1)
         inside |= out == out[0]
         until = np.inf if self.until_s is None else self.until_s
         grown = -np.expm1(-np.clip(times_s, self.from_s, until) / self.grow_s + self.from_s / self.grow_s)
         dried = np.exp(-np.maximum(times_s - until, 0.0) / self.dry_s)
-        siemens = grown * dried * inside.sum() / _LEAK_POINTS / self.leak_ohm
+        conductance = grown * dried * inside.sum() / _LEAK_POINTS / self.leak_ohm
         radius = 1e-3 * self.radius_mm / _LEAK_POINTS**0.5
-        return Contacts(np.clip(place[inside], 0.02, 0.98), np.full(inside.sum(), radius), siemens=siemens)
+        return FaultContacts(
+            np.clip(position[inside], 0.02, 0.98), np.full(inside.sum(), radius), conductance_s=conductance
+        )
 
 
 class DeadElectrode(Fault):
-    """A broken wire: the electrode floats, and the other three share all of the current."""
+    """Broken wire: the electrode floats, and the other three carry all of the current."""
 
-    kind: Literal["dead_electrode"] = "dead_electrode"
+    kind: Literal[FaultKind.DEAD_ELECTRODE] = FaultKind.DEAD_ELECTRODE
     electrode: Electrode = Field(description="electrode whose wire is broken")
     open_ohm: Positive = Field(1e9, description="resistance of the break")
 
-    def rewire(self, wiring: Wiring) -> None:
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
+        """Draw the keys that are the kind's own."""
+        return {"electrode": draws.electrode(rng)}
+
+    def modify_wiring(self, wiring: Wiring) -> None:
         """Add the break to the electrode's resistor."""
-        wiring.series_ohm[_number(self.electrode)] += self.open_ohm
+        wiring.series_ohm[_electrode_index(self.electrode)] += self.open_ohm
 
 
 class ShortedElectrode(Fault):
-    """A short circuit of an electrode, to the conducting layer or to another electrode."""
+    """Short circuit of an electrode, to the conducting layer or to another electrode."""
 
-    kind: Literal["shorted_electrode"] = "shorted_electrode"
+    kind: Literal[FaultKind.SHORTED_ELECTRODE] = FaultKind.SHORTED_ELECTRODE
     electrode: Electrode = Field(description="electrode that is shorted")
-    to: Electrode | Literal["layer"] = Field("layer", description="what it touches")
+    to: Electrode | Literal["layer"] = Field("layer", description="what it is shorted to")
     short_ohm: Positive = Field(5.0, description="resistance of the short circuit")
     input_ohm: NonNegative = Field(
-        50.0, description="resistance of each amplifier's input, by which two shorted electrodes share"
+        50.0,
+        description="input resistance of each amplifier, which divides the current of two shorted electrodes",
     )
 
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
+        """Draw the keys that are the kind's own."""
+        one, other = rng.permutation(ELECTRODES)[:2].tolist()
+        to = "layer" if rng.random() < 0.5 else other
+        return {"electrode": one, "to": to, "short_ohm": draws.log_uniform(rng, 0.5, 20)}
+
     @model_validator(mode="after")
-    def _is_another(self) -> Self:
+    def _check_other_electrode(self) -> Self:
         if self.to == self.electrode:
             raise ValueError(f'to = "{self.to}" is the electrode itself; name another one or "layer"')
         return self
 
-    def rewire(self, wiring: Wiring) -> None:
+    def modify_wiring(self, wiring: Wiring) -> None:
         """Add the short circuit."""
-        one = _number(self.electrode)
+        one = _electrode_index(self.electrode)
         if self.to == "layer":
-            wiring.to_layer.append((one, self.short_ohm))
+            wiring.layer_shorts.append((one, self.short_ohm))
             return
-        other = _number(self.to)
-        wiring.between.append((one, other, self.short_ohm))
+        other = _electrode_index(self.to)
+        wiring.electrode_shorts.append((one, other, self.short_ohm))
         wiring.series_ohm[[one, other]] += self.input_ohm
 
 
 class SwappedCables(Fault):
-    """Cables plugged into each other's sockets."""
+    """Electrode cables plugged into the wrong sockets."""
 
-    kind: Literal["swapped_cables"] = "swapped_cables"
+    kind: Literal[FaultKind.SWAPPED_CABLES] = FaultKind.SWAPPED_CABLES
     order: Annotated[tuple[Electrode, Electrode, Electrode, Electrode], Field(strict=False)] = Field(
-        description="electrodes that are plugged in where x0, xa, y0, yb belong"
+        description="electrodes found on the channels of x0, xa, y0, yb"
     )
 
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
+        """Draw the keys that are the kind's own."""
+        order = list(ELECTRODES)
+        i, j = rng.permutation(4)[:2].tolist()
+        order[i], order[j] = order[j], order[i]
+        return {"order": tuple(order)}
+
     @model_validator(mode="after")
-    def _is_an_order(self) -> Self:
+    def _check_order(self) -> Self:
         if set(self.order) != set(ELECTRODES) or self.order == ELECTRODES:
             raise ValueError("order must name each of x0, xa, y0, yb once, and change their order")
         return self
 
     @property
-    def permutation(self) -> list[int]:
-        """Number of the electrode on each channel."""
-        return [_number(electrode) for electrode in self.order]
+    def channel_permutation(self) -> list[int]:
+        """Index of the electrode on each channel."""
+        return [_electrode_index(electrode) for electrode in self.order]
 
 
 class SaturatedChannel(Fault):
-    """A channel at an end of its range."""
+    """Channel at an end of its range."""
 
-    kind: Literal["saturated_channel"] = "saturated_channel"
+    kind: Literal[FaultKind.SATURATED_CHANNEL] = FaultKind.SATURATED_CHANNEL
     electrode: Electrode = Field(description="electrode of the channel")
-    high: bool = Field(True, description="whether at the upper end")
+    high: bool = Field(True, description="true: at the upper end; false: at the lower")
 
-    def freeze(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
-        """The limit."""
-        channel = _number(self.electrode)
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
+        """Draw the keys that are the kind's own."""
+        return {"electrode": draws.electrode(rng), "high": bool(rng.random() < 0.8)}
+
+    def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
+        """Set the channel to its limit."""
+        channel = _electrode_index(self.electrode)
         counts[:, channel] = limits[channel, int(self.high)]
 
 
 class StuckChannel(Fault):
-    """A channel that shows one count for ever."""
+    """Channel that always reads the same count."""
 
-    kind: Literal["stuck_channel"] = "stuck_channel"
+    kind: Literal[FaultKind.STUCK_CHANNEL] = FaultKind.STUCK_CHANNEL
     electrode: Electrode = Field(description="electrode of the channel")
-    count: int | None = Field(None, description="what it shows; left out: what it showed when it got stuck")
+    count: int | None = Field(None, description="the count; left out: the reading when it got stuck")
 
-    def freeze(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
-        """The count."""
-        channel = _number(self.electrode)
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
+        """Draw the keys that are the kind's own."""
+        count = int(rng.integers(-2000, 20_000)) if rng.random() < 0.3 else None
+        return {"electrode": draws.electrode(rng), "count": count}
+
+    def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
+        """Set the channel to the count."""
+        channel = _electrode_index(self.electrode)
         if self.count is not None:
             counts[:, channel] = np.clip(self.count, *limits[channel])
 
 
 class TornCorner(Fault):
-    """A corner of the sheet is cut off, straight across: what is beyond the cut conducts no more."""
+    """Corner of the sheet cut off along a straight line: no conduction beyond the cut."""
 
-    kind: Literal["torn_corner"] = "torn_corner"
+    kind: Literal[FaultKind.TORN_CORNER] = FaultKind.TORN_CORNER
     corner: Corner = Field(description="the corner between these electrodes")
-    along_x_mm: NonNegative = Field(description="how much of the side along x is gone")
-    along_y_mm: NonNegative = Field(description="how much of the side along y is gone")
+    along_x_mm: NonNegative = Field(description="lost length of the side along x")
+    along_y_mm: NonNegative = Field(description="lost length of the side along y")
+
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
+        """Draw the keys that are the kind's own."""
+        x_mm, y_mm = (float(rng.uniform(0.2, 0.5)) * side for side in size_mm)
+        return {"corner": str(rng.choice(_CORNERS)), "along_x_mm": x_mm, "along_y_mm": y_mm}
 
     @property
-    def cut(self) -> tuple[Corner, float, float]:
-        """The corner and the lost sides [m]."""
+    def cut_corner(self) -> tuple[Corner, float, float]:
+        """Corner, and the lost lengths of its sides [m]."""
         return self.corner, 1e-3 * self.along_x_mm, 1e-3 * self.along_y_mm
 
 
 class Offset(Fault):
-    """An amplifier's zero has jumped."""
+    """Step of an amplifier's zero."""
 
-    kind: Literal["offset"] = "offset"
+    kind: Literal[FaultKind.OFFSET] = FaultKind.OFFSET
     electrode: Electrode = Field(description="electrode of the channel")
-    counts: float = Field(description="how far")
+    counts: float = Field(description="size of the step")
 
-    def signal(self, counts: FloatArray) -> FloatArray:
-        """With the offset."""
-        counts[:, _number(self.electrode)] += self.counts
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
+        """Draw the keys that are the kind's own."""
+        counts = draws.log_uniform(rng, 60, 3000) * float(rng.choice([-1, 1]))
+        return {"electrode": draws.electrode(rng), "counts": counts}
+
+    def distort_counts(self, counts: FloatArray) -> FloatArray:
+        """Add the offset."""
+        counts[:, _electrode_index(self.electrode)] += self.counts
         return counts
 
 
 class GainStep(Fault):
-    """A channel's gain has changed."""
+    """Step of a channel's gain."""
 
-    kind: Literal["gain_step"] = "gain_step"
+    kind: Literal[FaultKind.GAIN_STEP] = FaultKind.GAIN_STEP
     electrode: Electrode = Field(description="electrode of the channel")
-    factor: Positive = Field(description="times the gain that it had")
+    factor: Positive = Field(description="new gain relative to the old one")
 
-    def signal(self, counts: FloatArray) -> FloatArray:
-        """With the new gain."""
-        counts[:, _number(self.electrode)] *= self.factor
+    @classmethod
+    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
+        """Draw the keys that are the kind's own."""
+        factor = draws.log_uniform(rng, 1.15, 2.0) ** float(rng.choice([-1, 1]))
+        return {"electrode": draws.electrode(rng), "factor": factor}
+
+    def distort_counts(self, counts: FloatArray) -> FloatArray:
+        """Apply the new gain."""
+        counts[:, _electrode_index(self.electrode)] *= self.factor
         return counts
 
 
 class Heat(Fault):
-    """Not a fault: something warm or cold is held, and the pad takes on its temperature."""
+    """Not a fault: the pad takes on the temperature of a warm or cold object in the hand."""
 
-    kind: Literal["heat"] = "heat"
-    warmer_by_k: float = Field(description="temperature that it tends to, above its own; negative: colder")
-    time_s: Positive = Field(40.0, description="time constant with which it warms, and cools again")
+    is_influence: ClassVar[bool] = True
+    kind: Literal[FaultKind.HEAT] = FaultKind.HEAT
+    warmer_by_k: float = Field(
+        description="temperature that the pad tends to, relative to its own; negative: colder"
+    )
+    time_s: Positive = Field(40.0, description="time constant of warming and cooling")
 
-    def warmer_k(self, times_s: FloatArray) -> FloatArray:
-        """Exponentially there and back."""
+    def temperature_rise_k(self, times_s: FloatArray) -> FloatArray:
+        """Return an exponential rise, and a decay after the end."""
         until = np.inf if self.until_s is None else self.until_s
         risen = -np.expm1((self.from_s - np.clip(times_s, self.from_s, until)) / self.time_s)
         return np.asarray(self.warmer_by_k * risen * np.exp(-np.maximum(times_s - until, 0.0) / self.time_s))
 
 
+_ALL = tuple(Fault.__subclasses__())
 FAULTS: Mapping[str, type[Fault]] = MappingProxyType(
-    {
-        "gum": Gum,
-        "moisture": Moisture,
-        "dead_electrode": DeadElectrode,
-        "shorted_electrode": ShortedElectrode,
-        "swapped_cables": SwappedCables,
-        "saturated_channel": SaturatedChannel,
-        "torn_corner": TornCorner,
-        "offset": Offset,
-        "stuck_channel": StuckChannel,
-        "gain_step": GainStep,
-    }
+    {it.fault_kind(): it for it in _ALL if not it.is_influence}
 )
-INFLUENCES: Mapping[str, type[Fault]] = MappingProxyType({"heat": Heat})
+"""By kind, as in a scenario file."""
+INFLUENCES: Mapping[str, type[Fault]] = MappingProxyType(
+    {it.fault_kind(): it for it in _ALL if it.is_influence}
+)
 
-Acting = Annotated[
-    Gum
-    | Moisture
-    | DeadElectrode
-    | ShortedElectrode
-    | SwappedCables
-    | SaturatedChannel
-    | TornCorner
-    | Offset
-    | StuckChannel
-    | GainStep
-    | Heat,
-    Field(discriminator="kind"),
-]
+if TYPE_CHECKING:
+    AnyFault = Fault
+else:
+    AnyFault = Annotated[Union[_ALL], Field(discriminator="kind")]  # noqa: UP007  of a tuple
 
 
-def _number(electrode: str) -> int:
+def _electrode_index(electrode: str) -> int:
     return ELECTRODES.index(electrode)
-
-
-def _gentle(part: FloatArray) -> FloatArray:
-    part = np.clip(part, 0.0, 1.0)
-    return np.asarray(part * part * (3 - 2 * part))

@@ -1,6 +1,6 @@
-"""Answers a controller's requests to a simulated gripper: ZeroMQ REP, msgpack maps (docs/simulate.md).
+"""Server for commands to a simulated gripper: ZeroMQ REP with msgpack maps (see docs/simulate.md).
 
-Public name: `GripperService`. A request that can't be used is refused with the reason.
+Public name: `GripperService`. A request that can't be executed is answered with the reason.
 """
 
 from __future__ import annotations
@@ -15,66 +15,79 @@ import zmq
 
 from handtouch.simulate.gripper import GripperWorld
 
-_LOOK_MS = 100
-_LARGEST_BYTES = 65_536
+_POLL_MS = 100
+_MAX_REQUEST_BYTES = 65_536
 
 
 class GripperService:
-    """A thread that answers at `endpoint` until `close`; `since_s` turns monotonic ns into the world's time.
+    """Thread that answers requests at `endpoint`, from `open` until `close`.
 
-    Raises ValueError for an endpoint that can't be had.
+    `elapsed_s` converts monotonic nanoseconds to the time of the world.
     """
 
-    def __init__(self, world: GripperWorld, since_s: Callable[[int], float], endpoint: str) -> None:
-        self._world, self._since_s = world, since_s
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, _LARGEST_BYTES)
-        try:
-            self._socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            self._socket.close()
-            raise ValueError(
-                f"--gripper {endpoint}: {error.strerror}; give a free one, e.g. tcp://127.0.0.1:5590"
-            ) from error
+    def __init__(self, world: GripperWorld, elapsed_s: Callable[[int], float], endpoint: str) -> None:
+        self._world, self._elapsed_s, self._endpoint = world, elapsed_s, endpoint
+        self._socket: zmq.Socket[bytes] | None = None
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="gripper", daemon=True)
+        self._thread: threading.Thread | None = None
+
+    def open(self) -> None:
+        """Bind the endpoint and start the thread. Raises ValueError if the endpoint can't be bound."""
+        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.MAXMSGSIZE, _MAX_REQUEST_BYTES)
+        try:
+            socket.bind(self._endpoint)
+        except zmq.ZMQError as error:
+            socket.close()
+            raise ValueError(
+                f"{self._endpoint}: {error.strerror}; choose a free endpoint, e.g. tcp://127.0.0.1:5590"
+            ) from error
+        self._socket = socket
+        self._thread = threading.Thread(target=self._run, args=(socket,), name="gripper", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop answering and release the endpoint."""
         self._stop.set()
-        self._thread.join()
-        self._socket.close()
+        if self._thread is not None:
+            self._thread.join()
+        if self._socket is not None:
+            self._socket.close()
 
-    def _run(self) -> None:
+    def _run(self, socket: zmq.Socket[bytes]) -> None:
         while not self._stop.is_set():
-            if self._socket.poll(_LOOK_MS):
-                self._socket.send(msgpack.packb(self._answer(self._socket.recv(), time.monotonic_ns())))
+            if socket.poll(_POLL_MS):
+                socket.send(msgpack.packb(self._answer(socket.recv(), time.monotonic_ns())))
 
-    def _answer(self, request: bytes, t_ns: int) -> dict[str, Any]:
+    def _answer(self, data: bytes, now_ns: int) -> dict[str, Any]:
         try:
-            asked = msgpack.unpackb(request)
-            if not isinstance(asked, dict):
-                raise ValueError("a request is a map")
-            self._do(asked, self._since_s(t_ns))
+            request = msgpack.unpackb(data)
+            if not isinstance(request, dict):
+                raise ValueError("a request must be a map")
+            self._execute(request, self._elapsed_s(now_ns))
         except KeyError as error:
             return {"ok": False, "error": f"the key {error} is missing"}
         except (ValueError, TypeError, AttributeError, msgpack.UnpackException) as error:
             return {"ok": False, "error": str(error) or type(error).__name__}
-        return {"ok": True, "t_ns": t_ns, "position_m": self._world.position_m, "truth": self._world.truth()}
+        return {
+            "ok": True,
+            "t_ns": now_ns,
+            "position_m": self._world.position_m,
+            "truth": self._world.truth(),
+        }
 
-    def _do(self, asked: dict[str, Any], t_s: float) -> None:
+    def _execute(self, request: dict[str, Any], t_s: float) -> None:
         world = self._world
-        match asked["do"]:
+        match request["do"]:
             case "move":
-                world.command(t_s, asked["velocity_m_s"])
-            case "look":
+                world.command_velocity(t_s, request["velocity_m_s"])
+            case "state":
                 world.advance(t_s)
             case "reset":
                 world.advance(t_s)
-                world.reset(asked["object"], **asked.get("numbers", {}))
+                world.reset(request["object"], **request.get("parameters", {}))
             case "pull":
-                world.pull(t_s, float(asked["force_n"]), float(asked.get("ramp_s", 0.0)))
+                world.pull_object(t_s, float(request["force_n"]), float(request.get("ramp_s", 0.0)))
             case other:
-                raise ValueError(f"can't {other!r}; can move, look, reset, pull")
+                raise ValueError(f"unknown command {other!r}; known: move, state, reset, pull")

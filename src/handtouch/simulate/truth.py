@@ -1,71 +1,70 @@
-"""What really happened to a simulated hand, one record a contact and sample; kept as JSON lines.
+"""Ground truth of a simulated hand: one record per contact and sample, stored as JSON lines.
 
-Public names: `Truth`, `write`, `read`.
+Public names: `GroundTruth`, `write_header`, `write_records`, `read_records`.
 """
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TextIO
 
 Vector = tuple[float, float, float]
-_HEADER = "wall_minus_monotonic_ns"
+_OFFSET_KEY = "wall_minus_monotonic_ns"
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
-    """One contact as it really was at one sample."""
+class GroundTruth:
+    """True state of one contact at one sample."""
 
     t_ns: int
-    """Host's monotonic time of the SYNC that the sample belongs to."""
+    """Time of the sample's SYNC, on the host's monotonic clock."""
     hand: str
     link: str
     touch: int
-    """Its number in the scenario, from 0."""
+    """Number of the touch in the scenario, from 0."""
     u_m: float
     v_m: float
     """Arc lengths on the pad from electrodes x0 and y0."""
     position_m: Vector
-    """In the frame of the link, as is `normal`."""
+    """In the link's frame, as is `normal`."""
     normal: Vector
     force_n: float
     radius_m: float
     currents_a: tuple[float, float, float, float]
-    """Into the channels x0, xa, y0, yb before gain, noise and rounding."""
+    """Currents of the channels x0, xa, y0, yb, before gain, noise and rounding."""
     bound_m: float
-    """Least rms location error that an unbiased estimate from this sample can have (Cramer-Rao)."""
+    """Cramer-Rao bound: smallest rms position error of an unbiased estimate from this sample."""
 
 
-def write_header(file: TextIO) -> None:
-    """First line of a file: what turns its times into those of a log with wall-clock stamps."""
-    file.write(json.dumps({_HEADER: time.time_ns() - time.monotonic_ns()}) + "\n")
+def write_header(file: TextIO, wall_minus_monotonic_ns: int) -> None:
+    """Write the first line: the clock offset that converts the file's times to wall-clock times."""
+    file.write(json.dumps({_OFFSET_KEY: wall_minus_monotonic_ns}) + "\n")
 
 
-def write(file: TextIO, records: Iterable[Truth]) -> None:
-    """Append records, a line each."""
+def write_records(file: TextIO, records: Iterable[GroundTruth]) -> None:
+    """Append records, one line each."""
     for record in records:
         file.write(json.dumps(asdict(record)) + "\n")
 
 
-def read(path: Path | str, *, wall: bool = False) -> list[Truth]:
-    """Read a file back; with `wall`, its times as those of a log recorded with wall-clock stamps.
+def read_records(path: Path | str, *, wall: bool = False) -> list[GroundTruth]:
+    """Read a file; with `wall`, convert its times to the wall clock, as in a log recorded with it.
 
     Raises ValueError naming the line that isn't a record.
     """
-    names = {field.name for field in fields(Truth)}
+    names = {field.name for field in fields(GroundTruth)}
     records = []
     with open(path, encoding="utf-8") as file:
-        offset_ns = json.loads(file.readline())[_HEADER] if wall else file.readline() and 0
+        offset_ns = json.loads(file.readline())[_OFFSET_KEY] if wall else file.readline() and 0
         for number, line in enumerate(file, 2):
             found = json.loads(line)
             if found.keys() != names:
-                raise ValueError(f"{path}: line {number} isn't a record of the truth")
+                raise ValueError(f"{path}: line {number} is not a ground-truth record")
             found["t_ns"] += offset_ns
             for name in ("position_m", "normal", "currents_a"):
                 found[name] = tuple(found[name])
-            records.append(Truth(**found))
+            records.append(GroundTruth(**found))
     return records

@@ -1,6 +1,6 @@
-"""What the simulator hides from the estimator: noise, tolerances of parts, the true size of contacts.
+"""Differences between the simulated hand and its deployment file: noise, tolerances, contact size, drift.
 
-Public names: `World`, `Parts`, `Climate`.
+Public names: `World`, `PadParts`, `ElectronicsDrift`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.canbus.objects.channels import ELECTRODES
-from handtouch.hand.pads import mount_of, rotation_of
+from handtouch.config.channels import ELECTRODES
+from handtouch.hand.pads import mount_transform, rotation_from_rpy
 from handtouch.sheet import S1, S2, SheetModel
 from handtouch.simulate import noise
 
@@ -24,52 +24,52 @@ Four = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Parts:
-    """One pad as it was really built; electrodes in the order x0, xa, y0, yb."""
+class PadParts:
+    """True parts of one pad; electrodes in the order x0, xa, y0, yb."""
 
     gain: Four
-    """Of the channels; 1 is as configured."""
+    """Channel gains relative to the configured ones."""
     series_ohm: Four
     gap_before_mm: Four
-    """Bare length of each electrode's side, along the surface, from the corner where y or x begins."""
+    """Bare length of each electrode's side, along the surface, at its low end (y = 0 or x = 0)."""
     gap_after_mm: Four
-    """The same, to the corner where y or x ends."""
+    """Bare length at its high end."""
 
 
 @dataclass(frozen=True)
 class World:
-    """How reality differs from the deployment file; the same seed makes the same world.
+    """True properties of a hand that its deployment file doesn't know; the same seed gives the same world.
 
-    Parts are spread evenly within their tolerances, contact radii and sheets normally. Sheets are ideal and
-    nothing drifts unless it is said so. Raises ValueError for a seed below 0.
+    Parts are distributed uniformly within their tolerances, contact radii and sheets normally. By default
+    sheets are ideal and nothing drifts. Raises ValueError for a seed below 0.
     """
 
     seed: int = 1
     noise_counts: float | None = None
-    """Standard deviation of a reading; None: that of the file."""
+    """Standard deviation of a reading; None: the configured one."""
     gain_tolerance: float = 0.02
     gap_tolerance_mm: float = 0.2
     resistor_tolerance: float = 0.05
-    radius_spread: float = 1.0
+    radius_std_ratio: float = 1.0
     """Standard deviation of a contact's radius, in units of the sheet's contact_radius_std_mm."""
     sheet: SheetModel | None = None
-    """How the sheets creep, fade and remember, as `handtouch.sheet.S1`; None: they don't."""
-    sheet_spread: float = 0.15
-    """Relative standard deviation, from pad to pad, of that model's times, share and threshold."""
-    drift_counts_per_s: float = 0.0
-    """How fast the zero of a channel wanders at most, each channel on its own."""
-    warmth_k_per_s: float = 0.0
-    """How fast the temperature of the whole hand wanders at most."""
+    """Sheet behaviour (creep, adaptation, hysteresis), e.g. `handtouch.sheet.S1`; None: ideal sheets."""
+    sheet_relative_std: float = 0.15
+    """Relative standard deviation between pads of the model's times, share and threshold."""
+    zero_drift_counts_per_s: float = 0.0
+    """Maximum drift rate of each channel's zero; channels drift independently."""
+    temperature_drift_k_per_s: float = 0.0
+    """Maximum drift rate of the hand's temperature."""
     offset_counts_per_k: float = 0.0
     """Standard deviation of the temperature coefficients of the channels' zeros."""
     gain_per_k: float = 0.0
     """Temperature coefficient of all gains."""
-    mount_mm: float = 0.0
-    """Standard deviation of where a pad sits on its link, along each axis."""
-    mount_deg: float = 0.0
-    """And of how it is turned, about each axis."""
-    supply_per_s: float = 0.0
-    """How fast the driving potential wanders at most, relative to itself."""
+    mount_std_mm: float = 0.0
+    """Standard deviation of a pad's mounting position on its link, per axis."""
+    mount_std_deg: float = 0.0
+    """Standard deviation of a pad's orientation on its link, per axis."""
+    supply_drift_per_s: float = 0.0
+    """Maximum relative drift rate of the supply voltage."""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -77,11 +77,11 @@ class World:
 
     @classmethod
     def ideal_parts(cls, seed: int = 1) -> World:
-        """Only noise and quantisation hidden: everything else is as the file says."""
+        """Return a world with noise and quantisation only; everything else is as configured."""
         return cls(seed, None, 0.0, 0.0, 0.0, 0.0)
 
-    def parts(self, hand: str, pad: config.Pad) -> Parts:
-        """The pad as built; depends on nothing but the seed, the names and the pad's own table."""
+    def parts(self, hand: str, pad: config.Pad) -> PadParts:
+        """Return a pad's true parts; they depend only on the seed, the names and the pad's own table."""
         drawn = np.random.default_rng((self.seed, zlib.crc32(f"{hand}/{pad.link}".encode()))).uniform(
             -1, 1, 16
         )
@@ -89,125 +89,138 @@ class World:
         series = np.array(pad.series_ohm) * (1 + self.resistor_tolerance * drawn[4:8])
         gaps = np.maximum(pad.gap_mm + self.gap_tolerance_mm * drawn[8:].reshape(2, 4), 0.0)
         before, after = gaps
-        return Parts(_four(gain), _four(series), _four(before), _four(after))
+        return PadParts(_as_four(gain), _as_four(series), _as_four(before), _as_four(after))
 
     def mount(self, hand: str, pad: config.Pad) -> tuple[FloatArray, FloatArray]:
-        """Rotation (3, 3) and translation (3,) [m] of the pad's frame in its link's, as it really is."""
-        rotation, translation = mount_of(pad)
-        if not (self.mount_mm or self.mount_deg):
+        """Return true rotation (3, 3) and translation (3,) [m] of the pad's frame in its link's frame."""
+        rotation, translation = mount_transform(pad)
+        if not (self.mount_std_mm or self.mount_std_deg):
             return rotation, translation
         drawn = np.random.default_rng((self.seed, zlib.crc32(f"mount/{hand}/{pad.link}".encode())))
-        off_m, turned_deg = 1e-3 * self.mount_mm * drawn.normal(size=3), self.mount_deg * drawn.normal(size=3)
-        return rotation @ rotation_of(np.radians(turned_deg)), translation + rotation @ off_m
+        offset_m, rotation_deg = (
+            1e-3 * self.mount_std_mm * drawn.normal(size=3),
+            self.mount_std_deg * drawn.normal(size=3),
+        )
+        return rotation @ rotation_from_rpy(np.radians(rotation_deg)), translation + rotation @ offset_m
 
-    def gain_of(self, serial: int) -> Four:
-        """Gains of the channels of a unit that is put in instead of another."""
+    def replacement_gain(self, serial: int) -> Four:
+        """Return the channel gains of a replacement node."""
         drawn = np.random.default_rng((self.seed, serial, 1)).uniform(-1, 1, 4)
-        return _four(1 + self.gain_tolerance * drawn)
+        return _as_four(1 + self.gain_tolerance * drawn)
 
     @classmethod
-    def drifting(cls, seed: int = 1, sheet: SheetModel = S2) -> World:
-        """Parts with tolerances, real sheets, and electronics that drift: an ordinary day."""
-        return cls(seed, sheet=sheet)._with_drift()
+    def with_drift(cls, seed: int = 1, sheet: SheetModel = S2) -> World:
+        """Return a world with tolerances, sheet behaviour and drifting electronics."""
+        return cls(seed, sheet=sheet)._add_drift()
 
     @classmethod
-    def named(cls, seed: int, *, tolerances: bool, sheet: str | None, drift: bool) -> World:
-        """As the command line has it; a sheet by its name, S1 or S2."""
+    def from_options(cls, seed: int, *, tolerances: bool, sheet: str | None, drift: bool) -> World:
+        """Return the world of the command line's options; `sheet` is the name of a preset, S1 or S2."""
         world = cls(seed) if tolerances else cls.ideal_parts(seed)
         if sheet:
             world = replace(world, sheet={"S1": S1, "S2": S2}[sheet])
-        return world._with_drift() if drift else world
+        return world._add_drift() if drift else world
 
-    def _with_drift(self) -> World:
+    def _add_drift(self) -> World:
         return replace(
             self,
-            drift_counts_per_s=0.05,
-            warmth_k_per_s=0.01,
+            zero_drift_counts_per_s=0.05,
+            temperature_drift_k_per_s=0.01,
             offset_counts_per_k=2.0,
             gain_per_k=1e-4,
-            supply_per_s=1e-5,
+            supply_drift_per_s=1e-5,
         )
 
-    def model(self, hand: str, link: str) -> SheetModel | None:
-        """The sheet of one pad."""
+    def sheet_model(self, hand: str, link: str) -> SheetModel | None:
+        """Return the true sheet behaviour of one pad; None: ideal."""
         if self.sheet is None:
             return None
         drawn = np.random.default_rng((self.seed, zlib.crc32(f"sheet/{hand}/{link}".encode())))
-        factors = np.exp(self.sheet_spread * drawn.standard_normal(6))
-        was, creep = self.sheet.adaptation, self.sheet.creep
+        factors = np.exp(self.sheet_relative_std * drawn.standard_normal(6))
+        nominal, creep = self.sheet.adaptation, self.sheet.creep
         adaptation = replace(
-            was,
-            share=np.maximum(1 - (1 - np.asarray(was.share)) * factors[0], 0.0),
-            time_s=np.asarray(was.time_s) * factors[1],
-            recovery_s=np.asarray(was.recovery_s) * factors[2],
-            threshold_n=np.asarray(was.threshold_n) * factors[3],
+            nominal,
+            share=np.maximum(1 - (1 - np.asarray(nominal.share)) * factors[0], 0.0),
+            time_s=np.asarray(nominal.time_s) * factors[1],
+            recovery_s=np.asarray(nominal.recovery_s) * factors[2],
+            threshold_n=np.asarray(nominal.threshold_n) * factors[3],
         )
         times = tuple(float(time_s * factors[4]) for time_s in creep.times_s)
-        warmth = self.sheet.temperature
+        temperature = self.sheet.temperature
         return replace(
             self.sheet,
             adaptation=adaptation,
             creep=replace(creep, times_s=times),
-            temperature=replace(warmth, gain_per_k=float(warmth.gain_per_k * factors[5])),
+            temperature=replace(temperature, gain_per_k=float(temperature.gain_per_k * factors[5])),
         )
 
-    def radius_mm(self, sheet: config.Sheet, touch: int) -> float:
-        """True radius of a contact; `touch` is its number in the scenario."""
+    def contact_radius_mm(self, sheet: config.Sheet, touch: int) -> float:
+        """Return the true radius of a contact; `touch` is its number in the scenario."""
         drawn = np.random.default_rng((self.seed, touch)).normal()
-        spread = self.radius_spread * sheet.contact_radius_std_mm
-        return max(sheet.contact_radius_mm + spread * drawn, 0.3 * sheet.contact_radius_mm)
+        std = self.radius_std_ratio * sheet.contact_radius_std_mm
+        return max(sheet.contact_radius_mm + std * drawn, 0.3 * sheet.contact_radius_mm)
 
 
-class Climate:
-    """What the electronics go through: zeros that wander each on its own, and what the whole hand shares.
+class ElectronicsDrift:
+    """Drift of the electronics: zeros of each channel, and temperature and supply of the whole hand.
 
-    Rows are pads. Functions of times (n,) from the start.
+    Rows are pads. All methods are functions of times (n,) since the start.
     """
 
     def __init__(self, world: World, names: Sequence[tuple[str, str]]) -> None:
         """names: hand and link of each row."""
         self._world = world
-        self.steady = not (world.drift_counts_per_s or world.warmth_k_per_s or world.supply_per_s)
-        self._zeros = np.array(
-            [noise.key(world.seed, "zero", *name, channel) for name in names for channel in ELECTRODES],
+        self.is_constant = not (
+            world.zero_drift_counts_per_s or world.temperature_drift_k_per_s or world.supply_drift_per_s
+        )
+        self._zero_keys = np.array(
+            [
+                noise.stream_key(world.seed, "zero", *name, channel)
+                for name in names
+                for channel in ELECTRODES
+            ],
             np.uint64,
         )
-        self._per_k = world.offset_counts_per_k * noise.normal(self._zeros, 0)
-        self._warmth, self._supply = (
-            np.array([noise.key(world.seed, name)]) for name in ("warmth", "supply")
+        self._offset_counts_per_k = world.offset_counts_per_k * noise.standard_normal(self._zero_keys, 0)
+        self._temperature_key, self._supply_key = (
+            np.array([noise.stream_key(world.seed, name)]) for name in ("warmth", "supply")
         )
 
-    def warmer_k(self, times_s: FloatArray) -> FloatArray:
-        """Temperature of the hand (n,) above that at the start."""
-        return np.asarray(self._walk(self._world.warmth_k_per_s, self._warmth, times_s)[0])
+    def temperature_rise_k(self, times_s: FloatArray) -> FloatArray:
+        """Return the hand's temperature (n,) relative to that at the start."""
+        return np.asarray(
+            self._bounded_walk(self._world.temperature_drift_k_per_s, self._temperature_key, times_s)[0]
+        )
 
-    def drive(self, times_s: FloatArray) -> FloatArray:
-        """Potential (n,) relative to what it should be."""
-        return np.asarray(1 + self._walk(self._world.supply_per_s, self._supply, times_s)[0])
+    def supply_ratio(self, times_s: FloatArray) -> FloatArray:
+        """Return the supply voltage (n,) relative to the nominal one."""
+        return np.asarray(
+            1 + self._bounded_walk(self._world.supply_drift_per_s, self._supply_key, times_s)[0]
+        )
 
-    def gain(self, times_s: FloatArray) -> FloatArray:
-        """Of all channels (n,), relative to what it was."""
-        return np.asarray(1 + self._world.gain_per_k * self.warmer_k(times_s))
+    def gain_ratio(self, times_s: FloatArray) -> FloatArray:
+        """Return the gain of all channels (n,) relative to that at the start."""
+        return np.asarray(1 + self._world.gain_per_k * self.temperature_rise_k(times_s))
 
-    def zero(self, times_s: FloatArray) -> FloatArray:
-        """Counts (n, rows, 4) that channels show without any current."""
-        walk = self._walk(self._world.drift_counts_per_s, self._zeros, times_s)
-        walk += self._per_k[:, None] * self.warmer_k(times_s)
-        return np.asarray(walk.T.reshape(len(times_s), len(self._zeros) // 4, 4))
+    def zero_counts(self, times_s: FloatArray) -> FloatArray:
+        """Return the counts (n, rows, 4) of channels without current."""
+        walk = self._bounded_walk(self._world.zero_drift_counts_per_s, self._zero_keys, times_s)
+        walk += self._offset_counts_per_k[:, None] * self.temperature_rise_k(times_s)
+        return np.asarray(walk.T.reshape(len(times_s), len(self._zero_keys) // 4, 4))
 
     @staticmethod
-    def _walk(rate: float, keys: NDArray[np.uint64], times_s: FloatArray) -> FloatArray:
-        """Walks (keys, n) from 0, never steeper than the rate."""
+    def _bounded_walk(rate: float, keys: NDArray[np.uint64], times_s: FloatArray) -> FloatArray:
+        """Return random walks (keys, n) that start at 0 and never exceed the rate."""
         if not rate:
             return np.zeros((len(keys), len(times_s)))
-        return np.asarray(rate * (noise.wander(keys, times_s) - _at_start(keys.tobytes())))
+        return np.asarray(rate * (noise.random_walk(keys, times_s) - _walk_at_start(keys.tobytes())))
 
 
 @lru_cache(maxsize=1024)
-def _at_start(keys: bytes) -> FloatArray:
-    return noise.wander(np.frombuffer(keys, np.uint64), 0.0)
+def _walk_at_start(keys: bytes) -> FloatArray:
+    return noise.random_walk(np.frombuffer(keys, np.uint64), 0.0)
 
 
-def _four(values: NDArray[np.float64]) -> Four:
+def _as_four(values: NDArray[np.float64]) -> Four:
     x0, xa, y0, yb = values.tolist()
     return x0, xa, y0, yb

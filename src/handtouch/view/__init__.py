@@ -1,1 +1,1 @@
-"""What a person sees of a running hand: lines for pipes and logs, a live page in the terminal."""
+"""Displays of a running hand: text lines, a live table in the terminal, a page in the browser."""

@@ -1,46 +1,64 @@
-"""The table of topics and their payloads; encode and decode two-part messages [topic, msgpack map].
+"""The wire contract: topics, their payloads, and the codec of two-part messages [topic, msgpack map].
 
-Payloads are what is felt (`touch`: `Contact`, `HandFrame`, `Percept`), how all fares (`condition`: `Health`,
-`Joints`, `Service`) and what it is made from (`source`: `Raw`, `TickInputs`, `State`, `Config`). `Message` is
-one of these, `Outgoing` one of these or `Packed`: both are in `topics`, with the table. `encode` and `decode`
-are in `codec`. Import all of them from here.
-`docs/wire.md` describes every field for readers in other languages. SI units; `t_ns` is the host's monotonic
-clock; a number that isn't known is nil, never NaN. Fields with a default are left out of a message that has
-none of them.
+Import all names from here, but those of inputs from `handtouch.wire.inputs`. Payloads about contacts:
+`Contact`, `HandFrame`, `Percept`; about pads, joints and the daemon: `Health`, `JointPositions`, `Service`;
+for recorders: `Raw`, `TickInputs`, `StateSnapshot`, `Config`.
+
+docs/wire.md describes every field for readers in other languages. SI units; `t_ns` is of the host's monotonic
+clock; an unknown number is nil, never NaN. Optional fields are left out where they have their default.
 """
 
-from handtouch.wire.codec import SCHEMA_VERSION, WireError, decode, encode, plain
-from handtouch.wire.condition import Health, Joints, Service
-from handtouch.wire.source import Config, Raw, State, TickInputs
-from handtouch.wire.topics import COLUMNS, INPUTS, TOPICS, Message, Outgoing, Packed, Topic, topic_of
-from handtouch.wire.touch import Contact, Floats9, HandFrame, PadState, Percept, Placing, Vector3
+from handtouch.wire.codec import SCHEMA_VERSION, WireError, decode, encode, to_map
+from handtouch.wire.columns import Column
+from handtouch.wire.contact import PERCEPT_KINDS, Contact, HandFrame, Matrix3, Percept, Vector3
+from handtouch.wire.health import Health, JointPositions, Service
+from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
+from handtouch.wire.sequence import SequenceTracker
+from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus
+from handtouch.wire.topics import (
+    COLUMNS,
+    JOINTS,
+    SERVICE,
+    TOPICS,
+    EncodedMessage,
+    Message,
+    OutgoingMessage,
+    Topic,
+    topic_of,
+)
 
 __all__ = [
     "COLUMNS",
-    "INPUTS",
+    "JOINTS",
+    "PERCEPT_KINDS",
     "SCHEMA_VERSION",
+    "SERVICE",
     "TOPICS",
+    "Column",
     "Config",
     "Contact",
-    "Floats9",
+    "EncodedMessage",
+    "ForceStatus",
+    "FrameStatus",
     "HandFrame",
     "Health",
-    "Joints",
+    "JointPositions",
+    "Matrix3",
     "Message",
-    "Outgoing",
-    "Packed",
+    "OutgoingMessage",
     "PadState",
     "Percept",
-    "Placing",
+    "PositionStatus",
     "Raw",
+    "SequenceTracker",
     "Service",
-    "State",
+    "StateSnapshot",
     "TickInputs",
     "Topic",
     "Vector3",
     "WireError",
     "decode",
     "encode",
-    "plain",
+    "to_map",
     "topic_of",
 ]

@@ -1,28 +1,29 @@
-"""Messages to and from the two parts that are sent, [topic, msgpack map]."""
+"""Encoding and decoding of two-part messages: [topic, msgpack map]."""
 
 from __future__ import annotations
 
 import math
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import MISSING, fields
+from functools import cache
 from operator import attrgetter
-from typing import Any, Union
+from typing import Any, NamedTuple, Union
 
 import msgpack
 
-from handtouch.wire.topics import COLUMNS, TOPICS, Message, Outgoing, Packed, topic_of
+from handtouch.wire.topics import COLUMNS, TOPICS, EncodedMessage, Message, OutgoingMessage, Topic, topic_of
 
 SCHEMA_VERSION = 1
-"""When it goes up: docs/wire.md, "Versions"."""
+"""Rules for raising it: docs/wire.md, "Versions"."""
 
 
 class WireError(ValueError):
-    """A message that doesn't keep the contract."""
+    """A message that violates the wire contract; the text names topic and key."""
 
 
-_BY_PREFIX = {topic.prefix: topic for topic in TOPICS}
+_TOPIC_OF_PREFIX = {topic.prefix: topic for topic in TOPICS}
 _DEFAULTS = {
     topic.payload: {f.name: f.default for f in fields(topic.payload) if f.default is not MISSING}
     for topic in TOPICS
@@ -34,7 +35,7 @@ _FIELDS = {
 
 
 def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
-    """Of several attributes, or of one: `attrgetter` makes a tuple of several only."""
+    """Return an attrgetter that always returns a tuple, for a single name too."""
     get = attrgetter(*names)
     return get if len(names) > 1 else lambda message: (get(message),)
 
@@ -47,96 +48,191 @@ _OPTIONAL = {
 _PACKER = msgpack.Packer()
 
 
-def encode(message: Outgoing) -> list[bytes]:
-    """The two parts of a message, ready for a ZeroMQ multipart send."""
-    if isinstance(message, Packed):
+def encode(message: OutgoingMessage) -> list[bytes]:
+    """Return the two parts of a message, for a ZeroMQ multipart send."""
+    if isinstance(message, EncodedMessage):
         return [message.topic.encode(), message.payload]
-    return [topic_of(message).encode(), _PACKER.pack(plain(message))]
+    return [topic_of(message).encode(), _PACKER.pack(to_map(message))]
 
 
-def plain(message: Outgoing) -> dict[str, Any]:
-    """The map that a message is sent as."""
-    if isinstance(message, Packed):
+def to_map(message: OutgoingMessage) -> dict[str, Any]:
+    """Return the map that is sent for a message."""
+    if isinstance(message, EncodedMessage):
         return dict(msgpack.unpackb(message.payload))
     kind = type(message)
     names, values = _FIELDS[kind]
-    told = dict(zip(names, values(message), strict=True))
+    payload = dict(zip(names, values(message), strict=True))
     if kind in _OPTIONAL:
         names, get, defaults = _OPTIONAL[kind]
         if (optional := get(message)) != defaults:
             pairs = zip(names, optional, defaults, strict=True)
-            told.update((name, value) for name, value, default in pairs if value != default)
-    return told
+            payload.update((name, value) for name, value, default in pairs if value != default)
+    return payload
 
 
-def decode(parts: typing.Sequence[bytes]) -> Message:
-    """The message in the two parts of a ZeroMQ message; unknown keys of the map are ignored.
+def decode(parts: Sequence[bytes]) -> Message:
+    """Decode the two parts of a ZeroMQ message; unknown keys of the map are ignored.
 
-    Raises WireError naming what is wrong with a malformed message, whatever its bytes.
+    Raises WireError naming the violation, for any bytes.
     """
+    received = unpack(parts, _TOPIC_OF_PREFIX)
+    topic, payload = received.topic, received.payload
+    message = topic.payload(**check_fields(received.name, payload, topic.payload))
+    if "links" in payload:
+        _check_columns(received.name, message)
+    if topic_of(message) != received.name:
+        raise WireError(f"{received.name}: payload belongs to {topic_of(message)}")
+    return typing.cast(Message, message)
+
+
+class Received(NamedTuple):
+    """A received message whose fields aren't checked yet."""
+
+    name: str
+    """full topic"""
+    topic: Topic
+    keys: list[str]
+    """parts of the topic after the prefix"""
+    payload: dict[Any, Any]
+
+
+def unpack(parts: Sequence[bytes], topics: Mapping[str, Topic]) -> Received:
+    """Look up the topic of a message by its prefix and unpack its map. Raises WireError, for any bytes."""
     if len(parts) != 2:
         raise WireError(f"{len(parts)} parts instead of [topic, payload]")
     name = parts[0].decode("utf-8", "replace")
-    prefix, *rest = name.split("/")
-    row = _BY_PREFIX.get(prefix)
-    if row is None or len(rest) != row.parts:
-        raise WireError(f"unknown topic {name[:80]!r}")
+    prefix, *keys = name.split("/")
+    topic = topics.get(prefix)
+    if topic is None or len(keys) != len(topic.keys) or not all(keys):
+        known = ", ".join(t.pattern for t in topics.values())
+        raise WireError(f"unknown topic {name[:80]!r}; the topics are {known}")
     try:
         payload = msgpack.unpackb(parts[1])
     except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:
         raise WireError(f"{name}: payload isn't msgpack: {error}") from error
     if not isinstance(payload, dict):
         raise WireError(f"{name}: payload isn't a map")
-    if payload.get("v") != SCHEMA_VERSION:
-        raise WireError(f"{name}: schema version {payload.get('v')!r}, this reader knows {SCHEMA_VERSION}")
-    message = row.payload(**_checked(name, payload, row.payload))
-    for column, (kind, elements) in COLUMNS.get(row.payload, {}).items():
-        size = len(getattr(message, column))
-        if size == 0 and column in _DEFAULTS[row.payload]:
-            continue
-        if size != len(message.links) * elements * int(kind[-1]):
-            raise WireError(f"{name}: {column} doesn't have one row of {elements} {kind} per link")
-    if topic_of(message) != name:
-        raise WireError(f"{name}: payload belongs to {topic_of(message)}")
-    return typing.cast(Message, message)
+    version = payload.get("v")
+    if type(version) is not int or version != SCHEMA_VERSION:
+        raise WireError(f"{name}: schema version v = {version!r:.20}; this reader supports {SCHEMA_VERSION}")
+    return Received(name, topic, keys, payload)
 
 
-def _checked(topic: str, payload: dict[Any, Any], kind: type[Any]) -> dict[str, Any]:
+def check_fields(name: str, payload: Mapping[Any, Any], kind: type[Any]) -> dict[str, Any]:
+    """Check a map against the fields of a payload class; return its constructor's arguments.
+
+    Raises WireError naming the first key that is missing or has the wrong type.
+    """
     values = {}
-    for name, check in _CHECKS[kind]:
-        if name not in payload:
-            if name in _DEFAULTS[kind]:
+    for key, check, expected, optional in _field_checkers(typing.cast(Hashable, kind)):
+        if key not in payload:
+            if optional:
                 continue
-            raise WireError(f"{topic}: {name} is missing")
+            raise WireError(f"{name}: {key} is missing")
         try:
-            values[name] = check(payload[name])
-        except (TypeError, ValueError):
-            given = type(payload[name]).__name__  # not the value: it may be nested too deeply to be told
-            raise WireError(f"{topic}: {name} can't be this {given}") from None
+            values[key] = check(payload[key])
+        except (TypeError, ValueError, OverflowError):
+            raise WireError(f"{name}: {key} must be {expected}, not {_describe(payload[key])}") from None
     return values
 
 
-def _check(kind: Any) -> Callable[[Any], Any]:
-    """A function that returns a value of the annotated type or raises TypeError."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+def _check_columns(name: str, message: Any) -> None:
+    rows = len(message.links)
+    for key, column in COLUMNS[type(message)].items():
+        size = len(getattr(message, key))
+        if size == 0 and key in _DEFAULTS[type(message)]:
+            continue
+        if size != rows * column.row_bytes:
+            raise WireError(
+                f"{name}: {key} must have one row of {column.elements} {column.dtype} for each of "
+                f"{rows} links, {rows * column.row_bytes} bytes, not {size}"
+            )
+
+
+@cache
+def _field_checkers(kind: Hashable) -> tuple[tuple[str, Callable[[Any], Any], str, bool], ...]:
+    """Return key, check, expected type and whether it may be left out, of each field of a payload class."""
+    hints = typing.get_type_hints(kind)
+    return tuple(
+        (f.name, _checker(hints[f.name]), _expected(hints[f.name]), f.default is not MISSING)
+        for f in fields(typing.cast(Any, kind))
+    )
+
+
+_TYPE_NAMES = {
+    int: "an integer",
+    float: "a number",
+    str: "a string",
+    bool: "true or false",
+    bytes: "binary",
+    dict: "a map",
+}
+
+
+def _expected(hint: Any) -> str:
+    """Describe an annotated type by the types of JSON and msgpack."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
-        inner = next(_check(argument) for argument in arguments if argument is not type(None))
-        return lambda value: None if value is None else inner(value)
+        inner = next(argument for argument in arguments if argument is not type(None))
+        return f"{_expected(inner)} or nil"
+    if _is_array(origin):
+        return "a list of numbers"
     if origin is tuple:
-        item = _check(arguments[0])
+        item = _expected(arguments[0]).split(" ", 1)[1]
+        plural = "values true or false" if arguments[0] is bool else f"{item.split(' ')[0]}s"
+        return f"a list of {'' if arguments[-1] is Ellipsis else f'{len(arguments)} '}{plural}"
+    return _TYPE_NAMES[origin or hint]
+
+
+def _describe(value: Any) -> str:
+    """Describe a received value by its type; not by its content, which may be nested too deeply to print."""
+    if value is None:
+        return "nil"
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return _TYPE_NAMES.get(type(value), type(value).__name__)
+
+
+def _is_array(origin: Any) -> bool:
+    return getattr(origin, "__name__", "") == "ndarray"  # numpy is imported only by payloads that use it
+
+
+def _checker(hint: Any) -> Callable[[Any], Any]:
+    """Return a function that returns a value of the annotated type, or raises TypeError or ValueError."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (Union, types.UnionType):
+        inner = next(_checker(argument) for argument in arguments if argument is not type(None))
+        return lambda value: None if value is None else inner(value)
+    if _is_array(origin):
+        return _check_array
+    if origin is tuple:
+        item = _checker(arguments[0])
         length = None if arguments[-1] is Ellipsis else len(arguments)
-        return lambda value: _tuple(value, item, length)
-    accepted = {float: (float, int)}.get(kind, (origin or kind,))
-    return lambda value: _scalar(value, accepted, kind is bool)
+        return lambda value: _check_tuple(value, item, length)
+    accepted = {float: (float, int)}.get(hint, (origin or hint,))
+    return lambda value: _check_scalar(value, accepted, hint is bool)
 
 
-def _tuple(value: Any, item: Callable[[Any], Any], length: int | None) -> tuple[Any, ...]:
+def _check_array(value: Any) -> Any:
+    import numpy as np
+
+    if not isinstance(value, list) or not all(type(item) is float or type(item) is int for item in value):
+        raise TypeError
+    array = np.array(value, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError
+    return array
+
+
+def _check_tuple(value: Any, item: Callable[[Any], Any], length: int | None) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple) or (length is not None and len(value) != length):
         raise TypeError
     return tuple(item(element) for element in value)
 
 
-def _scalar(value: Any, accepted: tuple[type, ...], boolean: bool) -> Any:
+def _check_scalar(value: Any, accepted: tuple[type, ...], boolean: bool) -> Any:
     if not isinstance(value, accepted) or (isinstance(value, bool) and not boolean):
         raise TypeError
     if accepted[0] is not float:
@@ -145,9 +241,3 @@ def _scalar(value: Any, accepted: tuple[type, ...], boolean: bool) -> Any:
     if not math.isfinite(number):
         raise ValueError
     return number
-
-
-_CHECKS = {
-    payload: tuple((name, _check(hint)) for name, hint in typing.get_type_hints(payload).items())
-    for payload in _FIELDS
-}

@@ -1,108 +1,107 @@
-"""The table of topics, what columns hold, and to which topic a message belongs."""
+"""The table of topics: payload, keys and rate of each; everything else about topics is derived from it.
+
+Public names: `Topic`, `TOPICS`, `COLUMNS`, `JOINTS`, `SERVICE`, `topic_of`, `EncodedMessage`, `Message`,
+`OutgoingMessage`.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from operator import attrgetter
+from typing import Any, cast
 
-from handtouch.wire.condition import Health, Joints, Service
-from handtouch.wire.source import Config, Raw, State, TickInputs
-from handtouch.wire.touch import Contact, HandFrame, Percept
+from handtouch.wire.columns import Column, columns_of
+from handtouch.wire.contact import Contact, HandFrame, Percept
+from handtouch.wire.health import Health, JointPositions, Service
+from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 
 
 @dataclass(frozen=True, slots=True)
-class Packed:
-    """A message whose payload is encoded already; `decode(encode(it))` tells what it is."""
+class EncodedMessage:
+    """A message whose payload is encoded already; decode(encode(message)) returns its typed form."""
 
     topic: str
     payload: bytes
 
 
-Message = Contact | HandFrame | Health | Percept | Raw | Joints | Service | TickInputs | State | Config
-Outgoing = Message | Packed
-
-_F4 = ("<f4", 1)
-COLUMNS: dict[type[Any], dict[str, tuple[str, int]]] = {
-    HandFrame: {
-        "state": ("<u1", 1),
-        "contact": ("<u4", 1),
-        "sample_ns": ("<i8", 1),
-        "current_a": _F4,
-        "position_m": ("<f4", 3),
-        "normal": ("<f4", 3),
-        "covariance_m2": ("<f4", 9),
-        "pad_m": ("<f4", 2),
-        "force_n": _F4,
-        "force_std_n": _F4,
-        "saturated": ("<u1", 1),
-        "residual": _F4,
-        "residual_std": _F4,
-        "group": ("<u4", 1),
-        "palm": ("<u1", 1),
-        "palm_position_m": ("<f4", 3),
-        "palm_normal": ("<f4", 3),
-        "palm_covariance_m2": ("<f4", 9),
-        "base": ("<u1", 1),
-        "base_position_m": ("<f4", 3),
-        "base_normal": ("<f4", 3),
-        "base_covariance_m2": ("<f4", 9),
-        "joints_age_s": _F4,
-        "unestimated": ("<u1", 1),
-        "doubtful": ("<u1", 1),
-    },
-    Raw: {"counts": ("<i8", 4), "sample_ns": ("<i8", 1), "fresh": ("<u1", 1)},
-}
-"""Payload -> column -> (type of its elements: order, kind, bytes; elements per row)."""
-
-INPUTS = {
-    "counts": ("<i8", 4),
-    "arrived_ns": ("<i8", 1),
-    "fresh": ("<u1", 1),
-    "node_state": ("<u1", 1),
-    "synchronous": ("<u1", 1),
-    "period_ns": ("<i8", 1),
-    "paced_ns": ("<i8", 1),
-}
-"""Columns of `TickInputs`, as in COLUMNS."""
+Message = (
+    Contact
+    | HandFrame
+    | Health
+    | Percept
+    | Raw
+    | JointPositions
+    | Service
+    | TickInputs
+    | StateSnapshot
+    | Config
+)
+OutgoingMessage = Message | EncodedMessage
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A row of the table: how a topic starts, how many parts follow, what it carries."""
+    """A row of the table of topics."""
 
     prefix: str
-    parts: int
     payload: type[Any]
-    rate: str
+    keys: tuple[str, ...]
+    """payload fields whose values follow the prefix, separated by slashes; two at most"""
+    published: str
+    """when messages are sent"""
+    period_s: float = math.inf
+    """longest time between two messages"""
+    min_period_s: float = 0.0
+    """shortest time between two messages; 0: limited by the tick only"""
+
+    @property
+    def pattern(self) -> str:
+        """Subscription pattern of all topics of this row, e.g. contact/*/*."""
+        return "/".join([self.prefix, *["*"] * len(self.keys)])
+
+    @property
+    def timeout_s(self) -> float:
+        """Time without a message after which its publisher counts as disconnected: three periods."""
+        return 3 * self.period_s
+
+    def formatter(self) -> Callable[[Any], str]:
+        """Return a function that returns the topic of a payload."""
+        prefix, getters = self.prefix, [attrgetter(key) for key in self.keys]
+        if not getters:
+            return lambda _: prefix
+        if len(getters) == 1:
+            (only,) = getters
+            return lambda message: f"{prefix}/{only(message)}"
+        first, second = getters
+        return lambda message: f"{prefix}/{first(message)}/{second(message)}"
 
 
+JOINTS = Topic("joints", JointPositions, ("hand",), "while the hand has a URDF", min_period_s=0.033)
+SERVICE = Topic("service", Service, (), "twice a second", period_s=0.5, min_period_s=0.5)
 TOPICS = (
-    Topic("contact", 2, Contact, "at each tick while touched, and at begin and end"),
-    Topic("hand", 1, HandFrame, "one per tick"),
-    Topic("health", 2, Health, "at every change, and once a second"),
-    Topic("percept", 2, Percept, "at every change, and while there is something to tell"),
-    Topic("raw", 1, Raw, "one per tick"),
-    Topic("joints", 1, Joints, "thirty a second, where the hand has a URDF"),
-    Topic("service", 0, Service, "twice a second"),
-    Topic("tick", 0, TickInputs, "one per tick"),
-    Topic("state", 0, State, "to who subscribes, and when something other than a tick changes it"),
-    Topic("config", 0, Config, "to who subscribes, and when it is read again"),
+    Topic("contact", Contact, ("hand", "link"), "at begin and end of a contact, and per tick in between"),
+    Topic("hand", HandFrame, ("hand",), "per tick"),
+    Topic("health", Health, ("hand", "link"), "at every change, and once a second", period_s=1.0),
+    Topic("percept", Percept, ("hand", "kind"), "at every change, and while a contact lasts"),
+    Topic("raw", Raw, ("hand",), "per tick"),
+    JOINTS,
+    SERVICE,
+    Topic("tick", TickInputs, (), "per tick"),
+    Topic("state", StateSnapshot, (), "on subscription, and when an event other than a tick changes it"),
+    Topic("config", Config, (), "on subscription, and on reload"),
 )
-_ALONE: dict[type[Any], str] = {topic.payload: topic.prefix for topic in TOPICS if not topic.parts}
+COLUMNS: dict[type[Any], dict[str, Column]] = {
+    topic.payload: columns for topic in TOPICS if (columns := columns_of(topic.payload))
+}
+"""Payload -> its columns by name."""
+_FORMATTERS = {topic.payload: topic.formatter() for topic in TOPICS}
 
 
-def topic_of(message: Outgoing) -> str:
-    """Topic that a message belongs to."""
-    if isinstance(message, Packed):
-        return message.topic
-    if isinstance(message, Contact):
-        return f"contact/{message.hand}/{message.link}"
-    if isinstance(message, Health):
-        return f"health/{message.hand}/{message.link}"
-    if isinstance(message, HandFrame):
-        return f"hand/{message.hand}"
-    if isinstance(message, Percept):
-        return f"percept/{message.hand}/{message.kind}"
-    if isinstance(message, Joints):
-        return f"joints/{message.hand}"
-    return f"raw/{message.hand}" if isinstance(message, Raw) else _ALONE[type(message)]
+def topic_of(message: OutgoingMessage) -> str:
+    """Return the topic of a message."""
+    formatter = _FORMATTERS.get(type(message))
+    if formatter is None:
+        return cast(EncodedMessage, message).topic
+    return formatter(message)

@@ -1,1 +1,1 @@
-"""One CAN bus: open it, receive, send, count; the slab that samples go to; SYNC on all buses."""
+"""CAN buses: opening, receiving, sending, counters, bus state and SYNC."""

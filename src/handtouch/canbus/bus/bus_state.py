@@ -1,6 +1,8 @@
-"""How a bus fares: error frames, exceptions and counters to one state in words, with a remedy.
+"""Fault confinement state of a bus from error frames, exceptions and counters, with a problem text and
+remedy.
 
-Public names: `BusState`, `Condition`, `Trouble`, `trouble_of`, `is_queue_full`.
+Public names: `BusState`, `ErrorState`, `BusFault`, `fault_from_exception`, `errno_from_exception`,
+`is_queue_full`.
 """
 
 from __future__ import annotations
@@ -14,21 +16,21 @@ from enum import Enum
 from typing import Any
 
 
-class Condition(Enum):
-    """Fault confinement of ISO 11898-1, and a bus that can't be reached at all."""
+class ErrorState(Enum):
+    """Error state as in ISO 11898-1, plus DOWN for an interface that can't be reached."""
 
     ACTIVE = "active"
-    WARNING = "warning"  # an error counter is at 96 or more
-    PASSIVE = "passive"  # at 128 or more
-    BUS_OFF = "bus-off"  # the transmit error counter has passed 255: the controller takes no part
+    WARNING = "warning"  # an error counter is 96 or more
+    PASSIVE = "passive"  # 128 or more
+    BUS_OFF = "bus-off"  # transmit error counter above 255: the controller neither sends nor receives
     DOWN = "down"
 
 
 @dataclass(frozen=True, slots=True)
-class Trouble:
-    """What an exception tells of the bus; ACTIVE where it was a bad frame and nothing worse."""
+class BusFault:
+    """Bus state implied by an exception; ACTIVE if only a frame was bad."""
 
-    condition: Condition
+    error_state: ErrorState
     text: str
 
 
@@ -61,94 +63,97 @@ _PROTOCOL_BITS = {
     0x10: "bit error",
     0x20: "overload",
 }
-_LOCATIONS = {0x08: "CRC error", 0x18: "CRC error", 0x19: "no acknowledge", 0x1B: "no acknowledge"}
+_FAULT_LOCATIONS = {0x08: "CRC error", 0x18: "CRC error", 0x19: "no acknowledge", 0x1B: "no acknowledge"}
 _KERNEL_LAYOUT = frozenset({"socketcan", "gs_usb"})
 _WARNING_LIMIT, _PASSIVE_LIMIT = 96, 128
 
-_CALM_FRAMES = 255
-"""Good frames in each direction after which no error counter is at 96: each takes one off (ISO 11898-1)."""
-_TOLD_NS = 2_000_000_000
-"""How long a full transmit queue stays in the reason."""
+_MIN_RECOVERY_FRAMES = 255
+"""Good frames in each direction that bring every error counter below 96: each decrements it (ISO 11898-1)."""
+_QUEUE_FULL_HOLD_NS = 2_000_000_000
+"""Time for which a full transmit queue stays in `problem`."""
 
-_DAMAGED = "check wiring, termination (120 ohm at both ends) and the bit rate of all nodes"
-_ALONE = "no other node acknowledges: is one connected, powered and at this bit rate?"
-_FAULTS = ("no acknowledge", "bit error", "form error", "stuff error", "CRC error", "bus error")
+_WIRING_REMEDY = "check wiring, termination (120 ohm at both ends) and the bit rate of all nodes"
+_NO_ACKNOWLEDGE_REMEDY = "no other node acknowledges: is one connected, powered and at this bit rate?"
+_FAULT_CAUSES = ("no acknowledge", "bit error", "form error", "stuff error", "CRC error", "bus error")
 
-_OFF_TEXT = re.compile(r"bus[ _-]?off", re.IGNORECASE)
-_FULL_TEXT = re.compile(r"(queue|buffer|fifo)[^.]*(full|overflow|overrun)|XMTFULL|TXBUFOFL", re.IGNORECASE)
+_BUS_OFF_PATTERN = re.compile(r"bus[ _-]?off", re.IGNORECASE)
+_QUEUE_FULL_PATTERN = re.compile(
+    r"(queue|buffer|fifo)[^.]*(full|overflow|overrun)|XMTFULL|TXBUFOFL", re.IGNORECASE
+)
 
 
 class BusState:
-    """State of one bus. `error_frame` what comes, `look` now and then; times in ns of one monotonic clock.
+    """State of one bus: call `handle_error_frame` for each error frame and `update` regularly.
 
-    `condition` and `since_ns` say how it is, `problem` why and what helps (empty when all is well), `causes`
-    how often each cause was told, `transmit_errors` and `receive_errors` the controller's counters.
-    `restart_ms` is the kernel's automatic restart after bus-off, 0 for none, None while unknown.
+    `error_state` : current state, since `since_ns` on the clock of the calls
+    `problem` : cause and remedy, empty if there is no problem
+    `causes` : number of error frames by cause
+    `transmit_errors`, `receive_errors` : the controller's error counters
+    `restart_ms` : the kernel's automatic restart after bus-off, 0 for none, None while unknown
     """
 
     def __init__(self, interface: str = "socketcan", channel: str = "can0") -> None:
-        self.condition = Condition.ACTIVE
+        self.error_state = ErrorState.ACTIVE
         self.since_ns = 0
         self.causes: Counter[str] = Counter()
         self.transmit_errors = self.receive_errors = 0
         self.restart_ms: int | None = None
         self._interface, self._channel = interface, channel
-        self._recent: Counter[str] = Counter()  # causes since the bus was active last
-        self._trouble: Trouble | None = None
-        self._frames_at = self._sent_at = 0  # the counters at the last error frame
-        self._full = 0
-        self._full_ns: int | None = None
-        self._now_ns = 0
+        self._recent_causes: Counter[str] = Counter()  # since the bus was error-active last
+        self._fault: BusFault | None = None
+        self._frames_at_error = self._sent_at_error = 0  # the counters at the last error frame
+        self._queue_full_count = 0
+        self._queue_full_ns: int | None = None
 
-    def error_frame(self, classes: int, data: bytes | bytearray, t_ns: int, frames: int, sent: int) -> None:
-        """Take an error frame; `frames` and `sent` are how many good ones have come and gone by then."""
-        self._frames_at, self._sent_at = frames, sent
+    def handle_error_frame(
+        self, classes: int, data: bytes | bytearray, arrival_ns: int, frames: int, sent: int
+    ) -> None:
+        """Evaluate an error frame; `frames` and `sent` count the good frames received and sent so far."""
+        self._frames_at_error, self._sent_at_error = frames, sent
         if self._interface not in _KERNEL_LAYOUT:
-            self._count(["error frame"])
+            self._count_causes(["error frame"])
             return
         data = bytes(data[:8]).ljust(8, b"\0")
-        self._count(_causes(classes, data))
+        self._count_causes(_causes(classes, data))
         if classes & _COUNTERS or ((data[6] or data[7]) and classes & (_CONTROLLER | _PROTOCOL)):
             self.transmit_errors, self.receive_errors = data[6], data[7]
-        condition = _condition(classes, data)
-        if condition is not None:
-            self._become(condition, t_ns)
+        error_state = _error_state(classes, data)
+        if error_state is not None:
+            self._set_error_state(error_state, arrival_ns)
 
-    def look(self, t_ns: int, frames: int, sent: int, full: int, trouble: Trouble | None) -> None:
-        """Draw conclusions from what has passed since: good frames, a full transmit queue (`full` times so
-        far), and what is wrong with the adapter now.
-        """
-        self._now_ns = t_ns
-        if full > self._full:
-            self._full, self._full_ns = full, t_ns
-        elif self._full_ns is not None and t_ns - self._full_ns > _TOLD_NS:
-            self._full_ns = None
-        before, self._trouble = self._trouble, trouble
-        if trouble is not None and trouble.condition is not Condition.ACTIVE:
-            if trouble.condition is Condition.BUS_OFF and self.condition is not Condition.BUS_OFF:
-                self._count(["bus-off"])
-            self._become(trouble.condition, t_ns)
-        elif self.condition is Condition.DOWN or (before is not None and before.condition is self.condition):
-            self._become(Condition.ACTIVE, t_ns)
-        elif self.condition is Condition.BUS_OFF and frames > self._frames_at:
-            self._become(Condition.ACTIVE, t_ns)  # a controller that is off receives nothing
-        elif self.condition in (Condition.WARNING, Condition.PASSIVE) and self._is_calm(frames, sent):
-            self._become(Condition.ACTIVE, t_ns)
+    def update(self, now_ns: int, frames: int, sent: int, queue_full: int, fault: BusFault | None) -> None:
+        """Update the state from counters of good frames and full transmit queues, and the present fault."""
+        if queue_full > self._queue_full_count:
+            self._queue_full_count, self._queue_full_ns = queue_full, now_ns
+        elif self._queue_full_ns is not None and now_ns - self._queue_full_ns > _QUEUE_FULL_HOLD_NS:
+            self._queue_full_ns = None
+        previous, self._fault = self._fault, fault
+        state = self.error_state
+        if fault is not None and fault.error_state is not ErrorState.ACTIVE:
+            if fault.error_state is ErrorState.BUS_OFF and state is not ErrorState.BUS_OFF:
+                self._count_causes(["bus-off"])
+            self._set_error_state(fault.error_state, now_ns)
+        elif state is ErrorState.DOWN or (previous is not None and previous.error_state is state):
+            self._set_error_state(ErrorState.ACTIVE, now_ns)
+        elif state is ErrorState.BUS_OFF and frames > self._frames_at_error:
+            self._set_error_state(ErrorState.ACTIVE, now_ns)  # a bus-off controller receives nothing
+        elif state in (ErrorState.WARNING, ErrorState.PASSIVE) and self._has_recovered(frames, sent):
+            self._set_error_state(ErrorState.ACTIVE, now_ns)
 
     @property
     def problem(self) -> str:
-        """Why the bus isn't well, and what helps; empty when it is."""
-        told = [self._why()] if self.condition is not Condition.ACTIVE else []
-        if not told and self._trouble is not None:
-            told.append(self._trouble.text)
-        if self._full_ns is not None and self.condition is not Condition.DOWN:
-            told.append(self._queue_full())
-        return "; ".join(told)
+        """Cause of a bad state and its remedy; empty if there is no problem."""
+        problems = [self._describe_error_state()] if self.error_state is not ErrorState.ACTIVE else []
+        if not problems and self._fault is not None:
+            problems.append(self._fault.text)
+        if self._queue_full_ns is not None and self.error_state is not ErrorState.DOWN:
+            problems.append(self._describe_queue_full())
+        return "; ".join(problems)
 
-    def figures(self) -> dict[str, Any]:
-        """All of it, for a message."""
+    def report(self) -> dict[str, Any]:
+        """Return the state as a map for the service message."""
         return {
-            "state": self.condition.value,
+            "state": self.error_state.value,
             "since_ns": self.since_ns,
             "problem": self.problem,
             "causes": dict(self.causes),
@@ -156,108 +161,115 @@ class BusState:
             "receive_errors": self.receive_errors,
         }
 
-    def _count(self, causes: Iterable[str]) -> None:
+    def _count_causes(self, causes: Iterable[str]) -> None:
         causes = list(causes)
         self.causes.update(causes)
-        self._recent.update(causes)
+        self._recent_causes.update(causes)
 
-    def _become(self, condition: Condition, t_ns: int) -> None:
-        if condition is Condition.ACTIVE:
-            self._recent.clear()
-        if condition is not self.condition:
-            self.condition, self.since_ns = condition, t_ns
+    def _set_error_state(self, error_state: ErrorState, now_ns: int) -> None:
+        if error_state is ErrorState.ACTIVE:
+            self._recent_causes.clear()
+        if error_state is not self.error_state:
+            self.error_state, self.since_ns = error_state, now_ns
 
-    def _is_calm(self, frames: int, sent: int) -> bool:
-        transmit = self._recent["transmit passive"] or self._recent["transmit warning"]
-        return frames - self._frames_at >= _CALM_FRAMES and (
-            not transmit or sent - self._sent_at >= _CALM_FRAMES
+    def _has_recovered(self, frames: int, sent: int) -> bool:
+        transmit = self._recent_causes["transmit passive"] or self._recent_causes["transmit warning"]
+        return frames - self._frames_at_error >= _MIN_RECOVERY_FRAMES and (
+            not transmit or sent - self._sent_at_error >= _MIN_RECOVERY_FRAMES
         )
 
-    def _why(self) -> str:
-        if self.condition is Condition.DOWN:
-            return self._down()
-        faults = Counter({cause: self._recent[cause] for cause in _FAULTS if self._recent[cause]})
-        most = faults.most_common(1)[0][0] if faults else ""
-        seen = [f"mostly {most}"] if most else []
+    def _describe_error_state(self) -> str:
+        if self.error_state is ErrorState.DOWN:
+            return self._describe_down()
+        faults = Counter(
+            {cause: self._recent_causes[cause] for cause in _FAULT_CAUSES if self._recent_causes[cause]}
+        )
+        most_frequent = faults.most_common(1)[0][0] if faults else ""
+        details = [f"mostly {most_frequent}"] if most_frequent else []
         if self.transmit_errors or self.receive_errors:
-            seen.append(f"error counters: transmit {self.transmit_errors}, receive {self.receive_errors}")
-        word = "bus-off" if self.condition is Condition.BUS_OFF else f"error-{self.condition.value}"
-        told = word + (f" ({', '.join(seen)})" if seen else "")
-        remedy = _ALONE if most == "no acknowledge" and self.condition is not Condition.BUS_OFF else _DAMAGED
-        return f"{told}: {remedy}" + (f"; {self._recovery()}" if self.condition is Condition.BUS_OFF else "")
+            details.append(f"error counters: transmit {self.transmit_errors}, receive {self.receive_errors}")
+        is_off = self.error_state is ErrorState.BUS_OFF
+        state = "bus-off" if is_off else f"error-{self.error_state.value}"
+        if details:
+            state += f" ({', '.join(details)})"
+        alone = most_frequent == "no acknowledge" and not is_off
+        remedy = _NO_ACKNOWLEDGE_REMEDY if alone else _WIRING_REMEDY
+        return f"{state}: {remedy}" + (f"; {self._describe_recovery()}" if is_off else "")
 
-    def _recovery(self) -> str:
+    def _describe_recovery(self) -> str:
         if self._interface != "socketcan":
-            return "the adapter is closed and opened again until it works"
+            return "the adapter is reopened until it works"
         if self.restart_ms:
             return f"the kernel restarts {self._channel} after {self.restart_ms} ms"
         name = self._channel
         return (
-            f"{name} stays off until `ip link set {name} type can restart`; to have the kernel do it: "
+            f"{name} stays off until `ip link set {name} type can restart`; for automatic restart: "
             f"ip link set {name} down && ip link set {name} up type can restart-ms 100"
         )
 
-    def _down(self) -> str:
-        text = self._trouble.text if self._trouble is not None else "down"
+    def _describe_down(self) -> str:
+        text = self._fault.text if self._fault is not None else "down"
         if self._interface == "socketcan":
-            return f"{text}: ip link set {self._channel} up, or plug the adapter in; it is used again then"
-        return f"{text}: plug the adapter in; it is opened again until it works"
+            return f"{text}: ip link set {self._channel} up, or plug the adapter in; reception then resumes"
+        return f"{text}: plug the adapter in; it is reopened until it works"
 
-    def _queue_full(self) -> str:
-        remedy = _ALONE
+    def _describe_queue_full(self) -> str:
+        remedy = _NO_ACKNOWLEDGE_REMEDY
         if self._interface == "socketcan":
             remedy += f" If so, a longer queue helps: ip link set {self._channel} txqueuelen 128"
-        return f"transmit queue full, {self._full} frames not sent: {remedy}"
+        return f"transmit queue full, {self._queue_full_count} frames not sent: {remedy}"
 
 
-def trouble_of(error: BaseException) -> Trouble:
-    """What an exception of a python-can interface tells of the bus."""
+def fault_from_exception(error: BaseException) -> BusFault:
+    """Return the fault that an exception of a python-can interface stands for."""
     text = str(error) or type(error).__name__
-    if _OFF_TEXT.search(text):
-        return Trouble(Condition.BUS_OFF, text)
-    gone = code_of(error) in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
-    return Trouble(Condition.DOWN if gone else Condition.ACTIVE, text)
+    if _BUS_OFF_PATTERN.search(text):
+        return BusFault(ErrorState.BUS_OFF, text)
+    is_down = errno_from_exception(error) in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
+    return BusFault(ErrorState.DOWN if is_down else ErrorState.ACTIVE, text)
 
 
 def is_queue_full(error: BaseException) -> bool:
-    """Whether sending failed because the transmit queue had no room, by errno or by the driver's words."""
-    return code_of(error) in (errno.ENOBUFS, errno.EAGAIN) or bool(_FULL_TEXT.search(str(error)))
+    """Return True if sending failed because the transmit queue was full, by errno or by the driver's text."""
+    return errno_from_exception(error) in (errno.ENOBUFS, errno.EAGAIN) or bool(
+        _QUEUE_FULL_PATTERN.search(str(error))
+    )
 
 
-def code_of(error: BaseException) -> int | None:
-    """The errno of an exception of python-can or of the system, if it has one."""
+def errno_from_exception(error: BaseException) -> int | None:
+    """Return the errno of an exception of python-can or of the system, None if it has none."""
     code = getattr(error, "errno", None) or getattr(error, "error_code", None)
     return code if isinstance(code, int) else None
 
 
 def _causes(classes: int, data: bytes) -> list[str]:
-    """Causes that an error frame tells, each once."""
+    """Return the causes in an error frame, each once."""
     causes = {name: None for bit, name in _CLASSES.items() if classes & bit}
     if classes & _CONTROLLER:
         causes |= {name: None for bit, name in _CONTROLLER_BITS.items() if data[1] & bit}
     if classes & _PROTOCOL:
         causes |= {name: None for bit, name in _PROTOCOL_BITS.items() if data[2] & bit}
-        if data[3] in _LOCATIONS:
-            causes[_LOCATIONS[data[3]]] = None
+        if data[3] in _FAULT_LOCATIONS:
+            causes[_FAULT_LOCATIONS[data[3]]] = None
     return list(causes) or ["unspecified"]
 
 
-def _condition(classes: int, data: bytes) -> Condition | None:
-    """The state that an error frame tells; None where it tells none."""
+def _error_state(classes: int, data: bytes) -> ErrorState | None:
+    """Return the state reported by an error frame, None if it reports none."""
     if classes & _RESTARTED:
-        return Condition.ACTIVE
+        return ErrorState.ACTIVE
     if classes & _BUS_OFF:
-        return Condition.BUS_OFF
+        return ErrorState.BUS_OFF
     bits = data[1] if classes & _CONTROLLER else 0
     if bits & _PASSIVE_BITS:
-        return Condition.PASSIVE
+        return ErrorState.PASSIVE
     if bits & _WARNING_BITS:
-        return Condition.WARNING
+        return ErrorState.WARNING
     if bits & _ACTIVE_BIT:
-        return Condition.ACTIVE
+        return ErrorState.ACTIVE
     if classes & _COUNTERS:
         worst = max(data[6], data[7])
         if worst >= _PASSIVE_LIMIT:
-            return Condition.PASSIVE
-        return Condition.WARNING if worst >= _WARNING_LIMIT else Condition.ACTIVE
+            return ErrorState.PASSIVE
+        return ErrorState.WARNING if worst >= _WARNING_LIMIT else ErrorState.ACTIVE
     return None

@@ -1,7 +1,7 @@
-"""Expected load of a CAN bus, from its bit rate, the pads on it and the periods of SYNC and heartbeat.
+"""Expected load of a CAN bus from its bit rate, its number of pads and the periods of SYNC and heartbeat.
 
-Public names: `frame_bits`, `bus_load`, `burst_s`. Every figure is the worst case of bit
-stuffing, so a real bus carries somewhat less.
+Public names: `frame_bits`, `bus_load`, `burst_s`. All figures assume worst-case bit stuffing, so a real bus
+carries somewhat less.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ HEARTBEAT_DATA_BYTES = 1
 
 
 def frame_bits(data_bytes: int) -> int:
-    """Bits on the wire of a data frame with an 11-bit identifier, with interframe space and all stuff bits.
+    """Return the bits of a data frame with an 11-bit identifier, interframe space and all stuff bits.
 
     44 bits of frame, 3 of space and 8 a byte; of these the first 34 + 8 a byte are stuffed, at worst after
     every fourth bit (ISO 11898-1). Raises ValueError outside 0 to 8 bytes.
@@ -22,9 +22,9 @@ def frame_bits(data_bytes: int) -> int:
 
 
 def bus_load(bit_rate: float, pads: int, sync_period_s: float, heartbeat_s: float) -> float:
-    """Fraction of a bus that SYNC, one sample of each pad per SYNC and the pads' heartbeats take (1: full).
+    """Return the bus load of SYNC, one sample of each pad per SYNC and the nodes' heartbeats (1: full).
 
-    `bit_rate` in bit/s. Start-up (some 30 SDO frames a node) and foreign traffic come on top.
+    `bit_rate` in bit/s. Start-up (some 30 SDO frames per node) and other traffic add to it.
     """
     cycle = frame_bits(0) + pads * frame_bits(SAMPLE_DATA_BYTES)
     heartbeats = pads * frame_bits(HEARTBEAT_DATA_BYTES)
@@ -32,5 +32,5 @@ def bus_load(bit_rate: float, pads: int, sync_period_s: float, heartbeat_s: floa
 
 
 def burst_s(bit_rate: float, pads: int) -> float:
-    """Seconds from the start of SYNC until every pad's sample has passed, without other traffic."""
+    """Return the seconds from the start of SYNC to the end of the last sample, without other traffic."""
     return (frame_bits(0) + pads * frame_bits(SAMPLE_DATA_BYTES)) / bit_rate

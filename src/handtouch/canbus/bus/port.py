@@ -1,6 +1,6 @@
-"""One CAN bus: open it by python-can's interface name and channel, receive, send, count.
+"""A CAN bus, opened by python-can's interface name and channel: receive, send, counters, state.
 
-Public names: `Port`, `open_bus`, `BusError`.
+Public names: `Port`, `open_bus`, `BusError`, `query_restart_ms`.
 """
 
 from __future__ import annotations
@@ -14,211 +14,223 @@ from typing import Any
 
 import can
 
+from handtouch.canbus.bus.bus_state import (
+    BusState,
+    ErrorState,
+    errno_from_exception,
+    fault_from_exception,
+    is_queue_full,
+)
+from handtouch.canbus.bus.load import frame_bits
+from handtouch.canbus.bus.receivers import (
+    CyclicSender,
+    InProcessReceiver,
+    QueuedReceiver,
+    Receiver,
+    ThreadReceiver,
+)
+from handtouch.canbus.bus.router import BusCounters, CanFrame, Router
+from handtouch.canbus.bus.sockets import DatagramReceiver, SocketcanReceiver
 from handtouch.config import Bus
+from handtouch.core.slab import Slab
 
-from .bus_state import BusState, Condition, code_of, is_queue_full, trouble_of
-from .load import frame_bits
-from .receivers import CyclicSender, InProcessReceiver, QueuedReceiver, Receiver, ThreadReceiver
-from .router import Counters, Frame, Router
-from .slab import Slab
-from .sockets import DatagramReceiver, SocketcanReceiver
-
-_ECHOES = frozenset({"udp_multicast"})  # what we send comes back and is counted there
-_OWN_BIT_RATE = frozenset({"socketcan", "udp_multicast", "virtual"})  # python-can can't set it there
+_ECHOING_INTERFACES = frozenset({"udp_multicast"})
+"""Interfaces on which sent frames are received, and counted, again."""
+_INTERFACES_WITHOUT_BITRATE = frozenset({"socketcan", "udp_multicast", "virtual"})
+"""Interfaces whose bit rate python-can can't set."""
 
 
 class BusError(OSError):
-    """A bus that can't be opened; `str` names the bus, its interface and channel, and a remedy."""
+    """A bus can't be opened; `str` names the bus, its interface and channel, and a remedy."""
 
 
 class Port:
-    """A bus in use. Receive in one thread; `send` is safe from any.
+    """A bus in use. Receive in one thread; `send` may be called from any thread.
 
-    `echoes` says whether frames that we send are received, too.
+    `echoes`: sent frames are received, too.
     """
 
     def __init__(self, bus: Bus, receiver: Receiver, slab: Slab) -> None:
-        """Use a receiver that is open already; `Port.open` makes one from a bus's description."""
+        """Use an open receiver; `Port.open` makes one from a bus of the deployment."""
         self.name = bus.name
         self.bus = bus
-        self.router = Router(slab)
-        self.router.state = BusState(bus.interface, str(bus.channel))
-        self.echoes = bus.interface in _ECHOES
+        self.router = Router(slab, BusState(bus.interface, str(bus.channel)))
+        self.echoes = bus.interface in _ECHOING_INTERFACES
         self._receiver = receiver
         self._send_lock = threading.Lock()
-        self._was_off = False
+        self._was_bus_off = False
 
     @classmethod
     def open(cls, bus: Bus, slab: Slab) -> Port:
-        """Open a bus; samples will be written to `slab`. Raises BusError if it can't be opened."""
+        """Open a bus whose samples are written to `slab`. Raises BusError if it can't be opened."""
 
         def opener() -> can.BusABC:
             return open_bus(bus)
 
         try:
-            receiver = _receiver(bus, opener)
+            receiver = _open_receiver(bus, opener)
         except BusError:
             raise
-        except Exception as error:  # as in `open_bus`: it is there, but can't be received from
-            raise _unopened(bus, error) from error
+        except Exception as error:  # drivers raise anything; the bus exists, but can't be received from
+            raise _open_error(bus, error) from error
         return cls(bus, receiver, slab)
 
     @property
-    def is_queue(self) -> bool:
-        """Whether frames wait in this process, so that to `drain` asks nobody else."""
+    def has_local_queue(self) -> bool:
+        """True if received frames wait in a queue of this process, so that `drain` makes no system call."""
         return isinstance(self._receiver, QueuedReceiver)
 
     @property
     def slab(self) -> Slab:
-        """Where samples go; several ports may share one."""
+        """Slab that samples are written to; several ports may share one."""
         return self.router.slab
 
     @property
-    def counters(self) -> Counters:
-        """What this bus has carried."""
+    def counters(self) -> BusCounters:
+        """Counters of this bus."""
         return self.router.counters
 
     @property
-    def state(self) -> BusState:
-        """How the bus fares, as of the last `look`."""
-        return self.router.state
+    def bus_state(self) -> BusState:
+        """State of the bus as of the last `update_state`."""
+        return self.router.bus_state
 
     @property
     def problem(self) -> str:
-        """What is wrong with the bus (interface down, bus-off …) and what helps; empty when nothing is."""
-        return self.state.problem
+        """Problem of the bus (interface down, bus-off ...) and its remedy; empty if there is none."""
+        return self.bus_state.problem
 
-    def look(self, t_ns: int) -> BusState:
-        """Take in what has happened to the bus since the last look; cheap enough for every tick."""
-        counters, state = self.router.counters, self.router.state
-        state.look(t_ns, counters.frames, counters.sent, counters.queue_full, self._receiver.trouble)
-        off = state.condition is Condition.BUS_OFF
-        if off and not self._was_off and self.bus.interface == "socketcan":
-            threading.Thread(target=self._ask_restart, name="can-restart-ms", daemon=True).start()
-        self._was_off = off
+    def update_state(self, now_ns: int) -> BusState:
+        """Update the bus state from counters and the receiver's fault; cheap enough for every tick."""
+        counters, state = self.router.counters, self.router.bus_state
+        state.update(now_ns, counters.frames, counters.sent, counters.queue_full, self._receiver.fault)
+        is_off = state.error_state is ErrorState.BUS_OFF
+        if is_off and not self._was_bus_off and self.bus.interface == "socketcan":
+            threading.Thread(target=self._query_restart_ms, name="can-restart-ms", daemon=True).start()
+        self._was_bus_off = is_off
         return state
 
     def fileno(self) -> int:
-        """Descriptor that is readable while frames wait; the same for the port's whole life."""
+        """Return a descriptor that is readable while frames are waiting; it never changes."""
         return self._receiver.fileno()
 
     def route(self, can_id: int, slot: int) -> None:
-        """Samples with this identifier go straight to that slot of the slab; see `Router.route`."""
+        """Write samples with this identifier to a slot of the slab; see `Router.route`."""
         self.router.route(can_id, slot)
 
-    def drain(self) -> list[Frame]:
-        """Read what waits, at most a few thousand frames, without blocking.
+    def drain(self) -> list[CanFrame]:
+        """Read the waiting frames, at most MAX_DRAIN_FRAMES, without blocking.
 
-        Samples are in the slab then; all other data frames are returned. Call it when `fileno` is readable
-        and at least once a tick: a bus that is gone is opened again from here.
+        Samples are written to the slab; all other data frames are returned. Call it when `fileno` is readable
+        and at least once a tick, since it also reopens a disconnected bus.
         """
         return self._receiver.drain(self.router)
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> bool:
-        """Send a frame; a full queue or a bus that is down is counted, never raised. True if it went out.
+        """Send a frame; return False, and count it, if the queue is full or the bus is down.
 
-        A remote frame asks for as many bytes as `data` has, whatever they are.
+        A remote frame requests as many bytes as `data` has.
         """
         counters, receiver = self.router.counters, self._receiver
         with self._send_lock:
             try:
                 receiver.send(can_id, data, remote)
-            except Exception as error:  # noqa: BLE001 - drivers raise anything; it is counted, and told in `look`
-                self._not_sent(error)
+            except Exception as error:  # noqa: BLE001 - drivers raise anything; `update_state` reports it
+                self._count_send_failure(error)
                 return False
             counters.sent += 1
             if not self.echoes:
                 counters.bits += frame_bits(0 if remote else len(data))
-        if receiver.trouble is not None and receiver.trouble.condition is Condition.DOWN:
-            receiver.trouble = None  # where nobody sends, no frame will show that the interface is up again
+        if receiver.fault is not None and receiver.fault.error_state is ErrorState.DOWN:
+            receiver.fault = None  # on a silent bus no received frame would show that the interface is up
         return True
 
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
-        """Have the kernel send a frame now and every `period_s` seconds, if there is a kernel that can.
+        """Have the kernel send a frame now and every `period_s` seconds.
 
-        None if not; then `problem` may say why.
+        None where it can't; `problem` may then have the cause.
         """
         try:
             return self._receiver.send_cyclically(can_id, data, period_s)
-        except Exception as error:  # noqa: BLE001 - as above
-            self._not_sent(error)
+        except Exception as error:  # noqa: BLE001 - drivers raise anything
+            self._count_send_failure(error)
             return None
 
     def close(self) -> None:
-        """Give the bus back."""
+        """Close the bus."""
         self._receiver.close()
 
-    def _not_sent(self, error: Exception) -> None:
-        """Count it; a send also shows sooner than `recv` that the bus is down."""
+    def _count_send_failure(self, error: Exception) -> None:
+        """Count a failed send and keep its fault: sending detects a down bus sooner than receiving."""
         if is_queue_full(error):
             self.router.counters.queue_full += 1
             return
         self.router.counters.send_failures += 1
-        told = trouble_of(error)
-        if told.condition is not Condition.ACTIVE and self._receiver.trouble is None:
-            self._receiver.trouble = told
+        fault = fault_from_exception(error)
+        if fault.error_state is not ErrorState.ACTIVE and self._receiver.fault is None:
+            self._receiver.fault = fault
 
-    def _ask_restart(self) -> None:
-        """In a thread of its own: starting a program takes milliseconds."""
-        self.state.restart_ms = restart_ms(str(self.bus.channel))
+    def _query_restart_ms(self) -> None:
+        """Query the kernel's restart delay; in a thread, since starting a program takes milliseconds."""
+        self.bus_state.restart_ms = query_restart_ms(str(self.bus.channel))
 
 
 def open_bus(bus: Bus) -> can.BusABC:
-    """python-can's bus for a bus of the deployment. Raises BusError if it can't be opened."""
+    """Open the python-can bus for a bus of the deployment. Raises BusError if it can't be opened."""
     options: dict[str, Any] = dict(bus.options)
-    if bus.interface not in _OWN_BIT_RATE:
+    if bus.interface not in _INTERFACES_WITHOUT_BITRATE:
         options.setdefault("bitrate", bus.bitrate_bit_s)
     try:
         return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
-    except Exception as error:  # drivers raise anything; all of it means that the bus is not there
-        raise _unopened(bus, error) from error
+    except Exception as error:  # drivers raise anything
+        raise _open_error(bus, error) from error
 
 
-def restart_ms(channel: str) -> int | None:
-    """After how long the kernel restarts a SocketCAN interface by itself after bus-off, ms; 0: never.
+def query_restart_ms(channel: str) -> int | None:
+    """Return the delay after which the kernel restarts a SocketCAN interface after bus-off [ms], 0 for never.
 
-    None where that isn't known: without iproute2, or an interface that can't go bus-off.
+    None if unknown: without iproute2, or for an interface that can't go bus-off.
     """
     command = ["ip", "-details", "-json", "link", "show", "dev", channel]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-        link = json.loads(done.stdout)[0]["linkinfo"]
+        process = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        link = json.loads(process.stdout)[0]["linkinfo"]
         return int(link["info_data"].get("restart_ms", 0)) if link["info_kind"] == "can" else None
     except (OSError, ValueError, LookupError, TypeError, subprocess.SubprocessError):
         return None
 
 
-def _receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
+def _open_receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
     if bus.interface == "socketcan":
-        return SocketcanReceiver(opener, str(bus.channel))
+        return SocketcanReceiver(opener, str(bus.channel)).open()
     if bus.interface == "udp_multicast":
-        return DatagramReceiver(opener)
+        return DatagramReceiver(opener).open()
     if bus.interface == "virtual":
-        return InProcessReceiver(opener)
-    return ThreadReceiver(opener, bus.interface)
+        return InProcessReceiver(opener).open()
+    return ThreadReceiver(opener, bus.interface).open()
 
 
-def _unopened(bus: Bus, error: Exception) -> BusError:
+def _open_error(bus: Bus, error: Exception) -> BusError:
     return BusError(
         f'bus "{bus.name}" (interface {bus.interface}, channel {bus.channel}) can\'t be opened: '
-        f"{error}; {_remedy(bus, error)}"
+        f"{error}; {_open_remedy(bus, error)}"
     )
 
 
-def _remedy(bus: Bus, error: Exception) -> str:
+def _open_remedy(bus: Bus, error: Exception) -> str:
     if isinstance(error, NotImplementedError | ImportError):
         known = ", ".join(sorted(can.VALID_INTERFACES))
-        return f"interface must be one of python-can's, with its driver installed: {known}"
-    code = code_of(error)
+        return f"interface must be one of python-can's with its driver installed: {known}"
+    code = errno_from_exception(error)
     if bus.interface == "socketcan":
         if code == errno.EAFNOSUPPORT:
             return "this kernel has no CAN support (modprobe can can_raw); udp_multicast works without"
         return (
             "plug in the adapter, or bring the interface up: "
-            f"ip link set {bus.channel} up type can bitrate {bus.bitrate_bit_s} (ip link lists what there is)"
+            f"ip link set {bus.channel} up type can bitrate {bus.bitrate_bit_s} (see `ip link`)"
         )
     if code in (errno.EACCES, errno.EPERM):
-        return "this user may not open it; add it to the device's group (dialout for serial lines)"
+        return "this user may not open it; add the user to the device's group (dialout for serial adapters)"
     if bus.interface == "udp_multicast":
         return "give a multicast address as channel, e.g. 239.74.163.2, and options = { port = 43113 }"
     return "is the channel right, the adapter plugged in, and no other program using it?"

@@ -1,11 +1,12 @@
-"""Reading a CAN bus without blocking: what a receiver is; one for any python-can bus, one for in-process.
+"""Non-blocking reception from a CAN bus: the `Receiver` protocol, and receivers with a queue.
 
-A receiver has a file descriptor that becomes readable when frames wait and stays the same when the bus is
-opened anew, and `drain`, which hands all that waits to a router. None ever raises for what the bus does:
-errors are counted, told in `trouble`, and the bus is opened again with growing pauses. Two more: `sockets`.
+A receiver has a file descriptor, which is readable while frames are waiting and stays the same when the bus
+is reopened, and `drain`, which passes the waiting frames to a router. Receiving never raises for bus errors:
+they are counted and reported in `fault`, and the bus is reopened with growing delays. `sockets` has two more
+receivers.
 
-Public names: `Receiver`, `CyclicSender`, `QueuedReceiver`, `ThreadReceiver`, `InProcessReceiver`, `Retry`,
-`RECEIVE_BUFFER_BYTES`, `DRAIN_LIMIT`, `QUEUE_FRAMES`.
+Public names: `Receiver`, `CyclicSender`, `QueuedReceiver`, `ThreadReceiver`, `InProcessReceiver`,
+`ReopenBackoff`, `RECEIVE_BUFFER_BYTES`, `MAX_DRAIN_FRAMES`, `MAX_QUEUE_FRAMES`.
 """
 
 from __future__ import annotations
@@ -20,33 +21,41 @@ from collections import deque
 from collections.abc import Callable
 from queue import Queue
 from time import monotonic_ns
-from typing import Protocol
+from typing import Protocol, Self
 
 import can
 from can.interfaces import virtual
 
-from .bus_state import Condition, Trouble, code_of, trouble_of
-from .router import Frame, Router
+from handtouch.canbus.bus.bus_state import (
+    BusFault,
+    ErrorState,
+    errno_from_exception,
+    fault_from_exception,
+)
+from handtouch.canbus.bus.router import CanFrame, Router
 
 RECEIVE_BUFFER_BYTES = 4 << 20
-"""Socket receive buffer asked for; the kernel doubles it and books 768 bytes a frame: 10,900 frames, 1.3 s of
-a full 1 Mbit/s bus. After a pause of that length every heartbeat is overdue: nothing longer need be bridged.
+"""Requested receive buffer of a socket. The kernel doubles it and accounts 768 bytes per frame: 10,900 frames
+or 1.3 s of a fully loaded 1 Mbit/s bus. After a longer pause every heartbeat is overdue anyway.
 """
-DRAIN_LIMIT = 4096
-"""Frames read in one go at most, so that a flood can't keep the caller from its tick."""
-QUEUE_FRAMES = 16384
-"""Frames that wait for `drain` at most, 1.9 s of a full bus; older ones are dropped and counted."""
+MAX_DRAIN_FRAMES = 4096
+"""Most frames read by one `drain`, so that a flood of frames doesn't delay the caller's tick."""
+MAX_QUEUE_FRAMES = 16384
+"""Most frames waiting for `drain`, 1.9 s of a fully loaded bus; older ones are dropped and counted."""
 
-_TELLS_STATE = frozenset({"ixxat", "etas"})  # elsewhere python-can's `state` is what was asked for
-_SEND_TIMEOUT_S = 0.01  # an adapter that hangs must not hold up the other buses for longer
-_RETRY_FIRST_S, _RETRY_LAST_S = 0.1, 2.0
-_ERRORS_TO_REOPEN = 20  # in a row; a few bad datagrams or serial lines are no reason to lose what waits
+_INTERFACES_REPORTING_STATE = frozenset({"ixxat", "etas"})
+"""Interfaces whose python-can `state` is the controller's; elsewhere it is the last value set."""
+_SEND_TIMEOUT_S = 0.01  # an adapter that hangs must not delay the other buses longer than this
+_MIN_RETRY_S, _MAX_RETRY_S = 0.1, 2.0
+_MAX_CONSECUTIVE_ERRORS = (
+    20  # reopening loses the waiting frames; a few bad datagrams or lines don't justify it
+)
 _SO_RCVBUFFORCE = 33
-_GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is of no more use
-_OLDEST_STAMP_NS = 10_000_000_000
-_OFFSET_NS = 5_000
+_DISCONNECTED_ERRNOS = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is unusable
+_MAX_STAMP_AGE_NS = 10_000_000_000
+_MAX_CLOCK_READ_NS = 5_000
 
-# Unlike os.eventfd_write these keep the GIL: no other thread is let in amid a burst.
+# Unlike os.eventfd_write these keep the GIL, so no other thread runs in the middle of a burst.
 _LIBC = ctypes.PyDLL(None)
 _eventfd_write = _LIBC.eventfd_write
 _eventfd_write.argtypes = [ctypes.c_int, ctypes.c_uint64]
@@ -57,86 +66,99 @@ Opener = Callable[[], can.BusABC]
 
 
 class CyclicSender(Protocol):
-    """A frame that somebody else, such as the kernel, sends again and again."""
+    """Cyclic transmission of a frame by the kernel."""
 
     def set_period(self, period_s: float) -> None:
-        """Send it now, and with this period from now on. Raises CanError or OSError."""
+        """Send the frame now, and with this period from now on. Raises CanError or OSError."""
         ...
 
     def stop(self) -> None:
-        """Raises CanError or OSError."""
+        """Stop sending. Raises CanError or OSError."""
         ...
 
 
 class Receiver(Protocol):
-    """What a port needs of a receiver."""
+    """Interface of an open receiver to its port."""
 
-    trouble: Trouble | None  # what is wrong with the bus now, if anything
+    fault: BusFault | None  # present fault of the bus, if any
 
-    def fileno(self) -> int: ...
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while frames are waiting."""
+        ...
 
-    def drain(self, router: Router) -> list[Frame]: ...
+    def drain(self, router: Router) -> list[CanFrame]:
+        """Pass the waiting frames to the router; return those that it doesn't store or drop."""
+        ...
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Raises whatever the driver raises."""
+        """Send a frame. Raises the driver's exceptions."""
         ...
 
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
-        """None where nobody but us could do it. Raises CanError or OSError."""
+        """Have the kernel send a frame cyclically; None where it can't. Raises CanError or OSError."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close the bus."""
+        ...
 
 
-class Retry:
-    """Growing pauses between attempts to open a bus again."""
+class ReopenBackoff:
+    """Growing delays between attempts to reopen a bus."""
 
     def __init__(self) -> None:
-        self._pause_s = _RETRY_FIRST_S
+        self._retry_s = _MIN_RETRY_S
         self._due_ns = 0
 
-    def due(self, t_ns: int) -> bool:
-        """Whether to try at this time; if so, the next pause is longer."""
-        if t_ns < self._due_ns:
+    def due(self, now_ns: int) -> bool:
+        """Return True if an attempt is due now; the next delay is then longer."""
+        if now_ns < self._due_ns:
             return False
-        self._due_ns = t_ns + int(self._pause_s * 1e9)
-        self._pause_s = min(2 * self._pause_s, _RETRY_LAST_S)
+        self._due_ns = now_ns + int(self._retry_s * 1e9)
+        self._retry_s = min(2 * self._retry_s, _MAX_RETRY_S)
         return True
 
     def reset(self) -> None:
-        """It worked."""
-        self._pause_s = _RETRY_FIRST_S
+        """Return to the shortest delay after a success."""
+        self._retry_s = _MIN_RETRY_S
         self._due_ns = 0
 
 
-def within(t_ns: int, now_ns: int) -> int:
-    """A stamp made monotonic; `now_ns` where it can't be one of the last seconds."""
-    return t_ns if now_ns - _OLDEST_STAMP_NS < t_ns <= now_ns else now_ns
+def valid_arrival_ns(arrival_ns: int, now_ns: int) -> int:
+    """Return a receive stamp, or `now_ns` where the stamp is implausible (in the future or too old)."""
+    return arrival_ns if now_ns - _MAX_STAMP_AGE_NS < arrival_ns <= now_ns else now_ns
 
 
 def clock_offset_ns() -> int:
-    """Monotonic minus wall clock; taken again where something came between the readings."""
+    """Return monotonic minus wall clock; read again if the process was interrupted between the readings."""
     for _ in range(3):
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        if after - before < _OFFSET_NS:
+        if after - before < _MAX_CLOCK_READ_NS:
             break
     return (before + after) // 2 - wall
 
 
 class QueuedReceiver:
-    """Frames wait in a bounded queue that other threads fill; the first of a burst signals an eventfd."""
+    """Receiver whose bounded queue is filled by other threads; the first frame signals an eventfd."""
 
     def __init__(self, opener: Opener) -> None:
-        self._queue: deque[tuple[can.Message, int]] = deque(maxlen=QUEUE_FRAMES)  # with their arrival
+        self.fault: BusFault | None = None
+        self._opener = opener
+        self._queue: deque[tuple[can.Message, int]] = deque(maxlen=MAX_QUEUE_FRAMES)  # with arrival_ns
         self._lost = 0
         self._errors = 0
-        self._counted = (0, 0)
-        self.trouble: Trouble | None = None
-        self._bus: can.BusABC | None = opener()
-        self._eventfd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._reported_counts = (0, 0)
+        self._bus: can.BusABC | None = None
+        self._eventfd = -1
         self._signalled = False
         self._read_value = ctypes.c_uint64()
-        self._owed = False  # a signal whose flag has been lowered already
+        self._signal_pending = False  # a signal whose flag has been cleared already
+
+    def open(self) -> Self:
+        """Open the bus and the eventfd."""
+        self._bus = self._opener()
+        self._eventfd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        return self
 
     def fileno(self) -> int:
         return self._eventfd
@@ -144,34 +166,34 @@ class QueuedReceiver:
     def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
         bus = self._bus
         if bus is None:
-            raise OSError(errno.ENODEV, self.trouble.text if self.trouble else "closed")
-        bus.send(message(can_id, data, remote), _SEND_TIMEOUT_S)
+            raise OSError(errno.ENODEV, self.fault.text if self.fault else "closed")
+        bus.send(make_message(can_id, data, remote), _SEND_TIMEOUT_S)
 
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:  # noqa: ARG002
-        return None  # python-can would do it in a thread of its own, which is worse than our loop
+        return None  # python-can would send from a thread of its own, with more jitter than the loop
 
-    def drain(self, router: Router) -> list[Frame]:
-        others: list[Frame] = []
+    def drain(self, router: Router) -> list[CanFrame]:
+        others: list[CanFrame] = []
         self._lower_signal()
         popleft, accept = self._queue.popleft, router.accept_message
-        count = min(len(self._queue), DRAIN_LIMIT)
+        count = min(len(self._queue), MAX_DRAIN_FRAMES)
         for _ in range(count):
             frame = accept(*popleft())
             if frame is not None:
                 others.append(frame)
-        if count == DRAIN_LIMIT:
+        if count == MAX_DRAIN_FRAMES:
             self._raise_signal()
         lost, errors = self._lost, self._errors
-        router.counters.overflow += lost - self._counted[0]
-        router.counters.receive_failures += errors - self._counted[1]
-        self._counted = (lost, errors)
+        router.counters.overflow += lost - self._reported_counts[0]
+        router.counters.receive_failures += errors - self._reported_counts[1]
+        self._reported_counts = (lost, errors)
         return others
 
     def _lower_signal(self) -> None:
-        # Before the queue is read: what comes meanwhile is either read there or raises the signal again.
-        if self._signalled or self._owed:
-            # it fails where the reader is just about to raise it
-            self._owed = _eventfd_read(self._eventfd, ctypes.byref(self._read_value)) != 0
+        # Before the queue is read: a frame that arrives meanwhile is either read or raises the signal again.
+        if self._signalled or self._signal_pending:
+            # fails where another thread has set the flag but not yet written
+            self._signal_pending = _eventfd_read(self._eventfd, ctypes.byref(self._read_value)) != 0
             self._signalled = False
 
     def _raise_signal(self) -> None:
@@ -179,182 +201,193 @@ class QueuedReceiver:
             self._signalled = True
             _eventfd_write(self._eventfd, 1)
 
-    def _put(self, message: can.Message) -> None:
+    def _enqueue(self, message: can.Message) -> None:
         queue = self._queue
         if len(queue) == queue.maxlen:
             self._lost += 1
-        queue.append((message, monotonic_ns()))  # its own stamp may be of the adapter's clock
+        queue.append((message, monotonic_ns()))  # the message's own stamp may be of the adapter's clock
         if not self._signalled:
             self._raise_signal()
 
 
 class ThreadReceiver(QueuedReceiver):
-    """Any python-can bus: a thread waits in its `recv`."""
+    """Receiver for any python-can bus: a thread waits in `recv`."""
 
     def __init__(self, opener: Opener, interface: str) -> None:
         super().__init__(opener)
-        self._opener = opener
-        self._tells_state = interface in _TELLS_STATE
+        self._reports_state = interface in _INTERFACES_REPORTING_STATE
         self._closing = threading.Event()
-        self._open = True  # the same, cheaper to look at
-        self._thread = threading.Thread(target=self._run, name=f"can-{interface}", daemon=True)
+        self._running = False  # as `_closing`, but cheaper to read
+        self._thread = threading.Thread(target=self._receive_loop, name=f"can-{interface}", daemon=True)
+
+    def open(self) -> Self:
+        """Open the bus and start the thread."""
+        super().open()
+        self._running = True
         self._thread.start()
+        return self
 
     def close(self) -> None:
-        self._open = False
+        self._running = False
         self._closing.set()
         self._thread.join(timeout=5)
         if self._bus is not None:
-            self._drop(self._bus)
+            self._close_bus(self._bus)
         os.close(self._eventfd)
 
-    def _run(self) -> None:
-        retry = Retry()
-        in_a_row = 0
+    def _receive_loop(self) -> None:
+        backoff = ReopenBackoff()
+        consecutive_errors = 0
         while not self._closing.is_set():
             bus = self._bus
             if bus is None:
-                in_a_row = 0
-                self._reopen(retry)
+                consecutive_errors = 0
+                self._reopen(backoff)
                 continue
-            if self.trouble is not None and self.trouble.condition is Condition.BUS_OFF:  # told by `send`
-                self._drop(bus)
+            if self.fault is not None and self.fault.error_state is ErrorState.BUS_OFF:  # found by `send`
+                self._close_bus(bus)
                 continue
             try:
-                came = self._read(bus)
-            except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; here it is counted
-                in_a_row += 1
-                self._failed(trouble_of(error))
-                _forget_line(bus)
-                if is_hopeless(error, in_a_row):
-                    self._drop(bus)
-                    self.trouble = given_up(error)
+                received = self._receive(bus)
+            except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; it is counted here
+                consecutive_errors += 1
+                self._record_fault(fault_from_exception(error))
+                _clear_line_buffer(bus)
+                if must_reopen(error, consecutive_errors):
+                    self._close_bus(bus)
+                    self.fault = closed_bus_fault(error)
                 continue
-            if came:
-                in_a_row = 0
-                retry.reset()
-                self.trouble = None
+            if received:
+                consecutive_errors = 0
+                backoff.reset()
+                self.fault = None
 
-    def _read(self, bus: can.BusABC) -> bool:
-        """Take frames until none come for a while, or one has although there is trouble. Whether one came."""
-        recv, put, came = bus.recv, self._put, False
-        while self._open:
+    def _receive(self, bus: can.BusABC) -> bool:
+        """Enqueue frames until 0.1 s pass without one, or one arrives during a fault; True if any arrived."""
+        recv, enqueue, received = bus.recv, self._enqueue, False
+        while self._running:
             message = recv(0.1)
             if message is None:
-                if self._tells_state and bus.state is can.BusState.ERROR:
+                if self._reports_state and bus.state is can.BusState.ERROR:
                     raise can.CanOperationError("bus-off")
                 break
-            put(message)
-            came = True
-            if self.trouble is not None:
+            enqueue(message)
+            received = True
+            if self.fault is not None:
                 break
-        return came
+        return received
 
-    def _failed(self, trouble: Trouble) -> None:
+    def _record_fault(self, fault: BusFault) -> None:
         self._errors += 1
-        self.trouble = trouble
-        self._raise_signal()  # so that the count is taken
+        self.fault = fault
+        self._raise_signal()  # so that `drain` counts it
 
-    def _drop(self, bus: can.BusABC) -> None:
+    def _close_bus(self, bus: can.BusABC) -> None:
         self._bus = None
         try:
             bus.shutdown()
-        except Exception as error:  # noqa: BLE001 - as above
-            self._failed(trouble_of(error))
+        except Exception as error:  # noqa: BLE001 - drivers raise anything
+            self._record_fault(fault_from_exception(error))
 
-    def _reopen(self, retry: Retry) -> None:
-        if not retry.due(time.monotonic_ns()):
-            self._closing.wait(_RETRY_FIRST_S / 2)
+    def _reopen(self, backoff: ReopenBackoff) -> None:
+        if not backoff.due(time.monotonic_ns()):
+            self._closing.wait(_MIN_RETRY_S / 2)
             return
         try:
             self._bus = self._opener()
-        except Exception as error:  # noqa: BLE001 - as above
-            self._failed(given_up(error))
+        except Exception as error:  # noqa: BLE001 - drivers raise anything
+            self._record_fault(closed_bus_fault(error))
         else:
-            self.trouble = None
+            self.fault = None
 
 
 class InProcessReceiver(QueuedReceiver):
-    """python-can's virtual bus: who sends a frame puts it into our queue; there is no thread."""
+    """Receiver for python-can's virtual bus; frames are enqueued by the sender's thread."""
 
     def __init__(self, opener: Opener) -> None:
         super().__init__(opener)
+        self._senders_lock = threading.Lock()
+
+    def open(self) -> Self:
+        """Open the bus and replace its queue on the channel."""
+        super().open()
         bus = self._bus
         if not isinstance(bus, virtual.VirtualBus):
-            raise TypeError(f"{bus} is no virtual bus")
+            raise TypeError(f"{bus} is not a virtual bus")
         if bus.queue.maxsize:  # the bus's option rx_queue_size
             self._queue = deque(maxlen=bus.queue.maxsize)
-        self._several = threading.Lock()  # senders at once
         with virtual.channels_lock:
             bus.channel.remove(bus.queue)
-            bus.queue = _Inbox(self._take)
+            bus.queue = _Inbox(self._receive)
             bus.channel.append(bus.queue)
+        return self
 
     def close(self) -> None:
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
-        with self._several:  # a sender may be about to signal
+        with self._senders_lock:  # a sender may be about to signal
             os.close(self._eventfd)
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """As python-can does it, but without a deep copy for everyone, which costs five times as much."""
+        """Send as python-can does, without a deep copy per receiver, which costs five times as much."""
         bus = self._bus
         if not isinstance(bus, virtual.VirtualBus):
             raise OSError(errno.ENODEV, "closed")
         for inbox in bus.channel:
             if inbox is not bus.queue or bus.receive_own_messages:
-                sent = message(can_id, data, remote)
+                sent = make_message(can_id, data, remote)
                 sent.timestamp, sent.channel, sent.is_rx = time.time(), bus.channel_id, inbox is not bus.queue
                 inbox.put(sent, timeout=_SEND_TIMEOUT_S)
 
-    def _take(self, message: can.Message) -> None:
-        with self._several:
+    def _receive(self, message: can.Message) -> None:
+        with self._senders_lock:
             if self._bus is not None:
-                self._put(message)
+                self._enqueue(message)
 
 
 class _Inbox(Queue[can.Message]):
-    """A queue of a virtual channel that hands on what is put to it."""
+    """Queue of a virtual channel that passes each message to a function."""
 
-    def __init__(self, take: Callable[[can.Message], None]) -> None:
+    def __init__(self, deliver: Callable[[can.Message], None]) -> None:
         super().__init__()
-        self._take = take
+        self._deliver = deliver
 
     def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:  # noqa: ARG002
-        self._take(item)
+        self._deliver(item)
 
 
-def message(can_id: int, data: bytes, remote: bool = False) -> can.Message:
-    """python-can's message; a remote frame asks for as many bytes as `data` has."""
+def make_message(can_id: int, data: bytes, remote: bool = False) -> can.Message:
+    """Return a python-can message; a remote frame requests as many bytes as `data` has."""
     if remote:
         return can.Message(arbitration_id=can_id, dlc=len(data), is_remote_frame=True, is_extended_id=False)
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
-def _forget_line(bus: can.BusABC) -> None:
-    """slcan keeps a line that is no text, and fails on it again with every line to come."""
+def _clear_line_buffer(bus: can.BusABC) -> None:
+    """Clear slcan's buffer: it keeps a line that isn't text and fails on it with every further line."""
     buffer = getattr(bus, "_buffer", None)
     if isinstance(buffer, bytearray):
         buffer.clear()
 
 
-def given_up(error: Exception) -> Trouble:
-    """What to tell of a bus that has been given up with this error, until it is open again."""
-    told = trouble_of(error)
-    return told if told.condition is Condition.BUS_OFF else Trouble(Condition.DOWN, told.text)
+def closed_bus_fault(error: Exception) -> BusFault:
+    """Return the fault of a bus that was closed after this error, until it is reopened."""
+    fault = fault_from_exception(error)
+    return fault if fault.error_state is ErrorState.BUS_OFF else BusFault(ErrorState.DOWN, fault.text)
 
 
-def is_hopeless(error: Exception, in_a_row: int) -> bool:
-    """Whether a bus that has failed so many times in a row, last with this, has to be opened again."""
-    if code_of(error) == errno.ENETDOWN:  # the same socket works again when the interface is up
+def must_reopen(error: Exception, consecutive_errors: int) -> bool:
+    """Return True if a bus must be reopened after so many consecutive errors, `error` being the last."""
+    code = errno_from_exception(error)
+    if code == errno.ENETDOWN:  # the same socket works again when the interface is up
         return False
-    off = trouble_of(error).condition is Condition.BUS_OFF
-    return off or code_of(error) in _GONE or in_a_row >= _ERRORS_TO_REOPEN
+    is_off = fault_from_exception(error).error_state is ErrorState.BUS_OFF
+    return is_off or code in _DISCONNECTED_ERRNOS or consecutive_errors >= _MAX_CONSECUTIVE_ERRORS
 
 
 def grow_receive_buffer(target: socket.socket) -> int:
-    """Ask for RECEIVE_BUFFER_BYTES on a socket, past the system's limit where allowed; bytes granted."""
+    """Request RECEIVE_BUFFER_BYTES, past the system's limit if permitted; return the bytes granted."""
     try:
         target.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
     except PermissionError:  # needs CAP_NET_ADMIN

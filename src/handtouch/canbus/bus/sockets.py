@@ -1,4 +1,4 @@
-"""Receivers for buses with a socket, read without python-can's `recv`: SocketCAN and udp_multicast.
+"""Receivers that read a bus's socket without python-can's `recv`: SocketCAN and udp_multicast.
 
 Public names: `SocketcanReceiver`, `DatagramReceiver`.
 """
@@ -11,252 +11,262 @@ import select
 import socket
 import struct
 import time
-from typing import Any
+from typing import Any, Self
 
 import can
 import msgpack
 from can.interfaces.udp_multicast.utils import unpack_message
 
-from .bus_state import Trouble, trouble_of
-from .receivers import (
-    DRAIN_LIMIT,
+from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
+from handtouch.canbus.bus.receivers import (
+    MAX_DRAIN_FRAMES,
     CyclicSender,
     Opener,
-    Retry,
+    ReopenBackoff,
     clock_offset_ns,
-    given_up,
+    closed_bus_fault,
     grow_receive_buffer,
-    is_hopeless,
-    message,
-    within,
+    make_message,
+    must_reopen,
+    valid_arrival_ns,
 )
-from .router import IDENTIFIERS, Frame, Router
+from handtouch.canbus.bus.router import IDENTIFIER_COUNT, CanFrame, Router
 
 _SO_TIMESTAMPNS, _SO_MEMINFO = 35, 55
-_MEMINFO_DROPS = 8  # index into SO_MEMINFO's words
+_MEMINFO_DROPS_INDEX = 8  # of 32-bit words
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
 _TIMESPEC = struct.Struct("@ll")
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size)
-_LONGEST_BYTES = 4096  # of a datagram, as python-can has it
+_MAX_DATAGRAM_BYTES = 4096  # as in python-can
 _FLAGS = ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd")
-_REMOTE, _ERROR_FRAME, _IDENTIFIER = 0x40000000, 0x20000000, 0x1FFFFFFF
+_REMOTE_FLAG, _ERROR_FLAG, _IDENTIFIER_MASK = 0x40000000, 0x20000000, 0x1FFFFFFF
 
 
 class _SocketReceiver:
-    """A bus with a socket, read in the caller's thread; behind an epoll, so its descriptor never changes."""
+    """A bus whose socket is read in the caller's thread, behind an epoll with a constant descriptor."""
 
     def __init__(self, opener: Opener) -> None:
+        self.fault: BusFault | None = None
         self._opener = opener
-        self._epoll = select.epoll()
-        self._retry = Retry()
-        self._errors = 0
+        self._epoll: select.epoll | None = None
+        self._backoff = ReopenBackoff()
+        self._consecutive_errors = 0
         self._bus: can.BusABC | None = None
         self._dropped = 0
-        self.trouble: Trouble | None = None
+
+    def open(self) -> Self:
+        """Open the bus and the epoll."""
+        self._epoll = select.epoll()
         try:
-            self._use(opener())
+            self._attach_bus(self._opener())
         except BaseException:
             self._epoll.close()
             raise
+        return self
 
     def fileno(self) -> int:
-        return self._epoll.fileno()
+        return -1 if self._epoll is None else self._epoll.fileno()
 
     def close(self) -> None:
-        self._drop()
-        self._epoll.close()
+        self._close_bus()
+        if self._epoll is not None:
+            self._epoll.close()
 
-    def drain(self, router: Router) -> list[Frame]:
-        others: list[Frame] = []
+    def drain(self, router: Router) -> list[CanFrame]:
+        others: list[CanFrame] = []
         bus = self._bus or self._reopen(router)
         if bus is None:
             return others
         before = router.counters.frames
         try:
-            self._read(bus, router, others)
+            self._receive(bus, router, others)
             self._count_dropped(router)
             failure = None
-        except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; here it is counted
+        except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; it is counted here
             failure = error
         if router.counters.frames > before:
-            self.trouble = None
-            self._errors = 0
-            self._retry.reset()
+            self.fault = None
+            self._consecutive_errors = 0
+            self._backoff.reset()
         if failure is not None:
-            self._failed(router, failure)
+            self._record_failure(router, failure)
         return others
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
         if self._bus is None:
-            raise OSError(errno.ENODEV, self.trouble.text if self.trouble else "closed")
+            raise OSError(errno.ENODEV, self.fault.text if self.fault else "closed")
         self._send(self._bus, can_id, data, remote)
 
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:  # noqa: ARG002
         return None
 
-    def _read(self, bus: can.BusABC, router: Router, others: list[Frame]) -> None:
+    def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:
         raise NotImplementedError
 
     def _send(self, bus: can.BusABC, can_id: int, data: bytes, remote: bool) -> None:
-        bus.send(message(can_id, data, remote))
+        bus.send(make_message(can_id, data, remote))
 
-    def _use(self, bus: can.BusABC) -> None:
+    def _attach_bus(self, bus: can.BusABC) -> None:
         self._bus = bus
-        self._socket = socket.socket(fileno=os.dup(bus.fileno()))  # python-can has none for udp_multicast
-        self._dropped = _drops(self._socket)
+        self._socket = socket.socket(fileno=os.dup(bus.fileno()))  # udp_multicast doesn't expose its socket
+        self._dropped = _dropped_frames(self._socket)
         grow_receive_buffer(self._socket)
-        self._epoll.register(self._socket, select.EPOLLIN)
+        if self._epoll is not None:
+            self._epoll.register(self._socket, select.EPOLLIN)
 
-    def _drop(self) -> None:
+    def _close_bus(self) -> None:
         bus, self._bus = self._bus, None
         if bus is None:
             return
-        self._epoll.unregister(self._socket)
+        if self._epoll is not None:
+            self._epoll.unregister(self._socket)
         self._socket.close()
         try:
             bus.shutdown()
-        except Exception as error:  # noqa: BLE001 - as above
-            self.trouble = trouble_of(error)
+        except Exception as error:  # noqa: BLE001 - drivers raise anything
+            self.fault = fault_from_exception(error)
 
-    def _failed(self, router: Router, error: Exception) -> None:
+    def _record_failure(self, router: Router, error: Exception) -> None:
         router.counters.receive_failures += 1
-        self.trouble = trouble_of(error)
-        self._errors += 1
-        if is_hopeless(error, self._errors):
-            self._drop()
-            self.trouble = given_up(error)
+        self.fault = fault_from_exception(error)
+        self._consecutive_errors += 1
+        if must_reopen(error, self._consecutive_errors):
+            self._close_bus()
+            self.fault = closed_bus_fault(error)
 
     def _reopen(self, router: Router) -> can.BusABC | None:
-        if not self._retry.due(time.monotonic_ns()):
+        if not self._backoff.due(time.monotonic_ns()):
             return None
         try:
-            self._use(self._opener())
-        except Exception as error:  # noqa: BLE001 - as above
+            self._attach_bus(self._opener())
+        except Exception as error:  # noqa: BLE001 - drivers raise anything
             router.counters.receive_failures += 1
-            self.trouble = given_up(error)
+            self.fault = closed_bus_fault(error)
             return None
-        self._errors = 0
-        self.trouble = None
+        self._consecutive_errors = 0
+        self.fault = None
         return self._bus
 
     def _count_dropped(self, router: Router) -> None:
-        """The kernel tells how many frames this socket has lost since it was opened."""
-        total = _drops(self._socket)
+        """Count the frames that the kernel has dropped for this socket since the last call."""
+        total = _dropped_frames(self._socket)
         if total != self._dropped:
             router.counters.overflow += total - self._dropped & 0xFFFFFFFF
             self._dropped = total
 
 
 class SocketcanReceiver(_SocketReceiver):
-    """SocketCAN by its socket: kernel stamps, and a third of the cost of python-can's `recv`."""
+    """Receiver for SocketCAN: kernel receive stamps, at a third of the cost of python-can's `recv`."""
 
     def __init__(self, opener: Opener, channel: str) -> None:
         self._channel = channel
         super().__init__(opener)
 
     def _reopen(self, router: Router) -> can.BusABC | None:
-        # Asked by name, the kernel looks for a module to load: milliseconds that the other buses lose.
+        # To open an unknown name, the kernel searches for a module to load, which takes milliseconds.
         if all(name != self._channel for _, name in socket.if_nameindex()):
             return None
         return super()._reopen(router)
 
-    def _read(self, bus: can.BusABC, router: Router, others: list[Frame]) -> None:  # noqa: ARG002
-        recvmsg, unpack, accept = self._socket.recvmsg, _FRAME.unpack_from, router.accept
+    def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:  # noqa: ARG002
+        recvmsg, unpack, accept = self._socket.recvmsg, _FRAME.unpack_from, router.accept_frame
         stamp = _TIMESPEC.unpack_from
         offset_ns = clock_offset_ns()
-        for _ in range(DRAIN_LIMIT):
+        for _ in range(MAX_DRAIN_FRAMES):
             try:
                 frame, ancillary, _, _ = recvmsg(16, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return
-            t_ns = 0
+            arrival_ns = 0
             for _, kind, value in ancillary:
                 if kind == _SO_TIMESTAMPNS:
                     seconds, nanoseconds = stamp(value)
-                    t_ns = seconds * 1_000_000_000 + nanoseconds + offset_ns
+                    arrival_ns = seconds * 1_000_000_000 + nanoseconds + offset_ns
             can_id, size, data = unpack(frame)
             if can_id >= 0x800:
-                if can_id & _ERROR_FRAME:
-                    router.error(can_id & _IDENTIFIER, data, t_ns)
-                elif can_id & ~_REMOTE < 0x800:
-                    router.remote(can_id & ~_REMOTE)
+                if can_id & _ERROR_FLAG:
+                    router.handle_error_frame(can_id & _IDENTIFIER_MASK, data, arrival_ns)
+                elif can_id & ~_REMOTE_FLAG < 0x800:
+                    router.handle_remote_frame(can_id & ~_REMOTE_FLAG)
                 else:
-                    router.counters.foreign += 1  # extended
+                    router.counters.unknown_frames += 1  # extended
                 continue
             if size != 8:
                 data = data[:size]
-            if not accept(can_id, data, t_ns):
-                others.append((can_id, data, t_ns))
+            if not accept(can_id, data, arrival_ns):
+                others.append((can_id, data, arrival_ns))
 
     def _send(self, bus: can.BusABC, can_id: int, data: bytes, remote: bool) -> None:  # noqa: ARG002
-        frame = _FRAME.pack(can_id | _REMOTE if remote else can_id, len(data), data)
+        frame = _FRAME.pack(can_id | _REMOTE_FLAG if remote else can_id, len(data), data)
         self._socket.send(frame, socket.MSG_DONTWAIT)
 
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
         if self._bus is None:
-            raise OSError(errno.ENODEV, self.trouble.text if self.trouble else "closed")
-        # Not stored: python-can's shutdown would fail with the task of a gone device, and close nothing.
-        return _KernelSender(self._bus.send_periodic(message(can_id, data), period_s, store_task=False))
+            raise OSError(errno.ENODEV, self.fault.text if self.fault else "closed")
+        # Not stored: with the task of a removed device python-can's shutdown would fail and close nothing.
+        return _KernelSender(self._bus.send_periodic(make_message(can_id, data), period_s, store_task=False))
 
 
 class _KernelSender:
-    """A task of the kernel's broadcast manager; it ends with the process at the latest."""
+    """Task of the kernel's broadcast manager; ends with the process at the latest."""
 
     def __init__(self, task: Any) -> None:
         self._task = task
 
     def set_period(self, period_s: float) -> None:
         self._task.period = period_s
-        self._task.start()  # changes the task in place: there is never a second one
+        self._task.start()  # updates the existing task
 
     def stop(self) -> None:
         self._task.stop()
 
 
 class DatagramReceiver(_SocketReceiver):
-    """udp_multicast by its socket: python-can's `recv` asks select for each frame and checks all of it."""
+    """Receiver for udp_multicast; python-can's `recv` calls select and checks every key for each frame."""
 
-    def _read(self, bus: can.BusABC, router: Router, others: list[Frame]) -> None:  # noqa: ARG002
+    def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:  # noqa: ARG002
         recvmsg, unpack, accept, stamp = (
             self._socket.recvmsg,
             msgpack.unpackb,
-            router.accept,
+            router.accept_frame,
             _TIMESPEC.unpack,
         )
         offset_ns = clock_offset_ns()
-        for _ in range(DRAIN_LIMIT):
+        for _ in range(MAX_DRAIN_FRAMES):
             try:
-                packet, ancillary, _, _ = recvmsg(_LONGEST_BYTES, _ANCILLARY, socket.MSG_DONTWAIT)
+                packet, ancillary, _, _ = recvmsg(_MAX_DATAGRAM_BYTES, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return
-            t_ns = now_ns = time.monotonic_ns()
+            arrival_ns = now_ns = time.monotonic_ns()
             for _, kind, value in ancillary:
                 if kind == _SO_TIMESTAMPNS:
                     seconds, nanoseconds = stamp(value)
-                    t_ns = within(seconds * 1_000_000_000 + nanoseconds + offset_ns, now_ns)
-            told = unpack(packet)
-            if _is_data_frame(told):
-                can_id, data = told["arbitration_id"], told["data"]
-                if not accept(can_id, data, t_ns):
-                    others.append((can_id, data, t_ns))
-            elif (frame := router.accept_message(unpack_message(packet, check=True), t_ns)) is not None:
+                    arrival_ns = valid_arrival_ns(seconds * 1_000_000_000 + nanoseconds + offset_ns, now_ns)
+            fields = unpack(packet)
+            if _is_data_frame(fields):
+                can_id, data = fields["arbitration_id"], fields["data"]
+                if not accept(can_id, data, arrival_ns):
+                    others.append((can_id, data, arrival_ns))
+                continue
+            frame = router.accept_message(unpack_message(packet, check=True), arrival_ns)
+            if frame is not None:
                 others.append(frame)
 
 
-def _is_data_frame(told: Any) -> bool:
-    """Whether it is what almost all are; python-can judges the rest, and raises if it is no frame at all."""
-    if type(told) is not dict or type(can_id := told.get("arbitration_id")) is not int:
+def _is_data_frame(fields: Any) -> bool:
+    """Return True for a plain data frame; python-can decodes other packets, and raises for invalid ones."""
+    if type(fields) is not dict or type(can_id := fields.get("arbitration_id")) is not int:
         return False
-    if type(data := told.get("data")) is not bytes or told.get("dlc") != len(data):
+    if type(data := fields.get("data")) is not bytes or fields.get("dlc") != len(data):
         return False
-    flags = map(told.get, _FLAGS)
-    return 0 <= can_id < IDENTIFIERS and len(data) <= 8 and not any(flags)
+    flags = map(fields.get, _FLAGS)
+    return 0 <= can_id < IDENTIFIER_COUNT and len(data) <= 8 and not any(flags)
 
 
-def _drops(target: socket.socket) -> int:
-    """Frames that a socket's receive queue had no room for; 0 where the kernel is too old to tell (4.12)."""
+def _dropped_frames(target: socket.socket) -> int:
+    """Return the number of frames lost to a full receive queue of the socket; 0 before Linux 4.12."""
     try:
-        words = target.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+        words = target.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS_INDEX + 1))
     except OSError:
         return 0
-    return int.from_bytes(words[4 * _MEMINFO_DROPS :], "little")
+    return int.from_bytes(words[4 * _MEMINFO_DROPS_INDEX :], "little")

@@ -1,10 +1,11 @@
-"""SYNC on all buses: produced by the kernel or by the loop, or followed; its jitter; somebody else's SYNC.
+"""SYNC of a deployment's buses: production by the kernel or the loop, consumption, jitter.
 
-One SYNC time serves all buses. Where the kernel has a cyclic sender (SocketCAN) it sends, and the SYNC of
-the first such bus, looped back with its stamp, begins the cycle; the loop sends on the others when it
-sees that one. Without such a sender, or when its SYNC stays away, the loop's timer takes its place.
+All buses share one SYNC time. Where the kernel has a cyclic sender (SocketCAN), it sends SYNC, and the SYNC
+of the first such bus, looped back with its receive stamp, begins the cycle; the loop sends SYNC on the other
+buses when it receives that one. Without a cyclic sender, or when its SYNC is missing, the loop's timer
+replaces it.
 
-Public names: `Sync`, `Jitter`, `summary_us`.
+Public names: `Sync`, `SyncJitter`, `percentiles_us`.
 """
 
 from __future__ import annotations
@@ -16,64 +17,77 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .bus_state import Condition
-from .port import Port
-from .receivers import CyclicSender
-from .router import SYNC_ID
+from handtouch.canbus import cia301
+from handtouch.canbus.bus.bus_state import ErrorState
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.receivers import CyclicSender
 
 _log = logging.getLogger("handtouch.sync")
 
 _SECOND_NS = 1_000_000_000
-_LATE = 1.5  # periods after which a cycle begins without the SYNC that should have come
-_AWAY = 3.0  # periods after which the loop takes over from the kernel
-_SOONEST = 0.25  # of a period; SYNCs that are closer are one cycle's, lest a flood of them be one of ticks
-_RETRY_NS = 5 * _SECOND_NS  # until the kernel is tried again
-_TOLERANCE = 2  # SYNCs in a window beyond what its length gives: one at either end
-_MOST_INTERVALS = 4096  # in a second
-_ANOTHER = 'another SYNC producer is on this bus: set sync = "consumer" to follow it, or switch it off'
+_LATE_SYNC_PERIODS = 1.5
+"""Periods after which a cycle begins without its SYNC."""
+_MAX_MISSING_SYNC_PERIODS = 3.0
+"""Periods without a SYNC of the kernel after which the loop sends it."""
+_MIN_CYCLE_PERIODS = 0.25
+"""Shortest cycle; SYNCs that follow sooner belong to the same cycle, so that a flood of SYNCs causes no flood
+of ticks.
+"""
+_KERNEL_RETRY_NS = 5 * _SECOND_NS
+_WINDOW_TOLERANCE_SYNCS = 2  # more SYNCs than a window's length allows: one at either end
+_MAX_INTERVALS = 4096  # a second
+_OTHER_PRODUCER_PROBLEM = (
+    'another SYNC producer is on this bus; set sync = "consumer" to follow it, or switch it off'
+)
 
 
-class Jitter:
-    """How far the intervals from SYNC to SYNC are from the period, over the last second."""
+class SyncJitter:
+    """Deviations of the SYNC intervals from the period over the last second."""
 
     def __init__(self) -> None:
-        self._last_ns: int | None = None
+        self._last_sync_ns: int | None = None
         self._count = 0
-        self._at_ns: NDArray[np.int64] = np.full(_MOST_INTERVALS, np.iinfo(np.int64).min)
-        self._off_ns: NDArray[np.int64] = np.zeros(_MOST_INTERVALS, dtype=np.int64)
+        self._sync_ns: NDArray[np.int64] = np.full(_MAX_INTERVALS, np.iinfo(np.int64).min)
+        self._deviation_ns: NDArray[np.int64] = np.zeros(_MAX_INTERVALS, dtype=np.int64)
 
-    def add(self, t_ns: int, period_ns: int) -> None:
-        """A SYNC at this time."""
-        if self._last_ns is not None:
-            row = self._count % _MOST_INTERVALS
-            self._at_ns[row], self._off_ns[row] = t_ns, abs(t_ns - self._last_ns - period_ns)
+    def add_sync(self, sync_ns: int, period_ns: int) -> None:
+        """Add a SYNC sent or received at `sync_ns`."""
+        if self._last_sync_ns is not None:
+            row = self._count % _MAX_INTERVALS
+            self._sync_ns[row] = sync_ns
+            self._deviation_ns[row] = abs(sync_ns - self._last_sync_ns - period_ns)
             self._count += 1
-        self._last_ns = t_ns
+        self._last_sync_ns = sync_ns
 
-    def skip(self) -> None:
-        """The next interval tells nothing: the period has changed, or the sender."""
-        self._last_ns = None
+    def skip_interval(self) -> None:
+        """Leave the next interval out, since the period or the sender has changed."""
+        self._last_sync_ns = None
 
-    def figures(self, now_ns: int) -> dict[str, float]:
-        """`p50`, `p99` and `max` in microseconds; empty without two SYNCs within the last second."""
-        return summary_us(self._off_ns[self._at_ns >= now_ns - _SECOND_NS])
+    def percentiles_us(self, now_ns: int) -> dict[str, float]:
+        """Return `p50`, `p99` and `max` in microseconds; empty without two SYNCs within the last second."""
+        return percentiles_us(self._deviation_ns[self._sync_ns >= now_ns - _SECOND_NS])
 
 
-def summary_us(durations_ns: NDArray[np.int64]) -> dict[str, float]:
-    """`p50`, `p99` and `max` of durations, microseconds; empty of none. A tenth of `percentile`'s cost."""
+def percentiles_us(durations_ns: NDArray[np.int64]) -> dict[str, float]:
+    """Return `p50`, `p99` and `max` of durations in microseconds, at a tenth of the cost of
+    `numpy.percentile`.
+
+    Empty if there are no durations.
+    """
     if not len(durations_ns):
         return {}
     last = len(durations_ns) - 1
     ranks = last // 2, round(0.99 * last), last
-    found = np.partition(durations_ns, ranks)[list(ranks)] * 1e-3
-    return dict(zip(("p50", "p99", "max"), found.tolist(), strict=True))
+    values = np.partition(durations_ns, ranks)[list(ranks)] * 1e-3
+    return dict(zip(("p50", "p99", "max"), values.tolist(), strict=True))
 
 
 class Sync:
-    """SYNC of a deployment's buses: `start`, `poll` when `wake_ns` has come, tell it what was `seen`, `stop`.
+    """SYNC of a deployment's buses: `start`, `poll` at `wake_ns` at the latest, `handle_sync` per SYNC
+    received, `stop`.
 
-    Buses with sync = "producer", unless we only listen there, are driven; if there are none, the first bus's
-    SYNC is followed. Times in ns of the host's monotonic clock. `overruns` counts the periods that passed
+    SYNC is produced on buses with sync = "producer" unless their role is "listener"; without such a bus the
+    first bus's SYNC is followed. Times in ns of the host's monotonic clock. `overruns` counts the periods
     without a SYNC because the loop was late.
     """
 
@@ -81,180 +95,192 @@ class Sync:
         self.period_ns = period_ns
         self.overruns = 0
         self._buses = {port.name: _SyncBus(port) for port in ports}
-        self._produced = [bus for bus in self._buses.values() if bus.ours]
-        self._clock: _SyncBus | None = None  # whose SYNC begins the cycle; None: the loop's timer
-        self._due_ns = self._begun_ns = 0
-        self._has_looked = False  # for a late SYNC among what has been received
+        self._produced_buses = [bus for bus in self._buses.values() if bus.is_producer]
+        self._reference_bus: _SyncBus | None = None  # its SYNC begins the cycle; None: the loop's timer does
+        self._due_ns = self._cycle_sync_ns = 0
+        self._late_sync_checked = False  # the received frames were searched for a late SYNC
 
     def start(self, now_ns: int) -> None:
-        """The first SYNC is due now, at the next `poll`."""
-        for bus in self._produced:
-            bus.open_window(now_ns)
-        self._choose_clock()
+        """Schedule the first SYNC for the next `poll`."""
+        for bus in self._produced_buses:
+            bus.start_window(now_ns)
+        self._select_reference_bus()
         self._due_ns = now_ns
 
     def stop(self) -> None:
-        """Nobody sends SYNC for us any more."""
-        for bus in self._produced:
-            bus.halt()
-        self._choose_clock()
+        """Stop the kernel's cyclic senders."""
+        for bus in self._produced_buses:
+            bus.stop_kernel_sender()
+        self._select_reference_bus()
 
     @property
     def wake_ns(self) -> int:
-        """When to `poll` at the latest."""
+        """Latest time of the next `poll`."""
         return self._due_ns
 
     def set_period(self, period_ns: int, now_ns: int) -> None:
-        """Change the period. The kernel sends a SYNC at once, the loop as soon as the new period is over."""
+        """Change the period. The kernel sends a SYNC at once, the loop when the new period has passed."""
         if period_ns == self.period_ns:
             return
         self.period_ns = period_ns
         for bus in self._buses.values():
-            bus.jitter.skip()
-        for bus in self._produced:
+            bus.jitter.skip_interval()
+        for bus in self._produced_buses:
             if not bus.set_period(period_ns, now_ns):
-                self._take_over(bus, now_ns)
-        self._due_ns = max(now_ns, self._next_due_ns(self._begun_ns))
+                self._fall_back_to_loop(bus, now_ns)
+        self._due_ns = max(now_ns, self._next_due_ns(self._cycle_sync_ns))
 
     def poll(self, now_ns: int) -> int | None:
-        """Send what is due; the time of a cycle that begins now, be its SYNC ours or one that is late."""
+        """Send the SYNCs that are due; return the SYNC time of a cycle that begins now, None if none does."""
         if now_ns < self._due_ns:
             return None
-        if self._clock is not None and not self._has_looked:
-            self._has_looked = True  # after a pause of the loop the SYNC may be waiting to be received
+        if self._reference_bus is not None and not self._late_sync_checked:
+            self._late_sync_checked = True  # after a pause of the loop the SYNC may be among unread frames
             self._due_ns = now_ns
             return None
-        for bus in self._produced:
-            if bus.sender is not None and now_ns - bus.last_ns > _AWAY * self.period_ns:
-                self._take_over(bus, now_ns)
-        if self._clock is None:
+        for bus in self._produced_buses:
+            if (
+                bus.kernel_sender is not None
+                and now_ns - bus.last_sync_ns > _MAX_MISSING_SYNC_PERIODS * self.period_ns
+            ):
+                self._fall_back_to_loop(bus, now_ns)
+        if self._reference_bus is None:
             late = (now_ns - self._due_ns) // self.period_ns
             self.overruns += late
-            self._begin(now_ns, self._due_ns + late * self.period_ns)
+            self._begin_cycle(now_ns, self._due_ns + late * self.period_ns)
         else:
-            self._begin(now_ns, now_ns)
+            self._begin_cycle(now_ns, now_ns)
         return now_ns
 
-    def seen(self, bus_name: str, t_ns: int, now_ns: int) -> int | None:
-        """A SYNC was received, with this stamp; its time if it begins a cycle."""
+    def handle_sync(self, bus_name: str, arrival_ns: int, now_ns: int) -> int | None:
+        """Count a received SYNC; return `arrival_ns` if it begins a cycle, else None."""
         bus = self._buses[bus_name]
-        bus.received += 1
-        if not bus.ours or bus.sender is not None:
-            bus.last_ns = t_ns
-            bus.jitter.add(t_ns, self.period_ns)
-        if bus is not self._clock or t_ns - self._begun_ns < _SOONEST * self.period_ns:
+        bus.received_syncs += 1
+        if not bus.is_producer or bus.kernel_sender is not None:
+            bus.last_sync_ns = arrival_ns
+            bus.jitter.add_sync(arrival_ns, self.period_ns)
+        min_cycle_ns = _MIN_CYCLE_PERIODS * self.period_ns
+        if bus is not self._reference_bus or arrival_ns - self._cycle_sync_ns < min_cycle_ns:
             return None
-        self._begin(now_ns, t_ns)
-        return t_ns
+        self._begin_cycle(now_ns, arrival_ns)
+        return arrival_ns
 
-    def figures(self, bus_name: str, now_ns: int) -> dict[str, Any]:
-        """SYNC on a bus: sent by whom, jitter, how many were another producer's, what is wrong with it."""
+    def report(self, bus_name: str, now_ns: int) -> dict[str, Any]:
+        """Return a bus's SYNC producer, jitter, number of other producers' SYNCs and problem."""
         bus = self._buses[bus_name]
         return {
-            "by": "another" if not bus.ours else "loop" if bus.sender is None else "kernel",
-            "jitter_us": bus.jitter.figures(now_ns),
-            "others": bus.others,
+            "by": "other_producer"
+            if not bus.is_producer
+            else "loop"
+            if bus.kernel_sender is None
+            else "kernel",
+            "jitter_us": bus.jitter.percentiles_us(now_ns),
+            "other_syncs": bus.other_syncs,
             "problem": bus.problem,
         }
 
-    def _begin(self, now_ns: int, t_ns: int) -> None:
-        """A cycle begins: SYNC by the loop wherever the kernel doesn't send it."""
-        for bus in self._produced:
-            if bus.sender is None:
-                bus.send(now_ns, self.period_ns)
-        for bus in self._produced:
-            bus.judge(now_ns, self.period_ns)
-        self._choose_clock()
-        self._has_looked = False
-        self._begun_ns = t_ns
-        self._due_ns = self._next_due_ns(t_ns)
+    def _begin_cycle(self, now_ns: int, sync_ns: int) -> None:
+        """Begin a cycle; the loop sends SYNC on the buses on which the kernel doesn't."""
+        for bus in self._produced_buses:
+            if bus.kernel_sender is None:
+                bus.send_sync(now_ns, self.period_ns)
+        for bus in self._produced_buses:
+            bus.detect_other_producer(now_ns, self.period_ns)
+        self._select_reference_bus()
+        self._late_sync_checked = False
+        self._cycle_sync_ns = sync_ns
+        self._due_ns = self._next_due_ns(sync_ns)
 
-    def _next_due_ns(self, begun_ns: int) -> int:
-        return begun_ns + round(self.period_ns * (1.0 if self._clock is None else _LATE))
+    def _next_due_ns(self, sync_ns: int) -> int:
+        return sync_ns + round(self.period_ns * (1.0 if self._reference_bus is None else _LATE_SYNC_PERIODS))
 
-    def _choose_clock(self) -> None:
-        if self._produced:
-            self._clock = next((bus for bus in self._produced if bus.sender is not None), None)
+    def _select_reference_bus(self) -> None:
+        if self._produced_buses:
+            self._reference_bus = next(
+                (bus for bus in self._produced_buses if bus.kernel_sender is not None), None
+            )
         else:
-            self._clock = next(iter(self._buses.values()), None)
+            self._reference_bus = next(iter(self._buses.values()), None)
 
-    def _take_over(self, bus: _SyncBus, now_ns: int) -> None:
-        bus.halt()
-        bus.retry_ns = now_ns + _RETRY_NS
-        bus.open_window(now_ns, _TOLERANCE)
-        bus.problem = "the kernel's SYNC stays away; the loop sends it, and tries the kernel again"
+    def _fall_back_to_loop(self, bus: _SyncBus, now_ns: int) -> None:
+        bus.stop_kernel_sender()
+        bus.kernel_retry_ns = now_ns + _KERNEL_RETRY_NS
+        bus.start_window(now_ns, _WINDOW_TOLERANCE_SYNCS)
+        bus.problem = (
+            "no SYNC from the kernel's cyclic sender; the loop sends SYNC and retries the kernel every 5 s"
+        )
         _log.warning("bus %s: %s", bus.port.name, bus.problem)
-        self._choose_clock()
+        self._select_reference_bus()
 
 
 class _SyncBus:
-    """SYNC of one bus; `sender` is the kernel's, None where the loop or somebody else sends."""
+    """SYNC of one bus; `kernel_sender` is None where the loop or another producer sends."""
 
     def __init__(self, port: Port) -> None:
         self.port = port
-        self.ours = port.bus.sync == "producer" and port.bus.role != "listener"
-        self.sender: CyclicSender | None = None
-        self.jitter = Jitter()
-        self.last_ns = 0  # SYNC sent by us or seen
-        self.retry_ns = 0
-        self.received = self.others = 0
+        self.is_producer = port.bus.sync == "producer" and port.bus.role != "listener"
+        self.kernel_sender: CyclicSender | None = None
+        self.jitter = SyncJitter()
+        self.last_sync_ns = 0  # sent or received
+        self.kernel_retry_ns = 0
+        self.received_syncs = self.other_syncs = 0
         self.problem = ""
-        self._window_ns = self._sent = 0
+        self._window_start_ns = self._sent_syncs = 0
 
-    def send(self, now_ns: int, period_ns: int) -> None:
-        """Send SYNC now, by the kernel, which then goes on by itself, if it is time to try that."""
-        port, self.last_ns = self.port, now_ns
-        self.jitter.add(now_ns, period_ns)
-        if now_ns >= self.retry_ns:
-            self.retry_ns = now_ns + _RETRY_NS
-            if port.state.condition not in (Condition.DOWN, Condition.BUS_OFF):
-                self.sender = port.send_cyclically(SYNC_ID, b"", period_ns * 1e-9)
-                if self.sender is not None:
-                    self.jitter.skip()
-                    self.open_window(now_ns, self._sent)
+    def send_sync(self, now_ns: int, period_ns: int) -> None:
+        """Send SYNC now; have the kernel send it cyclically from now on if a retry is due."""
+        port, self.last_sync_ns = self.port, now_ns
+        self.jitter.add_sync(now_ns, period_ns)
+        if now_ns >= self.kernel_retry_ns:
+            self.kernel_retry_ns = now_ns + _KERNEL_RETRY_NS
+            if port.bus_state.error_state not in (ErrorState.DOWN, ErrorState.BUS_OFF):
+                self.kernel_sender = port.send_cyclically(cia301.SYNC, b"", period_ns * 1e-9)
+                if self.kernel_sender is not None:
+                    self.jitter.skip_interval()
+                    self.start_window(now_ns, self._sent_syncs)
                     return
-        if port.send(SYNC_ID, b""):
-            self._sent += 1
+        if port.send(cia301.SYNC, b""):
+            self._sent_syncs += 1
 
     def set_period(self, period_ns: int, now_ns: int) -> bool:
-        """False if the kernel refuses."""
-        self.open_window(now_ns, _TOLERANCE)
-        if self.sender is None:
+        """Change the period; return False if the kernel refuses."""
+        self.start_window(now_ns, _WINDOW_TOLERANCE_SYNCS)
+        if self.kernel_sender is None:
             return True
         try:
-            self.sender.set_period(period_ns * 1e-9)
+            self.kernel_sender.set_period(period_ns * 1e-9)
         except Exception:  # noqa: BLE001 - drivers raise anything; the loop takes over
             return False
         return True
 
-    def halt(self) -> None:
-        """The kernel sends no more."""
-        sender, self.sender = self.sender, None
-        self.jitter.skip()
+    def stop_kernel_sender(self) -> None:
+        """Stop the kernel's cyclic sender, if there is one."""
+        sender, self.kernel_sender = self.kernel_sender, None
+        self.jitter.skip_interval()
         if sender is not None:
             try:
                 sender.stop()
             except Exception as error:  # noqa: BLE001 - the interface may be gone, and the task with it
-                _log.info("bus %s: the kernel's SYNC can't be stopped: %s", self.port.name, error)
+                _log.warning("bus %s: kernel SYNC sender not stopped: %s", self.port.name, error)
 
-    def open_window(self, now_ns: int, allowed: int = 0) -> None:
-        """Count SYNCs from here; so many that were sent before may still come."""
-        self._window_ns, self._sent, self.received = now_ns, 0, -allowed
+    def start_window(self, now_ns: int, in_flight: int = 0) -> None:
+        """Count SYNCs from now on, except `in_flight` that were sent before."""
+        self._window_start_ns, self._sent_syncs, self.received_syncs = now_ns, 0, -in_flight
 
-    def judge(self, now_ns: int, period_ns: int) -> None:
-        """Once a second: did more SYNCs come than there can be of ours?"""
-        passed_ns = now_ns - self._window_ns
+    def detect_other_producer(self, now_ns: int, period_ns: int) -> None:
+        """Check once a second for more received SYNCs than this host can have sent."""
+        passed_ns = now_ns - self._window_start_ns
         if passed_ns < max(_SECOND_NS, 2 * period_ns):
             return
         ours = 0
-        if self.sender is not None:
-            ours = passed_ns // period_ns + _TOLERANCE
+        if self.kernel_sender is not None:
+            ours = passed_ns // period_ns + _WINDOW_TOLERANCE_SYNCS
         elif self.port.echoes:
-            ours = self._sent + _TOLERANCE
-        others = max(0, self.received - ours)
-        self.others += others
-        if others and self.problem != _ANOTHER:
-            _log.warning("bus %s: %s", self.port.name, _ANOTHER)
-        if others or self.sender is not None or self.problem == _ANOTHER:
-            self.problem = _ANOTHER if others else ""
-        self.open_window(now_ns)
+            ours = self._sent_syncs + _WINDOW_TOLERANCE_SYNCS
+        others = max(0, self.received_syncs - ours)
+        self.other_syncs += others
+        if others and self.problem != _OTHER_PRODUCER_PROBLEM:
+            _log.warning("bus %s: %s", self.port.name, _OTHER_PRODUCER_PROBLEM)
+        if others or self.kernel_sender is not None or self.problem == _OTHER_PRODUCER_PROBLEM:
+            self.problem = _OTHER_PRODUCER_PROBLEM if others else ""
+        self.start_window(now_ns)

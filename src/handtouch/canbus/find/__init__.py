@@ -1,1 +1,1 @@
-"""Who is on a bus: listen, ask, and give ids to nodes without one."""
+"""Search for nodes on a bus: passive analysis, probes, and LSS for nodes without an id."""

@@ -1,9 +1,9 @@
-"""Look at a bus without changing anything on it: listen, ask every id who it is, read what it offers.
+"""Survey of a bus that changes nothing on it: listen, probe every node id, read the nodes found.
 
-Public names: `Survey`, `NodeFacts`, `TpdoFacts`, `four_channels`.
+Public names: `BusSurvey`, `NodeFacts`, `TpdoFacts`, `find_four_channels`.
 
-All ids are asked at once and answer when they can, so that this takes as long as one time-out; the nodes
-that are there are then read side by side, by threads, while this one receives.
+All ids are probed at once, which takes one timeout in all; the nodes found are then read concurrently, by
+threads, while the calling thread receives.
 """
 
 from __future__ import annotations
@@ -16,34 +16,29 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.objects.sdo import Sdo, StepError
+from handtouch.canbus.find.traffic import Traffic
+from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient, SdoTransport
 
-from .lss import ANSWER_ID, REQUEST_ID
-from .traffic import NMT_STATES, Traffic
+RESPONSE_TIMEOUT_S = 0.2
+"""Timeout of a probe."""
+READ_TIMEOUT_S = 30.0
+"""Timeout for reading all nodes, long enough for the slowest bus."""
 
-ANSWER_WAIT_S = 0.2
-"""A node that is asked for an object answers within this."""
-READ_S = 30.0
-"""All that nodes tell is read within this, on the slowest bus."""
+MAX_READERS = 16
+"""Nodes read at the same time; their frames take 35 ms at 125 kbit/s, far less than a transfer's timeout."""
 
-READERS = 16
-"""Nodes read at the same time: their frames take 35 ms at 125 kbit/s, far less than a transfer's time-out."""
-
-_ANSWER, _REQUEST = 0x580, 0x600
-_DEVICE_TYPE, _IDENTITY, _HEARTBEAT, _INPUTS = 0x1000, 0x1018, 0x1017, 0x6401
-_NAME, _HARDWARE, _SOFTWARE = 0x1008, 0x1009, 0x100A
-_COMMUNICATION, _MAPPING = 0x1800, 0x1A00
-_TPDOS, _GAP = 512, 4  # as many TPDOs missing in a row are the end of them
+_MAX_MISSING_TPDOS = 4  # consecutive missing TPDOs that end the search
 _REQUEST_BITS = 135
-_SENDS, _SEND_PAUSE_S = 100, 0.002  # a full transmit queue is tried again
-_CONSTANT = frozenset({(_DEVICE_TYPE, 0), *((_IDENTITY, sub) for sub in (1, 2, 3, 4))})
-_OBJECT = struct.Struct("<BHB4s")
+_MAX_SEND_ATTEMPTS, _SEND_RETRY_S = 100, 0.002  # while the transmit queue is full
+_IDENTITY_OBJECTS = frozenset({(cia301.DEVICE_TYPE, 0), *((cia301.IDENTITY, sub) for sub in (1, 2, 3, 4))})
+_SDO_FRAME = struct.Struct("<BHB4s")
 
 
 @dataclass(frozen=True, slots=True)
 class TpdoFacts:
-    """A TPDO as its node has it: objects 0x1800 + n and 0x1A00 + n; None where the node hasn't got them."""
+    """A node's TPDO: objects 0x1800 + n and 0x1A00 + n; None where the node doesn't have them."""
 
     number: int
     cob_id: int | None
@@ -56,11 +51,15 @@ class TpdoFacts:
 
 @dataclass(frozen=True, slots=True)
 class NodeFacts:
-    """What a node tells of itself; None where it hasn't got the object.
+    """Data read from a node; None where it doesn't have the object.
 
-    `state` is the NMT state of its heartbeat, empty where none was heard; `boots` its boot-up messages;
-    `emergency` its latest EMCY message, `conflict` that two nodes have this id, `trouble` why it couldn't be
-    read, all in words and empty when all is well. `inputs` is the number of analogue inputs (0x6401 sub 0).
+    `state` : NMT state in its heartbeat, empty without a heartbeat
+    `answers` : it responds to SDO requests
+    `inputs` : number of analogue inputs (0x6401 sub 0)
+    `boots` : number of boot-up messages
+    `emergency` : text of its latest EMCY message
+    `conflict` : evidence that two nodes have this id, empty without one
+    `error` : reason why it couldn't be read, empty if it was
     """
 
     node_id: int
@@ -80,27 +79,27 @@ class NodeFacts:
     boots: int = 0
     emergency: str = ""
     conflict: str = ""
-    trouble: str = ""
+    error: str = ""
 
 
-class Survey:
-    """One bus. All calls from one thread; nothing is sent but by `ask`, `read` and `exchange`."""
+class BusSurvey:
+    """Survey of one bus, from one thread; only `probe_ids`, `read_nodes` and `exchange_lss` send frames."""
 
     def __init__(self, port: Port, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self.port = port
         self.traffic = Traffic()
         self._clock = clock
-        self._asked: dict[int, dict[tuple[int, int], set[bytes]]] = {}
-        self._answered: set[int] = set()
-        self._readers: dict[int, Sdo] = {}
-        self._lss: deque[bytes] = deque()
+        self._identity_values: dict[int, dict[tuple[int, int], set[bytes]]] = {}
+        self._responding_ids: set[int] = set()
+        self._readers: dict[int, SdoTransport] = {}
+        self._lss_responses: deque[bytes] = deque()
 
-    def listen(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Receive for so long, or until something is so (True then)."""
+    def receive(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Receive for that long, or until a condition is met; return True if it was."""
         end_ns = self._clock() + round(seconds * 1e9)
         while True:
             for frame in self.port.drain():
-                self._handle(*frame)
+                self._handle_frame(*frame)
             if until():
                 return True
             left_s = (end_ns - self._clock()) * 1e-9
@@ -108,166 +107,177 @@ class Survey:
                 return False
             select.select([self.port.fileno()], [], [], min(left_s, 0.02))
 
-    def ask(self, ids: Iterable[int] = range(1, 128)) -> set[int]:
-        """Ids that answer, to a request for the device type, with its value or with an abort.
+    def probe_ids(self, ids: Iterable[int] = range(1, 128)) -> set[int]:
+        """Return the ids that respond to a request for the device type, with its value or an abort.
 
-        Those that were heard and stay silent are asked once more.
+        Nodes of which other frames were received are probed once more if they don't respond.
         """
         ids = list(ids)
-        self._answered -= set(ids)
-        heard = self.traffic.nodes()
-        for asked in (ids, [node_id for node_id in ids if node_id in heard]):
-            silent = [node_id for node_id in asked if node_id not in self._answered]
+        self._responding_ids -= set(ids)
+        detected = self.traffic.detected_nodes()
+        for probed in (ids, [node_id for node_id in ids if node_id in detected]):
+            silent = [node_id for node_id in probed if node_id not in self._responding_ids]
             for node_id in silent:
-                self._send(_REQUEST + node_id, _OBJECT.pack(0x40, _DEVICE_TYPE, 0, bytes(4)))
+                self._send(
+                    cia301.SDO_REQUEST + node_id, _SDO_FRAME.pack(0x40, cia301.DEVICE_TYPE, 0, bytes(4))
+                )
             queued_s = len(silent) * _REQUEST_BITS / self.port.bus.bitrate_bit_s
             if silent:
-                self.listen(ANSWER_WAIT_S + queued_s, lambda: self._answered >= set(ids))
-        return self._answered & set(ids)
+                self.receive(RESPONSE_TIMEOUT_S + queued_s, lambda: self._responding_ids >= set(ids))
+        return self._responding_ids & set(ids)
 
-    def read(self, ids: Collection[int], told: Callable[[int], None] = lambda _: None) -> list[NodeFacts]:
-        """What the nodes with these ids tell of themselves; `told` is called with the number read so far."""
+    def read_nodes(
+        self, ids: Collection[int], progress: Callable[[int], None] = lambda _: None
+    ) -> list[NodeFacts]:
+        """Read the nodes with these ids; `progress` is called with the number read so far."""
         if not ids:
             return []
-        self._readers = {node_id: Sdo(node_id, self._send) for node_id in ids}
-        with ThreadPoolExecutor(READERS, "sdo") as pool:
-            jobs = [pool.submit(_read_node, node_id, sdo) for node_id, sdo in self._readers.items()]
-            end_ns = self._clock() + round(READ_S * 1e9)
-            while not self.listen(0.1, lambda: all(job.done() for job in jobs)):
-                told(sum(job.done() for job in jobs))
+        self._readers = {node_id: SdoTransport(node_id, self._send) for node_id in ids}
+        with ThreadPoolExecutor(MAX_READERS, "sdo") as pool:
+            jobs = [
+                pool.submit(_read_node, node_id, NodeSdoClient(transport))
+                for node_id, transport in self._readers.items()
+            ]
+            end_ns = self._clock() + round(READ_TIMEOUT_S * 1e9)
+            while not self.receive(0.1, lambda: all(job.done() for job in jobs)):
+                progress(sum(job.done() for job in jobs))
                 if self._clock() > end_ns:
                     self._readers = {}  # a transfer that never ends is cut off here, and times out
-        self.listen(0.01)  # for a second node's answer to the last request
+        self.receive(0.01)  # for a second node's response to the last request
         self._readers = {}
-        return [self._complete(job.result()) for job in jobs]
+        return [self._merge_traffic(job.result()) for job in jobs]
 
-    def silent(self, node_id: int) -> NodeFacts:
-        """What is known of a node that was heard and wasn't asked, or doesn't answer."""
-        return self._complete({"node_id": node_id})
+    def observed_facts(self, node_id: int) -> NodeFacts:
+        """Return what is known of a node that was not probed, or doesn't respond."""
+        return self._merge_traffic({"node_id": node_id})
 
-    def exchange(self, request: bytes | None, timeout_s: float) -> bytes | None:
-        """Send an LSS request and wait for an answer, as `LssMaster` wants it."""
+    def exchange_lss(self, request: bytes | None, timeout_s: float) -> bytes | None:
+        """Send an LSS request and wait for the response; the `Exchange` of an `LssMaster`."""
         if request is not None:
-            self.listen(0.0)
-            self._lss.clear()
-            self._send(REQUEST_ID, request)
-        self.listen(timeout_s, lambda: bool(self._lss))
-        return self._lss.popleft() if self._lss else None
+            self.receive(0.0)
+            self._lss_responses.clear()
+            self._send(cia301.LSS_REQUEST, request)
+        self.receive(timeout_s, lambda: bool(self._lss_responses))
+        return self._lss_responses.popleft() if self._lss_responses else None
 
-    def _handle(self, can_id: int, data: bytes, t_ns: int) -> None:
-        self.traffic.handle(can_id, data, t_ns)
-        if can_id == ANSWER_ID:
-            self._lss.append(data)
-        elif _ANSWER < can_id < _REQUEST and len(data) == 8:
-            self._hear_answer(can_id - _ANSWER, data)
+    def _handle_frame(self, can_id: int, data: bytes, arrival_ns: int) -> None:
+        self.traffic.handle_frame(can_id, data, arrival_ns)
+        if can_id == cia301.LSS_RESPONSE:
+            self._lss_responses.append(data)
+        elif cia301.SDO_RESPONSE < can_id < cia301.SDO_REQUEST and len(data) == 8:
+            self._handle_sdo_response(can_id - cia301.SDO_RESPONSE, data)
 
-    def _hear_answer(self, node_id: int, data: bytes) -> None:
-        command, index, sub, value = _OBJECT.unpack(data)
-        if command & 0xE0 in (0x40, 0x80) and (index, sub) == (_DEVICE_TYPE, 0):
-            self._answered.add(node_id)
-        if command & 0xE0 == 0x40 and (index, sub) in _CONSTANT:
-            self._asked.setdefault(node_id, {}).setdefault((index, sub), set()).add(value)
+    def _handle_sdo_response(self, node_id: int, data: bytes) -> None:
+        command, index, sub, value = _SDO_FRAME.unpack(data)
+        if command & 0xE0 in (0x40, 0x80) and (index, sub) == (cia301.DEVICE_TYPE, 0):
+            self._responding_ids.add(node_id)
+        if command & 0xE0 == 0x40 and (index, sub) in _IDENTITY_OBJECTS:
+            self._identity_values.setdefault(node_id, {}).setdefault((index, sub), set()).add(value)
         reader = self._readers.get(node_id)
-        if reader is not None and reader.waiting:
-            reader.deliver(data)
+        if reader is not None and reader.awaiting_response:
+            reader.deliver_response(data)
 
     def _send(self, can_id: int, data: bytes) -> bool:
-        for _ in range(_SENDS):
+        for _ in range(_MAX_SEND_ATTEMPTS):
             if self.port.send(can_id, data):
                 return True
-            time.sleep(_SEND_PAUSE_S)
+            time.sleep(_SEND_RETRY_S)
         return False
 
-    def _complete(self, facts: dict[str, object]) -> NodeFacts:
-        """Add what was heard of a node to what it told."""
+    def _merge_traffic(self, facts: dict[str, object]) -> NodeFacts:
+        """Add a node's observed traffic to the data read from it."""
         node_id = facts["node_id"]
         assert isinstance(node_id, int)
-        state = self.traffic.states.get(node_id)
+        state = self.traffic.nmt_states.get(node_id)
         name = "" if state is None else _state_name(state)
         return NodeFacts(
             **facts,  # type: ignore[arg-type]
             state=name,
-            boots=self.traffic.boots.get(node_id, 0),
+            boots=self.traffic.boot_up_counts.get(node_id, 0),
             emergency=self.traffic.emergencies.get(node_id, ""),
-            conflict=self._conflict(node_id),
+            conflict=self._describe_conflict(node_id),
         )
 
-    def _conflict(self, node_id: int) -> str:
-        """Two nodes with this id give themselves away by two answers to what is constant in a node."""
+    def _describe_conflict(self, node_id: int) -> str:
+        """Return evidence of two nodes with this id: different responses for a constant object."""
         names = {0: "device types", 1: "vendor ids", 2: "product codes", 3: "revisions", 4: "serial numbers"}
-        for (_, sub), values in sorted(self._asked.get(node_id, {}).items(), reverse=True):
+        for (_, sub), values in sorted(self._identity_values.get(node_id, {}).items(), reverse=True):
             if len(values) > 1:
                 numbers = sorted(int.from_bytes(value, "little") for value in values)
                 return f"two nodes with this id: {names[sub]} {' and '.join(map(str, numbers))}"
         return ""
 
 
-def four_channels(tpdos: Collection[TpdoFacts]) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """The four channels among what the TPDOs carry: (their mapping entries, numbers of their TPDOs).
+def find_four_channels(tpdos: Collection[TpdoFacts]) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+    """Return the mapping entries of the four channels, and the numbers of their TPDOs; None without any.
 
-    Looked for in this order: four entries or more of one object and width, in one TPDO or in several; exactly
-    four of one width, of any objects, in one TPDO or in several. None if there are no four of 8 to 32 bits.
+    Search order: four or more entries of one object and width, in one TPDO or in several; exactly four of one
+    width, of any objects, in one TPDO or in several. Entries have 8 to 32 bits.
     """
-    carried = [(tpdo.number, entry) for tpdo in tpdos for entry in tpdo.mapping if _is_integer(entry)]
+    carried = [(tpdo.number, entry) for tpdo in tpdos for entry in tpdo.mapping if _is_channel_entry(entry)]
     numbers = sorted({number for number, _ in carried})
     scopes = [[pair for pair in carried if pair[0] == number] for number in numbers] + [carried]
     for by_object in (True, False):
         for scope in scopes:
-            for group in _groups(scope, by_object):
+            for group in _group_entries(scope, by_object):
                 if len(group) == 4 or (by_object and len(group) > 4):
                     first = group[:4]
                     return tuple(entry for _, entry in first), tuple(sorted({number for number, _ in first}))
     return None
 
 
-def _groups(pairs: list[tuple[int, int]], by_object: bool) -> Iterator[list[tuple[int, int]]]:
-    """Entries of one width, and of one object; analogue inputs and process values before others."""
+def _group_entries(pairs: list[tuple[int, int]], by_object: bool) -> Iterator[list[tuple[int, int]]]:
+    """Group entries by width, and by object; analogue inputs and process values come first."""
     groups: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for number, entry in pairs:
         groups.setdefault((entry >> 16 if by_object else 0, entry & 0xFF), []).append((number, entry))
     yield from sorted(groups.values(), key=lambda group: not 0x6000 <= group[0][1] >> 16 <= 0x9FFF)
 
 
-def _is_integer(entry: int) -> bool:
-    """Whether a mapping entry may be a channel: of an integer's width, and no dummy."""
+def _is_channel_entry(entry: int) -> bool:
+    """Return True if a mapping entry may be a channel: an integer's width, and no dummy entry."""
     return entry & 0xFF in (8, 16, 24, 32) and entry >> 16 >= 0x2000
 
 
 def _state_name(state: int) -> str:
-    return NMT_STATES.get(state, f"state {state}")
+    return cia301.NMT_NAMES.get(state, f"state {state}")
 
 
-def _read_node(node_id: int, sdo: Sdo) -> dict[str, object]:
-    """All of a node; what was read until it fell silent, and `trouble` with the reason, where it does."""
+def _read_node(node_id: int, sdo: NodeSdoClient) -> dict[str, object]:
+    """Read a node; if it stops responding, return the data read so far and the reason as `error`."""
     facts: dict[str, object] = {"node_id": node_id, "answers": True}
     try:
-        facts["device_type"] = _number(sdo, _DEVICE_TYPE, 0)
+        facts["device_type"] = _read_integer(sdo, cia301.DEVICE_TYPE, 0)
         for sub, name in enumerate(("vendor_id", "product_code", "revision", "serial"), 1):
-            facts[name] = _number(sdo, _IDENTITY, sub)
-        facts["heartbeat_ms"] = _number(sdo, _HEARTBEAT, 0)
-        tpdos = facts["tpdos"] = tuple(_tpdos(sdo))
-        if four_channels(tpdos) is None:
-            facts["inputs"] = _number(sdo, _INPUTS, 0)
-        for index, name in ((_NAME, "name"), (_HARDWARE, "hardware"), (_SOFTWARE, "software")):
-            facts[name] = _text(sdo, index)
-    except StepError as error:
-        facts["trouble"] = str(error)
+            facts[name] = _read_integer(sdo, cia301.IDENTITY, sub)
+        facts["heartbeat_ms"] = _read_integer(sdo, cia301.HEARTBEAT_TIME, 0)
+        tpdos = facts["tpdos"] = tuple(_read_tpdos(sdo))
+        if find_four_channels(tpdos) is None:
+            facts["inputs"] = _read_integer(sdo, cia301.ANALOGUE_INPUTS, 0)
+        for index, name in (
+            (cia301.DEVICE_NAME, "name"),
+            (cia301.HARDWARE_VERSION, "hardware"),
+            (cia301.SOFTWARE_VERSION, "software"),
+        ):
+            facts[name] = _read_string(sdo, index)
+    except BootStepError as error:
+        facts["error"] = str(error)
     return facts
 
 
-def _tpdos(sdo: Sdo) -> Iterator[TpdoFacts]:
+def _read_tpdos(sdo: NodeSdoClient) -> Iterator[TpdoFacts]:
     missing = 0
-    for number in range(1, _TPDOS + 1):
-        count = _number(sdo, _MAPPING + number - 1, 0)
+    for number in range(1, cia301.MAX_TPDOS + 1):
+        count = _read_integer(sdo, cia301.TPDO_MAPPING + number - 1, 0)
         missing = missing + 1 if count is None else 0
-        if missing == _GAP:
+        if missing == _MAX_MISSING_TPDOS:
             return
         if count is None:
             continue
         subs = range(1, min(count, 64) + 1)
-        entries = [_number(sdo, _MAPPING + number - 1, sub) for sub in subs]
-        index = _COMMUNICATION + number - 1
-        cob_id, transmission, inhibit, event_ms = (_number(sdo, index, sub) for sub in (1, 2, 3, 5))
+        entries = [_read_integer(sdo, cia301.TPDO_MAPPING + number - 1, sub) for sub in subs]
+        index = cia301.TPDO_COMMUNICATION + number - 1
+        cob_id, transmission, inhibit, event_ms = (_read_integer(sdo, index, sub) for sub in (1, 2, 3, 5))
         yield TpdoFacts(
             number,
             None if cob_id is None else cob_id & 0x1FFFFFFF,
@@ -279,24 +289,24 @@ def _tpdos(sdo: Sdo) -> Iterator[TpdoFacts]:
         )
 
 
-def _number(sdo: Sdo, index: int, sub: int) -> int | None:
-    """As `_value`, 32 bits of it."""
-    value = _value(sdo, index, sub)
+def _read_integer(sdo: NodeSdoClient, index: int, sub: int) -> int | None:
+    """Read an object, limited to 32 bits; None if the node refuses."""
+    value = _read_object(sdo, index, sub)
     return None if value is None else value & 0xFFFFFFFF
 
 
-def _value(sdo: Sdo, index: int, sub: int) -> int | None:
-    """An object of any length, None if the node refuses to tell it. Raises StepError if it is silent."""
+def _read_object(sdo: NodeSdoClient, index: int, sub: int) -> int | None:
+    """Read an object of any length; None if the node refuses. Raises BootStepError after a timeout."""
     try:
         return sdo.read(index, sub, "an object")
-    except StepError as error:
-        if error.silent:
+    except BootStepError as error:
+        if error.timed_out:
             raise
         return None
 
 
-def _text(sdo: Sdo, index: int) -> str:
-    """A string object, printable; empty if the node hasn't got it. Raises StepError if it is silent."""
-    value = _value(sdo, index, 0) or 0
+def _read_string(sdo: NodeSdoClient, index: int) -> str:
+    """Read a string object, made printable; empty if the node doesn't have it."""
+    value = _read_object(sdo, index, 0) or 0
     data = value.to_bytes((value.bit_length() + 7) // 8, "little")
     return "".join(c if c.isprintable() else " " for c in data.decode("utf-8", "replace")).strip()[:80]

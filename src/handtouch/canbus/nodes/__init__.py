@@ -1,1 +1,1 @@
-"""The nodes of a hand as their master sees them: booted, watched, brought back."""
+"""Nodes of a hand from the master's side: boot-up, supervision, recovery."""

@@ -1,9 +1,8 @@
-"""The master's side of a hand's CANopen nodes: boots each one, watches it, brings it back when it was away.
+"""CANopen master of a hand's nodes: boots, supervises and recovers each of them.
 
-Public names: `Master`, `NodeSpec`, `NodeStatus`, `NodeEvent`, `SerialChanged`. One thread receives and calls
-`handle` and `poll`; whatever has to wait for a node's answer is done in worker threads of the master's own,
-so that one that is silent keeps none of the others waiting. Nodes are addressed one by one, never by a
-broadcast.
+Public names: `Master`, `NodeSpec`, `NodeState`, `NodeStatus`, `NodeEvent`, `SerialChanged`. One thread
+receives and calls `handle_frame` and `poll`; steps that wait for a node's response run in worker threads, so
+that a silent node doesn't delay the others. Nodes are addressed one by one, never by a broadcast.
 """
 
 from __future__ import annotations
@@ -15,73 +14,86 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.router import IDENTIFIERS, NOBODY
-from handtouch.canbus.objects import emergency
-from handtouch.canbus.objects.eds import EdsError
-from handtouch.canbus.objects.mapping import Mapping as PdoMapping
-
-from . import boot
-from .life import (
-    NMT_BOOT_UP,
-    Action,
-    Answer,
-    Babble,
-    Beats,
-    BootUp,
-    Event,
-    Failed,
-    Heartbeat,
+from handtouch.canbus.bus.router import IDENTIFIER_COUNT, NO_SLOT
+from handtouch.canbus.nodes import boot
+from handtouch.canbus.nodes.lifecycle import advance, due_ns, is_supervised
+from handtouch.canbus.nodes.lifecycle_types import (
+    BootUpReceived,
+    BusRole,
+    HeartbeatRate,
+    HeartbeatReceived,
+    LifecycleEvent,
+    NodeAction,
     NodeState,
-    Rest,
-    Role,
-    Sample,
-    Silence,
-    Stop,
-    Tick,
+    ProbeAnswered,
+    SampleRate,
+    SampleReceived,
+    SamplesMissing,
+    StandbyRequested,
+    StepFailed,
+    StopRequested,
+    TimerExpired,
 )
-from .lifecycle import advance, due_ns, is_supervised
-from .member import NMT_COMMANDS, Member, Outcome, Result, command, member, outcome
-from .spec import NodeEvent, NodeSpec, NodeStatus, SerialChanged
+from handtouch.canbus.nodes.managed_node import (
+    NMT_COMMANDS,
+    ManagedNode,
+    StepOutcome,
+    StepResult,
+    make_managed_node,
+    run_step,
+    send_nmt,
+)
+from handtouch.canbus.nodes.spec import (
+    NodeEvent,
+    NodeSpec,
+    NodeStatus,
+    SerialChanged,
+)
+from handtouch.canbus.objects import emergency
+from handtouch.canbus.objects.mapping import PdoMapping
+from handtouch.config.eds import EdsError
 
 __all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus", "SerialChanged"]
 
 STALE_PERIODS = 3
 """Periods without a sample after which an operational node is stale."""
-_LEAST_SILENCE_NS = 15_000_000
-"""And as long at least: at 1 kHz three periods are a pause of our own, in which nobody was asked."""
-BEATS_WATCHED = 10
-"""Heartbeat periods over which it is judged whether they come twice as often as they should."""
-CROWDED = 2
-"""Times in a row that they do before two nodes are said to have its id: late ones come in a burst once."""
-_TWICE = 1.6  # times as many
-BABBLE = 2
-"""Samples beyond one for each SYNC from which on a node is said to babble; duplicates are at most one."""
-_BABBLE_NS = 500_000_000  # over which they are counted
-_WORKERS = 32
-_EVENTS_KEPT = 1024
+_MIN_STALE_NS = 15_000_000
+"""Shortest time until stale: at 1 kHz three periods may be a pause of this process, without a SYNC."""
+HEARTBEAT_WINDOW_PERIODS = 10
+"""Heartbeat periods over which the heartbeat rate is measured."""
+MIN_DOUBLED_WINDOWS = 2
+"""Consecutive windows with a doubled rate that show a duplicate id; delayed heartbeats double one at most."""
+_MIN_DOUBLED_RATIO = 1.6
+MAX_EXTRA_SAMPLES_PER_SYNC = 2
+"""Samples beyond one per SYNC from which a node counts as babbling; duplicated frames cause one at most."""
+_SAMPLE_RATE_WINDOW_NS = 500_000_000
+_MAX_WORKERS = 32
+_MAX_EVENTS = 1024
 _NEVER_NS = 1 << 62
-_HASTE_NS = 30_000_000
-"""How long an answer to a request of the receiving thread's own is waited for."""
+_REQUEST_TIMEOUT_NS = 30_000_000
+"""Timeout of a request sent by the receiving thread itself."""
 _SDO_WRITTEN, _SDO_REFUSED = 0x60, 0x80
 
-_NMT, _SYNC, _TIME, _LSS_ANSWER, _LSS_REQUEST = 0x000, 0x080, 0x100, 0x7E4, 0x7E5
-_EMCY, _SDO_ANSWER, _SDO_REQUEST, _HEARTBEAT = 0x080, 0x580, 0x600, 0x700
-_PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
-_PROBE = bytes(
-    (0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0)
-)  # SDO: read 0x1000, the device type, which all nodes have
+_SHARED_IDS = (cia301.NMT, cia301.SYNC, cia301.TIME, cia301.LSS_RESPONSE, cia301.LSS_REQUEST)
+_PDO_IDS = range(0x180, 0x501, 0x80)
+_PROBE_REQUEST = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+"""SDO upload of the device type, 0x1000, which every node has."""
 
-_FOREIGN, _IGNORED = -1, -2
-_STARTED = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
+_UNKNOWN_SENDER, _IGNORED = -1, -2
+_STARTED_STATES = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
 
 
 class Master:
-    """Boots and watches nodes on one or several buses that share a slab.
+    """CANopen master of the nodes on one or several buses that share a slab.
 
-    `states` (slots,) uint8 holds the NodeState of each slot; samples are to be trusted in OPERATIONAL alone.
-    `period_ns` (slots,) int64 is how long it is between two samples at most: a SYNC period, or longer for an
-    event-driven node, `idle`; `paced_ns` since when. `paces` counts the changes.
+    `states` : (slots,) uint8, the NodeState of each slot; samples are valid in OPERATIONAL only
+    `sample_period_ns` : (slots,) int64, longest regular time between two samples: the SYNC period, or longer
+    for an event-driven node
+    `idle` : (slots,) bool, event-driven nodes
+    `transmission_since_ns` : (slots,) int64, time of the last change of `idle`
+    `transmission_changes` : number of these changes
     """
 
     def __init__(
@@ -90,7 +102,7 @@ class Master:
         """Read the nodes' EDS files; nothing is sent before `start`.
 
         With `sync_period_ns` an operational node without samples for three periods, and 15 ms, becomes STALE.
-        Raises EdsError for an EDS that can't be used, ValueError for nodes that contradict each other.
+        Raises EdsError for an unusable EDS, ValueError for nodes that contradict each other.
         """
         slabs = {id(port.slab): port.slab for port in ports.values()}
         if len(slabs) != 1:
@@ -99,357 +111,371 @@ class Master:
         self._ports = ports
         self.states: NDArray[np.uint8] = np.zeros(self._slab.size, dtype=np.uint8)
         self._sync_period_ns = sync_period_ns or 0
-        self.period_ns: NDArray[np.int64] = np.full(self._slab.size, self._sync_period_ns, dtype=np.int64)
-        self.paced_ns: NDArray[np.int64] = np.zeros(self._slab.size, dtype=np.int64)
+        self.sample_period_ns: NDArray[np.int64] = np.full(
+            self._slab.size, self._sync_period_ns, dtype=np.int64
+        )
+        self.transmission_since_ns: NDArray[np.int64] = np.zeros(self._slab.size, dtype=np.int64)
         self.idle: NDArray[np.bool_] = np.zeros(self._slab.size, dtype=np.bool_)
-        self.paces = 0
-        self._nodes = [member(spec, ports, sync_period_ns or 0) for spec in nodes]
+        self.transmission_changes = 0
+        self._nodes = [make_managed_node(spec, ports, sync_period_ns or 0) for spec in nodes]
         self._by_slot = {node.spec.slot: node for node in self._nodes}
         self._owners = _owners(ports, self._nodes)
-        self._waiting: dict[int, int] = {}  # slots whose next sample matters -> stamp of the last one
+        self._awaited_samples: dict[int, int] = {}  # slot -> arrival of its last sample
         self._next_due_ns = 0
-        self._repeats = (0, self._slab.repeats.copy())  # since when they are counted, and how many had come
+        self._repeat_window = (0, self._slab.repeat_counts.copy())  # its start, and the counts then
         self._babbling: set[int] = set()
-        self._neighbours = [  # slots of each bus's nodes, and whether its SYNC has our period
+        self._slots_by_bus = [  # slots of each bus's nodes, and if its SYNC is produced here
             (np.array(slots), port.bus.sync == "producer")
             for port in ports.values()
             if (slots := [node.spec.slot for node in self._nodes if node.port is port])
         ]
-        self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_EVENTS_KEPT)
-        self._results: deque[tuple[Member, Outcome | None, Result | None]] = deque()  # from the workers
+        self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_MAX_EVENTS)
+        # from the workers
+        self._results: deque[tuple[ManagedNode, StepOutcome | None, StepResult | None]] = deque()
         self._workers: ThreadPoolExecutor | None = None
 
-    def start(self, t_ns: int) -> None:
-        """Begin to look for the nodes."""
+    def start(self, now_ns: int) -> None:
+        """Begin to boot the nodes."""
         self._workers = ThreadPoolExecutor(
-            max_workers=min(_WORKERS, max(len(self._nodes), 1)), thread_name_prefix="canopen-sdo"
+            max_workers=min(_MAX_WORKERS, max(len(self._nodes), 1)), thread_name_prefix="canopen-sdo"
         )
         for node in self._nodes:
-            if node.timing.role is Role.LISTENER and node.mapping is not None:
-                self._route(node, node.mapping)
-                self._changed(node)
-        self._next_due_ns = t_ns
-        self.poll(t_ns)
+            if node.timing.role is BusRole.LISTENER and node.mapping is not None:
+                self._route_samples(node, node.mapping)
+                self._update_node_state(node)
+        self._next_due_ns = now_ns
+        self.poll(now_ns)
 
-    def handle(self, bus_name: str, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take a frame that was no sample. What no configured node sends is counted as foreign.
+    def handle_frame(self, bus_name: str, can_id: int, data: bytes, now_ns: int) -> None:
+        """Handle a frame that isn't a sample; one that no configured node sends is counted as foreign.
 
-        Before `start` and after `stop` nothing but that is done with it.
+        Before `start` and after `stop` frames are only counted.
         """
         owner = self._owners[bus_name][can_id]
         if owner >= 0 and self._workers is not None:
-            self._from_node(self._nodes[owner], can_id & 0x780, data, t_ns)
-        elif owner == _FOREIGN:
-            self._ports[bus_name].counters.foreign += 1
+            self._handle_node_frame(self._nodes[owner], can_id & 0x780, data, now_ns)
+        elif owner == _UNKNOWN_SENDER:
+            self._ports[bus_name].counters.unknown_frames += 1
         if self._results:
-            self._collect(t_ns)
+            self._collect_results(now_ns)
 
-    def poll(self, t_ns: int) -> None:
-        """Time-outs, retries and results of the worker; once a tick, after `drain` and `handle`."""
+    def poll(self, now_ns: int) -> None:
+        """Run timeouts and retries and collect the workers' results; once a tick, after `handle_frame`."""
         if self._workers is None:
             return
         if self._results:
-            self._collect(t_ns)
-        self._watch_samples(t_ns)
-        if t_ns - self._repeats[0] >= _BABBLE_NS and self._sync_period_ns:
-            self._watch_repeats(t_ns)
-        if t_ns >= self._next_due_ns:
-            self._tick(t_ns)
+            self._collect_results(now_ns)
+        self._check_samples(now_ns)
+        if now_ns - self._repeat_window[0] >= _SAMPLE_RATE_WINDOW_NS and self._sync_period_ns:
+            self._check_sample_rates(now_ns)
+        if now_ns >= self._next_due_ns:
+            self._run_timers(now_ns)
 
     @property
     def wake_ns(self) -> int:
-        """When to `poll` at the latest, were ticks far apart: a time-out, a retry, a node to be guarded."""
+        """Latest time of the next `poll` that a timeout, retry or guarding request needs."""
         return self._next_due_ns
 
-    def rest(self, slot: int, resting: bool, t_ns: int) -> None:
-        """A node isn't needed for now: excitation off, stopped; or it is again."""
+    def set_standby(self, slot: int, standby: bool, now_ns: int) -> None:
+        """Put a node in standby (excitation off, stopped), or boot it again."""
         node = self._by_slot[slot]
-        if node.life.resting != resting:
-            self._advance(node, Rest(resting), t_ns)
+        if node.lifecycle.standby != standby:
+            self._advance(node, StandbyRequested(standby), now_ns)
 
-    def pace(self, slot: int, idle: bool, t_ns: int) -> None:
-        """Make an operational node event-driven (`idle`), where it can be, or a started one synchronous.
+    def set_transmission(self, slot: int, idle: bool, now_ns: int) -> None:
+        """Make an operational node event-driven (`idle`), if it supports that, or a started one synchronous.
 
-        Back to synchronous is asked for at once, before the next SYNC; ask again until `idle` tells that it
-        is so. Whatever else has to be said to the node is said by a worker.
+        The request for synchronous transmission is sent at once, before the next SYNC; call again until
+        `self.idle` shows the change. All other requests are sent by a worker.
         """
         node = self._by_slot[slot]
-        may = self.can_idle(slot) if idle else node.life.state in _STARTED
-        if self._workers is None or node.idle == idle or not may:
+        allowed = self.can_idle(slot) if idle else node.lifecycle.state in _STARTED_STATES
+        if self._workers is None or node.idle == idle or not allowed:
             return
-        unanswered = node.asked_ns and t_ns - node.asked_ns > _HASTE_NS
-        if node.pacing and not unanswered:
+        unanswered = node.request_ns and now_ns - node.request_ns > _REQUEST_TIMEOUT_NS
+        if node.transmission_pending and not unanswered:
             return
-        node.pacing, node.asked_ns = True, 0
-        if idle or unanswered or node.working.locked() or node.mapping is None:
-            self._workers.submit(self._work, node, Action.PACE, node.life.attempt, idle)
+        node.transmission_pending, node.request_ns = True, 0
+        if idle or unanswered or node.sdo_lock.locked() or node.mapping is None:
+            self._workers.submit(
+                self._run_step, node, NodeAction.SET_TRANSMISSION, node.lifecycle.attempt, idle
+            )
             return
-        node.asked_ns, node.request = t_ns, boot.synchronous_request(node.mapping.tpdos[0])
-        node.port.send(_SDO_REQUEST + node.spec.node_id, node.request)
+        node.request_ns, node.request_data = now_ns, boot.synchronous_request(node.mapping.tpdos[0])
+        node.port.send(cia301.SDO_REQUEST + node.spec.node_id, node.request_data)
 
     def can_idle(self, slot: int) -> bool:
-        """Whether the node can be made event-driven: configured so, operational, and it hasn't refused."""
+        """Return True if a node can be made event-driven: configured, operational, and it hasn't refused."""
         node = self._by_slot[slot]
-        return node.may_idle and node.life.state is NodeState.OPERATIONAL
+        return node.can_idle and node.lifecycle.state is NodeState.OPERATIONAL
 
     def status(self) -> list[NodeStatus]:
-        """Every node as it is now, in the order given."""
+        """Return the status of every node in the order given."""
         return [node.status() for node in self._nodes]
 
-    def status_of(self, slot: int) -> NodeStatus:
-        """The node of a slot as it is now."""
+    def node_status(self, slot: int) -> NodeStatus:
+        """Return the status of the node of a slot."""
         return self._by_slot[slot].status()
 
-    def take_events(self) -> list[NodeEvent | SerialChanged]:
-        """What has happened since the last call, oldest first; the latest thousand if nobody asked."""
+    def drain_events(self) -> list[NodeEvent | SerialChanged]:
+        """Return the events since the last call, oldest first; at most the latest 1024."""
         events = list(self._events)
         self._events.clear()
         return events
 
-    def stop(self, t_ns: int) -> None:
-        """NMT stop to each configured node, one by one; returns when the workers have ended (in 0.2 s)."""
+    def stop(self, now_ns: int) -> None:
+        """Send NMT stop to each configured node and wait for the workers to end (up to 0.2 s)."""
         for node in self._nodes:
-            self._advance(node, Stop(), t_ns)
+            self._advance(node, StopRequested(), now_ns)
         if self._workers is not None:
             self._workers.shutdown(wait=True, cancel_futures=True)
             self._workers = None
         self._results.clear()
 
-    def _from_node(self, node: Member, service: int, data: bytes, t_ns: int) -> None:
-        size = {_HEARTBEAT: 1}.get(service, 8)
+    def _handle_node_frame(self, node: ManagedNode, service: int, data: bytes, now_ns: int) -> None:
+        size = {cia301.NMT_ERROR_CONTROL: 1}.get(service, 8)
         if len(data) != size:
-            node.port.counters.short += 1
-        elif service == _HEARTBEAT:
-            self._heartbeat(node, data[0] & 0x7F, t_ns)
-        elif service == _EMCY:
-            if (message := emergency.decode(data, t_ns)) is not None:
+            node.port.counters.wrong_length += 1
+        elif service == cia301.NMT_ERROR_CONTROL:
+            self._handle_heartbeat(node, data[0] & 0x7F, now_ns)
+        elif service == cia301.EMCY:
+            if (message := emergency.decode_emergency(data, now_ns)) is not None:
                 node.emergencies.append(message)
-        elif node.sdo.waiting:
-            node.sdo.deliver(data)
+        elif node.sdo.awaiting_response:
+            node.sdo.deliver_response(data)
         else:
-            if node.asked_ns and data[1:4] == node.request[1:4]:
-                self._pace_answered(node, data[0], t_ns)
-            self._advance(node, Answer(), t_ns)
+            if node.request_ns and data[1:4] == node.request_data[1:4]:
+                self._handle_transmission_response(node, data[0], now_ns)
+            self._advance(node, ProbeAnswered(), now_ns)
 
-    def _heartbeat(self, node: Member, nmt: int, t_ns: int) -> None:
-        if nmt == NMT_BOOT_UP:
-            node.booted, node.watched = True, None  # its heartbeat time is its own until it is configured
-            self._advance(node, BootUp(), t_ns)
+    def _handle_heartbeat(self, node: ManagedNode, nmt: int, now_ns: int) -> None:
+        if nmt == cia301.BOOT_UP:
+            node.booted, node.heartbeat_window = (
+                True,
+                None,
+            )  # not configured yet: its heartbeat time is its default
+            self._advance(node, BootUpReceived(), now_ns)
             return
         node.heartbeats += 1
-        self._watch_rate(node, t_ns)
-        if node.life.heartbeat_ns is not None:
-            node.missed += max(round((t_ns - node.life.heartbeat_ns) / node.timing.heartbeat_ns) - 1, 0)
-        self._advance(node, Heartbeat(nmt), t_ns)
+        self._check_heartbeat_rate(node, now_ns)
+        if node.lifecycle.last_heartbeat_ns is not None:
+            node.missed_heartbeats += max(
+                round((now_ns - node.lifecycle.last_heartbeat_ns) / node.timing.heartbeat_period_ns) - 1, 0
+            )
+        self._advance(node, HeartbeatReceived(nmt), now_ns)
 
-    def _watch_rate(self, node: Member, t_ns: int) -> None:
-        """Two nodes of one id give themselves away by their heartbeats, which come twice as often."""
-        if node.watched is None:
+    def _check_heartbeat_rate(self, node: ManagedNode, now_ns: int) -> None:
+        """Detect two nodes with one id by a doubled heartbeat rate."""
+        if node.heartbeat_window is None:
             return
-        since_ns, before = node.watched
-        periods = (t_ns - since_ns) / node.timing.heartbeat_ns
-        if periods < BEATS_WATCHED:
+        since_ns, before = node.heartbeat_window
+        periods = (now_ns - since_ns) / node.timing.heartbeat_period_ns
+        if periods < HEARTBEAT_WINDOW_PERIODS:
             return
-        node.watched = (t_ns, node.heartbeats)
-        twice = node.heartbeats - before > _TWICE * periods
-        node.crowded = node.crowded + 1 if twice else 0
-        if not twice or node.crowded >= CROWDED:
-            self._advance(node, Beats(twice), t_ns)
+        node.heartbeat_window = (now_ns, node.heartbeats)
+        doubled = node.heartbeats - before > _MIN_DOUBLED_RATIO * periods
+        node.doubled_windows = node.doubled_windows + 1 if doubled else 0
+        if not doubled or node.doubled_windows >= MIN_DOUBLED_WINDOWS:
+            self._advance(node, HeartbeatRate(doubled), now_ns)
 
-    def _watch_samples(self, t_ns: int) -> None:
-        stamps = self._slab.t_ns
-        for slot, seen_ns in list(self._waiting.items()):
-            if stamps[slot] != seen_ns:
-                self._waiting[slot] = int(stamps[slot])
-                self._advance(self._by_slot[slot], Sample(), t_ns)
+    def _check_samples(self, now_ns: int) -> None:
+        arrival_ns = self._slab.arrival_ns
+        for slot, previous_ns in list(self._awaited_samples.items()):
+            if arrival_ns[slot] != previous_ns:
+                self._awaited_samples[slot] = int(arrival_ns[slot])
+                self._advance(self._by_slot[slot], SampleReceived(), now_ns)
         if self._sync_period_ns:
-            ages = t_ns - np.maximum(stamps, self.paced_ns)
-            patience_ns = np.maximum(STALE_PERIODS * self.period_ns, _LEAST_SILENCE_NS)
-            silent = (self.states == NodeState.OPERATIONAL) & (ages > patience_ns)
-            if silent.any():
-                for slot in np.flatnonzero(silent).tolist():
-                    self._advance(self._by_slot[slot], Silence(int(ages[slot])), t_ns)
+            ages_ns = now_ns - np.maximum(arrival_ns, self.transmission_since_ns)
+            timeout_ns = np.maximum(STALE_PERIODS * self.sample_period_ns, _MIN_STALE_NS)
+            stale = (self.states == NodeState.OPERATIONAL) & (ages_ns > timeout_ns)
+            if stale.any():
+                for slot in np.flatnonzero(stale).tolist():
+                    self._advance(self._by_slot[slot], SamplesMissing(int(ages_ns[slot])), now_ns)
 
-    def _watch_repeats(self, t_ns: int) -> None:
-        """Which nodes send far more samples than SYNC asks for.
+    def _check_sample_rates(self, now_ns: int) -> None:
+        """Detect nodes that send far more than one sample per SYNC.
 
-        A SYNC too many, or one that somebody else sends as often as he likes, shows in most of a bus's nodes.
+        Extra SYNCs, or SYNCs of another producer at any rate, show in most nodes of a bus and are subtracted.
         """
-        since_ns, before = self._repeats
-        self._repeats = (t_ns, self._slab.repeats.copy())
-        extra = self._slab.repeats - before
-        periods = max((t_ns - since_ns) / self._sync_period_ns, 1.0)
+        since_ns, before = self._repeat_window
+        self._repeat_window = (now_ns, self._slab.repeat_counts.copy())
+        extra = self._slab.repeat_counts - before
+        periods = max((now_ns - since_ns) / self._sync_period_ns, 1.0)
         babbling: set[int] = set()
-        for slots, is_ours in self._neighbours:
-            alone = len(slots) == 1 and is_ours
-            usual = 0 if alone else np.sort(extra[slots])[(len(slots) - 1) // 2]
-            babbling.update(slots[extra[slots] - usual > BABBLE * periods].tolist())
+        for slots, is_producer in self._slots_by_bus:
+            alone = len(slots) == 1 and is_producer
+            median = 0 if alone else np.sort(extra[slots])[(len(slots) - 1) // 2]
+            babbling.update(slots[extra[slots] - median > MAX_EXTRA_SAMPLES_PER_SYNC * periods].tolist())
         for slot in babbling | self._babbling:
-            times = 1 + round(extra[slot] / periods) if slot in babbling else 0
-            self._advance(self._by_slot[slot], Babble(times), t_ns)
+            samples_per_sync = 1 + round(extra[slot] / periods) if slot in babbling else 0
+            self._advance(self._by_slot[slot], SampleRate(samples_per_sync), now_ns)
         self._babbling = babbling
 
-    def _tick(self, t_ns: int) -> None:
+    def _run_timers(self, now_ns: int) -> None:
         self._next_due_ns = _NEVER_NS
         for node in self._nodes:
-            due = due_ns(node.life, node.timing)
-            if due is not None and due <= t_ns:
-                self._advance(node, Tick(), t_ns)
-                due = due_ns(node.life, node.timing)
-            if node.guarded and is_supervised(node.life):
-                self._guard(node, t_ns)
-                due = min(node.guard_ns, due) if due is not None else node.guard_ns
+            due = due_ns(node.lifecycle, node.timing)
+            if due is not None and due <= now_ns:
+                self._advance(node, TimerExpired(), now_ns)
+                due = due_ns(node.lifecycle, node.timing)
+            if node.guarded and is_supervised(node.lifecycle):
+                self._send_guard_request(node, now_ns)
+                due = min(node.next_guard_ns, due) if due is not None else node.next_guard_ns
             if due is not None:
                 self._next_due_ns = min(self._next_due_ns, due)
 
-    def _guard(self, node: Member, t_ns: int) -> None:
-        """Ask a node that has no heartbeat for its state, once a period."""
-        if t_ns >= node.guard_ns:
-            node.port.send(_HEARTBEAT + node.spec.node_id, b"", remote=True)
-            node.guard_ns = t_ns + node.timing.heartbeat_ns
+    def _send_guard_request(self, node: ManagedNode, now_ns: int) -> None:
+        """Send a guarding request to a node without heartbeat, once a period."""
+        if now_ns >= node.next_guard_ns:
+            node.port.send(cia301.NMT_ERROR_CONTROL + node.spec.node_id, b"", remote=True)
+            node.next_guard_ns = now_ns + node.timing.heartbeat_period_ns
 
-    def _advance(self, node: Member, event: Event, t_ns: int) -> None:
-        before = node.life
-        node.life, actions = advance(before, event, t_ns, node.timing)
-        after = node.life
+    def _advance(self, node: ManagedNode, event: LifecycleEvent, now_ns: int) -> None:
+        before = node.lifecycle
+        node.lifecycle, actions = advance(before, event, now_ns, node.timing)
+        after = node.lifecycle
         if (before.state, before.reason) != (after.state, after.reason):
-            self._changed(node)
-            self._tell(node, before.state, after.reason, t_ns)
+            self._update_node_state(node)
+            self._append_event(node, before.state, after.reason, now_ns)
         due = due_ns(after, node.timing)
         if due is not None and due < self._next_due_ns:
             self._next_due_ns = due
         for action in actions:
-            self._act(node, action)
+            self._perform_action(node, action)
 
-    def _changed(self, node: Member) -> None:
-        """Keep what is derived from a node's state."""
-        slot, state = node.spec.slot, node.life.state
+    def _update_node_state(self, node: ManagedNode) -> None:
+        """Update the data derived from a node's state."""
+        slot, state = node.spec.slot, node.lifecycle.state
         self.states[slot] = state
-        overheard = node.timing.role is Role.LISTENER and state is NodeState.ABSENT
-        if overheard or state in (NodeState.SETTLING, NodeState.STALE):
-            self._waiting.setdefault(slot, int(self._slab.t_ns[slot]))
+        may_appear = node.timing.role is BusRole.LISTENER and state is NodeState.ABSENT
+        if may_appear or state in (NodeState.SETTLING, NodeState.STALE):
+            self._awaited_samples.setdefault(slot, int(self._slab.arrival_ns[slot]))
         else:
-            self._waiting.pop(slot, None)
+            self._awaited_samples.pop(slot, None)
 
-    def _tell(self, node: Member, old: NodeState, reason: str, t_ns: int) -> None:
-        self._events.append(NodeEvent(node.spec.slot, t_ns, old, node.life.state, reason))
+    def _append_event(self, node: ManagedNode, old: NodeState, reason: str, now_ns: int) -> None:
+        self._events.append(NodeEvent(node.spec.slot, now_ns, old, node.lifecycle.state, reason))
 
-    def _act(self, node: Member, action: Action) -> None:
+    def _perform_action(self, node: ManagedNode, action: NodeAction) -> None:
         if action in NMT_COMMANDS:
-            command(node, action)
-        elif action is Action.PROBE:
-            node.port.send(_SDO_REQUEST + node.spec.node_id, _PROBE)
-            # stopped, it serves no SDO; without heartbeat it tells its state only when it is asked
-            node.port.send(_HEARTBEAT + node.spec.node_id, b"", remote=True)
+            send_nmt(node, action)
+        elif action is NodeAction.PROBE:
+            node.port.send(cia301.SDO_REQUEST + node.spec.node_id, _PROBE_REQUEST)
+            # a stopped node serves no SDO; one without heartbeat reports its state only when guarded
+            node.port.send(cia301.NMT_ERROR_CONTROL + node.spec.node_id, b"", remote=True)
         elif self._workers is not None:
-            self._workers.submit(self._work, node, action, node.life.attempt)
+            self._workers.submit(self._run_step, node, action, node.lifecycle.attempt)
 
-    def _work(self, node: Member, step: Action, attempt: int, idle: bool = False) -> None:
-        """In a worker: carry out a step; its outcome goes to the receiving thread."""
-        with node.working:
-            self._results.append((node, *outcome(node, step, attempt, idle)))
+    def _run_step(self, node: ManagedNode, step: NodeAction, attempt: int, idle: bool = False) -> None:
+        """Run a step in a worker; its outcome goes to the receiving thread."""
+        with node.sdo_lock:
+            self._results.append((node, *run_step(node, step, attempt, idle)))
 
-    def _collect(self, t_ns: int) -> None:
+    def _collect_results(self, now_ns: int) -> None:
         while self._results:
             node, outcome, result = self._results.popleft()
-            if outcome is None or outcome.attempt != node.life.attempt:
+            if outcome is None or outcome.attempt != node.lifecycle.attempt:
                 continue
-            if outcome.step is Action.PACE:
-                self._paced(node, outcome, result, t_ns)
+            if outcome.step is NodeAction.SET_TRANSMISSION:
+                self._finish_transmission(node, outcome, result, now_ns)
                 continue
             if isinstance(result, boot.Identity):
-                self._take_identity(node, result, t_ns)
-            elif isinstance(result, boot.Configured):
+                self._update_identity(node, result, now_ns)
+            elif isinstance(result, boot.NodeConfigured):
                 node.guarded = result.guarded
-                node.booted, node.may_idle = False, result.may_idle
-                self._set_pace(node, False, t_ns)
-                self._next_due_ns = t_ns
-                if node.watched is None:
-                    node.watched, node.crowded = (t_ns, node.heartbeats), 0
+                node.booted, node.can_idle = False, result.can_idle
+                self._record_transmission(node, False, now_ns)
+                self._next_due_ns = now_ns
+                if node.heartbeat_window is None:
+                    node.heartbeat_window, node.doubled_windows = (now_ns, node.heartbeats), 0
                 if result.refusal:
-                    self._tell(node, node.life.state, result.refusal, t_ns)
-            elif isinstance(result, PdoMapping) and (clash := self._route(node, result)):
-                outcome = Failed(outcome.step, outcome.attempt, clash)
-            self._advance(node, outcome, t_ns)
+                    self._append_event(node, node.lifecycle.state, result.refusal, now_ns)
+            elif isinstance(result, PdoMapping) and (clash := self._route_samples(node, result)):
+                outcome = StepFailed(outcome.step, outcome.attempt, clash)
+            self._advance(node, outcome, now_ns)
 
-    def _paced(self, node: Member, outcome: Outcome, result: Result | None, t_ns: int) -> None:
-        node.pacing = False
-        if isinstance(result, boot.Paced):
-            self._set_pace(node, result.idle, t_ns)
-        elif isinstance(outcome, Failed):
-            # one that refuses to be event-driven isn't asked again until it boots
-            node.may_idle = node.idle
-            if outcome.silent:
-                self._advance(node, outcome, t_ns)
+    def _finish_transmission(
+        self, node: ManagedNode, outcome: StepOutcome, result: StepResult | None, now_ns: int
+    ) -> None:
+        node.transmission_pending = False
+        if isinstance(result, boot.TransmissionSet):
+            self._record_transmission(node, result.idle, now_ns)
+        elif isinstance(outcome, StepFailed):
+            # not requested again until the node boots
+            node.can_idle = node.idle
+            if outcome.timed_out:
+                self._advance(node, outcome, now_ns)
                 return
             kind = "event-driven" if node.idle else "synchronous"
-            self._tell(node, node.life.state, f"stays {kind}: {outcome.reason}", t_ns)
+            self._append_event(node, node.lifecycle.state, f"stays {kind}: {outcome.reason}", now_ns)
 
-    def _pace_answered(self, node: Member, command: int, t_ns: int) -> None:
-        """A node that doesn't let a PDO be changed while it is on needs more than one request."""
+    def _handle_transmission_response(self, node: ManagedNode, command: int, now_ns: int) -> None:
+        """Record the change, or have a worker make it: some nodes refuse to change an enabled PDO."""
         if command == _SDO_WRITTEN:
-            self._set_pace(node, False, t_ns)
+            self._record_transmission(node, False, now_ns)
         elif command == _SDO_REFUSED and self._workers is not None:
-            node.asked_ns = 0
-            self._workers.submit(self._work, node, Action.PACE, node.life.attempt, False)
+            node.request_ns = 0
+            self._workers.submit(
+                self._run_step, node, NodeAction.SET_TRANSMISSION, node.lifecycle.attempt, False
+            )
 
-    def _set_pace(self, node: Member, idle: bool, t_ns: int) -> None:
+    def _record_transmission(self, node: ManagedNode, idle: bool, now_ns: int) -> None:
         slot, spec = node.spec.slot, node.spec
-        node.idle, node.pacing, node.asked_ns = idle, False, 0
+        node.idle, node.transmission_pending, node.request_ns = idle, False, 0
         period_ns = spec.idle.period_ms * 1_000_000 if idle and spec.idle else 0
-        self.period_ns[slot] = max(period_ns, self._sync_period_ns)
-        self.paced_ns[slot] = t_ns
+        self.sample_period_ns[slot] = max(period_ns, self._sync_period_ns)
+        self.transmission_since_ns[slot] = now_ns
         self.idle[slot] = idle
-        self.paces += 1
+        self.transmission_changes += 1
 
-    def _take_identity(self, node: Member, identity: boot.Identity, t_ns: int) -> None:
+    def _update_identity(self, node: ManagedNode, identity: boot.Identity, now_ns: int) -> None:
         before = node.identity
         node.identity = identity
         if before is not None and before.serial != identity.serial:
-            self._events.append(SerialChanged(node.spec.slot, t_ns, before.serial, identity.serial))
+            self._events.append(SerialChanged(node.spec.slot, now_ns, before.serial, identity.serial))
 
-    def _route(self, node: Member, mapping: PdoMapping) -> str:
-        """Route the node's samples; the reason where an identifier of theirs is another node's already."""
+    def _route_samples(self, node: ManagedNode, mapping: PdoMapping) -> str:
+        """Route the node's samples; return the reason if another node has one of their identifiers."""
         router, slot = node.port.router, node.spec.slot
         for tpdo in mapping.tpdos:
-            owner = router.slot(tpdo.cob_id)
-            if owner not in (NOBODY, slot):
+            owner = router.get_slot(tpdo.cob_id)
+            if owner not in (NO_SLOT, slot):
                 return (
                     f"TPDO{tpdo.number} has identifier 0x{tpdo.cob_id:X}, as has "
-                    f"{self._by_slot[owner].spec.name}; give one of them another, and store it"
+                    f"{self._by_slot[owner].spec.name}; give one of them another identifier and store it"
                 )
         for tpdo in node.mapping.tpdos if node.mapping else ():
-            router.route(tpdo.cob_id, NOBODY)
+            router.route(tpdo.cob_id, NO_SLOT)
         if node.mapping is None or node.mapping.layout != mapping.layout:
-            node.port.slab.arrange(slot, mapping.layout)
+            node.port.slab.set_layout(slot, mapping.layout)
         for number, tpdo in enumerate(mapping.tpdos):
-            router.route(tpdo.cob_id, slot, number, tpdo.size)
+            router.route(tpdo.cob_id, slot, number, tpdo.size_bytes)
         node.mapping = mapping
         return ""
 
 
-def _owners(ports: Mapping[str, Port], nodes: Sequence[Member]) -> dict[str, list[int]]:
-    """For each bus and identifier: which of `nodes` handles it, _IGNORED or _FOREIGN."""
-    owners = {name: [_FOREIGN] * IDENTIFIERS for name in ports}
+def _owners(ports: Mapping[str, Port], nodes: Sequence[ManagedNode]) -> dict[str, list[int]]:
+    """Return for each bus and identifier the index in `nodes`, _IGNORED or _UNKNOWN_SENDER."""
+    owners = {name: [_UNKNOWN_SENDER] * IDENTIFIER_COUNT for name in ports}
     for table in owners.values():
-        for can_id in (_NMT, _SYNC, _TIME, _LSS_ANSWER, _LSS_REQUEST):
+        for can_id in _SHARED_IDS:
             table[can_id] = _IGNORED
     slots: set[int] = set()
-    heard: dict[tuple[str, int], str] = {}  # a listener's nodes by the identifiers of their samples
+    senders: dict[tuple[str, int], str] = {}  # nodes on listener buses by the identifiers of their samples
     for number, node in enumerate(nodes):
         spec, table = node.spec, owners[node.spec.bus]
-        if table[_HEARTBEAT + spec.node_id] != _FOREIGN or spec.slot in slots:
+        if table[cia301.NMT_ERROR_CONTROL + spec.node_id] != _UNKNOWN_SENDER or spec.slot in slots:
             raise ValueError(f'node "{spec.name}": node id {spec.node_id} or slot {spec.slot} is given twice')
         slots.add(spec.slot)
         for tpdo in node.mapping.tpdos if node.mapping else ():
-            other = heard.setdefault((spec.bus, tpdo.cob_id), spec.name)
+            other = senders.setdefault((spec.bus, tpdo.cob_id), spec.name)
             if other != spec.name:
                 raise EdsError(
                     f'nodes "{other}" and "{spec.name}" both send 0x{tpdo.cob_id:X} by their EDS; '
-                    "give each an EDS, or DCF, with the identifiers that it has"
+                    "give each an EDS or DCF with its own identifiers"
                 )
-        for service in (_EMCY, _SDO_ANSWER, _HEARTBEAT):
+        for service in (cia301.EMCY, cia301.SDO_RESPONSE, cia301.NMT_ERROR_CONTROL):
             table[service + spec.node_id] = number
-        for service in (_SDO_REQUEST, *_PDOS):  # our own requests, echoed; PDOs before they are routed
+        for service in (cia301.SDO_REQUEST, *_PDO_IDS):  # echoes of requests; PDOs before they are routed
             table[service + spec.node_id] = _IGNORED
     return owners

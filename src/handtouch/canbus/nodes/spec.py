@@ -1,6 +1,6 @@
-"""What the master is told of a node and what it tells.
+"""Nodes of a deployment as the master gets them, and their status and events as it reports them.
 
-Public names: `NodeSpec`, `node_specs`, `checked`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
+Public names: `NodeSpec`, `node_specs`, `check_nodes`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
 """
 
 from __future__ import annotations
@@ -8,30 +8,35 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from handtouch.canbus.objects.channels import (
+from handtouch.canbus.nodes.boot import Identity, IdleSettings
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.objects.emergency import Emergency
+from handtouch.canbus.objects.mapping import mapping_from_eds
+from handtouch.config import (
+    ConfigError,
+    Deployment,
+    Node,
+    Problem,
+)
+from handtouch.config.channels import (
     STANDARD_CHANNELS,
     Channels,
-    Object,
-    channels_of,
-    in_order,
-    written,
+    WritableObject,
+    order_by_electrode,
+    parse_writable_object,
+    resolve_channels,
 )
-from handtouch.canbus.objects.eds import EdsError
-from handtouch.canbus.objects.emergency import Emergency
-from handtouch.canbus.objects.mapping import from_eds
-from handtouch.config import ConfigError, Deployment, Node, Problem
-
-from .boot import Identity, Idle
-from .life import NodeState
+from handtouch.config.eds import EdsError
 
 
 @dataclass(frozen=True, slots=True)
 class NodeSpec:
-    """A node as the configuration describes it; identity fields left None are not checked.
+    """A node of the deployment; identity fields that are None are not checked.
 
-    `channels` are those of the electrodes x0, xa, y0, yb. `remap`: they may be mapped to a TPDO over SDO.
-    `event_timer_ms`: how often it sends if it can't follow SYNC. `foreign`: serial numbers that belong to
-    other pads.
+    `channels` : those of the electrodes x0, xa, y0, yb
+    `allow_pdo_remapping` : they may be mapped to a TPDO over SDO
+    `event_timer_ms` : period of a node that can't follow SYNC
+    `serials_of_other_pads` : serial numbers configured for other pads
     """
 
     slot: int
@@ -42,20 +47,20 @@ class NodeSpec:
     vendor_id: int | None = None
     product_code: int | None = None
     serial: int | None = None
-    foreign: frozenset[int] = frozenset()
+    serials_of_other_pads: frozenset[int] = frozenset()
     revision: int | None = None
     channels: Channels = STANDARD_CHANNELS
-    remap: bool = True
-    idle: Idle | None = None
-    excitation: Object | None = None
+    allow_pdo_remapping: bool = True
+    idle: IdleSettings | None = None
+    excitation: WritableObject | None = None
     heartbeat_ms: int = 100
     heartbeat_timeout_ms: int = 350
     event_timer_ms: int = 5
 
 
 def node_specs(deployment: Deployment) -> list[NodeSpec]:
-    """What a deployment says of every node, in the order of its pads. Raises EdsError."""
-    pads = [(hand.name, pad) for hand in deployment.hands for pad in hand.pads]
+    """Return the nodes of a deployment in the order of its pads. Raises EdsError."""
+    pads = deployment.pads
     specs = []
     for slot, (hand, pad) in enumerate(pads):
         kind = deployment.nodes[pad.node]
@@ -70,10 +75,10 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
                 product_code=kind.product_code,
                 revision=kind.revision,
                 serial=pad.serial,
-                channels=in_order(channels_of(kind.channels, kind.eds), pad.electrodes),
-                remap=kind.remap,
-                idle=_idle(kind, deployment.daemon.sync_period_ms),
-                excitation=written(kind.excitation) if kind.excitation else None,
+                channels=order_by_electrode(resolve_channels(kind.channels, kind.eds), pad.electrodes),
+                allow_pdo_remapping=kind.allow_pdo_remapping,
+                idle=_idle_settings(kind, deployment.daemon.sync_period_ms),
+                excitation=parse_writable_object(kind.excitation_object) if kind.excitation_object else None,
                 heartbeat_ms=kind.heartbeat_ms,
                 heartbeat_timeout_ms=kind.heartbeat_timeout_ms,
                 event_timer_ms=max(1, round(deployment.daemon.sync_period_ms)),
@@ -82,65 +87,65 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
     return specs
 
 
-def checked(deployment: Deployment, file: str) -> Deployment:
-    """The deployment, if nodes can have the objects that it names. Raises ConfigError with all mistakes."""
-    problems = [*_problems(deployment)]
+def check_nodes(deployment: Deployment, file: str) -> Deployment:
+    """Check the objects that a deployment names, and return it. Raises ConfigError with all problems."""
+    problems = [*_find_problems(deployment)]
     if problems:
         raise ConfigError(file, tuple(problems))
     return deployment
 
 
-def _problems(deployment: Deployment) -> Iterator[Problem]:
-    listened = {bus.name for bus in deployment.buses if bus.role == "listener"}
+def _find_problems(deployment: Deployment) -> Iterator[Problem]:
+    listener_buses = {bus.name for bus in deployment.buses if bus.role == "listener"}
     for name, kind in deployment.nodes.items():
-        place = f"[node.{name}]: "
+        prefix = f"[node.{name}]: "
         try:
-            channels = channels_of(kind.channels, kind.eds)
+            channels = resolve_channels(kind.channels, kind.eds)
             for hand in deployment.hands:
                 for pad in hand.pads:
-                    if pad.node == name and pad.bus in listened:
-                        from_eds(kind.eds, pad.node_id, channels)
+                    if pad.node == name and pad.bus in listener_buses:
+                        mapping_from_eds(kind.eds, pad.node_id, channels)
         except EdsError as error:
-            yield Problem(f"{place}channels", "", str(error))
-        if kind.excitation is not None:
-            yield from _unwritable(f"{place}excitation", kind.excitation)
+            yield Problem(f"{prefix}channels", "", str(error))
+        if kind.excitation_object is not None:
+            yield from _find_unwritable(f"{prefix}excitation_object", kind.excitation_object)
         if kind.idle is not None:
-            place = f"[node.{name}.idle]: "
+            prefix = f"[node.{name}.idle]: "
             for text in kind.idle.delta_objects:
-                yield from _unwritable(f"{place}delta_objects", text, kind.idle.delta_counts)
+                yield from _find_unwritable(f"{prefix}delta_objects", text, kind.idle.delta_counts)
             if kind.idle.enable_object:
-                yield from _unwritable(f"{place}enable_object", kind.idle.enable_object)
+                yield from _find_unwritable(f"{prefix}enable_object", kind.idle.enable_object)
 
 
-def _unwritable(place: str, text: str, value: int = 1) -> Iterator[Problem]:
+def _find_unwritable(key: str, text: str, value: int = 1) -> Iterator[Problem]:
     try:
-        size = written(text).size
+        size = parse_writable_object(text).size_bytes
     except EdsError as error:
-        yield Problem(place, "", str(error))
+        yield Problem(key, "", str(error))
         return
     if value >= 1 << 8 * size:
-        yield Problem(place, "", f'"{text}": delta_counts = {value} is beyond its type; choose a smaller one')
+        yield Problem(key, "", f'"{text}": delta_counts = {value} is beyond its type; choose a smaller value')
 
 
-def _idle(kind: Node, sync_period_ms: float) -> Idle | None:
-    """Events come no faster than samples would."""
+def _idle_settings(kind: Node, sync_period_ms: float) -> IdleSettings | None:
+    """Return a kind's idle settings, with the SYNC period as inhibit time."""
     if kind.idle is None:
         return None
-    enable, deltas = kind.idle.enable_object, tuple(map(written, kind.idle.delta_objects))
-    return Idle(
+    enable, deltas = kind.idle.enable_object, tuple(map(parse_writable_object, kind.idle.delta_objects))
+    return IdleSettings(
         kind.idle.delta_counts,
         kind.idle.period_ms,
         round(sync_period_ms * 10),
         deltas,
-        written(enable) if enable else None,
+        parse_writable_object(enable) if enable else None,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """A node as it is now. `identity` and `cob_ids` are what was last read from it, None and () before.
+    """Present status of a node. `identity` and `cob_ids` are as last read from it, None and () before.
 
-    `guarded`: it has no heartbeat, and is asked for its state instead. `idle`: it is event-driven for now.
+    `guarded`: it has no heartbeat and is guarded instead. `idle`: it is event-driven now.
     """
 
     slot: int
@@ -161,32 +166,32 @@ class NodeStatus:
 
     @property
     def serial(self) -> int | None:
-        """Serial number read from the node, None where it told none yet."""
+        """Serial number read from the node, None before."""
         return self.identity.serial if self.identity else None
 
 
 @dataclass(frozen=True, slots=True)
 class NodeEvent:
-    """A change in a node's life, or a new reason for the state it is in (`old` equals `new` then)."""
+    """A change of a node's state or, with `old_state` equal to `new_state`, of its reason."""
 
     slot: int
-    t_ns: int
-    old: NodeState
-    new: NodeState
+    event_ns: int
+    old_state: NodeState
+    new_state: NodeState
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.old.name.lower()} -> {self.new.name.lower()}: {self.reason}"
+        return f"{self.old_state.name.lower()} -> {self.new_state.name.lower()}: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
 class SerialChanged:
-    """Another unit answers in a node's place: its calibration is another's."""
+    """A node was replaced: the pad's calibration is that of another node."""
 
     slot: int
-    t_ns: int
-    before: int | None
-    after: int | None
+    event_ns: int
+    old_serial: int | None
+    new_serial: int | None
 
     def __str__(self) -> str:
-        return f"serial number was {self.before}, is {self.after}: another unit, not the one calibrated here"
+        return f"node replaced: serial number {self.old_serial} -> {self.new_serial}, uncalibrated"

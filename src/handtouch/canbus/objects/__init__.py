@@ -1,1 +1,1 @@
-"""What a node has and says: its channels, its electronic data sheet, its PDO mapping, SDO and EMCY."""
+"""CANopen objects of a node over the bus: PDO mapping, SDO, EMCY."""

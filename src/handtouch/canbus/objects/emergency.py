@@ -1,4 +1,4 @@
-"""EMCY messages of CANopen nodes as text (CiA 301, error codes and error register)."""
+"""EMCY messages of CANopen nodes (CiA 301): decoding, and error codes and registers as text."""
 
 from __future__ import annotations
 
@@ -10,32 +10,35 @@ _LAYOUT = struct.Struct("<HB5s")
 
 @dataclass(frozen=True, slots=True)
 class Emergency:
-    """One EMCY message: error code, error register (object 0x1001), five bytes of the manufacturer's own."""
+    """One EMCY message: error code, error register (object 0x1001), five manufacturer-specific bytes."""
 
-    t_ns: int
+    arrival_ns: int
     code: int
     register: int
     detail: bytes
     text: str
 
+    def __str__(self) -> str:
+        return self.text
 
-def decode(data: bytes, t_ns: int) -> Emergency | None:
-    """An EMCY message from its eight bytes of data; None if there aren't eight."""
+
+def decode_emergency(data: bytes, arrival_ns: int) -> Emergency | None:
+    """Decode an EMCY message; None unless it has eight bytes."""
     if len(data) != _LAYOUT.size:
         return None
     code, register, detail = _LAYOUT.unpack(data)
-    return Emergency(t_ns, code, register, detail, describe(code, register))
+    return Emergency(arrival_ns, code, register, detail, describe_emergency(code, register))
 
 
-def describe(code: int, register: int) -> str:
-    """Words for an error code and the set bits of the error register; unknown codes by their class."""
+def describe_emergency(code: int, register: int) -> str:
+    """Describe an error code and the set bits of the error register; unknown codes by their class."""
     text = _CODES.get(code) or _CLASSES.get(code >> 8) or _CLASSES.get(code >> 12 << 4) or "unknown error"
-    # The generic bit is set with every error and says nothing beside another.
-    bits = [name for bit, name in enumerate(_REGISTER) if register >> bit & 1 and (bit or register == 1)]
+    # The generic bit is set with every error; another bit makes it redundant.
+    bits = [name for bit, name in enumerate(_REGISTER_BITS) if register >> bit & 1 and (bit or register == 1)]
     return f"0x{code:04X} {text}" + (f" (register: {', '.join(bits)})" if bits else "")
 
 
-_REGISTER = (
+_REGISTER_BITS = (
     "generic",
     "current",
     "voltage",
@@ -47,7 +50,7 @@ _REGISTER = (
 )
 
 _CLASSES = {
-    0x00: "error gone",
+    0x00: "error reset",
     0x10: "generic error",
     0x20: "current",
     0x21: "current at the device's input",
@@ -85,5 +88,5 @@ _CODES = {
     0x8220: "PDO length exceeded",
     0x8230: "destination object of a multiplexed PDO not available",
     0x8240: "unexpected SYNC length",
-    0x8250: "RPDO time-out",
+    0x8250: "RPDO timeout",
 }

@@ -1,6 +1,6 @@
-"""Which PDOs carry a node's four channels, and where: read from the node, taken from its EDS, or mapped anew.
+"""PDO mapping of a node's four channels: read from the node, taken from its EDS, or written to the node.
 
-Public names: `Tpdo`, `Mapping`, `arrange`, `from_eds`, `read_mapping`.
+Public names: `NodeTpdo`, `PdoMapping`, `find_channels`, `mapping_from_eds`, `tpdo_numbers`, `read_mapping`.
 """
 
 from __future__ import annotations
@@ -9,244 +9,254 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from handtouch.canbus.bus.slab import PDO_BYTES, Field, Layout
+from handtouch.canbus import cia301
+from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient
+from handtouch.config import eds
+from handtouch.config.channels import Channel, Channels
+from handtouch.core.slab import PDO_BYTES, ChannelField, ChannelLayout
 
-from . import eds
-from .channels import Channel, Channels
-from .sdo import Sdo, StepError
-
-DEFAULT_TPDOS = (2, 1, 3, 4)
-"""Without an EDS: the four of the predefined connection set, that of CiA 401's analogue inputs first."""
-NOT_VALID = 1 << 31
-"""Bit of a PDO's identifier in 0x1800 + n sub 1 that switches it off."""
-COMMUNICATION, MAPPING = 0x1800, 0x1A00
-_NO_REMOTE, _EXTENDED, _IDENTIFIER = 1 << 30, 1 << 29, 0x7FF
-_FOR_PDOS = frozenset({*range(0x181, 0x581), 0x600, *range(0x680, 0x6E0)})  # others have a use in CANopen
-_PREDEFINED = 4
+DEFAULT_TPDO_NUMBERS = (2, 1, 3, 4)
+"""Without an EDS: those of the predefined connection set, that of CiA 401's analogue inputs first."""
+_PDO_IDENTIFIERS = frozenset({*range(0x181, 0x581), 0x600, *range(0x680, 0x6E0)})
+"""Identifiers that CANopen doesn't reserve for other services."""
 _PDO_BITS = 8 * PDO_BYTES
 
 
 @dataclass(frozen=True, slots=True)
-class Tpdo:
-    """A TPDO as the node has it; `entries` are the mapped objects, as 0x1A00 + n holds them.
+class NodeTpdo:
+    """A TPDO of a node; `entries` are the mapped objects in the format of 0x1A00 + n.
 
-    `no_remote`: bit 30 of its identifier, which many nodes don't let anybody change.
+    `no_rtr_bit`: bit 30 of its identifier, which is read-only in many nodes.
     """
 
     number: int
     cob_id: int
     enabled: bool
-    transmission: int
+    transmission_type: int
     entries: tuple[int, ...]
-    no_remote: int = 0
+    no_rtr_bit: int = 0
 
     @property
-    def on(self) -> int:
-        """0x1800 + n sub 1 while it is sent."""
-        return self.cob_id | self.no_remote
+    def enabled_entry(self) -> int:
+        """Value of 0x1800 + n sub 1 that enables the TPDO."""
+        return self.cob_id | self.no_rtr_bit
 
     @property
-    def off(self) -> int:
-        """0x1800 + n sub 1 while it isn't."""
-        return self.on | NOT_VALID
+    def disabled_entry(self) -> int:
+        """Value of 0x1800 + n sub 1 that disables the TPDO."""
+        return self.enabled_entry | cia301.INVALID_BIT
 
     @property
-    def size(self) -> int:
-        """Bytes of data."""
+    def size_bytes(self) -> int:
+        """Length of its data."""
         return (sum(entry & 0xFF for entry in self.entries) + 7) // 8
 
 
 @dataclass(frozen=True, slots=True)
-class Mapping:
-    """The TPDOs that carry the four channels, and where in them each is."""
+class PdoMapping:
+    """TPDOs that carry the four channels, and the layout of the channels in them."""
 
-    tpdos: tuple[Tpdo, ...]
-    layout: Layout
+    tpdos: tuple[NodeTpdo, ...]
+    layout: ChannelLayout
 
 
-def arrange(tpdos: Sequence[Tpdo], channels: Channels) -> Mapping | None:
-    """Find the channels in TPDOs, in one of them if one has all; None where some are in none.
+def find_channels(tpdos: Sequence[NodeTpdo], channels: Channels) -> PdoMapping | None:
+    """Return the mapping of the channels, to a single TPDO if one has all; None if a channel isn't mapped.
 
-    Raises StepError for a channel that is mapped with another width than its type's.
+    Raises BootStepError for a channel that is mapped with another width than that of its type.
     """
-    places = [dict(_places(tpdo, channels)) for tpdo in tpdos]
-    order = sorted(range(len(tpdos)), key=lambda number: -len(places[number]))
-    where = [next((n for n in order if channel in places[n]), None) for channel in channels]
-    if any(number is None for number in where):
+    offsets = [dict(_channel_offsets(tpdo, channels)) for tpdo in tpdos]
+    order = sorted(range(len(tpdos)), key=lambda row: -len(offsets[row]))
+    rows = [next((row for row in order if channel in offsets[row]), None) for channel in channels]
+    if any(row is None for row in rows):
         return None
-    used = sorted({number for number in where if number is not None})
+    used = sorted({row for row in rows if row is not None})
     fields = [
-        Field(used.index(number), places[number][channel], channel.bits, channel.signed)
-        for number, channel in zip(where, channels, strict=True)
-        if number is not None
+        ChannelField(used.index(row), offsets[row][channel], channel.bits, channel.signed)
+        for row, channel in zip(rows, channels, strict=True)
+        if row is not None
     ]
     x0, xa, y0, yb = fields
-    return Mapping(tuple(tpdos[number] for number in used), (x0, xa, y0, yb))
+    return PdoMapping(tuple(tpdos[row] for row in used), (x0, xa, y0, yb))
 
 
-def from_eds(path: Path | str | None, node_id: int, channels: Channels) -> Mapping:
-    """The mapping that a node has from the factory, by its EDS; without one CiA 401's, in TPDO2.
+def mapping_from_eds(path: Path | str | None, node_id: int, channels: Channels) -> PdoMapping:
+    """Return the default mapping by a node's EDS; without an EDS that of CiA 401, in TPDO2.
 
-    Raises EdsError where no TPDO of the EDS carries the channels.
+    Raises EdsError if no TPDO of the EDS carries the channels.
     """
     if path is None:
-        standard = Tpdo(2, 0x280 + node_id, True, 1, tuple(channel.entry for channel in channels))
-        found = arrange((standard,), channels)
-        if found is None or standard.size > PDO_BYTES:
-            raise eds.EdsError("channels of more than 64 bits come in several PDOs; give the node's eds")
-        return found
-    listed = [
-        Tpdo(
+        entries = tuple(channel.mapping_entry for channel in channels)
+        standard = NodeTpdo(2, cia301.tpdo_identifier(2) + node_id, True, cia301.SYNCHRONOUS, entries)
+        mapping = find_channels((standard,), channels)
+        if mapping is None or standard.size_bytes > PDO_BYTES:
+            raise eds.EdsError("channels of more than 64 bits need several PDOs; give the node's eds")
+        return mapping
+    defaults = [
+        NodeTpdo(
             t.number,
             t.cob_id,
             t.enabled,
-            t.transmission,
+            t.transmission_type,
             tuple(i << 16 | s << 8 | b for i, s, b in t.entries),
         )
-        for t in eds.tpdos(eds.load(path, node_id))
+        for t in eds.default_tpdos(eds.load_eds(path, node_id))
         if t.cob_id
     ]
     try:
-        found = arrange(listed, channels)
-        for tpdo in found.tpdos if found else ():
-            _checked(tpdo.number, tpdo.cob_id, tpdo.cob_id)
-    except StepError as error:
+        mapping = find_channels(defaults, channels)
+        for tpdo in mapping.tpdos if mapping else ():
+            _check_identifier(tpdo.number, tpdo.cob_id, tpdo.cob_id)
+    except BootStepError as error:
         raise eds.EdsError(f"{path}: {error}") from error
-    if found is None:
-        raise eds.EdsError(f"{path}: no TPDO carries {_names(channels)}; {_seen(listed)}; correct channels")
-    return found
+    if mapping is None:
+        raise eds.EdsError(
+            f"{path}: no TPDO carries {_channel_names(channels)}; {_describe_tpdos(defaults)}; "
+            "correct channels"
+        )
+    return mapping
 
 
 def tpdo_numbers(path: Path | str | None, channels: Channels) -> tuple[int, ...]:
-    """TPDOs in which to look for the channels, those first that carry some of them by the EDS."""
+    """Return the TPDOs to search for the channels; first those that carry some by the EDS."""
     if path is None:
-        return DEFAULT_TPDOS
-    wanted = {(channel.index, channel.sub) for channel in channels}
-    listed = eds.tpdos(eds.load(path, 1))
-    carries = {t.number: len(wanted & {(index, sub) for index, sub, _ in t.entries}) for t in listed}
-    return tuple(sorted(carries, key=lambda number: -carries[number]))
+        return DEFAULT_TPDO_NUMBERS
+    objects = {(channel.index, channel.sub) for channel in channels}
+    defaults = eds.default_tpdos(eds.load_eds(path, 1))
+    channel_counts = {
+        t.number: len(objects & {(index, sub) for index, sub, _ in t.entries}) for t in defaults
+    }
+    return tuple(sorted(channel_counts, key=lambda number: -channel_counts[number]))
 
 
 def read_mapping(
-    sdo: Sdo,
+    sdo: NodeSdoClient,
     node_id: int,
     numbers: Sequence[int],
     channels: Channels,
-    halt: Callable[[], None] | None = None,
-) -> Mapping:
-    """Find the TPDOs that carry the channels, among those numbers in this order.
+    enter_preoperational: Callable[[], None] | None = None,
+) -> PdoMapping:
+    """Read the TPDOs with these numbers, in this order, until all channels are found.
 
-    Where none do and `halt` is given, which makes the node pre-operational, the channels are mapped to TPDOs
-    that carry nothing else. Raises StepError telling what there is where that can't be.
+    If a channel isn't mapped and `enter_preoperational` is given, the channels are mapped to TPDOs that carry
+    nothing else. Raises BootStepError, with the mappings read, where neither is possible.
     """
-    seen: list[Tpdo] = []
+    candidates: list[NodeTpdo] = []
     for number in numbers:
-        entries = _entries(sdo, number)
+        entries = _read_entries(sdo, number)
         if entries is None:
             continue
-        seen.append(Tpdo(number, 0, False, 0, entries))
-        found = arrange(seen, channels)
-        if found is not None:
-            tpdos = tuple(_communication(sdo, tpdo) for tpdo in found.tpdos)
-            return Mapping(tpdos, found.layout)
-    if halt is None:
-        raise StepError(
-            f"no TPDO carries {_names(channels)}; {_seen(seen)}; map them in the node and store the mapping, "
-            "or correct channels in the deployment"
+        candidates.append(NodeTpdo(number, 0, False, 0, entries))
+        mapping = find_channels(candidates, channels)
+        if mapping is not None:
+            tpdos = tuple(_read_communication(sdo, tpdo) for tpdo in mapping.tpdos)
+            return PdoMapping(tpdos, mapping.layout)
+    if enter_preoperational is None:
+        raise BootStepError(
+            f"no TPDO carries {_channel_names(channels)}; {_describe_tpdos(candidates)}; "
+            "map them in the node and store the mapping, or correct channels in the deployment"
         )
-    return _remap(sdo, node_id, seen, channels, halt)
+    return _remap(sdo, node_id, candidates, channels, enter_preoperational)
 
 
-def _places(tpdo: Tpdo, channels: Channels) -> list[tuple[Channel, int]]:
-    """Channels in a TPDO, with the first bit of each."""
-    found, bit = [], 0
-    by_object = {channel.entry >> 8: channel for channel in channels}
+def _channel_offsets(tpdo: NodeTpdo, channels: Channels) -> list[tuple[Channel, int]]:
+    """Return the channels in a TPDO, with the first bit of each."""
+    offsets, bit = [], 0
+    by_object = {channel.mapping_entry >> 8: channel for channel in channels}
     for entry in tpdo.entries:
         channel = by_object.get(entry >> 8)
         if channel is not None and entry & 0xFF != channel.bits:
-            raise StepError(f"TPDO{tpdo.number} carries {channel} with {entry & 0xFF} bits; correct its type")
+            raise BootStepError(
+                f"TPDO{tpdo.number} carries {channel} with {entry & 0xFF} bits; correct its type"
+            )
         if channel is not None:
-            found.append((channel, bit))
+            offsets.append((channel, bit))
         bit += entry & 0xFF
-    return found if bit <= _PDO_BITS else []
+    return offsets if bit <= _PDO_BITS else []
 
 
-def _entries(sdo: Sdo, number: int) -> tuple[int, ...] | None:
-    """Objects mapped to a TPDO; None where the node hasn't got it."""
-    index, what = MAPPING + number - 1, f"mapping of TPDO{number}"
-    count = sdo.read_optional(index, 0, what)
+def _read_entries(sdo: NodeSdoClient, number: int) -> tuple[int, ...] | None:
+    """Read the entries of a TPDO's mapping; None if the node doesn't have that TPDO."""
+    index, name = cia301.TPDO_MAPPING + number - 1, f"mapping of TPDO{number}"
+    count = sdo.read_optional(index, 0, name)
     if count is None:
         return None
     if count > _PDO_BITS:  # 254 and 255 are multiplexed PDOs
         return ()
-    return tuple(filter(None, (sdo.read(index, sub, what) for sub in range(1, count + 1))))
+    return tuple(filter(None, (sdo.read(index, sub, name) for sub in range(1, count + 1))))
 
 
-def _communication(sdo: Sdo, tpdo: Tpdo) -> Tpdo:
-    index = COMMUNICATION + tpdo.number - 1
+def _read_communication(sdo: NodeSdoClient, tpdo: NodeTpdo) -> NodeTpdo:
+    index = cia301.TPDO_COMMUNICATION + tpdo.number - 1
     cob_id = sdo.read(index, 1, f"identifier of TPDO{tpdo.number}")
-    identifier = _checked(tpdo.number, cob_id, cob_id & _IDENTIFIER)
+    identifier = _check_identifier(tpdo.number, cob_id, cob_id & cia301.IDENTIFIER_MASK)
     transmission = sdo.read(index, 2, f"transmission type of TPDO{tpdo.number}")
-    enabled = not cob_id & NOT_VALID
-    return Tpdo(tpdo.number, identifier, enabled, transmission, tpdo.entries, cob_id & _NO_REMOTE)
+    enabled = not cob_id & cia301.INVALID_BIT
+    return NodeTpdo(tpdo.number, identifier, enabled, transmission, tpdo.entries, cob_id & cia301.NO_RTR_BIT)
 
 
-def _checked(number: int, cob_id: int, identifier: int) -> int:
-    """The identifier of a TPDO, if it can have that one."""
-    told = f"(0x{COMMUNICATION + number - 1:04X}:01 is 0x{cob_id:08X})"
-    if cob_id & _EXTENDED or not identifier:
-        raise StepError(f"TPDO{number} has no 11-bit identifier {told}")
-    if identifier not in _FOR_PDOS:
-        raise StepError(
-            f"TPDO{number} has identifier 0x{identifier:X}, which CANopen uses otherwise {told}; "
-            "give it another, and store it"
+def _check_identifier(number: int, cob_id: int, identifier: int) -> int:
+    """Return the identifier of a TPDO. Raises BootStepError if CANopen reserves it."""
+    entry = f"(0x{cia301.TPDO_COMMUNICATION + number - 1:04X}:01 is 0x{cob_id:08X})"
+    if cob_id & cia301.EXTENDED_BIT or not identifier:
+        raise BootStepError(f"TPDO{number} has no 11-bit identifier {entry}")
+    if identifier not in _PDO_IDENTIFIERS:
+        raise BootStepError(
+            f"TPDO{number} has identifier 0x{identifier:X}, which CANopen reserves for another service "
+            f"{entry}; give it another one and store it"
         )
     return identifier
 
 
 def _remap(
-    sdo: Sdo, node_id: int, seen: Sequence[Tpdo], channels: Channels, halt: Callable[[], None]
-) -> Mapping:
-    """Map the channels, in order, to as few TPDOs as hold them."""
-    ours = {channel.entry >> 8 for channel in channels}
-    free = [tpdo for tpdo in seen if all(entry >> 8 in ours for entry in tpdo.entries)]
-    groups = _groups(channels)
+    sdo: NodeSdoClient,
+    node_id: int,
+    candidates: Sequence[NodeTpdo],
+    channels: Channels,
+    enter_preoperational: Callable[[], None],
+) -> PdoMapping:
+    """Map the channels, in order, to as few TPDOs as can hold them."""
+    objects = {channel.mapping_entry >> 8 for channel in channels}
+    free = [tpdo for tpdo in candidates if all(entry >> 8 in objects for entry in tpdo.entries)]
+    groups = _group_by_pdo(channels)
     if len(free) < len(groups):
-        raise StepError(
-            f"no TPDO carries {_names(channels)}, and {len(groups)} that carry nothing else are needed to "
-            f"map them; {_seen(seen)}; map them in the node and store the mapping"
+        raise BootStepError(
+            f"no TPDO carries {_channel_names(channels)}, and {len(groups)} that carry nothing else are "
+            f"needed to map them; {_describe_tpdos(candidates)}; map them in the node and store the mapping"
         )
-    halt()
-    made = [
-        _map(sdo, node_id, tpdo.number, tuple(channel.entry for channel in group))
+    enter_preoperational()
+    mapped = [
+        _map_channels(sdo, node_id, tpdo.number, tuple(channel.mapping_entry for channel in group))
         for tpdo, group in zip(free, groups, strict=False)
     ]
-    found = arrange(made, channels)
-    if found is None:
-        raise StepError(f"mapped, but no TPDO carries {_names(channels)}; {_seen(made)}")
-    return found
+    mapping = find_channels(mapped, channels)
+    if mapping is None:
+        raise BootStepError(
+            f"mapped, but no TPDO carries {_channel_names(channels)}; {_describe_tpdos(mapped)}"
+        )
+    return mapping
 
 
-def _map(sdo: Sdo, node_id: int, number: int, entries: tuple[int, ...]) -> Tpdo:
-    """As CiA 301 has it: the PDO off, its mapping emptied, filled and counted; `configure` switches it on."""
-    communication, mapping = COMMUNICATION + number - 1, MAPPING + number - 1
-    what, name = f"mapping of TPDO{number}", f"identifier of TPDO{number}"
-    cob_id = sdo.read(communication, 1, name)
-    identifier = cob_id & _IDENTIFIER
-    if not identifier and number <= _PREDEFINED:
-        identifier = 0x80 + 0x100 * number + node_id
-    no_remote = cob_id & _NO_REMOTE
-    made = Tpdo(number, _checked(number, cob_id, identifier), False, 0, entries, no_remote)
-    sdo.set(communication, 1, made.off, 4, name)
-    sdo.set(mapping, 0, 0, 1, what)
+def _map_channels(sdo: NodeSdoClient, node_id: int, number: int, entries: tuple[int, ...]) -> NodeTpdo:
+    """Map a TPDO as CiA 301 requires: disable it, then clear, write and count its entries."""
+    communication, mapping = cia301.TPDO_COMMUNICATION + number - 1, cia301.TPDO_MAPPING + number - 1
+    mapping_name, identifier_name = f"mapping of TPDO{number}", f"identifier of TPDO{number}"
+    cob_id = sdo.read(communication, 1, identifier_name)
+    identifier = cob_id & cia301.IDENTIFIER_MASK
+    if not identifier and number <= cia301.PREDEFINED_TPDOS:
+        identifier = cia301.tpdo_identifier(number) + node_id
+    no_rtr_bit = cob_id & cia301.NO_RTR_BIT
+    tpdo = NodeTpdo(number, _check_identifier(number, cob_id, identifier), False, 0, entries, no_rtr_bit)
+    sdo.write_if_different(communication, 1, tpdo.disabled_entry, 4, identifier_name)
+    sdo.write_if_different(mapping, 0, 0, 1, mapping_name)
     for sub, entry in enumerate(entries, 1):
-        sdo.write(mapping, sub, entry, 4, what)
-    sdo.write(mapping, 0, len(entries), 1, what)
+        sdo.write_verified(mapping, sub, entry, 4, mapping_name)
+    sdo.write_verified(mapping, 0, len(entries), 1, mapping_name)
     transmission = sdo.read(communication, 2, f"transmission type of TPDO{number}")
-    return replace(made, transmission=transmission)
+    return replace(tpdo, transmission_type=transmission)
 
 
-def _groups(channels: Channels) -> list[list[Channel]]:
+def _group_by_pdo(channels: Channels) -> list[list[Channel]]:
     groups: list[list[Channel]] = [[]]
     for channel in channels:
         if sum(c.bits for c in groups[-1]) + channel.bits > _PDO_BITS:
@@ -255,15 +265,17 @@ def _groups(channels: Channels) -> list[list[Channel]]:
     return groups
 
 
-def _names(channels: Channels) -> str:
+def _channel_names(channels: Channels) -> str:
     return ", ".join(map(str, channels))
 
 
-def _seen(tpdos: Sequence[Tpdo]) -> str:
+def _describe_tpdos(tpdos: Sequence[NodeTpdo]) -> str:
     if not tpdos:
         return "the node has no TPDO"
-    return "; ".join(f"TPDO{t.number} has {', '.join(map(_entry, t.entries)) or 'nothing'}" for t in tpdos)
+    return "; ".join(
+        f"TPDO{t.number} has {', '.join(map(_describe_entry, t.entries)) or 'nothing'}" for t in tpdos
+    )
 
 
-def _entry(entry: int) -> str:
+def _describe_entry(entry: int) -> str:
     return f"0x{entry >> 16:04X}:{entry >> 8 & 0xFF:02X} ({entry & 0xFF} bit)"

@@ -1,7 +1,8 @@
-"""SDO client of one node: read and write unsigned objects, with the object named in whatever goes wrong.
+"""SDO client of one node: read and write unsigned objects; errors name the object.
 
-Public names: `Sdo`, `StepError`, `Outdated`. Transfers block until the node answers, so they run in a worker
-thread of the master; `Sdo.deliver` brings them the answers from the thread that receives.
+Public names: `NodeSdoClient`, `SdoTransport`, `BootStepError`, `BootStepCancelled`. Transfers block until the
+node responds, so they run in a worker thread of the master; `SdoTransport.deliver_response` passes the node's
+responses on from the receiving thread.
 """
 
 from __future__ import annotations
@@ -11,32 +12,34 @@ from collections.abc import Callable
 from canopen import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
+from handtouch.canbus import cia301
+
 SDO_TIMEOUT_S = 0.2
-SDO_ATTEMPTS = 2
-"""A lost frame costs one time-out; a node that answers neither attempt is silent."""
+MAX_SDO_ATTEMPTS = 2
+"""A lost frame costs one timeout; a node that responds to neither attempt is silent."""
 
-_NAMES_OBJECT = (0x40, 0x60, 0x80)  # SDO answers with index and sub-index: upload, download, abort
-_NOT_THERE = frozenset({0x06020000, 0x06090011, 0x060A0023, 0x08000024})  # abort codes
+_COMMANDS_WITH_OBJECT = (0x40, 0x60, 0x80)  # responses with index and sub-index: upload, download, abort
+_NO_OBJECT_ABORT_CODES = frozenset({0x06020000, 0x06090011, 0x060A0023, 0x08000024})
 
 
-class StepError(Exception):
-    """A step of a node's start failed; `str` is the reason in words.
+class BootStepError(Exception):
+    """A step of a node's boot failed; `str` is the reason.
 
-    `silent`: no answer came. `stranger`: it is not the configured node.
+    `timed_out`: the node didn't respond. `wrong_device`: it is not the configured node.
     """
 
-    def __init__(self, reason: str, *, silent: bool = False, stranger: bool = False) -> None:
+    def __init__(self, reason: str, *, timed_out: bool = False, wrong_device: bool = False) -> None:
         super().__init__(reason)
-        self.silent = silent
-        self.stranger = stranger
+        self.timed_out = timed_out
+        self.wrong_device = wrong_device
 
 
-class Outdated(Exception):  # noqa: N818 - not an error: the node has moved on and nobody waits for this any more
-    """The attempt that a step belongs to is over."""
+class BootStepCancelled(Exception):  # noqa: N818 - not an error: the node's state has changed meanwhile
+    """The boot attempt that a step belongs to has ended."""
 
 
-class _Link:
-    """What canopen's SDO client asks of its network."""
+class _SdoNetwork:
+    """The part of a canopen network that its SDO client uses."""
 
     def __init__(self, send: Callable[[int, bytes], bool]) -> None:
         self._send = send
@@ -45,78 +48,108 @@ class _Link:
         self._send(can_id, bytes(data))
 
 
-class Sdo:
-    """SDO client of one node. `read` and `write` raise StepError with the object named, or Outdated."""
+class SdoTransport:
+    """SDO channel of one node: one transfer at a time, responses from another thread."""
 
-    def __init__(self, node_id: int, send: Callable[[int, bytes], bool]) -> None:
-        self._client = SdoClient(0x600 + node_id, 0x580 + node_id, ObjectDictionary())
-        self._client.network = _Link(send)
-        self._client.RESPONSE_TIMEOUT = SDO_TIMEOUT_S
-        self.waiting = False
-        self._answered = False
+    def __init__(
+        self, node_id: int, send: Callable[[int, bytes], bool], timeout_s: float | None = None
+    ) -> None:
+        self._client = SdoClient(
+            cia301.SDO_REQUEST + node_id, cia301.SDO_RESPONSE + node_id, ObjectDictionary()
+        )
+        self._client.network = _SdoNetwork(send)
+        self._client.RESPONSE_TIMEOUT = self._timeout_s = SDO_TIMEOUT_S if timeout_s is None else timeout_s
+        self.awaiting_response = False
+        self._responded = False
         self._object = bytes(3)
-        self.outdated: Callable[[], bool] = lambda: False
 
-    def deliver(self, data: bytes) -> None:
-        """An answer of the node, 8 bytes; from the receiving thread, while `waiting`.
+    def deliver_response(self, data: bytes) -> None:
+        """Pass on a response of 8 bytes, from the receiving thread, while `awaiting_response`.
 
-        One for another object is dropped: it answers a probe, another master, or came too late.
+        A response for another object is dropped: it is late, or answers a probe or another master.
         """
-        if data[0] & 0xE0 in _NAMES_OBJECT and data[1:4] not in (self._object, bytes(3)):
+        if data[0] & 0xE0 in _COMMANDS_WITH_OBJECT and data[1:4] not in (self._object, bytes(3)):
             return
-        self._answered = True
+        self._responded = True
         self._client.on_response(0, data, 0.0)
 
-    def read(self, index: int, sub: int, what: str) -> int:
-        """Value of an unsigned object."""
-        data = self._transfer(index, sub, f"reading {what}", lambda c: c.upload(index, sub))
+    def transfer(
+        self,
+        index: int,
+        sub: int,
+        description: str,
+        run: Callable[[SdoClient], bytes | None],
+        is_cancelled: Callable[[], bool],
+    ) -> bytes | None:
+        """Run an upload or download, with one retry; `description` is for the error text.
+
+        Raises BootStepError, or BootStepCancelled if `is_cancelled` is true before an attempt.
+        """
+        self._object = index.to_bytes(2, "little") + bytes((sub,))
+        timeout: SdoCommunicationError | None = None
+        for _ in range(MAX_SDO_ATTEMPTS):
+            if is_cancelled():
+                raise BootStepCancelled
+            self._responded = False
+            self.awaiting_response = True
+            try:
+                return run(self._client)
+            except SdoAbortedError as error:
+                raise BootStepError(f"{description}: refused by the node ({error})") from error
+            except SdoCommunicationError as error:
+                if self._responded:
+                    raise BootStepError(f"{description}: {error}") from error
+                timeout = error
+            finally:
+                self.awaiting_response = False
+        raise BootStepError(
+            f"{description}: no answer within {self._timeout_s * 1e3:.0f} ms in {MAX_SDO_ATTEMPTS} attempts; "
+            "is its SDO server running, the bus overloaded?",
+            timed_out=True,
+        ) from timeout
+
+
+def _never_cancelled() -> bool:
+    return False
+
+
+class NodeSdoClient:
+    """Unsigned objects of one node; every method raises BootStepError, or BootStepCancelled."""
+
+    def __init__(self, transport: SdoTransport, is_cancelled: Callable[[], bool] = _never_cancelled) -> None:
+        self._transport = transport
+        self.is_cancelled = is_cancelled
+
+    def read(self, index: int, sub: int, name: str) -> int:
+        """Read an object."""
+        data = self._transfer(index, sub, f"reading {name}", lambda c: c.upload(index, sub))
         return int.from_bytes(data or b"", "little")
 
-    def read_optional(self, index: int, sub: int, what: str) -> int | None:
-        """As `read`; None where the node hasn't got the object."""
+    def read_optional(self, index: int, sub: int, name: str) -> int | None:
+        """Read an object; None if the node doesn't have it."""
         try:
-            return self.read(index, sub, what)
-        except StepError as error:
-            if isinstance(error.__cause__, SdoAbortedError) and error.__cause__.code in _NOT_THERE:
+            return self.read(index, sub, name)
+        except BootStepError as error:
+            cause = error.__cause__
+            if isinstance(cause, SdoAbortedError) and cause.code in _NO_OBJECT_ABORT_CODES:
                 return None
             raise
 
-    def write(self, index: int, sub: int, value: int, size: int, what: str) -> None:
-        """Set an unsigned object of `size` bytes and read it back."""
+    def write_verified(self, index: int, sub: int, value: int, size: int, name: str) -> None:
+        """Write an object of `size` bytes and read it back."""
         data = value.to_bytes(size, "little")
-        self._transfer(index, sub, f"writing {what}", lambda c: c.download(index, sub, data))
-        kept = self.read(index, sub, what)
-        if kept != value:
-            raise StepError(f"{what}, 0x{index:04X}:{sub:02X}, was set to {value} but reads {kept}")
+        self._transfer(index, sub, f"writing {name}", lambda c: c.download(index, sub, data))
+        actual = self.read(index, sub, name)
+        if actual != value:
+            raise BootStepError(f"{name}, 0x{index:04X}:{sub:02X}, was set to {value} but reads {actual}")
 
-    def set(self, index: int, sub: int, value: int, size: int, what: str) -> None:
-        """As `write`, but only if it isn't so already."""
-        if self.read(index, sub, what) != value:
-            self.write(index, sub, value, size, what)
+    def write_if_different(self, index: int, sub: int, value: int, size: int, name: str) -> None:
+        """Write and verify an object unless it has the value already."""
+        if self.read(index, sub, name) != value:
+            self.write_verified(index, sub, value, size, name)
 
     def _transfer(
-        self, index: int, sub: int, doing: str, transfer: Callable[[SdoClient], bytes | None]
+        self, index: int, sub: int, description: str, run: Callable[[SdoClient], bytes | None]
     ) -> bytes | None:
-        doing += f", 0x{index:04X}:{sub:02X}"
-        self._object = index.to_bytes(2, "little") + bytes((sub,))
-        silence: SdoCommunicationError | None = None
-        for _ in range(SDO_ATTEMPTS):
-            if self.outdated():
-                raise Outdated
-            self._answered = False
-            self.waiting = True
-            try:
-                return transfer(self._client)
-            except SdoAbortedError as error:
-                raise StepError(f"{doing}: refused by the node ({error})") from error
-            except SdoCommunicationError as error:
-                if self._answered:
-                    raise StepError(f"{doing}: {error}") from error
-                silence = error
-            finally:
-                self.waiting = False
-        told = (
-            f"{doing}: no answer within {SDO_TIMEOUT_S * 1e3:.0f} ms, asked {SDO_ATTEMPTS} times; "
-            "is its SDO server running, the bus overloaded?"
-        )
-        raise StepError(told, silent=True) from silence
+        description += f", 0x{index:04X}:{sub:02X}"
+        return self._transport.transfer(index, sub, description, run, self.is_cancelled)

@@ -1,36 +1,40 @@
-"""Grasps in MuJoCo: what the hand holds, where it touches, and how hard, computed by nobody here.
+"""Grasps simulated in MuJoCo, as an independent source of contact positions and forces.
 
-Public names: `played` (a grasp as what happens to a simulated hand), `grasp` -> `Grasp` (how one went),
-`THINGS`, `available`. Needs the extra `handtouch[mujoco]`.
+Public names: `grasp_stimulus` (a grasp as input of a simulated hand), `simulate_grasp` -> `GraspRecord`,
+`GRASP_OBJECTS`, `available`. Needs the extra `handtouch[mujoco]`.
 """
 
 from importlib.util import find_spec
 
 from handtouch import config
-from handtouch.simulate.grasp.episode import Grasp, grasp
-from handtouch.simulate.grasp.patches import patches
-from handtouch.simulate.grasp.things import THINGS
-from handtouch.simulate.grasp.timeline import Timeline
+from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
+from handtouch.simulate.grasp.grasp_stimulus import GraspStimulus
+from handtouch.simulate.grasp.patches import contact_patches
+from handtouch.simulate.grasp.simulation import GraspRecord, simulate_grasp
 from handtouch.simulate.world import World
 
-INSTALL = "pip install 'handtouch[mujoco]'"
+INSTALL_COMMAND = "pip install 'handtouch[mujoco]'"
 
-__all__ = ["INSTALL", "THINGS", "Grasp", "available", "grasp", "played"]
+__all__ = ["GRASP_OBJECTS", "INSTALL_COMMAND", "GraspRecord", "available", "grasp_stimulus", "simulate_grasp"]
 
 
 def available() -> bool:
-    """Whether MuJoCo is installed."""
+    """Return whether MuJoCo is installed."""
     return find_spec("mujoco") is not None
 
 
-def played(deployment: config.Deployment, thing: str, world: World, *, repeat: bool = False) -> Timeline:
-    """The first hand of a deployment grasps a thing, drawn by the world's seed.
+def grasp_stimulus(
+    deployment: config.Deployment, object_name: str, world: World, *, repeat: bool = False
+) -> GraspStimulus:
+    """Let the first hand of a deployment grasp an object, randomised by the world's seed.
 
-    Raises ValueError, in words for a user, where that can't be.
+    Raises ValueError, with a message for the user, without MuJoCo and for an unknown object or unfit hand.
     """
     if not available():
-        raise ValueError(f"--grasp {thing}: a package is missing that isn't installed by default: {INSTALL}")
-    if thing not in THINGS:
-        raise ValueError(f"--grasp {thing}: there is no such thing; there are {', '.join(THINGS)}")
-    went = grasp(deployment.hands[0], thing, world.seed, world)
-    return Timeline.play(went, patches(went), repeat=repeat)
+        raise ValueError(
+            f"--grasp {object_name}: needs MuJoCo, which isn't installed by default: {INSTALL_COMMAND}"
+        )
+    if object_name not in GRASP_OBJECTS:
+        raise ValueError(f"--grasp {object_name}: unknown object; known: {', '.join(GRASP_OBJECTS)}")
+    grasp = simulate_grasp(deployment.hands[0], object_name, world.seed, world)
+    return GraspStimulus.from_grasp(grasp, contact_patches(grasp), repeat=repeat)

@@ -1,7 +1,7 @@
-// How hard each pad was pressed in the last seconds.
+// Force of each pad over the last seconds.
 
-import { colourOf } from "./looks.js";
-import { sharp } from "./pads.js";
+import { colourOf } from "./colours.js";
+import { clearedContext } from "./pads.js";
 
 const SPAN_S = 10, LEFT = 30, BOTTOM = 16, TOP = 6;
 
@@ -11,7 +11,7 @@ export class HistoryView {
     this.lines = new Map();
   }
 
-  follow(number, contact, t) {
+  addSample(number, contact, t) {
     if (!this.lines.has(number)) this.lines.set(number, []);
     const line = this.lines.get(number);
     const force = contact ? contact.force_n : null;
@@ -23,7 +23,7 @@ export class HistoryView {
   }
 
   draw(t) {
-    const context = sharp(this.canvas), wide = this.canvas.clientWidth - LEFT, high = this.canvas.clientHeight - BOTTOM - TOP;
+    const context = clearedContext(this.canvas), wide = this.canvas.clientWidth - LEFT, high = this.canvas.clientHeight - BOTTOM - TOP;
     let most = 0;
     for (const line of this.lines.values()) {
       while (line.length && t - line[0].t > SPAN_S + 1) line.shift();

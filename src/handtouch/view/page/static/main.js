@@ -1,12 +1,12 @@
-// Follows the changes that `handtouch view` tells, and draws when there are any.
+// Receives changes from `handtouch view` and draws them.
 
 import { HandView } from "./hand.js";
 import { HistoryView } from "./history.js";
 import { PadsView } from "./pads.js";
-import { drawFelt, drawLegend, drawMessages, drawNodes, drawService } from "./panel.js";
+import { drawPercepts, drawLegend, drawMessages, drawNodes, drawService } from "./text_panel.js";
 
 const state = {
-  connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, felt: {}, percepts: false, messages: [], t: 0,
+  connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, percepts: {}, percepts_enabled: false, messages: [], time_s: 0,
 };
 const counts = { updates: 0, frames: 0 };
 const SLOW_MS = 40;
@@ -17,10 +17,10 @@ const history = new HistoryView(byId("history"));
 let numbers = new Map(); // of pads, by key
 let dirty = true;
 
-function take(changes) {
-  if (changes.t !== undefined) state.t = changes.t;
+function applyChanges(changes) {
+  if (changes.time_s !== undefined) state.time_s = changes.time_s;
   if (changes.scene) {
-    Object.assign(state, { scene: changes.scene, pads: {}, contacts: {}, felt: {} });
+    Object.assign(state, { scene: changes.scene, pads: {}, contacts: {}, percepts: {} });
     numbers = new Map(changes.scene.pads.map((pad, number) => [pad.key, number]));
     for (const view of [hand, pads]) view.show(changes.scene);
     history.clear();
@@ -29,39 +29,39 @@ function take(changes) {
     const [kind, name] = [key.slice(0, key.indexOf("/")), key.slice(key.indexOf("/") + 1)];
     if (kind === "joints") state.joints[name] = value ?? {};
     else if (kind === "pad") state.pads[name] = value;
-    else if (kind === "felt") state.felt[name] = value;
+    else if (kind === "percepts") state.percepts[name] = value;
     else if (kind === "contact") {
       state.contacts[name] = value;
-      pads.follow(name, value, state.t);
-      if (numbers.has(name)) history.follow(numbers.get(name), value, state.t);
-    } else if (["alive", "service", "messages", "percepts"].includes(key)) state[key] = value;
+      pads.addSample(name, value, state.time_s);
+      if (numbers.has(name)) history.addSample(numbers.get(name), value, state.time_s);
+    } else if (["alive", "service", "messages", "percepts_enabled"].includes(key)) state[key] = value;
   }
   if ("alive" in changes || "service" in changes || changes.scene) drawService(state);
   if (changes.scene || Object.keys(changes).some((key) => key.startsWith("pad/"))) drawNodes(state);
-  if (changes.scene || Object.keys(changes).some((key) => key.startsWith("felt/"))) drawFelt(state);
+  if (changes.scene || Object.keys(changes).some((key) => key.startsWith("percepts/"))) drawPercepts(state);
   if (changes.messages) drawMessages(state);
   dirty = true;
 }
 
-// Where drawing takes long, as in software, half of the time is left to others: a controller has better to do.
-let drawnAt = 0, restUntil = 0;
+// Where drawing is slow, as in software, it takes at most half of the time: the processor is shared with controllers.
+let drawnAt = 0, pausedUntil = 0;
 
 function draw(now) {
   requestAnimationFrame(draw);
   if (drawnAt) {
-    if (now - drawnAt > SLOW_MS) restUntil = 2 * now - drawnAt;
+    if (now - drawnAt > SLOW_MS) pausedUntil = 2 * now - drawnAt;
     drawnAt = 0;
   }
-  if (!dirty || now < restUntil) return;
+  if (!dirty || now < pausedUntil) return;
   dirty = false;
   drawnAt = now;
   hand.draw(state);
   pads.draw(state);
-  history.draw(state.t);
+  history.draw(state.time_s);
   counts.frames += 1;
 }
 
-function follow() {
+function connect() {
   const changes = new EventSource("changes");
   changes.onopen = () => {
     state.connected = true;
@@ -69,12 +69,12 @@ function follow() {
   };
   changes.onmessage = (message) => {
     counts.updates += 1;
-    take(JSON.parse(message.data));
+    applyChanges(JSON.parse(message.data));
   };
-  changes.onerror = () => { // the browser comes back by itself, but for an answer that is no stream
+  changes.onerror = () => { // the browser reconnects by itself, unless the response was no event stream
     state.connected = false;
     drawService(state);
-    if (changes.readyState === EventSource.CLOSED) setTimeout(follow, 1000);
+    if (changes.readyState === EventSource.CLOSED) setTimeout(connect, 1000);
   };
 }
 
@@ -88,7 +88,7 @@ function reportRates() {
   }, 1000);
 }
 
-function listen(canvas) {
+function handlePointer(canvas) {
   let from = null;
   canvas.addEventListener("pointerdown", (event) => {
     from = [event.clientX, event.clientY];
@@ -98,9 +98,9 @@ function listen(canvas) {
   canvas.addEventListener("pointermove", (event) => {
     const to = [event.clientX, event.clientY];
     if (from) {
-      const way = [to[0] - from[0], to[1] - from[1]];
-      if (event.shiftKey || event.buttons & 6) hand.move(...way);
-      else hand.turn(...way);
+      const delta = [to[0] - from[0], to[1] - from[1]];
+      if (event.shiftKey || event.buttons & 6) hand.pan(...delta);
+      else hand.rotate(...delta);
       from = to;
     } else hand.hovered = hand.nearest(...to);
     dirty = true;
@@ -110,15 +110,15 @@ function listen(canvas) {
     hand.zoom(Math.exp(event.deltaY * 0.001));
     dirty = true;
   }, { passive: false });
-  canvas.addEventListener("dblclick", () => { hand.home(); dirty = true; });
+  canvas.addEventListener("dblclick", () => { hand.resetView(); dirty = true; });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   new ResizeObserver(() => { dirty = true; }).observe(document.body);
 }
 
-window.handtouch = { state, counts, hand, pads }; // for the console, and for tests
+window.handtouch = { state, counts, hand, pads }; // for the console and for tests
 drawLegend();
 drawService(state);
-listen(byId("hand"));
+handlePointer(byId("hand"));
 reportRates();
-follow();
+connect();
 requestAnimationFrame(draw);

@@ -1,4 +1,4 @@
-// 4 x 4 matrices as WebGL takes them, by columns; vectors are arrays of three.
+// 4 x 4 matrices, column-major as in WebGL; vectors are arrays of three.
 
 export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const scale = (a, k) => [a[0] * k, a[1] * k, a[2] * k];
@@ -22,16 +22,16 @@ export function multiply(a, b) {
   return c;
 }
 
-// From the images of x, y and z, and of the origin.
+// Matrix from the images of x, y and z, and of the origin.
 export const frame = (x, y, z, origin) => new Float32Array([...x, 0, ...y, 0, ...z, 0, ...origin, 1]);
 
-// From a rotation row by row.
-export const pose = (turn, at) => frame(
-  [turn[0], turn[3], turn[6]], [turn[1], turn[4], turn[7]], [turn[2], turn[5], turn[8]], at,
+// Matrix from a row-major rotation and a translation.
+export const pose = (r, translation) => frame(
+  [r[0], r[3], r[6]], [r[1], r[4], r[7]], [r[2], r[5], r[8]], translation,
 );
 
-// A turn about a unit axis (Rodrigues).
-export function turned(axis, angle) {
+// Rotation about a unit axis (Rodrigues).
+export function axisRotation(axis, angle) {
   const [x, y, z] = axis;
   const c = Math.cos(angle), s = Math.sin(angle), k = 1 - c;
   return pose([
@@ -44,7 +44,7 @@ export function turned(axis, angle) {
 export const point = (m, p) => [0, 1, 2].map((row) => m[row] * p[0] + m[4 + row] * p[1] + m[8 + row] * p[2] + m[12 + row]);
 export const direction = (m, p) => [0, 1, 2].map((row) => m[row] * p[0] + m[4 + row] * p[1] + m[8 + row] * p[2]);
 
-// Two unit vectors that make a right-handed frame with a unit vector for z.
+// Two unit vectors that form a right-handed frame with the unit vector z.
 export function across(z) {
   const x = unit(cross(Math.abs(z[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0], z));
   return [x, cross(z, x)];

@@ -1,6 +1,6 @@
-// Every pad unrolled, seen from outside with x0 below, as they lie on the hand: where it is touched and was.
+// Every pad unrolled, seen from outside with x0 below, arranged as on the hand: contacts and their trails.
 
-import { CONTACT, colourOf, forceText, lookOf } from "./looks.js";
+import { CONTACT, colourOf, forceText, colourOfStatus } from "./colours.js";
 
 const TRAIL_S = 4, GAP = 6, LABEL = 26, HEADER = 16;
 
@@ -20,15 +20,15 @@ export class PadsView {
     });
   }
 
-  // A new place of a contact, or that it ended; `t` in seconds.
-  follow(key, contact, t) {
+  // Adds a new position of a contact, or its end; `t` in seconds.
+  addSample(key, contact, t) {
     const trail = (this.trails[key] ??= []);
-    if (contact?.pad_m) trail.push({ t, id: contact.id, at: contact.pad_m });
+    if (contact?.pad_m) trail.push({ t, id: contact.id, position: contact.pad_m });
   }
 
   draw(state) {
     if (!this.scene) return;
-    const context = sharp(this.canvas), wide = this.canvas.clientWidth, high = this.canvas.clientHeight;
+    const context = clearedContext(this.canvas), wide = this.canvas.clientWidth, high = this.canvas.clientHeight;
     const columns = this.scene.columns, widths = columns.map((c) => Math.max(...c.map((k) => this.sizes[k][1])));
     const across = widths.reduce((a, b) => a + b, 0);
     const tall = columns.map((c) => c.reduce((sum, k) => sum + this.sizes[k][0], 0));
@@ -40,7 +40,7 @@ export class PadsView {
       const used = tall[number] * k + column.length * (LABEL + GAP) - GAP;
       let y = high - used - GAP;
       if (column.length > 1) this.write(context, digitOf(this.scene.pads[column[0]].link), middle, 11, "#d5dce4", 600);
-      for (const pad of [...column].reverse()) { // the tip on top
+      for (const pad of [...column].reverse()) { // the fingertip on top
         const size = this.sizes[pad][0] * k;
         this.drawPad(context, state, pad, middle, y + LABEL + size / 2, k);
         y += size + LABEL + GAP;
@@ -50,34 +50,34 @@ export class PadsView {
   }
 
   drawPad(context, state, number, middle, centre, k) {
-    const pad = this.scene.pads[number], told = state.pads[pad.key], contact = state.contacts[pad.key];
+    const pad = this.scene.pads[number], health = state.pads[pad.key], contact = state.contacts[pad.key];
     const [long] = this.sizes[number];
-    const place = (u, aside) => [middle - aside * k, centre - (u - long / 2) * k];
+    const toCanvas = (u, offset) => [middle - offset * k, centre - (u - long / 2) * k];
     const half = halfWidth(pad.outline);
-    const onPad = ([u, v]) => place(u, v - half(u)); // seen from outside with x up, y points to the left
+    const onPad = ([u, v]) => toCanvas(u, v - half(u)); // seen from outside with x up, y points to the left
     context.beginPath();
-    pad.outline.forEach(([u, aside]) => context.lineTo(...place(u, aside)));
+    pad.outline.forEach(([u, offset]) => context.lineTo(...toCanvas(u, offset)));
     context.closePath();
     context.fillStyle = "#1a2028";
     context.fill();
     context.lineWidth = 1.5;
-    context.strokeStyle = lookOf(told);
+    context.strokeStyle = colourOfStatus(health);
     context.stroke();
-    const trail = (this.trails[pad.key] ?? []).filter((step) => state.t - step.t < TRAIL_S);
+    const trail = (this.trails[pad.key] ?? []).filter((point) => state.time_s - point.t < TRAIL_S);
     this.trails[pad.key] = trail;
     context.lineWidth = 2;
     for (let j = 1; j < trail.length; j++) {
       if (trail[j].id !== trail[j - 1].id) continue;
-      context.globalAlpha = 1 - (state.t - trail[j].t) / TRAIL_S;
+      context.globalAlpha = 1 - (state.time_s - trail[j].t) / TRAIL_S;
       context.strokeStyle = colourOf(number);
       context.beginPath();
-      context.moveTo(...onPad(trail[j - 1].at));
-      context.lineTo(...onPad(trail[j].at));
+      context.moveTo(...onPad(trail[j - 1].position));
+      context.lineTo(...onPad(trail[j].position));
       context.stroke();
     }
     context.globalAlpha = 1;
     const across = this.sizes[number][1];
-    this.boxes[pad.key] = [...place(long, across / 2), across * k, long * k];
+    this.boxes[pad.key] = [...toCanvas(long, across / 2), across * k, long * k];
     if (contact?.pad_m) {
       const [px, py] = onPad(contact.pad_m);
       context.fillStyle = CONTACT;
@@ -101,7 +101,7 @@ export class PadsView {
 
 const digitOf = (link) => link.split("_")[0];
 
-// Half the width of an unrolled pad at an arc length.
+// Returns half the width of an unrolled pad as a function of arc length.
 function halfWidth(outline) {
   const upper = outline.slice(0, outline.length / 2);
   return (u) => {
@@ -112,8 +112,8 @@ function halfWidth(outline) {
   };
 }
 
-// A canvas with as many pixels as the screen has there, cleared.
-export function sharp(canvas) {
+// Returns the context of a canvas resized to screen resolution and cleared.
+export function clearedContext(canvas) {
   const pixels = window.devicePixelRatio || 1;
   const wide = Math.round(canvas.clientWidth * pixels), high = Math.round(canvas.clientHeight * pixels);
   if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];

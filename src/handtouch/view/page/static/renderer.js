@@ -1,4 +1,4 @@
-// Draws coloured triangles with a light from above the viewer's shoulder: what a hand with its contacts needs.
+// WebGL renderer of coloured triangle meshes with two directional lights.
 
 const VERTEX = `#version 300 es
 uniform mat4 model, view, projection;
@@ -52,15 +52,15 @@ export class Renderer {
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  // Triangles to draw later; arrays of three numbers a corner.
+  // Uploads triangles; arrays of three numbers per corner.
   mesh(corners, normals) {
     const gl = this.gl, array = gl.createVertexArray();
     gl.bindVertexArray(array);
-    for (const [place, values] of [[0, corners], [1, normals]]) {
+    for (const [location, values] of [[0, corners], [1, normals]]) {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-      gl.enableVertexAttribArray(place);
-      gl.vertexAttribPointer(place, 3, gl.FLOAT, false, 0, 0);
+      gl.enableVertexAttribArray(location);
+      gl.vertexAttribPointer(location, 3, gl.FLOAT, false, 0, 0);
     }
     return { array, count: corners.length / 3 };
   }
@@ -77,8 +77,8 @@ export class Renderer {
     gl.uniformMatrix4fv(this.at.projection, false, projection);
   }
 
-  // `lit` 1: shaded, 0: in its own colour; `nearer`: so many metres towards the viewer, out of what it lies on;
-  // `through`: also where something is in front.
+  // `lit` 1: shaded, 0: unshaded; `nearer`: shift towards the viewer in metres, against z-fighting;
+  // `through`: drawn without depth test.
   draw(mesh, model, colour, { lit = 1, alpha = 1, nearer = 0, through = false } = {}) {
     const gl = this.gl;
     gl.bindVertexArray(mesh.array);
@@ -93,18 +93,18 @@ export class Renderer {
   }
 }
 
-// Shapes of unit size, for contacts: turned about z from a profile of [radius, height], seen from outside.
+// Surface of revolution about z from a profile of [radius, height], seen from outside.
 export function lathe(profile, sides = 20) {
   const corners = [], normals = [];
   for (let k = 0; k + 1 < profile.length; k++) {
     const [r0, z0] = profile[k], [r1, z1] = profile[k + 1];
     const size = Math.hypot(r1 - r0, z1 - z0) || 1, out = (z1 - z0) / size, up = (r0 - r1) / size;
     for (let side = 0; side < sides; side++) {
-      const at = (r, z, turn) => [r * Math.cos(turn), r * Math.sin(turn), z];
+      const at = (r, z, angle) => [r * Math.cos(angle), r * Math.sin(angle), z];
       const a = (2 * Math.PI * side) / sides, b = (2 * Math.PI * (side + 1)) / sides;
-      for (const [r, z, turn] of [[r0, z0, a], [r0, z0, b], [r1, z1, b], [r0, z0, a], [r1, z1, b], [r1, z1, a]]) {
-        corners.push(...at(r, z, turn));
-        normals.push(out * Math.cos(turn), out * Math.sin(turn), up);
+      for (const [r, z, angle] of [[r0, z0, a], [r0, z0, b], [r1, z1, b], [r0, z0, a], [r1, z1, b], [r1, z1, a]]) {
+        corners.push(...at(r, z, angle));
+        normals.push(out * Math.cos(angle), out * Math.sin(angle), up);
       }
     }
   }

@@ -1,0 +1,258 @@
+"""Automatic calibration of the node of one pad by ordinary contacts.
+
+Public: `AutoCalibrator`, `CalibrationState`, `GainUpdate`. A node that replaced another is in quarantine
+until
+it has a calibration of its own: from the store, from contacts, or from an operator. No clock; time is an
+argument.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.calibration.calibration import (
+    MAX_GAIN,
+    MIN_GAIN,
+    Gains,
+    channel_values,
+    matrix,
+)
+from handtouch.calibration.gains import (
+    BATCH_CONTACTS,
+    MAX_SHAPE_DEVIATION,
+    GainEstimator,
+    GainStatus,
+)
+from handtouch.calibration.stationary_contacts import StationaryContact
+from handtouch.field.model import ForwardModel
+from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.faults import FaultKind
+
+FloatArray = NDArray[np.float64]
+_INITIAL_LOG_GAIN_STDS = (0.05, 0.2)
+"""Initial standard deviation of log gains; the next one if no gains near these explain the contacts."""
+_CONTACTS_PER_UPDATE = BATCH_CONTACTS // 2
+"""Contacts passed to the estimator together: one by one they take several times as long."""
+_MIN_CONTACTS_TO_STORE_AGAIN = 4 * BATCH_CONTACTS
+"""Contacts after which gains known before are stored again; then twice as many each time."""
+_MAX_CALIBRATED_LOG_GAIN_STD = 0.02
+"""Standard deviation of the least certain log gain of a calibrated node. In this direction gains hardly
+change a position: by 0.3 to 0.5 % of the pad's length, rms, from 1:1 to 2:1."""
+_MANUAL_REMEDY = "measure them with `handtouch calibrate`"
+
+
+class CalibrationState(StrEnum):
+    """State of a node's calibration, as `health` publishes it."""
+
+    DEFAULT = "default"
+    """deployment file only, and no contradiction to it"""
+    CALIBRATED = "calibrated"
+    """own calibration active"""
+    QUARANTINED = "quarantined"
+    """replaced or changed, without a calibration of its own yet"""
+    MANUAL_REQUIRED = "manual_required"
+    """the same, and contacts can't calibrate it"""
+
+
+@dataclass(frozen=True)
+class GainUpdate:
+    """Consequence of contacts: apply the gains; store them, too."""
+
+    apply: bool = False
+    store: bool = False
+
+
+class AutoCalibrator:
+    """Calibration state and gain estimate of the node at one pad; `model` is the pad's."""
+
+    def __init__(self, model: ForwardModel) -> None:
+        self._model = model
+        self.serial: int | None = None
+        self.calibration_state = CalibrationState.DEFAULT
+        self.can_learn = False
+        """contacts can calibrate this node"""
+        self._obstacle = ""
+        self._quarantine_cause: tuple[FaultKind, str] = (FaultKind.NODE_REPLACED, "")
+        self._pending: list[StationaryContact] = []
+        self.since_ns, self._attempt, self._store_at_contacts = 0, 0, 0
+        self._has_own_gains = False  # the estimate started from gains of its own
+        self._mean_gain = 1.0  # geometric mean, not observable by contacts
+        self._estimator = GainEstimator(model)
+        self.estimate = self._estimator.estimate
+
+    def assign_node(
+        self,
+        serial: int,
+        before: int | None,
+        own: Gains | None,
+        obstacle: str,
+        now_ns: int,
+        *,
+        foreign: bool = False,
+    ) -> None:
+        """Assign a node to the pad.
+
+        before: serial number of the previous node, None if unknown. own: stored gains. obstacle: reason why
+        contacts can't calibrate it; empty without one. foreign: the gains were taken over from another node.
+        """
+        self.serial, self.can_learn, self._obstacle = serial, not obstacle, obstacle
+        self.since_ns = now_ns
+        replaced = before is not None and before != serial
+        self._quarantine_cause = FaultKind.NODE_REPLACED, f"node replaced: serial {before} -> {serial}"
+        self._restart_estimator(0, own)
+        if own and not foreign:
+            self.calibration_state = CalibrationState.CALIBRATED
+        elif replaced and not foreign:
+            self.calibration_state = CalibrationState.QUARANTINED
+        else:
+            self.calibration_state = CalibrationState.DEFAULT
+        self._require_manual_if_unobservable()
+
+    def apply_gains(self, own: Gains, *, foreign: bool = False) -> None:
+        """Restart from gains that an operator set, or rolled back to."""
+        self._restart_estimator(0, own)
+        self.calibration_state = CalibrationState.DEFAULT if foreign else CalibrationState.CALIBRATED
+
+    def accept_measured_law(self) -> None:
+        """Release a node from quarantine, as its contact law was measured, which determines forces."""
+        if self.force_unreliable:
+            self.calibration_state = CalibrationState.CALIBRATED
+
+    def revert_to_default(self) -> None:
+        """Restart from the deployment file's gains, unless the node is in quarantine."""
+        if not self.force_unreliable:
+            self._restart_estimator(0)
+            self.calibration_state = CalibrationState.DEFAULT
+
+    def add_contact(self, contact: StationaryContact) -> GainUpdate:
+        """Add a stationary contact; return what to do with the gains."""
+        if not self.can_learn or self._estimator.shape_deviation > MAX_SHAPE_DEVIATION:
+            return GainUpdate()
+        self._pending.append(contact)
+        if len(self._pending) < _CONTACTS_PER_UPDATE:
+            return GainUpdate()
+        contacts, self._pending = self._pending, []
+        before = self.estimate.contacts
+        currents = np.transpose([one.currents for one in contacts])
+        self._estimator.add_contacts(
+            currents, np.transpose([one.noise for one in contacts]), contact.last_sync_ns
+        )
+        self.estimate = self._estimator.estimate
+        if self.estimate.contacts == before:
+            return GainUpdate()
+        self._check_gain_limits()
+        return self._assess_estimate(contact.last_sync_ns)
+
+    @property
+    def force_unreliable(self) -> bool:
+        """Return whether forces are unreliable."""
+        return self.calibration_state in (CalibrationState.QUARANTINED, CalibrationState.MANUAL_REQUIRED)
+
+    @property
+    def gains(self) -> Gains:
+        """Return the gains estimated by contacts and stored values."""
+        return Gains(channel_values(self._mean_gain * self.estimate.gains), matrix(self.estimate.covariance))
+
+    @property
+    def progress(self) -> str:
+        """Return the progress of calibration by contacts as text."""
+        if self._obstacle:
+            return self._obstacle
+        if self.serial is None:
+            return ""
+        if (
+            self.calibration_state is CalibrationState.CALIBRATED
+            and self._has_own_gains
+            and not self.estimate.contacts
+        ):
+            return f"gains set or stored, known to {100 * self.estimate.std:.2g} %; contacts refine them"
+        return f"gains {self.estimate.status}: {self.estimate.reason}"
+
+    @property
+    def diagnoses(self) -> tuple[Diagnosis, ...]:
+        """Return the diagnosis of a node in quarantine: cause and remedy."""
+        if not self.force_unreliable:
+            return ()
+        kind, cause = self._quarantine_cause
+        if self.calibration_state is CalibrationState.MANUAL_REQUIRED:
+            reason = self._obstacle or self.estimate.reason
+            remedy = f"contacts can't calibrate it: {_MANUAL_REMEDY}"
+        else:
+            reason = self.estimate.reason
+            remedy = (
+                "ordinary contacts calibrate it: touch the pad all over with different forces; until then "
+                "its forces are invalid and its positions less certain"
+            )
+        evidence = f"no calibration of its own is stored; {reason}"
+        since_ns = self.since_ns
+        return (
+            Diagnosis(
+                kind=kind, cause=cause, evidence=evidence, remedy=remedy, since_ns=since_ns, force_valid=False
+            ),
+        )
+
+    def _check_gain_limits(self) -> None:
+        """Reject gains out of range, which contacts that are no points can lead to."""
+        lowest, highest = (self._mean_gain * limit(self.estimate.gains) for limit in (np.min, np.max))
+        if lowest >= MIN_GAIN and highest <= MAX_GAIN:
+            return
+        reason = (
+            f"gains from {lowest:.2g} to {highest:.2g} would explain its contacts, beyond any amplifier's "
+            f"({MIN_GAIN:g} to {MAX_GAIN:g}): the pad isn't as configured, or several objects touch it "
+            "at once"
+        )
+        self.estimate = replace(self.estimate, status=GainStatus.INVALID, reason=reason)
+
+    def _assess_estimate(self, now_ns: int) -> GainUpdate:
+        """Update the state after a batch of contacts."""
+        status = self.estimate.status
+        if status is GainStatus.INVALID:
+            return self._reject_gains(now_ns)
+        if status is GainStatus.UNDETERMINED:
+            return GainUpdate(apply=self.force_unreliable)
+        newly_calibrated = self.calibration_state is not CalibrationState.CALIBRATED
+        if not newly_calibrated and self.estimate.contacts < self._store_at_contacts:
+            return GainUpdate()
+        self._store_at_contacts = 2 * self.estimate.contacts
+        self.calibration_state = CalibrationState.CALIBRATED
+        return GainUpdate(apply=True, store=True)
+
+    def _reject_gains(self, now_ns: int) -> GainUpdate:
+        """Restart, or enter quarantine, as no gains near these explain the contacts."""
+        reason = self.estimate.reason
+        if self.calibration_state in (CalibrationState.CALIBRATED, CalibrationState.DEFAULT):
+            self.calibration_state, self.since_ns = CalibrationState.QUARANTINED, now_ns
+            self._quarantine_cause = FaultKind.GAINS_CHANGED, f"its gains have changed: {reason}"
+            self._restart_estimator(0)
+        elif self._attempt + 1 < len(_INITIAL_LOG_GAIN_STDS):
+            self._restart_estimator(self._attempt + 1)
+        else:
+            self.calibration_state = CalibrationState.MANUAL_REQUIRED
+            self._restart_estimator(0)  # and retry
+        self._require_manual_if_unobservable()
+        return GainUpdate(apply=True)
+
+    def _require_manual_if_unobservable(self) -> None:
+        if self.calibration_state is CalibrationState.QUARANTINED and (
+            self._estimator.shape_deviation > MAX_SHAPE_DEVIATION or self._obstacle
+        ):
+            self.calibration_state = CalibrationState.MANUAL_REQUIRED
+
+    def _restart_estimator(self, attempt: int, own: Gains | None = None) -> None:
+        self._attempt, self._pending, self._has_own_gains = attempt, [], own is not None
+        start, covariance = (own.factors, own.covariance) if own else (None, None)
+        self._mean_gain = math.exp(np.log(own.factors).mean()) if own else 1.0
+        self._estimator = GainEstimator(
+            self._model,
+            tolerance=_INITIAL_LOG_GAIN_STDS[attempt],
+            required_std=_MAX_CALIBRATED_LOG_GAIN_STD,
+            start=start,
+            covariance=covariance,
+        )
+        self.estimate = self._estimator.estimate
+        self._store_at_contacts = _MIN_CONTACTS_TO_STORE_AGAIN

@@ -1,0 +1,277 @@
+"""Calibration of one node beyond the deployment file, and its provenance; to JSON and back.
+
+Public: `Calibration` of `Gains`, `Offsets`, `LawParameters` and `StoredSheetState`; `Provenance`;
+`CalibrationVersion`, one entry of the store; `check_match`, which binds a version to a node, `MismatchError`;
+`differences`; `aged_gains`; `channel_values` and `matrix`, which convert arrays.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+ChannelValues = tuple[float, float, float, float]
+Matrix = tuple[tuple[float, ...], ...]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+
+Record = TypeVar("Record")
+
+_RECORD = ConfigDict(
+    extra="forbid", strict=True, allow_inf_nan=False, ser_json_bytes="base64", val_json_bytes="base64"
+)
+_LOG_GAIN_STD_PER_DAY = 1e-3
+"""Standard deviation of a log gain's random walk, after a day."""
+_NODE_TO_NODE_LOG_GAIN_STD = 0.05
+"""Standard deviation of a log gain from node to node."""
+MIN_GAIN, MAX_GAIN = 0.1, 10.0
+"""Range of gain factors; no amplifier meant for these channels is beyond it."""
+
+
+class MismatchError(ValueError):
+    """A calibration belongs to another node, or to the same node under other tables of the file."""
+
+
+def _check_covariance(values: Matrix) -> Matrix:
+    size = len(values)
+    if size not in (3, 4) or any(len(row) != size for row in values):
+        raise ValueError(f"must be a square matrix, has rows of {[len(row) for row in values]}")
+    array = np.array(values)
+    scale = float(np.abs(array).max())
+    if not np.allclose(array, array.T, rtol=0, atol=1e-9 * scale):
+        raise ValueError("must be symmetric")
+    if scale > 0 and np.linalg.eigvalsh(array / scale).min() < -1e-9:
+        raise ValueError("must not have negative eigenvalues")
+    return values
+
+
+Covariance3 = Annotated[Matrix, Field(min_length=3, max_length=3), AfterValidator(_check_covariance)]
+Covariance4 = Annotated[Matrix, Field(min_length=4, max_length=4), AfterValidator(_check_covariance)]
+
+
+@dataclass(frozen=True, config=_RECORD)
+class Gains:
+    """Factors that correct the currents of channels x0, xa, y0, yb; covariance (4, 4) of their logarithms."""
+
+    factors: tuple[Positive, Positive, Positive, Positive]
+    covariance: Covariance4
+
+
+@dataclass(frozen=True, config=_RECORD)
+class Offsets:
+    """Readings of untouched channels [counts], their variance [counts^2]; noise of readings if known."""
+
+    counts: ChannelValues
+    variance: tuple[NonNegative, NonNegative, NonNegative, NonNegative]
+    noise: tuple[NonNegative, NonNegative, NonNegative, NonNegative] | None = None
+
+
+@dataclass(frozen=True, config=_RECORD)
+class LawParameters:
+    """Contact law (paper eq. 12) and sheet; keys as in a deployment's `[sheet.NAME]`.
+
+    covariance: (3, 3), of ln contact_ohm_mm2, alpha, ln ohm_per_square.
+    """
+
+    contact_ohm_mm2: Positive
+    alpha: Positive
+    ohm_per_square: Positive
+    covariance: Covariance3
+
+
+@dataclass(frozen=True, config=_RECORD)
+class StoredSheetState:
+    """State of a sheet model; `data` is readable for a model of that kind and version only."""
+
+    kind: str
+    version: int
+    data: bytes
+
+
+@dataclass(frozen=True, config=_RECORD)
+class Calibration:
+    """Calibration of one node; None for parts that are unknown."""
+
+    gains: Gains | None = None
+    offsets: Offsets | None = None
+    law: LawParameters | None = None
+    sheet: StoredSheetState | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the known parts, ready for `json.dumps`; numbers keep all their digits."""
+        record: dict[str, Any] = _CALIBRATION.dump_python(self, mode="json", exclude_none=True)
+        return record
+
+    @classmethod
+    def from_json(cls, record: object) -> Calibration:
+        """Return the calibration in a record of `to_json`. Raises ValueError naming the wrong key."""
+        return _validate(_CALIBRATION, record, "calibration")
+
+
+@dataclass(frozen=True, config=_RECORD)
+class Provenance:
+    """Origin of a calibration.
+
+    method: e.g. "gains from contacts", "guided session". contacts: number used. residual: root mean square
+    misfit in standard deviations, NaN if unknown. hand, link: where the node was mounted. host, program: of
+    the writer. note: anything else. foreign: not empty if the values are another node's.
+    """
+
+    method: str
+    contacts: int = 0
+    residual: Annotated[float, Field(allow_inf_nan=True)] = math.nan
+    hand: str = ""
+    link: str = ""
+    host: str = ""
+    program: str = ""
+    note: str = ""
+    foreign: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a record ready for `json.dumps`, without a NaN."""
+        record: dict[str, Any] = _PROVENANCE.dump_python(self)
+        return {name: value for name, value in record.items() if value == value}
+
+    @classmethod
+    def from_json(cls, record: object) -> Provenance:
+        """Return the provenance in a record of `to_json`. Raises ValueError naming the wrong key."""
+        return _validate(_PROVENANCE, record, "provenance")
+
+
+@dataclass(frozen=True, config=_RECORD)
+class CalibrationVersion:
+    """One entry of the store. number: counts from 1 for each serial. config: hash of the pad's tables."""
+
+    serial: int
+    config: str
+    number: int
+    written_utc: str
+    provenance: Provenance
+    calibration: Calibration
+
+    @property
+    def calibration_id(self) -> str:
+        """Return the identifier that contacts carry, as "1001-3"."""
+        return f"{self.serial}-{self.number}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a record ready for `json.dumps`, the sheet's state as base64."""
+        record: dict[str, Any] = _VERSION.dump_python(self, mode="json", exclude_none=True)
+        return record | {"provenance": self.provenance.to_json()}
+
+    @classmethod
+    def from_json(cls, record: object) -> CalibrationVersion:
+        """Return the version in a record of `to_json`. Raises ValueError naming the wrong key."""
+        return _validate(_VERSION, record, "version")
+
+
+_CALIBRATION: TypeAdapter[Calibration] = TypeAdapter(Calibration)
+_PROVENANCE: TypeAdapter[Provenance] = TypeAdapter(Provenance)
+_VERSION: TypeAdapter[CalibrationVersion] = TypeAdapter(CalibrationVersion)
+_PROBLEMS = {"unexpected_keyword_argument": "unknown key", "missing": "missing key"}
+
+
+def _validate(adapter: TypeAdapter[Record], record: object, name: str) -> Record:
+    try:
+        return adapter.validate_json(json.dumps(record))
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        key = ".".join(map(str, (name, *problem["loc"])))
+        text = _PROBLEMS.get(problem["type"], problem["msg"].replace("Input should be", "must be"))
+        raise ValueError(f"{key}: {text}") from error
+
+
+@dataclass(frozen=True)
+class MatchedCalibration:
+    """A version to apply. mismatch: reason why it isn't this node's own; empty if it is."""
+
+    version: CalibrationVersion
+    mismatch: str
+
+
+def check_match(
+    version: CalibrationVersion, serial: int, config: str, *, accept_mismatch: bool = False
+) -> MatchedCalibration:
+    """Match a version with the node `serial` under the tables `config`.
+
+    Raises MismatchError if it is another node's, or was made under other tables, unless that is accepted;
+    then the result states it.
+    """
+    mismatches = [version.provenance.foreign] if version.provenance.foreign else []
+    if version.serial != serial:
+        mismatches.append(f"it was made for serial {version.serial}, not for {serial}")
+    if version.config != config:
+        mismatches.append(f"it was made under {version.config}, the deployment file now has {config}")
+    mismatch = "; ".join(mismatches)
+    if mismatch and not accept_mismatch:
+        raise MismatchError(
+            f"version {version.number} of serial {version.serial} doesn't match: {mismatch}; "
+            "calibrate this node, or accept the mismatch explicitly"
+        )
+    return MatchedCalibration(version, mismatch)
+
+
+def age_s(version: CalibrationVersion, now: datetime) -> float:
+    """Return the age of a version [s]; 0 if its time is in the future."""
+    written = datetime.fromisoformat(version.written_utc).astimezone(UTC)
+    return max(0.0, (now - written).total_seconds())
+
+
+def aged_gains(version: CalibrationVersion, now: datetime) -> Gains | None:
+    """Return the gains of a version, with the uncertainty of drift since, and of another node's gains."""
+    gains = version.calibration.gains
+    if gains is None:
+        return None
+    drift = _LOG_GAIN_STD_PER_DAY**2 * age_s(version, now) / 86400
+    if version.provenance.foreign:
+        drift += _NODE_TO_NODE_LOG_GAIN_STD**2
+    # a random walk of four gains that leaves their product unchanged
+    covariance = tuple(
+        tuple(value + drift * ((i == j) - 0.25) for j, value in enumerate(row))
+        for i, row in enumerate(gains.covariance)
+    )
+    return Gains(gains.factors, covariance)
+
+
+def channel_values(values: ArrayLike) -> ChannelValues:
+    """Return four numbers of an array as a tuple. Raises ValueError for another shape."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (4,):
+        raise ValueError(f"values has shape {array.shape}: must be (4,)")
+    x0, xa, y0, yb = array.tolist()
+    return x0, xa, y0, yb
+
+
+def matrix(values: ArrayLike) -> Matrix:
+    """Return the rows of a matrix as tuples. Raises ValueError for another shape."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2:
+        raise ValueError(f"matrix has shape {array.shape}: must have two axes")
+    return tuple(tuple(row) for row in array.tolist())
+
+
+def differences(
+    before: Calibration, after: Calibration
+) -> list[tuple[str, Sequence[float] | str | None, Any]]:
+    """Return what differs as (name, before, after), without covariances."""
+    rows: list[tuple[str, Any, Any]] = []
+    for part, names in (
+        ("gains", ("factors",)),
+        ("offsets", ("counts", "variance", "noise")),
+        ("law", ("contact_ohm_mm2", "alpha", "ohm_per_square")),
+        ("sheet", ("kind", "version", "data")),
+    ):
+        one, other = getattr(before, part), getattr(after, part)
+        for name in names:
+            old, new = getattr(one, name, None), getattr(other, name, None)
+            if old != new:
+                rows.append((f"{part}.{name}", old, new))
+    return rows

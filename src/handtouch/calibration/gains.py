@@ -1,0 +1,424 @@
+"""Estimate the ratios of a pad's four channel gains from ordinary contacts, without a reference.
+
+Public: `GainEstimator` (contacts in, `GainEstimate` out); `gain_deviation` and `fisher_covariance`, the
+Fisher bounds for a shape of pad and for given contacts.
+
+A point contact has three unknowns and gives four currents. The one number left over, the score, is the part
+of the misfit along the left null vector n of the fit's whitened Jacobian: a standard normal number if the
+gains are right. Log gains with an error d (summing to zero) move it by h . d, where h = n * expected
+currents / noise. So each contact is one linear equation for d; contacts are fitted again with the gains found
+(Gauss-Newton), which makes it the maximum-likelihood estimate with the positions as nuisance parameters.
+
+Contacts come in batches. A batch is iterated to convergence around the former gains, then only its
+information matrix is kept: the state has a fixed size. Contacts that are no points are recognised by a
+mixture of two normal distributions of the score, whose shares are estimated too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit
+
+from handtouch.field.estimate import estimate
+from handtouch.field.model import FloatArray, ForwardModel, channel_noise
+
+BATCH_CONTACTS = 32
+MAX_SHAPE_DEVIATION = 20.0
+"""Standard deviation of a log gain after 400 contacts, per noise, above which a shape is refused."""
+
+_MAX_BATCH_ITERATIONS = 8
+_CONVERGED_STEP_SIGMA = 0.02  # standard deviations of the gains: a smaller step ends a batch
+_L1_ITERATIONS, _EM_ITERATIONS = 12, 20
+_MIN_EDGE_DISTANCE_FRACTION = (
+    0.05  # of a side: nearer to an edge, a contact of real size is no point of the model
+)
+_MAX_NOISE_FRACTION = 0.02  # of the total: weaker contacts hold little information, with a bias
+_CELLS_PER_SIDE = 10  # a side
+_MEMORY_CONTACTS = 128.0  # contacts over which the share of points is estimated
+_MIN_OUTLIER_VARIANCE = 25.0  # variance of the scores of contacts that are no points, at least
+_MIN_INFORMATION_FRACTION = 0.2  # of a batch's information, however unlikely its contacts
+_DAY_NS = 86_400e9
+
+# orthonormal directions of four log gains that sum to zero
+_BASIS = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [1, -1, 0, 0], [0, 0, 1, -1]], dtype=np.float64)
+_BASIS = (_BASIS / np.linalg.norm(_BASIS, axis=1, keepdims=True))[1:].T
+
+
+class GainStatus(StrEnum):
+    """Status of a gain estimate."""
+
+    UNDETERMINED = "undetermined"
+    ESTIMATED = "estimated"
+    INVALID = "invalid"
+
+
+@dataclass(frozen=True)
+class GainEstimate:
+    """Gains estimated from contacts, channels in the order x0, xa, y0, yb.
+
+    gains: (4,), factors that correct the currents; their product is 1, a common factor is not observable.
+    covariance: (4, 4), of the logarithms of the gains; singular, as they sum to zero. Widened by the misfit.
+    contacts: number used. effective_contacts: number that counts, once those at one position and those that
+        are no points are discounted. point_fraction: share of them that are points.
+    misfit: root mean square score of recent points, near 1 where model and noise are right.
+    reason: of the status, as text.
+    """
+
+    gains: FloatArray
+    covariance: FloatArray
+    contacts: int
+    effective_contacts: float
+    point_fraction: float
+    misfit: float
+    status: GainStatus
+    reason: str
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the least certain log gain."""
+        return float(np.sqrt(np.diag(self.covariance).max()))
+
+
+class GainEstimator:
+    """Running estimate of the gains of one pad; its state has a fixed size.
+
+    model: of the pad, with channels x0, xa, y0, yb.
+    tolerance: standard deviation of a log gain before any contact.
+    drift_per_day: standard deviation of a log gain's random walk, after a day.
+    model_error: standard deviation of the model's fractions. It is the same for all contacts in one cell of
+        the pad, so a cell never adds more information than this allows, however often it is touched.
+    required_std: of the least certain log gain, at which the gains count as estimated.
+    start: initial gains (4,), their covariance (4, 4) of logarithms as `covariance`, both as stored.
+
+    Raises ValueError for a model with other channels, or a parameter out of range.
+    """
+
+    def __init__(
+        self,
+        model: ForwardModel,
+        *,
+        tolerance: float = 0.05,
+        drift_per_day: float = 1e-3,
+        model_error: float = 5e-4,
+        required_std: float = 5e-3,
+        start: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+    ) -> None:
+        for name, value, least in (
+            ("tolerance", tolerance, 1e-9),
+            ("drift_per_day", drift_per_day, 0.0),
+            ("model_error", model_error, 0.0),
+            ("required_std", required_std, 1e-9),
+        ):
+            if not least <= value < np.inf:
+                raise ValueError(f"{name} = {value}: must be finite and at least {least:g}")
+        self.shape_deviation = gain_deviation(model)
+        self._model = model
+        self._drift_per_day, self._model_error, self._required_std = drift_per_day, model_error, required_std
+        self._log_gains = np.zeros(4) if start is None else _normalised_logs(start)
+        self._information: FloatArray = np.eye(3) / tolerance**2
+        if covariance is not None:
+            known = _BASIS.T @ np.asarray(covariance, dtype=np.float64) @ _BASIS
+            self._information = _inverse(known + 1e-18 * np.eye(3))
+        # the positions behind given gains are unknown: each cell starts with half of the information it can
+        # add
+        already = 0.0 if covariance is None or model_error == 0 else model_error**-2
+        self._cell_information = np.full((_CELLS_PER_SIDE, _CELLS_PER_SIDE), already)
+        self._mixture = _OutlierMixture()
+        self._pending: list[FloatArray] = []
+        self._contacts, self._effective_contacts = 0, 0.0
+        self._misfit_sums = np.array([1.0, 0.0])  # weighted sum of squares, and of weights
+        self._last_ns: int | None = None
+
+    def add_contacts(self, currents: ArrayLike, noise: ArrayLike, now_ns: int) -> int:
+        """Add contacts, one column each; return the number of useful ones.
+
+        currents: (4, n) or (4,), any unit, offsets taken off, *not* corrected by this estimator's gains.
+        noise: their standard deviations, same unit: one, (4,) a channel, or broadcastable. Give a held
+            contact once, as its mean with the noise of that mean. now_ns: monotonic time of the last of them.
+        Raises ValueError for other shapes, or a time before that of the contacts given before.
+        """
+        readings = np.asarray(currents, dtype=np.float64)
+        if readings.shape[:1] != (4,) or readings.ndim > 2:
+            raise ValueError(f"currents have shape {readings.shape}: must be (4,) or (4, n)")
+        sigma = channel_noise(noise, readings.shape)
+        if self._last_ns is not None and now_ns < self._last_ns:
+            raise ValueError(f"now_ns = {now_ns}: contacts of {self._last_ns} were added before")
+        self._propagate_drift(now_ns)
+        columns = np.concatenate([readings.reshape(4, -1), sigma.reshape(4, -1)])
+        useful = columns[:, self._usable(columns[:4], columns[4:])]
+        self._pending.extend(useful.T)
+        while len(self._pending) >= BATCH_CONTACTS:
+            batch, self._pending = np.array(self._pending[:BATCH_CONTACTS]).T, self._pending[BATCH_CONTACTS:]
+            self._process_batch(batch[:4], batch[4:])
+        return int(useful.shape[1])
+
+    def process_pending(self) -> None:
+        """Process the contacts of an incomplete batch, as at the end of a recording."""
+        if self._pending:
+            batch, self._pending = np.array(self._pending).T, []
+            self._process_batch(batch[:4], batch[4:])
+
+    @property
+    def estimate(self) -> GainEstimate:
+        """Return the estimate after the batches so far."""
+        squares, counted = self._misfit_sums
+        misfit = float(np.sqrt(squares / counted)) if counted > 0 else float("nan")
+        # scores wider than by noise: model errors of the points widen the covariance of the gains too
+        covariance = _BASIS @ _inverse(self._information) @ _BASIS.T * max(1.0, np.nan_to_num(misfit) ** 2)
+        std = float(np.sqrt(np.diag(covariance).max()))
+        status, reason = self._assess(std)
+        return GainEstimate(
+            np.exp(self._log_gains),
+            covariance,
+            self._contacts,
+            self._effective_contacts,
+            1 - self._mixture.outlier_fraction,
+            misfit,
+            status,
+            reason,
+        )
+
+    def _assess(self, std: float) -> tuple[GainStatus, str]:
+        if self.shape_deviation > MAX_SHAPE_DEVIATION:
+            return GainStatus.INVALID, (
+                f"a pad of {self._model.a:.3g} by {self._model.b:.3g} can't be calibrated by contacts: 400 "
+                f"would determine its gains to {self.shape_deviation:.0f} times the noise (limit "
+                f"{MAX_SHAPE_DEVIATION:.0f}); "
+                "measure them with a known current into every channel"
+            )
+        if self._mixture.outlier_fraction > 0.5:
+            return GainStatus.INVALID, (
+                f"{100 * self._mixture.outlier_fraction:.0f} % of its contacts are no points under any "
+                f"gains near "
+                "these: the pad isn't built as configured, its gains have jumped, or only edges touch it; "
+                "calibrate again, with round contacts"
+            )
+        counts = f"{self._contacts} contacts, worth {self._effective_contacts:.0f} at distinct positions"
+        result = f"{counts}; gains known to {100 * std:.2g} %"
+        if std > self._required_std or self._contacts == 0:
+            return (
+                GainStatus.UNDETERMINED,
+                f"{result}, {100 * self._required_std:.2g} % required: touch the pad all over",
+            )
+        return GainStatus.ESTIMATED, result
+
+    def _usable(self, currents: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
+        """Return which contacts (n,) have enough force and distance from the edges."""
+        gains = np.exp(self._log_gains)[:, None]
+        found = estimate(self._model, currents * gains, sigma * gains)
+        inside = np.ones(currents.shape[1], dtype=bool)
+        with np.errstate(invalid="ignore"):
+            for at, side in ((found.x, self._model.a), (found.y, self._model.b)):
+                inside &= (at > _MIN_EDGE_DISTANCE_FRACTION * side) & (
+                    at < (1 - _MIN_EDGE_DISTANCE_FRACTION) * side
+                )
+            useful = inside & found.converged & (sigma.max(axis=0) < _MAX_NOISE_FRACTION * found.total)
+        return np.asarray(useful)
+
+    def _propagate_drift(self, now_ns: int) -> None:
+        """Add drift of the gains until now_ns; the information in the cells fades with it."""
+        days = 0.0 if self._last_ns is None else (now_ns - self._last_ns) / _DAY_NS
+        self._last_ns = now_ns
+        if days > 0 and self._drift_per_day > 0:
+            before = _inverse(self._information)
+            after = before + self._drift_per_day**2 * days * np.eye(3)
+            self._information = _inverse(after)
+            self._cell_information *= np.trace(before) / np.trace(after)
+
+    def _process_batch(self, currents: FloatArray, sigma: FloatArray) -> None:
+        """Process a batch (4, n): iterate around the former gains, then keep its information."""
+        known, positions = self._log_gains, None
+        for _ in range(_MAX_BATCH_ITERATIONS):
+            gains = np.exp(self._log_gains)[:, None]
+            view = _ContactLinearisation.linearise(self._model, currents * gains, sigma * gains, positions)
+            positions = view.positions
+            share, cells = self._information_shares(view)
+            spread = np.sqrt(1 + (self._model_error * view.score_sensitivity) ** 2)
+            mixture = replace(self._mixture)
+            prior = _BASIS.T @ (known - self._log_gains)
+            found = mixture.solve(view, share, spread, self._information, prior)
+            information = self._information + (view.score_slope * found.precision) @ view.score_slope.T
+            self._log_gains = self._log_gains + _BASIS @ found.step
+            if found.step @ information @ found.step < _CONVERGED_STEP_SIGMA**2:
+                break
+        self._information, self._mixture, self._cell_information = information, mixture, cells
+        self._contacts += len(share)
+        self._effective_contacts += float(found.precision @ spread**2)
+        fade = 1 - len(share) / _MEMORY_CONTACTS
+        self._misfit_sums = fade * self._misfit_sums + [
+            found.point_probability @ found.squared_scores,
+            found.point_probability.sum(),
+        ]
+
+    def _information_shares(self, view: _ContactLinearisation) -> tuple[FloatArray, FloatArray]:
+        """Return the share of each contact's information (n,) given earlier ones nearby, and the updated
+        cells.
+
+        Independent information i of a cell and a common error m give 1 / (1 / i + m^2) together.
+        """
+        cells, error = self._cell_information.copy(), self._model_error**2
+        at = (
+            (view.positions / [[self._model.a], [self._model.b]] * _CELLS_PER_SIDE)
+            .clip(0, _CELLS_PER_SIDE - 1)
+            .astype(int)
+        )
+        share = np.zeros(at.shape[1])
+        for k, (i, j) in enumerate(at.T):
+            before, own = cells[i, j], view.score_sensitivity[k] ** 2
+            cells[i, j] += own
+            share[k] = 1 / ((1 + before * error) * (1 + cells[i, j] * error))
+        return share, cells
+
+
+def gain_deviation(model: ForwardModel, contacts: int = 400) -> float:
+    """Return the Fisher bound: standard deviation of the least certain log gain, per noise / total.
+
+    For `contacts` spread evenly over the pad, 10 % of a side and farther from the edges. Raises ValueError
+    for a model with other channels.
+    """
+    at = 0.1 + 0.8 * (np.arange(20) + 0.5) / 20
+    x, y = (grid.ravel() for grid in np.meshgrid(at * model.a, at * model.b))
+    covariance = fisher_covariance(model, x, y, 1.0) * x.size / contacts
+    return float(np.sqrt(np.diag(covariance).max()))
+
+
+def fisher_covariance(model: ForwardModel, x: FloatArray, y: FloatArray, noise: ArrayLike) -> FloatArray:
+    """Return the Fisher bound of the log gains, (4, 4), of contacts at unknown positions x, y (n,).
+
+    noise: of the channels as a part of each contact's total, as `channel_noise` takes it.
+    """
+    slope = _score_slopes(model, x, y, channel_noise(noise, (4, *x.shape)), np.ones(x.shape))[1]
+    return np.asarray(_BASIS @ np.linalg.pinv(slope @ slope.T, rcond=1e-14) @ _BASIS.T)
+
+
+@dataclass
+class _OutlierMixture:
+    """Mixture of scores: standard normal for points, normal with a wide spread for other contacts.
+
+    points, others: contacts counted as either, with what is thought before any. squares: of scores, summed
+    over the others.
+    """
+
+    point_count: float = 19.0
+    outlier_count: float = 1.0
+    outlier_squares: float = 100.0
+
+    @property
+    def outlier_fraction(self) -> float:
+        """Share of contacts that are no points."""
+        return self.outlier_count / (self.point_count + self.outlier_count)
+
+    def solve(
+        self,
+        view: _ContactLinearisation,
+        share: FloatArray,
+        spread: FloatArray,
+        information: FloatArray,
+        prior: FloatArray,
+    ) -> _GainStep:
+        """Return the most likely step of the gains for contacts and prior, (3,) with its information.
+
+        share (n,): of a contact's information that counts; spread (n,): standard deviation of a point's
+        score. Starts from the least absolute scores, which are robust against a minority, then
+        expectation-maximisation.
+        """
+
+        def step_for(precision: FloatArray) -> FloatArray:
+            weighted = view.score_slope * precision
+            right = information @ prior - weighted @ view.score
+            return np.asarray(np.linalg.solve(information + weighted @ view.score_slope.T, right))
+
+        step = prior
+        for _ in range(_L1_ITERATIONS):
+            score = np.abs(view.score + step @ view.score_slope) / spread
+            step = step_for(share / np.maximum(score, 0.1))
+        points, others, squares = self.point_count, self.outlier_count, self.outlier_squares
+        for _ in range(_EM_ITERATIONS):
+            z = (view.score + step @ view.score_slope) ** 2 / spread**2
+            wide = max(self.outlier_squares / self.outlier_count, _MIN_OUTLIER_VARIANCE)
+            log_odds = (
+                np.log(self.outlier_count / self.point_count) - np.log(wide) / 2 + z * (1 - 1 / wide) / 2
+            )
+            other = expit(log_odds)
+            self.point_count, self.outlier_count = points + (1 - other).sum(), others + other.sum()
+            self.outlier_squares = squares + other @ z
+            weight = 1 - other + other / wide
+            # uncertainty of a contact's class reduces the information (Louis 1982)
+            information_loss = other * (1 - other) * (1 - 1 / wide) ** 2 * z
+            kept = max(1 - (share @ information_loss) / (share @ weight), _MIN_INFORMATION_FRACTION)
+            weight = kept * share * weight
+            step = step_for(weight)
+        fade = min(1.0, _MEMORY_CONTACTS / (self.point_count + self.outlier_count))
+        self.point_count, self.outlier_count, self.outlier_squares = (
+            fade * v for v in (self.point_count, self.outlier_count, self.outlier_squares)
+        )
+        return _GainStep(step, weight, 1 - other, z)
+
+
+class _GainStep(NamedTuple):
+    """Step (3,); for each contact (n,): precision of its score, probability of a point, squared score."""
+
+    step: FloatArray
+    precision: FloatArray
+    point_probability: FloatArray
+    squared_scores: FloatArray
+
+
+@dataclass(frozen=True)
+class _ContactLinearisation:
+    """Linearisation of the scores of contacts (n,) around the gains that correct them.
+
+    positions (2, n); score (n,); slope (3, n): what a step of the gains adds to the score; sharpness (n,):
+    score per error of the fractions.
+    """
+
+    positions: FloatArray
+    score: FloatArray
+    score_slope: FloatArray
+    score_sensitivity: FloatArray
+
+    @classmethod
+    def linearise(
+        cls, model: ForwardModel, currents: FloatArray, sigma: FloatArray, start: FloatArray | None
+    ) -> _ContactLinearisation:
+        found = estimate(model, currents, sigma, start)
+        positions = np.stack([found.x, found.y])
+        known = np.isfinite(positions).all(axis=0)
+        x, y = np.where(known, positions, [[model.a / 2], [model.b / 2]])
+        total = np.where(known, found.total, 1.0)
+        null, slope = _score_slopes(model, x, y, sigma, total)
+        score = np.einsum("nc,cn->n", null, currents / sigma)
+        sharpness = total * np.linalg.norm(null.T / sigma, axis=0)
+        return cls(np.stack([x, y]), np.where(known, score, 0.0), slope * known, sharpness)
+
+
+def _score_slopes(
+    model: ForwardModel, x: FloatArray, y: FloatArray, sigma: FloatArray, total: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return left null vectors (n, 4) of fits at x, y (n,), and the slopes (3, n) of their scores by
+    gains."""
+    fractions, jacobian = model.fractions_with_jacobian(x, y)
+    if len(fractions) != 4:
+        raise ValueError(f"the model has {len(fractions)} channels: gains are estimated from four")
+    columns = np.moveaxis(np.concatenate([fractions[:, None], jacobian], axis=1) / sigma[:, None], 2, 0)
+    columns = columns / np.linalg.norm(columns, axis=1, keepdims=True)
+    null = np.linalg.qr(columns, mode="complete").Q[:, :, 3]
+    return null, _BASIS.T @ (null.T * total * fractions / sigma)
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def _normalised_logs(gains: ArrayLike) -> FloatArray:
+    values = np.asarray(gains, dtype=np.float64)
+    if values.shape != (4,) or not (values > 0).all() or not np.isfinite(values).all():
+        raise ValueError(f"gains {values}: must be four positive numbers")
+    logs = np.log(values)
+    return np.asarray(logs - logs.mean())

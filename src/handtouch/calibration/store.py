@@ -1,0 +1,181 @@
+"""Calibration store: every calibration of every node, in one SQLite file; nothing is overwritten.
+
+Public: `Store` (open, write, read, roll back), `NodeHistory` and `store_path`. Readers and one writer at a
+time may be different processes. The errors are those of `store_file`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Self
+
+from handtouch.calibration import store_file
+from handtouch.calibration.calibration import Calibration, CalibrationVersion, Provenance
+from handtouch.calibration.store_file import DamagedStoreError, NewerStoreError, StoreError
+
+__all__ = ["DamagedStoreError", "NewerStoreError", "NodeHistory", "Store", "StoreError", "store_path"]
+
+
+@dataclass(frozen=True)
+class NodeHistory:
+    """A node in the store: number of versions, and the newest."""
+
+    serial: int
+    version_count: int
+    newest: CalibrationVersion
+
+
+def store_path(configured: str | None = None, folder: Path | None = None) -> Path:
+    """Return the store's path: `[daemon] store`, relative to the deployment file's folder.
+
+    Else in the state folder given by systemd, or $XDG_STATE_HOME/handtouch, or ~/.local/state/handtouch.
+    """
+    if configured is not None:
+        return (folder or Path()) / Path(configured).expanduser()
+    if state_folder := os.environ.get("STATE_DIRECTORY"):
+        return Path(state_folder.split(":")[0]) / "calibrations.db"
+    home = os.environ.get("XDG_STATE_HOME", "")
+    state = Path(home) if Path(home).is_absolute() else Path.home() / ".local" / "state"
+    return state / "handtouch" / "calibrations.db"
+
+
+class Store:
+    """An open store; close it, or use it in a `with` block."""
+
+    def __init__(self, path: Path | str, *, create: bool = True) -> None:
+        """Open and verify a store; create it if there is none and `create`.
+
+        Raises DamagedStoreError (the file is then moved aside, and opening again creates a new one),
+        NewerStoreError, or StoreError; an older schema is migrated, and a copy of the old file kept.
+        """
+        self.path = Path(path)
+        if not self.path.exists():
+            if not create:
+                raise StoreError(f"{self.path}: there is no calibration store here yet")
+            store_file.create(self.path)
+        self._connection = store_file.connect(self.path)
+        self._inode = self.path.stat().st_ino
+        self._seen_data_version = self._data_version()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    @property
+    def damaged_files(self) -> list[Path]:
+        """Return damaged stores that were moved aside here, oldest first; they may hold what this one
+        lacks."""
+        return store_file.damaged_files(self.path)
+
+    def changed(self) -> bool:
+        """Return whether another process has written since the last call, or since opening."""
+        before, self._seen_data_version = self._seen_data_version, self._data_version()
+        return self._seen_data_version != before
+
+    def write(
+        self, serial: int, config: str, calibration: Calibration, provenance: Provenance, now: datetime
+    ) -> CalibrationVersion:
+        """Add a version for the node `serial` under the tables `config`; it is on disk on return.
+
+        Raises ValueError for a serial that binds nothing (0: the node has none) or a naive `now`, StoreError
+        if it can't be written; then nothing has changed.
+        """
+        if not 0 < serial <= 0xFFFFFFFF:
+            raise ValueError(
+                f"serial = {serial}: a calibration is bound to a serial number of 1 to 4294967295; a node "
+                "without one (object 0x1018 sub 4) can't be distinguished from its replacement"
+            )
+        if now.tzinfo is None:
+            raise ValueError("now: needs a time zone")
+        written = now.astimezone(UTC).isoformat(timespec="milliseconds")
+        with self._transaction() as connection:
+            (newest,) = connection.execute(
+                "SELECT coalesce(max(number), 0) FROM calibration WHERE serial = ?", (serial,)
+            ).fetchone()
+            version = CalibrationVersion(serial, config, newest + 1, written, provenance, calibration)
+            text = json.dumps(version.to_json(), sort_keys=True)
+            store_file.append(connection, (serial, config, version.number, text))
+        return version
+
+    def roll_back(
+        self, serial: int, number: int, provenance: Provenance, now: datetime
+    ) -> CalibrationVersion:
+        """Write an older version again, as the newest one. Raises StoreError if there is no such version.
+
+        Host, program and note are those of `provenance`, the rest that of the older version.
+        """
+        old = self.get(serial, number)
+        origin = replace(
+            old.provenance, host=provenance.host, program=provenance.program, note=provenance.note
+        )
+        return self.write(serial, old.config, old.calibration, origin, now)
+
+    def get(self, serial: int, number: int) -> CalibrationVersion:
+        """Return one version. Raises StoreError listing the existing ones."""
+        if found := self._select("serial = ? AND number = ?", serial, number):
+            return found[0]
+        known = [str(version.number) for version in self.versions(serial)]
+        existing = f"there are: {', '.join(known)}" if known else "there is none of that serial"
+        raise StoreError(f"{self.path}: no version {number} of serial {serial}; {existing}")
+
+    def versions(self, serial: int) -> list[CalibrationVersion]:
+        """Return all versions of a node, oldest first."""
+        return self._select("serial = ?", serial)
+
+    def newest(self, serial: int, config: str | None = None) -> CalibrationVersion | None:
+        """Return the newest version of a node: under the tables `config` if there is one, else under any.
+
+        `check_match` refuses a version of other tables.
+        """
+        order = "ORDER BY config = ? DESC, number DESC LIMIT 1"
+        found = self._select(f"serial = ? {order}", serial, config or "")
+        return found[0] if found else None
+
+    def node_histories(self) -> list[NodeHistory]:
+        """Return all nodes, by serial number."""
+        with self._translate_errors("read"):
+            counts = self._connection.execute(
+                "SELECT serial, count(*), max(number) FROM calibration GROUP BY serial ORDER BY serial"
+            ).fetchall()
+        return [NodeHistory(serial, count, self.get(serial, newest)) for serial, count, newest in counts]
+
+    def _data_version(self) -> int:
+        with self._translate_errors("read"):
+            return int(self._connection.execute("PRAGMA data_version").fetchone()[0])
+
+    def _select(self, condition: str, *values: object) -> list[CalibrationVersion]:
+        order = "" if "ORDER BY" in condition else "ORDER BY number"
+        with self._translate_errors("read"):
+            rows = self._connection.execute(
+                f"SELECT version FROM calibration WHERE {condition} {order}", values
+            ).fetchall()
+        return [CalibrationVersion.from_json(json.loads(text)) for (text,) in rows]
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        with self._translate_errors("written"):
+            if not self.path.exists() or self.path.stat().st_ino != self._inode:
+                raise StoreError(f"{self.path}: was replaced or moved since it was opened; open it again")
+            with self._connection:  # commits, or rolls back after an error
+                self._connection.execute("BEGIN IMMEDIATE")
+                yield self._connection
+
+    @contextlib.contextmanager
+    def _translate_errors(self, action: str) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, OSError) as error:
+            raise StoreError(f"{self.path}: the calibration store can't be {action}: {error}") from error

@@ -1,0 +1,126 @@
+"""Schedule of storing baselines and sheet states, which the daemon tracks.
+
+Public: `StoreSchedule`; `restored_back_force`, which reads a stored sheet state.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.calibration.calibration import (
+    CalibrationVersion,
+    Offsets,
+    StoredSheetState,
+    channel_values,
+)
+
+FloatArray = NDArray[np.float64]
+
+_STORE_PERIOD_NS, _FIRST_STORE_DELAY_NS = 3_600_000_000_000, 60_000_000_000
+"""Period of storing for one node, and delay of the first."""
+_MIN_OFFSET_CHANGE = 2.0
+"""Least change of a channel's offset that is stored, in counts and standard deviations of a reading."""
+_MIN_BACK_FORCE_CHANGE = 0.1
+"""Least relative change of the back force that is stored, of 1 N at least."""
+_STATE_KIND, _STATE_VERSION = "back force", 1
+_SHEET_RECOVERY_S = 3600.0
+"""Time constant of a sheet without potential, assumed since the state was stored."""
+
+
+class TrackedState(Protocol):
+    """Baselines and sheet states of n pads, as `ipc.SampleBlock` carries them."""
+
+    @property
+    def offset_counts(self) -> FloatArray:
+        """Return the offsets (n, 4)."""
+
+    @property
+    def offset_std(self) -> FloatArray:
+        """Return the standard deviations (n,) of their sums, NaN if unknown."""
+
+    @property
+    def noise_counts(self) -> FloatArray:
+        """Return the noise of readings (n, 4)."""
+
+    @property
+    def back_n(self) -> FloatArray:
+        """Return the back forces (n,) [N], NaN if unknown."""
+
+    @property
+    def back_std_n(self) -> FloatArray:
+        """Return the standard deviations (n,) [N] of the back forces."""
+
+
+class StoreSchedule:
+    """Schedule of n pads; `update_block` with every block."""
+
+    def __init__(self, pads: int) -> None:
+        self._block: TrackedState | None = None
+        self._stored_offset_counts: FloatArray = np.full((pads, 4), np.nan)
+        self._stored_back_force_n = np.full(pads, np.nan)
+        self._next_ns = np.full(pads, -1, dtype=np.int64)
+
+    def update_block(self, block: TrackedState) -> None:
+        """Keep the newest state that the daemon tracks."""
+        self._block = block
+
+    def reset_pad(self, pad: int) -> None:
+        """Restart the schedule of a pad, whose node was replaced."""
+        self._stored_offset_counts[pad], self._stored_back_force_n[pad], self._next_ns[pad] = (
+            np.nan,
+            np.nan,
+            -1,
+        )
+
+    def due_parts(
+        self, pad: int, now_ns: int, last: bool = False
+    ) -> tuple[Offsets | None, StoredSheetState | None]:
+        """Return the parts to store now, None for unchanged ones; `last`: before the process ends."""
+        if self._next_ns[pad] < 0:
+            self._next_ns[pad] = now_ns + _FIRST_STORE_DELAY_NS
+        if self._block is None or (now_ns < self._next_ns[pad] and not last):
+            return None, None
+        self._next_ns[pad] = now_ns + _STORE_PERIOD_NS
+        return self._due_offsets(pad, self._block), self._due_sheet_state(pad, self._block)
+
+    def _due_offsets(self, pad: int, block: TrackedState) -> Offsets | None:
+        offset, std, noise = block.offset_counts[pad], block.offset_std[pad], block.noise_counts[pad]
+        if not np.isfinite(std):
+            return None
+        moved = np.abs(offset - self._stored_offset_counts[pad])
+        if (moved < _MIN_OFFSET_CHANGE * np.maximum(1.0, noise)).all():  # False for NaN
+            return None
+        self._stored_offset_counts[pad] = offset
+        return Offsets(channel_values(offset), channel_values(np.full(4, std**2 / 4)), channel_values(noise))
+
+    def _due_sheet_state(self, pad: int, block: TrackedState) -> StoredSheetState | None:
+        back, std = float(block.back_n[pad]), float(block.back_std_n[pad])
+        before = self._stored_back_force_n[pad]
+        if not math.isfinite(back) or abs(back - before) < _MIN_BACK_FORCE_CHANGE * max(before, 1.0):
+            return None
+        self._stored_back_force_n[pad] = back
+        return StoredSheetState(_STATE_KIND, _STATE_VERSION, msgpack.packb([back, std]))
+
+
+def restored_back_force(version: CalibrationVersion, away_s: float) -> tuple[float, float] | None:
+    """Return back force and standard deviation [N], away_s after it was stored; None if unknown."""
+    state = version.calibration.sheet
+    if state is None or (state.kind, state.version) != (_STATE_KIND, _STATE_VERSION):
+        return None
+    try:
+        back, std = map(float, _unpack_numbers(state.data))
+    except (ValueError, TypeError):
+        return None
+    return back, math.hypot(std, back * -math.expm1(-away_s / _SHEET_RECOVERY_S))
+
+
+def _unpack_numbers(data: bytes) -> Any:
+    try:
+        return msgpack.unpackb(data)
+    except msgpack.exceptions.UnpackException as error:
+        raise ValueError("no msgpack") from error

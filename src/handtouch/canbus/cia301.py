@@ -1,0 +1,70 @@
+"""Constants of CiA 301: identifiers, NMT, object indices, PDO parameters.
+
+Indices and identifiers that depend on a PDO's number or on a node id are given by their first value.
+"""
+
+from __future__ import annotations
+
+# COB-IDs of the predefined connection set; those for a node id are added to it
+NMT = 0x000
+SYNC = 0x080
+EMCY = 0x080
+TIME = 0x100
+SDO_RESPONSE = 0x580
+SDO_REQUEST = 0x600
+NMT_ERROR_CONTROL = 0x700
+"""Boot-up, heartbeat and node guarding."""
+LSS_RESPONSE = 0x7E4
+LSS_REQUEST = 0x7E5
+
+# NMT states, as in heartbeats, and commands
+BOOT_UP, STOPPED, OPERATIONAL, PREOPERATIONAL = 0, 4, 5, 127
+NMT_NAMES = {
+    BOOT_UP: "boot-up",
+    STOPPED: "stopped",
+    OPERATIONAL: "operational",
+    PREOPERATIONAL: "pre-operational",
+}
+START_NODE, STOP_NODE, ENTER_PREOPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
+
+# communication profile area
+DEVICE_TYPE = 0x1000
+ERROR_REGISTER = 0x1001
+DEVICE_NAME, HARDWARE_VERSION, SOFTWARE_VERSION = 0x1008, 0x1009, 0x100A
+GUARD_TIME = 0x100C
+LIFE_TIME_FACTOR = 0x100D
+EMCY_COB_ID = 0x1014
+HEARTBEAT_TIME = 0x1017
+IDENTITY = 0x1018
+"""Sub-indices 1 to 4: vendor id, product code, revision, serial number."""
+SERIAL_SUB = 4
+TPDO_COMMUNICATION = 0x1800
+"""Sub-indices 1 to 5: identifier, transmission type, inhibit time, (reserved), event timer."""
+TPDO_MAPPING = 0x1A00
+MAX_TPDOS = 512
+PREDEFINED_TPDOS = 4
+"""TPDO1 to TPDO4 have identifiers in the predefined connection set."""
+ANALOGUE_INPUTS = 0x6401
+"""CiA 401: read analogue input, 16 bit."""
+
+# an identifier in an object such as 0x1800 sub 1
+INVALID_BIT = 1 << 31
+NO_RTR_BIT = 1 << 30
+EXTENDED_BIT = 1 << 29
+IDENTIFIER_MASK = 0x7FF
+
+# transmission types
+SYNCHRONOUS = 1
+"""With every SYNC."""
+SYNCHRONOUS_TYPES = range(241)
+EVENT_DRIVEN = 255
+"""By the events of the device profile; 254: by those of the manufacturer."""
+EVENT_DRIVEN_TYPES = (254, EVENT_DRIVEN)
+DUMMY_ENTRIES = range(1, 0x20)
+"""Indices of data types: mapping entries that only fill a PDO."""
+PDO_BYTES = 8
+
+
+def tpdo_identifier(number: int) -> int:
+    """Return the first identifier of TPDO `number` (1 to 4) in the predefined connection set."""
+    return 0x80 + 0x100 * number

@@ -1,0 +1,189 @@
+"""Types of a CANopen node's lifecycle: states, events, actions, timing.
+
+Public names: `Lifecycle` with its `NodeState`; `LifecycleEvent`, a union of the event classes; `NodeAction`;
+`BusRole` and `NodeTiming`, the parameters of `lifecycle.advance`. Times are in ns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, IntEnum, auto
+
+
+class NodeState(IntEnum):
+    """State of a node; samples are valid in OPERATIONAL only."""
+
+    ABSENT = 0  # no message received yet, or lost: its heartbeat timed out
+    BOOTING = 1  # present; its identity is being read
+    IDENTIFIED = 2  # the configured device; its PDO mapping is being read
+    CONFIGURING = 3  # its heartbeat and PDOs are being written and read back
+    SETTLING = 4  # started; its first samples are discarded
+    OPERATIONAL = 5
+    STALE = 6  # present, but sends no samples
+    FAULTED = 7  # unusable for the reason given; retried
+    STOPPED = 8  # by handtouch: at its end, or because the scene doesn't need the node
+
+
+class NodeAction(Enum):
+    """Action for the caller. IDENTIFY, READ_MAPPING and CONFIGURE end in a StepDone or a StepFailed."""
+
+    PROBE = auto()  # request an object over SDO, without waiting, to find out if a node is there
+    IDENTIFY = auto()
+    READ_MAPPING = auto()
+    CONFIGURE = auto()
+    ENTER_PREOPERATIONAL = auto()  # these three: NMT commands to this node alone
+    START = auto()
+    STOP = auto()
+    ENTER_STANDBY = auto()  # excitation off, where the node supports it, then STOP
+    SET_TRANSMISSION = auto()  # event-driven or synchronous; started by the master itself
+
+
+class BusRole(Enum):
+    """Role of handtouch on a node's bus."""
+
+    MASTER = "master"  # configures and starts the node
+    GUEST = "guest"  # configures the node; another NMT master starts it
+    LISTENER = "listener"  # sends nothing
+
+
+@dataclass(frozen=True, slots=True)
+class NodeTiming:
+    """Times of one node [ns], and handtouch's role on its bus."""
+
+    heartbeat_period_ns: int
+    heartbeat_timeout_ns: int
+    role: BusRole = BusRole.MASTER
+    settle_samples: int = 3
+    settle_timeout_ns: int = 1_000_000_000
+    min_retry_ns: int = 100_000_000
+    max_retry_ns: int = 5_000_000_000
+
+    def retry_delay_ns(self, failures: int) -> int:
+        """Return the delay after that many consecutive failures: doubled with each, up to `max_retry_ns`."""
+        return min(self.min_retry_ns << min(max(failures - 1, 0), 16), self.max_retry_ns)
+
+
+CONNECTION_REMEDY = "check its power, cable, node id and the bit rate and termination of the bus"
+
+
+@dataclass(frozen=True, slots=True)
+class Lifecycle:
+    """State of a node and all that its next transition depends on."""
+
+    state: NodeState = NodeState.ABSENT
+    since_ns: int = 0
+    reason: str = f"no message received yet; {CONNECTION_REMEDY}"
+    nmt_state: int | None = None  # as last reported by the node
+    last_frame_ns: int | None = None  # boot-up, heartbeat or SDO response
+    last_heartbeat_ns: int | None = None  # the last one, or the start of supervision; None: not supervised
+    started_ns: int = 0
+    due_ns: int = 0  # next probe (ABSENT), next attempt (FAULTED) or settling timeout (SETTLING)
+    attempt: int = 0  # number of the boot; results of other attempts are void
+    failures: int = 0  # consecutive failed attempts
+    unanswered_probes: int = 0  # consecutive
+    samples_to_discard: int = 0
+    reboots: int = 0
+    heartbeat_required: bool = False  # lost by heartbeat timeout: unusable until it sends a heartbeat
+    wrong_device: bool = False  # not the configured node, at its last identification
+    duplicate_id: bool = False  # two nodes have its id
+    babbling: bool = False  # sends many samples per SYNC
+    boot_reason: str = ""  # cause of the present boot
+    standby: bool = False  # not needed now: configured, but stopped instead of started
+
+
+@dataclass(frozen=True, slots=True)
+class BootUpReceived:
+    """Boot-up message: the node has started or restarted."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeartbeatReceived:
+    """Heartbeat with the node's NMT state."""
+
+    nmt_state: int
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeAnswered:
+    """SDO response to a probe."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepDone:
+    """Success of a step of attempt `attempt`."""
+
+    step: NodeAction
+    attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class StepFailed:
+    """Failure of a step of attempt `attempt`.
+
+    `timed_out`: the node didn't respond. `wrong_device`: it is not the configured node.
+    """
+
+    step: NodeAction
+    attempt: int
+    reason: str
+    timed_out: bool = False
+    wrong_device: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SampleReceived:
+    """A sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class SamplesMissing:
+    """The last sample is too old, by `age_ns`."""
+
+    age_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class HeartbeatRate:
+    """Heartbeat rate over a window; `doubled`: twice the configured one, as if two nodes had its id."""
+
+    doubled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRate:
+    """Samples per SYNC over a window; 0 for the regular one."""
+
+    samples_per_sync: int
+
+
+@dataclass(frozen=True, slots=True)
+class TimerExpired:
+    """The time returned by `lifecycle.due_ns` has come."""
+
+
+@dataclass(frozen=True, slots=True)
+class StandbyRequested:
+    """The scene doesn't need the node (`standby`), or needs it again."""
+
+    standby: bool
+
+
+@dataclass(frozen=True, slots=True)
+class StopRequested:
+    """The master stops."""
+
+
+LifecycleEvent = (
+    BootUpReceived
+    | HeartbeatReceived
+    | ProbeAnswered
+    | StepDone
+    | StepFailed
+    | SampleReceived
+    | SamplesMissing
+    | HeartbeatRate
+    | SampleRate
+    | StandbyRequested
+    | TimerExpired
+    | StopRequested
+)

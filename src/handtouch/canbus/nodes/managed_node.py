@@ -1,0 +1,180 @@
+"""A node managed by the master: its data, and its boot steps over SDO as run by a worker.
+
+Public names: `ManagedNode`, `make_managed_node`, `run_step`, `send_nmt`, `StepOutcome`, `StepResult`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from handtouch.canbus import cia301
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.nodes import boot
+from handtouch.canbus.nodes.lifecycle_types import (
+    BusRole,
+    Lifecycle,
+    NodeAction,
+    NodeState,
+    NodeTiming,
+    StepDone,
+    StepFailed,
+)
+from handtouch.canbus.nodes.spec import NodeSpec, NodeStatus
+from handtouch.canbus.objects import emergency
+from handtouch.canbus.objects.mapping import PdoMapping, mapping_from_eds, read_mapping, tpdo_numbers
+from handtouch.canbus.objects.sdo import BootStepCancelled, BootStepError, NodeSdoClient, SdoTransport
+
+MAX_EMERGENCIES = 16
+StepOutcome = StepDone | StepFailed
+StepResult = boot.Identity | PdoMapping | boot.NodeConfigured | boot.TransmissionSet
+
+NMT_COMMANDS = {
+    NodeAction.START: cia301.START_NODE,
+    NodeAction.STOP: cia301.STOP_NODE,
+    NodeAction.ENTER_PREOPERATIONAL: cia301.ENTER_PREOPERATIONAL,
+}
+_STATES_WITH_BOOT_REASON = (NodeState.IDENTIFIED, NodeState.CONFIGURING, NodeState.SETTLING)
+_INACTIVE_STATES = (NodeState.ABSENT, NodeState.STOPPED)
+
+
+@dataclass(slots=True, eq=False)
+class ManagedNode:
+    """Data of a node. Only the receiving thread changes them."""
+
+    spec: NodeSpec
+    port: Port
+    timing: NodeTiming
+    tpdo_numbers: tuple[int, ...]
+    sdo: SdoTransport
+    lifecycle: Lifecycle = field(default_factory=Lifecycle)
+    identity: boot.Identity | None = None
+    mapping: PdoMapping | None = None
+    sdo_lock: threading.Lock = field(default_factory=threading.Lock)  # one transfer at a time
+    booted: bool = False  # and not configured since
+    guarded: bool = False
+    next_guard_ns: int = 0  # time of the next guarding request
+    heartbeats: int = 0
+    missed_heartbeats: int = 0
+    can_idle: bool = False  # it can be made event-driven
+    idle: bool = False  # it is event-driven
+    transmission_pending: bool = False  # a change of `idle` is in progress
+    request_ns: int = 0  # time of the receiving thread's own request for the change, 0 for none
+    request_data: bytes = b""  # data of that request
+    heartbeat_window: tuple[int, int] | None = None  # its start, and `heartbeats` then
+    doubled_windows: int = 0  # consecutive windows with a doubled heartbeat rate
+    emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=MAX_EMERGENCIES))
+
+    def status(self) -> NodeStatus:
+        """Return the present status."""
+        reason = self.lifecycle.reason
+        if self.lifecycle.boot_reason and self.lifecycle.state in _STATES_WITH_BOOT_REASON:
+            reason = f"{self.lifecycle.boot_reason}; {reason}"
+        return NodeStatus(
+            self.spec.slot,
+            self.spec.name,
+            self.spec.bus,
+            self.spec.node_id,
+            self.lifecycle.state,
+            self.lifecycle.since_ns,
+            reason,
+            self.identity,
+            tuple(tpdo.cob_id for tpdo in self.mapping.tpdos) if self.mapping else (),
+            self.guarded,
+            self.idle,
+            self.heartbeats,
+            self.missed_heartbeats,
+            self.lifecycle.reboots,
+            tuple(self.emergencies),
+        )
+
+
+def make_managed_node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns: int) -> ManagedNode:
+    """Make a node on one of the ports. Raises EdsError, and ValueError for an invalid spec."""
+    if spec.bus not in ports:
+        raise ValueError(f'node "{spec.name}" is on bus "{spec.bus}", which is not open')
+    if not 1 <= spec.node_id <= 127:
+        raise ValueError(f'node "{spec.name}": node id {spec.node_id} is outside 1 to 127')
+    port = ports[spec.bus]
+    if not 0 <= spec.slot < port.slab.size:
+        raise ValueError(f'node "{spec.name}": slot {spec.slot} is outside the slab of {port.slab.size}')
+    timing = NodeTiming(
+        heartbeat_period_ns=spec.heartbeat_ms * 1_000_000,
+        heartbeat_timeout_ns=spec.heartbeat_timeout_ms * 1_000_000,
+        settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
+        role=BusRole(port.bus.role),
+    )
+    node = ManagedNode(
+        spec, port, timing, tpdo_numbers(spec.eds, spec.channels), SdoTransport(spec.node_id, port.send)
+    )
+    if timing.role is BusRole.LISTENER:  # it can't be read from the node
+        node.mapping = mapping_from_eds(spec.eds, spec.node_id, spec.channels)
+    return node
+
+
+def run_step(
+    node: ManagedNode, step: NodeAction, attempt: int, idle: bool
+) -> tuple[StepOutcome | None, StepResult | None]:
+    """Run a step until the node has responded; return None, None if the step is cancelled."""
+
+    def is_cancelled() -> bool:
+        lifecycle = node.lifecycle
+        if lifecycle.attempt != attempt:
+            return True
+        if step is NodeAction.ENTER_STANDBY:
+            return not lifecycle.standby
+        return lifecycle.state in _INACTIVE_STATES
+
+    result: StepResult | None = None
+    outcome: StepOutcome = StepDone(step, attempt)
+    try:
+        result = _perform_step(node, NodeSdoClient(node.sdo, is_cancelled), step, idle)
+        if isinstance(result, boot.Identity):  # published even if it is that of a wrong device
+            boot.check_identity(result, _expected_identity(node.spec))
+    except BootStepCancelled:
+        return None, None
+    except BootStepError as error:
+        outcome = StepFailed(step, attempt, str(error), error.timed_out, error.wrong_device)
+    except Exception as error:  # noqa: BLE001 - the future would hide it; here it becomes the node's reason
+        outcome = StepFailed(step, attempt, f"unexpected {type(error).__name__}: {error}")
+    return outcome, result
+
+
+def _expected_identity(spec: NodeSpec) -> boot.ExpectedIdentity:
+    return boot.ExpectedIdentity(
+        spec.vendor_id, spec.product_code, spec.revision, spec.serial, spec.serials_of_other_pads
+    )
+
+
+def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle: bool) -> StepResult | None:
+    spec = node.spec
+    if step is NodeAction.IDENTIFY:
+        return boot.read_identity(sdo)
+
+    def enter_preoperational() -> None:
+        if node.lifecycle.nmt_state != cia301.PREOPERATIONAL and node.timing.role is BusRole.MASTER:
+            send_nmt(node, NodeAction.ENTER_PREOPERATIONAL)
+
+    if step is NodeAction.READ_MAPPING:
+        before_remapping = enter_preoperational if spec.allow_pdo_remapping else None
+        return read_mapping(sdo, spec.node_id, node.tpdo_numbers, spec.channels, before_remapping)
+    if step is NodeAction.ENTER_STANDBY:
+        try:
+            boot.set_excitation(sdo, spec.excitation, False)
+        finally:
+            if not sdo.is_cancelled():
+                send_nmt(node, NodeAction.STOP)
+        return None
+    if node.mapping is None:
+        raise BootStepError("no PDO mapping to configure")
+    if step is NodeAction.SET_TRANSMISSION:
+        boot.set_transmission(sdo, node.mapping.tpdos[0], idle)
+        return boot.TransmissionSet(idle)
+    return boot.configure_node(sdo, node.mapping, spec, enter_preoperational, node.booted)
+
+
+def send_nmt(node: ManagedNode, action: NodeAction) -> None:
+    """Send an NMT command to one node; node id 0, which addresses all, is never sent."""
+    node.port.send(cia301.NMT, bytes((NMT_COMMANDS[action], node.spec.node_id)))

@@ -1,0 +1,59 @@
+"""Command line: `main` and the parser of all commands.
+
+A module per group of commands adds their arguments (`control`, `daemons`, `keys`, `monitoring`, ...). The
+functions that run a command, with its printing, are in modules of their own (`control_text`, `status`, ...),
+which are imported only when the command runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+from handtouch import __version__
+from handtouch.cli import (
+    bridge,
+    calibrations,
+    control,
+    daemons,
+    keys,
+    monitoring,
+    recording,
+    setup,
+)
+from handtouch.cli.options import EXIT_STATUS_HELP, LazyFunction
+
+COMMAND_GROUPS = (daemons, monitoring, recording, control, bridge, keys, setup, calibrations)
+"""Modules with a function `add`, in the order of `--help`."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; exit status 0 (success), 1 (failure) or 2 (wrong usage or invalid file)."""
+    # arrays are small: threads of the linear algebra library would only compete with the daemon's main thread
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    options = vars(build_parser().parse_args(arguments))
+    command: LazyFunction = options.pop("command")
+    try:
+        return command(**options)
+    except KeyboardInterrupt:
+        return 0
+    except BrokenPipeError:  # the reader of our output has exited, as `| head` does
+        sys.stderr.close()
+        return 0
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="handtouch",
+        epilog=EXIT_STATUS_HELP,
+        description="Middleware for tactile sensors of a robot hand: reads CANopen sensor nodes and "
+        "publishes contacts (position, force, uncertainty) over ZeroMQ.",
+    )
+    parser.add_argument("--version", action="version", version=f"handtouch {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for group in COMMAND_GROUPS:
+        group.add(commands)
+    return parser

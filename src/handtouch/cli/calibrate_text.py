@@ -1,0 +1,97 @@
+"""The command `calibrate`: a guided measurement, or a request to the daemon."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from handtouch.calibration.store import StoreError
+from handtouch.cli import control_text
+from handtouch.config import ConfigError
+from handtouch.procedures import calibrate
+
+
+def run(
+    pad: str,
+    *,
+    endpoint: str,
+    key: str | None,
+    as_json: bool,
+    live: str,
+    weights: str,
+    from_file: Path | None,
+    config: Path | None,
+    name: str | None,
+    gains: Sequence[float] | None,
+    offsets: Sequence[float] | None,
+    law: Sequence[float] | None,
+    **options: Any,
+) -> int:
+    """Measure a contact law, set a calibration or print the active one; `options` of `CalibrateOptions`.
+
+    Exit status 0, 1 (no law found, no daemon, refused), 2 (wrong usage or invalid file).
+    """
+    guided = bool(weights) or from_file is not None
+    values: dict[str, Any] = {"gains": gains, "offset_counts": offsets, "law": law}
+    values = {option: value for option, value in values.items() if value is not None}
+    if conflict := _find_conflict(guided, values, name, config, bool(weights) and from_file is not None):
+        print(f"handtouch calibrate: {conflict}", file=sys.stderr)
+        return 2
+    if guided and config is not None:
+        guided_options = calibrate.CalibrateOptions(
+            pad=pad, config=config, weights=weights, from_file=from_file, as_json=as_json, **options
+        )
+        return _run_guided(guided_options, calibrate.DaemonEndpoints(live, endpoint, key))
+    if law is not None:
+        values["law"] = dict(zip(("contact_ohm_mm2", "alpha", "ohm_per_square"), law, strict=True))
+    if name is not None:
+        values["name"] = name
+    return control_text.run_calibrate(endpoint, key, as_json, pad, **values)
+
+
+def _find_conflict(
+    guided: bool, values: dict[str, Any], name: str | None, config: Path | None, two_sources: bool
+) -> str:
+    """Return the conflict between options with its remedy; empty if there is none."""
+    if guided and (values or name is not None):
+        return "--weights and --from measure a law, --name, --gains, --offsets and --law set one; use either"
+    if guided and config is None:
+        return "--config CONFIG is missing: the deployment file that the daemon runs with"
+    if two_sources:
+        return "--weights measures, --from reads recorded readings; use either"
+    if values and name is None:
+        return "--name NAME is missing: the id of the new calibration"
+    return ""
+
+
+def _run_guided(options: calibrate.CalibrateOptions, endpoints: calibrate.DaemonEndpoints) -> int:
+    try:
+        if options.from_file is not None:
+            result = calibrate.refit_recording(options, options.from_file, datetime.now(UTC))
+            if options.as_json:
+                _print_json(result)
+            else:
+                print("\n".join(result.lines))
+            return 1 if result.report.fit.problems else 0
+        # with --json, standard output is for the result alone
+        with contextlib.redirect_stdout(sys.stderr) if options.as_json else contextlib.nullcontext():
+            result = calibrate.run_guided(options, endpoints, lambda: datetime.now(UTC))
+        if options.as_json:
+            _print_json(result)
+        return 0 if result.calibration_id else 1
+    except (calibrate.CalibrationError, StoreError, OSError, RuntimeError) as error:  # the daemon refuses
+        print(error, file=sys.stderr)
+        return 1
+    except (ConfigError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _print_json(result: calibrate.CalibrationResult) -> None:
+    record = calibrate.report.to_json(result.report, calibration_id=result.calibration_id or None)
+    print(json.dumps(record, indent=2))

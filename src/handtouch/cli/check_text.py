@@ -1,0 +1,67 @@
+"""Output of `handtouch check`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from handtouch import config
+from handtouch.procedures.check import find_warnings, load_deployment, summary
+
+
+def run(config_path: Path | None, as_json: bool, schema: bool) -> int:
+    """Print a deployment's summary and warnings; exit status 0, 1 (warnings), 2 (invalid file)."""
+    if schema:
+        print(json.dumps(config.json_schema(), indent=2))
+        return 0
+    if config_path is None:
+        print("handtouch check: give a deployment file, or --schema", file=sys.stderr)
+        return 2
+    try:
+        deployment = load_deployment(config_path)
+    except config.ConfigError as error:
+        _print_error(error, as_json)
+        return 2
+    warnings = list(find_warnings(deployment))
+    if as_json:
+        report = {"file": str(config_path), "ok": True, **summary(deployment), "warnings": warnings}
+        print(json.dumps(report, indent=2))
+    else:
+        _print_summary(config_path, summary(deployment), warnings)
+    return 1 if warnings else 0
+
+
+def _print_error(error: config.ConfigError, as_json: bool) -> None:
+    if not as_json:
+        print(error, file=sys.stderr)
+        return
+    problems = [
+        {"location": problem.location, "value": problem.value.removeprefix(" = "), "remedy": problem.remedy}
+        for problem in error.problems
+    ]
+    print(json.dumps({"file": error.file, "ok": False, "problems": problems}, indent=2))
+
+
+def _print_summary(path: Path, facts: dict[str, Any], warnings: list[str]) -> None:
+    print(f"{path}: {1e3 / facts['sync_period_ms']:.4g} Hz")
+    for bus in facts["buses"]:
+        print(
+            f"  bus {bus['name']}: {bus['interface']} {bus['channel']}, "
+            f"{bus['bitrate_bit_s'] / 1e3:g} kbit/s, {bus['pads']} pads, "
+            f"load {bus['load']:.0%}, samples within {bus['burst_ms']:.2f} ms of SYNC"
+        )
+    for hand in facts["hands"]:
+        print(f"  hand {hand['name']}: {len(hand['pads'])} pads")
+        for pad in hand["pads"]:
+            a, b = pad["rectangle_mm"]
+            serial = "no serial" if pad["serial"] is None else f"serial {pad['serial']}"
+            print(
+                f"    {pad['link']:<16} {pad['bus']} node 0x{pad['node_id']:02X}  {pad['surface']:<8} "
+                f"{a:5.1f} x {b:5.1f} mm  {serial}"
+            )
+    for warning in warnings:
+        print(f"  warning: {warning}")
+    if not warnings:
+        print("  no warnings")

@@ -1,0 +1,150 @@
+"""The command `commission`: the guided session on the terminal, and the report at its end."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from handtouch import config
+from handtouch.canbus.bus.port import BusError
+from handtouch.canbus.nodes.spec import check_nodes
+from handtouch.procedures.commission import daemon_is_running, select_rows
+from handtouch.procedures.commission.outcome import PadOutcome
+from handtouch.procedures.commission.procedure import CommissioningProcedure
+from handtouch.procedures.commission.record import CommissioningRecord
+from handtouch.procedures.commission.sample_source import open_sample_source
+from handtouch.procedures.dialogue import open_dialogue
+
+_COLUMN_TITLES = ("pad", "node", "serial", "electrodes", "noise", "result")
+
+
+def run(
+    config_path: Path,
+    buses: Sequence[str] = (),
+    *,
+    links: Sequence[str] = (),
+    dry_run: bool = False,
+    assume_yes: bool = False,
+    timeout_s: float = 60.0,
+) -> int:
+    """Commission the pads of a deployment that match `links`, all that are not done by default.
+
+    Exit status: 0 success, 1 a problem was found, a pad was skipped or not done, 2 wrong usage.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # stop nodes, restore the terminal
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master reports these errors itself
+    try:
+        deployment = config.load(config_path)
+        for text in buses:
+            deployment = config.with_bus(deployment, text)
+        rows = select_rows(deployment, links)
+        if daemon_is_running(control := deployment.daemon.control):
+            print(
+                f"a daemon is running at {control} and uses these buses; stop it first (Ctrl-C, or "
+                "systemctl stop handtouch), and start it again afterwards",
+                file=sys.stderr,
+            )
+            return 1
+        deployment = check_nodes(deployment, str(config_path))
+    except config.ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    record = CommissioningRecord(config_path, dry_run)
+    saved = True
+    try:
+        with open_sample_source(deployment) as source, open_dialogue() as dialogue:
+            procedure = CommissioningProcedure(
+                deployment, source, dialogue, record.save, rows, assume_yes=assume_yes, timeout_s=timeout_s
+            )
+            if done := record.restore_progress(procedure, rows if links else ()):
+                dialogue.print_line(f"{done} pads were done before; --link NAME repeats one.")
+            try:
+                procedure.run()
+            except KeyboardInterrupt:
+                dialogue.print_line("Interrupted; results so far are kept.")
+            except (OSError, ValueError, KeyError) as error:  # disk full; file edited meanwhile
+                dialogue.print_line(f"{config_path} can't be written: {error}", "bad")
+                saved = False
+            table = format_table(procedure)
+    except BusError as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(table, end="")
+    print(_format_changes(record), end="")
+    return 0 if saved and all(procedure.outcomes[row].ok for row in rows) else 1
+
+
+def _format_changes(record: CommissioningRecord) -> str:
+    difference = format_difference(record.original, record.text, str(record.path))
+    if not difference:
+        return f"{record.path}: no changes.\n"
+    if record.dry_run:
+        return f"{difference}Nothing was written (--dry-run).\n"
+    return f"{difference}{record.path}: written; backup of the original: {record.backup}\n"
+
+
+def format_table(procedure: CommissioningProcedure) -> str:
+    """Format a line per pad with its problems below; noise in counts, measured (configured)."""
+    outcomes = [procedure.outcomes[row] for row in procedure.selected_rows]
+    rows = [_cells(procedure, row, procedure.outcomes[row]) for row in procedure.selected_rows]
+    widths = [max(len(cells[i]) for cells in (_COLUMN_TITLES, *rows)) for i in range(len(_COLUMN_TITLES))]
+    lines = [_format_row(_COLUMN_TITLES, widths)]
+    for outcome, cells in zip(outcomes, rows, strict=True):
+        lines.append(_format_row(cells, widths))
+        lines += [f"    {problem}" for problem in outcome.problems]
+    ok = sum(outcome.ok for outcome in outcomes)
+    lines.append(f"{ok} of {len(rows)} pads are ok.")
+    return "\n".join(lines) + "\n"
+
+
+def format_difference(before: str, after: str, name: str) -> str:
+    """Format the changed lines of each table as a diff; empty without changes.
+
+    Tables are compared one by one: a diff of the whole text would show swapped nodes as moved pads.
+    """
+    shown, line = [], 1
+    for old, new in zip(_split_tables(before), _split_tables(after), strict=True):
+        if old != new:
+            link = next((text.partition("=")[2].strip() for text in old if text.startswith("link")), "")
+            shown.append(f"@@ line {line} @@ {old[0].strip()} {link}".rstrip())
+            body = list(difflib.unified_diff(old, new, n=1, lineterm=""))[2:]
+            shown += [text for text in body if not text.startswith("@@")]
+        line += len(old)
+    return "\n".join([f"--- {name}", f"+++ {name}, as found", *shown]) + "\n" if shown else ""
+
+
+def _split_tables(text: str) -> list[list[str]]:
+    """Split a text into lists of lines, one for each table."""
+    tables: list[list[str]] = [[]]
+    for line in text.splitlines():
+        if line.startswith("["):
+            tables.append([])
+        tables[-1].append(line)
+    return tables
+
+
+def _cells(procedure: CommissioningProcedure, row: int, outcome: PadOutcome) -> tuple[str, ...]:
+    node, rest = procedure.node_of(row), procedure.rest_of(row)
+    known = outcome.slot is not None
+    configured = procedure.configured_noise_counts(row)
+    noise = "-"
+    if rest is not None and rest.samples:
+        noise = f"{float(np.max(rest.std)):.1f} ({configured:g})"
+    return (
+        outcome.name,
+        f"{node.bus} 0x{node.node_id:02X}" if known else "-",
+        str(node.serial) if known and node.serial else "-",
+        " ".join(outcome.electrodes) if outcome.electrodes else "-",
+        noise,
+        outcome.result.value,
+    )
+
+
+def _format_row(cells: tuple[str, ...], widths: list[int]) -> str:
+    return "  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()

@@ -1,0 +1,200 @@
+"""Arguments of the commands that send a request to a running daemon: `tare`, `scene`, `calibrate`, ..."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from handtouch.cli.options import (
+    Subparsers,
+    add_command,
+    add_endpoint,
+    add_json,
+    comma_separated,
+    integer,
+    positive_number,
+)
+from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
+
+_TEXT = "handtouch.cli.control_text"
+
+
+def add(commands: Subparsers) -> None:
+    """Add `tare`, `scene`, `snapshot`, `calibrate`, `disable`, `enable`, `reload` and `log`."""
+    tare = _add_request(commands, "tare", f"{_TEXT}:run_tare", "zero (tare) pads; refused for loaded pads")
+    _add_pads(tare, nargs="*", default=["*"], text="(default: all)")
+
+    _add_scene(commands)
+    _add_request(
+        commands,
+        "snapshot",
+        f"{_TEXT}:run_snapshot",
+        "print the present state of all pads and their contacts",
+    )
+    _add_calibrate(commands)
+
+    disable = _add_request(
+        commands, "disable", f"{_TEXT}:run_disable", "disable pads: no contacts, excitation off"
+    )
+    _add_pads(disable, nargs="+")
+    disable.add_argument(
+        "--name", help="name shown as the reason in `status` and health messages (default: your login name)"
+    )
+    _add_pads(
+        _add_request(commands, "enable", f"{_TEXT}:run_enable", "enable disabled pads again"), nargs="+"
+    )
+
+    reload = _add_request(
+        commands, "reload", f"{_TEXT}:run_reload", "make the daemon read its deployment file again"
+    )
+    reload.add_argument("--dry-run", action="store_true", help="print the changes without applying them")
+
+    log = _add_request(commands, "log", f"{_TEXT}:run_log", "set the daemon's log level")
+    log.add_argument(
+        "level", choices=("debug", "info", "warning", "error"), help="least severity that is logged"
+    )
+
+
+def _add_calibrate(commands: Subparsers) -> None:
+    calibrate = _add_request(
+        commands,
+        "calibrate",
+        "handtouch.cli.calibrate_text:run",
+        "measure a pad's contact law with known weights (--weights), or set its calibration (--name); with "
+        "neither, print the active calibration",
+    )
+    calibrate.add_argument("pad", metavar="PAD", help='pad, such as "left/index_distal"')
+
+    guided = calibrate.add_argument_group("guided measurement with known weights")
+    guided.add_argument(
+        "--weights",
+        default="",
+        metavar="LIST",
+        help="weights to place, such as 20,50,100,200,500; 200@4: on a base of radius 4 mm",
+    )
+    guided.add_argument(
+        "--config", type=Path, metavar="CONFIG", help="deployment file that the daemon runs with (required)"
+    )
+    guided.add_argument(
+        "--unit",
+        dest="weight_unit",
+        choices=("gf", "n"),
+        default="gf",
+        help="unit of the weights: gram-force or newton (default: gf)",
+    )
+    guided.add_argument(
+        "--repeats",
+        type=integer(1, 100, "an integer, 1 to 100"),
+        default=3,
+        metavar="N",
+        help="measurements per weight (default: 3)",
+    )
+    guided.add_argument(
+        "--radius-mm",
+        type=positive_number,
+        metavar="MM",
+        help="radius of the base that the weights stand on (default: the sheet's contact_radius_mm)",
+    )
+    guided.add_argument(
+        "--radius-std-mm",
+        type=positive_number,
+        metavar="MM",
+        help="error of that radius, 1 sigma (default: contact_radius_std_mm, or 5 %% of --radius-mm)",
+    )
+    guided.add_argument("--log", type=Path, metavar="FILE", help="record the readings to this file")
+    guided.add_argument(
+        "--from",
+        dest="from_file",
+        type=Path,
+        metavar="FILE",
+        help="fit readings recorded with --log instead of measuring",
+    )
+    guided.add_argument("--plot", type=Path, metavar="PNG", help="plot current against force")
+    guided.add_argument("--yes", action="store_true", help="apply the law without confirmation")
+    guided.add_argument(
+        "--no-store",
+        dest="store",
+        action="store_false",
+        help="don't store the calibration: it lasts until the daemon exits",
+    )
+    guided.add_argument(
+        "--seconds",
+        dest="timeout_s",
+        type=positive_number,
+        default=60.0,
+        metavar="S",
+        help="time limit for placing a weight or pressing a key (default: 60)",
+    )
+    guided.add_argument("--live", default=LIVE_ENDPOINT, help=f"live stream (default: {LIVE_ENDPOINT})")
+
+    direct = calibrate.add_argument_group("direct setting; omitted values are left unchanged")
+    direct.add_argument("--name", help="id of the new calibration, published in contact messages")
+    direct.add_argument(
+        "--gains", type=float, nargs=4, metavar="G", help="relative gains of the channels x0, xa, y0, yb"
+    )
+    direct.add_argument(
+        "--offsets", type=float, nargs=4, metavar="COUNTS", help="counts of the untouched channels"
+    )
+    direct.add_argument(
+        "--law",
+        type=float,
+        nargs=3,
+        metavar=("K", "ALPHA", "OHM"),
+        help="contact_ohm_mm2, alpha and ohm_per_square, as in [sheet.NAME]",
+    )
+
+
+def _add_scene(commands: Subparsers) -> None:
+    scene = _add_request(
+        commands,
+        "scene",
+        f"{_TEXT}:run_scene",
+        "show or change the scene: the links, outputs, tolerance and rate that the task uses",
+    )
+    scene.add_argument(
+        "--links",
+        type=comma_separated,
+        metavar="PATTERNS",
+        help='links in use, such as "thumb_*,index_*"; "" for none: their pads are switched off',
+    )
+    scene.add_argument(
+        "--outputs",
+        type=comma_separated,
+        metavar="NAMES",
+        help="outputs in use, of position, force, raw, palm, base, motion, stiffness, shape, texture; "
+        '"" for touched or not only',
+    )
+    scene.add_argument(
+        "--tolerance-mm",
+        type=float,
+        metavar="MM",
+        help="tolerable position error; 0: as accurate as possible",
+    )
+    scene.add_argument("--rate-hz", type=float, metavar="HZ", help="rate of contact updates; 0: one per SYNC")
+    scene.add_argument(
+        "--name", help="add a temporary scene of this client to the others, instead of changing the default"
+    )
+    scene.add_argument(
+        "--lease-s", type=positive_number, metavar="S", help="lifetime of the temporary scene (default: 10)"
+    )
+    scene.add_argument(
+        "--reset",
+        action="store_true",
+        default=None,
+        help="restore the deployment file's scene; with --name: end that scene",
+    )
+
+
+def _add_pads(parser: argparse.ArgumentParser, text: str = "", **options: Any) -> None:
+    parser.add_argument(
+        "pads", metavar="PAD", help=f'pads such as "thumb_*" or "left/index_distal" {text}'.strip(), **options
+    )
+
+
+def _add_request(commands: Subparsers, name: str, function: str, text: str) -> argparse.ArgumentParser:
+    """Add a command with the options of the control endpoint."""
+    parser = add_command(commands, name, function, text)
+    add_endpoint(parser, CONTROL_ENDPOINT, "control endpoint")
+    add_json(parser)
+    return parser

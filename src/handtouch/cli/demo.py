@@ -1,0 +1,242 @@
+"""`handtouch demo`: a simulated hand, the daemon and a live view in one process, on a virtual bus.
+
+With `view` another process shows the hand in the browser. It needs no hardware and doesn't interfere with a
+daemon on the same machine: the bus is python-can's `virtual` interface, and endpoints use free ports.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, Self
+
+from handtouch import wire
+from handtouch.client import Subscriber, connect
+from handtouch.config import Deployment, load, shipped
+from handtouch.config.tables import Behaviour
+from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.hand import kinematics
+from handtouch.host.signals import stop_on_signals
+from handtouch.simulate.grasp import grasp_stimulus as grasped
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.score import score_contacts
+from handtouch.simulate.simulated_hand import SimulatedHand
+from handtouch.simulate.stimulus import Stimulus
+from handtouch.simulate.world import World
+from handtouch.view.displays import (
+    Display,
+    LineDisplay,
+    LiveDisplay,
+    show_messages,
+)
+from handtouch.view.message_lines import diagnosis_text
+from handtouch.view.page import HOST, PORT
+
+DEFAULT_DEPLOYMENT = "utah_mit.toml"
+DEFAULT_SCENARIO = "utah_mit_session.toml"
+_BOOT_ALLOWANCE_S = 2.0
+_SAMPLE_WINDOW_FRACTION = 0.95  # long, as the nodes share the interpreter
+_GIL_SWITCH_INTERVAL_S = 0.0005
+"""Short, as hand, daemon and view share one interpreter, and the daemon must not wait for the view."""
+
+
+def run(
+    *,
+    config_path: Path | None = None,
+    seconds: float | None = None,
+    plain: bool = False,
+    tolerances: bool = False,
+    seed: int = 1,
+    view: bool = False,
+    grasp: str | None = None,
+    scenario_path: Path | None = None,
+    sheet: Literal["S1", "S2"] | None = None,
+    drift: bool = False,
+) -> int:
+    """Play the scenario to its end, for `seconds`, or until Ctrl-C; then print the accuracy.
+
+    With `grasp`, an object, the hand grasps it instead. `scenario_path`, `sheet` (behaviour) and `drift`
+    start the supervisor, with a temporary store. With `view` the scenario repeats until `seconds` have passed
+    or Ctrl-C. Exit status 0; 1 if no contact was received; 2 for an unusable configuration.
+    """
+    logging.basicConfig(level=logging.ERROR)
+    try:
+        deployment = _with_palm_output(
+            in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))
+        )
+        if scenario_path or sheet or drift:
+            deployment = _with_supervisor(deployment, sheet)
+        world = World.from_options(seed, tolerances=tolerances, sheet=sheet, drift=drift)
+        file = scenario_path or (None if config_path else shipped.path(DEFAULT_SCENARIO))
+        scenario = _scenario(deployment, file, grasp=grasp, world=world, repeat=view)
+    except ValueError as error:  # of a file, or of an impossible grasp
+        print(error, file=sys.stderr)
+        return 2
+    endless = view and seconds is None
+    length_s = float("inf") if endless else seconds or scenario.duration_s + _BOOT_ALLOWANCE_S
+    stop = stop_on_signals()
+    sys.setswitchinterval(_GIL_SWITCH_INTERVAL_S)
+    print("building the simulated hand ...", file=sys.stderr)
+    try:
+        hand = SimulatedHand.open(deployment, scenario, world, record=not endless)
+        with (
+            hand,
+            TemporaryDirectory(prefix="handtouch-demo-") as folder,
+            HandtouchDaemon.open(deployment, folder=Path(folder)) as daemon,
+            _subscribe(daemon) as messages,
+            _browser_view(daemon) if view else nullcontext("") as url,
+        ):
+            collector = _ContactCollector(_choose_display(plain, url), keep=not endless)
+            hand.publish_joints(deployment, scenario, daemon.inputs.endpoint)
+            hand.start()
+            with _daemon_thread(daemon, stop):
+                end_s = time.monotonic() + length_s
+                with collector:
+                    show_messages(messages, collector, lambda: stop.is_set() or time.monotonic() > end_s)
+    except ValueError as error:  # a scenario for another hand, an EDS that can't be simulated
+        print(error, file=sys.stderr)
+        return 2
+    for text in collector.diagnoses.values():
+        print(f"diagnosis: {text}")
+    if not endless:
+        print(score_contacts(collector.contacts, hand.truth))
+    return 0 if collector.contact_count else 1
+
+
+@contextmanager
+def _daemon_thread(daemon: HandtouchDaemon, stop: threading.Event) -> Iterator[None]:
+    """Run the daemon in a thread until the block ends."""
+    thread = threading.Thread(target=daemon.run, args=(stop,), name="handtouch-daemon")
+    thread.start()
+    try:
+        yield
+    finally:  # also if stdout was closed
+        stop.set()
+        thread.join()
+
+
+def _choose_display(plain: bool, url: str) -> Display:
+    """Return the live view on a terminal, else lines; both show the URL of the page, if there is one."""
+    if sys.stdout.isatty() and not plain:
+        return LiveDisplay(f"handtouch demo{f', in the browser at {url}' if url else ''}: Ctrl-C ends it")
+    if url:
+        print(f"in the browser at {url}", file=sys.stderr)
+    return LineDisplay()
+
+
+def _scenario(
+    deployment: Deployment, file: Path | None, *, grasp: str | None, world: World, repeat: bool
+) -> Stimulus:
+    """Return the stimulus: a grasp, a scenario file, or a tour of all pads."""
+    if grasp:
+        return grasped(deployment, grasp, world, repeat=repeat)
+    scenario = Scenario.load(file) if file else Scenario.tour(deployment)
+    return scenario.model_copy(update={"repeat": True}) if repeat else scenario
+
+
+@contextmanager
+def _browser_view(daemon: HandtouchDaemon) -> Iterator[str]:
+    """Run `handtouch view` for this daemon in a process; yields the URL of its page, empty if it failed."""
+    with socket.socket() as probe:
+        taken = probe.connect_ex((HOST, PORT)) == 0
+    command = [sys.executable, "-m", "handtouch", "view", "--key", "", "--port", "0" if taken else str(PORT)]
+    endpoint = daemon.publisher.endpoints["live"]
+    with subprocess.Popen(
+        [*command, "--endpoint", endpoint], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline().split()
+            yield next((part for part in line if part.startswith("http")), "")
+        finally:
+            process.terminate()
+
+
+class _ContactCollector:
+    """Display that counts contacts, keeps them for the score, and collects diagnoses."""
+
+    def __init__(self, display: Display, keep: bool) -> None:
+        self.contacts: list[wire.Contact] = []
+        self.diagnoses: dict[tuple[str, str], str] = {}
+        self.contact_count = 0
+        self._display, self._keep_contacts = display, keep
+
+    def show_message(self, message: wire.Message) -> None:
+        if isinstance(message, wire.Contact):
+            self.contact_count += 1
+            if self._keep_contacts:
+                self.contacts.append(message)
+        if isinstance(message, wire.Health):
+            for diagnosis in message.diagnoses:
+                text = f"{message.hand}/{message.link}: {diagnosis_text(diagnosis)}"
+                self.diagnoses.setdefault((message.link, diagnosis["kind"]), text)
+        if not (isinstance(message, wire.Service) and isinstance(self._display, LineDisplay)):
+            self._display.show_message(message)
+
+    def refresh(self, alive: bool) -> None:
+        self._display.refresh(alive)
+
+    def __enter__(self) -> Self:
+        self._display.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._display.__exit__(None, None, None)
+
+
+def _with_palm_output(deployment: Deployment) -> Deployment:
+    """Return the deployment with contacts also in the palm's frame, if Pinocchio and a URDF are available."""
+    if not kinematics.pinocchio_available() or not any(hand.urdf for hand in deployment.hands):
+        return deployment
+    scene = deployment.scene.model_copy(update={"outputs": (*deployment.scene.outputs, "palm")})
+    return deployment.model_copy(update={"scene": scene})
+
+
+def _with_supervisor(deployment: Deployment, sheet: Literal["S1", "S2"] | None) -> Deployment:
+    """Return the deployment with a supervisor, serial numbers for it, and the sheet behaviour of a preset."""
+    first = 1001
+    hands = []
+    for hand in deployment.hands:
+        pads = tuple(pad.model_copy(update={"serial": first + k}) for k, pad in enumerate(hand.pads))
+        hands.append(hand.model_copy(update={"pads": pads}))
+        first += len(pads)
+    daemon = deployment.daemon.model_copy(update={"supervise": True, "store": "calibrations.db"})
+    sheets = deployment.sheets
+    if sheet:
+        behaviour = Behaviour(preset=sheet)
+        sheets = {name: old.model_copy(update={"behaviour": behaviour}) for name, old in sheets.items()}
+    return deployment.model_copy(update={"hands": tuple(hands), "daemon": daemon, "sheets": sheets})
+
+
+def in_process_deployment(deployment: Deployment) -> Deployment:
+    """Return the deployment with virtual buses in this process and endpoints on free ports."""
+    buses = tuple(
+        bus.model_copy(
+            update={
+                "interface": "virtual",
+                "channel": f"handtouch-{os.getpid()}-{bus.name}",
+                "options": {},
+                "sync": "producer",
+            }
+        )
+        for bus in deployment.buses
+    )
+    settings = dict.fromkeys(("live", "complete", "control", "inputs"), "tcp://127.0.0.1:*")
+    # simulated nodes don't belong in the calibration store
+    alone = {**settings, "keys": None, "sample_window_fraction": _SAMPLE_WINDOW_FRACTION, "supervise": False}
+    daemon = deployment.daemon.model_copy(update=alone)
+    return deployment.model_copy(update={"buses": buses, "daemon": daemon})
+
+
+def _subscribe(daemon: HandtouchDaemon) -> Subscriber[wire.Message]:
+    endpoint = daemon.publisher.endpoints["live"]
+    return connect("contact/*/*", "health/*/*", "service", endpoint=endpoint, key="", queue=100_000)

@@ -1,0 +1,74 @@
+"""Output of `handtouch keys`; each function returns the exit status."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from handtouch.client import keys
+
+
+def run_make(folder: Path, name: str | None) -> int:
+    """Create a daemon's keys, named after the host by default; exit status 0, or 2 (failed)."""
+    try:
+        made = keys.make_server_keys(folder, name or platform.node())
+    except keys.KeyFileError as error:
+        return _print_error(error)
+    print(
+        f"created {folder}: keys of daemon {made.name}; public key {made.public_key}\n"
+        f'name the folder in the deployment file: [daemon] keys = "{folder.name}"\n'
+        f"then authorise a client: handtouch keys client {folder} NAME --rights read"
+    )
+    return 0
+
+
+def run_client(folder: Path, name: str, rights: str, file: Path | None) -> int:
+    """Create a client's keys; exit status 0, or 2 (failed)."""
+    file = file or Path(f"{name}.key")
+    try:
+        keys.add_client(folder, name, rights, file)
+    except keys.KeyFileError as error:
+        return _print_error(error)
+    print(
+        f"created {file}: authorises {name} to {'read' if rights == 'read' else 'read and control'}\n"
+        "move it to the client's machine, readable by its user only, and name it there: "
+        f"export HANDTOUCH_KEY=$PWD/{file.name}"
+    )
+    return 0
+
+
+def run_list(folder: Path, as_json: bool) -> int:
+    """List the authorised clients; exit status 0, 1 (unusable entries), 2 (no such folder)."""
+    if not (folder / keys.CLIENTS_FOLDER).is_dir():
+        return _print_error(
+            keys.KeyFileError(
+                f"{folder}: not a folder of keys; create one with `handtouch keys make {folder}`"
+            )
+        )
+    clients, problems = keys.load_clients(folder)
+    if as_json:
+        print(json.dumps({"clients": [asdict(c) for c in clients.values()], "problems": problems}, indent=2))
+    else:
+        for client in clients.values():
+            print(f"{client.rights:<8} {client.public_key}  {client.name}")
+        for problem in problems:
+            print(problem, file=sys.stderr)
+    return 1 if problems else 0
+
+
+def run_revoke(folder: Path, name: str) -> int:
+    """Revoke a client's authorisation; exit status 0, or 2 (failed)."""
+    try:
+        keys.revoke(folder, name)
+    except keys.KeyFileError as error:
+        return _print_error(error)
+    print(f"revoked {name}; an existing connection of it lasts until the daemon restarts")
+    return 0
+
+
+def _print_error(error: keys.KeyFileError) -> int:
+    print(error, file=sys.stderr)
+    return 2

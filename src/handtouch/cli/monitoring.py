@@ -1,0 +1,72 @@
+"""Arguments of the commands that show what a running daemon publishes: `watch`, `view`, `status`."""
+
+from __future__ import annotations
+
+from handtouch.cli.options import (
+    Subparsers,
+    add_command,
+    add_endpoint,
+    add_json,
+    add_percepts,
+    integer,
+    positive_number,
+)
+from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
+
+
+def add(commands: Subparsers) -> None:
+    """Add `watch`, `view` and `status`."""
+    _add_watch(commands)
+    _add_view(commands)
+
+    status = add_command(
+        commands,
+        "status",
+        "handtouch.cli.status:run",
+        "print the state of a running daemon, its buses and its pads",
+    )
+    add_endpoint(status, CONTROL_ENDPOINT, "control endpoint")
+    add_json(status)
+
+
+def _add_watch(commands: Subparsers) -> None:
+    watch = add_command(
+        commands, "watch", "handtouch.cli.watch:run", "show the messages of a running daemon in the terminal"
+    )
+    watch.add_argument(
+        "patterns",
+        metavar="PATTERN",
+        nargs="*",
+        help='topics such as "contact/*/thumb_*", "hand/*", "service" (default: contacts and health)',
+    )
+    add_endpoint(watch, LIVE_ENDPOINT, "live stream")
+    style = watch.add_mutually_exclusive_group()
+    style.add_argument(
+        "--plain", dest="style", action="store_const", const="plain", help="print lines, also on a terminal"
+    )
+    style.add_argument("--json", dest="style", action="store_const", const="json", help="print JSON lines")
+    watch.add_argument(
+        "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
+    )
+    watch.set_defaults(style="auto")
+
+
+def _add_view(commands: Subparsers) -> None:
+    view = add_command(
+        commands, "view", "handtouch.cli.view:run", "serve a live 3D view of a running daemon's hands"
+    )
+    add_endpoint(view, LIVE_ENDPOINT, "live stream")
+    view.add_argument(
+        "--host", default="127.0.0.1", help="address that the page is served at (default: 127.0.0.1)"
+    )
+    view.add_argument(
+        "--port",
+        type=integer(0, 65535, "a port, 0 to 65535"),
+        default=5588,
+        help="TCP port of the page, 0 for any free one (default: 5588)",
+    )
+    view.add_argument("--open", dest="show", action="store_true", help="open the page in a browser")
+    view.add_argument(
+        "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
+    )
+    add_percepts(view)

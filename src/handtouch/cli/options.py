@@ -1,0 +1,129 @@
+"""Building blocks of the command line: adding a command, options that several have, types of values."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+EXIT_STATUS_HELP = (
+    "Exit status: 0 success, 1 failure or a problem found (check: warnings), 2 wrong usage or invalid file."
+)
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+@dataclass(frozen=True)
+class LazyFunction:
+    """A function "module:name" that is imported when it is called, so that `--help` stays quick."""
+
+    reference: str
+
+    def load(self) -> Callable[..., int]:
+        """Import the function."""
+        module, _, name = self.reference.partition(":")
+        function: Callable[..., int] = getattr(importlib.import_module(module), name)
+        return function
+
+    def __call__(self, **options: Any) -> int:
+        return self.load()(**options)
+
+
+def add_command(commands: Subparsers, name: str, function: str, text: str) -> argparse.ArgumentParser:
+    """Add a command that calls `function` ("module:name") with its options as keyword arguments.
+
+    `text` is its line in `handtouch --help` and the description in its own help.
+    """
+    description = text[0].upper() + text[1:] + "."
+    parser = commands.add_parser(name, help=text, description=description, epilog=EXIT_STATUS_HELP)
+    parser.set_defaults(command=LazyFunction(function))
+    return parser
+
+
+def add_command_group(commands: Subparsers, name: str, text: str, description: str) -> Subparsers:
+    """Add a command with subcommands, and return where to add these."""
+    parser = commands.add_parser(name, help=text, description=description, epilog=EXIT_STATUS_HELP)
+    return parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+
+def add_config(parser: argparse.ArgumentParser, text: str = "deployment file (TOML)", **options: Any) -> None:
+    """Add the deployment file, a positional argument, as `config_path`."""
+    parser.add_argument("config_path", type=Path, metavar="CONFIG", help=text, **options)
+
+
+def add_bus(
+    parser: argparse.ArgumentParser,
+    text: str = "another CAN interface for a bus of the deployment, e.g. can0=socketcan:vcan0; repeatable",
+) -> None:
+    """Add `--bus`, which may be given several times, as `buses`."""
+    parser.add_argument(
+        "--bus",
+        dest="buses",
+        action="append",
+        default=[],
+        metavar="NAME=INTERFACE:CHANNEL[,OPTION=VALUE...]",
+        help=text,
+    )
+
+
+def add_endpoint(parser: argparse.ArgumentParser, default: str, text: str) -> None:
+    """Add `--endpoint` and `--key`."""
+    parser.add_argument("--endpoint", default=default, help=f"{text} (default: {default})")
+    add_key(parser)
+
+
+def add_key(parser: argparse.ArgumentParser) -> None:
+    """Add `--key`."""
+    parser.add_argument(
+        "--key",
+        metavar="FILE",
+        help="client key, for a daemon that requires one (default: the file in $HANDTOUCH_KEY, if set)",
+    )
+
+
+def add_json(parser: argparse.ArgumentParser, text: str = "print JSON") -> None:
+    """Add `--json` as `as_json`."""
+    parser.add_argument("--json", dest="as_json", action="store_true", help=text)
+
+
+def add_percepts(parser: argparse.ArgumentParser) -> None:
+    """Add `--percepts`."""
+    parser.add_argument(
+        "--percepts",
+        action="store_true",
+        help="also subscribe to percepts (slip, stiffness, shape, texture), so that the daemon computes them",
+    )
+
+
+def positive_number(text: str) -> float:
+    """Parse a finite number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: must be a number above 0")
+    return value
+
+
+def integer(least: int, most: int, text: str) -> Callable[[str], int]:
+    """Return a parser of integers (decimal, 0x...) from `least` to `most`; `text` describes them."""
+
+    def parse(value: str) -> int:
+        try:
+            number = int(value, 0)
+        except ValueError:
+            number = least - 1
+        if not least <= number <= most:
+            raise argparse.ArgumentTypeError(f"{value}: must be {text}")
+        return number
+
+    return parse
+
+
+def comma_separated(text: str) -> list[str]:
+    """Split a list such as "thumb_*,index_*"."""
+    return [part.strip() for part in text.split(",") if part.strip()]

@@ -1,0 +1,240 @@
+"""The command `handtouch replay`: publishing, and printing of the outcome.
+
+Public names: `run`, `speed_limiter`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from handtouch import wire
+from handtouch.client.keys import KeyFileError
+from handtouch.config import ConfigError, Deployment, load
+from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.publisher import Publisher
+from handtouch.record.comparison import LinkComparison
+from handtouch.record.exact_replay import ReplayResult, recorded_deployment
+from handtouch.record.recording import Recording, is_recording
+from handtouch.record.replay_log import LogReplaySummary, replay_log
+from handtouch.record.replay_recording import first_config, replay_recording
+from handtouch.view.message_lines import contact_line
+
+
+def run(
+    path: Path,
+    config_path: Path | None = None,
+    *,
+    speed: float | None = None,
+    as_json: bool = False,
+    report: Path | None = None,
+    publish: bool = False,
+) -> int:
+    """Replay a recording or a log, print its contacts and the comparison with the recorded ones.
+
+    `speed`: factor over the recorded speed, 0 without delays; None: 0, or 1 if published.
+
+    Exit status 0; 1 for an unreadable file, no sample of the deployment, or contacts that differ although the
+    deployment is the recorded one; 2 for wrong usage or deployment file.
+    """
+    on_contact = _print_json if as_json else _print_line
+    if speed is None:
+        speed = 1.0 if publish else 0.0
+    try:
+        deployment = load(config_path) if config_path else None
+        with ExitStack() as stack:
+            if is_recording(path):
+                return _replay_recording(path, deployment, on_contact, publish, speed, report, stack)
+            if deployment is None:
+                print(
+                    f"{path}: a CAN log needs a deployment file: handtouch replay LOG CONFIG", file=sys.stderr
+                )
+                return 2
+            if report:
+                print(
+                    "--report is for MCAP recordings; a CAN log has no contacts to compare", file=sys.stderr
+                )
+                return 2
+            publisher, pace = _open_publisher(deployment, publish, speed, stack)
+            summary = replay_log(path, deployment, on_contact, pace=pace, publisher=publisher)
+            return _print_log_summary(summary, path, config_path)
+    except (ConfigError, KeyFileError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    except (OSError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
+
+
+def _replay_recording(
+    path: Path,
+    deployment: Deployment | None,
+    on_contact: Callable[[wire.Contact], None],
+    publish: bool,
+    speed: float,
+    report: Path | None,
+    stack: ExitStack,
+) -> int:
+    recording = Recording(path)
+    recorded = stack.enter_context(recorded_deployment(first_config(recording)))
+    publisher, pace = _open_publisher(deployment or recorded, publish, speed, stack)
+    began_s = time.monotonic()
+    result, comparison = replay_recording(recording, on_contact, deployment, pace=pace, publisher=publisher)
+    _print_result(recording, result, time.monotonic() - began_s)
+    if comparison is not None:
+        links = comparison.links()
+        if result.ticks:
+            print(comparison_table(links), file=sys.stderr)
+        details: dict[str, Any] = {"links": {name: asdict(link) for name, link in links.items()}}
+        status = 0 if result.ticks else 1
+    else:
+        if result.ticks:
+            print(_equality_line(result), file=sys.stderr)
+        first = result.first_difference
+        details = {"equal": result.equal, "first_difference": None if first is None else asdict(first)}
+        status = 0 if result.ticks and result.equal == result.compared else 1
+    if report:
+        report.write_text(json.dumps(_report(recording, result) | details, indent=1) + "\n")
+    return status
+
+
+def speed_limiter(speed: float) -> Callable[[int], None]:
+    """Return a function that sleeps until a stamp is due at `speed` times the recorded speed; 0: no sleep."""
+    if speed == 0:
+        return lambda _: None
+    start: list[int] = []
+
+    def pace(t_ns: int) -> None:
+        if not start:
+            start.extend((time.monotonic_ns(), t_ns))
+        ahead_s = (start[0] + (t_ns - start[1]) / speed - time.monotonic_ns()) * 1e-9
+        if ahead_s > 1e-3:
+            time.sleep(ahead_s)
+
+    return pace
+
+
+def _open_publisher(
+    deployment: Deployment, publish: bool, speed: float, stack: ExitStack
+) -> tuple[Publisher | None, Callable[[int], None]]:
+    """Return a publisher if requested, and the function that keeps the speed and serves subscriptions."""
+    pace = speed_limiter(speed)
+    if not publish:
+        return None, pace
+    context = stack.enter_context(zmq.Context())
+    settings = deployment.daemon
+    authenticator = Authenticator.open(context, Path(settings.keys) if settings.keys else None)
+    stack.callback(authenticator.close)
+    publisher = Publisher.open(context, settings.live, settings.complete, authenticator)
+    stack.callback(publisher.close)
+
+    def serve(t_ns: int) -> None:
+        authenticator.poll(time.monotonic_ns())
+        publisher.poll_subscriptions(t_ns)
+        pace(t_ns)
+
+    return publisher, serve
+
+
+def _print_json(contact: wire.Contact) -> None:
+    print(json.dumps(asdict(contact)))
+
+
+def _print_line(contact: wire.Contact) -> None:
+    if contact.event != "update":
+        print(contact_line(contact))
+
+
+def _print_log_summary(summary: LogReplaySummary, path: Path, config_path: Path | None) -> int:
+    counts = ", ".join(
+        f"{name}: {c.frames} frames, {c.samples} samples, {c.wrong_length} of wrong length, "
+        f"{c.unknown_frames} unknown"
+        for name, c in summary.buses.items()
+    )
+    print(
+        f"{summary.contacts} contacts in {summary.log_s:.1f} s of log, {summary.ticks} ticks "
+        f"of {1e3 * summary.period_s:.4g} ms; {counts}",
+        file=sys.stderr,
+    )
+    if summary.samples:
+        return 0
+    channels = ", ".join(f"{channel} ({count} frames)" for channel, count in summary.unmatched.items())
+    print(
+        f"{path}: no frame is a sample of {config_path}; check the channels of its buses and its node ids"
+        + (f". Channels of the log without a bus: {channels}" if channels else ""),
+        file=sys.stderr,
+    )
+    return 1
+
+
+def _print_result(recording: Recording, result: ReplayResult, seconds: float) -> None:
+    speed = result.log_s / seconds if seconds else 0.0
+    print(
+        f"{result.ticks} ticks of {result.log_s:.1f} s replayed in {seconds:.1f} s "
+        f"({speed:.1f} times as fast), {result.contacts} contacts",
+        file=sys.stderr,
+    )
+    if result.build_differences:
+        print("build or processor differ from the recorded ones; the last bits may differ:", file=sys.stderr)
+        print("\n".join(f"  {line}" for line in result.build_differences), file=sys.stderr)
+    if result.skipped_ticks:
+        print(f"{result.skipped_ticks} ticks not replayed: no state recorded before them", file=sys.stderr)
+    if not result.ticks:
+        print(f"{recording.path}: holds no tick that can be replayed", file=sys.stderr)
+    if recording.truncation:
+        print(f"{recording.path}: {recording.truncation}; all before it is used", file=sys.stderr)
+
+
+def _equality_line(result: ReplayResult) -> str:
+    if result.equal == result.compared:
+        return f"all {result.compared} contact messages are equal, bit for bit"
+    differing = result.compared - result.equal
+    return f"{differing} of {result.compared} contact messages differ; first: {result.first_difference}"
+
+
+def _report(recording: Recording, result: ReplayResult) -> dict[str, Any]:
+    return {
+        "recording": str(recording.path),
+        "truncation": recording.truncation,
+        "seconds": result.log_s,
+        "ticks": result.ticks,
+        "skipped_ticks": result.skipped_ticks,
+        "contacts": result.contacts,
+        "compared": result.compared,
+        "build_differences": result.build_differences,
+    }
+
+
+def comparison_table(links: Mapping[str, LinkComparison]) -> str:
+    """Format the comparison of each link as lines."""
+    rows = [
+        (
+            "link", "contacts", "only recorded", "only replayed", "samples", "shift mm", "95 %", "force",
+            "begin ms",
+        )
+    ]  # fmt: skip
+    for name, link in links.items():
+        rows.append(
+            (
+                name,
+                f"{link.recorded} -> {link.replayed}",
+                str(link.only_recorded),
+                str(link.only_replayed),
+                str(link.samples),
+                f"{link.shift_mm['median']:.3f}" if link.shift_mm else "-",
+                f"{link.shift_mm['p95']:.3f}" if link.shift_mm else "-",
+                f"x {link.force_ratio['median']:.3f}" if link.force_ratio else "-",
+                f"{link.begin_delay_ms:+.1f}" if link.begin_delay_ms is not None else "-",
+            )
+        )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)

@@ -1,0 +1,19 @@
+"""`handtouch run`: run the daemon and report why it can't start."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from handtouch.daemon import daemon
+
+
+def run_command(config_path: Path, buses: Sequence[str]) -> int:
+    """Run the daemon; exit status 1 if buses or endpoints can't be opened, 2 for wrong configuration."""
+    try:
+        daemon.run(config_path, tuple(buses))
+    except daemon.StartError as error:
+        print(error, file=sys.stderr)
+        return 2 if error.permanent else 1
+    return 0

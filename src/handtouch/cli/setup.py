@@ -1,0 +1,144 @@
+"""Arguments of the setup commands: `check`, `doctor`, `scan`, `commission`, `figures`, `design`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from handtouch.cli.options import (
+    Subparsers,
+    add_bus,
+    add_command,
+    add_config,
+    add_json,
+    integer,
+    positive_number,
+)
+
+
+def add(commands: Subparsers) -> None:
+    """Add `check`, `doctor`, `scan`, `commission`, `figures` and `design`."""
+    check = add_command(
+        commands,
+        "check",
+        "handtouch.cli.check_text:run",
+        "check a deployment file: errors, bus load, warnings",
+    )
+    add_config(check, nargs="?")
+    add_json(check)
+    check.add_argument(
+        "--schema", action="store_true", help="print the JSON schema of deployment files instead"
+    )
+
+    doctor = add_command(
+        commands,
+        "doctor",
+        "handtouch.cli.doctor_text:run",
+        "check that this machine can run the daemon: packages, clock, buffers, CAN interfaces, endpoints",
+    )
+    add_config(doctor, "deployment file, to check its buses and endpoints too", nargs="?")
+    add_json(doctor)
+
+    _add_scan(commands)
+    _add_commission(commands)
+
+    figures = add_command(
+        commands,
+        "figures",
+        "handtouch.cli.drawing_text:run_figures",
+        "draw the theoretical figures of the paper that the sensor model comes from",
+    )
+    figures.add_argument(
+        "--out",
+        type=Path,
+        default=Path("figures"),
+        metavar="FOLDER",
+        help="folder to write to (default: figures)",
+    )
+
+    design = add_command(
+        commands,
+        "design",
+        "handtouch.cli.drawing_text:run_design",
+        "draw maps of the expected position error on a pad, as configured",
+    )
+    add_config(design)
+    design.add_argument("--link", help="pad to draw (default: the first)")
+    design.add_argument(
+        "--out",
+        type=Path,
+        default=Path("design"),
+        metavar="FOLDER",
+        help="folder to write to (default: design)",
+    )
+
+
+def _add_scan(commands: Subparsers) -> None:
+    scan = add_command(
+        commands,
+        "scan",
+        "handtouch.cli.scan_text:run",
+        "find the nodes on CAN buses, compare them with a deployment, and print the tables that it lacks",
+    )
+    add_config(scan, "deployment file to compare with", nargs="?")
+    add_bus(scan, "bus to scan, e.g. can0=socketcan:can0, or another interface for a bus of the deployment")
+    scan.add_argument(
+        "--seconds",
+        type=positive_number,
+        metavar="S",
+        help="time to listen before nodes are queried (default: 1, with --listen 5)",
+    )
+    add_json(scan)
+    mode = scan.add_mutually_exclusive_group()
+    mode.add_argument("--listen", action="store_true", help="only listen: send no frame at all")
+    mode.add_argument(
+        "--lss", action="store_true", help="also find nodes without a node id (LSS); changes none"
+    )
+    mode.add_argument(
+        "--assign",
+        type=integer(1, 127, "a node id, 1 to 127 (0x01 to 0x7F)"),
+        metavar="FIRST_ID",
+        help="find nodes without a node id and store one in each: the deployment's for that serial number, "
+        "else the first free one from FIRST_ID upwards, in the order of serial numbers",
+    )
+    scan.add_argument(
+        "--lss-wait-ms",
+        type=positive_number,
+        default=5.0,
+        metavar="MS",
+        help="minimum time to wait for an LSS response (default: 5)",
+    )
+
+
+def _add_commission(commands: Subparsers) -> None:
+    commission = add_command(
+        commands,
+        "commission",
+        "handtouch.cli.commission_text:run",
+        "identify each pad's node, electrode order and dead channels from guided presses, and write "
+        "them to the deployment file",
+    )
+    add_config(commission)
+    add_bus(commission)
+    commission.add_argument(
+        "--link",
+        dest="links",
+        action="append",
+        default=[],
+        metavar="PATTERN",
+        help='pads to commission, such as "thumb_*" or "left/index_distal"; repeatable (default: all that '
+        "are not done yet)",
+    )
+    commission.add_argument(
+        "--dry-run", action="store_true", help="print the changes of the file instead of writing them"
+    )
+    commission.add_argument(
+        "--yes", dest="assume_yes", action="store_true", help="accept swapped nodes without confirmation"
+    )
+    commission.add_argument(
+        "--seconds",
+        dest="timeout_s",
+        type=positive_number,
+        default=60.0,
+        metavar="S",
+        help="time limit for a press or a key (default: 60)",
+    )

@@ -1,0 +1,159 @@
+"""`handtouch simulate`: a simulated hand on the buses of a deployment, in real time."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from handtouch import config
+from handtouch.canbus.bus.port import BusError
+from handtouch.canbus.nodes.spec import check_nodes
+from handtouch.config import shipped
+from handtouch.config.problems import ConfigError
+from handtouch.host.signals import stop_on_signals
+from handtouch.simulate import truth as truth_file
+from handtouch.simulate.grasp import grasp_stimulus
+from handtouch.simulate.gripper import GripperStimulus
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.simulated_hand import SimulatedHand
+from handtouch.simulate.stimulus import Stimulus
+from handtouch.simulate.world import World
+
+DEFAULT_SCENARIO = "utah_mit_session.toml"
+_STATUS_PERIOD_S = 5.0
+_POLL_PERIOD_S = 0.5
+
+
+def run_command(
+    config_path: Path,
+    *,
+    seed: int,
+    tolerances: bool,
+    sheet: str | None,
+    drift: bool,
+    **options: Any,
+) -> int:
+    """Run the command with the world of its options; the others are those of `run`."""
+    world = World.from_options(seed, tolerances=tolerances, sheet=sheet, drift=drift)
+    return run(config_path, world=world, **options)
+
+
+def run(
+    config_path: Path,
+    *,
+    buses: Sequence[str] = (),
+    scenario: Path | None = None,
+    gripper: str | None = None,
+    grasp: str | None = None,
+    truth: Path | None = None,
+    world: World | None = None,
+    seconds: float | None = None,
+    stop: threading.Event | None = None,
+    status_period_s: float = _STATUS_PERIOD_S,
+) -> int:
+    """Simulate the nodes of a deployment until `seconds` have passed, `stop` is set, or a signal arrives.
+
+    Without `stop`, SIGINT and SIGTERM end it. The hand plays `scenario`; or executes commands received at
+    the endpoint `gripper`; or grasps the object named `grasp`, repeatedly; else the shipped session if the
+    deployment has its links, else a tour of all pads. `buses` replace those of the deployment, as
+    `config.with_bus` does. Exit status 0; 1 for a bus, endpoint or file that can't be opened; 2 for a mistake
+    in the deployment or scenario.
+    """
+    try:
+        deployment = config.load(config_path)
+        for other in buses:
+            deployment = config.with_bus(deployment, other)
+        check_nodes(deployment, str(config_path))
+        world = world or World.ideal_parts()
+        if gripper and (truth or world.sheet):
+            raise ValueError("--gripper excludes --truth and --sheet, which need the contacts in advance")
+        stimulus: Stimulus
+        if grasp:
+            stimulus = grasp_stimulus(deployment, grasp, world, repeat=True)
+        elif gripper:
+            stimulus = GripperStimulus.from_deployment(deployment, str(config_path))
+        else:
+            stimulus = Scenario.load(scenario) if scenario else _default_scenario(deployment)
+        hand = SimulatedHand.open(deployment, stimulus, world, record=truth is not None)
+    except BusError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except ValueError as error:  # ConfigError, or an EDS that can't be simulated
+        print(error, file=sys.stderr)
+        return 2
+    with hand, contextlib.ExitStack() as stack:
+        try:
+            if isinstance(stimulus, GripperStimulus) and gripper:
+                hand.serve_gripper(stimulus, gripper)
+        except ValueError as error:
+            print(f"--gripper {error}", file=sys.stderr)
+            return 1
+        try:
+            file = stack.enter_context(truth.open("w", encoding="utf-8")) if truth else None
+        except OSError as error:
+            print(f"{truth}: {error.strerror}", file=sys.stderr)
+            return 1
+        hand.publish_joints(deployment, stimulus, deployment.daemon.inputs.replace("//*:", "//127.0.0.1:"))
+        _serve(hand, deployment, file, seconds, stop or stop_on_signals(), status_period_s)
+    return 0
+
+
+def _serve(
+    hand: SimulatedHand,
+    deployment: config.Deployment,
+    truth: TextIO | None,
+    seconds: float | None,
+    stop: threading.Event,
+    status_period_s: float,
+) -> None:
+    """Run the hand until it is stopped, print its status from time to time, then write the ground truth."""
+    buses = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in deployment.buses)
+    print(f"{len(hand.devices)} nodes on {buses}; the scenario starts with the first SYNC", flush=True)
+    if truth:
+        truth_file.write_header(truth, time.time_ns() - time.monotonic_ns())
+    hand.start()
+    begin_s = time.monotonic()
+    status_s, status_syncs = begin_s, 0
+    while not stop.wait(_POLL_PERIOD_S if seconds is None else min(_POLL_PERIOD_S, seconds / 4)):
+        now_s = time.monotonic()
+        if seconds is not None and now_s - begin_s >= seconds:
+            break
+        if now_s - status_s >= status_period_s:
+            rate_hz = (hand.sync_count - status_syncs) / (now_s - status_s)
+            print(_status_line(hand, deployment, now_s - begin_s, rate_hz), flush=True)
+            status_s, status_syncs = now_s, hand.sync_count
+    hand.stop()
+    if truth:  # not earlier: computing it would delay the nodes
+        truth_file.write_records(truth, hand.pop_truth())
+    print(f"{hand.sync_count} SYNCs answered", flush=True)
+
+
+def _status_line(hand: SimulatedHand, deployment: config.Deployment, elapsed_s: float, rate_hz: float) -> str:
+    states = [device.state for device in hand.devices.values()]
+    parts = [
+        f"{elapsed_s:6.0f} s",
+        f"{rate_hz:5.0f} SYNC/s",
+        f"{states.count('OPERATIONAL')} of {len(states)} operational",
+    ]
+    silent = hand.buses_without_sync
+    for sync, remedy in (
+        ("producer", "start the daemon with `handtouch run`"),
+        ("consumer", "start the SYNC producer of the bus"),
+    ):
+        if names := [bus.name for bus in deployment.buses if bus.name in silent and bus.sync == sync]:
+            parts.append(f'{", ".join(names)}: no SYNC received; {remedy} (sync = "{sync}")')
+    return "  ".join(parts)
+
+
+def _default_scenario(deployment: config.Deployment) -> Scenario:
+    """Return the shipped session, repeating, if the deployment has its links; else a tour of all pads."""
+    session = Scenario.load(shipped.path(DEFAULT_SCENARIO))
+    with contextlib.suppress(ConfigError):
+        session.check_links(entry.pad.link for entry in deployment.pads)
+        return session.model_copy(update={"repeat": True})
+    return Scenario.tour(deployment)

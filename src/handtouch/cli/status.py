@@ -1,0 +1,151 @@
+"""Output of `handtouch status`: state of the daemon, its buses and its pads."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from handtouch.cli.scene_text import scene_lines
+from handtouch.client import CONTROL_ENDPOINT, request
+from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
+
+_PIPE_WIDTH_COLUMNS = 200
+"""Width without a terminal: one line per pad, for grep."""
+
+
+def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bool = False) -> int:
+    """Print the status; exit status 0 (all pads ok), 1 (not all, or no daemon), 2 (usage)."""
+    try:
+        answer = request("status", endpoint=endpoint, key=key)
+    except (OSError, RuntimeError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if as_json:
+        print(json.dumps(answer, indent=2))
+    else:
+        _print_status(answer, Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH_COLUMNS))
+    return 0 if all(map(_is_ok, answer["pads"])) else 1
+
+
+def _is_ok(pad: dict[str, Any]) -> bool:
+    return (
+        pad["state"] in ("clear", "touched", "off")
+        and pad.get("calibration_state") not in UNCALIBRATED_STATES
+    )
+
+
+def _print_supervisor(answer: dict[str, Any], console: Console) -> None:
+    """Print the state of the supervisor process and its diagnoses."""
+    figures = answer["service"].get("supervisor")
+    if figures is None:
+        return
+    lag = "" if figures["lag_s"] is None else f", {figures['lag_s']:.1f} s behind"
+    exited = f" (last exit: {figures['exit_reason']})" if figures["exit_reason"] else ""
+    process = "" if figures["pid"] is None else f", process {figures['pid']}"
+    console.print(
+        f"supervisor {figures['state']}{process}{lag}, {figures['restarts']} restarts{exited}; "
+        f"calibrations: {figures['summary'] or 'not known yet'}",
+        highlight=False,
+    )
+    if figures["store_error"]:
+        text = f"calibration store: {figures['store_error']}"
+        console.print(text, highlight=False, markup=False, style="red")
+    for pad in answer["pads"]:
+        for diagnosis in pad.get("diagnoses", ()):
+            text = f"{pad['hand']}/{pad['link']}: {diagnosis_text(diagnosis)}"
+            console.print(text, highlight=False, markup=False, style="yellow")
+
+
+def _print_loop(service: dict[str, Any], console: Console) -> None:
+    """Print mean durations of the stages of a cycle, late ticks, resources and rejections."""
+    loop, process = service["loop"], service["process"]
+    means = (
+        f"{stage} {1e3 * figures['sum_s'] / sum(figures['counts']):.2f}"
+        for stage, figures in loop["stages"].items()
+        if figures["counts"]
+    )
+    console.print(
+        f"mean time per cycle, ms: {', '.join(means) or 'none yet'}; late ticks: {_counts_text(loop['late'])}"
+    )
+    console.print(
+        f"memory {process['memory_bytes'] / 1e6:.0f} MB, {process['cpu_s']:.0f} s of CPU time, "
+        f"of which the main loop {process['loop_cpu_s']:.0f} s; rejected: {_counts_text(service['rejected'])}"
+    )
+
+
+def _counts_text(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "none"
+
+
+def _print_status(answer: dict[str, Any], console: Console) -> None:
+    service = answer["service"]
+    tick = service["tick_us"]
+    console.print(
+        f"handtouch {service['version']}, process {service['pid']}, up {service['uptime_s']:.0f} s: "
+        f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
+        + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
+    )
+    drops = ", ".join(f"{count} on {stream}" for stream, count in service["drops"].items() if count) or "none"
+    console.print(
+        f"messages dropped: {drops}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
+    )
+    _print_loop(service, console)
+    for name, bus in service["buses"].items():
+        sync = bus["sync"]
+        counts = ", ".join(
+            f"{key} {value}" for key, value in bus.items() if isinstance(value, int) and key != "since_ns"
+        )
+        causes = [f"{cause} {count}" for cause, count in bus["causes"].items()]
+        problems = "; ".join(filter(None, [bus["problem"], sync["problem"]]))
+        jitter = sync["jitter_us"]
+        console.print(
+            f"bus {name}: {bus['state']}, load {100 * bus['load']:.0f} %, SYNC by {sync['by']}"
+            + (f" (jitter p99 {jitter['p99']:.0f} us, max {jitter['max']:.0f})" if jitter else "")
+            + f", {counts}"
+            + (f"; error frames: {', '.join(causes)}" if causes else "")
+            + (f" [red]{problems}[/red]" if problems else "")
+        )
+    for line in scene_lines(answer["scene"]):
+        console.print(line, highlight=False, markup=False)
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for column in (
+        "link",
+        "pad",
+        "node",
+        "id",
+        "serial",
+        "Hz",
+        "missed",
+        "heartbeats missed",
+        "reboots",
+        "reason",
+    ):
+        number = column in ("id", "serial", "Hz", "missed", "heartbeats missed", "reboots")
+        table.add_column(column, justify="right" if number else "left", no_wrap=column != "reason")
+    for pad in answer["pads"]:
+        table.add_row(
+            f"{pad['hand']}/{pad['link']}",
+            pad["state"]
+            + (
+                f" ({pad['calibration_state']})"
+                if pad.get("calibration_state") in UNCALIBRATED_STATES
+                else ""
+            ),
+            pad["node_state"] + (" (event)" if pad["sampling"] == "event" else ""),
+            str(pad["node_id"]),
+            "" if pad["serial"] is None else str(pad["serial"]),
+            f"{pad['rate_hz']:.0f}",
+            str(pad["missed_samples"]),
+            str(pad["heartbeats_missed"]),
+            str(pad["reboots"]),
+            "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]])),
+        )
+    console.print(table)
+    _print_supervisor(answer, console)

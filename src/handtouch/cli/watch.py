@@ -1,0 +1,44 @@
+"""`handtouch watch`: show messages as a live table in a terminal, as plain or JSON lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+
+from handtouch.client import connect
+from handtouch.view.displays import Display, LineDisplay, LiveDisplay, show_messages
+
+
+def run(
+    patterns: Sequence[str],
+    *,
+    endpoint: str,
+    key: str | None,
+    style: str = "auto",
+    seconds: float = 0,
+) -> int:
+    """Show messages until Ctrl-C, or for `seconds`; `style`: auto, plain or json.
+
+    Default patterns: contacts and health, as a live table on a terminal. Exit status 0, 1 if no message was
+    received in that time or the daemon rejects this client, 2 for wrong usage.
+    """
+    live = style == "auto" and sys.stdout.isatty() and not patterns
+    default = ("contact/*/*", "health/*/*", "service") if live else ("contact/*/*", "health/*/*")
+    end_s = time.monotonic() + seconds if seconds else float("inf")
+    try:
+        messages = connect(*(patterns or default), endpoint=endpoint, key=key)
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
+    display: Display = LiveDisplay(f"handtouch at {endpoint}") if live else LineDisplay(style == "json")
+    try:
+        with messages, display:
+            show_messages(messages, display, lambda: time.monotonic() > end_s)
+            has_received = messages.has_received
+    except PermissionError as error:
+        print(error, file=sys.stderr)
+        return 1
+    if not has_received:
+        print(f"no message from {endpoint}; check that `handtouch run` is running", file=sys.stderr)
+    return 0 if has_received else 1

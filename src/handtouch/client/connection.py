@@ -1,0 +1,142 @@
+"""One client connection to an endpoint of a daemon: CURVE key, reconnection, authentication errors.
+
+Public names: `Connection`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+import zmq
+from zmq.utils.monitor import parse_monitor_message
+
+from handtouch.client.keys import ClientKey, load_client
+
+_HANDSHAKE_EVENTS = (
+    zmq.Event.HANDSHAKE_SUCCEEDED
+    | zmq.Event.HANDSHAKE_FAILED_AUTH
+    | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
+    | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
+)
+_MAX_HANDSHAKE_FAILURES = 3
+"""Consecutive failed handshakes that are put down to a daemon that restarts."""
+RECONNECT_OPTIONS: Mapping[int, int] = {
+    zmq.HEARTBEAT_IVL: 500,
+    zmq.HEARTBEAT_TIMEOUT: 1500,
+    zmq.RECONNECT_IVL: 50,
+    zmq.RECONNECT_IVL_MAX: 1000,
+}
+"""Socket options: a dead connection is detected within 1.5 s, and retried at least once a second."""
+
+
+class Connection:
+    """A connected socket and the monitor that reports rejected handshakes; made by `open`."""
+
+    def __init__(
+        self,
+        socket: zmq.Socket[bytes],
+        monitor: zmq.Socket[bytes],
+        endpoint: str,
+        key: ClientKey | None,
+    ) -> None:
+        self.socket = socket
+        self.endpoint = endpoint
+        self._monitor = monitor
+        self._key = key
+        self._failures = 0
+        self._poller = zmq.Poller()
+        self._poller.register(socket, zmq.POLLIN)
+        self._poller.register(monitor, zmq.POLLIN)
+
+    @classmethod
+    def open(
+        cls, socket_type: int, endpoint: str, key: Path | str | None, options: Mapping[int, int]
+    ) -> Self:
+        """Connect a new socket with these options to an endpoint.
+
+        `key` is a client's key file, None: the file named by HANDTOUCH_KEY, "": none; used over TCP only.
+        Raises ValueError for an invalid endpoint or an unusable key file.
+        """
+        file = os.environ.get("HANDTOUCH_KEY", "") if key is None else key
+        client_key = load_client(Path(file)) if file and endpoint.startswith("tcp://") else None
+        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(socket_type)
+        monitor: zmq.Socket[bytes] | None = None
+        try:
+            for option, value in options.items():
+                socket.setsockopt(option, value)
+            if client_key is not None:
+                socket.setsockopt(zmq.CURVE_SERVERKEY, client_key.server_key.encode())
+                socket.setsockopt(zmq.CURVE_PUBLICKEY, client_key.public_key.encode())
+                socket.setsockopt(zmq.CURVE_SECRETKEY, client_key.secret_key.encode())
+            monitor = socket.get_monitor_socket(_HANDSHAKE_EVENTS)
+            socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            if monitor is not None:
+                monitor.close()
+            socket.close()
+            raise ValueError(
+                f"{endpoint!r} is no ZeroMQ endpoint ({error.strerror}); use the form tcp://127.0.0.1:5580"
+            ) from error
+        return cls(socket, monitor, endpoint, client_key)
+
+    def poll(self, wait_ms: int | None) -> bool:
+        """Wait for a message or a connection event; return False after `wait_ms` without one.
+
+        Raises PermissionError when the daemon rejects this client.
+        """
+        ready = {socket for socket, _ in self._poller.poll(wait_ms)}
+        if self._monitor in ready and self.socket not in ready:
+            self._handle_monitor_event(self._monitor.recv_multipart())
+        return bool(ready)
+
+    @property
+    def readable(self) -> bool:
+        """True if a message can be received now."""
+        return bool(int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+
+    async def wait(self) -> None:
+        """Return once a message may be received. Raises PermissionError when the daemon rejects us."""
+        loop, woken = asyncio.get_running_loop(), asyncio.Event()
+        descriptors = [int(socket.getsockopt(zmq.FD)) for socket in (self.socket, self._monitor)]
+        for descriptor in descriptors:
+            loop.add_reader(descriptor, woken.set)
+        try:
+            while not self.readable:
+                if not self.poll(0):  # the descriptors are edge-triggered: poll before waiting on them
+                    await woken.wait()
+                    woken.clear()
+        finally:
+            for descriptor in descriptors:
+                loop.remove_reader(descriptor)
+
+    def close(self) -> None:
+        """Close the socket and its monitor; the daemon notices within milliseconds."""
+        if not self._monitor.closed:
+            self._poller.unregister(self._monitor)
+            self.socket.disable_monitor()
+            self._monitor.close()
+        self.socket.close()
+
+    def _handle_monitor_event(self, parts: list[bytes]) -> None:
+        event = parse_monitor_message(parts)["event"]
+        self._failures = 0 if event == zmq.Event.HANDSHAKE_SUCCEEDED else self._failures + 1
+        if event == zmq.Event.HANDSHAKE_FAILED_AUTH and self._key is not None:
+            raise PermissionError(
+                f"{self.endpoint} rejects the key of {self._key.name}: unknown there, or without the right "
+                "to this endpoint; check `handtouch keys list FOLDER` on the daemon's machine"
+            )
+        if self._failures < _MAX_HANDSHAKE_FAILURES and event != zmq.Event.HANDSHAKE_FAILED_PROTOCOL:
+            return  # a daemon that shuts down during the handshake looks the same; ZeroMQ retries
+        if self._key is None:
+            raise PermissionError(
+                f"{self.endpoint} requires a key: make one with `handtouch keys client FOLDER NAME` on the "
+                "daemon's machine; pass its file by --key, key= or HANDTOUCH_KEY"
+            )
+        raise PermissionError(
+            f"{self.endpoint}: CURVE handshake failed with the key of {self._key.name} for "
+            f"{self._key.server}: this is another daemon, or it has new keys, or none"
+        )

@@ -1,0 +1,141 @@
+"""Send joint states, commands and forces of a robot to a handtouch daemon.
+
+    with handtouch.Robot() as robot:
+        robot.send_joints("right", {"index_mcp": 0.4, "index_pip": 0.7}, t_ns=time.monotonic_ns())
+
+Public names: `Robot`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from handtouch.client.connection import RECONNECT_OPTIONS, Connection
+from handtouch.host.endpoints import INPUTS_ENDPOINT
+from handtouch.wire.inputs import (
+    InputMessage,
+    JointCommand,
+    JointState,
+    LinkForces,
+    encode,
+)
+
+_QUEUE_MESSAGES = 16
+_LINGER_MS = 200
+
+
+class Robot:
+    """The robot's connection to a daemon's inputs endpoint; sending never blocks, and there are no answers.
+
+    Messages sent before the connection is up are lost: call `wait_connected` where the first one matters.
+    `key` as for `connect`; it needs the right `control`. Messages that the daemon can't use are counted by
+    cause in `inputs` of its `service` message. Raises ValueError for an invalid endpoint or an unusable key
+    file; sending raises PermissionError when the daemon rejects this client.
+    """
+
+    def __init__(self, endpoint: str = INPUTS_ENDPOINT, key: Path | str | None = None) -> None:
+        self.endpoint = endpoint
+        self._subscribed: set[bytes] = set()
+        options = {zmq.SNDHWM: _QUEUE_MESSAGES, zmq.LINGER: _LINGER_MS, **RECONNECT_OPTIONS}
+        self._connection = Connection.open(zmq.XPUB, endpoint, key, options)
+
+    def send_joints(
+        self,
+        hand: str,
+        position_rad: Mapping[str, float],
+        *,
+        t_ns: int | None = None,
+        velocity_rad_s: Mapping[str, float] | None = None,
+        position_std_rad: Mapping[str, float] | float | None = None,
+        gravity: Sequence[float] | None = None,
+    ) -> None:
+        """Send joint positions of a hand, by joint name, at `t_ns` of time.monotonic_ns() (None: now).
+
+        Prismatic joints in metres. Velocities and standard deviations are of the same joints; a single
+        deviation applies to all. gravity: (3,) its direction in the frame of the hand's base, of any length;
+        overrides the deployment's, for a hand on an arm that its URDF doesn't contain. Raises ValueError for
+        mappings with different joints, and for NaN and infinity.
+        """
+        names = tuple(position_rad)
+        std = position_std_rad
+        if isinstance(std, (int, float)):
+            std = dict.fromkeys(names, float(std))
+        std_rad = None if std is None else _to_array(std, names)
+        velocity = None if velocity_rad_s is None else _to_array(velocity_rad_s, names)
+        t_ns = time.monotonic_ns() if t_ns is None else t_ns
+        down = None if gravity is None else np.asarray(gravity, np.float64)
+        angles = _to_array(position_rad, names)
+        self._send(JointState(hand, t_ns, names, angles, velocity, None, std_rad, down))
+
+    def send_commands(self, hand: str, position_rad: Mapping[str, float], *, t_ns: int | None = None) -> None:
+        """Send the commanded positions of joints of a hand, in effect from `t_ns` on; as `send_joints`.
+
+        For hands without joint encoders: stiffness is then estimated from the commanded closing.
+        """
+        names = tuple(position_rad)
+        t_ns = time.monotonic_ns() if t_ns is None else t_ns
+        self._send(JointCommand(hand, t_ns, names, _to_array(position_rad, names)))
+
+    def send_forces(
+        self,
+        hand: str,
+        force_n: Mapping[str, float],
+        std_n: Mapping[str, float] | float,
+        *,
+        t_ns: int | None = None,
+    ) -> None:
+        """Send reference forces on links, from another sensor, and their deviations; as `send_joints`."""
+        links = tuple(force_n)
+        std = std_n if isinstance(std_n, Mapping) else dict.fromkeys(links, float(std_n))
+        t_ns = time.monotonic_ns() if t_ns is None else t_ns
+        self._send(LinkForces(hand, t_ns, links, _to_array(force_n, links), _to_array(std, links)))
+
+    def wait_connected(self, timeout_s: float = 2.0) -> bool:
+        """Wait until a daemon has connected; return False after `timeout_s`.
+
+        Raises PermissionError when the daemon rejects this client.
+        """
+        end_s = time.monotonic() + timeout_s
+        while not self._subscribed:
+            left_ms = max(0, round((end_s - time.monotonic()) * 1000))
+            if not self._connection.poll(left_ms) and left_ms == 0:
+                break
+            self._read_subscriptions()
+        return bool(self._subscribed)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; queued messages have 0.2 s to be sent."""
+        self._connection.close()
+
+    def _send(self, message: InputMessage) -> None:
+        self._connection.poll(0)
+        self._read_subscriptions()
+        self._connection.socket.send_multipart(encode(message), zmq.NOBLOCK)  # dropped when the queue is full
+
+    def _read_subscriptions(self) -> None:
+        while True:
+            try:
+                request = self._connection.socket.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            (self._subscribed.add if request[:1] == b"\x01" else self._subscribed.discard)(request[1:])
+
+
+def _to_array(values: Mapping[str, float], names: tuple[str, ...]) -> NDArray[np.float64]:
+    if not names or values.keys() != set(names):
+        differ = ", ".join(sorted(set(names) ^ values.keys())) or "none given"
+        raise ValueError(f"all mappings must have the same names, one or more: {differ}")
+    return np.array([values[name] for name in names], np.float64)

@@ -1,0 +1,111 @@
+"""Electronic data sheets (CiA 306): a node's objects, its default TPDOs and the types of objects.
+
+Public names: `load_eds`, `default_tpdos`, `TpdoDefault`, `integer_type`, `EdsError`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from canopen import ObjectDictionary
+
+from handtouch.config.eds_file import (
+    INTEGER_TYPES,
+    TPDO_INDICES,
+    TPDO_MAPPING_INDICES,
+    TYPE_NAMES,
+    EdsError,
+    mapping_entries,
+    parse_eds,
+    raw_value,
+    variable_at,
+)
+
+__all__ = ["EdsError", "TpdoDefault", "default_tpdos", "integer_type", "load_eds"]
+
+_PREDEFINED_TPDO_COUNT = 4
+_EVENT_DRIVEN = 255
+
+
+@dataclass(frozen=True, slots=True)
+class TpdoDefault:
+    """Default of a TPDO, after power-on.
+
+    `number` : from 1
+    `cob_id` : 11-bit identifier; 0 if neither the EDS nor CiA 301 has one for this number
+    `enabled` : valid, with an 11-bit identifier
+    `transmission_type` : transmission type as in CiA 301; 255, event-driven, where the EDS is silent
+    `mapping_entries` : (index, sub-index, bits) in the order of transfer, up to the first that the EDS
+    leaves empty;
+        indices 1 to 7 are dummy entries, gaps of that length
+    `remappable` : its mapping may be written
+    """
+
+    number: int
+    cob_id: int
+    enabled: bool
+    transmission_type: int
+    entries: tuple[tuple[int, int, int], ...]
+    remappable: bool
+
+
+def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
+    """Load the object dictionary of an EDS or DCF file for one node id (1-127).
+
+    UTF-8, Latin-1 and UTF-16. Of keys and sections that come twice the first counts, as in Windows' own INI
+    functions, with which most vendors' tools read them. Raises EdsError.
+    """
+    try:
+        raw = Path(path).read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: no path at all, as with a NUL in it
+        raise EdsError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    return parse_eds(str(path), raw, node_id)
+
+
+def default_tpdos(dictionary: ObjectDictionary) -> tuple[TpdoDefault, ...]:
+    """Return the TPDOs of an object dictionary by number; values of a DCF precede defaults."""
+    return tuple(
+        _default_tpdo(dictionary, index - TPDO_INDICES.start + 1)
+        for index in TPDO_INDICES
+        if index in dictionary
+    )
+
+
+def integer_type(dictionary: ObjectDictionary, index: int, sub: int) -> tuple[int, bool] | None:
+    """Return (bits, signed) of an integer object; None if the dictionary doesn't have the object.
+
+    8 to 64 bits in steps of 8. Raises EdsError for any other type, naming object and type.
+    """
+    variable = variable_at(dictionary, index, sub)
+    if variable is None:
+        return None
+    kind = variable.data_type
+    if kind not in INTEGER_TYPES:
+        name = TYPE_NAMES.get(kind, f"of type {kind}")
+        raise EdsError(
+            f'object 0x{index:04X} sub {sub} "{variable.name}" is {name}; an integer is needed here'
+        )
+    return INTEGER_TYPES[kind]
+
+
+def _default_tpdo(dictionary: ObjectDictionary, number: int) -> TpdoDefault:
+    communication, mapping = TPDO_INDICES[number - 1], TPDO_MAPPING_INDICES[number - 1]
+    node_id = dictionary.node_id or 0
+    predefined = 0x80 + 0x100 * number if number <= _PREDEFINED_TPDO_COUNT else 0
+    cob_id = raw_value(dictionary, communication, 1)
+    if cob_id is None:
+        cob_id = predefined
+    if predefined and cob_id & 0x7FF == predefined:  # in some files the firmware adds the node id
+        cob_id += node_id
+    transmission = raw_value(dictionary, communication, 2)
+    subs = [variable_at(dictionary, mapping, sub) for sub in (0, 1)]
+    writable = [bool(variable.writable) for variable in subs if variable is not None]
+    return TpdoDefault(
+        number=number,
+        cob_id=cob_id & 0x7FF,
+        enabled=bool(cob_id & 0x7FF) and not cob_id & (1 << 31 | 1 << 29),
+        transmission_type=_EVENT_DRIVEN if transmission is None else transmission,
+        entries=tuple(mapping_entries(dictionary, mapping)),
+        remappable=bool(writable) and all(writable),
+    )

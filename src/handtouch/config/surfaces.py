@@ -1,0 +1,106 @@
+"""The `surface` table of a pad, one definition for each kind in the registry of `handtouch.field`.
+
+Public names: `SurfaceTable`, `SURFACE_TABLES`, `PadSurface`, `surface_table`. Keys, ranges and descriptions
+are declared by the surface classes; nothing here names a shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+
+from pydantic import Field, TypeAdapter, create_model
+
+from handtouch.config.base import Table
+from handtouch.field.surface import SURFACES, AnisotropicSurface, Surface
+from handtouch.field.surface_base import SurfaceKey, surface_keys
+
+
+class SurfaceTable(Table):
+    """The shape of a sensing surface; its keys, in millimetres and degrees, depend on `kind`."""
+
+    kind: str
+    resistivity_ratio: float = Field(
+        1.0,
+        gt=0,
+        description="resistivity of the sheet along x over that along y, as it lies on this pad; "
+        "ohm_per_square is then their geometric mean",
+    )
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, key: str) -> Any:
+            """Return the value of one of the shape's own keys."""
+
+    def build(self) -> Surface:
+        """Return the surface in metres and radians. Raises ValueError for a shape that can't exist."""
+        return _build(self)
+
+    @property
+    def rectangle_mm(self) -> tuple[float, float]:
+        """Sides (a, b) [mm] of the conformal rectangle."""
+        surface = self.build()
+        return surface.a * 1e3, surface.b * 1e3
+
+    def problems(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, remedy) for every reason why no such surface exists; key "" for the whole table."""
+        shape = SURFACES[self.kind]
+        found = list(shape.check_keys(self.model_dump()))
+        if not found:
+            try:
+                self.build()
+            except ValueError as error:
+                found = [_in_keys_of_the_file(shape, str(error))]
+        yield from found
+
+
+@lru_cache(maxsize=256)
+def _build(table: SurfaceTable) -> Surface:
+    surface = SURFACES[table.kind].from_keys(table.model_dump())
+    ratio = table.resistivity_ratio
+    return surface if ratio == 1 else AnisotropicSurface(surface, ratio)
+
+
+def _in_keys_of_the_file(shape: type[Surface], text: str) -> tuple[str, str]:
+    """Return the key that an error of the constructor is about, and its text with the file's key names."""
+    first = ""
+    for name, key in surface_keys(shape).items():
+        if text.startswith(name):
+            first = key.name
+        text = text.replace(name, key.name)
+    return first, text.removeprefix(first).removeprefix(":").strip()
+
+
+def _key_field(key: SurfaceKey) -> tuple[Any, Any]:
+    """Return type and pydantic field of a key."""
+    number = Annotated[float, Field(gt=key.above, lt=key.below, le=key.at_most)]
+    if key.is_list:
+        numbers = Annotated[tuple[number, ...], Field(strict=False, min_length=2)]
+        return numbers, Field(description=key.description)
+    return float, Field(gt=key.above, lt=key.below, le=key.at_most, description=key.description)
+
+
+def _definition(kind: str, shape: type[Surface]) -> type[SurfaceTable]:
+    fields: dict[str, Any] = {key.name: _key_field(key) for key in surface_keys(shape).values()}
+    fields["kind"] = Literal[kind], ...
+    doc = (shape.__doc__ or "").partition("\n")[0]
+    return create_model(kind.capitalize(), __base__=SurfaceTable, __doc__=doc, __module__=__name__, **fields)
+
+
+SURFACE_TABLES: dict[str, type[SurfaceTable]] = {
+    kind: _definition(kind, shape) for kind, shape in sorted(SURFACES.items())
+}
+"""Definition of the `surface` table of each kind."""
+
+if TYPE_CHECKING:
+    PadSurface = SurfaceTable
+else:
+    PadSurface = Annotated[Union[tuple(SURFACE_TABLES.values())], Field(discriminator="kind")]  # noqa: UP007
+
+_ADAPTER: TypeAdapter[SurfaceTable] = TypeAdapter(PadSurface)
+
+
+def surface_table(kind: str, **keys: Any) -> SurfaceTable:
+    """Return the table of a surface, checked as if it stood in a deployment file."""
+    return _ADAPTER.validate_python({"kind": kind, **keys})

@@ -1,0 +1,293 @@
+"""Baselines: counts of untouched pads, tracked while a pad is untouched and held while it is touched.
+
+Public name: `Baseline`.
+
+Ticks only collect samples (`add_samples`); a tenth of a second of them is then processed at once
+(`update_baseline`), with its duration, so that tick rate and missing samples make no difference. Rules:
+* An untouched pad's baseline is tracked with a time constant, up to a maximum rate: a slower rise is drift.
+* A touched pad's baseline is held, after release too, until the pad reads nearly its baseline again: leakage
+  or creep neither triggers another contact nor becomes the baseline.
+* The common drift of a hand's untouched pads (temperature, supply) is applied to touched ones too.
+* The initial baseline and its standard deviation decide whether a first reading is a contact.
+* A sheet only sinks current. A reading below the baseline means that the pad was touched when that was
+  learned, too lightly to be distinguished from an offset: the baseline is learned again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.intp]
+
+BLOCK_DURATION_NS = 97_000_000  # no multiple of a period: rounding of stamps moves no sample to another block
+_MAX_PAUSE_NS = 3600 * 10**9
+_TRACKING_TIME_S = 10.0  # time constant of offsets
+_NOISE_TIME_S = 60.0  # time constant of the noise estimate
+_NOISE_PERIOD_BLOCKS = 10  # blocks per update of the noise estimate
+_MIN_VARIANCE_SAMPLES = 4  # in a block
+_DRIFT_SPEED_PERIOD_S = 60.0  # untouched time per measurement of the drift speed
+_DRIFT_SPEED_GAIN = 0.2  # of such a measurement
+_INITIAL_DRIFT_SIGMA_PER_S = 0.02  # of the noise
+_MAX_RETURN_FRACTION = 0.5  # of the end threshold: a released pad's distance from its baseline
+_CONFIDENCE_SIGMA = 3.0
+_MIN_COMMON_DRIFT_PADS = 3  # untouched pads of a hand
+_GRAVITY_GAIN, _MIN_TURN_SQUARED = 0.02, 0.05  # fraction of an innovation; squared change of unit gravity
+_ONES = np.ones(4)
+
+
+class Baseline:
+    """Baselines of n pads of four channels x0, xa, y0, yb [counts]; `hands` are the rows of each hand.
+
+    noise_counts: configured noise of a channel. begin_counts, end_counts: sums of channels at which a contact
+    begins and ends. max_rise_time_s: a reading that takes longer to rise to `end_counts` is drift. All (n,).
+
+    Public state: `offset` (n, 4); `std` (n,) of the sum of the four; `noise_squared` (n, 4) [counts^2] of
+    untouched samples; `held` (n,): touched, or released and not back yet; `unverified` (n,): no reading has
+    agreed with the baseline yet; `known` (n,): set, or measured untouched; `drift_speed` (n,): recent drift
+    of the sum, without the common one [counts/s]; `gravity_slope` (n, 4, 3): change of a channel per unit of
+    gravity.
+    """
+
+    def __init__(
+        self,
+        noise_counts: FloatArray,
+        begin_counts: FloatArray,
+        end_counts: FloatArray,
+        max_rise_time_s: FloatArray,
+        hands: Iterable[slice],
+    ) -> None:
+        n = len(noise_counts)
+        self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
+        self.offset = np.zeros((n, 4))
+        self.std = begin_counts / _CONFIDENCE_SIGMA
+        self.noise_squared = np.repeat(np.square(noise_counts)[:, None], 4, axis=1)
+        self.held = np.zeros(n, np.bool_)
+        self.unverified = np.ones(n, np.bool_)
+        self.known = np.zeros(n, np.bool_)
+        self.touching = np.zeros(n, np.bool_)
+        self.drift_speed = _INITIAL_DRIFT_SIGMA_PER_S * noise_counts
+        self.gravity_slope = np.zeros((n, 4, 3))
+        self.gravity: FloatArray | None = None
+        """(n, 3) unit gravity in each link's frame, of the last `set_gravity`; 0: never known"""
+        self.smoothed_gravity = np.zeros((n, 3))  # with the time constant of the offset
+        self.expected_counts = np.zeros((n, 4))
+        """(n, 4) counts to subtract from a reading"""
+        self._hand_membership = np.zeros((len(hands := list(hands)), n))
+        for row, pads in enumerate(hands):
+            self._hand_membership[row, pads] = 1.0
+        self.common_drift = np.zeros(len(hands))
+        """drift per channel common to each hand's pads"""
+        self._sum, self._squares, self._buffer = np.zeros((n, 4)), np.zeros((n, 4)), np.zeros((n, 4))
+        self._count = np.zeros(n)
+        self._blocks = np.zeros(1, np.int64)
+        self._block_begin_ns = np.full(1, -_MAX_PAUSE_NS)
+        self._drift_until_ns = np.zeros(n, np.int64)  # time of each pad's last offset update
+        self._anchor, self._anchored_s = np.zeros(n), np.zeros(n)
+
+    def set_settings(
+        self,
+        noise_counts: FloatArray,
+        begin_counts: FloatArray,
+        end_counts: FloatArray,
+        max_rise_time_s: FloatArray,
+    ) -> None:
+        """Change the settings of all pads."""
+        self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
+
+    def set_offset(self, pad: int, offset: npt.ArrayLike, std: npt.ArrayLike = 0.0) -> None:
+        """Set a pad's offsets (4,) and their standard deviations (4,) or () [counts], from a store or a tare.
+        The next reading is a contact only if it differs by more than these explain."""
+        self.offset[pad] = offset
+        if self.gravity is not None:
+            self.offset[pad] -= self.gravity_slope[pad] @ self.gravity[pad]
+        self.std[pad] = np.sqrt(np.sum(np.square(np.broadcast_to(std, 4))))
+        self.unverified[pad] = self.known[pad] = True
+        self.held[pad] = self.touching[pad]
+        self._anchored_s[pad] = 0.0
+        self._discard_samples(np.array([pad]))
+        self._update_expected()
+
+    def reset_pad(self, pad: int) -> None:
+        """Forget what was learned of a pad, because its node was replaced."""
+        self.gravity_slope[pad] = 0.0
+        self.noise_squared[pad] = self._noise[pad] ** 2
+        self.drift_speed[pad] = _INITIAL_DRIFT_SIGMA_PER_S * self._noise[pad]
+        self.set_offset(pad, np.zeros(4), self._begin_threshold[pad] / (2 * _CONFIDENCE_SIGMA))
+        self.known[pad] = False
+
+    def set_gravity(self, gravity: FloatArray) -> None:
+        """Set the unit direction of gravity in each link's frame (n, 3); NaN where unknown: the last one
+        holds."""
+        if self.gravity is None:
+            self.gravity = np.zeros_like(gravity)
+        known = ~np.isnan(gravity[:, 0])
+        first = known & ~self.gravity.any(axis=1)
+        self.gravity[known] = gravity[known]
+        self.smoothed_gravity[first] = gravity[first]
+        self._update_expected()
+
+    @property
+    def unknown_in_contact(self) -> BoolArray:
+        """Pads (n,) touched since the start, so that their baseline was never measured."""
+        return np.asarray(self.touching & ~self.known)
+
+    @property
+    def noise_counts(self) -> FloatArray:
+        """Standard deviation of each channel (n, 4), measured while untouched."""
+        return np.asarray(np.sqrt(self.noise_squared))
+
+    def add_samples(self, excess: FloatArray, free: BoolArray) -> None:
+        """Add the samples of a tick: counts less `expected_counts` (n, 4), of the pads that are `free` (n,):
+        untouched, with a new sample that can be trusted."""
+        if np.count_nonzero(free) == free.size:
+            masked = excess
+        else:
+            masked = np.multiply(excess, free[:, None], out=self._buffer)
+        self._sum += masked
+        self._squares += np.multiply(masked, masked, out=self._buffer)
+        self._count += free
+
+    def begin_contacts(self, began: IntArray) -> None:
+        """Hold the baselines of these pads; the samples collected last may be the contact's approach."""
+        self.held[began] = True
+        self._discard_samples(began)
+
+    def update_baseline(self, sync_ns: int, touching: BoolArray) -> bool:
+        """Process the samples collected, once a block is complete; return True if it was. `touching` (n,):
+        present contacts."""
+        elapsed_ns = sync_ns - int(self._block_begin_ns[0])
+        if 0 <= elapsed_ns < BLOCK_DURATION_NS:
+            return False
+        self._block_begin_ns[0] = sync_ns
+        if not 0 <= elapsed_ns < _MAX_PAUSE_NS:  # the first block, or another clock
+            self._drift_until_ns[:] = sync_ns
+            return False
+        np.copyto(self.touching, touching)
+        self.held |= touching
+        sampled = self._count > 0
+        mean = self._sum / np.maximum(self._count, 1.0)[:, None]
+        total = mean @ _ONES
+        self._release_returned(sampled & ~touching, total)
+        free = sampled & ~self.held
+        dt_s = np.asarray((sync_ns - self._drift_until_ns) * 1e-9, np.float64)
+        np.copyto(self._drift_until_ns, sync_ns, where=free | self.held)
+        moved = self._track_offsets(mean, free, dt_s)
+        self._update_drift(moved @ _ONES, free, elapsed_ns * 1e-9, dt_s)
+        self._blocks[0] += 1
+        if self._blocks[0] % _NOISE_PERIOD_BLOCKS == 0:
+            self._update_noise(mean, free)
+        if self.gravity is not None:
+            self._update_gravity_slope(mean, free, dt_s)
+        self._update_expected()
+        self._sum[:] = 0.0
+        self._squares[:] = 0.0
+        self._count[:] = 0.0
+        return True
+
+    # Details: parts of `update_baseline` --------------------------------------------------------------------
+
+    def _release_returned(self, sampled: BoolArray, total: FloatArray) -> None:
+        """End the hold of pads that read nearly their baseline again."""
+        near = _MAX_RETURN_FRACTION * self._end_threshold + _CONFIDENCE_SIGMA * np.hypot(
+            self.std, 2 * self._noise
+        )
+        less = sampled & (total < -near) & (total >= -self._begin_threshold)
+        if np.count_nonzero(less):
+            self.unverified |= less
+            self.held |= less  # until the next block: only a part of this one may be without the touch
+            self.std[less] = self._begin_threshold[less] / _CONFIDENCE_SIGMA
+            sampled = sampled & ~less
+        elif not np.count_nonzero(self.unverified) and not np.count_nonzero(self.held):
+            return
+        first_near = _CONFIDENCE_SIGMA * np.hypot(self.std, 2 * self._noise)
+        first_near = np.minimum(first_near, np.maximum(self._begin_threshold, _CONFIDENCE_SIGMA * self.std))
+        near = np.where(self.unverified, first_near, near)
+        back = sampled & (np.abs(total) <= near)
+        first = np.flatnonzero(back & self.unverified)
+        if len(first):
+            count = self._count[first]
+            variance = np.square(self._noise[first]) * 4 / count
+            gain = np.square(self.std[first]) / (np.square(self.std[first]) + variance)
+            jump = self._sum[first] * (gain / count)[:, None]
+            self.offset[first] += jump
+            self._sum[first] -= jump * count[:, None]
+            self._squares[first] = 0.0
+            self._count[first] = 0.0
+            self.std[first] = np.sqrt(gain * variance)
+            self.unverified[first], self.known[first] = False, True
+        self.held &= ~back
+
+    def _track_offsets(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> FloatArray:
+        """Move offsets towards the readings: do/dt = excess / time constant, up to the maximum rate. Return
+        the change (n, 4). Exact for a constant reading, whatever the intervals."""
+        excess = np.abs(mean) @ _ONES
+        linear = self._max_rate * _TRACKING_TIME_S
+        bound_s = np.maximum(excess - linear, 0.0) / self._max_rate
+        remaining = np.minimum(excess, linear) * np.exp(np.minimum(bound_s - dt_s, 0.0) / _TRACKING_TIME_S)
+        remaining = np.maximum(remaining, excess - self._max_rate * dt_s)
+        fraction = (1 - remaining / np.maximum(excess, 1e-12)) * free
+        moved = mean * fraction[:, None]
+        self.offset += moved
+        return np.asarray(moved)
+
+    def _update_drift(self, moved: FloatArray, free: BoolArray, elapsed_s: float, dt_s: FloatArray) -> None:
+        """Apply the untouched pads' common drift to held ones, and propagate the standard deviations."""
+        pads = self._hand_membership @ free
+        shift = np.where(
+            pads >= _MIN_COMMON_DRIFT_PADS,
+            self._hand_membership @ (moved * free) / np.maximum(4 * pads, 1.0),
+            0.0,
+        )
+        self.common_drift += shift
+        kept = shift @ self._hand_membership * self.held
+        self.offset += kept[:, None]
+        settled = (
+            self.drift_speed * _TRACKING_TIME_S + _MAX_RETURN_FRACTION * self._noise - self.std
+        ) * -np.expm1(-dt_s / _TRACKING_TIME_S)
+        self.std += np.where(free, settled, self.drift_speed * elapsed_s)
+        self._anchored_s += free * dt_s
+        if np.count_nonzero(due := self._anchored_s >= _DRIFT_SPEED_PERIOD_S):
+            own = self.offset @ _ONES - 4 * (self.common_drift @ self._hand_membership)
+            speed = np.abs(own - self._anchor)[due] / self._anchored_s[due]
+            self.drift_speed[due] += _DRIFT_SPEED_GAIN * (speed - self.drift_speed[due])
+            self._anchor[due], self._anchored_s[due] = own[due], 0.0
+
+    def _update_noise(self, mean: FloatArray, free: BoolArray) -> None:
+        """Update the noise from the scatter about a block's mean; no baseline moves within a block."""
+        enough = free & (self._count >= _MIN_VARIANCE_SAMPLES)
+        spare = np.maximum(self._count - 1, 1.0)[:, None]
+        variance = (self._squares - self._sum * mean) / spare
+        part = -np.expm1(-_NOISE_PERIOD_BLOCKS * BLOCK_DURATION_NS * 1e-9 / _NOISE_TIME_S) * enough
+        self.noise_squared += (variance - self.noise_squared) * part[:, None]
+
+    def _update_gravity_slope(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> None:
+        """Update gravity slopes from the unexplained rest of offsets and the change of gravity (normalised
+        LMS); both are smoothed alike, so a constant offset isn't attributed to gravity."""
+        assert self.gravity is not None
+        turn = self.gravity - self.smoothed_gravity
+        self.smoothed_gravity += turn * (-np.expm1(-dt_s / _TRACKING_TIME_S) * free)[:, None]
+        gain = _GRAVITY_GAIN * free / (np.square(turn).sum(axis=1) + _MIN_TURN_SQUARED)
+        moved = (mean * gain[:, None])[:, :, None] * turn[:, None]
+        self.gravity_slope += moved
+        by_turn = np.matmul(moved, self.smoothed_gravity[:, :, None])[:, :, 0]
+        self.offset -= by_turn  # explained by gravity now
+
+    def _discard_samples(self, pads: IntArray) -> None:
+        self._sum[pads] = self._squares[pads] = 0.0
+        self._count[pads] = 0.0
+
+    def _update_expected(self) -> None:
+        np.copyto(self.expected_counts, self.offset)
+        if self.gravity is not None:
+            self.expected_counts += np.matmul(self.gravity_slope, self.gravity[:, :, None])[:, :, 0]
+
+    def _set_limits(
+        self, noise: FloatArray, begin: FloatArray, end: FloatArray, max_rise_time_s: FloatArray
+    ) -> None:
+        self._noise, self._begin_threshold, self._end_threshold = noise, begin, end
+        self._max_rate = end / max_rise_time_s

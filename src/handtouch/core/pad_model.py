@@ -1,0 +1,332 @@
+"""Parameters of all pads as columns over the hands, computed once from the deployment."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch import config
+from handtouch.calibration.calibration import Calibration, LawParameters
+from handtouch.config import Deployment
+from handtouch.config.channels import (
+    ELECTRODES,
+    Channels,
+    order_by_electrode,
+    resolve_channels,
+)
+from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
+from handtouch.field import LocatorBank
+from handtouch.field.contact_law import ContactLaw, ForceEstimate
+from handtouch.field.network import ElectrodeNetwork
+from handtouch.hand import (
+    PadGeometry,
+    electrode_network,
+    mount_transform,
+    pad_surface,
+)
+
+FloatArray = NDArray[np.float64]
+_MIN_ALPHA = 0.1
+
+
+class PadModel:
+    """Columns of the n pads of a deployment, in its order, which is also the slab's.
+
+    `hands`, `links`, `frame_links` (URDF links) and `calibration_ids` (n,) are names; `rows_of_hand`: hand ->
+    slice of rows. `ampere_per_count` (n, 4) of the electrodes x0, xa, y0, yb includes `gains` (n, 4);
+    `noise_counts` (n,) and `noise_a` (n, 4) are standard deviations of a channel. The counts of untouched
+    pads are state of the tick: see `Baseline`.
+
+    `gain_covariance` (n, 4, 4) is that of log gains; `quarantined` (n,): no force is published;
+    `position_unreliable` (n,); `diagnoses` (n,): names of the diagnoses responsible for either. `laws` (n,)
+    are contact laws of calibrations, None where the deployment's applies.
+
+    A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
+    `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_samples`,
+    `end_samples`: debounce. `max_rise_time_s`: a slower rise to `end_threshold_n` is drift. `behaviours`
+    (n,): sheet behaviour, None where it isn't modelled. `locator` locates contacts, `placement` transforms
+    them to link frames, `estimate_force` applies the contact law.
+    """
+
+    def __init__(self, deployment: Deployment) -> None:
+        entries = deployment.pads
+        pads = [pad for _, pad in entries]
+        nodes = [deployment.nodes[pad.node] for pad in pads]
+        sheets = [deployment.sheets[pad.sheet] for pad in pads]
+        touches = [pad.touch or deployment.touch for pad in pads]
+        self.size = len(pads)
+        self.hands = [hand for hand, _ in entries]
+        self.links = [pad.link for pad in pads]
+        self.frame_links = [pad.mount.link or pad.link for pad in pads]
+        self.rows_of_hand = _rows_of_hands(self.hands)
+        self.default_calibration_ids = [default_calibration_id_of(pad, deployment) for pad in pads]
+        self.calibration_ids = list(self.default_calibration_ids)
+        kinds = {name: resolve_channels(node.channels, node.eds) for name, node in deployment.nodes.items()}
+        self.ampere_per_count = np.array(
+            [_ampere_per_count(pad, deployment, kinds[pad.node]) for pad in pads]
+        )
+        counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
+        self.noise_counts = np.array(counts)
+        self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
+        self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
+        self._nominal_a = self.ampere_per_count.copy()
+        self.gains = np.ones((self.size, 4))
+        self.gain_covariance = np.zeros((self.size, 4, 4))
+        self.quarantined = np.zeros(self.size, dtype=np.bool_)
+        self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
+        self.diagnoses: list[tuple[str, ...]] = [()] * self.size
+        self.any_gain_uncertain = False
+        self.begin_threshold_n = np.array([touch.begin_threshold_n for touch in touches])
+        self.end_threshold_n = np.array([touch.end_threshold_n for touch in touches])
+        self.begin_samples = np.array([touch.begin_samples for touch in touches])
+        self.end_samples = np.array([touch.end_samples for touch in touches])
+        self.max_rise_time_s = np.array([touch.max_rise_time_s for touch in touches])
+        kinds_of_sheet = {name: _behaviour_of_sheet(sheet) for name, sheet in deployment.sheets.items()}
+        self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]
+        networks = networks_of(deployment)
+        full_scale_a = np.array([node.full_scale_ma * 1e-3 for node in nodes])
+        finest = float((self.noise_a.min(axis=1) / full_scale_a).min())  # noise of the strongest contact
+        self.locator = LocatorBank(networks, tolerance=finest / 10)
+        self.placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in pads])
+        self._drive_v = np.array([node.drive_v for node in nodes])
+        self.laws: list[LawParameters | None] = [None] * self.size
+        self._file_laws = [law_of(sheet) for sheet in sheets]
+        self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
+        self._series_form = np.stack([network.series_quadratic_form for network in networks])
+        self._has_series = np.array([any(pad.series_ohm) for pad in pads])
+        self._law = ContactLaw(
+            np.array([sheet.contact_ohm_mm2 * 1e-6 for sheet in sheets]),
+            np.array([sheet.alpha for sheet in sheets]),
+            np.array([sheet.contact_radius_mm * 1e-3 for sheet in sheets]),
+            np.array([sheet.contact_radius_std_mm * 1e-3 for sheet in sheets]),
+            np.array([sheet.reference_kpa * 1e3 for sheet in sheets]),
+        )
+        self._law_axes = np.zeros((3, 3, self.size))
+        """parameters of `LawParameters.covariance` by its axes by pads: one standard deviation per axis"""
+        self._laws_on_axes: tuple[ContactLaw, FloatArray] | None = None
+        self._centre_spreading = self._spreading_at_centre(networks)
+        self.begin_threshold_a, self.end_threshold_a = (
+            self._threshold_current(force) for force in (self.begin_threshold_n, self.end_threshold_n)
+        )
+
+    def apply_calibration(self, pad: int, calibration: Calibration, name: str) -> None:
+        """Apply gains and contact law of a pad's calibration; its offsets are applied to the baseline.
+
+        Parts that the calibration lacks are the deployment's.
+        """
+        gains = calibration.gains.factors if calibration.gains else (1.0,) * 4
+        self.set_gains_and_law(pad, gains, name, calibration.law)
+
+    def set_gains_and_law(
+        self, pad: int, gains: ArrayLike, calibration_id: str, law: LawParameters | None = None
+    ) -> None:
+        """Set the gains of the channels x0, xa, y0, yb of a pad, its contact law and calibration id.
+
+        `law` None: the deployment's. Where series resistors matter, contacts are located with the
+        deployment's sheet resistance.
+        """
+        if law != self.laws[pad]:
+            self._set_law(pad, law)
+        self.gains[pad] = gains
+        self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
+        self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
+        self.calibration_ids[pad] = calibration_id
+
+    @property
+    def begin_threshold_counts(self) -> FloatArray:
+        """Sum of the channels at which a contact begins (n,)."""
+        return np.asarray(self.begin_threshold_a / self.ampere_per_count.mean(axis=1))
+
+    @property
+    def end_threshold_counts(self) -> FloatArray:
+        """Sum of the channels at which a contact ends (n,)."""
+        return np.asarray(self.end_threshold_a / self.ampere_per_count.mean(axis=1))
+
+    def law(self, pad: int) -> LawParameters:
+        """Return the contact law of a pad: its calibration's, or the deployment's."""
+        return self.laws[pad] or self._file_laws[pad]
+
+    def set_uncertainty(
+        self,
+        pad: int,
+        log_gain_covariance: ArrayLike,
+        quarantined: bool,
+        position_unreliable: bool = False,
+        diagnoses: tuple[str, ...] = (),
+    ) -> None:
+        """Set the covariance (4, 4) of a pad's log gains; `quarantined`: publish no force;
+        `position_unreliable`: publish positions as unreliable; because of `diagnoses`."""
+        self.gain_covariance[pad] = log_gain_covariance
+        self.quarantined[pad], self.position_unreliable[pad] = quarantined, position_unreliable
+        self.diagnoses[pad] = diagnoses
+        self.any_gain_uncertain = bool(self.gain_covariance.any() or self.quarantined.any())
+
+    def copy_calibrations(self, other: PadModel) -> None:
+        """Take over all calibrations of the model that this one replaces."""
+        for pad in range(self.size):
+            calibrated = (
+                bool((other.gains[pad] != 1).any())
+                or other.calibration_ids[pad] != other.default_calibration_ids[pad]
+            )
+            calibration_id = other.calibration_ids[pad] if calibrated else self.calibration_ids[pad]
+            self.set_gains_and_law(pad, other.gains[pad], calibration_id, other.laws[pad])
+            self.set_uncertainty(
+                pad,
+                other.gain_covariance[pad],
+                bool(other.quarantined[pad]),
+                bool(other.position_unreliable[pad]),
+                other.diagnoses[pad],
+            )
+
+    def estimate_force(
+        self,
+        index: NDArray[np.intp],
+        currents: FloatArray,
+        total_a: FloatArray,
+        total_std_a: FloatArray,
+        radius_m: FloatArray,
+    ) -> ForceEstimate:
+        """Estimate forces of contacts on the pads `index` (n,) from total currents and their standard
+        deviation.
+
+        `currents` (4, n), in any unit, and the spreading radius there identify the position.
+        """
+        return self._law.select(index).force(
+            total_a,
+            self._drive_v[index],
+            self._sheet_ohm[index],
+            radius_m,
+            self._series_resistance(index, currents),
+            current_std_a=total_std_a,
+        )
+
+    def law_force_std(
+        self,
+        index: NDArray[np.intp],
+        currents: FloatArray,
+        total_a: FloatArray,
+        radius_m: FloatArray,
+        force_n: FloatArray,
+    ) -> FloatArray:
+        """Return the standard deviation [N] of forces (n,) from the covariance of calibrated laws; arguments
+        as of `estimate_force`. Delta method along the axes of the covariance; 0 for the deployment's law,
+        which has none."""
+        if self._laws_on_axes is None:
+            return np.zeros(len(index))
+        law, sheet_ohm = self._laws_on_axes
+        rows = (index + self.size * np.arange(3)[:, None]).ravel()
+        along = law.select(rows).force(
+            np.tile(total_a, 3),
+            np.tile(self._drive_v[index], 3),
+            sheet_ohm[rows],
+            np.tile(radius_m, 3),
+            np.tile(self._series_resistance(index, currents), 3) if self._has_series.any() else 0.0,
+        )
+        return np.asarray(np.sqrt(np.square(along.force_n.reshape(3, -1) - force_n).sum(axis=0)))
+
+    def _series_resistance(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray | float:
+        """Return the equivalent series resistance from contact to ground [ohm] (n,), sum of phi_i V_i / I."""
+        if not self._has_series[index].any():
+            return 0.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fractions = currents / currents.sum(axis=0)
+        return np.asarray(np.einsum("in,nij,jn->n", fractions, self._series_form[index], fractions))
+
+    def _set_law(self, pad: int, law: LawParameters | None) -> None:
+        """Apply a contact law, and the thresholds [A] that follow from it."""
+        self.laws[pad] = law
+        applied, old = law or self._file_laws[pad], self._law
+        contact, alpha = np.array(old.contact_ohm_m2), np.array(old.alpha)
+        contact[pad], alpha[pad] = applied.contact_ohm_mm2 * 1e-6, applied.alpha
+        self._sheet_ohm[pad] = applied.ohm_per_square
+        self._law = replace(old, contact_ohm_m2=contact, alpha=alpha)
+        variances, axes = np.linalg.eigh(np.array(applied.covariance))
+        self._law_axes[:, :, pad] = axes * np.sqrt(np.maximum(variances, 0.0))
+        self._laws_on_axes = self._perturbed_laws() if self._law_axes.any() else None
+        self.begin_threshold_a[pad] = self._threshold_current(self.begin_threshold_n)[pad]
+        self.end_threshold_a[pad] = self._threshold_current(self.end_threshold_n)[pad]
+
+    def _perturbed_laws(self) -> tuple[ContactLaw, FloatArray]:
+        """Return the laws one standard deviation along each axis, and their sheet resistances: (3 n,), axis
+        by axis."""
+        law, (log_layer, alpha, log_sheet) = self._law, self._law_axes
+        along = ContactLaw(
+            (np.asarray(law.contact_ohm_m2) * np.exp(log_layer)).ravel(),
+            np.maximum(np.asarray(law.alpha) + alpha, _MIN_ALPHA).ravel(),
+            np.tile(np.asarray(law.radius_m), 3),
+            np.tile(np.asarray(law.radius_std_m), 3),
+            np.tile(np.asarray(law.reference_pa), 3),
+        )
+        return along, (self._sheet_ohm * np.exp(log_sheet)).ravel()
+
+    def _spreading_at_centre(
+        self, networks: Sequence[ElectrodeNetwork]
+    ) -> tuple[FloatArray, FloatArray | float]:
+        """Return spreading radius [m] and series resistance [ohm] at the centre of each pad."""
+        x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
+        pads = np.arange(self.size)
+        scale = self.placement.to_link_frame(pads, x, y, np.zeros((self.size, 2, 2))).scale_m_per_unit
+        radius_m = self.locator.conformal_radius(pads, x, y) * scale
+        return radius_m, self._series_resistance(pads, self.locator.fractions(pads, x, y))
+
+    def _threshold_current(self, force_n: FloatArray) -> FloatArray:
+        """Return the total current of a contact of that force at the centre of each pad."""
+        return self._law.current(force_n, self._drive_v, self._sheet_ohm, *self._centre_spreading)
+
+
+def _behaviour_of_sheet(sheet: config.Sheet) -> SheetBehaviour | None:
+    return sheet_behaviour_of(sheet.behaviour) if sheet.behaviour else None
+
+
+def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:
+    """Return the current per count of the electrodes x0, xa, y0, yb."""
+    node = deployment.nodes[pad.node]
+    scale = [node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES]
+    return [
+        node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor
+        for channel, factor in zip(order_by_electrode(channels, pad.electrodes), scale, strict=True)
+    ]
+
+
+def _rows_of_hands(hands: list[str]) -> dict[str, slice]:
+    """Return the rows of each hand; the pads of a hand are consecutive."""
+    first = {hand: hands.index(hand) for hand in hands}
+    return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
+
+
+def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
+    """Return the electrode network of every pad; identical pads share one object and its table."""
+    shared: dict[tuple[object, ...], ElectrodeNetwork] = {}
+    networks = []
+    for _, pad in deployment.pads:
+        sheet = deployment.sheets[pad.sheet]
+        parameters = (pad.surface, pad.gap_mm, pad.series_ohm, sheet.ohm_per_square)
+        if parameters not in shared:
+            shared[parameters] = electrode_network(pad, sheet)
+        networks.append(shared[parameters])
+    return networks
+
+
+def law_of(sheet: config.Sheet) -> LawParameters:
+    """Return the contact law of a deployment's sheet; without covariance."""
+    return LawParameters(sheet.contact_ohm_mm2, sheet.alpha, sheet.ohm_per_square, ((0.0,) * 3,) * 3)
+
+
+def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
+    """Return the id of the default calibration, which changes with the pad's tables in the deployment.
+
+    Not with `serial`: calibrations are bound to it anyway, and a replacement node keeps its own when the
+    deployment file gets its serial number.
+    """
+    parts = (
+        pad.model_copy(update={"serial": None}),
+        deployment.nodes[pad.node],
+        deployment.sheets[pad.sheet],
+    )
+    text = "".join(part.model_dump_json() for part in parts)
+    return "nominal-" + hashlib.sha256(text.encode()).hexdigest()[:12]

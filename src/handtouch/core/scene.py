@@ -1,0 +1,323 @@
+"""Scenes: outputs used by tasks, joined with subscriptions; nothing else is computed.
+
+A scene states what a task uses. The deployment file has one; a control request may replace it, and clients
+add their own for as long as they renew them. Of the union, only outputs with a subscriber are computed.
+
+Public names: `ActiveScenes`, `SceneRequirements`, `Demand`, `select_pads`, `FILE_OWNER`, `CONTROL_OWNER`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.config.tables import SceneRequest
+from handtouch.wire import PERCEPT_KINDS
+
+FILE_OWNER, CONTROL_OWNER = "the deployment file", "control"
+MAX_CLIENTS = 32
+BoolArray = NDArray[np.bool_]
+PadName = tuple[str, str]
+"""hand, link"""
+
+
+class SceneRequirements(NamedTuple):
+    """Union of scenes over n pads; tolerance [m] and rate [Hz] are the strictest requested."""
+
+    pads: BoolArray
+    position: BoolArray
+    force: BoolArray
+    raw: BoolArray
+    palm: BoolArray
+    base: BoolArray
+    tolerance_m: NDArray[np.float64]
+    rate_hz: NDArray[np.float64]
+    """inf: at every SYNC"""
+    percepts: BoolArray
+    """(kinds, n), rows as PERCEPT_KINDS"""
+
+
+def select_pads(patterns: Sequence[str], names: Sequence[PadName]) -> BoolArray:
+    """Return the pads (hand, link) named by patterns such as "thumb_*" or "left/index_distal".
+
+    Raises ValueError for a pattern that matches none.
+    """
+    chosen = np.zeros(len(names), dtype=np.bool_)
+    for pattern in patterns:
+        full = pattern if "/" in pattern else f"*/{pattern}"
+        hits = [fnmatchcase(f"{hand}/{link}", full) for hand, link in names]
+        if not any(hits):
+            known = ", ".join(f"{hand}/{link}" for hand, link in names)
+            raise ValueError(f'no pad is named "{pattern}"; there are {known}')
+        chosen |= np.array(hits)
+    return chosen
+
+
+def merge_scenes(scenes: Sequence[SceneRequest], names: Sequence[PadName]) -> SceneRequirements:
+    """Return the union of scenes over the pads. Raises ValueError for a pattern that matches none."""
+    n = len(names)
+    shape = (6 + len(PERCEPT_KINDS), n)
+    pads, position, force, raw, palm, base, *percepts = np.zeros(shape, dtype=np.bool_)
+    merged = SceneRequirements(
+        pads, position, force, raw, palm, base, np.full(n, np.inf), np.zeros(n), np.array(percepts)
+    )
+    outputs = {"position": position, "force": force, "raw": raw, "palm": palm, "base": base}
+    for scene in scenes:
+        chosen = select_pads(scene.links, names)
+        pads[chosen] = True
+        for output, requested in outputs.items():
+            requested[chosen] |= output in scene.outputs
+        merged.percepts[np.outer([kind in scene.outputs for kind in PERCEPT_KINDS], chosen)] = True
+        position[chosen] |= bool({"palm", "base"} & set(scene.outputs))  # they need the position on the link
+        np.minimum(merged.tolerance_m, scene.tolerance_mm * 1e-3, out=merged.tolerance_m, where=chosen)
+        np.maximum(merged.rate_hz, scene.rate_hz or np.inf, out=merged.rate_hz, where=chosen)
+    merged.tolerance_m[~pads] = 0.0
+    return merged
+
+
+class ActiveScenes:
+    """The active scenes: a base, and those of clients by name, each until its lease ends. Times in ns.
+
+    `requirements` is their union; `version` counts its changes.
+    """
+
+    def __init__(self, file: SceneRequest, names: Sequence[PadName]) -> None:
+        self.names = list(names)
+        self.version = 0
+        self._file = file
+        self._base: SceneRequest | None = None  # replaces the file's
+        self._clients: dict[str, tuple[SceneRequest, int]] = {}
+        self.requirements = merge_scenes([file], self.names)
+
+    @property
+    def base(self) -> SceneRequest:
+        """The base scene: the file's, or its replacement by a control request."""
+        return self._base or self._file
+
+    def set_file(self, file: SceneRequest) -> None:
+        """Set the deployment file's scene after a reload."""
+        self._file = file
+        self._merge()
+
+    def set_base(self, base: SceneRequest | None) -> None:
+        """Replace the file's scene, None: restore it. Raises ValueError, changing nothing."""
+        if base is not None:
+            select_pads(base.links, self.names)
+        self._base = base
+        self._merge()
+
+    def set_client_scene(self, client: str, scene: SceneRequest, lease_ns: int, now_ns: int) -> None:
+        """Add a client's scene, or renew it. Raises ValueError, changing nothing."""
+        select_pads(scene.links, self.names)
+        if client not in self._clients and len(self._clients) >= MAX_CLIENTS:
+            raise ValueError(f"{MAX_CLIENTS} clients have scenes already; wait until a lease ends")
+        known = self._clients.get(client)
+        self._clients[client] = scene, now_ns + lease_ns
+        if known is None or known[0] != scene:
+            self._merge()
+
+    def client_scene(self, client: str) -> SceneRequest | None:
+        """Return a client's scene, None without one."""
+        held = self._clients.get(client)
+        return held[0] if held else None
+
+    def remove_client(self, client: str) -> None:
+        """Remove a client's scene."""
+        if self._clients.pop(client, None):
+            self._merge()
+
+    def expire_leases(self, now_ns: int) -> None:
+        """Remove scenes whose lease has ended."""
+        if self._clients:
+            for client in [name for name, (_, end_ns) in self._clients.items() if now_ns >= end_ns]:
+                self.remove_client(client)
+
+    def by_owner(self) -> dict[str, SceneRequest]:
+        """Return every active scene by its owner."""
+        base = {FILE_OWNER if self._base is None else CONTROL_OWNER: self.base}
+        return base | {f"client {name}": scene for name, (scene, _) in self._clients.items()}
+
+    def describe(self, now_ns: int) -> list[dict[str, Any]]:
+        """Return the active scenes as plain values; `lease_s` is the rest of a client's lease."""
+        ends = {f"client {name}": end_ns for name, (_, end_ns) in self._clients.items()}
+        return [
+            {
+                "owner": owner,
+                "links": list(scene.links),
+                "outputs": list(scene.outputs),
+                "tolerance_mm": scene.tolerance_mm,
+                "rate_hz": scene.rate_hz,
+                "lease_s": (ends[owner] - now_ns) * 1e-9 if owner in ends else None,
+            }
+            for owner, scene in self.by_owner().items()
+        ]
+
+    def _merge(self) -> None:
+        self.requirements = merge_scenes(list(self.by_owner().values()), self.names)
+        self.version += 1
+
+
+class SubscriptionSource(Protocol):
+    """Source of subscriptions: the daemon's publisher."""
+
+    @property
+    def subscriptions(self) -> frozenset[bytes]: ...
+
+    def has_subscriber(self, topic: str) -> bool: ...
+
+
+class RequestedOutputs(NamedTuple):
+    """Outputs computed for each of n pads: they are in a scene and have a subscriber."""
+
+    position: BoolArray
+    force: BoolArray
+    tolerance_m: NDArray[np.float64]
+    interval_ticks: NDArray[np.int64]
+    """ticks from one update to the next"""
+    palm: BoolArray
+    base: BoolArray
+    percepts: BoolArray | None = None
+    """(kinds, n), rows as PERCEPT_KINDS; None: no percepts"""
+    action_requests: BoolArray | None = None
+    """pads that may get action requests"""
+
+
+class Demand:
+    """Scenes joined with subscriptions; call `update` after every tick: it calls `apply` after changes.
+
+    `disabled_by`: pad -> name of the client that disabled it.
+    """
+
+    def __init__(
+        self,
+        scenes: ActiveScenes,
+        subscribers: SubscriptionSource,
+        tick_hz: float,
+        apply: Callable[[RequestedOutputs, SceneRequirements, BoolArray, int], None],
+    ) -> None:
+        n = len(scenes.names)
+        self.scenes = scenes
+        self.disabled_by: dict[int, str] = {}
+        self.transformable = np.ones(n, dtype=np.bool_)
+        """pads whose contacts can be transformed to palm and base"""
+        self._subscribers, self._tick_hz, self._apply = subscribers, tick_hz, apply
+        self._merged_versions: object = None
+        self._disabled_version = 0
+        self.ticks_per_hand_frame = 1
+        """ticks per hand frame, as the most frequently updated pad requires"""
+        none = np.zeros(n, dtype=np.bool_)
+        self.requested = RequestedOutputs(none, none, np.zeros(n), np.ones(n, dtype=np.int64), none, none)
+
+    def update(self, now_ns: int) -> None:
+        """Merge scenes and subscriptions again if any of them changed."""
+        self.scenes.expire_leases(now_ns)
+        versions = self.scenes.version, self._disabled_version, self._subscribers.subscriptions
+        if versions != self._merged_versions:
+            self._merged_versions = versions
+            self._merge(now_ns)
+
+    def disable(self, pads: Sequence[int], by: str) -> None:
+        """Disable pads, on behalf of a named client."""
+        self.disabled_by.update(dict.fromkeys(pads, by))
+        self._disabled_version += 1
+
+    def enable(self, pads: Sequence[int]) -> None:
+        """Enable pads again."""
+        for pad in pads:
+            self.disabled_by.pop(pad, None)
+        self._disabled_version += 1
+
+    def describe_pads(self) -> list[dict[str, Any]]:
+        """Return as plain values, for each pad: computed outputs, skipped ones with the reason, scenes and
+        subscriptions."""
+        scenes = {
+            owner: (select_pads(scene.links, self.scenes.names), scene)
+            for owner, scene in self.scenes.by_owner().items()
+        }
+        described = []
+        for pad, (hand, link) in enumerate(self.scenes.names):
+            topics = (f"contact/{hand}/{link}".encode(), f"hand/{hand}".encode())
+            owners = [owner for owner, (chosen, _) in scenes.items() if chosen[pad]]
+            prefixes = [p for p in self._subscribers.subscriptions if any(t.startswith(p) for t in topics)]
+            subscribed = sorted(prefix.decode("utf-8", "replace") for prefix in prefixes)
+            computed, skipped = self._computed_and_skipped(pad, bool(subscribed))
+            described.append(
+                {
+                    "hand": hand,
+                    "link": link,
+                    "computed": computed,
+                    "not_computed": skipped,
+                    "scenes": owners,
+                    "subscriptions": subscribed,
+                    "tolerance_mm": float(self.requested.tolerance_m[pad]) * 1e3,
+                    "rate_hz": self._tick_hz / int(self.requested.interval_ticks[pad]),
+                }
+            )
+        return described
+
+    def _computed_and_skipped(self, pad: int, subscribed: bool) -> tuple[list[str], dict[str, str]]:
+        needed = self.scenes.requirements
+        raw = self._subscribers.has_subscriber(f"raw/{self.scenes.names[pad][0]}")
+        requested = self.requested
+        outputs = {
+            "position": requested.position,
+            "force": requested.force,
+            "palm": requested.palm,
+            "base": requested.base,
+        }
+        percepts: list[str] = []
+        if requested.percepts is not None:
+            percepts = [
+                kind for kind, pads in zip(PERCEPT_KINDS, requested.percepts, strict=True) if pads[pad]
+            ]
+        contacts = (output for output, pads in outputs.items() if pads[pad])
+        computed = ["contact", *contacts, *["raw"] * raw, *percepts]
+        skipped = {}
+        for output in ("contact", *outputs):
+            if pad in self.disabled_by:
+                skipped[output] = f"disabled by {self.disabled_by[pad]}"
+            elif not needed.pads[pad]:
+                skipped[output] = "in no scene"
+            elif output == "contact" or outputs[output][pad]:
+                if output in ("palm", "base") and not self.transformable[pad]:
+                    skipped[output] = "the hand has no URDF, or handtouch[urdf] isn't installed"
+            elif not subscribed:
+                skipped[output] = "no subscriber"
+            else:
+                skipped[output] = "in no scene's outputs"
+        if not raw:
+            skipped["raw"] = "no subscriber"
+        return [output for output in computed if output not in skipped], skipped
+
+    def _merge(self, now_ns: int) -> None:
+        names, needed, has = self.scenes.names, self.scenes.requirements, self._subscribers.has_subscriber
+        subscribed = np.array([has(f"contact/{hand}/{link}") or has(f"hand/{hand}") for hand, link in names])
+        enabled = np.ones(len(names), dtype=np.bool_)
+        enabled[list(self.disabled_by)] = False
+        subscribed &= enabled
+        in_scene = enabled & needed.pads
+        action_requests = in_scene & [has(f"percept/{hand}/action_request") for hand, _ in names]
+        percepts = np.array([[has(f"percept/{hand}/{kind}") for hand, _ in names] for kind in PERCEPT_KINDS])
+        percepts = in_scene & (percepts | needed.percepts | action_requests)
+        perceived = percepts.any(axis=0)
+        located = needed.position | needed.force  # force depends on the position
+        with np.errstate(divide="ignore"):
+            every = np.where(needed.pads & ~needed.raw, np.floor(self._tick_hz / needed.rate_hz + 1e-9), 1)
+        every = np.where(perceived, 1, np.maximum(every, 1))  # slip is detected in any tick
+        self.requested = RequestedOutputs(
+            position=subscribed & located | perceived,
+            force=subscribed & needed.force | perceived,
+            tolerance_m=np.where(located & ~perceived, needed.tolerance_m, 0.0),
+            interval_ticks=every.astype(np.int64),
+            palm=subscribed & needed.palm | perceived & self.transformable,
+            base=subscribed & needed.base,
+            percepts=percepts if perceived.any() else None,
+            action_requests=action_requests,
+        )
+        intervals = self.requested.interval_ticks[needed.pads]
+        self.ticks_per_hand_frame = int(intervals.min()) if len(intervals) else 1
+        self._apply(self.requested, needed, enabled, now_ns)

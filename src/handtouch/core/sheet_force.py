@@ -1,0 +1,345 @@
+"""Compensation of sheet behaviour (creep, adaptation, hysteresis) in forces, with their uncertainty.
+Positions need none: they follow from ratios of currents.
+
+Public names: `SheetForceCompensation`, `SheetBehaviour`, `sheet_behaviour_of`, `ForceReliability`,
+`ForceReference`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from handtouch import sheet
+from handtouch.config import Behaviour
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.intp]
+
+UPDATE_PERIOD_S = 0.1
+_MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
+_MIN_FORCE_N = 1e-6
+_MIN_UNTOUCHED_PROBABILITY = 0.3  # that no undetected press occurred in a pause, however long
+_MAX_FORCE_STD_FRACTION = 0.5  # of the force: above it, the force is invalid
+_HOUR_S = 3600.0
+_LOG_GAIN_STD_PER_HOUR = 0.05
+_MAX_LOG_GAIN_RATE_PER_S = 0.02
+_OUTLIER_SIGMA = 4.0
+_MAX_REFERENCE_OFFSET_NS = 50_000_000  # between a reference and the sample it is compared with
+_MIN_CONTACT_AGE_S = 1.0  # of a contact that is compared with a reference
+_MIN_REFERENCE_INTERVAL_S = 1.0  # references in quicker succession aren't independent
+
+
+class ForceReliability(IntEnum):
+    """Reliability of a pad's force."""
+
+    UNRELIABLE = 0  # too little evidence since the calibration, or baseline unknown
+    RELIABLE = 1
+    INVALID = 2  # the sheet's state determines no force any more
+
+
+class ForceReference(NamedTuple):
+    """Forces on pads (k,) rows, measured by another sensor (k,) [N], and their time."""
+
+    pads: IntArray
+    force_n: FloatArray
+    std_n: FloatArray
+    measured_ns: int
+
+
+@dataclass(frozen=True)
+class SheetBehaviour:
+    """Models of a `[sheet.NAME.behaviour]`, and the uncertainty of their parameters."""
+
+    model: sheet.SheetModel
+    uncertainty: sheet.ParameterUncertainty
+    gain_std: float
+    back_force_std_n: float
+    forget_time_s: float
+    slow_creep: float
+
+
+class SheetForceCompensation:
+    """Compensated forces of n pads; `behaviours`: sheet behaviour of each, None where it isn't modelled.
+
+    Public state: `force_n`, `std_n` (n,) compensated, of touched pads; `state` (n,) of `ForceReliability`;
+    evidence since the last calibration, `contacts` (n,) and `touched_s` (n,); `log_gain`, `log_gain_std`
+    (n,): log of the factor applied to compensated forces, from reference forces.
+    """
+
+    def __init__(self, behaviours: Sequence[SheetBehaviour | None], period_ns: int) -> None:
+        n = len(behaviours)
+        self.modelled = np.array([behaviour is not None for behaviour in behaviours], np.bool_)
+        self.any_modelled = bool(self.modelled.any())
+        self.force_n, self.std_n = np.full(n, np.nan), np.full(n, np.nan)
+        self.state = np.where(self.modelled, ForceReliability.UNRELIABLE, ForceReliability.RELIABLE).astype(
+            np.uint8
+        )
+        self.contacts, self.touched_s = np.zeros(n, np.int64), np.zeros(n)
+        self.log_gain = np.zeros(n)
+        self.log_gain_std = np.array([0.0 if b is None else b.gain_std for b in behaviours])
+        self._first_gain_std = self.log_gain_std.copy()
+        self._slow_creep = np.array([0.0 if b is None else b.slow_creep for b in behaviours])
+        self._last_touch_ns = np.zeros(n, np.int64)
+        self._gain = np.ones(n)
+        self._confirmed = np.zeros(n, np.bool_)
+        self._begin_s = np.zeros(n)  # `touched_s` when the contact began
+        self._compared_ns = np.zeros(n, np.int64)
+        self._period_ns = period_ns
+        self._updated_ns = np.zeros(1, np.int64)  # time of the sheets' state
+        self._apparent = np.zeros(n)
+        self._waited_s = np.zeros(1)  # since the last update of uncertainties
+        self._new_contacts = np.zeros(n, np.bool_)  # since then
+        self._relative_std = np.full(n, np.nan)  # standard deviation over force
+        self.groups = _BehaviourGroups(behaviours)
+
+    def with_behaviours(
+        self, before: Sequence[SheetBehaviour | None], behaviours: Sequence[SheetBehaviour | None]
+    ) -> SheetForceCompensation:
+        """Return self, or another object if behaviours changed; state of unchanged pads is kept."""
+        if behaviours == before:
+            return self
+        fresh = SheetForceCompensation(behaviours, self._period_ns)
+        kept = np.array([old == new for old, new in zip(before, behaviours, strict=True)])
+        for name in ("force_n", "std_n", "state", "contacts", "touched_s", "log_gain", "log_gain_std"):
+            getattr(fresh, name)[kept] = getattr(self, name)[kept]
+        fresh._gain[:] = np.exp(fresh.log_gain)
+        fresh._updated_ns[:] = self._updated_ns
+        for pad in np.flatnonzero(kept & self.modelled).tolist():
+            group, row = self.groups.find(pad)
+            fresh.set_back_force(
+                pad, group.compensator.back_n[row], group.compensator.back_std_n[row], confirmed=False
+            )
+        fresh._confirmed[kept] = self._confirmed[kept]
+        return fresh
+
+    def set_back_force(self, pad: int, back_n: float, std_n: float, *, confirmed: bool = True) -> None:
+        """Set the back force of a pad's sheet [N], e.g. from a store; `confirmed`: its forces are reliable
+        without further evidence. Ignored for a pad without sheet model."""
+        if not self.modelled[pad]:
+            return
+        group, row = self.groups.find(pad)
+        back, spread = group.compensator.back_n.copy(), group.compensator.back_std_n.copy()
+        back[row], spread[row] = back_n, std_n
+        group.compensator.set_back_force(back, spread)
+        self._confirmed[pad] |= confirmed
+
+    def reset_evidence(self, pad: int, *, new_sheet: bool = False) -> None:
+        """Restart the evidence: the pad has another calibration, and perhaps another sheet."""
+        self.contacts[pad], self.touched_s[pad], self._begin_s[pad] = 0, 0.0, 0.0
+        self._confirmed[pad] = False
+        self.log_gain[pad], self._gain[pad] = 0.0, 1.0
+        self.log_gain_std[pad] = self._first_gain_std[pad]
+        if self.modelled[pad]:
+            self.state[pad] = ForceReliability.UNRELIABLE
+            if new_sheet:
+                group, row = self.groups.find(pad)
+                group.compensator.reset_pads(np.array([row]))
+
+    @property
+    def back_force(self) -> tuple[FloatArray, FloatArray]:
+        """Back force of each sheet and its standard deviation (n,) [N]; NaN where not modelled."""
+        back, std = np.full(len(self.force_n), np.nan), np.full(len(self.force_n), np.nan)
+        for group in self.groups.all:
+            back[group.rows], std[group.rows] = group.compensator.back_n, group.compensator.back_std_n
+        return back, std
+
+    def begin_contacts(self, began: IntArray) -> None:
+        """Note contacts that began on these pads. In the pause before, a press below the threshold may have
+        wiped the back force: take the mean of both possibilities, and their difference as uncertainty."""
+        pause_s = (self._updated_ns[0] - self._last_touch_ns[began]) * 1e-9
+        for group in self.groups.all:
+            rows = np.searchsorted(group.pads, began)
+            here = np.flatnonzero(group.pads[np.minimum(rows, len(group.pads) - 1)] == began)
+            group.decay_back_force(rows[here], pause_s[here])
+        self.contacts[began] += 1
+        self._begin_s[began] = self.touched_s[began]
+        self._new_contacts[began] = True
+
+    def compensate_forces(
+        self, uncompensated_n: FloatArray, uncompensated_std_n: FloatArray, touching: BoolArray, sync_ns: int
+    ) -> IntArray:
+        """Advance all sheets to `sync_ns` and compensate the forces of touched pads with a model; return
+        these pads (k,).
+
+        uncompensated_n, uncompensated_std_n: (n,) of the contact law [N]; untouched pads count as 0.
+        """
+        dt_s = self._interval_s(sync_ns)
+        apparent = self._apparent
+        apparent.fill(0.0)
+        np.copyto(apparent, uncompensated_n, where=touching)
+        for group in self.groups.all:
+            load = group.compensator.compensate(apparent[group.rows], dt_s)
+            self.force_n[group.rows] = load
+        self._waited_s[0] += dt_s
+        pressed: IntArray = (touching & self.modelled).nonzero()[0]
+        if not len(pressed):
+            self._waited_s[0] = 0.0
+            return pressed
+        self._last_touch_ns[pressed] = self._updated_ns
+        force = self.force_n.take(pressed) * self._gain.take(pressed)
+        if self._waited_s[0] >= UPDATE_PERIOD_S or np.count_nonzero(self._new_contacts):
+            self._update_uncertainty(pressed, force, uncompensated_std_n, touching)
+        self.force_n[pressed] = force
+        self.std_n[pressed] = force * self._relative_std.take(pressed)
+        return pressed
+
+    def update_gains(
+        self, reference: ForceReference, sample_ns: npt.NDArray[np.int64], touching: BoolArray
+    ) -> int:
+        """Compare forces with a reference: a scalar Kalman filter on each pad's log gain, limited to 2 % a
+        second. `sample_ns` (n,): times of the pads' samples. Return the number of pads updated; references
+        that are late, unsteady, not positive or outliers are ignored."""
+        pads = np.asarray(reference.pads)
+        force, estimated = np.asarray(reference.force_n, np.float64), self.force_n[pads]
+        since_s = (reference.measured_ns - self._compared_ns[pads]) * 1e-9
+        with np.errstate(all="ignore"):
+            usable = self.modelled[pads] & touching[pads] & (force > 0) & (estimated > 0)
+            usable &= np.abs(sample_ns[pads] - reference.measured_ns) <= _MAX_REFERENCE_OFFSET_NS
+            usable &= self.touched_s[pads] - self._begin_s[pads] >= _MIN_CONTACT_AGE_S
+            usable &= since_s >= _MIN_REFERENCE_INTERVAL_S
+            pads, force, estimated = pads[usable], force[usable], estimated[usable]
+            since_s = since_s[usable]
+            excess = np.log(force / estimated)
+            spread = np.square(self.log_gain_std[pads])
+            sheets = np.maximum(np.square(self.std_n[pads] / estimated) - spread, 0.0)
+            noise = np.square(np.asarray(reference.std_n, np.float64)[usable] / force) + sheets
+        since_s = np.minimum(since_s, _HOUR_S)
+        spread = spread + np.square(_LOG_GAIN_STD_PER_HOUR) * since_s / _HOUR_S
+        used = np.isfinite(excess) & (np.square(excess) <= _OUTLIER_SIGMA**2 * (spread + noise))
+        pads, excess, since_s = pads[used], excess[used], since_s[used]
+        spread, noise = spread[used], noise[used]
+        gain = spread / (spread + noise)
+        most = _MAX_LOG_GAIN_RATE_PER_S * np.minimum(since_s, 60.0)
+        move = np.clip(gain * excess, -most, most)
+        self.log_gain[pads] += move
+        clipped = np.abs(gain * excess - move)
+        self.log_gain_std[pads] = np.sqrt((1 - gain) * spread + np.square(clipped))
+        self._gain[pads] = np.exp(self.log_gain[pads])
+        self._compared_ns[pads] = reference.measured_ns
+        self._confirmed[pads] = True
+        return len(pads)
+
+    def _update_uncertainty(
+        self, pressed: IntArray, force: FloatArray, uncompensated_std_n: FloatArray, touching: BoolArray
+    ) -> None:
+        """Update standard deviations and reliability of touched pads; periodically and at contact begin."""
+        self.touched_s += self._waited_s * touching
+        self._waited_s[0] = 0.0
+        self._new_contacts[:] = False
+        for group in self.groups.all:
+            self.std_n[group.rows] = group.compensator.std_n()
+        variance = np.square(self.std_n[pressed]) + np.square(uncompensated_std_n[pressed])
+        held_s = self.touched_s[pressed] - self._begin_s[pressed]
+        wander = self._slow_creep[pressed] * np.log1p(held_s / _MIN_CONTACT_AGE_S)
+        variance += np.square(force) * (np.square(self.log_gain_std[pressed]) + np.square(wander))
+        std = np.sqrt(variance)
+        self._relative_std[pressed] = std / np.maximum(force, _MIN_FORCE_N)
+        enough = (self.contacts[pressed] >= _MIN_CONTACTS) & (self.touched_s[pressed] >= _MIN_TOUCHED_S)
+        known = enough | self._confirmed[pressed]
+        sane = std < _MAX_FORCE_STD_FRACTION * force  # False for what isn't finite
+        self.state[pressed] = np.where(sane, known, ForceReliability.INVALID)
+
+    def _interval_s(self, sync_ns: int) -> float:
+        """Return the whole periods since the last tick (equal intervals are cheapest), keeping the rest."""
+        elapsed_ns = sync_ns - int(self._updated_ns[0])
+        if elapsed_ns > 10**9 * _HOUR_S or elapsed_ns < 0:
+            self._updated_ns[0] = sync_ns
+            return 0.0
+        periods = (elapsed_ns + self._period_ns // 2) // self._period_ns
+        self._updated_ns[0] += periods * self._period_ns
+        return periods * self._period_ns * 1e-9
+
+
+class _BehaviourGroups:
+    """Pads by sheet behaviour; groups are attributes, where `core.state` finds their state."""
+
+    def __init__(self, behaviours: Sequence[SheetBehaviour | None]) -> None:
+        kinds = dict.fromkeys(b for b in behaviours if b is not None)
+        for number, kind in enumerate(kinds):
+            setattr(
+                self, f"group{number}", _BehaviourGroup(kind, np.flatnonzero([b == kind for b in behaviours]))
+            )
+
+    @property
+    def all(self) -> Iterable[_BehaviourGroup]:
+        return vars(self).values()
+
+    def find(self, pad: int) -> tuple[_BehaviourGroup, int]:
+        """Return the group of a pad, and its row there."""
+        return next((g, int(g.pads.searchsorted(pad))) for g in self.all if pad in g.pads)
+
+
+class _BehaviourGroup:
+    """Pads of equal sheet behaviour."""
+
+    def __init__(self, behaviour: SheetBehaviour, pads: IntArray) -> None:
+        self.pads = pads
+        whole = len(pads) == pads[-1] - pads[0] + 1
+        self.rows: slice | IntArray = slice(int(pads[0]), int(pads[-1]) + 1) if whole else pads
+        self._forget_time_s = behaviour.forget_time_s
+        self.compensator = sheet.SheetCompensator(
+            behaviour.model, len(pads), behaviour.uncertainty, update_period_s=UPDATE_PERIOD_S
+        )
+        if behaviour.back_force_std_n:
+            self.compensator.set_back_force(0.0, behaviour.back_force_std_n)
+
+    def decay_back_force(self, rows: IntArray, pause_s: FloatArray) -> None:
+        """Update back forces of rows after a pause. An undetected press may have wiped them, more probably
+        the longer the pause and the larger the back force; else they are unchanged. Set mean and variance
+        over both. The rate of such presses is unknown (exponential prior), and without activity it is 0: the
+        probability never reaches 1, and both possibilities stay within 1.96 standard deviations."""
+        back, std = self.compensator.back_n, self.compensator.back_std_n
+        kept = _MIN_UNTOUCHED_PROBABILITY + (1 - _MIN_UNTOUCHED_PROBABILITY) / (
+            1 + pause_s / self._forget_time_s * back[rows]
+        )
+        std[rows] = np.sqrt(kept * (np.square(std[rows]) + (1 - kept) * np.square(back[rows])))
+        back[rows] *= kept
+
+
+def sheet_behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
+    """Build the preset with the deployment's changes, and the uncertainty of its parameters."""
+    preset = {"S1": sheet.S1, "S2": sheet.S2}[behaviour.preset]
+    adaptation, creep, noise = preset.adaptation, preset.creep, preset.fluctuation
+    share, time_s = 1 - creep.instant, creep.times_s[0]
+    share = share if behaviour.creep_share is None else behaviour.creep_share
+    time_s = time_s if behaviour.creep_time_s is None else behaviour.creep_time_s
+    changed = {
+        "share": behaviour.adaptation_share,
+        "time_s": behaviour.adaptation_time_s,
+        "recovery_s": behaviour.recovery_time_s,
+        "fatigue_s": behaviour.fatigue_s,
+        "threshold_n": behaviour.threshold_n,
+    }
+    model = replace(
+        preset,
+        adaptation=replace(adaptation, **{key: value for key, value in changed.items() if value is not None}),
+        creep=sheet.Creep.first_order(1 - share, time_s) if share else sheet.Creep(1.0, (), ()),
+        fluctuation=noise if behaviour.press_std is None else replace(noise, press_std=behaviour.press_std),
+    )
+    if behaviour.hysteresis_width:
+        loop = sheet.PrandtlIshlinskii.from_width(
+            behaviour.hysteresis_width, behaviour.hysteresis_full_scale_n
+        )
+        model = replace(model, hysteresis=loop)
+    uncertainty = sheet.ParameterUncertainty(
+        behaviour.parameter_std_fraction,
+        behaviour.parameter_std_fraction,
+        behaviour.parameter_std_fraction,
+        math.inf,
+    )
+    return SheetBehaviour(
+        model,
+        uncertainty,
+        behaviour.gain_std,
+        behaviour.back_force_std_n,
+        behaviour.forget_time_s,
+        behaviour.slow_creep,
+    )

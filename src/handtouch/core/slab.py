@@ -1,0 +1,191 @@
+"""The slab: the latest sample of every pad, written straight from the bus and unpacked once a tick.
+
+A PDO's data is a little-endian word of 64 bits and a channel a bit field of one such word, so that samples of
+any width and mapping are stored as received and unpacked for the whole hand at once.
+
+Public names: `Slab`, `ChannelField`, `ChannelLayout`, `STANDARD_LAYOUT`, `MAX_PDOS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.config.channels import integer_limits
+
+MAX_PDOS = 4
+"""Most PDOs that the four channels of a pad may be spread over."""
+PDO_BYTES = 8
+_WORD_BITS = 8 * PDO_BYTES
+_SAMPLE_BYTES = MAX_PDOS * PDO_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelField:
+    """Bit field of a channel: PDO of its pad (0 to 3), first bit, and integer type."""
+
+    pdo: int
+    first_bit: int
+    bits: int
+    signed: bool
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """Lowest and highest count of the channel."""
+        return integer_limits(self.bits, self.signed)
+
+
+ChannelLayout = tuple[ChannelField, ChannelField, ChannelField, ChannelField]
+"""Fields of the electrodes x0, xa, y0, yb."""
+
+STANDARD_LAYOUT: ChannelLayout = (
+    ChannelField(0, 0, 16, True),
+    ChannelField(0, 16, 16, True),
+    ChannelField(0, 32, 16, True),
+    ChannelField(0, 48, 16, True),
+)
+"""Four int16 in one PDO (CiA 401: object 0x6401 sub 1 to 4)."""
+
+
+class Slab:
+    """Latest complete sample of each of `size` pads, as arrays in memory that the receive path writes.
+
+    `arrival_ns` (size,) int64 arrival of its last PDO on the host's monotonic clock, 0 before the first;
+    `fresh` (size,) uint8, 1 if it arrived since `begin_cycle`; `repeat_counts` (size,) int64, samples that
+    replaced a fresh one.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.arrival_ns: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
+        self.repeat_counts: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
+        self.fresh_count = 0
+        self._bytes = bytearray(size * _SAMPLE_BYTES)
+        self._words: NDArray[np.int64] = np.frombuffer(self._bytes, dtype="<i8")
+        # memoryviews: no boxing of numpy scalars, which costs 50 ns
+        self._arrival_ns, self._repeat_counts = self.arrival_ns.data, self.repeat_counts.data
+        self._fresh = bytearray(size)
+        self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
+        self._is_fresh = self.fresh.view(np.bool_)
+        self._standard_counts = np.frombuffer(self._bytes, dtype="<i2").reshape(size, _SAMPLE_BYTES // 2)[
+            :, :4
+        ]
+        self._has_standard_layout = np.ones(size, dtype=np.bool_)
+        self._all_standard = True
+        self._required_pdos = [1] * size  # bit set of the PDOs of a sample
+        self._partial_samples: dict[int, _PartialSample] = {}  # of pads with several PDOs
+        self._word_indices = np.zeros((size, 4), dtype=np.intp)
+        self._left_shifts = np.zeros((size, 4), dtype=np.int64)
+        self._right_shifts = np.zeros((size, 4), dtype=np.int64)
+        self._unsigned_masks: NDArray[np.int64] | None = None  # applied after the shifts
+        self._low_limits = np.zeros((size, 4), dtype=np.int64)
+        self._high_limits = np.zeros((size, 4), dtype=np.int64)
+        self._counts = np.zeros((size, 4), dtype=np.int64)
+        for slot in range(size):
+            self.set_layout(slot, STANDARD_LAYOUT)
+
+    def set_layout(self, slot: int, layout: ChannelLayout) -> None:
+        """Set the channel fields of a slot, STANDARD_LAYOUT by default; its present sample is discarded."""
+        for channel, field in enumerate(layout):
+            self._word_indices[slot, channel] = slot * MAX_PDOS + field.pdo
+            self._left_shifts[slot, channel] = _WORD_BITS - field.first_bit - field.bits
+            self._right_shifts[slot, channel] = _WORD_BITS - field.bits
+            low, high = field.limits
+            # an amplifier at its limit gives either of the two lowest counts; a current of zero is no limit
+            self._low_limits[slot, channel] = low + 1 if field.signed else -1
+            self._high_limits[slot, channel] = high
+        required = 0
+        for field in layout:
+            required |= 1 << field.pdo
+        self._required_pdos[slot] = required
+        self._has_standard_layout[slot] = layout == STANDARD_LAYOUT
+        self._all_standard = bool(self._has_standard_layout.all())
+        self._partial_samples.pop(slot, None)
+        if required != 1:
+            self._partial_samples[slot] = _PartialSample(frozenset(field.pdo for field in layout))
+        self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = bytes(_SAMPLE_BYTES)
+        unsigned = self._low_limits == -1
+        self._unsigned_masks = np.where(unsigned, self._high_limits, -1) if unsigned.any() else None
+
+    def write_pdo(self, slot: int, data: bytes | bytearray, arrival_ns: int, pdo: int = 0) -> None:
+        """Store a PDO of a slot, at most 8 bytes; `pdo` as numbered by the slot's layout.
+
+        A sample counts when all its PDOs have arrived; a second one within a cycle replaces the first. One of
+        several PDOs is dropped if the previous SYNC brought fewer than all: the missing ones may arrive now.
+        """
+        if self._required_pdos[slot] == 1:
+            start = slot * _SAMPLE_BYTES
+            self._bytes[start : start + len(data)] = data
+        elif self._partial_samples[slot].add_pdo(pdo, data, arrival_ns):
+            self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = self._partial_samples[slot].data
+        else:
+            return
+        self._arrival_ns[slot] = arrival_ns
+        if self._fresh[slot]:
+            self._repeat_counts[slot] += 1
+        else:
+            self._fresh[slot] = 1
+            self.fresh_count += 1
+
+    def unpack_counts(self) -> NDArray[np.int64]:
+        """Return counts (size, 4) of the electrodes x0, xa, y0, yb; the array is reused by the next call."""
+        counts = self._counts
+        if self._all_standard:
+            np.copyto(counts, self._standard_counts)
+            return counts
+        np.take(self._words, self._word_indices, out=counts, mode="clip")
+        np.left_shift(counts, self._left_shifts, out=counts)
+        np.right_shift(counts, self._right_shifts, out=counts)
+        if self._unsigned_masks is not None:
+            np.bitwise_and(counts, self._unsigned_masks, out=counts)
+        return counts
+
+    def saturated(self, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which of the counts (size, 4) are at a limit of their channel's range."""
+        return (counts >= self._high_limits) | (counts <= self._low_limits)
+
+    @property
+    def limits(self) -> NDArray[np.int64]:
+        """Counts (size, 8) at which the four channels are at the bottom and at the top of their range."""
+        return np.hstack([self._low_limits, self._high_limits])
+
+    def begin_cycle(self, sync_ns: int) -> None:
+        """Begin a cycle at a SYNC: samples that arrived since then are fresh, even if before this call."""
+        np.greater_equal(self.arrival_ns, sync_ns, out=self._is_fresh)
+        self.fresh_count = int(np.count_nonzero(self.fresh))
+        for parts in self._partial_samples.values():
+            parts.begin_cycle(sync_ns)
+
+
+class _PartialSample:
+    """A sample of several PDOs, `required`, while it is incomplete."""
+
+    def __init__(self, required: frozenset[int]) -> None:
+        self.data = bytearray(_SAMPLE_BYTES)
+        self._required = required
+        self._missing = set(required)
+        self._first_arrival_ns: dict[int, int] = {}  # PDO -> first arrival in this cycle
+        self._last_arrival_ns: dict[int, int] = {}
+        self._mixes_cycles = False
+
+    def add_pdo(self, pdo: int, data: bytes | bytearray, arrival_ns: int) -> bool:
+        """Store a PDO; return True when the sample is complete and of one SYNC."""
+        start = pdo * PDO_BYTES
+        self.data[start : start + len(data)] = data
+        self._first_arrival_ns.setdefault(pdo, arrival_ns)
+        self._last_arrival_ns[pdo] = arrival_ns
+        self._missing.discard(pdo)
+        if self._missing:
+            return False
+        self._missing |= self._required
+        return not self._mixes_cycles
+
+    def begin_cycle(self, sync_ns: int) -> None:
+        """Drop PDOs from before the SYNC; PDOs arriving late in the next cycle look as if they were of it."""
+        first, last = self._first_arrival_ns, self._last_arrival_ns
+        self._mixes_cycles = any(first.get(pdo, sync_ns) >= sync_ns for pdo in self._required)
+        self._last_arrival_ns = {pdo: at for pdo, at in last.items() if at >= sync_ns}
+        self._first_arrival_ns = dict(self._last_arrival_ns)
+        self._missing = set(self._required - self._last_arrival_ns.keys()) or set(self._required)

@@ -1,0 +1,511 @@
+"""The tick: one vectorised pass from the slab's counts to the contacts of all hands.
+
+counts -> currents -> touched pads -> position and force of those -> link frame -> begin, update, end.
+Free of I/O and clocks: the state is in `TickProcessor`, the time is an argument.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch import wire
+from handtouch.core.baseline import Baseline
+from handtouch.core.contacts import BoolArray, ContactDetector, IntArray
+from handtouch.core.cycle import Cycle
+from handtouch.core.linearisation import (
+    FORCE_COLUMN,
+    MAX_GAUSS_NEWTON_DISTANCE,
+    NORMAL_COLUMNS,
+    PAD_COLUMNS,
+    POSITION_COLUMNS,
+    RESIDUAL_COLUMN,
+    VALUE_COUNT,
+    XY_COLUMNS,
+    ContactLinearisations,
+    ContactSolution,
+)
+from handtouch.core.pad_model import PadModel
+from handtouch.core.sheet_force import ForceReference, ForceReliability, SheetForceCompensation
+from handtouch.core.slab import Slab
+from handtouch.wire import PadState
+
+FloatArray = NDArray[np.float64]
+_MAX_SAMPLE_AGE_PERIODS = 3
+_MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION = 10.0, 0.02
+"""Most negative plausible current of a channel: in noise sigma, and as a fraction of all channels."""
+# plain ints: looking up enum members costs a microsecond each
+_CLEAR, _TOUCHED, _STALE, _FAULTED = map(
+    int, (PadState.CLEAR, PadState.TOUCHED, PadState.STALE, PadState.FAULTED)
+)
+_UNRELIABLE, _INVALID = int(ForceReliability.UNRELIABLE), int(ForceReliability.INVALID)
+_NO_LIMIT_NS = np.iinfo(np.int64).max
+_CONTACT_COLUMNS = (
+    *("pad_m", "residual", "position_m", "normal", "force_n"),  # evaluated in every tick, in this order
+    *("force_std_n", "residual_std", "covariance_m2"),
+)
+CONTACT_DTYPE = np.dtype(
+    [
+        (name, column.dtype, (column.elements,) if column.elements > 1 else ())
+        for name in _CONTACT_COLUMNS
+        for column in (wire.COLUMNS[wire.HandFrame][name],)
+    ]
+)
+"""Columns of the hand frame that are written per contact."""
+_EVALUATED_VALUES = VALUE_COUNT - PAD_COLUMNS.start
+"""Leading float32 values of CONTACT_DTYPE that are evaluated in every tick."""
+_ALL_CHANNELS = np.ones(4)
+_RELINEARISE_DISTANCE = 0.7
+"""Fraction of a linearisation's range beyond which it is renewed, before the contact leaves it."""
+_RELINEARISE_ALONG_DISTANCE = 0.3
+"""Beyond this fraction it is renewed together with one that must be: each further one costs a tenth."""
+_SMOOTHING_TICKS = 4
+"""Time constant of exponential smoothing; it lags one tick less behind a steady change."""
+_NONE_SOLVED = np.zeros(0, dtype=np.intp), np.zeros((0, 4))
+
+
+@dataclass(frozen=True)
+class PadColumns:
+    """State and contact values of n pads; a row keeps its last values until newer ones are computed."""
+
+    state: NDArray[np.uint8]
+    """PadState"""
+    sample_ns: NDArray[np.int64]
+    """SYNC of the newest sample, 0 before the first"""
+    total_current_a: FloatArray
+    """sum of the four channels"""
+    values: FloatArray
+    """(n, VALUE_COUNT) contact values from the currents of each tick; the six below are views of it"""
+    xy: FloatArray
+    """(n, 2) position on the pad's rectangle"""
+    position_m: FloatArray
+    """(n, 3) in the link frame; NaN without a valid position"""
+    normal: FloatArray
+    """(n, 3)"""
+    pad_m: FloatArray
+    """(n, 2) arc lengths from the electrodes x0 and y0"""
+    residual: FloatArray
+    force_n: FloatArray
+    """NaN without a valid force; a lower bound where `force_saturated`"""
+    uncompensated_force_n: FloatArray
+    """force of the contact law, before the sheet behaviour is compensated"""
+    force_std_n: FloatArray
+    covariance_m2: FloatArray
+    """(n, 3, 3); this and the following belong to the contact's last solution"""
+    force_saturated: NDArray[np.bool_]
+    residual_std: FloatArray
+    """of a point contact, from channel noise"""
+    contact_columns: NDArray[np.void]
+    """published contact columns, as CONTACT_DTYPE; all NaN without contact"""
+
+    @classmethod
+    def empty(cls, n: int) -> PadColumns:
+        """Return columns of n pads without samples."""
+
+        def unknown(*shape: int) -> FloatArray:
+            return np.full((n, *shape), np.nan)
+
+        values = unknown(VALUE_COUNT)
+        return cls(
+            state=np.full(n, PadState.STARTING, dtype=np.uint8),
+            sample_ns=np.zeros(n, dtype=np.int64),
+            total_current_a=np.zeros(n),
+            values=values,
+            xy=values[:, XY_COLUMNS],
+            position_m=values[:, POSITION_COLUMNS],
+            normal=values[:, NORMAL_COLUMNS],
+            pad_m=values[:, PAD_COLUMNS],
+            residual=values[:, RESIDUAL_COLUMN],
+            force_n=values[:, FORCE_COLUMN],
+            uncompensated_force_n=unknown(),
+            force_std_n=unknown(),
+            covariance_m2=unknown(3, 3),
+            force_saturated=np.zeros(n, dtype=np.bool_),
+            residual_std=unknown(),
+            contact_columns=np.full((n, CONTACT_DTYPE.itemsize // 4), np.nan, dtype="<f4").view(
+                CONTACT_DTYPE
+            )[:, 0],
+        )
+
+
+class TickResult(NamedTuple):
+    """Rows of the columns that one tick changed."""
+
+    sync_ns: int
+    began: IntArray
+    updated: IntArray
+    """contacts with a new sample that did not begin in this tick"""
+    ended: IntArray
+
+
+class TickProcessor:
+    """State of all pads from tick to tick."""
+
+    def __init__(self, model: PadModel, period_ns: int) -> None:
+        self.model = model
+        self.columns = PadColumns.empty(model.size)
+        self.contacts = ContactDetector(
+            model.begin_threshold_a, model.end_threshold_a, model.begin_samples, model.end_samples
+        )
+        self.counts: NDArray[np.int64] = np.zeros((model.size, 4), dtype=np.int64)
+        """counts of the last tick"""
+        self.sample_counts = np.zeros(model.size, dtype=np.int64)
+        """samples received"""
+        self.missed_sample_counts = np.zeros(model.size, dtype=np.int64)
+        """expected samples that arrived after their tick or not at all"""
+        self.max_sample_period_ns = np.full(model.size, period_ns, dtype=np.int64)
+        """longest time between two samples of a pad"""
+        self.period_since_ns = np.zeros(model.size, dtype=np.int64)
+        """time at which `max_sample_period_ns` was set"""
+        self.synchronous = np.ones(model.size, dtype=np.bool_)
+        """pads sampled by SYNC; the others are event-driven and not waited for"""
+        self.position_requested = np.ones(model.size, dtype=np.bool_)
+        """pads whose contact position is computed; see `set_requested`"""
+        self.state_changed = False
+        """something other than a tick changed the state; read and reset by `TickJournal`"""
+        self.baseline = Baseline(
+            model.noise_counts,
+            model.begin_threshold_counts,
+            model.end_threshold_counts,
+            model.max_rise_time_s,
+            model.rows_of_hand.values(),
+        )
+        """counts of untouched pads"""
+        self.sheet_force = SheetForceCompensation(model.behaviours, period_ns)
+        """compensation of creep, adaptation and hysteresis"""
+        self.linearisations = ContactLinearisations(model)
+        self._last_solved = _NONE_SOLVED  # pads and currents of the contacts of the last tick
+        self._smoothed_currents = np.full((model.size, 4), np.nan)  # lagging behind the present ones
+        self._contact_rows = self.columns.contact_columns.view("<f4").reshape(model.size, -1)
+        self._no_pads = np.zeros(model.size, dtype=np.bool_)
+        self._sampled, self._trusted = self._no_pads.copy(), self._no_pads.copy()  # of the last tick
+        self._baseline_samples_added = True  # of the last tick
+        self._tick_count = 0
+        self._update_interval_ticks = np.ones(model.size, dtype=np.int64)
+        self._some_skipped = False  # some output isn't requested in every tick
+        self._min_counts = -_MAX_NEGATIVE_SIGMA * model.noise_counts[:, None]
+        self._excess = np.zeros((model.size, 4))  # counts above the baseline
+        self._currents = np.zeros((model.size, 4))
+        self._law_std_n = np.full(model.size, np.nan)  # of forces, from noise and contact radius
+        self._uncompensated_std_n = np.full(model.size, np.nan)  # including the baseline
+        self._sync_ns = 0
+        self._used_arrival_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the newest used samples
+
+    def expected_pads(self) -> NDArray[np.bool_]:
+        """Return the pads whose sample a tick waits for: those alive and sampled by SYNC."""
+        return np.asarray((self.columns.state <= _TOUCHED) & self.synchronous)
+
+    def set_requested(
+        self,
+        position: BoolArray,
+        force: BoolArray,
+        tolerance_m: FloatArray,
+        interval_ticks: NDArray[np.int64],
+    ) -> None:
+        """Restrict positions, forces and updates to the requested pads; all (n,), copied."""
+        if self.sheet_force.any_modelled:  # the sheet's history needs every contact
+            position, force = position | self.sheet_force.modelled, force | self.sheet_force.modelled
+        changed = np.flatnonzero(
+            (position != self.position_requested) | (force != self.linearisations.force_requested)
+        )
+        self.discard_solutions(changed)
+        self.linearisations.force_requested[:], self.linearisations.tolerance_m[:] = force, tolerance_m
+        self.position_requested[:], self._update_interval_ticks[:] = position, interval_ticks
+        self._some_skipped = not (position.all() and (interval_ticks == 1).all())
+
+    def is_force_unreliable(self, pads: slice | int) -> BoolArray:
+        """Return the touched pads whose force is unreliable: baseline or sheet state is not known well
+        enough yet."""
+        unreliable = self.baseline.unknown_in_contact[pads] | (self.sheet_force.state[pads] == _UNRELIABLE)
+        return np.asarray(unreliable & self.contacts.touching[pads])
+
+    def position_noise_covariance(self, pads: IntArray) -> FloatArray:
+        """Return the covariance (k, 2, 2) of arc lengths on pads (k,) that is independent in each sample."""
+        return self.linearisations.position_noise_covariance(pads, self._currents.take(pads, axis=0))
+
+    def solve_all(self) -> None:
+        """Compute position and force of every touched pad, requested or not; valid until `set_requested`."""
+        everything = ~self._no_pads
+        self.set_requested(
+            everything, everything, self.linearisations.tolerance_m, self._update_interval_ticks
+        )
+        touching = np.flatnonzero(self.contacts.touching)
+        if len(touching):
+            self._solve_contacts(touching)
+            self._store_compensated_forces(np.flatnonzero(self.contacts.touching & self.sheet_force.modelled))
+
+    def set_baseline(self, pad: int, offset_counts: ArrayLike, std_counts: ArrayLike = 0.0) -> None:
+        """Set the untouched counts (4,) of a pad and their standard deviation, from a store or a tare."""
+        self.baseline.set_offset(pad, offset_counts, std_counts)
+        self.state_changed = True
+
+    def reset_pad(self, pad: int) -> None:
+        """Forget what was learned of a pad: its node and sheet were replaced."""
+        self.baseline.reset_pad(pad)
+        self.sheet_force.reset_evidence(pad, new_sheet=True)
+        self.state_changed = True
+
+    def set_gravity(self, gravity: FloatArray) -> None:
+        """Set the direction of gravity in each link's frame (n, 3), NaN where unknown."""
+        self.baseline.set_gravity(gravity)
+
+    def update_force_gains(self, reference: ForceReference) -> int:
+        """Compare forces with an external measurement; return the number of pads whose gain was updated."""
+        return self.sheet_force.update_gains(reference, self.columns.sample_ns, self.contacts.touching)
+
+    def replace_model(self, model: PadModel, changed: IntArray) -> None:
+        """Continue with another model of the same pads, `changed` of which differ; contacts continue."""
+        self.sheet_force = self.sheet_force.with_behaviours(self.model.behaviours, model.behaviours)
+        self.baseline.set_settings(
+            model.noise_counts,
+            model.begin_threshold_counts,
+            model.end_threshold_counts,
+            model.max_rise_time_s,
+        )
+        for pad in changed.tolist():
+            self.sheet_force.reset_evidence(pad)
+        before, self.model = self.linearisations, model
+        self.linearisations = ContactLinearisations(model)
+        self.linearisations.share_state(before)
+        self._min_counts = -_MAX_NEGATIVE_SIGMA * model.noise_counts[:, None]
+        self.discard_solutions(changed)
+        self.contacts.set_thresholds(
+            model.begin_threshold_a, model.end_threshold_a, model.begin_samples, model.end_samples
+        )
+
+    def discard_solutions(self, pads: IntArray) -> None:
+        """Discard the values and linearisations of these pads."""
+        columns = self.columns
+        self.state_changed = True
+        self.linearisations.discard(pads)
+        columns.values[pads] = columns.force_std_n[pads] = self._contact_rows[pads] = np.nan
+        columns.uncompensated_force_n[pads] = np.nan
+
+    def run_tick(
+        self,
+        slab: Slab,
+        node_state: NDArray[np.uint8],
+        cycle: Cycle,
+        now_ns: int,
+        until_ns: int = _NO_LIMIT_NS,
+    ) -> TickResult:
+        """Process the samples of a cycle, and those of the previous one that arrived after its tick.
+
+        `now_ns` is the time of the tick; samples that arrived at `until_ns` or later belong to the next
+        cycle. `node_state` (n,): PadState.CLEAR where the node is up, else the state to give its pad.
+        """
+        model, columns, contacts = self.model, self.columns, self.contacts
+        self._add_baseline_samples()
+        operational = np.logical_not(node_state)  # CLEAR is 0
+        sampled = self._update_samples(slab, operational, cycle, until_ns)
+        self.counts = counts = slab.unpack_counts()
+        excess = np.subtract(counts, self.baseline.expected_counts, out=self._excess)
+        implausible, stale = self._find_implausible(counts, slab), self._find_stale(now_ns, sampled)
+        trusted = operational
+        if not (implausible is self._no_pads is stale):
+            trusted = operational & ~(implausible | stale)
+        np.multiply(excess, model.ampere_per_count, out=self._currents)
+        np.copyto(columns.total_current_a, self._currents @ _ALL_CHANNELS, where=sampled)
+        began, ended, measured = contacts.detect_contacts(
+            columns.total_current_a, sampled, trusted, columns.sample_ns
+        )
+        self._resolve_states(node_state, operational, implausible, stale)
+        if len(began):
+            columns.values[began] = np.nan  # not a starting point: it is of the contact before
+            self.linearisations.discard(began)
+            self._smoothed_currents[began] = np.nan
+            self.baseline.begin_contacts(began)
+            self.sheet_force.begin_contacts(began)
+        self._sampled, self._trusted, self._baseline_samples_added = sampled, trusted, False
+        self._sync_ns = cycle.sync_ns
+        self._tick_count += 1
+        solved = measured
+        if self._some_skipped:
+            due = self._tick_count % self._update_interval_ticks[measured] == 0
+            measured = measured[due | np.isin(measured, began)]
+            solved = measured[self.position_requested[measured]]
+        if len(solved):
+            self._solve_contacts(solved)
+        if self.sheet_force.any_modelled:
+            raw = self.columns.uncompensated_force_n
+            self._store_compensated_forces(
+                self.sheet_force.compensate_forces(
+                    raw, self._uncompensated_std_n, contacts.touching, cycle.sync_ns
+                )
+            )
+        if len(solved):
+            np.fmax(
+                contacts.peak_force_n, columns.force_n, out=contacts.peak_force_n, where=contacts.touching
+            )
+        if len(ended):
+            self._contact_rows[ended] = np.nan
+        updated = np.setdiff1d(measured, began) if len(began) else measured
+        return TickResult(cycle.sync_ns, began, updated, ended)
+
+    # Details of every tick. A ufunc on few elements costs its call, so rare conditions are tested first, by
+    # `count_nonzero`, the fastest of numpy's calls ----------------------------------------------------------
+
+    def _update_samples(self, slab: Slab, operational: BoolArray, cycle: Cycle, until_ns: int) -> BoolArray:
+        """Set the sample times of new samples; return the pads (n,) that have one."""
+        columns, size = self.columns, self.model.size
+        sampled: BoolArray = (slab.arrival_ns != self._used_arrival_ns) & operational
+        in_time = slab.fresh.view(np.bool_)
+        if until_ns == _NO_LIMIT_NS:
+            np.copyto(self._used_arrival_ns, slab.arrival_ns)
+        else:
+            here = slab.arrival_ns < until_ns
+            sampled &= here
+            in_time = in_time & here
+            np.copyto(self._used_arrival_ns, slab.arrival_ns, where=here)
+        np.copyto(columns.sample_ns, cycle.sync_ns, where=sampled)
+        if np.count_nonzero(in_time) < size:
+            self.missed_sample_counts += self.expected_pads() & operational & ~in_time
+            np.copyto(columns.sample_ns, cycle.previous_sync_ns, where=sampled & ~in_time)
+        if np.count_nonzero(self.synchronous) < size:
+            np.copyto(columns.sample_ns, slab.arrival_ns, where=sampled & ~self.synchronous)
+        return sampled
+
+    def _find_implausible(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
+        """Return the pads (n,) with a channel at the end of its range, or sourcing current.
+
+        A sheet only sinks current. If all channels source, by no more than begins a contact, the baseline is
+        wrong, not the pad: it was learned during a light touch."""
+        railed, least, excess = slab.saturated(counts), self._min_counts, self._excess
+        if not np.count_nonzero(railed) and not np.count_nonzero(excess < least):
+            return self._no_pads
+        limit = _MAX_NEGATIVE_FRACTION * np.abs(excess).sum(axis=1) - least[:, 0]
+        sources = excess.min(axis=1) < -limit
+        if np.count_nonzero(sources):
+            amount_a = -(excess * self.model.ampere_per_count).sum(axis=1)
+            sources &= (excess.max(axis=1) > -least[:, 0]) | (amount_a > self.model.begin_threshold_a)
+        return np.asarray(railed.any(axis=1) | sources)
+
+    def _find_stale(self, now_ns: int, sampled: BoolArray) -> BoolArray:
+        """Return the pads (n,) without a sample for three periods."""
+        if np.count_nonzero(sampled) == self.model.size:
+            return self._no_pads
+        since_ns = np.maximum(self.columns.sample_ns, self.period_since_ns)
+        return np.asarray(
+            (now_ns - since_ns > _MAX_SAMPLE_AGE_PERIODS * self.max_sample_period_ns) & ~sampled
+        )
+
+    def _resolve_states(
+        self,
+        node_state: NDArray[np.uint8],
+        operational: BoolArray,
+        implausible: BoolArray,
+        stale: BoolArray,
+    ) -> None:
+        state = self.columns.state
+        np.copyto(state, node_state)
+        np.copyto(state, _TOUCHED, where=operational & self.contacts.touching)
+        if not (implausible is self._no_pads is stale):
+            np.copyto(state, _FAULTED, where=operational & implausible)
+            np.copyto(state, _STALE, where=operational & stale)
+
+    def _solve_contacts(self, touched: IntArray) -> None:
+        """Compute position and force of the contacts on the pads `touched`."""
+        currents = self._currents.take(touched, axis=0)
+        values, off = self.linearisations.evaluate(touched, currents)
+        if np.count_nonzero(off <= 1) < off.size:  # or NaN
+            self._solve_outside_range(touched, currents, values, off)
+        self._last_solved = touched, currents
+        self.columns.values[touched] = values
+        self._contact_rows[touched, :_EVALUATED_VALUES] = values[:, PAD_COLUMNS.start :]
+        if self.sheet_force.any_modelled:
+            self.columns.uncompensated_force_n[touched] = values[:, FORCE_COLUMN]
+
+    def _add_baseline_samples(self) -> None:
+        """Count samples, and pass those of untouched pads to the baseline, unless a contact may be beginning.
+        Runs after the messages of a tick are sent, off the critical path."""
+        if self._baseline_samples_added:
+            return
+        self._baseline_samples_added = True
+        self.sample_counts += self._sampled
+        free = self._sampled & self._trusted
+        free &= self.columns.total_current_a <= self.model.begin_threshold_a
+        free &= ~self.contacts.touching
+        self.baseline.add_samples(self._excess, free)
+
+    def _store_compensated_forces(self, pads: IntArray) -> None:
+        """Replace forces of the contact law by compensated ones, for pads with a sheet model."""
+        columns, compensated = self.columns, self.sheet_force
+        force = np.where(compensated.state[pads] == _INVALID, np.nan, compensated.force_n[pads])
+        std = np.where(columns.force_saturated[pads], np.inf, compensated.std_n[pads])
+        columns.force_n[pads], columns.force_std_n[pads] = force, std
+        columns.contact_columns["force_n"][pads] = force
+        self.columns.contact_columns["force_std_n"][pads] = np.where(np.isfinite(std), std, np.nan)
+
+    def _update_force_std(self, pads: IntArray) -> None:
+        """Update standard deviations of forces from contact law and baseline."""
+        columns = self.columns
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = self.baseline.std[pads] * self.model.ampere_per_count[pads].mean(axis=1)
+            by_baseline = (
+                self.linearisations.force_slopes(pads) * off / (self._currents[pads] @ _ALL_CHANNELS)
+            )
+        std = np.hypot(self._law_std_n[pads], by_baseline)
+        self._uncompensated_std_n[pads] = std
+        if self.sheet_force.any_modelled:
+            plain = ~self.sheet_force.modelled[pads]
+            pads, std = pads[plain], std[plain]
+        columns.force_std_n[pads] = std
+        self.columns.contact_columns["force_std_n"][pads] = np.where(np.isfinite(std), std, np.nan)
+
+    def _solve_outside_range(
+        self, pads: IntArray, currents: FloatArray, values: FloatArray, off: FloatArray
+    ) -> None:
+        """Solve contacts outside the range of their linearisation; update their `values` and `off`."""
+        far = off.max(axis=1)
+        near = np.flatnonzero((far > 1) & (far <= MAX_GAUSS_NEWTON_DISTANCE))
+        if len(near):
+            self._linearise(pads[near], currents[near], values[near, XY_COLUMNS])
+            values[near], off[near] = self.linearisations.evaluate(pads[near], currents[near])
+        lost = np.flatnonzero(~(off.max(axis=1) <= 1))
+        if len(lost):
+            some = pads[lost]
+            self._store_solution(
+                some, self.linearisations.solve_contacts(some, currents[lost], self.columns.xy[some])
+            )
+            values[lost], off[lost] = self.linearisations.evaluate(some, currents[lost])
+
+    def prepare_next_tick(self) -> None:
+        """Update the baseline; renew linearisations that contacts are about to leave, ahead of the contact.
+
+        Call between two ticks, off the critical path: it makes the next tick cheap and changes no contact.
+        """
+        self._add_baseline_samples()
+        if self._sync_ns and self.baseline.update_baseline(self._sync_ns, self.contacts.touching):
+            touching = np.flatnonzero(self.contacts.touching)
+            if len(touching):
+                self._update_force_std(touching)
+        pads, currents = self._last_solved
+        self._last_solved = _NONE_SOLVED
+        if not len(pads):
+            return
+        smoothed = self._smoothed_currents.take(pads, axis=0)
+        smoothed = np.where(np.isnan(smoothed), currents, smoothed + (currents - smoothed) / _SMOOTHING_TICKS)
+        self._smoothed_currents[pads] = smoothed
+        ahead = currents + (currents - smoothed) / (_SMOOTHING_TICKS - 1)
+        values, off = self.linearisations.evaluate(pads, ahead)
+        if np.count_nonzero(off > _RELINEARISE_DISTANCE) and np.count_nonzero(
+            (far := off.max(axis=1)) > _RELINEARISE_DISTANCE
+        ):
+            leaving = np.flatnonzero(far > _RELINEARISE_ALONG_DISTANCE)
+            self._linearise(pads[leaving], ahead[leaving], values[leaving, XY_COLUMNS])
+
+    def _linearise(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> None:
+        self._store_solution(pads, self.linearisations.linearise(pads, currents, xy))
+
+    def _store_solution(self, pads: IntArray, solved: ContactSolution) -> None:
+        columns = self.columns
+        columns.covariance_m2[pads] = solved.covariance_m2
+        self._law_std_n[pads] = solved.force_std_n
+        columns.force_saturated[pads] = solved.force_saturated
+        columns.residual_std[pads] = solved.residual_std
+        self._update_force_std(pads)
+        columns.contact_columns["residual_std"][pads] = solved.residual_std
+        columns.contact_columns["covariance_m2"][pads] = solved.covariance_m2.reshape(-1, 9)

@@ -1,0 +1,250 @@
+"""Messages of each tick: contacts, hand frames and raw counts, for the topics with a subscriber."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import wire
+from handtouch.core.hand_frame import HandFrameEncoder
+from handtouch.core.pad_model import PadModel
+from handtouch.core.slab import Slab
+from handtouch.core.tick import CONTACT_DTYPE, TickProcessor, TickResult
+from handtouch.core.transforms import ContactTransforms
+from handtouch.wire import ForceStatus, PadState, PositionStatus
+
+END_REASONS = {
+    PadState.STALE: "stale",
+    PadState.LOST: "lost",
+    PadState.FAULTED: "faulted",
+    PadState.STARTING: "restarted",
+    PadState.OFF: "off",
+}
+"""End reason of a contact by the state of its pad; "released" for any other."""
+_STOPPED = "stopped"
+_WITH_STD = (ForceStatus.VALID, ForceStatus.UNRELIABLE)
+
+
+class MessageSink(Protocol):
+    """Receiver of messages: the daemon's publisher, or a recorder."""
+
+    def has_subscriber(self, topic: str) -> bool:
+        """Return True if a message of this topic has a receiver."""
+
+    def send(self, message: wire.OutgoingMessage) -> None:
+        """Send a message."""
+
+
+class TickMessages:
+    """Messages of every tick for the pads of a model; `session` is the daemon's.
+
+    `seq` counts all messages of a topic, sent or not, so that a late subscriber sees the gap.
+    """
+
+    def __init__(
+        self,
+        model: PadModel,
+        tick: TickProcessor,
+        session: int = 0,
+        transforms: ContactTransforms | None = None,
+    ) -> None:
+        self._model = model
+        self._transforms = transforms or ContactTransforms(model.hands)
+        self._tick = tick
+        self._session = session
+        self._seq: NDArray[np.int64] = np.zeros(model.size, dtype=np.int64)
+        self._frame_seq = 0
+        self._frame_tick = 0, 0  # number and SYNC time of the last frames' tick
+        self._end_reason = ""  # of all contacts, when the daemon stops
+        self._position_status = np.zeros(model.size, dtype=np.uint8)
+        self._force_status = np.zeros(model.size, dtype=np.uint8)
+        self._encoders = {hand: self._make_encoder(hand, rows) for hand, rows in model.rows_of_hand.items()}
+        self._hand_topics = [(hand, f"hand/{hand}", f"raw/{hand}") for hand in model.rows_of_hand]
+        self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
+
+    def send_contacts(self, result: TickResult, now_ns: int, sink: MessageSink) -> None:
+        """Send begin, update and end of contacts, and clear those that ended."""
+        for event, rows in (("begin", result.began), ("update", result.updated), ("end", result.ended)):
+            if len(rows):
+                self._seq[rows] += 1
+            for pad in rows.tolist():
+                if sink.has_subscriber(self._topics[pad]):
+                    sink.send(self._contact_message(pad, event, result.sync_ns, now_ns))
+        self._tick.contacts.clear_ended(result.ended)
+        self._transforms.discard(result.ended)
+
+    def replace_model(self, model: PadModel) -> None:
+        """Continue with another model of the same pads."""
+        self._model = model
+
+    def end_all_contacts(self, now_ns: int, sink: MessageSink) -> None:
+        """Send the end of every contact, because the daemon stops."""
+        touching = np.flatnonzero(self._tick.contacts.touching)
+        self._end_reason = _STOPPED
+        none = np.zeros(0, dtype=np.intp)
+        self.send_contacts(TickResult(now_ns, none, none, touching), now_ns, sink)
+        self._tick.contacts.touching[:] = False
+        self._tick.columns.contact_columns.view("<f4")[:] = np.nan
+        self._tick.columns.state[:] = PadState.STARTING
+
+    def send_hand_frames(self, slab: Slab, tick_number: int, sync_ns: int, sink: MessageSink) -> None:
+        """Send the frame and the raw counts of every hand with a subscriber."""
+        self._frame_seq += 1
+        self._frame_tick = tick_number, sync_ns
+        for hand, topic, raw in self._hand_topics:
+            if sink.has_subscriber(topic):
+                sink.send(self._hand_frame(hand))
+            if sink.has_subscriber(raw):
+                sink.send(self._raw_message(hand, slab))
+
+    def warm_caches(self, sink: MessageSink) -> None:
+        """Encode the frames of hands with a subscriber, without sending them."""
+        for hand, topic, _ in self._hand_topics:
+            if sink.has_subscriber(topic):
+                wire.encode(self._hand_frame(hand))
+
+    def retained_messages(self) -> dict[str, Callable[[int], wire.OutgoingMessage | None]]:
+        """Return topic -> function of the time [ns] that makes its retained message: contacts and hands."""
+        return {
+            **{topic: partial(self._retained_contact, pad) for pad, topic in enumerate(self._topics)},
+            **{f"hand/{hand}": partial(self._retained_hand, hand) for hand in self._model.rows_of_hand},
+        }
+
+    def _retained_contact(self, pad: int, now_ns: int) -> wire.Contact | None:
+        if not self._tick.contacts.touching[pad]:
+            return None
+        return self._contact_message(pad, "update", 0, now_ns, retained=True)
+
+    def _retained_hand(self, hand: str, _: int) -> wire.EncodedMessage | None:
+        return self._hand_frame(hand, retained=True) if self._frame_seq else None
+
+    def _hand_frame(self, hand: str, retained: bool = False) -> wire.EncodedMessage:
+        rows = self._model.rows_of_hand[hand]
+        optional = self._transforms.hand_columns(rows)
+        self._update_statuses(rows)
+        tick_number, sync_ns = self._frame_tick
+        return self._encoders[hand].encode(self._frame_seq, sync_ns, tick_number, retained, optional)
+
+    def _update_statuses(self, rows: slice) -> None:
+        """Write the status columns of a hand's pads; the encoder copies them."""
+        tick, columns = self._tick, self._tick.columns
+        position, force = self._position_status[rows], self._force_status[rows]
+        position[:], force[:] = PositionStatus.NOT_COMPUTED, ForceStatus.NOT_COMPUTED
+        touching = tick.contacts.touching[rows]
+        if not np.count_nonzero(touching):
+            return
+        located = touching & np.isfinite(columns.contact_columns["position_m"][rows, 0])
+        position[touching & tick.position_requested[rows]] = PositionStatus.INVALID
+        position[located] = PositionStatus.VALID
+        position[located & self._model.position_unreliable[rows]] = PositionStatus.UNRELIABLE
+        requested = touching & tick.linearisations.force_requested[rows]
+        force[requested] = ForceStatus.VALID
+        force[requested & tick.is_force_unreliable(rows)] = ForceStatus.UNRELIABLE
+        force[requested & columns.force_saturated[rows]] = ForceStatus.LOWER_BOUND
+        force[requested & np.isnan(columns.contact_columns["force_n"][rows])] = ForceStatus.INVALID
+
+    def _make_encoder(self, hand: str, rows: slice) -> HandFrameEncoder:
+        columns = self._tick.columns
+        sources: dict[str, NDArray[Any]] = {
+            "state": columns.state[rows],
+            "contact_id": self._tick.contacts.id[rows],
+            "sample_ns": columns.sample_ns[rows],
+            "total_current_a": columns.total_current_a[rows],
+            "position_status": self._position_status[rows],
+            "force_status": self._force_status[rows],
+            **{name: columns.contact_columns[name][rows] for name in CONTACT_DTYPE.names or ()},
+        }
+        return HandFrameEncoder(self._session, hand, tuple(self._model.links[rows]), sources)
+
+    def _raw_message(self, hand: str, slab: Slab) -> wire.Raw:
+        rows = self._model.rows_of_hand[hand]
+        return wire.Raw(
+            v=wire.SCHEMA_VERSION,
+            session=self._session,
+            seq=self._frame_seq,
+            t_ns=self._frame_tick[1],
+            tick=self._frame_tick[0],
+            hand=hand,
+            links=tuple(self._model.links[rows]),
+            counts=self._tick.counts[rows].astype("<i8").tobytes(),
+            sample_ns=self._tick.columns.sample_ns[rows].astype("<i8").tobytes(),
+            fresh=slab.fresh[rows].tobytes(),
+            retained=False,
+        )
+
+    def _contact_message(
+        self, pad: int, event: str, sync_ns: int, now_ns: int, retained: bool = False
+    ) -> wire.Contact:
+        model, columns, contacts = self._model, self._tick.columns, self._tick.contacts
+        sample_ns = int(columns.sample_ns[pad])
+        begin_ns = int(contacts.begin_ns[pad])
+        position, normal, on_pad = (
+            column[pad].tolist() for column in (columns.position_m, columns.normal, columns.pad_m)
+        )
+        located = all(map(math.isfinite, (*position, *normal, *on_pad)))
+        covariance = columns.covariance_m2[pad].ravel().tolist()
+        bounded = located and all(map(math.isfinite, covariance))  # at a corner it may be unbounded
+        force_n = _finite_or_none(columns.force_n[pad])
+        force_status = self._force_status_of(pad, force_n)
+        t_ns = sample_ns if event != "end" else sync_ns
+        modelled = self._tick.sheet_force.modelled[pad]
+        state = PadState(int(columns.state[pad]))
+        return wire.Contact(
+            v=wire.SCHEMA_VERSION,
+            session=self._session,
+            seq=int(self._seq[pad]),
+            t_ns=t_ns,
+            event=event,
+            id=int(contacts.id[pad]),
+            hand=model.hands[pad],
+            link=model.links[pad],
+            frame=model.frame_links[pad],
+            begin_ns=begin_ns,
+            duration_s=(t_ns - begin_ns) * 1e-9,
+            age_s=(now_ns - sample_ns) * 1e-9,
+            position_m=tuple(position) if located else None,
+            normal=tuple(normal) if located else None,
+            covariance_m2=tuple(covariance) if bounded else None,
+            pad_m=tuple(on_pad) if located else None,
+            position_status=self._position_status_of(pad, located).text,
+            force_n=force_n,
+            force_std_n=_finite_or_none(columns.force_std_n[pad]) if force_status in _WITH_STD else None,
+            peak_force_n=_finite_or_none(contacts.peak_force_n[pad]),
+            force_status=force_status.text,
+            total_current_a=float(columns.total_current_a[pad]),
+            residual=_finite_or_none(columns.residual[pad]),
+            residual_std=_finite_or_none(columns.residual_std[pad]),
+            begin_threshold_n=float(model.begin_threshold_n[pad]),
+            end_threshold_n=float(model.end_threshold_n[pad]),
+            calibration_id=model.calibration_ids[pad],
+            end_reason=self._end_reason or END_REASONS.get(state, "released") if event == "end" else "",
+            retained=retained,
+            uncompensated_force_n=_finite_or_none(columns.uncompensated_force_n[pad]) if modelled else None,
+            diagnoses=model.diagnoses[pad],
+            **self._transforms.contact_fields(pad),
+        )
+
+    def _position_status_of(self, pad: int, located: bool) -> PositionStatus:
+        if located:
+            unreliable = self._model.position_unreliable[pad]
+            return PositionStatus.UNRELIABLE if unreliable else PositionStatus.VALID
+        requested = self._tick.position_requested[pad]
+        return PositionStatus.INVALID if requested else PositionStatus.NOT_COMPUTED
+
+    def _force_status_of(self, pad: int, force_n: float | None) -> ForceStatus:
+        if not self._tick.linearisations.force_requested[pad]:
+            return ForceStatus.NOT_COMPUTED
+        if force_n is None:
+            return ForceStatus.INVALID
+        if self._tick.columns.force_saturated[pad]:
+            return ForceStatus.LOWER_BOUND
+        return ForceStatus.UNRELIABLE if self._tick.is_force_unreliable(pad) else ForceStatus.VALID
+
+
+def _finite_or_none(value: np.float64) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,187 @@
+"""Access control of the daemon's endpoints: CURVE keys over TCP, and limits on message sizes.
+
+Public names: `Authenticator`, `REFUSAL_CAUSES`.
+
+The hot thread answers the handshakes itself, a few per poll: they are rare, and a flood of them waits. A
+thread for them would compete with the tick for the interpreter lock.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections import Counter
+from pathlib import Path
+
+import zmq
+from zmq.utils import z85
+from zmq.utils.monitor import recv_monitor_message
+
+from handtouch.client import keys
+from handtouch.daemon.cause_counter import CauseCounter
+from handtouch.daemon.endpoints import is_readable
+
+REFUSAL_CAUSES = {
+    "no_key": "client has no key",
+    "wrong_server_key": "client has the key of another daemon",
+    "unknown_key": "client key is unknown",
+    "no_right": 'client has the right "read", but not "control"',
+    "malformed": "peer doesn't speak ZMTP, or disconnected during the handshake",
+}
+"""Causes of refused connections: name of the counter -> description."""
+
+_ZAP_ENDPOINT = "inproc://zeromq.zap.01"
+_POLL_PERIOD_NS = 10_000_000
+_MAX_HANDSHAKES_PER_POLL = 2
+_MAX_EVENTS_PER_POLL = 100
+_HANDSHAKE_TIMEOUT_MS = 5000
+"""A connection that isn't authenticated by then is closed."""
+_MAX_MESSAGE_BYTES = {"read": 4096, "control": 1_000_000, "inputs": 65_536}
+"""Largest message that a client may send; on the streams clients send subscriptions only."""
+_HANDSHAKE_FAILURE_EVENTS = (
+    zmq.Event.HANDSHAKE_FAILED_NO_DETAIL | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
+)  # failures of authentication are counted by `_answer_zap_request`
+_ZMTP_MECHANISM_MISMATCH = 0x11000002
+_ZMTP_CRYPTOGRAPHIC = 0x11000001
+
+_log = logging.getLogger("handtouch.security")
+
+
+class Authenticator:
+    """Controls access to the sockets of one context; `poll` it after every tick.
+
+    `refused` counts connections by cause (`REFUSAL_CAUSES`). Without keys (`open` without a folder) any
+    client may connect, and only the size limits apply. Client files are read again when they change.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        folder: Path | None = None,
+        zap: zmq.Socket[bytes] | None = None,
+    ) -> None:
+        self._refusals = CauseCounter(_log, "connection refused", REFUSAL_CAUSES)
+        self._context, self._folder, self._zap = context, folder, zap
+        self._monitors: list[zmq.Socket[bytes]] = []
+        self._last_poll_ns = 0
+        self._clients: dict[str, keys.AuthorisedClient] = {}
+        self._folder_fingerprint: object = None
+        if folder is not None:
+            self._key = keys.load_server(folder)
+            self._reload_clients()
+
+    @classmethod
+    def open(cls, context: zmq.Context[zmq.Socket[bytes]], folder: Path | None = None) -> Authenticator:
+        """Answer ZeroMQ's authentication requests with the keys in `folder`. Raises KeyFileError."""
+        if folder is None:
+            return cls(context)
+        if not zmq.has("curve"):
+            raise keys.KeyFileError("this pyzmq was built without CURVE; pip install --force-reinstall pyzmq")
+        zap: zmq.Socket[bytes] = context.socket(zmq.REP)
+        try:
+            opened = cls(context, folder, zap)
+            zap.setsockopt(zmq.LINGER, 0)
+            zap.bind(_ZAP_ENDPOINT)
+        except BaseException:
+            zap.close()
+            raise
+        return opened
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Refused connections by cause."""
+        return self._refusals.counts
+
+    def secure_socket(self, socket: zmq.Socket[bytes], endpoint: str, right: str) -> None:
+        """Limit message sizes of a socket before it is bound; over TCP, require keys with the given right."""
+        socket.setsockopt(zmq.MAXMSGSIZE, _MAX_MESSAGE_BYTES[right])
+        socket.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_TIMEOUT_MS)
+        if self._folder is None or not endpoint.startswith("tcp://"):
+            return
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, self._key.secret_key.encode())
+        socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
+        address = f"inproc://refused-{len(self._monitors)}"
+        socket.monitor(address, _HANDSHAKE_FAILURE_EVENTS)
+        monitor: zmq.Socket[bytes] = self._context.socket(zmq.PAIR)
+        monitor.setsockopt(zmq.LINGER, 0)
+        monitor.setsockopt(zmq.RCVHWM, 0)  # a full queue would block ZeroMQ's own thread
+        monitor.connect(address)
+        self._monitors.append(monitor)
+
+    def poll(self, now_ns: int) -> None:
+        """Answer handshakes and count refusals, every 10 ms, as polling costs microseconds."""
+        if self._zap is None or now_ns - self._last_poll_ns < _POLL_PERIOD_NS:
+            return
+        self._last_poll_ns = now_ns
+        for _ in range(_MAX_HANDSHAKES_PER_POLL):
+            if not is_readable(self._zap):
+                break
+            self._zap.send_multipart(
+                self._answer_zap_request(self._zap.recv_multipart(zmq.NOBLOCK), now_ns), zmq.NOBLOCK
+            )
+        for monitor in self._monitors:
+            for _ in range(_MAX_EVENTS_PER_POLL):
+                if not is_readable(monitor):
+                    break
+                value = recv_monitor_message(monitor, zmq.NOBLOCK)["value"]
+                cause = {_ZMTP_MECHANISM_MISMATCH: "no_key", _ZMTP_CRYPTOGRAPHIC: "wrong_server_key"}
+                self._refusals.add(cause.get(value, "malformed"), "", now_ns)
+
+    def close(self) -> None:
+        """Close the authentication sockets; call it after the secured sockets are closed."""
+        for monitor in self._monitors:
+            monitor.close()
+        if self._zap is not None:
+            self._zap.close()
+
+    def _answer_zap_request(self, request: list[bytes], now_ns: int) -> list[bytes]:
+        """Return the reply to a request of ZeroMQ's authentication protocol (RFC 27)."""
+        version, number, right, address, _, mechanism, *credentials = request
+        self._reload_clients()
+        key = z85.encode(credentials[0]).decode() if mechanism == b"CURVE" else ""
+        client = self._clients.get(key)
+        user, origin = b"", f"from {address.decode('ascii', 'replace')}"
+        if client is None:
+            self._refusals.add("unknown_key", f"{key} {origin}", now_ns)
+        elif right in (b"control", b"inputs") and client.rights != "control":
+            self._refusals.add("no_right", f"{client.name} {origin}", now_ns)
+        else:
+            user = client.name.encode()
+            _log.debug("client %s: connected %s to %s", client.name, origin, right.decode())
+        status = (b"200", b"OK") if user else (b"400", b"NO ACCESS")
+        return [version, number, *status, user, b""]
+
+    def _reload_clients(self) -> None:
+        """Read the client files again if any of them changed."""
+        assert self._folder is not None
+        fingerprint = _fingerprint_folder(self._folder)
+        if fingerprint == self._folder_fingerprint:
+            return
+        self._folder_fingerprint = fingerprint
+        self._clients, problems = keys.load_clients(self._folder)
+        for problem in problems:
+            _log.error("client key rejected: %s", problem)
+        if not self._clients:
+            _log.warning(
+                "no client is authorised; create a client key with handtouch keys client %s NAME",
+                self._folder,
+            )
+
+
+def _fingerprint_folder(folder: Path) -> object:
+    """Return a value that changes whenever a client file changes."""
+    try:
+        with os.scandir(folder / keys.CLIENTS_FOLDER) as entries:
+            files = sorted((entry.name, *_fingerprint_file(entry.stat())) for entry in entries)
+        folders = (
+            _fingerprint_file(os.stat(folder)),
+            _fingerprint_file(os.stat(folder / keys.CLIENTS_FOLDER)),
+        )
+        return (*folders, files)
+    except OSError as error:
+        return str(error)
+
+
+def _fingerprint_file(status: os.stat_result) -> tuple[int, int, int, int]:
+    return status.st_ctime_ns, status.st_size, status.st_mode, status.st_uid

@@ -1,0 +1,67 @@
+"""Buffer that collects the columns of several ticks into one block for the supervisor process.
+
+Public name: `BlockBuffer`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.core.pipeline import Pipeline
+from handtouch.supervisor.ipc import SampleBlock
+
+_MAX_BLOCK_NS = 100_000_000
+_MAX_BLOCK_BYTES = 60_000  # several blocks fit into a socket buffer
+_BYTES_PER_PAD_TICK = 30  # approximately
+_MAX_BLOCK_TICKS = 50
+
+
+class BlockBuffer:
+    """Collects ticks of `pads` pads; `add_tick` returns complete blocks, at least every 100 ms."""
+
+    def __init__(self, pads: int) -> None:
+        self.max_ticks = int(np.clip(_MAX_BLOCK_BYTES // (_BYTES_PER_PAD_TICK * pads), 1, _MAX_BLOCK_TICKS))
+        k = self.max_ticks
+        self._sync_ns: NDArray[np.int64] = np.zeros(k, np.int64)
+        self._sample_ns: NDArray[np.int64] = np.zeros((k, pads), np.int64)
+        self._counts: NDArray[np.int32] = np.zeros((k, pads, 4), np.int32)
+        self._fresh: NDArray[np.bool_] = np.zeros((k, pads), np.bool_)
+        self._state: NDArray[np.uint8] = np.zeros((k, pads), np.uint8)
+        self._contact_id: NDArray[np.uint32] = np.zeros((k, pads), np.uint32)
+        self._count = 0
+
+    def add_tick(self, pipeline: Pipeline) -> SampleBlock | None:
+        """Copy the columns of the newest tick; return the block if it is complete, else None."""
+        k, tick = self._count, pipeline.tick
+        self._sync_ns[k] = pipeline.cycle.sync_ns
+        self._sample_ns[k] = tick.columns.sample_ns
+        np.copyto(self._counts[k], tick.counts, casting="unsafe")
+        self._fresh[k] = pipeline.slab.fresh
+        self._state[k] = tick.columns.state
+        self._contact_id[k] = tick.contacts.id
+        self._count = k + 1
+        if self._count < self.max_ticks and self._sync_ns[k] - self._sync_ns[0] < _MAX_BLOCK_NS:
+            return None
+        return self._take_block(pipeline)
+
+    def clear(self) -> None:
+        """Discard the collected ticks."""
+        self._count = 0
+
+    def _take_block(self, pipeline: Pipeline) -> SampleBlock:
+        k, self._count = slice(0, self._count), 0
+        baseline, back = pipeline.tick.baseline, pipeline.tick.sheet_force.back_force
+        return SampleBlock(
+            self._sync_ns[k],
+            self._sample_ns[k],
+            self._counts[k],
+            self._fresh[k],
+            self._state[k],
+            self._contact_id[k],
+            baseline.expected_counts,
+            np.where(baseline.unverified, np.nan, baseline.std),
+            np.sqrt(baseline.noise_squared),
+            back[0],
+            back[1],
+        )

@@ -1,0 +1,40 @@
+"""Explanation of a pad's state for `health`: cause, evidence and remedy."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.config.channels import ELECTRODES
+from handtouch.wire import PadState
+
+
+def explain_pad_state(
+    state: PadState,
+    node: NodeState,
+    node_reason: str,
+    counts: NDArray[np.int64],
+    railed: NDArray[np.bool_],
+) -> str:
+    """Return why a pad is in its state, and a remedy; empty if there is no fault.
+
+    `node_reason` is the master's explanation of the node state, `counts` (4,) the newest sample, `railed`
+    (4,) which channels are at the end of their range.
+    """
+    if state <= PadState.TOUCHED or (state == PadState.STARTING and node == NodeState.OPERATIONAL):
+        return ""
+    if node not in (NodeState.OPERATIONAL, NodeState.STALE):
+        return node_reason
+    if state == PadState.FAULTED:
+        channels = dict(zip(ELECTRODES, counts.tolist(), strict=True))
+        if at_end := [name for name, at in zip(ELECTRODES, railed.tolist(), strict=True) if at]:
+            return (
+                f"channel {' and '.join(at_end)} at the end of its range: "
+                "check for a short circuit, a loose electrode or a force beyond full scale"
+            )
+        return (
+            f"channel {min(channels, key=channels.__getitem__)} reads {min(channels.values())} counts, but "
+            "electrode currents can't be negative: check its amplifier and wiring"
+        )
+    return "heartbeats arrive, samples don't: check the node's SYNC and PDO settings and the bus load"

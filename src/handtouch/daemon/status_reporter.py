@@ -1,0 +1,354 @@
+"""Status of the daemon and its pads: health and service messages, and the reply to `status`.
+
+Public name: `StatusReporter`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, fields, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import __version__, wire
+from handtouch.canbus.bus.bus_state import ErrorState
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.sync import Sync, percentiles_us
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
+from handtouch.config import Deployment
+from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.pad_explanation import explain_pad_state
+from handtouch.daemon.publisher import Publisher
+from handtouch.daemon.stage_timer import StageTimer
+from handtouch.daemon.supervisor_client import SupervisorClient
+from handtouch.wire import PadState
+
+_SECOND_NS = 1_000_000_000
+_SERVICE_PERIOD_NS = round(wire.SERVICE.period_s * _SECOND_NS)
+_log = logging.getLogger("handtouch.health")
+_loop_log = logging.getLogger("handtouch.loop")
+_bus_log = logging.getLogger("handtouch.bus")
+
+_WITHOUT_DIGITS = str.maketrans("", "", "0123456789")
+_BUS_LEVELS = {
+    ErrorState.WARNING: logging.WARNING,
+    ErrorState.PASSIVE: logging.WARNING,
+    ErrorState.BUS_OFF: logging.ERROR,
+    ErrorState.DOWN: logging.ERROR,
+}
+
+_PAD_STATE_OF_NODE_STATE = {
+    NodeState.OPERATIONAL: PadState.CLEAR,
+    NodeState.STALE: PadState.CLEAR,  # the tick detects missing samples itself
+    NodeState.FAULTED: PadState.FAULTED,
+    NodeState.STOPPED: PadState.OFF,
+}
+
+
+class StatusReporter:
+    """Reports on pipeline, master, buses and publisher; `poll` it after every tick.
+
+    It also maintains the pipeline's `node_state`, the pad state that follows from each node's state.
+    `refusals` returns refused connections and requests by cause, `input_statistics` the counters of the
+    inputs endpoint at a time [ns], `process_statistics` the resource usage of this process, `wall_offset_ns`
+    the difference of wall clock and monotonic clock. `on_message` gets every message, subscribed or not.
+    """
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        pipeline: Pipeline,
+        master: Master,
+        ports: Mapping[str, Port],
+        sync: Sync,
+        publisher: Publisher,
+        *,
+        started_ns: int,
+        wall_offset_ns: Callable[[], int],
+        process_statistics: Callable[[], dict[str, Any]],
+        refusals: Callable[[], Mapping[str, int]],
+        input_statistics: Callable[[int], dict[str, Any]],
+        supervisor: SupervisorClient | None = None,
+        on_message: Callable[[wire.Health | wire.Service], None] | None = None,
+    ) -> None:
+        n = pipeline.model.size
+        self._deployment = deployment
+        self._pipeline = pipeline
+        self._master = master
+        self._ports = ports
+        self._sync = sync
+        self._publisher = publisher
+        self._wall_offset_ns, self._process_statistics = wall_offset_ns, process_statistics
+        self._refusals, self._input_statistics = refusals, input_statistics
+        self._on_message = on_message
+        self.supervisor = supervisor
+        self._pads = deployment.pads
+        self._names = [(hand, pad.link) for hand, pad in self._pads]
+        self._topics = [f"health/{hand}/{link}" for hand, link in self._names]
+        self._disabled_by: dict[int, str] = {}
+        self._previous_event_pads: set[int] = set()
+        self._published_state = np.full(n, PadState.STARTING, dtype=np.uint8)
+        self._was_up = np.zeros(n, dtype=np.bool_)
+        self._started_ns = started_ns
+        self.stage_timer = StageTimer(self._started_ns)
+        self._sample_rate_window = _RateWindow(self._started_ns, np.zeros(n, dtype=np.int64))
+        self._published_this_second = 0  # pads are published in turn, as all at once would delay a tick
+        self._seq: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
+        self._service_seq = 0
+        self._service_window = _RateWindow(self._started_ns, self._totals())
+        self._sample_rate_hz = np.zeros(n)
+        self._rates_hz: dict[str, float] = {}
+        self._tick_durations_ns: list[int] = []
+        self._tick_us: dict[str, float] = {}
+        self._logged_bus_state: dict[str, tuple[str, str]] = {}
+
+    def record_tick(self, from_ns: int, to_ns: int) -> None:
+        """Record a tick: last sample read at `from_ns`, messages sent at `to_ns`."""
+        self._tick_durations_ns.append(to_ns - from_ns)
+        self.stage_timer.record_tick(self._pipeline.cycle.sync_ns, self._sync.period_ns, from_ns, to_ns)
+
+    def set_disabled(self, disabled_by: Mapping[int, str]) -> None:
+        """Set the disabled pads and the names of the clients that disabled them; takes effect at once."""
+        if disabled_by != self._disabled_by:
+            self._disabled_by = dict(disabled_by)
+            self._update_node_states()
+
+    def poll(self, now_ns: int) -> None:
+        """Copy node states from the master; publish changes at once and every pad once a second."""
+        events = self._master.drain_events()
+        if events:
+            for event in events:
+                self._log_event(event)
+            self._update_node_states()
+            if self.supervisor is not None:
+                self.supervisor.handle_node_events(events, now_ns)
+        state = self._pipeline.tick.columns.state
+        visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
+        changed = self._previous_event_pads | set(np.flatnonzero(visible != self._published_state).tolist())
+        self._previous_event_pads = {event.slot for event in events}  # published once a tick has applied them
+        self._published_state[:] = visible
+        if self.supervisor is not None and self.supervisor.changed_pads:
+            changed |= self.supervisor.changed_pads
+            self.supervisor.changed_pads.clear()
+        for pad in sorted(changed.union(self._pads_due(now_ns))):
+            self._seq[pad] += 1
+            self._publish(self._topics[pad], partial(self._make_health, pad, now_ns))
+        if now_ns - self._service_window.since_ns >= _SERVICE_PERIOD_NS:
+            rates = self._service_window.per_second(now_ns, self._totals())
+            self._rates_hz = dict(
+                zip(["ticks", *_bus_counter_names(self._ports)], rates.tolist(), strict=True)
+            )
+            self._tick_us = percentiles_us(np.array(self._tick_durations_ns, dtype=np.int64))
+            if late := self.stage_timer.take_late_ticks():
+                parts = (f"{name} {count} (up to {max_ns * 1e-6:.1f} ms)" for name, count, max_ns in late)
+                about = {"fields": {"part": late[0][0]}}
+                _loop_log.warning("late ticks by longest part: %s", ", ".join(parts), extra=about)
+            self._tick_durations_ns.clear()
+            self._log_bus_states()
+            self._service_seq += 1
+            self._publish("service", partial(self._make_service, now_ns))
+
+    def retained_messages(self) -> dict[str, Callable[[int], wire.OutgoingMessage | None]]:
+        """Return, by topic, functions that make the retained message at a time [ns]."""
+        pads = {topic: partial(self._retained_health, pad) for pad, topic in enumerate(self._topics)}
+        return {**pads, "service": self._retained_service}
+
+    def status(self, now_ns: int) -> dict[str, Any]:
+        """Return service and health of all pads, for the control endpoint."""
+        pads = (replace(self._make_health(pad, now_ns), seq=0) for pad in range(len(self._pads)))
+        return {
+            "service": _message_fields(replace(self._make_service(now_ns), seq=0)),
+            "pads": [_message_fields(health) for health in pads],
+        }
+
+    def summary(self) -> str:
+        """Return a one-line summary for systemd."""
+        states = self._master.states
+        up = int(np.count_nonzero((states == NodeState.OPERATIONAL) | (states == NodeState.STOPPED)))
+        hands = ", ".join(hand.name for hand in self._deployment.hands)
+        return f"{hands}: {up} of {len(self._pads)} nodes up, {self._rates_hz.get('ticks', 0.0):.0f} ticks/s"
+
+    def _log_event(self, event: NodeEvent | SerialChanged) -> None:
+        hand, link = self._names[event.slot]
+        node_id = self._pads[event.slot][1].node_id
+        level, state = logging.WARNING, "node replaced"
+        if isinstance(event, NodeEvent):
+            level = _event_level(event)
+            state = f"{event.new_state.name} {event.reason.translate(_WITHOUT_DIGITS)}"
+        extra = {"fields": {"hand": hand, "link": link}, "state": state}
+        _log.log(level, "node 0x%02X (%s/%s): %s", node_id, hand, link, event, extra=extra)
+
+    def _log_bus_states(self) -> None:
+        for name, port in self._ports.items():
+            state, problem = port.bus_state.error_state.value, port.bus_state.problem
+            key = state, problem.translate(_WITHOUT_DIGITS)
+            before = self._logged_bus_state.get(name, (ErrorState.ACTIVE.value, ""))
+            if key == before:
+                continue
+            self._logged_bus_state[name] = key
+            level = _BUS_LEVELS.get(port.bus_state.error_state, logging.WARNING if problem else logging.INFO)
+            extra = {"fields": {"bus": name}, "state": state}
+            text = f"{before[0]} -> {state}" + (f": {problem}" if problem else "")
+            _bus_log.log(level, "bus %s: %s", name, text, extra=extra)
+
+    def _pads_due(self, now_ns: int) -> range:
+        """Return the pads due to be published: each once a second, spread over the second."""
+        passed_ns, first = now_ns - self._sample_rate_window.since_ns, self._published_this_second
+        self._published_this_second = min(len(self._pads), len(self._pads) * passed_ns // _SECOND_NS)
+        due = range(first, self._published_this_second)
+        if passed_ns >= _SECOND_NS:
+            self._sample_rate_hz = self._sample_rate_window.per_second(
+                now_ns, self._pipeline.tick.sample_counts
+            )
+            self._published_this_second = 0
+        return due
+
+    def _publish(self, topic: str, make: Callable[[], wire.Health | wire.Service]) -> None:
+        """Make and send a message if its topic has a subscriber or `on_message` is set."""
+        subscribed = self._publisher.has_subscriber(topic)
+        if subscribed or self._on_message is not None:
+            message = make()
+            if self._on_message is not None:
+                self._on_message(message)
+            if subscribed:
+                self._publisher.send(message)
+
+    def _retained_health(self, pad: int, now_ns: int) -> wire.Health | None:
+        return replace(self._make_health(pad, now_ns), retained=True) if self._seq[pad] else None
+
+    def _retained_service(self, now_ns: int) -> wire.Service | None:
+        return replace(self._make_service(now_ns), retained=True) if self._service_seq else None
+
+    def _update_node_states(self) -> None:
+        """Map node states to pad states; an absent node is lost if it was operational before."""
+        for slot, state in enumerate(map(NodeState, self._master.states.tolist())):
+            self._was_up[slot] |= state == NodeState.OPERATIONAL
+            missing = PadState.LOST if self._was_up[slot] else PadState.STARTING
+            self._pipeline.node_state[slot] = (
+                missing
+                if state == NodeState.ABSENT
+                else _PAD_STATE_OF_NODE_STATE.get(state, PadState.STARTING)
+            )
+        self._pipeline.node_state[list(self._disabled_by)] = PadState.OFF
+
+    def _make_health(self, pad: int, now_ns: int) -> wire.Health:
+        hand, settings = self._pads[pad]
+        status = self._master.node_status(pad)
+        columns = self._pipeline.tick.columns
+        sample_ns = int(columns.sample_ns[pad])
+        state = PadState(int(columns.state[pad]))
+        counts = self._pipeline.tick.counts[pad]
+        railed = self._pipeline.slab.saturated(self._pipeline.tick.counts)[pad]
+        return wire.Health(
+            v=wire.SCHEMA_VERSION,
+            session=self._publisher.session,
+            seq=int(self._seq[pad]),
+            t_ns=now_ns,
+            hand=hand,
+            link=settings.link,
+            bus=settings.bus,
+            node_id=settings.node_id,
+            state=state.name.lower(),
+            node_state=status.state.name.lower(),
+            node_state_since_ns=status.since_ns,
+            sampling="off" if state == PadState.OFF else "event" if status.idle else "sync",
+            reason=self._disabled_reason(pad)
+            or explain_pad_state(state, status.state, status.reason, counts, railed),
+            serial=status.serial,
+            rate_hz=float(self._sample_rate_hz[pad]) if state <= PadState.TOUCHED else 0.0,
+            samples=int(self._pipeline.tick.sample_counts[pad]),
+            missed_samples=int(self._pipeline.tick.missed_sample_counts[pad]),
+            age_s=(now_ns - sample_ns) * 1e-9 if sample_ns else None,
+            reboots=status.reboots,
+            heartbeats_missed=status.heartbeats_missed,
+            emergencies=tuple(str(emergency) for emergency in status.emergencies),
+            retained=False,
+            **(self.supervisor.health_fields(pad) if self.supervisor is not None else {}),
+        )
+
+    def _disabled_reason(self, pad: int) -> str:
+        by = self._disabled_by.get(pad)
+        return f"disabled by {by}; switch it on with `handtouch enable`" if by else ""
+
+    def _make_service(self, now_ns: int) -> wire.Service:
+        bit_rates = {bus.name: bus.bitrate_bit_s for bus in self._deployment.buses}
+        return wire.Service(
+            v=wire.SCHEMA_VERSION,
+            session=self._publisher.session,
+            seq=self._service_seq,
+            t_ns=now_ns,
+            wall_offset_ns=self._wall_offset_ns(),
+            version=__version__,
+            pid=os.getpid(),
+            uptime_s=(now_ns - self._started_ns) * 1e-9,
+            period_s=self._deployment.daemon.sync_period_ms * 1e-3,
+            hands={hand.name: [pad.link for pad in hand.pads] for hand in self._deployment.hands},
+            ticks=self._pipeline.ticks,
+            overruns=self._sync.overruns,
+            rate_hz=self._rates_hz.get("ticks", 0.0),
+            tick_us=self._tick_us,
+            loop=self.stage_timer.statistics(),
+            contacts=self._pipeline.tick.contacts.begun_count,
+            rejected=dict(self._refusals()),
+            process=self._process_statistics(),
+            buses={
+                name: {
+                    "load": self._rates_hz.get(f"{name} bits", 0.0) / bit_rates[name],
+                    "lost_hz": self._rates_hz.get(f"{name} lost", 0.0),
+                    **port.bus_state.report(),
+                    "sync": self._sync.report(name, now_ns),
+                    **asdict(port.counters),
+                }
+                for name, port in self._ports.items()
+            },
+            drops=dict(self._publisher.drops),
+            subscriptions=tuple(
+                sorted(prefix.decode("utf-8", "replace") for prefix in self._publisher.subscriptions)
+            ),
+            retained=False,
+            supervisor=self.supervisor.statistics() if self.supervisor is not None else None,
+            inputs=self._input_statistics(now_ns),
+        )
+
+    def _totals(self) -> NDArray[np.int64]:
+        counters = [port.counters for port in self._ports.values()]
+        return np.array(
+            [self._pipeline.ticks, *(n for bus in counters for n in (bus.bits, bus.overflow))], dtype=np.int64
+        )
+
+
+def _event_level(event: NodeEvent) -> int:
+    """Return the log level of a node event: faults are errors, lost nodes and missing samples warnings."""
+    if event.new_state == NodeState.FAULTED:
+        return logging.ERROR
+    lost = event.new_state == NodeState.ABSENT and event.old_state != NodeState.ABSENT
+    return logging.WARNING if lost or event.new_state == NodeState.STALE else logging.INFO
+
+
+def _bus_counter_names(names: Iterable[str]) -> list[str]:
+    return [f"{name} {counter}" for name in names for counter in ("bits", "lost")]
+
+
+class _RateWindow:
+    """Rates of increasing counters over the time since the last call."""
+
+    def __init__(self, since_ns: int, totals: NDArray[np.int64]) -> None:
+        self.since_ns = since_ns
+        self._totals = totals
+
+    def per_second(self, now_ns: int, totals: NDArray[np.int64]) -> NDArray[np.float64]:
+        rates = (totals - self._totals).astype(np.float64) * (_SECOND_NS / max(1, now_ns - self.since_ns))
+        self.since_ns, self._totals = now_ns, totals.copy()
+        return rates
+
+
+def _message_fields(message: wire.Health | wire.Service) -> dict[str, Any]:
+    """Return the fields by name without the deep copies of `asdict`, which take milliseconds."""
+    return {field.name: getattr(message, field.name) for field in fields(message)}

@@ -1,0 +1,426 @@
+"""One simulated node: NMT slave, heartbeat or node guarding, EMCY, SDO server and TPDOs (CiA 301)."""
+
+from __future__ import annotations
+
+import random
+import struct
+from contextlib import AbstractContextManager
+from functools import partial
+from typing import Protocol
+
+import can
+from canopen.nmt import COMMAND_TO_STATE, NMT_STATES
+
+from handtouch.canbus import cia301
+from handtouch.config import eds
+from handtouch.device import inputs
+from handtouch.device.faults import FaultSwitches
+from handtouch.device.object_values import Address, ObjectValues
+from handtouch.device.pdo import DeviceTpdo
+from handtouch.device.scheduler import ScheduledJob
+from handtouch.device.sdo import DeviceSdoServer
+from handtouch.device.spec import DeviceSpec
+
+RESETS = (cia301.RESET_NODE, cia301.RESET_COMMUNICATION)
+NMT_COMMANDS = (cia301.START_NODE, cia301.STOP_NODE, cia301.ENTER_PREOPERATIONAL, *RESETS)
+_ERROR_REGISTER, _EMCY_COB_ID = (cia301.ERROR_REGISTER, 0), (cia301.EMCY_COB_ID, 0)
+_GUARD_TIME, _LIFE_TIME_FACTOR = (cia301.GUARD_TIME, 0), (cia301.LIFE_TIME_FACTOR, 0)
+_HEARTBEAT_TIME = (cia301.HEARTBEAT_TIME, 0)
+_LIFE_GUARD_ERROR = 0x8130
+_MAX_BACKLOG_NS = 100_000_000  # of a babbling node, after a pause of the program
+
+
+class DeviceHost(Protocol):
+    """Bus of a device: its lock, time, samples and transmission."""
+
+    @property
+    def lock(self) -> AbstractContextManager[bool]: ...
+
+    @property
+    def now_ns(self) -> int: ...
+
+    @property
+    def sample_count(self) -> int: ...
+
+    def schedule(self, due_ns: int, job: ScheduledJob) -> None: ...
+
+    def mark_changed(self) -> None: ...
+
+    def electrode_counts(self, row: int) -> list[int]: ...
+
+    def transmit(self, message: can.Message) -> None: ...
+
+
+class Device(FaultSwitches):
+    """One simulated node; made by `DeviceBus.add`. Its methods may be called from any thread.
+
+    `sdo` : its SDO server, with fault switches of its own
+    """
+
+    def __init__(self, bus: DeviceHost, row: int, node_id: int, spec: DeviceSpec) -> None:
+        self.node_id, self.row, self.spec = node_id, row, spec
+        self.plugged = False
+        self._bus = bus
+        self._nmt_state = 0
+        self._is_bus_off = False
+        self._counts_sample = -1
+        self._noise = random.Random(node_id)
+        # jobs of an earlier generation are void
+        self._power_generation = self._heartbeat_generation = 0
+        self._babble_generation = self._guard_generation = 0
+        self._toggle_bit = 0
+        self._channels = {address: channel for channel, address in enumerate(spec.channels)}
+        dictionary = spec.load_dictionary(node_id)
+        self._objects = ObjectValues(dictionary, self._measured_value, self._check_write, self._handle_write)
+        spec.write_identity(self._objects)
+        self._limits = spec.channel_limits(self._objects)
+        self._excitation = spec.find_excitation(self._objects)
+        self._excited_sample: int | None = -inputs.SETTLE_SAMPLES - 1
+        self.sdo = DeviceSdoServer(node_id, self._objects, self._send)
+        self._tpdos = [
+            DeviceTpdo(default, self._objects, self._channels, self.channel_counts, spec.strict_pdo)
+            for default in eds.default_tpdos(dictionary)
+        ]
+        self._load_objects()
+
+    @property
+    def state(self) -> str:
+        """Name of the NMT state, "UNPLUGGED" without power."""
+        return str(NMT_STATES[self._nmt_state]) if self.plugged else "UNPLUGGED"
+
+    @property
+    def serial(self) -> int:
+        """Serial number, 0x1018 sub 4; 0 without one."""
+        return self._objects.get_integer(cia301.IDENTITY, cia301.SERIAL_SUB)
+
+    @property
+    def fail_sdo(self) -> dict[Address, int | None]:
+        """`sdo.fail`: object -> abort code in response to every request for it, None for no response."""
+        return self.sdo.fail
+
+    def plug(self) -> None:
+        """Power on: boot-up message, defaults, pre-operational; no effect if powered."""
+        with self._bus.lock:
+            self._power_generation += 1
+            if not self.plugged:
+                self._boot(power=True)
+
+    def unplug(self) -> None:
+        """Power off: neither send nor receive until `plug`."""
+        with self._bus.lock:
+            self._power_generation += 1
+            self.plugged = self._is_bus_off = False
+            self.refresh()
+
+    def reboot(self) -> None:
+        """Restart as by its watchdog."""
+        self.unplug()
+        self.plug()
+
+    def brown_out(self, away_ns: int, *, times: int = 1, every_ns: int = 0) -> None:
+        """Lose power now for `away_ns`, `times` times in all, with a period of `every_ns`."""
+        if times < 1 or away_ns < 0 or (times > 1 and every_ns <= away_ns):
+            raise ValueError(
+                f"need times >= 1 and every_ns > away_ns >= 0, got {times}, {every_ns}, {away_ns}"
+            )
+        with self._bus.lock:
+            self.unplug()
+            restore = partial(self._restore_power, self._power_generation, (away_ns, times - 1, every_ns))
+            self._bus.schedule(self._bus.now_ns + away_ns, restore)
+
+    def bus_off(self, away_ns: int, *, boots: bool = False) -> None:
+        """Neither send nor receive for `away_ns`; then continue, or boot if `boots`."""
+        with self._bus.lock:
+            self._is_bus_off = self.plugged
+            self.refresh()
+            self._bus.schedule(
+                self._bus.now_ns + away_ns, partial(self._leave_bus_off, self._power_generation, boots)
+            )
+
+    def replace_device(self, serial: int) -> None:
+        """Replace it by another device of the same kind."""
+        with self._bus.lock:
+            self.unplug()
+            self._objects.set_default(cia301.IDENTITY, cia301.SERIAL_SUB, serial)
+            self.plug()
+
+    def read_object(self, index: int, sub: int) -> int:
+        """Return the unsigned value of an object, 0 without such an object."""
+        with self._bus.lock:
+            return self._objects.get_integer(index, sub)
+
+    def write_object(self, index: int, sub: int, value: int, *, keep: bool = False) -> None:
+        """Set an object from inside the node, even if read-only; `keep` makes it the default."""
+        with self._bus.lock:
+            if keep:
+                self._objects.set_default(index, sub, value)
+            self._objects.set_integer(index, sub, value)
+            self._handle_write(index, sub, value)
+
+    def saturate_channels(self) -> None:
+        """Set all channels to the upper end of their ranges until `release_channels`."""
+        self.stuck_counts = {channel: high for channel, (_, high) in enumerate(self._limits)}
+
+    def stick_channel(self, channel: int) -> None:
+        """Keep a channel (0-3) at its present count until `release_channels`."""
+        with self._bus.lock:
+            self.stuck_counts = {**self.stuck_counts, channel: self.channel_counts()[channel]}
+
+    def release_channels(self) -> None:
+        """Undo `saturate_channels` and `stick_channel`."""
+        self.stuck_counts = {}
+
+    def send_emergency(self, code: int, register: int = 0, data: bytes = b"") -> None:
+        """Send an EMCY message; `data` are up to five manufacturer-specific bytes."""
+        with self._bus.lock:
+            self._objects.set_integer(*_ERROR_REGISTER, register)
+            cob_id = self._objects.get_integer(*_EMCY_COB_ID) or cia301.EMCY + self.node_id
+            if self._serves_sdo and not cob_id & cia301.INVALID_BIT:
+                self._send(cob_id & cia301.IDENTIFIER_MASK, struct.pack("<HB5s", code, register, data))
+
+    def start_babbling(self, rate_hz: float, identifier: int | None = None, data: bytes = bytes(8)) -> None:
+        """Send a frame at a high rate in any NMT state, by default with the identifier of its first TPDO."""
+        if rate_hz <= 0 or not 0 <= (identifier or 0) <= cia301.IDENTIFIER_MASK:
+            raise ValueError(f"need rate_hz > 0 and an 11-bit identifier, got {rate_hz} and {identifier}")
+        with self._bus.lock:
+            self._babble_generation += 1
+            frame = _message(
+                self._tpdos[0].message.arbitration_id if identifier is None else identifier, data
+            )
+            period_ns = max(round(1e9 / rate_hz), 1)
+            self._bus.schedule(
+                self._bus.now_ns, partial(self._send_babble, self._babble_generation, frame, period_ns)
+            )
+
+    def stop_babbling(self) -> None:
+        """Stop what `start_babbling` started."""
+        self._babble_generation += 1
+
+    def refresh(self) -> None:
+        """Apply a change of switches, settings or state to the TPDOs sent."""
+        self._counts_sample = -1
+        self._bus.mark_changed()
+
+    # Called by `DeviceBus` under its lock.
+
+    @property
+    def active_tpdos(self) -> list[DeviceTpdo]:
+        """TPDOs that it sends at present."""
+        is_connected = self.plugged and not self._is_bus_off
+        is_sending = is_connected and self._nmt_state == cia301.OPERATIONAL and self.send_data
+        return self._tpdos if is_sending else []
+
+    @property
+    def inputs_settled(self) -> bool:
+        """True unless the excitation was switched on within the last SETTLE_SAMPLES samples."""
+        return (
+            self._excited_sample is None
+            or self._bus.sample_count - self._excited_sample > inputs.SETTLE_SAMPLES
+        )
+
+    @property
+    def is_excited(self) -> bool:
+        """True while the excitation of its pad is on."""
+        return self.plugged and self._excited_sample is not None
+
+    @property
+    def sends_sampled_counts(self) -> bool:
+        """True if its TPDOs carry the sampler's counts unchanged."""
+        return (
+            self.inputs_settled
+            and self._excited_sample is not None
+            and tuple(self.wiring) == inputs.STRAIGHT_WIRING
+            and not (self.stuck_counts or self.open_electrodes)
+            and self.line is None
+            and self.frame_bytes is None
+        )
+
+    def channel_counts(self) -> list[int]:
+        """Return the counts of the four channels at the latest sample."""
+        if self._counts_sample != self._bus.sample_count:
+            self._counts_sample = self._bus.sample_count
+            self._counts = inputs.read_channels(
+                self._bus.electrode_counts(self.row),
+                self._limits,
+                self._noise,
+                wiring=self.wiring,
+                open_electrodes=self.open_electrodes,
+                stuck_counts=self.stuck_counts,
+                excited=self._excited_sample is not None,
+                settled=max(self._bus.sample_count - (self._excited_sample or 0) - 1, 0),
+            )
+        return self._counts
+
+    def handle_nmt(self, command: int) -> None:
+        """Handle an NMT command."""
+        if not self.plugged or self._is_bus_off:
+            return
+        if command in RESETS:
+            self._boot(power=command == cia301.RESET_NODE)
+            return
+        state = COMMAND_TO_STATE[command]
+        if state != self._nmt_state:
+            self._enter_nmt_state(state)
+
+    def handle_sdo(self, data: bytes) -> None:
+        """Handle an SDO request."""
+        if self._serves_sdo:
+            self.sdo.handle_request(data)
+
+    def handle_guard_request(self, now_ns: int) -> None:
+        """Respond to a guarding request with state and toggle bit, and restart the life time."""
+        is_guarded = _GUARD_TIME in self._objects and not self._objects.get_integer(*_HEARTBEAT_TIME)
+        if not is_guarded or not self.plugged or self._is_bus_off:
+            return
+        if self.send_heartbeat:
+            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((self._toggle_bit | self._nmt_state,)))
+        self._toggle_bit ^= 0x80
+        life_ms = self._objects.get_integer(*_GUARD_TIME) * self._objects.get_integer(*_LIFE_TIME_FACTOR)
+        self._guard_generation += 1
+        if life_ms:
+            self._bus.schedule(
+                now_ns + life_ms * 1_000_000, partial(self._handle_guard_timeout, self._guard_generation)
+            )
+
+    def transmit(self, message: can.Message, is_data: bool = False) -> None:
+        """Send a frame through the line, which may be faulty."""
+        line = self.line
+        if not self.plugged or self._is_bus_off:
+            return
+        if is_data and self.frame_bytes is not None:
+            data = bytes(message.data).ljust(self.frame_bytes, b"\0")[: self.frame_bytes]
+            message = _message(message.arbitration_id, data)
+        if line is None or (line.data_only and not is_data):
+            self._bus.transmit(message)
+            return
+        for frame in line.received_copies(message):
+            if line.late_ns:
+                self._bus.schedule(self._bus.now_ns + line.late_ns, partial(self._send_delayed, frame))
+            else:
+                self._bus.transmit(frame)
+
+    @property
+    def _serves_sdo(self) -> bool:
+        """True in pre-operational and operational, in which SDO and EMCY work."""
+        states = (cia301.OPERATIONAL, cia301.PREOPERATIONAL)
+        return self.plugged and not self._is_bus_off and self._nmt_state in states
+
+    def _boot(self, power: bool) -> None:
+        """Initialise as in CiA 301: defaults, boot-up message, pre-operational."""
+        self._objects.reset(application=power)
+        self.sdo.reset()
+        self._toggle_bit = 0
+        self._guard_generation += 1
+        self.plugged = True
+        self._load_objects()
+        self._send(cia301.NMT_ERROR_CONTROL + self.node_id, b"\0")
+        self._enter_nmt_state(cia301.PREOPERATIONAL)
+        self._start_heartbeat(self._objects.get_integer(*_HEARTBEAT_TIME))
+
+    def _enter_nmt_state(self, state: int) -> None:
+        self._nmt_state = state
+        for tpdo in self._tpdos:
+            tpdo.reset_history()
+        self.refresh()
+
+    def _load_objects(self) -> None:
+        """Load the settings from the objects."""
+        for tpdo in self._tpdos:
+            tpdo.load_settings()
+        self._set_excitation(self._excitation is None or bool(self._objects.get_integer(*self._excitation)))
+        self.refresh()
+
+    def _set_excitation(self, on: bool) -> None:
+        if not on:
+            self._excited_sample = None
+        elif self._excited_sample is None:
+            self._excited_sample = self._bus.sample_count
+
+    # Objects with side effects.
+
+    def _measured_value(self, index: int, sub: int) -> int | None:
+        channel = self._channels.get((index, sub))
+        return None if channel is None else self.channel_counts()[channel]
+
+    def _check_write(self, index: int, sub: int, value: int) -> None:
+        for tpdo in self._tpdos:
+            tpdo.check_write(index, sub, value)
+
+    def _handle_write(self, index: int, sub: int, value: int) -> None:
+        if (index, sub) == _HEARTBEAT_TIME:
+            self._start_heartbeat(value)
+        elif (index, sub) == self._excitation:
+            self._set_excitation(bool(value))
+        for tpdo in self._tpdos:
+            tpdo.handle_write(index)
+        self.refresh()
+
+    # Scheduled jobs.
+
+    def _start_heartbeat(self, period_ms: int) -> None:
+        self._heartbeat_generation += 1
+        if period_ms:
+            period_ns = period_ms * 1_000_000
+            self._bus.schedule(
+                self._bus.now_ns + period_ns,
+                partial(self._emit_heartbeat, self._heartbeat_generation, period_ns),
+            )
+
+    def _emit_heartbeat(self, generation: int, period_ns: int, due_ns: int, now_ns: int) -> int | None:
+        if generation != self._heartbeat_generation or not self.plugged:
+            return None
+        if self.send_heartbeat:
+            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((self._nmt_state,)))
+        return due_ns + period_ns * (1 + (now_ns - due_ns) // period_ns)
+
+    def _handle_guard_timeout(self, generation: int, *_: int) -> None:
+        """Report an expired life time, and leave operational."""
+        if generation != self._guard_generation or not self.plugged:
+            return
+        self.send_emergency(_LIFE_GUARD_ERROR, 0x11)
+        if self._nmt_state == cia301.OPERATIONAL:
+            self._enter_nmt_state(cia301.PREOPERATIONAL)
+
+    def _send_babble(
+        self, generation: int, frame: can.Message, period_ns: int, due_ns: int, now_ns: int
+    ) -> int | None:
+        if generation != self._babble_generation:
+            return None
+        self.transmit(frame, is_data=True)
+        return max(due_ns + period_ns, now_ns - _MAX_BACKLOG_NS)
+
+    def _restore_power(
+        self, generation: int, remaining: tuple[int, int, int], due_ns: int, _now_ns: int
+    ) -> None:
+        if generation != self._power_generation:
+            return  # it was switched meanwhile
+        self.plug()
+        away_ns, times, every_ns = remaining
+        if times:
+            self._bus.schedule(
+                due_ns + every_ns - away_ns,
+                partial(self._repeat_brown_out, self._power_generation, remaining),
+            )
+
+    def _repeat_brown_out(self, generation: int, remaining: tuple[int, int, int], *_: int) -> None:
+        if generation == self._power_generation:
+            away_ns, times, every_ns = remaining
+            self.brown_out(away_ns, times=times, every_ns=every_ns)
+
+    def _leave_bus_off(self, generation: int, boots: bool, *_: int) -> None:
+        if generation != self._power_generation or not self._is_bus_off:
+            return
+        self._is_bus_off = False
+        self.refresh()
+        if boots:
+            self._boot(power=True)
+
+    def _send_delayed(self, frame: can.Message, *_: int) -> None:
+        self._bus.transmit(frame)
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        self.transmit(_message(can_id, data))
+
+
+def _message(can_id: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)

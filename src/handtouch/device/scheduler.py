@@ -1,0 +1,35 @@
+"""Jobs in the order of their due times."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+
+ScheduledJob = Callable[[int, int], int | None]
+"""(due time, present time) [ns] -> next due time, None for never."""
+
+
+class Scheduler:
+    """Queue of jobs by due time."""
+
+    def __init__(self) -> None:
+        self._jobs: list[tuple[int, int, ScheduledJob]] = []
+        self._numbers = itertools.count()
+
+    @property
+    def next_ns(self) -> int | None:
+        """Due time of the next job, None without jobs."""
+        return self._jobs[0][0] if self._jobs else None
+
+    def schedule(self, due_ns: int, job: ScheduledJob) -> None:
+        """Add a job; jobs with the same due time run in the order of their addition."""
+        heapq.heappush(self._jobs, (due_ns, next(self._numbers), job))
+
+    def run_due(self, now_ns: int) -> None:
+        """Run the jobs that are due at `now_ns`."""
+        while self._jobs and self._jobs[0][0] <= now_ns:
+            due_ns, _, job = heapq.heappop(self._jobs)
+            again_ns = job(due_ns, now_ns)
+            if again_ns is not None:
+                self.schedule(again_ns, job)

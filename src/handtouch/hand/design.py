@@ -1,0 +1,269 @@
+"""Design study of a pad: expected location error as a map, and the effect of other design choices.
+
+Public names: `PadDesign`, `expected_error`, `error_summary`, `draw_map`, `draw_choices`, `pad_design`,
+`draw_design`. Drawing needs matplotlib, the extra `figures`.
+
+Errors are Cramer-Rao bounds, which the estimator reaches, for the converter's noise, quantisation included,
+at the current that a given force causes at each position.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from handtouch import config
+from handtouch.field import (
+    ContactLaw,
+    ElectrodeNetwork,
+    PlaneSurface,
+    Surface,
+)
+from handtouch.field.figures import (
+    ACCENT,
+    DPI,
+    ERRATUM,
+    INK,
+    format_axes,
+    new_figure,
+)
+from handtouch.hand import electrode_network, pad_surface
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FloatArray = npt.NDArray[np.float64]
+
+FIRM_TOUCH_N = 1.0
+EDGE_MARGIN = 0.1  # of each side, excluded from medians and worst cases
+_MAP_EDGE_FRACTION, _MAP_STEPS = 0.02, 61  # of the map
+_WIRE_COUNT_BITS = 16  # counts are published as int16
+
+
+@dataclass(frozen=True)
+class PadDesign:
+    """One pad: its surface, electrodes on the surface's rectangle, contact law and electronics.
+
+    noise_counts: standard deviation of a channel's reading besides quantisation, in counts of 16 bits. bits:
+    of the converter. light_touch_n: force of a light touch.
+    """
+
+    name: str
+    surface: Surface
+    network: ElectrodeNetwork
+    law: ContactLaw
+    drive_v: float
+    full_scale_a: float
+    noise_counts: float
+    light_touch_n: float
+    bits: int = _WIRE_COUNT_BITS
+
+    @property
+    def noise_a(self) -> float:
+        """Standard deviation of a channel's current [A]."""
+        per_count = self.full_scale_a / 2 ** (_WIRE_COUNT_BITS - 1)
+        step = self.full_scale_a / 2 ** (self.bits - 1)
+        return math.hypot(self.noise_counts * per_count, step / math.sqrt(12))
+
+
+def expected_error(
+    pad: PadDesign, force_n: float, x: npt.ArrayLike, y: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviation of position on the surface [m] and the total current [A], shape (...).
+
+    The deviation is the root of the sum of both coordinates' variances. x, y: positions on the pad's
+    rectangle.
+    """
+    x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+    outer = pad.network.spreading_radius(x, y) * pad.surface.scale(x, y)
+    total = pad.law.current(
+        force_n, pad.drive_v, pad.network.sheet_ohm_per_square, outer, pad.network.series_resistance(x, y)
+    )
+    fractions, jacobian = pad.network.fractions_with_jacobian(x, y)
+    slopes = jacobian / pad.surface.scales(x, y)
+    columns = np.moveaxis(np.concatenate([slopes, fractions[:, None]], axis=1), (0, 1), (-2, -1))
+    covariance = np.linalg.inv(np.swapaxes(columns, -1, -2) @ columns)
+    spread = np.sqrt(covariance[..., 0, 0] + covariance[..., 1, 1])
+    return np.asarray(spread * pad.noise_a / total), np.asarray(total)
+
+
+def error_summary(pad: PadDesign, force_n: float) -> tuple[float, float]:
+    """Return the median and worst expected error [m], `EDGE_MARGIN` of each side left out."""
+    steps = np.linspace(EDGE_MARGIN, 1 - EDGE_MARGIN, 25)
+    x, y = np.meshgrid(steps * pad.network.a, steps * pad.network.b)
+    error, _ = expected_error(pad, force_n, x, y)
+    return float(np.median(error)), float(error.max())
+
+
+def draw_map(pad: PadDesign) -> Figure:
+    """Draw the expected error over the unrolled pad, for a light and a firm touch."""
+    from matplotlib.colors import LogNorm
+
+    figure = new_figure(10.0, 4.6)
+    steps = np.linspace(_MAP_EDGE_FRACTION, 1 - _MAP_EDGE_FRACTION, _MAP_STEPS)
+    x, y = np.meshgrid(steps * pad.network.a, steps * pad.network.b)
+    u, v = pad.surface.from_rectangle(x, y)
+    _, width = pad.surface.from_rectangle(x, np.full_like(y, pad.surface.b))
+    across = v - width / 2
+    for axes, force in zip(figure.subplots(1, 2), (pad.light_touch_n, FIRM_TOUCH_N), strict=True):
+        error = 1e3 * expected_error(pad, force, x, y)[0]
+        scale = LogNorm(error.min(), np.quantile(error, 0.98))
+        mesh = axes.pcolormesh(1e3 * u, 1e3 * across, error, norm=scale, cmap="viridis_r", shading="gouraud")
+        levels = [level for level in _round_numbers() if error.min() < level < np.quantile(error, 0.95)]
+        lines = axes.contour(1e3 * u, 1e3 * across, error, levels, colors="white", linewidths=0.8)
+        axes.clabel(lines, fmt=_format_tick, fontsize=8)
+        axes.set_aspect("equal")
+        bar = figure.colorbar(mesh, ax=axes, shrink=0.9, format=_format_tick)
+        bar.ax.minorticks_off()
+        bar.set_ticks(levels)
+        bar.ax.tick_params(labelsize=8)
+        bar.set_label("expected error, mm", fontsize=8)
+        middle, worst = (1e3 * value for value in error_summary(pad, force))
+        title = f"{force:g} N: median {middle:.2g}, worst {worst:.2g} mm"
+        format_axes(axes, title, "from electrode x0, mm", "from the centre line, mm")
+        axes.grid(visible=False)
+    figure.suptitle(
+        f"{pad.name}: expected location error, mm (1 sigma), unrolled surface; numbers: inner 80 %",
+        fontsize=10,
+    )
+    return figure
+
+
+def draw_choices(pad: PadDesign) -> Figure:
+    """Draw the error over aspect, gaps, series resistors and converter bits, one changed at a time."""
+    figure = new_figure(9.6, 7.0)
+    aspects, gaps, resistors, bits = figure.subplots(2, 2).flat
+    network = pad.network
+    area, gap = network.a * network.b, _mean_gap(network)
+    shorter = min(network.a, network.b)
+
+    def of_aspect(aspect: float) -> PadDesign:
+        a, b = math.sqrt(area * aspect), math.sqrt(area / aspect)
+        return replace(pad, surface=PlaneSurface(a, b), network=_evenly_gapped_network(a, b, gap, network))
+
+    _plot_error_curve(aspects, pad, np.geomspace(0.25, 4, 17), of_aspect, network.a / network.b)
+    aspects.set_xscale("log")
+    aspects.set_xticks([0.25, 0.5, 1, 2, 4], ["1:4", "1:2", "1:1", "2:1", "4:1"])
+    aspects.minorticks_off()
+    format_axes(aspects, "Aspect, flat, area kept", "along x : along y", "expected error, mm")
+
+    def of_gap(percent: float) -> PadDesign:
+        return replace(
+            pad, network=_evenly_gapped_network(network.a, network.b, percent / 100 * shorter, network)
+        )
+
+    _plot_error_curve(gaps, pad, np.linspace(0.5, 25, 15), of_gap, 100 * gap / shorter)
+    format_axes(gaps, "Bare corners", "gap, % of the shorter side", "expected error, mm")
+
+    # touching electrodes share their currents, so resistors need a gap
+    apart = network if gap > 0 else _evenly_gapped_network(network.a, network.b, 1e-3 * shorter, network)
+
+    def of_resistor(ohm: float) -> PadDesign:
+        return replace(pad, network=apart.with_series_ohm((ohm,) * 4))
+
+    alike = len(set(network.series_ohm)) == 1
+    _plot_error_curve(
+        resistors, pad, np.linspace(0, 1000, 15), of_resistor, network.series_ohm[0] if alike else None
+    )
+    format_axes(resistors, "Equal series resistors", "ohm", "expected error, mm")
+
+    def of_bits(count: float) -> PadDesign:
+        return replace(pad, bits=round(count))
+
+    _plot_error_curve(bits, pad, np.arange(8.0, 19.0), of_bits, pad.bits)
+    format_axes(bits, "Bits of the converter, sign included", "bits", "expected error, mm")
+    figure.suptitle(f"{pad.name}: one choice varied at a time, inner 80 %; dots: as configured", fontsize=10)
+    return figure
+
+
+def pad_design(deployment: config.Deployment, link: str | None = None) -> PadDesign:
+    """Return the design of the pad on a link, or of the first pad. Raises ValueError naming the known
+    links.
+    """
+    pads = [entry.pad for entry in deployment.pads]
+    chosen = next((pad for pad in pads if link in (None, pad.link)), None)
+    if chosen is None:
+        raise ValueError(f"no pad on link {link}; known links: {', '.join(pad.link for pad in pads)}")
+    sheet, node = deployment.sheets[chosen.sheet], deployment.nodes[chosen.node]
+    law = ContactLaw(
+        sheet.contact_ohm_mm2 * 1e-6,
+        sheet.alpha,
+        sheet.contact_radius_mm * 1e-3,
+        sheet.contact_radius_std_mm * 1e-3,
+        sheet.reference_kpa * 1e3,
+    )
+    return PadDesign(
+        chosen.link,
+        pad_surface(chosen),
+        electrode_network(chosen, sheet),
+        law,
+        node.drive_v,
+        node.full_scale_ma * 1e-3,
+        node.noise_counts,
+        (chosen.touch or deployment.touch).begin_threshold_n,
+    )
+
+
+def draw_design(pad: PadDesign, out: Path) -> list[Path]:
+    """Write the drawings of a pad into the folder `out`, created if missing; return their paths.
+
+    Raises ImportError without matplotlib, OSError if `out` cannot be written.
+    """
+    drawings: dict[str, Callable[[PadDesign], Figure]] = {"error": draw_map, "choices": draw_choices}
+    out.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for kind, draw in drawings.items():
+        paths.append(out / f"{pad.name}_{kind}.png")
+        draw(pad).savefig(paths[-1], dpi=DPI)
+    return paths
+
+
+def _plot_error_curve(
+    axes: Axes,
+    pad: PadDesign,
+    values: Sequence[float] | FloatArray,
+    variant: Callable[[float], PadDesign],
+    configured: float | None,
+) -> None:
+    """Plot median and worst error over one design choice, for both forces."""
+    for force, colour in ((pad.light_touch_n, ACCENT), (FIRM_TOUCH_N, INK)):
+        middle, worst = 1e3 * np.array([error_summary(variant(float(v)), force) for v in values]).T
+        axes.plot(values, middle, color=colour, label=f"{force:g} N, median")
+        axes.plot(values, worst, "--", color=colour, linewidth=1, label=f"{force:g} N, worst")
+        if configured is not None:
+            axes.plot(
+                [configured] * 2,
+                1e3 * np.array(error_summary(variant(configured), force)),
+                "o",
+                color=ERRATUM,
+            )
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(_format_tick)
+    axes.legend(fontsize=7, frameon=False)
+
+
+def _format_tick(value: float, _position: float = 0) -> str:
+    return f"{value:g}"
+
+
+def _round_numbers() -> list[float]:
+    """Return 1, 2 and 5 times every power of ten."""
+    return [digit * 10.0**decade for decade in range(-6, 3) for digit in (1, 2, 5)]
+
+
+def _evenly_gapped_network(a: float, b: float, gap: float, like: ElectrodeNetwork) -> ElectrodeNetwork:
+    """Return a network of four electrodes with equal gaps, sheet and resistors as of another pad."""
+    return ElectrodeNetwork(a, b, gap, like.sheet_ohm_per_square, like.series_ohm)
+
+
+def _mean_gap(network: ElectrodeNetwork) -> float:
+    """Return the mean bare length at the ends of the electrodes, in the unit of the rectangle."""
+    lengths = {"x0": network.b, "xa": network.b, "y0": network.a, "yb": network.a}
+    return float(np.mean([(lengths[e.side] - (e.stop - e.start)) / 2 for e in network.electrodes]))

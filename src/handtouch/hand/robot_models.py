@@ -1,0 +1,215 @@
+"""Kinematics and URDF checks of the hands of a deployment.
+
+Public names: `RobotModels`, `check_urdfs`, `drop_invalid_urdfs`, `unchecked_items`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.config import (
+    ConfigError,
+    Deployment,
+    Hand,
+    Problem,
+)
+from handtouch.hand import kinematics, urdf
+from handtouch.hand.body_distance import find_mesh, signed_distance_m
+from handtouch.hand.kinematics import HandKinematics
+from handtouch.hand.pads import MountUncertainty, mount_transform
+from handtouch.hand.urdf import RobotDescription, UrdfError
+
+FloatArray = NDArray[np.float64]
+_MAX_PAD_DEPTH_M, _MAX_PAD_HEIGHT_M = 0.003, 0.010
+"""Distance of a pad's centre below its link's body, and above it, beyond which its mount is rejected."""
+_OUTWARD_TEST_STEP_M = 0.003
+_KEYS_REQUIRING_URDF = (
+    *("palm_link", "base_link", "joint_names", "joint_prefix"),
+    *("mount_std_mm", "mount_std_deg", "joint_std_deg", "joint_std_mm"),
+)
+INSTALL_COMMAND = "pip install 'handtouch[urdf]'"
+
+
+class RobotModels:
+    """Kinematics of the hands that have a URDF; all attributes are lists over these hands.
+
+    `hands`: names; `kinematics`; `pad_rows`: numbers of its pads among those of the deployment, in the order
+    of the kinematics' links; `joint_names`: names of the kinematics' joints in joint states;
+    `joints_stale_s`, `group_distance_m`; `gravity`: unit vector (3,) in the base frame; `mounts`: uncertainty
+    of its mounts, None if not stated; `joint_std`: (m,) for joints whose states carry no deviation [rad, m if
+    prismatic]. Raises UrdfError, KeyError or OSError for errors that `check_urdfs` reports.
+    """
+
+    def __init__(self, deployment: Deployment) -> None:
+        self.hands: list[str] = []
+        self.kinematics: list[HandKinematics] = []
+        self.pad_rows: list[NDArray[np.intp]] = []
+        self.joint_names: list[tuple[str, ...]] = []
+        self.joints_stale_s: list[float] = []
+        self.group_distance_m: list[float] = []
+        self.mounts: list[MountUncertainty | None] = []
+        self.joint_std: list[FloatArray] = []
+        self.gravity: list[NDArray[np.float64]] = []
+        first = 0
+        for hand in deployment.hands:
+            if hand.urdf and kinematics.pinocchio_available():
+                robot = urdf.read_urdf(Path(hand.urdf))
+                links = [pad.mount.link or pad.link for pad in hand.pads]
+                made = HandKinematics(
+                    robot, links, hand.palm_link or robot.root, hand.base_link or robot.root
+                )
+                self.hands.append(hand.name)
+                self.kinematics.append(made)
+                self.pad_rows.append(np.arange(first, first + len(hand.pads)))
+                self.joint_names.append(tuple(_message_joint_name(hand, joint) for joint in made.joints))
+                self.joints_stale_s.append(hand.joint_state_timeout_ms * 1e-3)
+                self.group_distance_m.append(hand.grouping_distance_mm * 1e-3)
+                self.mounts.append(
+                    MountUncertainty(hand) if hand.mount_std_mm or hand.mount_std_deg else None
+                )
+                slides = np.array([robot.joints[name].kind == "prismatic" for name in made.joints], np.bool_)
+                std = np.where(slides, hand.joint_std_mm * 1e-3, np.radians(hand.joint_std_deg))
+                self.joint_std.append(std)
+                self.gravity.append(np.array(hand.gravity) / np.linalg.norm(hand.gravity))
+            first += len(hand.pads)
+
+
+def _message_joint_name(hand: Hand, joint: str) -> str:
+    return hand.joint_names.get(joint, hand.joint_prefix + joint)
+
+
+def check_urdfs(deployment: Deployment, file: str) -> Deployment:
+    """Return the deployment if its hands fit their URDFs. Raises ConfigError naming every error."""
+    problems = [*_unavailable_frames(deployment)]
+    for number, hand in enumerate(deployment.hands, 1):
+        problems += _hand_problems(number, hand)
+    if problems:
+        raise ConfigError(file, tuple(problems))
+    return deployment
+
+
+def drop_invalid_urdfs(deployment: Deployment, file: str) -> tuple[Deployment, tuple[Problem, ...]]:
+    """Return the deployment without URDFs that don't fit their hands, and the errors found.
+
+    Such a hand is served in link frames only. Raises ConfigError if palm or base output is requested and no
+    hand can ever provide it.
+    """
+    if unserved := tuple(_unavailable_frames(deployment)):
+        raise ConfigError(file, unserved)
+    hands, problems = [], []
+    for number, hand in enumerate(deployment.hands, 1):
+        found = list(_hand_problems(number, hand))
+        problems += found
+        hands.append(hand.model_copy(update={"urdf": None}) if found else hand)
+    return deployment.model_copy(update={"hands": tuple(hands)}), tuple(problems)
+
+
+def _unavailable_frames(deployment: Deployment) -> Iterator[Problem]:
+    """Yield frames that the file's scene requests and no hand can provide."""
+    requested = sorted({"palm", "base"} & set(deployment.scene.outputs))
+    if requested and not any(hand.urdf for hand in deployment.hands):
+        yield Problem("[scene]: outputs", _value_text(requested), "needs a hand with a URDF: [[hand]] urdf")
+    elif requested and not kinematics.pinocchio_available():
+        yield Problem(
+            "[scene]: outputs",
+            _value_text(requested),
+            f"needs a package that isn't installed: {INSTALL_COMMAND}",
+        )
+
+
+def unchecked_items(deployment: Deployment) -> Iterator[str]:
+    """Yield what couldn't be checked, and why; for a deployment that has passed `check_urdfs`."""
+    for hand in deployment.hands:
+        if not hand.urdf:
+            continue
+        if not kinematics.pinocchio_available():
+            yield f"{hand.name}: urdf: contacts aren't published in palm and base frame; {INSTALL_COMMAND}"
+        robot = urdf.read_urdf(Path(hand.urdf))
+        for pad in hand.pads:
+            meshes = [s.file for s in robot.bodies[pad.mount.link or pad.link] if s.kind == "mesh"]
+            lost = [mesh for mesh in meshes if find_mesh(mesh, robot.path.parent) is None]
+            if lost or (meshes and not kinematics.pinocchio_available()):
+                why = f"file {lost[0]} not found" if lost else f"meshes are read with {INSTALL_COMMAND}"
+                yield f"{hand.name}/{pad.link}: position on the link's body not checked: {why}"
+
+
+def _hand_problems(number: int, hand: Hand) -> Iterator[Problem]:
+    location = f'[[hand]] {number} "{hand.name}": '
+    if not any(hand.gravity):
+        yield Problem(
+            f"{location}gravity", _value_text(hand.gravity), "must not be zero, e.g. [0.0, 0.0, -1.0]"
+        )
+    if not hand.urdf:
+        for key in _KEYS_REQUIRING_URDF:
+            if value := getattr(hand, key):
+                yield Problem(f"{location}{key}", _value_text(value), "needs a URDF, and urdf is missing")
+        return
+    try:
+        robot = urdf.read_urdf(Path(hand.urdf))
+    except UrdfError as error:
+        yield Problem(f"{location}urdf", _value_text(hand.urdf), str(error))
+        return
+    for key in ("palm_link", "base_link"):
+        if (value := getattr(hand, key)) and value not in robot.bodies:
+            yield Problem(f"{location}{key}", _value_text(value), _no_such("link", value, list(robot.bodies)))
+    for joint in hand.joint_names:
+        if joint not in robot.joints:
+            yield Problem(
+                f"{location}joint_names", _value_text(joint), _no_such("joint", joint, list(robot.joints))
+            )
+    for count, pad in enumerate(hand.pads, 1):
+        at = f'[[hand.pad]] {count} "{hand.name}/{pad.link}": '
+        key, link = ("mount.link", pad.mount.link) if pad.mount.link else ("link", pad.link)
+        if link not in robot.bodies:
+            remedy = _no_such("link", link, list(robot.bodies))
+            yield Problem(
+                f"{at}{key}", _value_text(link), f"{remedy}; set mount.link to the link that carries the pad"
+            )
+        else:
+            yield from _mount_problems(at, pad, link, robot)
+
+
+def _mount_problems(at: str, pad: config.Pad, link: str, robot: RobotDescription) -> Iterator[Problem]:
+    rotation, middle = mount_transform(pad)
+    outward = middle + _OUTWARD_TEST_STEP_M * rotation[:, 2]
+    height, outward_height = signed_distance_m(
+        robot.bodies[link], np.stack([middle, outward]), robot.path.parent
+    ).tolist()
+    if height == np.inf:
+        return  # the URDF has no body for this link
+    body = f'the body of link "{link}"'
+    if height < -_MAX_PAD_DEPTH_M:
+        yield Problem(
+            f"{at}mount.position_mm",
+            _value_text(pad.mount.position_mm),
+            f"the pad's centre is {-height * 1e3:.1f} mm inside {body}; move it to the surface",
+        )
+    elif height > _MAX_PAD_HEIGHT_M:
+        yield Problem(
+            f"{at}mount.position_mm",
+            _value_text(pad.mount.position_mm),
+            f"the pad's centre is {height * 1e3:.1f} mm from {body}; is it on another link, or in metres?",
+        )
+    elif outward_height <= height:
+        yield Problem(
+            f"{at}mount.rpy_deg",
+            _value_text(pad.mount.rpy_deg),
+            f"the pad faces into {body}; its z axis points outward",
+        )
+
+
+def _no_such(what: str, name: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    suggestion = f'did you mean "{near[0]}"? ' if near else ""
+    return f"the URDF has no such {what}; {suggestion}known: {', '.join(known)}"
+
+
+def _value_text(value: object) -> str:
+    return f" = {json.dumps(value, ensure_ascii=False)}"

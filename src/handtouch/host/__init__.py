@@ -1,0 +1,1 @@
+"""Host interface of every process: signals, logging, real-time scheduling, systemd notification."""

@@ -1,0 +1,60 @@
+"""Facts about this machine: kernel parameters and network interfaces.
+
+Public name: `Machine`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_NET_ADMIN_BIT = 12
+
+
+@dataclass(frozen=True)
+class Machine:
+    """The kernel's file systems; tests give folders of their own."""
+
+    proc: Path = Path("/proc")
+    sys: Path = Path("/sys")
+
+    def read_sysctl(self, name: str) -> int | None:
+        """Return a kernel parameter by its path below /proc/sys."""
+        try:
+            return int((self.proc / "sys" / name).read_text())
+        except (OSError, ValueError):
+            return None
+
+    def read_link(self, name: str) -> dict[str, Any] | None:
+        """Return a network interface as `ip -details -json link` describes it; None without iproute2."""
+        try:
+            done = subprocess.run(
+                ["ip", "-details", "-json", "link", "show", "dev", name],
+                capture_output=True,
+                text=True,
+                timeout=10,
+                check=False,
+            )
+            answer = json.loads(done.stdout) if done.returncode == 0 else []
+        except (OSError, ValueError, subprocess.TimeoutExpired):
+            return None
+        return next((dict(link) for link in answer if link), None)
+
+    def bit_rate(self, name: str) -> int | None:
+        """Return the bit rate that `ip link set` has given a SocketCAN interface."""
+        link = self.read_link(name) or {}
+        rate = link.get("linkinfo", {}).get("info_data", {}).get("bittiming", {}).get("bitrate")
+        return rate if isinstance(rate, int) else None
+
+    def has_net_admin(self) -> bool:
+        """Check for CAP_NET_ADMIN, with which socket buffers may exceed rmem_max."""
+        try:
+            status = (self.proc / "self/status").read_text()
+        except OSError:
+            return False
+        found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+        return found is not None and bool(int(found[1], 16) >> _NET_ADMIN_BIT & 1)

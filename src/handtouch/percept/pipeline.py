@@ -1,0 +1,118 @@
+"""Pipeline of percept estimators: per-tick updates, one slow fit at a time, and action requests.
+
+Public names: `PerceptPipeline`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.percept.action_request import ActionRequest, ActionSelector, Question
+from handtouch.percept.samples import (
+    ContactBuffer,
+    ContactSamples,
+    IntArray,
+    PerceptEstimate,
+    PerceptEstimator,
+)
+from handtouch.wire import PERCEPT_KINDS
+
+_FIT_PERIOD_NS = 10_000_000
+"""From one fit to the next, whatever the tick period: bounds the load to one fit in 10 ms."""
+
+
+class PerceptPipeline:
+    """Runs estimators over n pads; call `process_tick` after every tick.
+
+    Each estimator runs only for the pads it is requested for.
+    """
+
+    def __init__(self, buffer: ContactBuffer, estimators: Sequence[PerceptEstimator]) -> None:
+        self.buffer = buffer
+        self.estimators = list(estimators)
+        self.action_selector = ActionSelector()
+        self.action_request_pads = np.zeros(buffer.size, dtype=np.bool_)
+        """pads (n,) about which actions may be requested"""
+        self.fit_count = 0
+        """fits done so far"""
+        self._last_fit_ns = 0
+        self._next_estimator = 0  # the first to offer a fit
+
+    def set_requested(self, requested: NDArray[np.bool_], action_request_pads: NDArray[np.bool_]) -> None:
+        """Set the pads of each estimator (kinds, n), rows as PERCEPT_KINDS, and those of action requests
+        (n,).
+        """
+        changed = np.zeros(self.buffer.size, dtype=np.bool_)
+        for estimator in self.estimators:
+            pads = requested[PERCEPT_KINDS.index(estimator.kind)]
+            changed |= pads != estimator.requested
+            estimator.requested = pads.copy()
+        # for an estimator, every contact begins with its first sample
+        self.buffer.end_contacts(np.flatnonzero(changed))
+        self.action_request_pads = action_request_pads.copy()
+
+    def process_tick(
+        self, sample: ContactSamples, ended: IntArray, tick_ns: int
+    ) -> tuple[list[PerceptEstimate], list[ActionRequest]]:
+        """Process the samples of a tick at `tick_ns`, and the pads (k,) whose contacts ended."""
+        found: list[PerceptEstimate] = []
+        if len(ended):
+            ended = ended[self.buffer.contact_id[ended] > 0]
+            for estimator in self.estimators:
+                if len(rows := ended[estimator.requested[ended]]):
+                    found += estimator.end_contacts(self.buffer, rows, tick_ns)
+            self.buffer.end_contacts(ended)
+        if len(sample.pads):
+            began = self.buffer.add_samples(sample)
+            for estimator in self.estimators:
+                found += self._process_samples(estimator, sample, began)
+        found += self._fit_next(tick_ns)
+        return found, self._select_requests(tick_ns)
+
+    def _process_samples(
+        self, estimator: PerceptEstimator, sample: ContactSamples, began: IntArray
+    ) -> Sequence[PerceptEstimate]:
+        rows = estimator.requested[sample.pads]
+        count = np.count_nonzero(rows)
+        if not count:
+            return ()
+        if count < len(rows):
+            some = ContactSamples(sample.pads[rows], sample.sample_ns[rows], sample.contact_id[rows])
+            some.values = sample.values[rows]
+            sample, began = some, began[estimator.requested[began]]
+        return estimator.process_samples(self.buffer, sample, began)
+
+    def _fit_next(self, tick_ns: int) -> Sequence[PerceptEstimate]:
+        """Run at most one fit; estimators take turns."""
+        if tick_ns - self._last_fit_ns < _FIT_PERIOD_NS:
+            return ()
+        for number in range(len(self.estimators)):
+            estimator = self.estimators[(self._next_estimator + number) % len(self.estimators)]
+            if (
+                estimator.requested.any()
+                and (pad := estimator.next_pad_to_fit(self.buffer, tick_ns)) is not None
+            ):
+                self._next_estimator += number + 1
+                self._last_fit_ns = tick_ns
+                self.fit_count += 1
+                return estimator.fit_contact(self.buffer, pad, tick_ns)
+        return ()
+
+    def _select_requests(self, tick_ns: int) -> list[ActionRequest]:
+        if not self.action_request_pads.any() or not self.action_selector.is_due(tick_ns):
+            return []
+        questions = [
+            question
+            for estimator in self.estimators
+            if estimator.requested.any()
+            for question in estimator.open_questions(tick_ns)
+            if self._is_requested(question)
+        ]
+        return self.action_selector.select_requests(questions, tick_ns)
+
+    def _is_requested(self, question: Question) -> bool:
+        pads = self.buffer.hand_index == question.hand if question.pad < 0 else question.pad
+        return bool(np.any(self.action_request_pads[pads]))

@@ -1,0 +1,226 @@
+"""Buffer of the latest samples of every contact, and the interface of percept estimators.
+
+Public names: `ContactBuffer`, `SampleWindow`, `ContactSamples`, `FitSchedule`, `PerceptEstimate`,
+`PerceptEstimator`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from handtouch.percept.action_request import Question
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+SAMPLES_PER_CONTACT = 512
+"""Samples kept of a contact."""
+
+SAMPLE_FIELDS: dict[str, tuple[int, ...]] = {
+    "pad_m": (2,),  # arc lengths on the pad
+    "pad_noise_m2": (2, 2),  # part of pad_m's covariance that is independent in each sample
+    "position_m": (3,),  # in the link's frame
+    "normal": (3,),
+    "covariance_m2": (3, 3),  # of position_m, systematic errors included
+    "force_n": (),  # sheet behaviour compensated, where it is modelled
+    "force_std_n": (),
+    "uncompensated_force_n": (),  # by the contact law alone; NaN where the sheet isn't modelled
+    "total_current_a": (),
+    "residual": (),
+    "residual_std": (),
+    "palm_position_m": (3,),  # NaN without joint states; also the following
+    "palm_normal": (3,),
+    "palm_covariance_m2": (3, 3),
+    "palm_rotation": (3, 3),  # of the link frame in the palm frame
+    "palm_joints_m2": (),  # contribution of joints to palm_covariance_m2, mean per axis
+    "joints_age_s": (),
+    "commanded_m": (),  # commanded displacement of the link along the normal since the contact began
+    "commanded_normal": (3,),  # in the palm frame, at the commanded joint positions
+}
+"""Fields of a sample and their shapes; SI units, NaN where unknown."""
+
+
+def _slices() -> tuple[dict[str, slice], int]:
+    at, slices = 0, {}
+    for name, shape in SAMPLE_FIELDS.items():
+        slices[name] = slice(at, at + int(np.prod(shape, dtype=int)))
+        at = slices[name].stop
+    return slices, at
+
+
+_SLICES, _WIDTH = _slices()
+
+
+class ContactSamples:
+    """Samples (k,) of as many pads at one tick: `pads`, `sample_ns`, `contact_id`, and SAMPLE_FIELDS by name.
+
+    Fields can be assigned, and read as views: `sample["force_n"]` is (k,), `sample["pad_m"]` (k, 2).
+    """
+
+    def __init__(self, pads: IntArray, sample_ns: NDArray[np.int64], contact_id: NDArray[np.uint32]) -> None:
+        self.pads, self.sample_ns, self.contact_id = pads, sample_ns, contact_id
+        self.values = np.full((len(pads), _WIDTH), np.nan)
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return self.values[:, _SLICES[name]].reshape(len(self.pads), *SAMPLE_FIELDS[name])
+
+    def __setitem__(self, name: str, values: FloatArray) -> None:
+        self.values[:, _SLICES[name]] = np.reshape(values, (len(self.pads), -1))
+
+
+class SampleWindow:
+    """Last samples (k,) of one contact, oldest first: `sample_ns`, `relative_s`, and SAMPLE_FIELDS by name.
+
+    The arrays are views of a ring buffer: copy what outlives the tick.
+    """
+
+    def __init__(self, sample_ns: NDArray[np.int64], values: FloatArray) -> None:
+        self.sample_ns, self._values = sample_ns, values
+
+    def __len__(self) -> int:
+        return len(self.sample_ns)
+
+    @property
+    def relative_s(self) -> FloatArray:
+        """Time relative to the last sample [s], zero or negative."""
+        return (
+            np.asarray((self.sample_ns - self.sample_ns[-1]) * 1e-9) if len(self.sample_ns) else np.zeros(0)
+        )
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return np.asarray(self._values[:, _SLICES[name]].reshape(len(self.sample_ns), *SAMPLE_FIELDS[name]))
+
+
+class ContactBuffer:
+    """Ring buffers of the contacts of n pads. Each sample is stored twice, so that every window is
+    contiguous.
+
+    `contact_id` (n,): 0 where nothing touches; `sample_count` (n,): samples of that contact since it began.
+    """
+
+    def __init__(
+        self, pads: int, hand_index: Sequence[int] | None = None, length: int = SAMPLES_PER_CONTACT
+    ) -> None:
+        """hand_index: number of each pad's hand; default: all pads are of one."""
+        self.size, self.length = pads, length
+        self.hand_index = (
+            np.zeros(pads, dtype=np.intp) if hand_index is None else np.asarray(hand_index, np.intp)
+        )
+        self.contact_id = np.zeros(pads, dtype=np.uint32)
+        self.sample_count = np.zeros(pads, dtype=np.int64)
+        self._sample_ns = np.zeros((pads, 2 * length), dtype=np.int64)
+        self._values = np.full((pads, 2 * length, _WIDTH), np.nan)
+
+    def add_samples(self, sample: ContactSamples) -> IntArray:
+        """Add the samples of a tick; return the pads on which a new contact began."""
+        pads = sample.pads
+        new = self.contact_id[pads] != sample.contact_id
+        began = pads[new]
+        self.sample_count[began] = 0
+        self.contact_id[pads] = sample.contact_id
+        at = self.sample_count[pads] % self.length
+        for where in (at, at + self.length):
+            self._sample_ns[pads, where] = sample.sample_ns
+            self._values[pads, where] = sample.values
+        self.sample_count[pads] += 1
+        return np.asarray(began)
+
+    def end_contacts(self, pads: IntArray) -> None:
+        """Mark the contacts on these pads as ended."""
+        self.contact_id[pads] = 0
+        self.sample_count[pads] = 0
+
+    def window(self, pad: int, max_samples: int = SAMPLES_PER_CONTACT) -> SampleWindow:
+        """Return the last samples of the contact on a pad, at most `max_samples`."""
+        k = int(min(max_samples, self.sample_count[pad], self.length))
+        stop = int((self.sample_count[pad] - 1) % self.length) + self.length + 1
+        return SampleWindow(self._sample_ns[pad, stop - k : stop], self._values[pad, stop - k : stop])
+
+    def latest_field(self, pads: IntArray, name: str, back: IntArray | int = 0) -> FloatArray:
+        """Return a field of the last sample of each pad (k, ...), or of `back` samples earlier; NaN if
+        missing.
+        """
+        at = (self.sample_count[pads] - 1 - back) % self.length
+        values = self._values[pads, at, _SLICES[name]]
+        values[self.sample_count[pads] <= back] = np.nan
+        return np.asarray(values.reshape(len(pads), *SAMPLE_FIELDS[name]))
+
+    def latest_sample_ns(self, pads: IntArray, back: IntArray | int = 0) -> NDArray[np.int64]:
+        """Return the times (k,) of these samples."""
+        return np.asarray(self._sample_ns[pads, (self.sample_count[pads] - 1 - back) % self.length])
+
+
+class FitSchedule:
+    """Schedules fits of n pads: the longest waiting first, none more often than every `period_ns`."""
+
+    def __init__(self, pads: int, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._last_fit_ns = np.full(pads, -(10**18), dtype=np.int64)
+
+    def next_pad(self, ready: NDArray[np.bool_], now_ns: int) -> int | None:
+        """Return the next of the pads that are `ready` (n,), or None if none is due."""
+        pads = np.flatnonzero(ready & (now_ns - self._last_fit_ns >= self._period_ns))
+        return int(pads[np.argmin(self._last_fit_ns[pads])]) if len(pads) else None
+
+    def mark_fitted(self, pad: int, now_ns: int) -> None:
+        """Record a fit of the pad at `now_ns`."""
+        self._last_fit_ns[pad] = now_ns
+
+
+@dataclass(frozen=True, slots=True)
+class PerceptEstimate:
+    """Estimate of one kind for a contact, or for a whole hand (`pad` -1).
+
+    `label` is the most probable class, "" without classes; `state` is undetermined (`reason` says what is
+    missing), estimated or invalid.
+    """
+
+    kind: str
+    hand: int
+    pad: int
+    contact: int
+    estimate_ns: int
+    state: str
+    label: str = ""
+    probabilities: Mapping[str, float] = field(default_factory=dict)
+    values: Mapping[str, float | str | Sequence[float] | None] = field(default_factory=dict)
+    """by name with unit; standard deviations as NAME_std, covariances row by row"""
+    evidence: Mapping[str, float | int] = field(default_factory=dict)
+    """counts of the data used: samples, contacts, seconds"""
+    reason: str = ""
+    urgent: bool = False
+    """publish at once, regardless of the kind's period"""
+
+
+class PerceptEstimator(Protocol):
+    """Estimator of one kind of percept over all pads; `requested` (n,) are the pads it runs for.
+
+    `process_samples` is called in every tick and must be quick. Slow work belongs in `fit_contact`, which is
+    called for one pad now and then and must stay below a few milliseconds.
+    """
+
+    kind: str
+    requested: NDArray[np.bool_]
+
+    def process_samples(
+        self, buffer: ContactBuffer, sample: ContactSamples, began: IntArray
+    ) -> Sequence[PerceptEstimate]:
+        """Process a tick's samples of requested pads, already in the buffer; return new estimates."""
+
+    def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:
+        """Return the pad most in need of a fit, or None."""
+
+    def fit_contact(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
+        """Fit the contact on one pad, or the object in its hand."""
+
+    def end_contacts(self, buffer: ContactBuffer, pads: IntArray, now_ns: int) -> Sequence[PerceptEstimate]:
+        """Handle the end of contacts on these pads, whose windows still exist; return final estimates."""
+
+    def open_questions(self, now_ns: int) -> Sequence[Question]:
+        """Return the undecided questions with the probabilities so far."""

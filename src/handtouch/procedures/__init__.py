@@ -1,0 +1,1 @@
+"""Procedures around a deployment: check, doctor, scan, commissioning, calibration by weights."""

@@ -1,0 +1,126 @@
+"""A pad as a running daemon serves it: hand frames as samples, tare and calibration by control.
+
+Public names: `DaemonEndpoints`, `ServedPad`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Self
+
+from handtouch import client, wire
+from handtouch.calibration.calibration import LawParameters
+from handtouch.procedures.calibrate.procedure import PadSample
+
+_RECEIVE_TIMEOUT_S = 0.5
+_SCENE_LEASE_S = 60.0
+_TARE_TIMEOUT_S = 60.0
+
+
+@dataclass(frozen=True)
+class DaemonEndpoints:
+    """Endpoints of a daemon, and its public key."""
+
+    live: str
+    control: str
+    key: str | None
+
+
+class ServedPad:
+    """The pad `hand`/`link` of a daemon; use it in a `with` block, in which a scene keeps the pad active.
+
+    `active_calibration`: the daemon's answer to `calibrate`. `serial`: of the node, None until known or if
+    there is none. `tare_offsets`: mean counts and their variances (4,) of the last tare. Raises what
+    `client.request` does.
+    """
+
+    def __init__(self, endpoints: DaemonEndpoints, hand: str, link: str) -> None:
+        self.name = f"{hand}/{link}"
+        self.active_calibration: dict[str, Any] = {}
+        self.serial: int | None = None
+        self.tare_offsets: tuple[list[float], list[float]] | None = None
+        self._endpoints, self._hand, self._link = endpoints, hand, link
+        self._sync_ns = 0
+        self._lease_renewed_s = -math.inf
+
+    def __enter__(self) -> Self:
+        self.active_calibration = self._request("calibrate", pad=self.name)
+        self._renew_lease()
+        self._messages = client.connect(
+            f"hand/{self._hand}",
+            f"health/{self._hand}/{self._link}",
+            endpoint=self._endpoints.live,
+            key=self._endpoints.key,
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._messages.close()
+        self._request("scene", name=self._scene_name, reset=True)
+
+    def samples(self) -> Iterator[PadSample]:
+        """Yield a sample for each frame; without frames, one that is not alive every half second."""
+        while True:
+            self._renew_lease()
+            message = self._messages.recv(_RECEIVE_TIMEOUT_S)
+            if isinstance(message, wire.Health):
+                self.serial = message.serial or None
+            elif isinstance(message, wire.HandFrame) and not message.retained:
+                self._sync_ns = max(message.t_ns, self._sync_ns)
+                yield self._sample_from_frame(message)
+            elif message is None:
+                self._sync_ns += round(_RECEIVE_TIMEOUT_S * 1e9)
+                yield PadSample(self._sync_ns, alive=False)
+
+    def tare(self) -> str:
+        """Zero the pad; return the reason of a refusal, empty if it was done."""
+        (pad,) = self._request("tare", _TARE_TIMEOUT_S, pads=[self.name])["pads"]
+        if not pad["tared"]:
+            return str(pad["reason"])
+        variance = [std**2 / max(pad["samples"], 1) for std in pad["std_counts"]]
+        self.tare_offsets = list(pad["offset_counts"]), variance
+        return ""
+
+    def apply_law(self, calibration_id: str, law: LawParameters) -> str:
+        """Apply a law; return the identifier of the active calibration."""
+        parameters = {key: getattr(law, key) for key in ("contact_ohm_mm2", "alpha", "ohm_per_square")}
+        answer = self._request("calibrate", pad=self.name, name=calibration_id, law=parameters)
+        return str(answer["calibration_id"])
+
+    @property
+    def _scene_name(self) -> str:
+        return f"calibrate {self.name}"[:64]
+
+    def _renew_lease(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._lease_renewed_s > _SCENE_LEASE_S / 3:
+            self._lease_renewed_s = now_s
+            self._request(
+                "scene",
+                name=self._scene_name,
+                links=[self.name],
+                outputs=["position", "force"],
+                rate_hz=0,
+                lease_s=_SCENE_LEASE_S,
+            )
+
+    def _sample_from_frame(self, frame: wire.HandFrame) -> PadSample:
+        row = frame.links.index(self._link)
+        columns = client.columns(frame)
+        state = wire.PadState(int(columns["state"][row]))
+        x, y = columns["pad_m"][row].tolist()
+        return PadSample(
+            frame.t_ns,
+            alive=state in (wire.PadState.CLEAR, wire.PadState.TOUCHED),
+            touched=state is wire.PadState.TOUCHED,
+            current_a=float(columns["total_current_a"][row]),
+            position_m=(x, y),
+            force_n=float(columns["force_n"][row]),
+        )
+
+    def _request(self, command: str, timeout_s: float = 3.0, **arguments: Any) -> dict[str, Any]:
+        endpoint, key = self._endpoints.control, self._endpoints.key
+        return client.request(command, endpoint=endpoint, key=key, timeout_s=timeout_s, **arguments)

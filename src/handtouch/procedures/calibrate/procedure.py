@@ -1,0 +1,290 @@
+"""Guided procedure with an operator who places weights on a pad: tare, then one weight after another.
+
+No clock, socket, file or terminal: samples carry their times, texts go to a `Dialogue`.
+
+Public names: `WeightProcedure`, `PadSample`, `SampledPad`, `SettlingDetector`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.text import Text
+
+from handtouch.procedures.calibrate.readings import PadCircuitModel, Weight, WeightReading
+from handtouch.procedures.dialogue import Dialogue, Key
+
+_SECOND_NS = 1_000_000_000
+_CREEP_DELAY_NS = _SECOND_NS  # after about a second a sheet carries its full current
+_MEAN_DURATION_NS = _SECOND_NS  # averaged for a reading
+_BATCH_COUNT = 10  # noise is correlated for some 50 ms: means of batches are independent, samples aren't
+_MAX_SETTLED_DRIFT, _MAX_SETTLED_DRIFT_SIGMA = (
+    0.005,
+    3.0,
+)  # more drift than this fraction, or standard errors, is creep
+_MIN_SAMPLES = 2 * _BATCH_COUNT
+_MIN_UNLOADED_NS = 300_000_000
+_MAX_ATTEMPTS = 3
+_SETTLING_TIMEOUT_NS = 15 * _SECOND_NS
+
+
+@dataclass(frozen=True)
+class PadSample:
+    """Sample of a pad. alive: the pad delivers samples; total current [A]; if touched, contact position as
+    arc lengths [m] and the daemon's force [N], NaN without one."""
+
+    sync_ns: int
+    alive: bool
+    touched: bool = False
+    current_a: float = 0.0
+    position_m: tuple[float, float] = (math.nan, math.nan)
+    force_n: float = math.nan
+
+
+class SampledPad(Protocol):
+    """Pad as served by a daemon."""
+
+    def samples(self) -> Iterator[PadSample]:
+        """Yield samples endlessly, also while the pad delivers none."""
+
+    def tare(self) -> str:
+        """Zero the pad; return the reason of a refusal, empty if it was done."""
+
+
+class _WeightKeyPressed(Exception):  # noqa: N818 - no error: a key that ends the current step
+    def __init__(self, key: Key) -> None:
+        self.key = key
+
+
+class _NoReading(Exception):  # noqa: N818
+    """No usable reading in time; `str` is the reason."""
+
+
+class WeightProcedure:
+    """Measures known weights on one pad, in the given order.
+
+    timeout_s: of waiting for a weight or a key. `readings`: those so far.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        weights: Sequence[Weight],
+        circuit_model: PadCircuitModel,
+        pad: SampledPad,
+        dialogue: Dialogue,
+        *,
+        timeout_s: float = 60.0,
+    ) -> None:
+        self.readings: list[WeightReading] = []
+        self._name, self._weights, self._circuit_model = name, weights, circuit_model
+        self._pad, self._dialogue = pad, dialogue
+        self._timeout_ns = round(timeout_s * 1e9)
+        self._samples = pad.samples()
+
+    def run(self) -> Iterator[WeightReading]:
+        """Tare, then yield a reading of every weight; ends early when the operator quits."""
+        try:
+            self._tare_pad()
+            skipped: set[Weight] = set()
+            for number, weight in enumerate(self._weights, 1):
+                if weight in skipped:
+                    continue
+                if self._measure_weight(f"[{number}/{len(self._weights)}]", weight):
+                    yield self.readings[-1]
+                else:
+                    skipped.add(weight)
+        except _WeightKeyPressed:  # quit; skip and again are handled per weight
+            self._print_line("Quit; the readings so far are kept.")
+
+    def confirm(self, question: str) -> bool:
+        """Return whether the operator confirms with Enter."""
+        return self._ask_key(question) is Key.ENTER
+
+    def _tare_pad(self) -> None:
+        while True:
+            self._print_line(f"Don't touch {self._name}: taring ...", "ask")
+            reason = self._pad.tare()
+            if not reason:
+                self._print_line("  tared.", "good")
+                return
+            self._print_line(f"  not tared: {reason}", "bad")
+            if self._ask_key("Enter or a: repeat, q: quit") not in (Key.ENTER, Key.AGAIN):
+                raise _WeightKeyPressed(Key.QUIT)
+
+    def _measure_weight(self, title: str, weight: Weight) -> bool:
+        """Measure a weight once; return False to skip it from now on. Raises _WeightKeyPressed to quit."""
+        while True:
+            try:
+                reading = self._measure_with_retries(title, weight)
+            except _NoReading as failed:
+                self._print_line(f"  {failed}.", "bad")
+                key = self._ask_key(f"Enter or a: repeat, s: skip {weight.name}, q: quit")
+            except _WeightKeyPressed as pressed:
+                key = pressed.key
+            else:
+                self.readings.append(reading)
+                self._report_reading(reading)
+                return True
+            if key is Key.QUIT:
+                raise _WeightKeyPressed(key)
+            if key is Key.SKIP:
+                return False
+
+    def _measure_with_retries(self, title: str, weight: Weight) -> WeightReading:
+        rejection = ""
+        for _ in range(_MAX_ATTEMPTS):
+            self._await_unloaded()
+            self._print_line(f"{title} place {weight.name} on the middle of {self._name}", "ask")
+            reading, rejection = self._await_reading(weight)
+            if not rejection:
+                return reading
+            self._print_line(f"  {rejection}; remove it and place it again.", "bad")
+        raise _NoReading(rejection)
+
+    def _await_reading(self, weight: Weight) -> tuple[WeightReading, str]:
+        """Return the settled reading and its problem, if any. Raises _NoReading, _WeightKeyPressed."""
+        settling = SettlingDetector()
+        started_ns: int | None = None
+        for sample in self._samples:
+            started_ns = started_ns if started_ns is not None else sample.sync_ns
+            self._check_key()
+            settled = settling.add_sample(sample)
+            self._show_progress(sample, settling)
+            if settled is not None:
+                reading = WeightReading(weight, *settled)
+                return reading, self._circuit_model.rejection_reason(reading.position_m, reading.current_a)
+            since = settling.loaded_ns
+            if since is not None and sample.sync_ns - since > _SETTLING_TIMEOUT_NS:
+                drift = f"{settling.relative_drift:.1%} a second"
+                raise _NoReading(f"the reading doesn't settle ({drift}): is the weight stable?")
+            if since is None and sample.sync_ns - started_ns > self._timeout_ns:
+                raise _NoReading(
+                    f"{self._name} delivers no samples: is its node connected? See `handtouch status`"
+                    if not sample.alive
+                    else "no contact: is the weight on this pad, and heavier than its begin_threshold_n?"
+                )
+        raise _NoReading("the samples ended")
+
+    def _await_unloaded(self) -> None:
+        """Wait until the pad is unloaded. Raises _NoReading, _WeightKeyPressed."""
+        unloaded_ns: int | None = None
+        started_ns: int | None = None
+        for sample in self._samples:
+            started_ns = started_ns if started_ns is not None else sample.sync_ns
+            self._check_key()
+            if sample.touched or not sample.alive:
+                unloaded_ns = None
+            elif unloaded_ns is None:
+                unloaded_ns = sample.sync_ns
+            elif sample.sync_ns - unloaded_ns >= _MIN_UNLOADED_NS:
+                return
+            if sample.sync_ns - started_ns > self._timeout_ns:
+                reason = "is still loaded" if sample.alive else "delivers no samples: see `handtouch status`"
+                raise _NoReading(f"{self._name} {reason}")
+
+    def _report_reading(self, reading: WeightReading) -> None:
+        same = [other.current_a for other in self.readings if other.weight == reading.weight]
+        x, y = (1e3 * value for value in reading.position_m)
+        text = f"  {reading.weight.name}: {1e3 * reading.current_a:.4g} mA at ({x:.1f}, {y:.1f}) mm"
+        if len(same) > 1:
+            text += f", {len(same)} readings scatter by {np.std(same, ddof=1) / np.mean(same):.1%}"
+        self._print_line(f"{text}; remove it.", "good")
+
+    def _show_progress(self, sample: PadSample, settling: SettlingDetector) -> None:
+        def draw() -> Text:
+            state = "no samples" if not sample.alive else "settling" if sample.touched else "waiting"
+            text = Text(f"  {1e3 * sample.current_a:8.4f} mA  {state}")
+            if settling.loaded_ns is not None and math.isfinite(settling.relative_drift):
+                text.append(f", {settling.relative_drift:+.2%} a second")
+            text.append("   a: repeat, s: skip, q: quit", "dim")
+            return text
+
+        self._dialogue.show_live(sample.sync_ns, draw)
+
+    def _ask_key(self, question: str) -> Key:
+        """Wait for a key; quit if keys aren't available, or after the timeout."""
+        self._print_line(f"  {question}", "ask")
+        started_ns: int | None = None
+        for sample in self._samples:
+            started_ns = started_ns if started_ns is not None else sample.sync_ns
+            key = self._dialogue.read_key()
+            if key is not None:
+                return key
+            if not self._dialogue.accepts_keys or sample.sync_ns - started_ns > self._timeout_ns:
+                break
+        return Key.QUIT
+
+    def _check_key(self) -> None:
+        key = self._dialogue.read_key()
+        if key is not None and key is not Key.ENTER:
+            raise _WeightKeyPressed(key)
+
+    def _print_line(self, text: str, style: str = "") -> None:
+        self._dialogue.print_line(text, style)
+
+
+class SettlingDetector:
+    """Detects when a placed load has settled: a second for the sheet's creep, then a mean of a second.
+
+    `loaded_ns`: begin of the load, None without one; `relative_drift`: change over the time of the mean, as a
+    fraction of it, NaN before there is any.
+    """
+
+    def __init__(self) -> None:
+        self.loaded_ns: int | None = None
+        self.relative_drift = math.nan
+        self._samples: deque[PadSample] = deque()
+
+    def add_sample(self, sample: PadSample) -> tuple[float, float, int, tuple[float, float], float] | None:
+        """Add a sample; once settled, return mean current, its std [A], samples, position [m], force [N]."""
+        if not sample.alive:
+            return None
+        if not sample.touched:
+            self.loaded_ns, self.relative_drift = None, math.nan
+            self._samples.clear()
+            return None
+        if self.loaded_ns is None:
+            self.loaded_ns = sample.sync_ns
+        if sample.sync_ns - self.loaded_ns < _CREEP_DELAY_NS:
+            return None
+        self._samples.append(sample)
+        while sample.sync_ns - self._samples[0].sync_ns > _MEAN_DURATION_NS:
+            self._samples.popleft()
+        if (
+            sample.sync_ns - self.loaded_ns < _CREEP_DELAY_NS + _MEAN_DURATION_NS
+            or len(self._samples) < _MIN_SAMPLES
+        ):
+            return None
+        return self._mean_if_settled()
+
+    def _mean_if_settled(self) -> tuple[float, float, int, tuple[float, float], float] | None:
+        current = np.array([sample.current_a for sample in self._samples])
+        mean = float(current.mean())
+        batches = np.array([part.mean() for part in np.array_split(current, _BATCH_COUNT)])
+        trend, standard_error = _trend(batches)
+        self.relative_drift = trend / mean
+        if abs(trend) > max(_MAX_SETTLED_DRIFT * abs(mean), _MAX_SETTLED_DRIFT_SIGMA * standard_error):
+            return None
+        positions = np.array([sample.position_m for sample in self._samples])
+        if not np.isfinite(positions).all(axis=1).any():
+            return None
+        x, y = np.nanmedian(positions, axis=0).tolist()
+        forces = np.array([sample.force_n for sample in self._samples])
+        force = float(np.nanmean(forces)) if np.isfinite(forces).any() else math.nan
+        noise = float(batches.std(ddof=1)) / math.sqrt(_BATCH_COUNT)
+        return mean, noise, len(current), (x, y), force
+
+
+def _trend(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the change over equally spaced values, by a line through them, and its standard error."""
+    abscissa = np.linspace(-0.5, 0.5, len(values))
+    slope = float(abscissa @ values / (abscissa @ abscissa))
+    residual = values - values.mean() - slope * abscissa
+    return slope, math.sqrt(float(residual @ residual) / (len(values) - 2) / float(abscissa @ abscissa))

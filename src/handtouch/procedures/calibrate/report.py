@@ -1,0 +1,163 @@
+"""Report of a calibration: force errors before and after, the law with its intervals, as text and JSON.
+
+Public names: `CalibrationReport`, `build_report`, `format_text`, `to_json`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from handtouch.calibration.calibration import LawParameters
+from handtouch.field import ContactLaw
+from handtouch.procedures.calibrate.fit import PARAMETERS, LawFit
+from handtouch.procedures.calibrate.readings import ContactCircuit, PadCircuitModel, WeightReading
+
+_UNITS = {"contact_ohm_mm2": "ohm mm2", "alpha": "", "ohm_per_square": "ohm per square"}
+
+
+@dataclass(frozen=True)
+class WeightErrors:
+    """Readings of one weight: number, mean current, its scatter, rms relative force errors; NaN if
+    unknown."""
+
+    weight: str
+    force_n: float
+    readings: int
+    current_a: float
+    scatter: float
+    force_error_before: float
+    force_error_after: float
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """Fit with the force errors of the daemon before, and expected after it."""
+
+    pad: str
+    fit: LawFit
+    weight_errors: tuple[WeightErrors, ...]
+    force_error_before: float
+    force_error_after: float
+    default_law: LawParameters
+
+
+def build_report(
+    pad: str,
+    fit: LawFit,
+    circuit_model: PadCircuitModel,
+    readings: Sequence[WeightReading],
+    circuits: Sequence[ContactCircuit],
+    file: LawParameters,
+) -> CalibrationReport:
+    """Return the report of a fit.
+
+    before: errors of the forces that the daemon published; after: expected for the same readings under the
+    new law, with the contact radius of the deployment file.
+    """
+    after = [
+        reported_force(fit.law, circuit_model, reading, circuit) / reading.weight.force_n - 1
+        for reading, circuit in zip(readings, circuits, strict=True)
+    ]
+    before = [reading.reported_force_n / reading.weight.force_n - 1 for reading in readings]
+    rows = []
+    for weight in sorted({reading.weight for reading in readings}, key=lambda w: (w.radius_m, w.force_n)):
+        chosen = [k for k, reading in enumerate(readings) if reading.weight == weight]
+        current = np.array([readings[k].current_a for k in chosen])
+        scatter = float(current.std(ddof=1) / current.mean()) if len(chosen) > 1 else math.nan
+        errors = _rms([before[k] for k in chosen]), _rms([after[k] for k in chosen])
+        rows.append(
+            WeightErrors(weight.name, weight.force_n, len(chosen), float(current.mean()), scatter, *errors)
+        )
+    return CalibrationReport(pad, fit, tuple(rows), _rms(before), _rms(after), file)
+
+
+def reported_force(
+    law: LawParameters, circuit_model: PadCircuitModel, reading: WeightReading, circuit: ContactCircuit
+) -> float:
+    """Return the force [N] that the daemon estimates for a reading under a law; NaN above the sheet's
+    limit."""
+    contact = ContactLaw(
+        law.contact_ohm_mm2 * 1e-6,
+        law.alpha,
+        circuit_model.sheet.contact_radius_mm * 1e-3,
+        reference_pa=circuit_model.sheet.reference_kpa * 1e3,
+    )
+    estimate = contact.force(
+        reading.current_a, circuit.drive_v, law.ohm_per_square, circuit.spreading_m, circuit.series_ohm
+    )
+    return float(estimate.force_n)
+
+
+def format_text(report: CalibrationReport) -> str:
+    """Return the report as text."""
+    fit, law = report.fit, report.fit.law
+    lines = [
+        f"{'weight':>16} {'n':>3} {'mA':>9} {'scatter':>8} {'before':>8} {'after':>8}   force error, rms"
+    ]
+    rows = [
+        (row.weight, row.readings, row.current_a, row.scatter, row.force_error_before, row.force_error_after)
+        for row in report.weight_errors
+    ]
+    for name, count, current, *parts in rows:
+        lines += [
+            f"{name:>16} {count:>3} {1e3 * current:>9.4g} " + " ".join(f"{_percent(p):>8}" for p in parts)
+        ]
+    lines.append(
+        f"{'all':>39} {_percent(report.force_error_before):>8} {_percent(report.force_error_after):>8}"
+    )
+    lines.append("")
+    for name in PARAMETERS:
+        value, interval, file = getattr(law, name), fit.intervals[name], getattr(report.default_law, name)
+        kept = "  (not observed)" if name == "ohm_per_square" and not fit.sheet_observed else ""
+        lines.append(
+            f"{name:<16} {value:>9.5g}  95 %: {interval.low:.5g} to {interval.high:.5g} {_UNITS[name]}; "
+            f"file: {file:.5g}{kept}"
+        )
+    lines.append(f"{'scatter':<16} {fit.scatter:>9.1%}  from press to press, of the load")
+    lines += [f"Note: {remark}." for remark in fit.remarks]
+    lines += [f"Not enough: {problem}." for problem in fit.problems]
+    return "\n".join(lines)
+
+
+def to_json(report: CalibrationReport, **more: Any) -> dict[str, Any]:
+    """Return the report for `json.dumps`; unknown values are None."""
+    fit = report.fit
+    record = {
+        "pad": report.pad,
+        "law": {**{name: getattr(fit.law, name) for name in PARAMETERS}, "covariance": fit.law.covariance},
+        "intervals_95": {name: [interval.low, interval.high] for name, interval in fit.intervals.items()},
+        "sheet_observed": fit.sheet_observed,
+        "scatter": fit.scatter,
+        "misfit": fit.misfit,
+        "freedom": fit.degrees_of_freedom,
+        "radii_m": fit.radii_m.tolist(),
+        "force_error_before": report.force_error_before,
+        "force_error_after": report.force_error_after,
+        "weights": [asdict(row) for row in report.weight_errors],
+        "problems": list(fit.problems),
+        "remarks": list(fit.remarks),
+        **more,
+    }
+    return {key: _finite_or_none(value) for key, value in record.items()}
+
+
+def _finite_or_none(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite_or_none(item) for key, item in value.items()}
+    return [_finite_or_none(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _rms(values: Sequence[float]) -> float:
+    known = np.array([value for value in values if math.isfinite(value)])
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1%}" if math.isfinite(value) else "-"

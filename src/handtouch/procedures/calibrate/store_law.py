@@ -1,0 +1,69 @@
+"""Storage of a measured law as a new version of the node's calibration.
+
+Public name: `store_law`.
+"""
+
+from __future__ import annotations
+
+import getpass
+import platform
+from datetime import datetime
+from pathlib import Path
+
+import handtouch
+from handtouch import config
+from handtouch.calibration.calibration import (
+    Calibration,
+    Offsets,
+    Provenance,
+    channel_values,
+)
+from handtouch.calibration.store import Store, StoreError, store_path
+from handtouch.procedures.calibrate.recording import RecordingHeader
+from handtouch.procedures.calibrate.report import CalibrationReport
+
+METHOD = "guided session"
+
+
+def store_law(
+    path: Path,
+    deployment: config.Deployment,
+    pad: tuple[str, config.Pad],
+    header: RecordingHeader,
+    report: CalibrationReport,
+    now: datetime,
+) -> str:
+    """Store the law measured on a pad of a hand of the deployment at `path`; return its calibration_id.
+
+    Gains and sheet state of the newest version stay, if they are this node's under these tables; offsets are
+    those of the tare. Raises StoreError, also for a node without a serial number.
+    """
+    hand, table = pad
+    if header.serial is None:
+        raise StoreError(f"{report.pad}: its node has no serial number; a calibration is bound to one")
+    fit = report.fit
+    weights = ", ".join(row.weight for row in report.weight_errors)
+    provenance = Provenance(
+        METHOD,
+        contacts=len(fit.residuals),
+        residual=fit.misfit,
+        hand=hand,
+        link=table.link,
+        host=platform.node(),
+        program=f"{getpass.getuser()}, handtouch {handtouch.__version__}",
+        note=f"weights {weights}; scatter {fit.scatter:.1%}; sheet "
+        f"{'' if fit.sheet_observed else 'not '}observed",
+    )
+    with Store(store_path(deployment.daemon.store, path.parent)) as store:
+        newest = store.newest(header.serial, header.default_calibration_id)
+        own = (
+            newest is not None
+            and newest.config == header.default_calibration_id
+            and not newest.provenance.foreign
+        )
+        known = newest.calibration if newest is not None and own else Calibration()
+        offsets = known.offsets
+        if len(header.zero) == 2:
+            offsets = Offsets(channel_values(header.zero[0]), channel_values(header.zero[1]))
+        made = Calibration(known.gains, offsets, fit.law, known.sheet)
+        return store.write(header.serial, header.default_calibration_id, made, provenance, now).calibration_id

@@ -1,0 +1,159 @@
+"""Checks of a deployment beyond its syntax: objects, robot descriptions, bus load, questionable values.
+
+Public names: `load_deployment`, `summary`, `find_warnings`, `worst_bus_load`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from handtouch import config
+from handtouch.canbus.bus.load import burst_s, bus_load
+from handtouch.canbus.nodes.spec import check_nodes
+from handtouch.config.channels import full_scale_counts, max_count
+from handtouch.hand.robot_models import check_urdfs, unchecked_items
+
+MAX_USUAL_LOAD = 0.7
+MAX_USUAL_ASPECT = 3.0
+
+
+def load_deployment(path: Path) -> config.Deployment:
+    """Load a deployment and check its node objects and robot descriptions too. Raises ConfigError."""
+    return check_urdfs(check_nodes(config.load(path), str(path)), str(path))
+
+
+def summary(deployment: config.Deployment) -> dict[str, Any]:
+    """Return the buses with their load and the hands with the sizes of their pads, as JSON values."""
+    return {
+        "sync_period_ms": deployment.daemon.sync_period_ms,
+        "buses": [
+            {
+                "name": bus.name,
+                "interface": bus.interface,
+                "channel": bus.channel,
+                "bitrate_bit_s": bus.bitrate_bit_s,
+                "pads": len(deployment.pads_on(bus.name)),
+                "load": round(worst_bus_load(deployment, bus), 4),
+                "burst_ms": round(_burst_ms(deployment, bus), 3),
+            }
+            for bus in deployment.buses
+        ],
+        "hands": [
+            {"name": hand.name, "pads": [_pad_summary(pad) for pad in hand.pads]} for hand in deployment.hands
+        ],
+    }
+
+
+def worst_bus_load(deployment: config.Deployment, bus: config.Bus) -> float:
+    """Return the fraction of a bus that SYNC, samples and heartbeats take with worst-case bit stuffing."""
+    pads = [entry.pad for entry in deployment.pads_on(bus.name)]
+    if not pads:
+        return 0.0
+    heartbeat_ms = len(pads) / sum(1 / deployment.nodes[pad.node].heartbeat_ms for pad in pads)
+    return bus_load(
+        bus.bitrate_bit_s, len(pads), deployment.daemon.sync_period_ms * 1e-3, heartbeat_ms * 1e-3
+    )
+
+
+def find_warnings(deployment: config.Deployment) -> Iterator[str]:
+    """Yield what is valid but questionable."""
+    for bus in deployment.buses:
+        yield from _bus_warnings(deployment, bus)
+    for key, names in (("node", deployment.nodes), ("sheet", deployment.sheets)):
+        used = {getattr(pad, key) for _, pad in deployment.pads}
+        for name in names:
+            if name not in used:
+                yield f"[{key}.{name}]: no pad uses it"
+    for name, node in deployment.nodes.items():
+        if node.heartbeat_timeout_ms < 2 * node.heartbeat_ms:
+            yield (
+                f"[node.{name}]: heartbeat_timeout_ms = {node.heartbeat_timeout_ms}: less than two heartbeat "
+                f"periods of {node.heartbeat_ms} ms, so one late heartbeat is a timeout; three are usual"
+            )
+        if node.full_scale_counts and node.full_scale_counts > (limit := max_count(node)):
+            yield (
+                f"[node.{name}]: full_scale_counts = {node.full_scale_counts}: its channels reach at most "
+                f"{limit}, so full_scale_ma is never reached; check the type of the channels"
+            )
+    yield from unchecked_items(deployment)
+    for hand in deployment.hands:
+        yield from _serial_warnings(hand)
+    for entry in deployment.pads:
+        yield from _pad_warnings(entry.name, entry.pad, deployment)
+
+
+def _bus_warnings(deployment: config.Deployment, bus: config.Bus) -> Iterator[str]:
+    location = f'[[bus]] "{bus.name}"'
+    if not deployment.pads_on(bus.name):
+        yield f"{location}: no pad is on it"
+        return
+    load, period_ms = worst_bus_load(deployment, bus), deployment.daemon.sync_period_ms
+    window_ms = period_ms * deployment.daemon.sample_window_fraction
+    if load > 1:
+        yield f"{location}: load {load:.0%}: exceeds the bus; raise sync_period_ms, or use another bus"
+    elif load > MAX_USUAL_LOAD:
+        yield f"{location}: load {load:.0%}: above {MAX_USUAL_LOAD:.0%} retransmissions delay samples"
+    if _burst_ms(deployment, bus) > window_ms:
+        yield (
+            f"{location}: the samples take up to {_burst_ms(deployment, bus):.2f} ms after SYNC, and a tick "
+            f"waits {window_ms:.2f} ms (sample_window_fraction = "
+            f"{deployment.daemon.sample_window_fraction}): the last ones are used one period late"
+        )
+
+
+def _serial_warnings(hand: config.Hand) -> Iterator[str]:
+    without = [pad.link for pad in hand.pads if pad.serial is None]
+    if without:
+        yield f"{hand.name}: no serial for {', '.join(without)}: replaced sensors are not detected"
+
+
+def _pad_warnings(name: str, pad: config.Pad, deployment: config.Deployment) -> Iterator[str]:
+    a, b = pad.surface.rectangle_mm
+    sheet, node = deployment.sheets[pad.sheet], deployment.nodes[pad.node]
+    touch = pad.touch or deployment.touch
+    if max(a / b, b / a) > MAX_USUAL_ASPECT:
+        long, short = ("x", "y") if a > b else ("y", "x")
+        yield (
+            f"{name}: {max(a / b, b / a):.1f} times longer along {long} than along {short}: the far "
+            "electrodes carry almost no current, so positions are inaccurate"
+        )
+    if 2 * sheet.contact_radius_mm > min(a, b) / 2:
+        yield (
+            f"{name}: contact_radius_mm = {sheet.contact_radius_mm}: large for a pad of "
+            f"{min(a, b):.1f} mm, so forces are wrong near its edges"
+        )
+    noise_ma = node.noise_counts * node.full_scale_ma / full_scale_counts(node)
+    noise_n = _force_of_current(sheet, node, 3 * noise_ma)
+    if touch.end_threshold_n < noise_n:
+        yield (
+            f"{name}: end_threshold_n = {touch.end_threshold_n}: below the force that noise alone can read, "
+            f"{noise_n:.3g} N"
+        )
+
+
+def _force_of_current(sheet: config.Sheet, node: config.Node, current_ma: float) -> float:
+    """Return the force [N] of the assumed contact at a current [mA] too small for the sheet to limit it."""
+    area_mm2 = math.pi * sheet.contact_radius_mm**2
+    ohm = node.drive_v / (current_ma * 1e-3)
+    pressure_kpa = sheet.reference_kpa * math.pow(sheet.contact_ohm_mm2 / area_mm2 / ohm, 1 / sheet.alpha)
+    return pressure_kpa * 1e-3 * area_mm2
+
+
+def _burst_ms(deployment: config.Deployment, bus: config.Bus) -> float:
+    return burst_s(bus.bitrate_bit_s, len(deployment.pads_on(bus.name))) * 1e3
+
+
+def _pad_summary(pad: config.Pad) -> dict[str, Any]:
+    a, b = pad.surface.rectangle_mm
+    return {
+        "link": pad.link,
+        "bus": pad.bus,
+        "node_id": pad.node_id,
+        "serial": pad.serial,
+        "surface": pad.surface.kind,
+        "rectangle_mm": [round(a, 2), round(b, 2)],
+        "aspect": round(max(a / b, b / a), 3),
+    }

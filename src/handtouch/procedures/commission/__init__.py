@@ -1,0 +1,44 @@
+"""Commissioning: press one pad after another to find how the hand is wired, and write it to the deployment.
+
+Modules: `procedure` is the dialogue, `sample_source` reads the buses, `press` detects presses,
+`electrode_order` finds what each channel is wired to, `press_instructions` describes where to press,
+`node_assignment` maps pads to nodes, `deployment_edit` and `record` write the deployment file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from handtouch import client, config
+from handtouch.host.endpoints import to_connect
+
+__all__ = ["daemon_is_running", "select_rows"]
+
+_DAEMON_TIMEOUT_S = 0.5
+
+
+def select_rows(deployment: config.Deployment, patterns: Sequence[str]) -> list[int]:
+    """Return the rows of the pads that match patterns (default: all). Raises ConfigError for one without."""
+    if not patterns:
+        return list(range(len(deployment.pads)))
+    rows: set[int] = set()
+    for pattern in patterns:
+        matching = deployment.rows_matching(pattern)
+        if not matching:
+            remedy = f"matches no pad; pads: {', '.join(deployment.pad_names)}"
+            raise config.ConfigError(
+                "handtouch commission", (config.Problem("--link", f" {pattern}", remedy),)
+            )
+        rows.update(matching)
+    return sorted(rows)
+
+
+def daemon_is_running(endpoint: str) -> bool:
+    """Check whether a daemon, which would use the same buses, answers at a control endpoint."""
+    try:
+        client.request("status", endpoint=to_connect(endpoint), timeout_s=_DAEMON_TIMEOUT_S)
+    except TimeoutError:
+        return False
+    except (PermissionError, RuntimeError):
+        pass  # it runs, and rejects the request
+    return True

@@ -1,0 +1,153 @@
+"""Tables of a deployment file that a scan can write: buses, kinds of nodes, and a pad for each node.
+
+Public names: `fragment`, `channel_names`, `FILL_IN`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+
+from handtouch import config
+from handtouch.canbus.find.survey import NodeFacts, find_four_channels
+from handtouch.config.channels import PROFILE_TYPES
+
+FILL_IN = "FILL IN"
+"""Mark of lines to be completed by the user; they are comments until then."""
+
+_DEFAULT_CHANNELS = ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4")
+_NODE_FILL_INS = (
+    ("drive_v = 5.0", "voltage of the conducting layer; see the node's manual"),
+    ("full_scale_ma = 10.0", "electrode current at the greatest count; see the node's manual"),
+    ("noise_counts = 1.0", "noise of one channel (1 sigma); see the node's manual"),
+)
+_PAD_FILL_INS = (
+    ('sheet = "firm"', "name of the pad's [sheet.NAME] table"),
+    ('surface = { kind = "plane", length_mm = 30.0, width_mm = 20.0 }', "shape and size of the pad"),
+    ("gap_mm = 0.8", "bare length between corner and electrode on each side"),
+)
+
+FoundNodes = Sequence[tuple[config.Bus, Sequence[NodeFacts]]]
+"""Buses, each with the nodes to write."""
+
+
+def fragment(found: FoundNodes, deployment: config.Deployment | None = None) -> str:
+    """Return TOML for the nodes with four channels; buses and kinds of the deployment are reused.
+
+    Empty if there is none. It is a complete deployment once the lines marked FILL IN are completed and a
+    [sheet.NAME] table is added.
+    """
+    usable = [(bus, [node for node in nodes if channel_names(node)]) for bus, nodes in found]
+    if not any(nodes for _, nodes in usable):
+        return ""
+    kinds = _NodeKinds(deployment)
+    pads = list(_pad_lines(usable, kinds))
+    lines: list[str] = []
+    for bus, nodes in usable:
+        if nodes and deployment is None:
+            lines += ["[[bus]]", *_bus_lines(bus), ""]
+    lines += kinds.lines
+    if deployment is None:
+        lines += ["[[hand]]", 'name = "hand"  # as in topics', ""]
+    else:
+        hands = ", ".join(hand.name for hand in deployment.hands)
+        lines += [f"# Insert below the [[hand]] that the pads belong to: {hands}", ""]
+    return "\n".join([*lines, *pads]).rstrip() + "\n"
+
+
+def channel_names(node: NodeFacts) -> tuple[str, ...]:
+    """Return the objects of a node's four channels as a deployment lists them, empty if there are none.
+
+    A type is added where the object doesn't imply it; its sign is a guess then.
+    """
+    chosen = find_four_channels(node.tpdos)
+    if chosen is None:
+        return _DEFAULT_CHANNELS if (node.inputs or 0) >= 4 else ()
+    return tuple(_object_name(entry) for entry in chosen[0])
+
+
+def _object_name(entry: int) -> str:
+    name = f"0x{entry >> 16:04X}:{entry >> 8 & 0xFF}"
+    bits, _ = PROFILE_TYPES.get(entry >> 16, (0, True))
+    return name if bits == entry & 0xFF else f"{name}:i{entry & 0xFF}"
+
+
+class _NodeKinds:
+    """`[node.NAME]` tables: those of the deployment, and new ones for nodes that match none."""
+
+    def __init__(self, deployment: config.Deployment | None) -> None:
+        self.lines: list[str] = []
+        self._existing = dict(deployment.nodes) if deployment else {}
+        self._added: dict[tuple[object, ...], str] = {}
+
+    def kind_name(self, node: NodeFacts) -> str:
+        """Return the name of a node's kind, adding a table if there is none yet."""
+        channels = channel_names(node)
+        for name, kind in self._existing.items():
+            same = kind.vendor_id in (None, node.vendor_id) and kind.product_code in (None, node.product_code)
+            if same and kind.channels == channels:
+                return name
+        key = (node.vendor_id, node.product_code, channels)
+        if key not in self._added:
+            self._added[key] = self._new_name(node.name)
+            self.lines += [f"[node.{self._added[key]}]", *_node_lines(node, channels), ""]
+        return self._added[key]
+
+    def _new_name(self, device_name: str) -> str:
+        slug = re.sub(r"[^a-z0-9]+", "_", device_name.lower()).strip("_")[:40]
+        stem = slug if slug[:1].isalpha() else f"node_{slug}".strip("_")
+        taken = {*self._existing, *self._added.values()}
+        return next(n for n in (stem, *(f"{stem}_{i}" for i in range(2, 999))) if n not in taken)
+
+
+def _bus_lines(bus: config.Bus) -> Iterator[str]:
+    yield f'name = "{bus.name}"'
+    yield f'interface = "{bus.interface}"'
+    yield f"channel = {json.dumps(bus.channel)}"
+    yield f"bitrate_bit_s = {bus.bitrate_bit_s}"
+    if bus.options:
+        options = ", ".join(f"{key} = {json.dumps(value)}" for key, value in bus.options.items())
+        yield f"options = {{ {options} }}"
+
+
+def _node_lines(node: NodeFacts, channels: tuple[str, ...]) -> Iterator[str]:
+    if node.name:
+        yield f"# {' '.join(part for part in (node.name, node.hardware, node.software) if part)}"
+    if node.vendor_id is not None:
+        yield f"vendor_id = 0x{node.vendor_id:X}"
+    if node.product_code is not None:
+        yield f"product_code = 0x{node.product_code:X}"
+    if channels != _DEFAULT_CHANNELS:
+        guessed = any(name.count(":") > 1 for name in channels)
+        remark = "  # i: signed, u: unsigned; see its manual or EDS" if guessed else ""
+        yield f"channels = [{', '.join(map(json.dumps, channels))}]{remark}"
+    yield from _fill_in_lines(_NODE_FILL_INS)
+
+
+def _pad_lines(found: FoundNodes, kinds: _NodeKinds) -> Iterator[str]:
+    serials = Counter(node.serial for _, nodes in found for node in nodes)
+    number = 0
+    for bus, nodes in found:
+        for node in nodes:
+            number += 1
+            yield "[[hand.pad]]"
+            yield f'link = "name_me_{number}"  # link with this pad; handtouch commission finds it'
+            yield f'bus = "{bus.name}"'
+            yield f"node_id = 0x{node.node_id:02X}"
+            if node.serial and serials[node.serial] == 1:
+                yield f"serial = {node.serial}"
+            else:
+                serial = (
+                    f"serial number {node.serial} like other nodes" if node.serial else "no serial number"
+                )
+                yield f"# it has {serial}: its replacement can't be detected"
+            yield f'node = "{kinds.kind_name(node)}"'
+            yield from _fill_in_lines(_PAD_FILL_INS)
+            yield ""
+
+
+def _fill_in_lines(lines: Iterable[tuple[str, str]]) -> Iterator[str]:
+    for line, description in lines:
+        yield f"# {line}  # {FILL_IN}: {description}"

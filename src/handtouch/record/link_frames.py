@@ -1,0 +1,127 @@
+"""Link frames for Foxglove: from the recorded URDF and joint states, else links in a row.
+
+Public names: `LinkFrames`, `LinkTransform`, `quaternion`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.hand import urdf
+
+FloatArray = NDArray[np.float64]
+ROOT_FRAME = "handtouch"
+_HAND_SPACING_M = 0.3
+"""Distance of hands."""
+_LINK_SPACING_M = 0.05
+"""Distance of links of a hand without URDF."""
+
+
+class LinkTransform(NamedTuple):
+    """A frame in its parent; rotation as x, y, z, w."""
+
+    parent: str
+    child: str
+    translation_m: tuple[float, ...]
+    rotation: tuple[float, ...]
+
+
+class LinkFrames:
+    """Frames and bodies of links, from payloads of `config`, `service` and `joints`."""
+
+    def __init__(self) -> None:
+        self._hands: dict[str, list[str]] = {}
+        self._robots: dict[str, urdf.RobotDescription] = {}
+        self._joints: dict[str, dict[str, float]] = {}
+
+    def set_deployment(self, payload: dict[str, Any]) -> None:
+        """Read the URDFs of a deployment; a malformed one is ignored."""
+        tables = json.loads(payload["deployment"])
+        self._robots.clear()
+        for hand in tables["hand"]:
+            data = payload["files"].get(hand.get("urdf"))
+            if data is None:
+                continue
+            try:
+                self._robots[hand["name"]] = urdf.parse_urdf(data, Path(hand["urdf"]))
+            except urdf.UrdfError:  # the daemon has reported it
+                continue
+
+    def set_links(self, hands: dict[str, list[str]]) -> None:
+        """Set the links of each hand that carry pads."""
+        self._hands = hands
+
+    def set_joints(self, payload: dict[str, Any]) -> None:
+        """Set the joint positions of a hand."""
+        known = zip(payload["names"], payload["position_rad"], strict=True)
+        self._joints[payload["hand"]] = {name: value for name, value in known if value is not None}
+
+    def frame_name(self, hand: str, link: str) -> str:
+        """Return the name of a link's frame; with the hand's name if there are several."""
+        return link if len(self._hands) < 2 else f"{hand}/{link}"
+
+    def frames(self, moved: str = "") -> Iterator[LinkTransform]:
+        """Yield all frames, or the movable ones of a hand that moved."""
+        for number, (hand, links) in enumerate(self._hands.items()):
+            if moved and hand != moved:
+                continue
+            robot = self._robots.get(hand)
+            if robot is None:
+                if not moved:
+                    for index, link in enumerate(links):
+                        at = index * _LINK_SPACING_M, number * _LINK_SPACING_M, 0.0
+                        yield LinkTransform(ROOT_FRAME, self.frame_name(hand, link), at, (0.0, 0.0, 0.0, 1.0))
+                continue
+            if not moved:
+                at = 0.0, number * _HAND_SPACING_M, 0.0
+                yield LinkTransform(ROOT_FRAME, self.frame_name(hand, robot.root), at, (0.0, 0.0, 0.0, 1.0))
+            for joint in robot.joints.values():
+                if not moved or joint.kind in urdf.MOVABLE_JOINT_TYPES:
+                    yield self._joint_frame(hand, joint)
+
+    def bodies(self) -> Iterator[tuple[str, list[urdf.BodyShape]]]:
+        """Yield frame and shapes of each link with a body."""
+        for hand, robot in self._robots.items():
+            for link, shapes in robot.bodies.items():
+                if shapes:
+                    yield self.frame_name(hand, link), list(shapes)
+
+    def _joint_frame(self, hand: str, joint: urdf.UrdfJoint) -> LinkTransform:
+        rotation, translation = joint.rotation, joint.translation_m
+        if joint.kind in urdf.MOVABLE_JOINT_TYPES:
+            name, factor, offset = joint.mimic or (joint.name, 1.0, 0.0)
+            at = factor * self._joints.get(hand, {}).get(name, 0.0) + offset
+            if joint.kind == "prismatic":
+                translation = translation + rotation @ joint.axis * at
+            else:
+                rotation = rotation @ _axis_rotation(joint.axis, at)
+        parent, child = self.frame_name(hand, joint.parent), self.frame_name(hand, joint.child)
+        return LinkTransform(parent, child, tuple(translation.tolist()), quaternion(rotation))
+
+
+def quaternion(rotation: FloatArray) -> tuple[float, ...]:
+    """Return x, y, z, w of a rotation matrix (3, 3), with w >= 0."""
+    # the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue: stable for every rotation
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    k = [
+        [a - e - i, 0, 0, 0],
+        [d + b, e - a - i, 0, 0],
+        [g + c, h + f, i - a - e, 0],
+        [h - f, c - g, d - b, a + e + i],
+    ]
+    found = np.linalg.eigh(np.array(k) / 3)[1][:, -1]
+    return tuple((found * math.copysign(1.0, found[3])).tolist())
+
+
+def _axis_rotation(axis: FloatArray, angle: float) -> FloatArray:
+    """Return the rotation about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)

@@ -1,0 +1,184 @@
+"""Replay of a CAN log: the frames drive the pipeline as a live bus does; contacts are identical each time.
+
+Public names: `replay_log`, `LogReplaySummary`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import can
+
+from handtouch import wire
+from handtouch.canbus import cia301
+from handtouch.canbus.bus.router import BusCounters, Router
+from handtouch.canbus.objects.mapping import mapping_from_eds
+from handtouch.config import Deployment
+from handtouch.config.channels import order_by_electrode, resolve_channels
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.record.replay_sink import ContactCallback, ReplayPublisher, ReplaySink
+from handtouch.wire import PadState
+
+_NODE_COB_BASES = (0x080, 0x580, 0x600, 0x700)
+"""COB-ID bases of EMCY, SDO and heartbeat, which a deployment's nodes send besides TPDOs."""
+_PERIOD_SYNCS = 50
+_MAX_PAUSE_TICKS = 8
+"""Ticks by the timer in a pause of the log: enough for every pad to become stale."""
+
+
+@dataclass
+class LogReplaySummary:
+    """Result of a replay: recorded time, ticks, contacts begun, and the counters of each bus.
+
+    `period_s`: from the log's SYNCs. `unmatched`: frames by channel, of channels without a bus in the
+    deployment.
+    """
+
+    period_s: float
+    log_s: float = 0.0
+    ticks: int = 0
+    contacts: int = 0
+    buses: dict[str, BusCounters] = field(default_factory=dict)
+    unmatched: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        """Samples of all buses."""
+        return sum(counters.samples for counters in self.buses.values())
+
+
+class _LogReplayer:
+    """Pipeline driven by the stamps of a log; cycles begin at the SYNCs of `sync_channel`."""
+
+    def __init__(
+        self, deployment: Deployment, sink: ReplaySink, period_ns: int, sync_channel: str | None
+    ) -> None:
+        self.pipeline = Pipeline(
+            PadModel(deployment), period_ns, deployment.daemon.sample_window_fraction, sink
+        )
+        self.routers = {bus.name: Router(self.pipeline.slab) for bus in deployment.buses}
+        self.unmatched: dict[str, int] = {}
+        self._by_channel = {str(bus.channel): self.routers[bus.name] for bus in deployment.buses}
+        self._only_router = next(iter(self.routers.values())) if len(self.routers) == 1 else None
+        self._sync_channel = sync_channel
+        self._known_ids = {cia301.SYNC}
+        pads = [entry.pad for entry in deployment.pads]
+        for slot, pad in enumerate(pads):
+            kind = deployment.nodes[pad.node]
+            channels = order_by_electrode(resolve_channels(kind.channels, kind.eds), pad.electrodes)
+            mapping = mapping_from_eds(kind.eds, pad.node_id, channels)
+            self.pipeline.slab.set_layout(slot, mapping.layout)
+            for number, tpdo in enumerate(mapping.tpdos):
+                self.routers[pad.bus].route(tpdo.cob_id, slot, number, tpdo.size_bytes)
+            self._known_ids |= {base + pad.node_id for base in _NODE_COB_BASES}
+        self.pipeline.node_state[:] = PadState.CLEAR
+
+    def process_frame(self, message: can.Message, t_ns: int) -> None:
+        """Process a frame of the log."""
+        self._advance_to(t_ns)
+        if _is_sync(message) and str(message.channel) == self._sync_channel:
+            self.pipeline.begin_cycle(t_ns, t_ns)
+            return
+        router = self._only_router or self._by_channel.get(str(message.channel))
+        if router is None:
+            channel = str(message.channel)
+            self.unmatched[channel] = self.unmatched.get(channel, 0) + 1
+            return
+        frame = router.accept_message(message, t_ns)
+        if frame is not None and frame[0] not in self._known_ids and frame[0] != 0:
+            router.counters.unknown_frames += 1
+        self.pipeline.tick_if_due(t_ns)
+
+    def _advance_to(self, t_ns: int) -> None:
+        """Run the ticks due before `t_ns`, by the timer where SYNC is missing."""
+        pipeline, cycle = self.pipeline, self.pipeline.cycle
+        if cycle.sync_ns == 0:
+            cycle.sync_ns = t_ns
+        pipeline.tick_if_due(t_ns)
+        for _ in range(_MAX_PAUSE_TICKS):
+            if t_ns < cycle.sync_overdue_ns:
+                return
+            sync_ns = cycle.sync_ns + cycle.period_ns
+            pipeline.begin_cycle(sync_ns, sync_ns)
+            pipeline.tick_if_due(min(t_ns, sync_ns + cycle.window_ns))
+        pipeline.begin_cycle(t_ns, t_ns)
+
+
+def replay_log(
+    log: Path,
+    deployment: Deployment,
+    on_contact: ContactCallback,
+    *,
+    pace: Callable[[int], None] = lambda _: None,
+    publisher: ReplayPublisher | None = None,
+) -> LogReplaySummary:
+    """Run the pipeline over a log in any format that python-can reads; `on_contact` gets its contacts.
+
+    Times are the log's stamps in ns, and the period is that of its SYNCs, if it has any. The deployment's
+    buses are identified by their channel in the log; a single bus gets all frames. `pace` is called with each
+    frame's stamp before the frame is processed; it may sleep, to keep the recorded speed.
+
+    Raises ValueError naming the log if python-can can't read it, OSError if it doesn't exist.
+    """
+    period_ns, sync_channel = _sync_period(log, round(deployment.daemon.sync_period_ms * 1e6))
+    contacts = 0
+
+    def count(contact: wire.Contact) -> None:
+        nonlocal contacts
+        contacts += contact.event == "begin"
+        on_contact(contact)
+
+    replayer = _LogReplayer(deployment, ReplaySink(count, publisher), period_ns, sync_channel)
+    if publisher is not None:
+        publisher.retained_messages.update(replayer.pipeline.messages.retained_messages())
+    first_ns = t_ns = 0
+    for message in _read_log(log):
+        t_ns = round(message.timestamp * 1e9)
+        first_ns = first_ns or t_ns
+        pace(t_ns)
+        replayer.process_frame(message, t_ns)
+    replayer.pipeline.end_session(t_ns)
+    return LogReplaySummary(
+        period_s=period_ns * 1e-9,
+        log_s=(t_ns - first_ns) * 1e-9,
+        ticks=replayer.pipeline.ticks,
+        contacts=contacts,
+        buses={name: router.counters for name, router in replayer.routers.items()},
+        unmatched=replayer.unmatched,
+    )
+
+
+def _sync_period(log: Path, period_ns: int) -> tuple[int, str | None]:
+    """Return period and channel of the log's first SYNCs; the given period and None if it has none."""
+    stamps: list[float] = []
+    channel: str | None = None
+    for message in _read_log(log):
+        if _is_sync(message) and channel in (None, str(message.channel)):
+            channel = str(message.channel)
+            stamps.append(message.timestamp)
+            if len(stamps) > _PERIOD_SYNCS:
+                break
+    steps = sorted(later - earlier for earlier, later in itertools.pairwise(stamps))
+    return (round(steps[len(steps) // 2] * 1e9) if steps else period_ns), channel
+
+
+def _is_sync(message: can.Message) -> bool:
+    special = message.is_extended_id or message.is_error_frame or message.is_remote_frame
+    return message.arbitration_id == cia301.SYNC and not special
+
+
+def _read_log(log: Path) -> Iterator[can.Message]:
+    if not log.is_file():
+        raise FileNotFoundError(f"{log}: no such log")
+    try:
+        with can.LogReader(log) as reader:
+            yield from reader
+    except Exception as error:  # readers raise any exception; each means that the log is malformed
+        raise ValueError(
+            f"{log}: python-can can't read it ({error}); it reads candump .log, .asc, .blf, .csv, .db, .trc "
+            "and these with .gz"
+        ) from error

@@ -1,0 +1,224 @@
+"""MuJoCo model of a deployment's hand and an object: bodies of the URDF, with pads at their true mounting.
+
+Public names: `MujocoScene`, `MujocoPad`. MuJoCo reads the URDF itself; each pad's surface is a geom of the
+same shape, a skin on the link's body. Parts of the hand don't collide with each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.hand.pads import rotation_from_rpy
+from handtouch.simulate.grasp.grasp_objects import GraspObject
+from handtouch.simulate.pad_geometry import (
+    SimulatedPrism,
+    SimulatedRevolution,
+    SimulatedSurface,
+    simulated_surface,
+)
+from handtouch.simulate.world import World
+
+FloatArray = NDArray[np.float64]
+TIME_STEP_S = 1e-3
+_SKIN_THICKNESS_M = 1.5e-3  # URDF bodies are shrunk by this, so that objects touch the pads
+_PLATE_HALF_THICKNESS_M = 2e-3
+_PROFILE_RINGS = 24  # of a surface of revolution
+_CIRCLE_VERTICES = 96  # of a cone's circles
+_HAND_COLLISION_BIT, _OBJECT_COLLISION_BIT = 1, 2
+_STIFFNESS_NM, _DAMPING_NM_S = 1.5, 0.03
+_CONTACT_TIME_CONSTANT_S = 5e-3  # soft contact, as of a skin
+_GRAVITY_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class MujocoPad:
+    """Pad of the model."""
+
+    link: str
+    body_id: int
+    rotation: FloatArray
+    """(3, 3), true orientation of the pad's frame in its link's frame."""
+    translation_m: FloatArray
+    shape: SimulatedSurface
+
+
+class MujocoScene:
+    """MuJoCo model and data of a scene, at its start.
+
+    `joints` and `pads` are in the order of URDF and deployment. Raises ValueError for an unfit hand.
+    """
+
+    def __init__(self, hand: config.Hand, world: World, grasp_object: GraspObject) -> None:
+        import mujoco
+
+        if not hand.urdf:
+            raise ValueError(f'hand "{hand.name}" has no URDF, which a grasp needs: set urdf in [[hand]]')
+        self.grasp_object = grasp_object
+        spec: Any = mujoco.MjSpec.from_file(str(Path(hand.urdf)))
+        spec.compiler.fusestatic = False
+        self.joints = tuple(joint.name for joint in spec.joints)
+        if not any(name.endswith(f"_{end}") for name in self.joints for end in grasp_object.closed_deg):
+            ends = ", ".join(f"_{end}" for end in grasp_object.closed_deg)
+            has = ", ".join(self.joints)
+            raise ValueError(f'hand "{hand.name}" can\'t grasp: no joint ends in {ends}; its joints: {has}')
+        for geom in spec.geoms:
+            _shrink_geom(mujoco, geom)
+        mounts = {pad.link: world.mount(hand.name, pad) for pad in hand.pads}
+        for pad in hand.pads:
+            _add_pad(mujoco, spec, spec.body(pad.mount.link or pad.link), pad, *mounts[pad.link])
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity, geom.friction[0] = (
+                _HAND_COLLISION_BIT,
+                _OBJECT_COLLISION_BIT,
+                grasp_object.friction,
+            )
+        _add_motors(mujoco, spec, self.joints, grasp_object)
+        _set_solver_options(mujoco, spec)
+        hand_only = spec.compile()
+        data = mujoco.MjData(hand_only)
+        mujoco.mj_forward(hand_only, data)
+        palm = hand_only.body(hand.palm_link or hand_only.body(1).name).id
+        palm_rotation, palm_m = data.xmat[palm].reshape(3, 3), data.xpos[palm]
+        spec.option.gravity = palm_rotation @ [0.0, 0.0, -_GRAVITY_M_S2]  # the palm faces up
+        _add_object(mujoco, spec, grasp_object, palm_rotation, palm_m)
+        self.model: Any = spec.compile()
+        self.data: Any = mujoco.MjData(self.model)
+        mujoco.mj_forward(self.model, self.data)
+        self.palm_body = palm
+        self.object_body: int = self.model.body("object").id
+        self.pads = tuple(
+            MujocoPad(
+                pad.link,
+                self.model.body(pad.mount.link or pad.link).id,
+                *mounts[pad.link],
+                simulated_surface(pad.surface),
+            )
+            for pad in hand.pads
+        )
+        self.joint_qpos = np.array([self.model.joint(name).qposadr[0] for name in self.joints])
+        self.pad_row_by_geom = {
+            self.model.geom(f"pad {pad.link}").id: row for row, pad in enumerate(hand.pads)
+        }
+        """Row of the pad by MuJoCo's geom id."""
+        self.palm_rotation, self.palm_m = palm_rotation.copy(), palm_m.copy()
+
+    def to_palm(self, points_m: FloatArray) -> FloatArray:
+        """Transform points (n, 3) from the world's frame to that of the palm, which is fixed."""
+        return np.asarray((points_m - self.palm_m) @ self.palm_rotation)
+
+
+def _shrink_geom(mujoco: Any, geom: Any) -> None:
+    if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
+        geom.size = np.asarray(geom.size) - _SKIN_THICKNESS_M
+    else:
+        geom.size[0] -= _SKIN_THICKNESS_M
+
+
+def _add_pad(
+    mujoco: Any, spec: Any, body: Any, pad: config.Pad, rotation: FloatArray, translation: FloatArray
+) -> None:
+    geom = body.add_geom(name=f"pad {pad.link}", density=0.0)
+    shape, radius_m = simulated_surface(pad.surface), 0.0
+    turn = rotation
+    if pad.surface.kind == "plane":
+        geom.type, radius_m = mujoco.mjtGeom.mjGEOM_BOX, _PLATE_HALF_THICKNESS_M
+        geom.size = [shape.length_m / 2, shape.arc / 2, _PLATE_HALF_THICKNESS_M]
+    elif pad.surface.kind == "cylinder":
+        geom.type, radius_m = mujoco.mjtGeom.mjGEOM_CYLINDER, shape.start_radius_m
+        geom.size = [radius_m, shape.length_m / 2, 0.0]
+        turn = rotation @ rotation_from_rpy([0.0, np.pi / 2, 0.0])
+    elif pad.surface.kind == "sphere":
+        geom.type, radius_m = mujoco.mjtGeom.mjGEOM_SPHERE, shape.start_radius_m
+        geom.size = [radius_m, 0.0, 0.0]
+    else:
+        geom.type = mujoco.mjtGeom.mjGEOM_MESH
+        spec.add_mesh(name=f"pad {pad.link}", uservert=np.ravel(_hull_points(shape)))
+        geom.meshname = f"pad {pad.link}"
+    geom.pos = translation - radius_m * rotation[:, 2]
+    geom.quat = _quaternion(mujoco, turn)
+
+
+def _hull_points(shape: SimulatedSurface) -> list[FloatArray]:
+    """Return points (3,) in the pad's frame whose convex hull is the body under the surface."""
+    if isinstance(shape, SimulatedPrism):
+        under = np.array([0.0, 0.0, -2 * _PLATE_HALF_THICKNESS_M])
+        corners = [shape.faces()[0][0], *(end for _, end, _, _ in shape.faces())]
+        top = [shape.point(s, phi) for s in (0.0, shape.length_m) for phi in corners]
+        return [*top, *(point + under for point in top)]
+    rings = _PROFILE_RINGS if isinstance(shape, SimulatedRevolution) else 2
+    around = 2 * np.pi * np.arange(_CIRCLE_VERTICES) / _CIRCLE_VERTICES
+    return [shape.point(s, phi) for s in np.linspace(0.0, shape.length_m, rings).tolist() for phi in around]
+
+
+def _add_object(
+    mujoco: Any, spec: Any, grasped: GraspObject, palm_rotation: FloatArray, palm_m: FloatArray
+) -> None:
+    """Add the object, free to move, and a holder that can hold it."""
+    pose = {
+        "pos": palm_m + palm_rotation @ grasped.position_m,
+        "quat": _quaternion(mujoco, palm_rotation @ rotation_from_rpy(np.radians(grasped.rpy_deg))),
+    }
+    body = spec.worldbody.add_body(name="object", **pose)
+    body.add_freejoint()
+    geom = body.add_geom(name="object", mass=grasped.mass_kg)
+    geom.contype, geom.conaffinity, geom.friction[0] = (
+        _OBJECT_COLLISION_BIT,
+        _HAND_COLLISION_BIT,
+        grasped.friction,
+    )
+    geom.condim = 4
+    if grasped.kind == "frustum":
+        geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, "object"
+        around = 2 * np.pi * np.arange(_CIRCLE_VERTICES) / _CIRCLE_VERTICES
+        low, high, half_m = grasped.size_m
+        rings = [
+            (r * np.cos(a), r * np.sin(a), z) for r, z in ((low, -half_m), (high, half_m)) for a in around
+        ]
+        spec.add_mesh(name="object", uservert=np.ravel(rings))
+    else:
+        geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{grasped.kind.upper()}")
+        geom.size[: len(grasped.size_m)] = grasped.size_m
+    spec.worldbody.add_body(name="holder", mocap=True, **pose)
+    held = spec.add_equality(
+        name="held",
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="holder",
+        name2="object",
+    )
+    held.data[:11] = [0.0] * 10 + [1.0]  # centres coincide; the last is the weight of the rotation
+
+
+def _add_motors(mujoco: Any, spec: Any, joints: Sequence[str], grasp_object: GraspObject) -> None:
+    """Add a position-controlled motor with limited torque to every joint."""
+    for name in joints:
+        joint = spec.joint(name)
+        joint.armature, joint.damping[0] = 1e-4, 0.005
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.gaintype, motor.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+        motor.gainprm[0] = _STIFFNESS_NM
+        motor.biasprm[1], motor.biasprm[2] = -_STIFFNESS_NM, -_DAMPING_NM_S
+        motor.forcelimited, motor.forcerange = True, [-grasp_object.max_torque_nm, grasp_object.max_torque_nm]
+
+
+def _set_solver_options(mujoco: Any, spec: Any) -> None:
+    spec.option.timestep = TIME_STEP_S
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10
+    for geom in spec.geoms:
+        geom.condim = 4
+        geom.solref = [_CONTACT_TIME_CONSTANT_S, 1.0]
+
+
+def _quaternion(mujoco: Any, rotation: FloatArray) -> FloatArray:
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation).ravel())
+    return quat

@@ -1,0 +1,307 @@
+"""Geometry of a simulated pad, directly from the millimetres of the deployment.
+
+Public names: `SimulatedSurface` and its subclasses, `SheetMetric`, `simulated_surface`. It is independent of
+`handtouch.field.surface`, so that a mistake in either shows as a position error instead of cancelling.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BPoly, CubicSpline, PPoly
+
+from handtouch import config
+
+FloatArray = NDArray[np.float64]
+_ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(20)
+
+
+@dataclass(frozen=True)
+class SheetMetric:
+    """Surface of revolution as the sheet's equation has it: arc length s, angle phi, radius r(s)."""
+
+    length_m: float
+    """Length of the profile."""
+    arc: float
+    """Angle phi at electrode yb."""
+
+    def radius(self, s_m: ArrayLike) -> FloatArray:
+        """Return metres along the surface per unit of phi at `s_m` (...)."""
+        raise NotImplementedError
+
+    def isothermal(self, s_m: ArrayLike) -> FloatArray:
+        """Return the integral of ds / radius from electrode x0 to `s_m` (...); with phi, a conformal map."""
+        half = np.asarray(s_m, np.float64)[..., None] / 2
+        return np.asarray((half / self.radius(half * (1 + _ABSCISSAE))) @ _WEIGHTS)
+
+
+@dataclass(frozen=True)
+class SimulatedSurface(SheetMetric):
+    """Surface of revolution, a cylinder, a cone or a sphere; or a plane.
+
+    Its coordinates are the arc length s along the profile, in metres from electrode x0, and the angle phi, in
+    radians from electrode y0. On a plane phi is in metres, and the radius is 1.
+    """
+
+    start_radius_m: float
+    """Radius at s = 0, of a straight profile."""
+    slope: float = 0.0
+    """Change of radius per metre of a straight profile."""
+    sphere_from_rad: float | None = None
+    """Latitude at s = 0 if the profile is a meridian of a sphere, whose radius is `start_radius_m`."""
+    flat: bool = False
+    resistivity_ratio: float = 1.0
+    """Resistivity along s over that along phi; the sheet's resistance is their geometric mean."""
+
+    @property
+    def metric(self) -> SheetMetric:
+        """Equivalent surface with an isotropic sheet: s is stretched if the sheet is anisotropic."""
+        return self if self.resistivity_ratio == 1 else _StretchedMetric.of_surface(self)
+
+    @property
+    def stretch(self) -> float:
+        """Length of s in `metric` relative to that on the surface."""
+        return math.sqrt(self.resistivity_ratio)
+
+    def radius(self, s_m: ArrayLike) -> FloatArray:
+        """Return metres along the surface per unit of phi at `s_m` (...)."""
+        s = np.asarray(s_m, np.float64)
+        if self.flat:
+            return np.ones_like(s)
+        if self.sphere_from_rad is None:
+            return np.asarray(self.start_radius_m + self.slope * s)
+        return np.asarray(self.start_radius_m * np.cos(self.sphere_from_rad + s / self.start_radius_m))
+
+    def point(self, s_m: float, phi: float) -> FloatArray:
+        """Return a position (3,) [m] in the pad's frame: origin at its centre, x towards xa, z outward."""
+        if self.flat:
+            return np.array([s_m - self.length_m / 2, phi - self.arc / 2, 0.0])
+        axial, radius = self._profile(s_m)
+        middle_axial, middle_radius = self._profile(self.length_m / 2)
+        angle = phi - self.arc / 2
+        return self._to_pad_frame(
+            axial - middle_axial, radius * math.sin(angle), radius * math.cos(angle) - middle_radius
+        )
+
+    def normal(self, s_m: float, phi: float) -> FloatArray:
+        """Return the outward unit normal (3,) in the pad's frame."""
+        if self.flat:
+            return np.array([0.0, 0.0, 1.0])
+        angle, climb = phi - self.arc / 2, self._profile_angle(s_m)
+        return self._to_pad_frame(
+            -math.sin(climb), math.cos(climb) * math.sin(angle), math.cos(climb) * math.cos(angle)
+        )
+
+    def _profile(self, s_m: float) -> tuple[float, float]:
+        """Return the position along the axis and the distance from it [m]."""
+        if self.sphere_from_rad is None:
+            axial = s_m * math.cos(self._profile_angle(s_m))
+        else:
+            axial = self.start_radius_m * math.sin(self.sphere_from_rad + s_m / self.start_radius_m)
+        return axial, float(self.radius(s_m))
+
+    def _profile_angle(self, s_m: float) -> float:
+        """Return the angle between profile and axis, positive where it widens."""
+        if self.sphere_from_rad is None:
+            return math.asin(self.slope)
+        return -(self.sphere_from_rad + s_m / self.start_radius_m)
+
+    def _to_pad_frame(self, axial: float, aside: float, outward: float) -> FloatArray:
+        tilt = self._profile_angle(self.length_m / 2)
+        cos, sin = math.cos(tilt), math.sin(tilt)
+        return np.array([cos * axial + sin * outward, aside, cos * outward - sin * axial])
+
+
+@dataclass(frozen=True)
+class _StretchedMetric(SheetMetric):
+    """Metric of an anisotropic sheet: along s, lengths are multiplied by sqrt(resistivity_ratio)."""
+
+    surface: SimulatedSurface
+
+    @classmethod
+    def of_surface(cls, surface: SimulatedSurface) -> _StretchedMetric:
+        return cls(surface.length_m * surface.stretch, surface.arc, surface)
+
+    def radius(self, s_m: ArrayLike) -> FloatArray:
+        return self.surface.radius(np.asarray(s_m, np.float64) / self.surface.stretch)
+
+    def isothermal(self, s_m: ArrayLike) -> FloatArray:
+        stretch = self.surface.stretch
+        return stretch * self.surface.isothermal(np.asarray(s_m, np.float64) / stretch)
+
+
+@dataclass(frozen=True)
+class SimulatedPrism(SimulatedSurface):
+    """Strip bent along lines parallel to x; phi is the length along its cross-section, in metres."""
+
+    corners_m: tuple[tuple[float, float], ...] = ()
+    """Corners (aside, up) of the cross-section from electrode y0 to yb."""
+
+    def point(self, s_m: float, phi: float) -> FloatArray:
+        """Return a position (3,) [m] in the pad's frame."""
+        aside, up = self._to_middle(self._section(phi) - self._section(self.arc / 2))
+        return np.array([s_m - self.length_m / 2, aside, up])
+
+    def normal(self, s_m: float, phi: float) -> FloatArray:  # noqa: ARG002
+        """Return the outward unit normal (3,) in the pad's frame; on a fold that of the later face."""
+        aside, up = self._to_middle(self._direction(phi))
+        return np.array([0.0, -up, aside])
+
+    def faces(self) -> list[tuple[float, float, FloatArray, FloatArray]]:
+        """Return begin and end [m] of each face along the section, and its ends (2,) in the pad's frame."""
+        ends = [0.0, *np.cumsum(self._widths()).tolist()]
+        middle = self._section(self.arc / 2)
+        points = [self._to_middle(np.array(corner) - middle) for corner in self.corners_m]
+        return list(zip(ends[:-1], ends[1:], points[:-1], points[1:], strict=True))
+
+    def _widths(self) -> FloatArray:
+        return np.asarray(np.linalg.norm(np.diff(self.corners_m, axis=0), axis=1))
+
+    def _section(self, phi: float) -> FloatArray:
+        ends = np.concatenate([[0.0], np.cumsum(self._widths())])
+        return np.array([np.interp(phi, ends, along) for along in np.array(self.corners_m).T])
+
+    def _direction(self, phi: float) -> FloatArray:
+        ends = np.cumsum(self._widths())
+        face = min(int(np.searchsorted(ends, phi, side="right")), len(ends) - 1)
+        return np.asarray(np.diff(self.corners_m, axis=0)[face] / self._widths()[face])
+
+    def _to_middle(self, vector: FloatArray) -> FloatArray:
+        """Rotate a vector (aside, up) of the section to the pad's frame, whose y is along the middle face."""
+        cos, sin = self._direction(self.arc / 2)
+        return np.array([cos * vector[0] + sin * vector[1], cos * vector[1] - sin * vector[0]])
+
+
+@dataclass(frozen=True)
+class SimulatedRevolution(SimulatedSurface):
+    """Surface of revolution with a cubic spline through given points as its profile."""
+
+    points_m: tuple[tuple[float, float], ...] = ()
+    """Points (axial, radius) from electrode x0 to xa; the axis points from the first to the last."""
+
+    def radius(self, s_m: ArrayLike) -> FloatArray:
+        """Return metres along the surface per unit of phi at `s_m` (...)."""
+        return np.asarray(_profile(self.points_m).curve(self._parameter(s_m))[..., 1])
+
+    def isothermal(self, s_m: ArrayLike) -> FloatArray:
+        """Return the integral of ds / radius from electrode x0 to `s_m` (...); with phi, a conformal map."""
+        return np.asarray(_profile(self.points_m).isothermal(self._parameter(s_m)))
+
+    def profile_point(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return axial position and radius at `s_m` (...) [m]."""
+        axial, radius = np.moveaxis(_profile(self.points_m).curve(self._parameter(s_m)), -1, 0)
+        return axial, radius
+
+    def profile_angle(self, s_m: float) -> float:
+        """Return the angle between profile and axis."""
+        return self._profile_angle(s_m)
+
+    def profile_angles(self, s_m: FloatArray) -> FloatArray:
+        """Return the angles (...) between profile and axis at `s_m` (...)."""
+        axial, radius = np.moveaxis(_profile(self.points_m).curve(self._parameter(s_m), 1), -1, 0)
+        return np.asarray(np.arctan2(radius, axial))
+
+    def _parameter(self, s_m: ArrayLike) -> FloatArray:
+        return np.asarray(_profile(self.points_m).from_length(np.asarray(s_m, np.float64)))
+
+    def _profile(self, s_m: float) -> tuple[float, float]:
+        axial, radius = _profile(self.points_m).curve(self._parameter(s_m)).tolist()
+        return axial, radius
+
+    def _profile_angle(self, s_m: float) -> float:
+        axial, radius = _profile(self.points_m).curve(self._parameter(s_m), 1).tolist()
+        return math.atan2(radius, axial)
+
+
+@dataclass(frozen=True)
+class _SplineProfile:
+    """Spline profile: curve by parameter, and tables to and from arc length and isothermal coordinate."""
+
+    curve: CubicSpline
+    length_m: float
+    from_length: BPoly
+    isothermal: PPoly
+
+
+@lru_cache(maxsize=64)
+def _profile(points_m: tuple[tuple[float, float], ...]) -> _SplineProfile:
+    points = np.array(points_m)
+    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    curve = CubicSpline(knots, points)
+    t = np.unique(np.concatenate([np.linspace(a, b, 129) for a, b in itertools.pairwise(knots)]))
+    speed = np.linalg.norm(curve(t, 1), axis=1)
+    half = np.diff(t)[:, None] / 2
+    samples = t[:-1, None] + half * (1 + _ABSCISSAE)
+    lengths = np.linalg.norm(curve(samples, 1), axis=2) * half
+    s = np.concatenate([[0.0], np.cumsum(lengths @ _WEIGHTS)])
+    logs = np.concatenate([[0.0], np.cumsum((lengths / curve(samples)[..., 1]) @ _WEIGHTS)])
+    from_length = BPoly.from_derivatives(s, np.stack([t, 1 / speed], axis=1))
+    isothermal = PPoly.from_bernstein_basis(
+        BPoly.from_derivatives(t, np.stack([logs, speed / curve(t)[:, 1]], axis=1))
+    )
+    return _SplineProfile(curve, float(s[-1]), from_length, isothermal)
+
+
+def simulated_surface(surface: config.SurfaceTable) -> SimulatedSurface:
+    """Return the geometry of a pad's `surface` table."""
+    built = _BUILDERS[surface.kind](surface)
+    return replace(built, resistivity_ratio=surface.resistivity_ratio)
+
+
+def _plane(table: Any) -> SimulatedSurface:
+    return SimulatedSurface(table.length_mm * 1e-3, table.width_mm * 1e-3, 1.0, flat=True)
+
+
+def _cylinder(table: Any) -> SimulatedSurface:
+    return SimulatedSurface(table.length_mm * 1e-3, math.radians(table.arc_deg), table.radius_mm * 1e-3)
+
+
+def _cone(table: Any) -> SimulatedSurface:
+    slope = (table.far_radius_mm - table.near_radius_mm) / table.slant_mm
+    arc = math.radians(table.arc_deg)
+    return SimulatedSurface(table.slant_mm * 1e-3, arc, table.near_radius_mm * 1e-3, slope)
+
+
+def _sphere(table: Any) -> SimulatedSurface:
+    radius = table.radius_mm * 1e-3
+    length = radius * math.radians(table.to_deg - table.from_deg)
+    start = math.radians(table.from_deg)
+    return SimulatedSurface(length, math.radians(table.arc_deg), radius, sphere_from_rad=start)
+
+
+def _prism(table: Any) -> SimulatedSurface:
+    corners = _pairs(table.section_aside_mm, table.section_up_mm)
+    width = sum(math.dist(a, b) for a, b in itertools.pairwise(corners))
+    return SimulatedPrism(table.length_mm * 1e-3, width, 1.0, flat=True, corners_m=corners)
+
+
+def _revolution(table: Any) -> SimulatedSurface:
+    forward = 1 if table.profile_axial_mm[-1] >= table.profile_axial_mm[0] else -1
+    points = _pairs([forward * axial for axial in table.profile_axial_mm], table.profile_radius_mm)
+    length = _profile(points).length_m
+    return SimulatedRevolution(length, math.radians(table.arc_deg), points[0][1], points_m=points)
+
+
+def _pairs(first_mm: Any, second_mm: Any) -> tuple[tuple[float, float], ...]:
+    return tuple((1e-3 * a, 1e-3 * b) for a, b in zip(first_mm, second_mm, strict=True))
+
+
+_BUILDERS: Mapping[str, Callable[[Any], SimulatedSurface]] = MappingProxyType(
+    {
+        "plane": _plane,
+        "cylinder": _cylinder,
+        "cone": _cone,
+        "sphere": _sphere,
+        "prism": _prism,
+        "revolution": _revolution,
+    }
+)
+"""By `kind` of the deployment's `surface` table."""

@@ -1,0 +1,100 @@
+"""Input of a simulated hand, as an interface: contacts, faults, replaced nodes, joint motion over time.
+
+Implemented by `Scenario` (a file), `GraspStimulus` (a grasp in MuJoCo) and `GripperStimulus` (live commands).
+Public names: `Stimulus` (a whole hand), `PadStimulus` (one pad), `AppliedContact`, `JointTrajectory`,
+`NodeReplacement`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from handtouch.config.base import Table
+from handtouch.config.tables import Name, PositivePerChannel, Unsigned32
+from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.faults import Fault
+
+FloatArray = NDArray[np.float64]
+
+
+class AppliedContact(NamedTuple):
+    """A contact at one moment: number of its touch, position as fractions of the pad, force."""
+
+    touch_number: int
+    x: float
+    y: float
+    force_n: float
+    radius_m: float | None = None
+    """None: the touch's radius, or the world's."""
+
+
+class NodeReplacement(Table):
+    """`[[swap]]`: a pad's node is replaced by one with another serial number."""
+
+    link: Name = Field(description="link whose pad gets another node")
+    at_s: float = Field(ge=0, description="time since the start; happens once, even in a repeating scenario")
+    serial: Unsigned32 = Field(description="serial number of the new node")
+    gain: PositivePerChannel | None = Field(
+        None,
+        description="gains of its channels, relative to the configured ones; left out: drawn by serial",
+    )
+
+
+class JointTrajectory(Protocol):
+    """Joint positions of a hand over time."""
+
+    def positions_at(self, t_s: float) -> dict[str, float]:
+        """Return the reported position of each joint at `t_s` [rad or m]."""
+
+
+class PadStimulus(Protocol):
+    """Contacts on one pad over time."""
+
+    @property
+    def max_contacts(self) -> int:
+        """Largest number of simultaneous contacts."""
+
+    @property
+    def event_times_s(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times [s]: to sample the force at; after which the sheet settles; at which touches begin."""
+
+    def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and radii (k, n) [m].
+
+        k is `max_contacts`, n the number of times.
+        """
+
+
+class Stimulus(Protocol):
+    """Input of a simulated hand. Times are seconds since the start; a repeating one starts again at 0."""
+
+    @property
+    def faults(self) -> Sequence[Fault]: ...
+    @property
+    def node_replacements(self) -> Sequence[NodeReplacement]: ...
+    @property
+    def repeat(self) -> bool: ...
+    @property
+    def duration_s(self) -> float:
+        """Duration of one pass."""
+
+    @property
+    def touch_links(self) -> Sequence[tuple[str, float | None]]:
+        """Link of each touch, and its radius [m] where the touch defines one."""
+
+    def contacts_at(self, t_s: float) -> list[AppliedContact]:
+        """Return the contacts of all pads at `t_s`."""
+
+    def pad_stimulus(self, link: str, radius_m: Callable[[int], float]) -> PadStimulus:
+        """Return the contacts of one pad; `radius_m(number)` is for touches that define no radius."""
+
+    def joint_trajectory(self, robot: RobotDescription) -> JointTrajectory | None:
+        """Return the joint motion of a hand; None if its joints don't move."""
+
+    def check_links(self, links: Iterable[str], file: str = ...) -> None:
+        """Raise ConfigError if a touch, fault or replacement names a link that carries no pad."""

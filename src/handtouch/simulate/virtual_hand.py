@@ -1,0 +1,224 @@
+"""Virtual hand: computes the counts of every pad's channels from a stimulus, and the ground truth.
+
+Public name: `VirtualHand`. It has neither clock nor state: the same time gives the same sample.
+
+A contact obeys V = J [R_contact + R_sheet + sum_i phi_i R_i m_i], where J is its current, phi the shares of
+`SheetMaps`, R_i the resistors and m = (1 + G R / rho)^-1 phi the shares that the electrodes collect through
+them. The contact is a disc with the resistance of eqs. 9-11 of the paper, its outer radius the conformal one;
+the shares are those of its centre, exact by the mean-value property if the disc lies on the sheet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch import config
+from handtouch.simulate import noise
+from handtouch.simulate.faults import Fault
+from handtouch.simulate.pad_circuit import contact_layer_ohm
+from handtouch.simulate.sheet_solver import SheetMapBank
+from handtouch.simulate.stimulus import AppliedContact, Stimulus
+from handtouch.simulate.truth import GroundTruth, Vector
+from handtouch.simulate.virtual_pad import VirtualPad
+from handtouch.simulate.world import ElectronicsDrift, World
+
+FloatArray = NDArray[np.float64]
+_QUANTISATION_VARIANCE = 1 / 12  # counts^2, by rounding
+
+
+class VirtualHand:
+    """Pads of a deployment, or of one of its buses, with a stimulus in a world.
+
+    Rows are the pads in the order of the file; `pads` are (hand's name, pad). `faults` are added to those of
+    the stimulus.
+    """
+
+    def __init__(
+        self,
+        deployment: config.Deployment,
+        stimulus: Stimulus,
+        world: World,
+        bus: str | None = None,
+        faults: Sequence[Fault] = (),
+    ) -> None:
+        self.pads = [(hand, pad) for hand, pad in deployment.pads if bus in (None, pad.bus)]
+        self._stimulus = stimulus
+        all_faults = (*stimulus.faults, *faults)
+        self._virtual_pads = [
+            VirtualPad.build(deployment, hand, pad, stimulus, world, all_faults) for hand, pad in self.pads
+        ]
+        self._bank = SheetMapBank([row.circuit.maps for row in self._virtual_pads])
+        self._circuits = _HealthyCircuits(self._virtual_pads)
+        self._noise = np.array([row.noise_counts for row in self._virtual_pads])
+        self._keys = np.array([row.noise_keys for row in self._virtual_pads]).reshape(-1, 4)
+        self._gains = np.array([row.counts_per_ampere for row in self._virtual_pads])
+        limits = np.array([row.limits for row in self._virtual_pads])
+        self._low, self._high = limits[:, :, 0], limits[:, :, 1]
+        self._sample_count = 0
+        self._drift = ElectronicsDrift(world, [(row.hand, row.pad.link) for row in self._virtual_pads])
+        self._special_rows = [
+            number for number, row in enumerate(self._virtual_pads) if row.faults or row.replacement_gains
+        ]
+        self._touch_pads = [
+            [
+                (number, radius_m or 1e-3 * world.contact_radius_mm(row.sheet, index))
+                for number, row in enumerate(self._virtual_pads)
+                if row.pad.link == link
+            ]
+            for index, (link, radius_m) in enumerate(stimulus.touch_links)
+        ]
+
+    def sample(self, t_s: float) -> NDArray[np.int64]:
+        """Return counts (pads, 4) of the channels x0, xa, y0, yb, `t_s` after the start of the scenario."""
+        self._sample_count += 1
+        if history := self._virtual_pads[self._sample_count % len(self._virtual_pads)].history:
+            history.extend_ahead(t_s)  # one pad per sample, to keep samples fast
+        counts = self._noise[:, None] * noise.standard_normal(self._keys, round(t_s * 1e9))
+        gains, times_s = self._gains, np.array([t_s])
+        if not self._drift.is_constant:
+            counts += self._drift.zero_counts(times_s)[0]
+            gains = gains * self._drift.gain_ratio(times_s) * self._drift.supply_ratio(times_s)
+        all_contacts = self._contacts_at(t_s)
+        contact_counts = Counter(contact.row for contact in all_contacts)
+        special = {*self._special_rows, *(row for row, number in contact_counts.items() if number > 1)}
+        if contacts := [contact for contact in all_contacts if contact.row not in special]:
+            currents, _ = self._currents(contacts, t_s)
+            rows = [contact.row for contact in contacts]
+            counts[rows] += currents * gains[rows]
+        readings = np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
+        for row in special:
+            readings[row] = self.counts(row, [t_s])[0]
+        return readings
+
+    def counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:
+        """Return counts (n, 4) of one pad at times (n,), the same as those of `sample`."""
+        return self._virtual_pads[pad_row].counts(times_s)
+
+    def prepare(self) -> None:
+        """Solve all sheets in advance, so that a live hand doesn't pause for it."""
+        for row in self._virtual_pads:
+            row.prepare()
+
+    def switch_excitation(self, pad_row: int, t_s: float, on: bool) -> None:
+        """Switch a pad's excitation at `t_s`, later than any switch before; without it the sheet recovers.
+
+        It is on from the start.
+        """
+        if history := self._virtual_pads[pad_row].history:
+            history.switch_excitation(t_s, on)
+
+    def truth(self, t_s: float, sync_ns: int = 0) -> list[GroundTruth]:
+        """Return the true contacts of the sample at `t_s`; `sync_ns` is its SYNC on the host's clock."""
+        contacts = self._contacts_at(t_s)
+        if not contacts:
+            return []
+        return [
+            self._truth(contact, currents, jacobian, sync_ns)
+            for contact, currents, jacobian in zip(contacts, *self._currents(contacts, t_s), strict=True)
+        ]
+
+    def _contacts_at(self, t_s: float) -> list[_PadContact]:
+        return [
+            _PadContact(row, contact, contact.radius_m or radius_m)
+            for contact in self._stimulus.contacts_at(t_s)
+            for row, radius_m in self._touch_pads[contact.touch_number]
+        ]
+
+    def _currents(self, contacts: Sequence[_PadContact], t_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return currents (k, 4) [A], and derivatives (k, 4, 3) by x, y [fractions] and total current."""
+        rows = np.array([contact.row for contact in contacts])
+        x, y, force, radius = np.array(
+            [(c.contact.x, c.contact.y, c.contact.force_n, c.radius_m) for c in contacts]
+        ).T
+        times_s = np.array([t_s])
+        pads = [self._virtual_pads[contact.row] for contact in contacts]
+        force = force * [1.0 if pad.is_ideal else pad.force_ratio(times_s)[0] for pad in pads]
+        values, slopes = self._bank.look_up(rows, x, y)
+        shares, log_radius = values[:4].T, values[4]
+        collected, total = self._circuits.solve_contacts(rows, shares, log_radius, force, radius)
+        by_position = self._circuits.share_to_channel[rows] @ slopes[:4].transpose(2, 0, 1)
+        jacobian = np.concatenate([total[:, None, None] * by_position, collected[:, :, None]], axis=2)
+        return total[:, None] * collected, jacobian
+
+    def _truth(
+        self, contact: _PadContact, currents: FloatArray, jacobian: FloatArray, sync_ns: int
+    ) -> GroundTruth:
+        row, applied = self._virtual_pads[contact.row], contact.contact
+        shape = row.shape
+        s_m, phi = applied.x * shape.length_m, applied.y * shape.arc
+        parallel_m = float(shape.radius(s_m))
+        in_counts = jacobian * self._gains[contact.row][:, None]
+        in_counts[:, :2] /= (shape.length_m, shape.arc * parallel_m)
+        variance = row.noise_counts**2 + _QUANTISATION_VARIANCE
+        covariance = variance * np.linalg.inv(in_counts.T @ in_counts)
+        return GroundTruth(
+            sync_ns,
+            row.hand,
+            row.pad.link,
+            applied.touch_number,
+            s_m,
+            phi * parallel_m,
+            _vector(row.rotation @ shape.point(s_m, phi) + row.translation),
+            _vector(row.rotation @ shape.normal(s_m, phi)),
+            applied.force_n,
+            contact.radius_m,
+            tuple(currents.tolist()),
+            math.sqrt(covariance[0, 0] + covariance[1, 1]),
+        )
+
+
+@dataclass(frozen=True)
+class _PadContact:
+    row: int
+    contact: AppliedContact
+    radius_m: float
+
+
+class _HealthyCircuits:
+    """Circuits of all pads without faults: supply, contact, sheet, resistors."""
+
+    def __init__(self, rows: Sequence[VirtualPad]) -> None:
+        self._drive_v = np.array([row.circuit.drive_v for row in rows])
+        self._sheet_ohm = np.array([row.sheet.ohm_per_square for row in rows])
+        self._alpha = np.array([row.sheet.alpha for row in rows])
+        self._reference_pa = np.array([row.sheet.reference_kpa * 1e3 for row in rows])
+        self._contact_ohm_m2 = np.array([row.sheet.contact_ohm_mm2 * 1e-6 for row in rows])
+        circuits = [row.circuit.healthy for row in rows]
+        self._impedance_ohm = np.array([circuit.impedance_ohm for circuit in circuits])
+        self.share_to_channel = np.array([circuit.share_to_channel for circuit in circuits])
+        """(rows, 4, 4): from the shares of grounded electrodes to those of the channels."""
+
+    def solve_contacts(
+        self,
+        rows: NDArray[np.intp],
+        shares: FloatArray,
+        log_radius: FloatArray,
+        force_n: FloatArray,
+        radius_m: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the shares (k, 4) of the channels in each contact's current, and these currents (k,) [A]."""
+        column = shares[:, :, None]
+        collected = (self.share_to_channel[rows] @ column)[:, :, 0]
+        sheet_ohm = self._sheet_ohm[rows]
+        ohm = contact_layer_ohm(
+            force_n,
+            radius_m,
+            sheet_ohm,
+            self._contact_ohm_m2[rows],
+            self._reference_pa[rows],
+            self._alpha[rows],
+        )
+        ohm += sheet_ohm / (2 * math.pi) * np.maximum(log_radius - np.log(radius_m), 0.0)
+        ohm += (column.transpose(0, 2, 1) @ self._impedance_ohm[rows] @ column)[:, 0, 0]
+        return collected, self._drive_v[rows] / ohm
+
+
+def _vector(values: FloatArray) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,0 +1,239 @@
+"""One pad of a virtual hand, with its true parts, contacts and faults: counts of its channels at any time.
+
+Public name: `VirtualPad`. It has neither clock nor state: the same time gives the same counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch import config
+from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
+from handtouch.sheet import SheetModel
+from handtouch.simulate import noise
+from handtouch.simulate.faults import Fault, Gum, StuckChannel
+from handtouch.simulate.pad_circuit import PadCircuit
+from handtouch.simulate.pad_geometry import SimulatedSurface, simulated_surface
+from handtouch.simulate.sheet_history import SimulatedSheetHistory
+from handtouch.simulate.sheet_solver import ElectrodeGaps, solve_sheet
+from handtouch.simulate.stimulus import PadStimulus, Stimulus
+from handtouch.simulate.world import ElectronicsDrift, PadParts, World
+
+FloatArray = NDArray[np.float64]
+CountArray = NDArray[np.int64]
+_IDEAL_SHEET_GAIN_PER_K = 0.01  # as the paper's sheets
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualPad:
+    """One pad: its contacts, faults, sheet and channels."""
+
+    hand: str
+    pad: config.Pad
+    sheet: config.Sheet
+    circuit: PadCircuit
+    touches: PadStimulus
+    faults: tuple[Fault, ...]
+    rotation: FloatArray
+    translation: FloatArray
+    noise_counts: float
+    noise_keys: NDArray[np.uint64]
+    """(4,), random streams of the channels' noise."""
+    limits: CountArray
+    """(4, 2), lowest and highest count of each channel."""
+    counts_per_ampere: FloatArray
+    """(4,), channels x0, xa, y0, yb."""
+    replacement_gains: tuple[tuple[float, FloatArray], ...]
+    """Times of node replacements [s], with the gains (4,) of the new node relative to the first one's."""
+    drift: ElectronicsDrift
+    """Drift of this pad."""
+    sheet_model: SheetModel | None
+    repeat_period_s: float
+    """Period after which the scenario repeats; infinite: it doesn't."""
+
+    @classmethod
+    def build(
+        cls,
+        deployment: config.Deployment,
+        hand: str,
+        pad: config.Pad,
+        stimulus: Stimulus,
+        world: World,
+        faults: Sequence[Fault],
+    ) -> VirtualPad:
+        """Build a pad with the touches, faults and replacements of its link."""
+        node, sheet, parts = deployment.nodes[pad.node], deployment.sheets[pad.sheet], world.parts(hand, pad)
+        channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad.electrodes)
+        limits = np.array([channel.limits for channel in channels])
+        scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES])
+        full = np.array([node.full_scale_counts or high for high in limits[:, 1]])
+        per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(parts.gain)
+        shape = simulated_surface(pad.surface)
+        gaps = _gaps_from_parts(shape, parts)
+        circuit = PadCircuit(
+            shape,
+            gaps,
+            solve_sheet(shape, gaps),
+            sheet,
+            np.array(parts.series_ohm),
+            node.drive_v,
+            limits[:, 1] / per_ampere,
+        )
+        keys = [noise.stream_key(world.seed, "noise", hand, pad.link, name) for name in ELECTRODES]
+        return cls(
+            hand,
+            pad,
+            sheet,
+            circuit,
+            stimulus.pad_stimulus(pad.link, lambda number: 1e-3 * world.contact_radius_mm(sheet, number)),
+            tuple(fault for fault in faults if fault.link == pad.link),
+            *world.mount(hand, pad),
+            node.noise_counts if world.noise_counts is None else world.noise_counts,
+            np.array(keys),
+            limits,
+            per_ampere,
+            tuple(
+                (node.at_s, np.array(node.gain or world.replacement_gain(node.serial)) / np.array(parts.gain))
+                for node in sorted(stimulus.node_replacements, key=lambda node: node.at_s)
+                if node.link == pad.link
+            ),
+            ElectronicsDrift(world, [(hand, pad.link)]),
+            world.sheet_model(hand, pad.link),
+            stimulus.duration_s if stimulus.repeat else np.inf,
+        )
+
+    @property
+    def shape(self) -> SimulatedSurface:
+        """Surface of the pad."""
+        return self.circuit.shape
+
+    @property
+    def has_single_contacts_only(self) -> bool:
+        """True without faults, replaced nodes and simultaneous contacts."""
+        return not (self.faults or self.replacement_gains) and self.touches.max_contacts <= 1
+
+    def counts(self, times_s: ArrayLike) -> CountArray:
+        """Return counts (n, 4) of the channels x0, xa, y0, yb at times (n,) since the start."""
+        t = np.atleast_1d(np.asarray(times_s, np.float64))
+        counts = self._compute_counts(t, self._other_faults)
+        for fault in self._stuck_faults:
+            self._apply_stuck_channel(fault, t, counts)
+        return counts
+
+    @property
+    def is_ideal(self) -> bool:
+        """True if apparent and true force are always the same."""
+        return self.sheet_model is None and self.drift.is_constant and not self.faults
+
+    def force_ratio(self, times_s: FloatArray) -> FloatArray:
+        """Return apparent over true force (n,)."""
+        if self.is_ideal:
+            return np.ones(len(times_s))
+        if self.history is None:
+            return np.asarray(1 + _IDEAL_SHEET_GAIN_PER_K * self._temperature_rise_k(times_s))
+        return self.history.force_ratio(times_s)
+
+    @cached_property
+    def history(self) -> SimulatedSheetHistory | None:
+        """History of the sheet; None for an ideal sheet."""
+        if self.sheet_model is None:
+            return None
+        force_times, settling, begins = self.touches.event_times_s
+        gum = [fault.from_s for fault in self.faults if isinstance(fault, Gum)]
+        ends = [fault.until_s for fault in self.faults if isinstance(fault, Gum) and fault.until_s]
+        after = [from_s + step for from_s in gum for step in np.arange(0, 4, 0.05)]
+        return SimulatedSheetHistory(
+            self.sheet_model,
+            self.noise_keys[0] + np.uint64(7),
+            self._total_force_n,
+            self._temperature_rise_k,
+            np.concatenate([force_times, after, ends]),
+            np.concatenate([settling, gum, ends]),
+            np.concatenate([begins, gum]),
+            self.repeat_period_s,
+        )
+
+    def prepare(self) -> None:
+        """Solve the sheet for all contacts and faults in advance, so that a live hand doesn't pause."""
+        if not self.has_single_contacts_only:
+            begins = [fault.from_s for fault in self.faults]
+            changes = [*self.touches.event_times_s[1], *begins]
+            times = [t + step for t in changes for step in (0.01, 0.1) if t + step < self.repeat_period_s]
+            self.counts(np.array(times, np.float64))
+
+    def _total_force_n(self, scenario_s: FloatArray) -> FloatArray:
+        """Return the total force (n,) at times of the scenario."""
+        total = self.touches.contacts(scenario_s)[1].sum(0)
+        for fault in self.faults:
+            contacts = fault.contacts(scenario_s, self.circuit.size_m)
+            if contacts is not None and contacts.force_n is not None:
+                total += contacts.force_n
+        return np.asarray(total)
+
+    def _temperature_rise_k(self, times_s: FloatArray) -> FloatArray:
+        scenario_s = self._scenario_time_s(times_s)
+        return np.asarray(
+            self.drift.temperature_rise_k(times_s)
+            + sum(fault.temperature_rise_k(scenario_s) for fault in self.faults)
+        )
+
+    def _compute_counts(self, times_s: FloatArray, faults: Sequence[Fault]) -> CountArray:
+        scenario_s = self._scenario_time_s(times_s)
+        force_ratio, supply_ratio = self.force_ratio(times_s), self.drift.supply_ratio(times_s)
+        amperes = self.circuit.currents(scenario_s, self.touches, faults, force_ratio, supply_ratio)
+        for fault in faults:
+            if order := fault.channel_permutation:
+                amperes = np.where(fault.is_active(scenario_s)[:, None], amperes[:, order], amperes)
+        counts = amperes * self.counts_per_ampere * self.drift.gain_ratio(times_s)[:, None]
+        for from_s, gains in self.replacement_gains:
+            later = [at_s for at_s, _ in self.replacement_gains if at_s > from_s]
+            counts[(times_s >= from_s) & (times_s < min(later, default=np.inf))] *= gains
+        counts += self.drift.zero_counts(times_s)[:, 0]
+        for fault in faults:
+            active = np.flatnonzero(fault.is_active(scenario_s))
+            counts[active] = fault.distort_counts(counts[active])
+        sample_ns = np.rint(times_s * 1e9).astype(np.int64)
+        counts += self.noise_counts * noise.standard_normal(self.noise_keys, sample_ns[:, None])
+        readings = np.clip(np.rint(counts), *self.limits.T).astype(np.int64)
+        for fault in faults:
+            active = np.flatnonzero(fault.is_active(scenario_s))
+            affected = readings[active]
+            fault.override_counts(affected, self.limits)
+            readings[active] = affected
+        return readings
+
+    def _apply_stuck_channel(self, fault: StuckChannel, times_s: FloatArray, counts: CountArray) -> None:
+        active = np.flatnonzero(fault.is_active(self._scenario_time_s(times_s)))
+        if len(active):
+            channel = ELECTRODES.index(fault.electrode)
+            stuck = self._compute_counts(np.array([fault.from_s]), self._other_faults)[0, channel]
+            counts[active, channel] = stuck
+
+    def _scenario_time_s(self, times_s: FloatArray) -> FloatArray:
+        """Convert times since the start to times of a possibly repeating scenario."""
+        return times_s % self.repeat_period_s if np.isfinite(self.repeat_period_s) else times_s
+
+    @cached_property
+    def _stuck_faults(self) -> list[StuckChannel]:
+        """Faults that hold the reading of a channel at their begin."""
+        return [fault for fault in self.faults if isinstance(fault, StuckChannel) and fault.count is None]
+
+    @cached_property
+    def _other_faults(self) -> list[Fault]:
+        return [fault for fault in self.faults if fault not in self._stuck_faults]
+
+
+def _gaps_from_parts(shape: SimulatedSurface, parts: PadParts) -> ElectrodeGaps:
+    """Return the gaps in the coordinates of the surface."""
+    ends = shape.radius([0.0, shape.length_m])
+    units = (*ends.tolist(), 1.0, 1.0)  # metres per unit of the coordinate along the side
+    x0, xa, y0, yb = (
+        (1e-3 * before / unit, 1e-3 * after / unit)
+        for before, after, unit in zip(parts.gap_before_mm, parts.gap_after_mm, units, strict=True)
+    )
+    return ElectrodeGaps(x0, xa, y0, yb)

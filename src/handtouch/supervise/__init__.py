@@ -1,1 +1,0 @@
-"""Watches over every sensor: what is wrong with a pad, and what helps."""

@@ -1,0 +1,1 @@
+"""Supervisor process: learns gains and offsets from blocks of samples, and diagnoses pads."""

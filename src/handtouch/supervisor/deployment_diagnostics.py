@@ -1,0 +1,74 @@
+"""Diagnosis of all hands of a deployment, from the daemon's blocks to published diagnoses.
+
+Public name: `DeploymentDiagnostics`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from handtouch.config import Deployment
+from handtouch.supervisor import diagnose
+from handtouch.supervisor.ipc import FloatArray, SampleBlock
+from handtouch.wire.diagnosis import Diagnosis
+
+_BLOCK_DURATION_NS = 250_000_000
+"""Duration of the samples that are diagnosed together."""
+
+
+class DeploymentDiagnostics:
+    """Diagnostics of all pads, numbered in the order of the deployment."""
+
+    def __init__(self, deployment: Deployment) -> None:
+        self._hands: list[tuple[slice, diagnose.HandDiagnostics]] = []
+        self._models: dict[int, diagnose.DiagnosisModel] = {}
+        self._default_ampere_per_count: dict[int, FloatArray] = {}
+        first = 0
+        for hand in deployment.hands:
+            rows = slice(first, first + len(hand.pads))
+            model = diagnose.DiagnosisModel.from_deployment(deployment, hand.name)
+            self._models[first], self._default_ampere_per_count[first] = model, model.ampere_per_count.copy()
+            self._hands.append((rows, diagnose.HandDiagnostics(model)))
+            first = rows.stop
+        self._pending: list[SampleBlock] = []
+        self._diagnoses: list[tuple[int, Diagnosis]] = []
+
+    def process_block(self, block: SampleBlock) -> Sequence[tuple[int, Diagnosis]]:
+        """Process a block; return the active diagnoses with their pads, updated every quarter of a second."""
+        self._pending.append(block)
+        if block.sync_ns[-1] - self._pending[0].sync_ns[0] < _BLOCK_DURATION_NS:
+            return self._diagnoses
+        blocks, self._pending = self._pending, []
+        sample_ns, counts, fresh = (
+            np.concatenate([getattr(one, name) for one in blocks])
+            for name in ("sample_ns", "counts", "fresh")
+        )
+        self._diagnoses = []
+        for rows, hand in self._hands:
+            if fresh[:, rows].any():
+                samples = counts[:, rows].astype(np.int64)
+                hand.process_block(diagnose.HandSamples(sample_ns[:, rows], samples, fresh[:, rows]))
+            self._diagnoses += [
+                (rows.start + row, diagnosis.published)
+                for row, diagnosis in hand.diagnoses_by_pad()
+                if diagnosis.is_fault
+            ]
+        return self._diagnoses
+
+    def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
+        """Set the stored offsets (4,) of a pad."""
+        rows, hand = self._hand_of(pad)
+        hand.set_offsets(pad - rows.start, offset_counts)
+
+    def set_gains(self, pad: int, gains: ArrayLike) -> None:
+        """Set the gains (4,) of a pad and discard its contacts so far."""
+        rows, hand = self._hand_of(pad)
+        row, model = pad - rows.start, self._models[rows.start]
+        model.ampere_per_count[row] = self._default_ampere_per_count[rows.start][row] * np.asarray(gains)
+        hand.reset_contacts(row)
+
+    def _hand_of(self, pad: int) -> tuple[slice, diagnose.HandDiagnostics]:
+        return next((rows, hand) for rows, hand in self._hands if rows.start <= pad < rows.stop)

@@ -1,0 +1,141 @@
+"""Detect faults of single channels that show in every sample: stuck, saturated, shorted to the layer.
+
+Public: `ChannelFaultDetector`, `ChannelFault`. A reading of a healthy channel repeats by chance with a
+probability
+that follows from its noise; a run of repeats less likely than e^-ALARM_NATS is a fault.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from handtouch.supervisor.diagnose.features import BlockFeatures
+from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray
+from handtouch.wire.faults import FaultKind
+
+ALARM_NATS = 40.0
+"""Nats; 15 pads of 200 Hz make 7e9 readings per week: 7e9 e^-40 is one false alarm in 600 million weeks."""
+
+_MIN_REPEATS = 200
+_MIN_RAILED_NS = 1_000_000_000
+_MIN_RAILED_TOUCHED_NS = 20_000_000_000
+_MAX_UNTOUCHED_FRACTION = 0.03  # of the railed channel: less than the other three get from a contact anywhere
+_IDLE_RATIO_RANGE = (
+    0.7,
+    1.3,
+)  # of the currents that the layer's potential on an electrode drives into the other three
+_FAULT_CLEAR_NS = 2_000_000_000
+
+
+@dataclass(frozen=True)
+class ChannelFault:
+    """Fault of one channel of a pad."""
+
+    kind: FaultKind
+    since_ns: int
+    evidence: dict[str, float]
+
+
+class ChannelFaultDetector:
+    """Detector of faults of the four channels of n pads."""
+
+    def __init__(self, model: DiagnosisModel) -> None:
+        self._model = model
+        n = len(model.links)
+        chance = _repeat_probability(
+            0.5 * np.hypot(model.noise_counts, 0.0)
+        )  # half the noise, as a channel may be quieter
+        self._max_repeats = np.maximum(np.ceil(ALARM_NATS / -np.log(chance)), _MIN_REPEATS)
+        self._repeats = np.zeros((n, 4), dtype=np.int64)
+        self._repeats_since_ns = np.zeros((n, 4), dtype=np.int64)
+        self._railed_since_ns = np.full((n, 4), -1, dtype=np.int64)  # begin of saturation; -1: none
+        self._healthy_since_ns = np.zeros((n, 4), dtype=np.int64)  # since when it is healthy again
+        self._min_counts = np.full(
+            (n, 4, 4), np.inf
+        )  # lowest reading of each channel while another was railed
+        self._idle_counts = np.array(
+            [_idle_counts(model, row) for row in range(n)]
+        )  # (n, 4 shorted, 4 channels)
+        self.faults: dict[tuple[int, int], ChannelFault] = {}
+
+    @property
+    def faulty_channels(self) -> NDArray[np.bool_]:
+        """Return the channels (n, 4) with a fault."""
+        bad = np.zeros(self._repeats.shape, dtype=np.bool_)
+        for pad, channel in self.faults:
+            bad[pad, channel] = True
+        return bad
+
+    def process_block(self, features: BlockFeatures) -> None:
+        """Update faults by the features of a block."""
+        t_ns = features.last_sample_ns[:, None]
+        begins = features.varied | (self._repeats == 0)
+        self._repeats_since_ns = np.where(begins, t_ns, self._repeats_since_ns)
+        self._repeats = np.where(features.varied, 0, self._repeats) + features.trailing_repeats
+        railed = features.railed_fraction >= 1.0
+        self._railed_since_ns = np.where(
+            railed, np.where(self._railed_since_ns < 0, t_ns, self._railed_since_ns), -1
+        )
+        least = (features.means / self._model.ampere_per_count).min(axis=0)[:, None, :]
+        self._min_counts = np.where(railed[:, :, None], np.minimum(self._min_counts, least), np.inf)
+        for pad, channel in np.argwhere(railed | (self._repeats >= self._max_repeats[:, None])).tolist():
+            fault = self._classify(pad, channel, features)
+            if fault is not None:
+                self._healthy_since_ns[pad, channel] = -1
+                before = self.faults.get((pad, channel))
+                if before is None or before.kind != fault.kind:
+                    self.faults[pad, channel] = fault
+        for pad, channel in list(self.faults):
+            if railed[pad, channel] or not features.varied[pad, channel]:
+                self._healthy_since_ns[pad, channel] = -1
+            elif self._healthy_since_ns[pad, channel] < 0:
+                self._healthy_since_ns[pad, channel] = int(features.last_sample_ns[pad])
+            elif features.last_sample_ns[pad] - self._healthy_since_ns[pad, channel] > _FAULT_CLEAR_NS:
+                del self.faults[pad, channel]
+
+    def _classify(self, pad: int, channel: int, features: BlockFeatures) -> ChannelFault | None:
+        count = int(features.last_counts[pad, channel])
+        if self._railed_since_ns[pad, channel] < 0:
+            evidence = {"count": float(count), "repeats": float(self._repeats[pad, channel])}
+            return ChannelFault(FaultKind.STUCK_CHANNEL, int(self._repeats_since_ns[pad, channel]), evidence)
+        since = int(self._railed_since_ns[pad, channel])
+        lasted = int(features.last_sample_ns[pad]) - since
+        if lasted < _MIN_RAILED_NS:
+            return None
+        others = np.delete(features.means[:, pad] / self._model.ampere_per_count[pad], channel, axis=1)
+        least = np.delete(self._min_counts[pad, channel], channel)
+        expected = np.delete(self._idle_counts[pad, channel], channel)
+        evidence = {"count": float(count), "others_counts": float(others.sum(axis=1).min())}
+        if (
+            count > 0
+            and (least > _IDLE_RATIO_RANGE[0] * expected).all()
+            and (least < _IDLE_RATIO_RANGE[1] * expected).all()
+        ):
+            return ChannelFault(FaultKind.SHORTED_ELECTRODE, since, evidence)
+        untouched = np.abs(least).sum() < _MAX_UNTOUCHED_FRACTION * abs(count)
+        if untouched or count < 0 or lasted > _MIN_RAILED_TOUCHED_NS:
+            return ChannelFault(FaultKind.SATURATED_CHANNEL, since, evidence)
+        return None
+
+
+def _repeat_probability(std: FloatArray) -> FloatArray:
+    """Return the probability (n,) that two rounded normal readings of std (n,) counts are equal."""
+    steps = np.arange(-40, 41)
+    width = np.maximum(std, 0.05)[:, None]
+    chance = ndtr((steps + 0.5) / width) - ndtr((steps - 0.5) / width)
+    return np.asarray(np.clip((chance**2).sum(axis=1), 0.5, 1 - 1e-3))
+
+
+def _idle_counts(model: DiagnosisModel, row: int) -> FloatArray:
+    """Return counts [shorted, channel] with an electrode at the layer's potential; infinite if unknown."""
+    network = model.networks[row]
+    try:
+        conductance = network.conductance / network.sheet_ohm_per_square
+    except ValueError:
+        return np.full((4, 4), np.inf)
+    volts = model.drive_v[row]
+    return np.asarray(-volts * conductance / model.ampere_per_count[row])

@@ -1,0 +1,190 @@
+"""Diagnosis of a hand: from blocks of samples to diagnoses, by three detectors.
+
+Public: `HandDiagnostics`. `channel_faults` checks single samples, `static_load` what persists,
+`contact_faults` what begins and ends; each leaves out pads in which the former found a fault.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handtouch.supervisor.diagnose.channel_faults import ChannelFaultDetector
+from handtouch.supervisor.diagnose.contact_faults import (
+    ContactCurrents,
+    ContactFaultDetector,
+    HypothesisTables,
+)
+from handtouch.supervisor.diagnose.descriptions import (
+    describe_channel_faults,
+    describe_contact_fault,
+    describe_static_load,
+    named_electrodes,
+)
+from handtouch.supervisor.diagnose.features import GROUP_SAMPLES, BlockFeatures, extract_features
+from handtouch.supervisor.diagnose.model import (
+    DiagnosisModel,
+    FloatArray,
+    HandSamples,
+    PadDiagnosis,
+)
+from handtouch.supervisor.diagnose.static_load import StaticLoadDetector
+from handtouch.wire.faults import FaultKind
+
+BoolArray = NDArray[np.bool_]
+_MIN_CONTACT_COUNTS, _MAX_RELEASED_COUNTS = 250.0, 60.0
+_MIN_MOVE_FRACTION, _MAX_SMEAR_FRACTION = 0.08, 0.03  # of a side, roughly
+
+
+class HandDiagnostics:
+    """Detectors and active diagnoses of all pads of a hand; `process_block` takes block after block.
+
+    offset_counts: (n, 4), stored readings of the untouched channels; those of the model if left out.
+    tables: of hypotheses, by network, shared by diagnostics of one model.
+    """
+
+    def __init__(
+        self,
+        model: DiagnosisModel,
+        offset_counts: ArrayLike | None = None,
+        tables: dict[int, HypothesisTables] | None = None,
+    ) -> None:
+        self._model = model
+        offsets = model.offset_counts if offset_counts is None else offset_counts
+        self._offsets = np.asarray(offsets, np.float64)
+        n = len(model.links)
+        noise = np.hypot(model.noise_counts, 12**-0.5)
+        self._channels = ChannelFaultDetector(model)
+        self._static_loads = StaticLoadDetector(noise)
+        self._mean_noise_counts = noise / np.sqrt(GROUP_SAMPLES)
+        self._tables = {} if tables is None else tables
+        self._contact_detectors: dict[int, ContactFaultDetector] = {}
+        self._released = np.ones(n, dtype=np.bool_)
+        self._last_position = np.full((n, 2), np.nan)
+        self._diagnoses: dict[tuple[int, FaultKind], PadDiagnosis] = {}
+
+    def diagnoses(self) -> list[PadDiagnosis]:
+        """Return all active diagnoses."""
+        return list(self._diagnoses.values())
+
+    def diagnoses_by_pad(self) -> list[tuple[int, PadDiagnosis]]:
+        """Return all active diagnoses, each with the row of its pad."""
+        return [(pad, diagnosis) for (pad, _), diagnosis in self._diagnoses.items()]
+
+    def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
+        """Replace the stored offsets (4,) of a pad."""
+        self._offsets = self._offsets.copy()
+        self._offsets[pad] = offset_counts
+        self._static_loads.reset_zero(np.arange(len(self._model.links)) == pad)
+
+    def reset_contacts(self, pad: int) -> None:
+        """Discard the contacts of a pad, whose calibration or node was replaced."""
+        if pad in self._contact_detectors:
+            self._contact_detectors[pad].reset()
+
+    def process_block(self, block: HandSamples) -> list[PadDiagnosis]:
+        """Process a block; return the diagnoses that began, changed or ended.
+
+        Raises ValueError for a block of the wrong shape.
+        """
+        features = extract_features(block, self._model, self._offsets)
+        sample_ns = int(features.last_sample_ns.max())
+        self._channels.process_block(features)
+        faulty = self._channels.faulty_channels
+        counts = features.means / self._model.ampere_per_count
+        healthy: BoolArray = np.asarray(np.logical_not(faulty.any(axis=1)))
+        self._static_loads.process_block(
+            sample_ns, counts, np.repeat(healthy[:, None], 4, axis=1).astype(np.float64)
+        )
+        self._process_contacts(features, counts, healthy)
+        return self._update_diagnoses(self._collect_diagnoses(), sample_ns)
+
+    def _process_contacts(self, features: BlockFeatures, counts: FloatArray, healthy: BoolArray) -> None:
+        """Pass new contacts to their detectors: the highest short mean of each, less the static load."""
+        excess = counts - self._static_loads.floor_counts
+        totals = excess.sum(axis=2)
+        least = np.maximum(_MIN_CONTACT_COUNTS, 2 * np.abs(self._static_loads.floor_counts).sum(axis=1))
+        self._released |= totals.min(axis=0) < _MAX_RELEASED_COUNTS
+        strongest = totals.argmax(axis=0)
+        for pad in np.flatnonzero((totals.max(axis=0) > least) & healthy).tolist():
+            reading = excess[strongest[pad], pad]
+            position = _approximate_position(reading)
+            if _is_sliding(excess[:, pad], int(strongest[pad]), position):
+                continue
+            if (
+                not self._released[pad]
+                and np.abs(position - self._last_position[pad]).max() < _MIN_MOVE_FRACTION
+            ):
+                continue
+            self._released[pad] = totals[-1, pad] < _MAX_RELEASED_COUNTS
+            self._last_position[pad] = position
+            noise = np.hypot(
+                self._mean_noise_counts[pad], 0.05 * np.abs(self._static_loads.floor_counts[pad])
+            )
+            scale = self._model.ampere_per_count[pad]
+            contact = ContactCurrents(
+                int(features.last_sample_ns[pad]), reading * scale, noise * scale, position
+            )
+            self._contact_detector(pad).add_contact(contact, np.zeros(4, dtype=np.bool_))
+
+    def _contact_detector(self, pad: int) -> ContactFaultDetector:
+        """Return the detector of a pad, made on first use: tables take a quarter of a second per design."""
+        if pad not in self._contact_detectors:
+            network = self._model.networks[pad]
+            if id(network) not in self._tables:
+                self._tables[id(network)] = HypothesisTables(network, self._model.surfaces[pad])
+            self._contact_detectors[pad] = ContactFaultDetector(self._tables[id(network)])
+        return self._contact_detectors[pad]
+
+    def _collect_diagnoses(self) -> dict[tuple[int, FaultKind], PadDiagnosis]:
+        active: dict[tuple[int, FaultKind], PadDiagnosis] = {}
+        faulty = {pad for pad, _ in self._channels.faults}
+        for pad in faulty:
+            faults = {channel: f for (row, channel), f in self._channels.faults.items() if row == pad}
+            for diagnosis in describe_channel_faults(self._model.links[pad], faults):
+                active[pad, diagnosis.kind] = diagnosis
+        for pad, load in self._static_loads.loads.items():
+            if pad not in faulty and load.kind is not None:
+                before = self._diagnoses.get((pad, load.kind))
+                names = named_electrodes(load)
+                if before is None or before.electrodes != names:  # locating a load is expensive
+                    before = describe_static_load(self._model, pad, load)
+                active[pad, load.kind] = before
+        for pad, detector in self._contact_detectors.items():
+            fault = detector.fault
+            if pad not in faulty and fault is not None:
+                active[pad, fault.kind] = describe_contact_fault(self._model, pad, fault)
+        return active
+
+    def _update_diagnoses(
+        self, active: dict[tuple[int, FaultKind], PadDiagnosis], sample_ns: int
+    ) -> list[PadDiagnosis]:
+        changes = []
+        for key, diagnosis in active.items():
+            before = self._diagnoses.get(key)
+            if before is None or _differs(before, diagnosis):
+                changes.append(diagnosis)
+            else:
+                active[key] = before
+        changes += [replace(f, until_ns=sample_ns) for key, f in self._diagnoses.items() if key not in active]
+        self._diagnoses = active
+        return changes
+
+
+def _approximate_position(reading: FloatArray) -> FloatArray:
+    """Return the position as fractions of the sides, by ratios: enough to distinguish positions."""
+    x0, xa, y0, yb = np.maximum(reading, 1.0)
+    return np.asarray(np.clip([xa / (x0 + xa), yb / (y0 + yb)], 0.0, 0.999))
+
+
+def _is_sliding(excess: FloatArray, at: int, position: FloatArray) -> bool:
+    """Return whether the contact slides so fast that the short mean (g, 4) at `at` smears it."""
+    near = [excess[k] for k in (at - 1, at + 1) if 0 <= k < len(excess)]
+    there = [e for e in near if e.sum() > 0.3 * excess[at].sum()]
+    return any(np.abs(_approximate_position(e) - position).max() > _MAX_SMEAR_FRACTION for e in there)
+
+
+def _differs(before: PadDiagnosis, now: PadDiagnosis) -> bool:
+    return before.electrodes != now.electrodes

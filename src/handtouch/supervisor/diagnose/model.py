@@ -1,0 +1,112 @@
+"""Inputs and results of a hand's diagnosis: `DiagnosisModel`, `HandSamples`, `PadDiagnosis`.
+
+Electrodes and channels are always in the order x0, xa, y0, yb.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
+from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.surface import Surface
+from handtouch.hand import electrode_network, pad_surface
+from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.faults import FaultKind
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HandSamples:
+    """m consecutive samples of all n pads of a hand, as in topic `raw/<hand>`.
+
+    sample_ns: (m, n) time of each sample. counts: (m, n, 4). fresh: (m, n), whether the sample belongs to
+    this tick. Blocks of 0.2 to 0.5 s work best; samples of a pad are in order of time.
+    """
+
+    sample_ns: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    fresh: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class PadDiagnosis:
+    """A diagnosis of one pad with what is not published of it.
+
+    published: as health carries it. link: that carries the pad. values: evidence as numbers, by name and
+    unit. electrodes: those concerned. until_ns: end; None while it lasts.
+    """
+
+    published: Diagnosis
+    link: str
+    values: Mapping[str, float] = field(default_factory=dict)
+    electrodes: tuple[str, ...] = ()
+    until_ns: int | None = None
+
+    @property
+    def kind(self) -> FaultKind:
+        """Identifier of the fault."""
+        return self.published.kind
+
+    @property
+    def is_fault(self) -> bool:
+        """Return whether it needs attention; a held object doesn't."""
+        return self.kind != FaultKind.HELD_OBJECT
+
+
+@dataclass(frozen=True)
+class DiagnosisModel:
+    """Parameters of the n pads of a hand, from deployment file and calibration.
+
+    networks, surfaces, sheets: of each pad. drive_v: (n,). ampere_per_count, offset_counts: (n, 4) as
+    calibrated; offsets are the stored ones, not a running baseline. noise_counts: (n,) of a reading.
+    limits: (n, 4, 2) lowest and highest count.
+    """
+
+    links: tuple[str, ...]
+    networks: Sequence[ElectrodeNetwork]
+    surfaces: Sequence[Surface]
+    sheets: Sequence[config.Sheet]
+    drive_v: FloatArray
+    ampere_per_count: FloatArray
+    noise_counts: FloatArray
+    limits: FloatArray
+    offset_counts: FloatArray
+
+    @classmethod
+    def from_deployment(cls, deployment: config.Deployment, hand: str) -> DiagnosisModel:
+        """Build the model of a hand from its deployment. Raises KeyError for an unknown hand."""
+        pads = {h.name: h.pads for h in deployment.hands}[hand]
+        nodes = [deployment.nodes[pad.node] for pad in pads]
+        scale, limits = np.zeros((len(pads), 4)), np.zeros((len(pads), 4, 2))
+        for row, (pad, node) in enumerate(zip(pads, nodes, strict=True)):
+            channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad.electrodes)
+            for k, (name, channel) in enumerate(zip(ELECTRODES, channels, strict=True)):
+                full = node.full_scale_counts or channel.limits[1]
+                factor = node.channel_scale[pad.electrodes.index(name)]
+                scale[row, k] = node.full_scale_ma * 1e-3 / full * factor
+                limits[row, k] = channel.limits
+        by_design: dict[object, ElectrodeNetwork] = {}  # pads of one design share one network and its tables
+        networks = []
+        for pad in pads:
+            design = (pad.surface, pad.gap_mm, pad.series_ohm, pad.sheet)
+            if design not in by_design:
+                by_design[design] = electrode_network(pad, deployment.sheets[pad.sheet])
+            networks.append(by_design[design])
+        return cls(
+            links=tuple(pad.link for pad in pads),
+            networks=networks,
+            surfaces=[pad_surface(pad) for pad in pads],
+            sheets=[deployment.sheets[pad.sheet] for pad in pads],
+            drive_v=np.array([node.drive_v for node in nodes]),
+            ampere_per_count=scale,
+            noise_counts=np.array([node.noise_counts for node in nodes]),
+            limits=limits,
+            offset_counts=np.zeros((len(pads), 4)),
+        )

@@ -1,0 +1,420 @@
+"""Work of the supervisor process, whose results may take seconds: calibration, storage, diagnosis.
+
+Public: `SupervisorWorker`: messages of the daemon in, messages to it out (`ipc`). It calibrates nodes by
+their contacts, stores calibrations and baselines, and diagnoses pads. No clock and no I/O but the store's.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from handtouch.calibration.auto_calibration import AutoCalibrator, CalibrationState
+from handtouch.calibration.calibration import (
+    CalibrationVersion,
+    ChannelValues,
+    Gains,
+    Provenance,
+    age_s,
+    aged_gains,
+    channel_values,
+    matrix,
+)
+from handtouch.calibration.stationary_contacts import StationaryContactDetector
+from handtouch.calibration.store_client import MountingPoint, StoreClient
+from handtouch.calibration.store_schedule import StoreSchedule, restored_back_force
+from handtouch.field.network import ElectrodeNetwork
+from handtouch.hand import electrode_network
+from handtouch.supervisor.ipc import (
+    MAX_DIAGNOSES,
+    MAX_TEXT,
+    CalibrationAssessment,
+    CalibrationUpdate,
+    ContactLawMessage,
+    SampleBlock,
+    WorkerConfig,
+    WorkerMessage,
+    WorkerStatus,
+    unpack_block,
+)
+from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.faults import FaultKind
+
+_log = logging.getLogger("handtouch.supervisor")
+_STATUS_PERIOD_NS = 500_000_000
+_STORE_POLL_PERIOD_NS = 2_000_000_000
+"""Period of checks whether other processes have stored anything."""
+
+
+class Diagnostics(Protocol):
+    """Source of diagnoses, as `DeploymentDiagnostics`."""
+
+    def process_block(self, block: SampleBlock) -> Sequence[tuple[int, Diagnosis]]:
+        """Process a block; return the active diagnoses, each with its pad."""
+
+    def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
+        """Set the stored offsets (4,) of a pad."""
+
+    def set_gains(self, pad: int, gains: ChannelValues) -> None:
+        """Set the gains (4,) of a pad and discard its contacts so far."""
+
+
+@dataclass
+class _PadEntry:
+    """State of one pad."""
+
+    mounting_point: MountingPoint
+    calibrator: AutoCalibrator
+    contact_detector: StationaryContactDetector
+    version_number: int = 0
+    """number of the newest stored version of the node, 0 for none"""
+    rejection_reason: str = ""
+    """reason why a stored calibration isn't applied"""
+    foreign_source: str = ""
+    """origin of its calibration, if taken over from another node"""
+    last_assessment: CalibrationAssessment | None = None
+
+
+class SupervisorWorker:
+    """Processes the daemon's messages; `process_message` returns the messages for the daemon.
+
+    The store is opened on first use.
+    """
+
+    def __init__(
+        self, start: WorkerConfig, store: StoreClient, diagnostics: Diagnostics | None = None
+    ) -> None:
+        deployment = start.deployment
+        entries = deployment.pads
+        models: dict[object, ElectrodeNetwork] = {}
+        self._pads = []
+        noise = start.noise_counts[:, None] * start.ampere_per_count
+        for number, (hand, pad) in enumerate(entries):
+            design = (pad.surface, pad.gap_mm, pad.series_ohm, pad.sheet)
+            if design not in models:
+                models[design] = electrode_network(pad, deployment.sheets[pad.sheet])
+            mounting_point = MountingPoint(hand, pad.link, start.default_calibration_ids[number])
+            self._pads.append(
+                _PadEntry(
+                    mounting_point, AutoCalibrator(models[design]), StationaryContactDetector(noise[number])
+                )
+            )
+        self._ampere_per_count = start.ampere_per_count
+        self._store, self._diagnostics = store, diagnostics
+        self._store_schedule = StoreSchedule(len(entries))
+        self._diagnoses: dict[int, list[Diagnosis]] = {}
+        self._latest_sync_ns = self._status_sent_ns = self._store_polled_ns = 0
+
+    def process_message(self, message: dict[str, Any], now: datetime) -> list[WorkerMessage]:
+        """Process a message of the daemon; return the messages that follow."""
+        messages: list[WorkerMessage] = []
+        if message["kind"] == "serials":
+            self._latest_sync_ns = max(self._latest_sync_ns, message["sync_ns"])
+            self._assign_nodes(message["serials"], message["before"], now, messages)
+        elif message["kind"] == "block":
+            self._process_block(unpack_block(message, len(self._pads)), now, messages)
+        elif message["kind"] == "manual_calibration":
+            update = CalibrationUpdate.model_validate_json(message["update"])
+            self._apply_manual_calibration(update, message["given"], messages)
+        self._poll_store(now, messages)
+        for pad in range(len(self._pads)):
+            self._report_assessment(pad, messages)
+        if self._latest_sync_ns - self._status_sent_ns >= _STATUS_PERIOD_NS:
+            self._status_sent_ns = self._latest_sync_ns
+            messages.append(
+                WorkerStatus(
+                    processed_ns=self._latest_sync_ns,
+                    store_error=self._store.error[:MAX_TEXT],
+                    summary=self._summary(),
+                )
+            )
+        return messages
+
+    def finish(self, now: datetime) -> None:
+        """Store what isn't stored yet and close the store."""
+        for pad, row in enumerate(self._pads):
+            self._store_state(pad, row, now, last=True)
+        self._store.close()
+
+    # Calibration of nodes ---------------------------------------------------------------------------------
+
+    def _assign_nodes(
+        self,
+        serials: Sequence[int | None],
+        before: Sequence[int | None],
+        now: datetime,
+        messages: list[WorkerMessage],
+    ) -> None:
+        """Assign nodes to pads; a new node gets its stored calibration."""
+        shared = Counter(serials)
+        for pad, (row, serial) in enumerate(zip(self._pads, serials, strict=True)):
+            obstacle = _obstacle(serial, shared)
+            if serial is None or (
+                serial == row.calibrator.serial and row.calibrator.can_learn == (not obstacle)
+            ):
+                continue
+            last = before[pad] or self._store.last_serial_at(row.mounting_point, now)
+            version = None
+            if not obstacle:
+                version, row.rejection_reason = self._store.newest_applicable(serial, row.mounting_point, now)
+            own = aged_gains(version, now) if version else None
+            row.version_number, row.foreign_source = 0, version.provenance.foreign if version else ""
+            row.calibrator.assign_node(
+                serial, last, own, obstacle, self._latest_sync_ns, foreign=bool(row.foreign_source)
+            )
+            self._store_schedule.reset_pad(pad)
+            if self._diagnostics is not None:
+                self._diagnostics.set_gains(pad, row.calibrator.gains.factors)
+            name = f"{row.mounting_point.hand}/{row.mounting_point.link}"
+            _log.info(
+                "%s: node with serial %d: calibration %s%s", name, serial, row.calibrator.calibration_state,
+                f", version {version.number} of {version.written_utc}" if version else "",
+            )  # fmt: skip
+            if version is not None:
+                messages.append(self._restore_calibration(pad, version, now))
+
+    def _poll_store(self, now: datetime, messages: list[WorkerMessage]) -> None:
+        """Apply what other processes have stored meanwhile: `calibrate`, a rollback, an import."""
+        if self._latest_sync_ns - self._store_polled_ns < _STORE_POLL_PERIOD_NS:
+            return
+        self._store_polled_ns = self._latest_sync_ns
+        if not self._store.changed(now):
+            return
+        for pad, row in enumerate(self._pads):
+            if row.calibrator.serial is None or not row.calibrator.can_learn:
+                continue
+            version, row.rejection_reason = self._store.newest_applicable(
+                row.calibrator.serial, row.mounting_point, now
+            )
+            if version is None or version.number == row.version_number:
+                continue
+            row.foreign_source = version.provenance.foreign
+            if own := aged_gains(version, now):
+                row.calibrator.apply_gains(own, foreign=bool(row.foreign_source))
+            elif version.calibration.law and row.calibrator.force_unreliable:
+                row.calibrator.accept_measured_law()
+            else:
+                row.calibrator.revert_to_default()
+            if self._diagnostics is not None:
+                self._diagnostics.set_gains(pad, row.calibrator.gains.factors)
+            messages.append(self._restore_calibration(pad, version, now))
+            _log.info(
+                "%s/%s: calibration %s stored by another process: applied",
+                row.mounting_point.hand,
+                row.mounting_point.link,
+                version.calibration_id,
+            )
+
+    def _apply_manual_calibration(
+        self, update: CalibrationUpdate, given: Sequence[str], messages: list[WorkerMessage]
+    ) -> None:
+        """Continue from an operator's calibration; send it again, as a stored one may have replaced it."""
+        row = self._pads[update.pad]
+        if update.serial != row.calibrator.serial:
+            return
+        if "gains" in given:
+            row.foreign_source = ""
+            row.calibrator.apply_gains(Gains(update.gains, matrix(np.reshape(update.covariance, (4, 4)))))
+        if "law" in given:
+            row.calibrator.accept_measured_law()
+        if self._diagnostics is not None:
+            if "gains" in given:
+                self._diagnostics.set_gains(update.pad, update.gains)
+            if update.offset_counts is not None:
+                self._diagnostics.set_offsets(update.pad, update.offset_counts)
+        if {"gains", "law"} & {*given}:
+            messages.append(update)
+
+    def _process_block(self, block: SampleBlock, now: datetime, messages: list[WorkerMessage]) -> None:
+        self._latest_sync_ns = int(block.sync_ns[-1])
+        self._update_diagnoses(block)
+        self._store_schedule.update_block(block)
+        for pad in np.flatnonzero(block.contact_id.any(axis=0)).tolist():
+            self._learn_from_contacts(pad, block, now, messages)
+        for pad, row in enumerate(self._pads):
+            self._store_state(pad, row, now)
+
+    def _learn_from_contacts(
+        self, pad: int, block: SampleBlock, now: datetime, messages: list[WorkerMessage]
+    ) -> None:
+        """Calibrate the node of a pad by the contacts in a block."""
+        row = self._pads[pad]
+        if not row.calibrator.can_learn or pad in self._diagnoses:  # nothing is learnt from a faulty pad
+            return
+        fresh = block.fresh[:, pad]
+        currents = (block.counts[:, pad] - block.offset_counts[pad]) * self._ampere_per_count[pad]
+        for sync_ns, contact_id, reading in zip(
+            block.sync_ns[fresh].tolist(), block.contact_id[fresh, pad].tolist(), currents[fresh], strict=True
+        ):
+            contact = row.contact_detector.add_sample(contact_id, reading, sync_ns)
+            if contact is None:
+                continue
+            gain_update = row.calibrator.add_contact(contact)
+            version = self._store_gains(row, now) if gain_update.store else None
+            if gain_update.apply:
+                assert row.calibrator.serial is not None
+                name = version.calibration_id if version else f"{row.calibrator.serial}-learning"
+                messages.append(_calibration_update(pad, row.calibrator.serial, name, row.calibrator.gains))
+                if self._diagnostics is not None:
+                    self._diagnostics.set_gains(pad, row.calibrator.gains.factors)
+
+    def _store_gains(self, row: _PadEntry, now: datetime) -> CalibrationVersion | None:
+        estimate, serial = row.calibrator.estimate, row.calibrator.serial
+        assert serial is not None
+        residual = estimate.misfit
+        origin = Provenance("gains from contacts", contacts=estimate.contacts, residual=residual)
+        version = self._record_stored(
+            row, self._store.store_parts(serial, row.mounting_point, origin, now, gains=row.calibrator.gains)
+        )
+        name = f"{row.mounting_point.hand}/{row.mounting_point.link}"
+        stored = f"stored as {version.calibration_id}" if version else "not stored"
+        _log.info("%s: gains of node %d from contacts %s: %s", name, serial, stored, estimate.reason)
+        return version
+
+    def _store_state(self, pad: int, row: _PadEntry, now: datetime, last: bool = False) -> None:
+        serial = row.calibrator.serial
+        if (
+            serial is None
+            or not row.calibrator.can_learn
+            or row.calibrator.calibration_state not in (CalibrationState.DEFAULT, CalibrationState.CALIBRATED)
+        ):
+            return
+        offsets, sheet = self._store_schedule.due_parts(pad, self._latest_sync_ns, last)
+        if offsets is not None or sheet is not None:
+            origin = Provenance("baseline and sheet state tracked")
+            first = self._store.newest_applicable(serial, row.mounting_point, now)[0] is None
+            version = self._record_stored(
+                row,
+                self._store.store_parts(
+                    serial, row.mounting_point, origin, now, offsets=offsets, sheet=sheet
+                ),
+            )
+            if version is not None and first:
+                self._set_diagnostic_offsets(pad, version)
+
+    @staticmethod
+    def _record_stored(row: _PadEntry, version: CalibrationVersion | None) -> CalibrationVersion | None:
+        if version is not None:
+            row.version_number, row.foreign_source = version.number, version.provenance.foreign
+        return version
+
+    def _set_diagnostic_offsets(self, pad: int, version: CalibrationVersion) -> None:
+        """Make the offsets of a version the zero from which diagnostics detects static loads."""
+        if self._diagnostics is not None and version.calibration.offsets is not None:
+            self._diagnostics.set_offsets(pad, version.calibration.offsets.counts)
+
+    def _restore_calibration(self, pad: int, version: CalibrationVersion, now: datetime) -> CalibrationUpdate:
+        """Return the update of a pad to a stored version."""
+        known, row = version.calibration, self._pads[pad]
+        row.version_number = version.number
+        self._set_diagnostic_offsets(pad, version)
+        gains = row.calibrator.gains
+        if not known.gains and row.calibrator.calibration_state is CalibrationState.DEFAULT:
+            # gains as in the deployment file, whose uncertainty is unknown
+            gains = Gains((1.0,) * 4, matrix(np.zeros((4, 4))))
+        update = _calibration_update(pad, version.serial, version.calibration_id, gains)
+        found: dict[str, Any] = {}
+        if known.offsets:
+            found["offset_counts"] = known.offsets.counts
+            found["offset_std"] = channel_values(np.sqrt(known.offsets.variance))
+        if known.law:
+            found["law"] = ContactLawMessage.model_validate(asdict(known.law))
+        if back := restored_back_force(version, age_s(version, now)):
+            found["back_n"], found["back_std_n"] = back
+        return update.model_copy(update=found)
+
+    # Reports ----------------------------------------------------------------------------------------------
+
+    def _update_diagnoses(self, block: SampleBlock) -> None:
+        self._diagnoses = {}
+        for pad, diagnosis in self._diagnostics.process_block(block) if self._diagnostics else ():
+            self._diagnoses.setdefault(pad, []).append(diagnosis)
+
+    def _report_assessment(self, pad: int, messages: list[WorkerMessage]) -> None:
+        """Report the assessment of a pad, if it changed."""
+        row = self._pads[pad]
+        progress = row.calibrator.progress
+        if row.rejection_reason:
+            progress = f"{row.rejection_reason}; {progress}"
+        diagnoses = (*row.calibrator.diagnoses, *self._store_diagnoses(row), *self._diagnoses.get(pad, ()))
+        assessment = CalibrationAssessment(
+            pad=pad,
+            serial=row.calibrator.serial,
+            calibration_state=row.calibrator.calibration_state,
+            calibration_progress=progress[:MAX_TEXT],
+            diagnoses=tuple(map(_shorten, diagnoses[:MAX_DIAGNOSES])),
+        )
+        if row.calibrator.serial is not None and assessment != row.last_assessment:
+            row.last_assessment = assessment
+            messages.append(assessment)
+
+    def _store_diagnoses(self, row: _PadEntry) -> tuple[Diagnosis, ...]:
+        """Return the diagnosis of a calibration from another node, or of an unavailable store."""
+        if row.foreign_source:
+            return (
+                Diagnosis(
+                    kind=FaultKind.FOREIGN_CALIBRATION,
+                    cause="the active calibration was taken over from another node",
+                    evidence=row.foreign_source,
+                    remedy="return to an older one with `handtouch calibrations rollback`, or measure it "
+                    "with `handtouch calibrate`",
+                    since_ns=row.calibrator.since_ns,
+                ),
+            )
+        if (
+            not self._store.error
+            or row.calibrator.calibration_state is CalibrationState.CALIBRATED
+            or not row.calibrator.can_learn
+        ):
+            return ()
+        return (
+            Diagnosis(
+                kind=FaultKind.STORE_UNAVAILABLE,
+                cause="the stored calibration of this node can't be read",
+                evidence=self._store.error,
+                remedy="repair the store; until then, the deployment file's calibration applies, and the "
+                "node is calibrated again by contacts",
+                since_ns=row.calibrator.since_ns,
+            ),
+        )
+
+    def _summary(self) -> str:
+        counts = Counter(
+            row.calibrator.calibration_state.value for row in self._pads if row.calibrator.serial is not None
+        )
+        return ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "no nodes yet"
+
+
+def _shorten(diagnosis: Diagnosis) -> Diagnosis:
+    return replace(
+        diagnosis,
+        cause=diagnosis.cause[:MAX_TEXT],
+        evidence=diagnosis.evidence[:MAX_TEXT],
+        remedy=diagnosis.remedy[:MAX_TEXT],
+    )
+
+
+def _calibration_update(pad: int, serial: int, name: str, gains: Gains) -> CalibrationUpdate:
+    covariance = tuple(value for row in gains.covariance for value in row)
+    return CalibrationUpdate(
+        pad=pad, serial=serial, calibration_id=name, gains=gains.factors, covariance=covariance
+    )
+
+
+def _obstacle(serial: int | None, shared: Counter[int | None]) -> str:
+    """Return the reason why a node can't be calibrated by contacts; empty if it can."""
+    if not serial:
+        return "no calibration by contacts: the node has no serial number (object 0x1018 sub 4)"
+    if shared[serial] > 1:
+        return (
+            f"no calibration by contacts: {shared[serial]} nodes have the serial number {serial}; assign "
+            "unique ones"
+        )
+    return ""

@@ -1,0 +1,275 @@
+"""State shown by the page, updated by messages; each page receives the changes since its last update.
+
+Public names: `VersionedValues`, `PageModel`. Uses no clock and no socket. Values are plain, for JSON.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from handtouch import wire
+from handtouch.client import columns
+from handtouch.config import Deployment
+from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
+from handtouch.view.page.percepts import PerceptSummaries
+from handtouch.view.page.scene_graph import scene_of
+
+FloatArray = NDArray[np.float64]
+_MAX_MESSAGES = 60
+_PAD_STATES = tuple(state.name.lower() for state in wire.PadState)
+_OK_STATES = ("clear", "touched")
+_FAULT_STATES = ("stale", "lost", "faulted")
+_MERGE_WINDOW_NS = 1_000_000_000
+_ELLIPSE_95_SIGMA = 2.4477
+"""Half axes of the 95 % ellipse of a two-dimensional Gaussian, in standard deviations."""
+
+
+class VersionedValues:
+    """Values by key, each with the version at which it changed last."""
+
+    def __init__(self) -> None:
+        self.version = 0
+        self._values: dict[str, tuple[int, Any]] = {}
+
+    def set_value(self, key: str, value: Any) -> None:
+        """Set a value; equal values are no change."""
+        if key not in self._values or self._values[key][1] != value:
+            self.version += 1
+            self._values[key] = self.version, value
+
+    def clear_prefix(self, prefix: str) -> None:
+        """Set the values of all keys with this prefix to None."""
+        for key in [key for key in self._values if key.startswith(prefix)]:
+            self.set_value(key, None)
+
+    def changes_since(self, version: int) -> dict[str, Any]:
+        """Return the values that changed after a version."""
+        return {key: value for key, (changed, value) in self._values.items() if changed > version}
+
+
+class PageModel:
+    """Collects messages by `add_message`; `update_values` writes the resulting state to `values`.
+
+    `percepts`: True if percepts are subscribed; otherwise the page shows how to enable them.
+
+    Keys of `values`: `scene` (as `scene_graph.scene_of`), `joints/<hand>`, `pad/<hand>/<link>`,
+    `contact/<hand>/<link>` (None: no contact), `percepts/<hand>/<link>` (as `PerceptSummaries.current`),
+    `percepts_enabled`, `service`, `alive`, `messages`, `time_s`.
+    """
+
+    def __init__(self, percepts: bool = False) -> None:
+        self.values = VersionedValues()
+        self.values.set_value("percepts_enabled", percepts)
+        self._session: int | None = None
+        self._deployment = ""
+        self._frames: dict[str, wire.HandFrame] = {}
+        self._short_contacts: dict[str, tuple[wire.HandFrame, int]] = {}
+        self._health: dict[str, wire.Health] = {}
+        self._percepts = PerceptSummaries()
+        self._faults: dict[str, tuple[str, str]] = {}
+        self._messages: deque[dict[str, Any]] = deque(maxlen=_MAX_MESSAGES)
+        self._wall_offset_ns = 0
+        self._last_message_ns = 0
+
+    def add_message(self, message: wire.Message) -> None:
+        """Process a message of any topic."""
+        if self._session is not None and message.session != self._session:
+            self._reset(message.t_ns)
+        self._session = message.session
+        if isinstance(message, wire.HandFrame):
+            self._add_frame(message)
+        elif isinstance(message, wire.JointPositions):
+            angles = zip(message.names, message.position_rad, strict=False)
+            known = {name: round(angle, 4) for name, angle in angles if angle is not None}
+            self.values.set_value(f"joints/{message.hand}", known)
+        elif isinstance(message, wire.Percept):
+            self._percepts.add_percept(message)
+        elif isinstance(message, wire.Health):
+            self._add_health(message)
+        elif isinstance(message, wire.Service):
+            self._wall_offset_ns = message.wall_offset_ns
+            self.values.set_value("service", _service_values(message))
+        elif isinstance(message, wire.Config):
+            self._add_config(message)
+
+    def update_values(self, alive: bool) -> None:
+        """Write the state after the messages since the last call; `alive`: the daemon is connected."""
+        self.values.set_value("alive", alive)
+        if not alive:
+            self._frames.clear()
+            self._short_contacts.clear()
+            self._percepts.clear()
+            self.values.clear_prefix("contact/")
+            self.values.clear_prefix("percepts/")
+            return
+        touched: dict[str, int] = {}
+        for hand, frame in self._frames.items():
+            values = columns(frame)
+            for row, link in enumerate(frame.links):
+                key = f"{hand}/{link}"
+                code = values["state"][row]
+                self._set_pad(key, _PAD_STATES[code] if code < len(_PAD_STATES) else "faulted")
+                touched[key] = int(values["contact_id"][row])
+                shown = (frame, row) if touched[key] else self._short_contacts.get(key)
+                self.values.set_value(f"contact/{key}", _contact_values(*shown) if shown else None)
+            self.values.set_value("time_s", round(frame.t_ns * 1e-9, 3))
+        if self._frames:
+            now_ns = max(frame.t_ns for frame in self._frames.values())
+            for key, summary in self._percepts.current(touched, now_ns).items():
+                self.values.set_value(f"percepts/{key}", summary)
+        self._frames.clear()
+        self._short_contacts.clear()
+
+    def _add_frame(self, frame: wire.HandFrame) -> None:
+        """Store a frame; a contact that ends before the next update is shown in that update."""
+        before = self._frames.get(frame.hand)
+        if before is not None and before.links == frame.links:
+            was, now = columns(before)["contact_id"], columns(frame)["contact_id"]
+            for row in np.flatnonzero((was != 0) & (was != now)).tolist():
+                self._short_contacts[f"{frame.hand}/{frame.links[row]}"] = before, row
+        self._frames[frame.hand] = frame
+
+    def _add_config(self, message: wire.Config) -> None:
+        content = f"{message.deployment}{sorted(message.files)}"
+        if content == self._deployment:
+            return
+        self._deployment = content
+        try:
+            deployment = Deployment.model_validate_json(message.deployment)
+        except ValidationError as error:
+            self._append_message(message.t_ns, f"can't read the daemon's deployment: {error}", "lost")
+            return
+        scene = scene_of(deployment, message.files)
+        self.values.set_value("scene", scene)
+        for problem in scene["problems"]:
+            self._append_message(message.t_ns, problem, "stale")
+
+    def _add_health(self, health: wire.Health) -> None:
+        key = f"{health.hand}/{health.link}"
+        before, self._health[key] = self._health.get(key), health
+        if health.state in _FAULT_STATES and self._faults.get(key) != (health.state, health.reason):
+            self._faults[key] = health.state, health.reason
+            why = f": {health.reason}" if health.reason else f", node {health.node_state}"
+            self._append_message(health.t_ns, f"{health.state}{why}", health.state, health.link)
+        elif health.state in _OK_STATES and key in self._faults:
+            del self._faults[key]
+            self._append_message(health.t_ns, "recovered", "clear", health.link)
+        known = {diagnosis.get("kind") for diagnosis in before.diagnoses} if before else set()
+        for diagnosis in health.diagnoses:
+            if diagnosis.get("kind") not in known:
+                self._append_message(health.t_ns, diagnosis_text(diagnosis), "unreliable", health.link)
+        if (
+            before
+            and before.calibration_state in UNCALIBRATED_STATES
+            and health.calibration_state not in UNCALIBRATED_STATES
+        ):
+            self._append_message(health.t_ns, f"{health.calibration_state} again", "clear", health.link)
+        self._set_pad(key, health.state)
+
+    def _set_pad(self, key: str, state: str) -> None:
+        """Set state and health of a pad; `status` selects its colour."""
+        health = self._health.get(key)
+        value: dict[str, Any] = {"state": state, "status": "clear" if state == "touched" else state}
+        if health is not None:
+            unreliable = health.calibration_state in UNCALIBRATED_STATES or health.diagnoses
+            if unreliable and state in _OK_STATES:
+                value["status"] = "unreliable"
+            value |= {
+                "node_state": health.node_state,
+                "rate_hz": round(health.rate_hz),
+                "reason": health.reason,
+                "diagnoses": [diagnosis_text(diagnosis) for diagnosis in health.diagnoses],
+                "calibration_state": health.calibration_state,
+                "calibration_progress": health.calibration_progress,
+            }
+        self.values.set_value(f"pad/{key}", value)
+
+    def _reset(self, t_ns: int) -> None:
+        """Discard the state of the previous session; the scene may still be valid."""
+        self._frames.clear()
+        self._short_contacts.clear()
+        self._health.clear()
+        self._faults.clear()
+        self._percepts.clear()
+        self.values.clear_prefix("contact/")
+        self.values.clear_prefix("percepts/")
+        self._append_message(t_ns, "daemon restarted", "starting")
+
+    def _append_message(self, t_ns: int, text: str, status: str, link: str = "") -> None:
+        """Append a line; the same event of several pads within a second is one line."""
+        last = self._messages[-1] if self._messages else None
+        links = [link] if link else []
+        if (
+            last
+            and link
+            and (last["text"], last["status"]) == (text, status)
+            and t_ns - self._last_message_ns < _MERGE_WINDOW_NS
+        ):
+            self._messages.pop()
+            links = [*last["links"], *(links if link not in last["links"] else [])]
+        self._last_message_ns = t_ns
+        wall_s = round((t_ns + self._wall_offset_ns) * 1e-9, 2) if self._wall_offset_ns else None
+        self._messages.append({"wall_s": wall_s, "links": links, "text": text, "status": status})
+        self.values.set_value("messages", list(self._messages))
+
+
+def _service_values(service: wire.Service) -> dict[str, Any]:
+    supervisor = service.supervisor or {}
+    return {
+        "version": service.version,
+        "rate_hz": round(service.rate_hz),
+        "tick_us": service.tick_us.get("p50"),
+        "drops": sum(service.drops.values()),
+        "overruns": service.overruns,
+        "supervisor": supervisor.get("state"),
+        "buses": {
+            name: {
+                "load": round(bus.get("load", 0.0), 2),
+                "state": bus.get("state", "?"),
+                "problem": bus.get("problem", ""),
+            }
+            for name, bus in sorted(service.buses.items())
+        },
+    }
+
+
+def _contact_values(frame: wire.HandFrame, row: int) -> dict[str, Any]:
+    """Return a contact with the half axes of the 95 % ellipse of its position, in the link frame."""
+    values = columns(frame)
+    position = values["position_m"][row]
+    value: dict[str, Any] = {
+        "id": int(values["contact_id"][row]),
+        "force_n": _rounded_number(values["force_n"][row], 3),
+        "force_std_n": _rounded_number(values["force_std_n"][row], 3),
+        "position_status": _status_text(wire.PositionStatus, values["position_status"][row]),
+        "force_status": _status_text(wire.ForceStatus, values["force_status"][row]),
+    }
+    if np.isfinite(position).all():
+        variance, axes = np.linalg.eigh(
+            np.nan_to_num(values["covariance_m2"][row]).reshape(3, 3).astype(float)
+        )
+        half = axes * (_ELLIPSE_95_SIGMA * np.sqrt(np.maximum(variance, 0.0)))
+        value |= {
+            "position_m": _rounded_vector(position),
+            "normal": _rounded_vector(values["normal"][row]),
+            "axes_m": [_rounded_vector(half[:, 2]), _rounded_vector(half[:, 1])],
+            "pad_m": _rounded_vector(values["pad_m"][row]),
+        }
+    return value
+
+
+def _status_text(codes: type[wire.PositionStatus] | type[wire.ForceStatus], code: int) -> str:
+    return codes(code).text if code < len(codes) else "unreliable"  # of a newer daemon
+
+
+def _rounded_vector(values: FloatArray) -> list[float]:
+    return [round(value, 7) for value in values.tolist()]
+
+
+def _rounded_number(value: float, digits: int) -> float | None:
+    return round(float(value), digits) if np.isfinite(value) else None

@@ -1,0 +1,27 @@
+// Colours of statuses and pads, and texts of forces and problems.
+
+export const STATUS_COLOURS = {
+  clear: "#4fa58b", unreliable: "#e8b23a", stale: "#e07b2e", lost: "#e5484d", faulted: "#e5484d",
+  starting: "#7d8794", off: "#4a525e",
+};
+export const LEGEND = [
+  ["clear", "ok"], ["unreliable", "unreliable"], ["stale", "stale"], ["lost", "lost or faulted"], ["starting", "starting"], ["off", "off"],
+];
+export const BODY = [0.36, 0.4, 0.46];
+export const CONTACT = "#ff5a1f";
+export const ELLIPSE = "#ffe9a8";
+export const MAGNIFIED = 100; // scale of the ellipse: positions are known to hundredths of a millimetre
+
+export const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
+export const colourOfStatus = (pad) => STATUS_COLOURS[pad?.status] ?? STATUS_COLOURS.starting;
+
+// Colour of a pad's trail and force history.
+export const colourOf = (number, lightness = 66) => `hsl(${(number * 137.5 + 190) % 360} 70% ${lightness}%)`;
+
+export function forceText(contact) {
+  if (contact.force_n === null) return "?";
+  if (contact.force_status === "lower_bound") return `> ${contact.force_n.toFixed(2)} N`;
+  return `${contact.force_status === "unreliable" ? "~ " : ""}${contact.force_n.toFixed(2)} N`;
+}
+
+export const problemOf = (state) => [state.reason, ...(state.diagnoses ?? [])].filter(Boolean).join("; ");

@@ -1,0 +1,100 @@
+// Text of the page: daemon, buses, nodes, percepts and messages.
+
+import { LEGEND, STATUS_COLOURS, colourOfStatus, problemOf } from "./colours.js";
+
+const byId = (id) => document.getElementById(id);
+
+function set(id, text) {
+  if (byId(id).textContent !== text) byId(id).textContent = text;
+}
+
+function element(kind, className, text) {
+  const made = document.createElement(kind);
+  made.className = className;
+  made.textContent = text;
+  return made;
+}
+
+export function drawLegend() {
+  for (const [status, text] of LEGEND) {
+    const entry = element("span", "", text), dot = element("i", "dot", "");
+    dot.style.background = STATUS_COLOURS[status];
+    entry.prepend(dot);
+    byId("legend").append(entry);
+  }
+}
+
+export function drawService({ connected, alive, service, scene }) {
+  const waiting = !scene;
+  const trouble = !connected ? "disconnected from handtouch view; start it again and this page reconnects"
+    : waiting ? "waiting for the daemon ..."
+    : !alive ? "daemon disconnected; check that handtouch run is running" : "";
+  document.body.classList.toggle("disconnected", Boolean(trouble));
+  set("trouble", trouble);
+  byId("trouble").hidden = !trouble;
+  byId("status").style.background = trouble ? STATUS_COLOURS.lost : STATUS_COLOURS.clear;
+  if (!service) return;
+  const tick = service.tick_us ? `tick ${(service.tick_us / 1000).toFixed(2)} ms` : "";
+  const supervisor = service.supervisor ? `supervisor ${service.supervisor}` : "";
+  set("service", [`handtouch ${service.version}`, `${service.rate_hz} ticks/s`, tick, `${service.drops} dropped`, supervisor].filter(Boolean).join(" · "));
+  byId("buses").replaceChildren(...Object.entries(service.buses).map(([name, bus]) => {
+    const faulty = bus.state !== "active" || bus.problem;
+    const line = element("div", faulty ? "faulty" : "", `${name} ${bus.state}, load ${Math.round(100 * bus.load)} %${bus.problem ? `: ${bus.problem}` : ""}`);
+    const load = element("b", "load", ""), part = element("i", "", "");
+    part.style.width = `${Math.min(100, 100 * bus.load)}%`;
+    load.append(part);
+    line.append(load);
+    return line;
+  }));
+}
+
+export function drawNodes({ scene, pads }) {
+  if (!scene) return;
+  const up = scene.pads.filter((pad) => pads[pad.key]?.node_state === "operational").length;
+  set("up", `${up} of ${scene.pads.length} operational`);
+  byId("nodes").replaceChildren(...scene.pads.map((pad) => {
+    const health = pads[pad.key], chip = element("span", "", pad.link.replaceAll("_", " "));
+    const dot = element("i", "dot", "");
+    dot.style.background = colourOfStatus(health);
+    chip.prepend(dot);
+    if (health?.node_state && health.node_state !== "operational") chip.append(element("em", "", health.node_state));
+    chip.title = `${pad.link}, ${pad.node_text}: ${health ? `${health.state}, ${health.node_state ?? "?"}, ${health.rate_hz ?? 0} samples/s` : "unknown"}${health && problemOf(health) ? `\n${problemOf(health)}` : ""}`;
+    return chip;
+  }));
+}
+
+// Percepts of each contact and of the whole hand, and action requests.
+export function drawPercepts({ scene, percepts, percepts_enabled: enabled }) {
+  if (!scene) return;
+  if (!enabled) return byId("percepts").replaceChildren(element("li", "dim", "handtouch view --percepts shows slip, stiffness, shape and texture"));
+  const order = new Map(scene.pads.map((pad, number) => [pad.key, number]));
+  const entries = Object.entries(percepts).filter(([, summary]) => summary);
+  entries.sort(([a], [b]) => (order.get(a) ?? -1) - (order.get(b) ?? -1)); // whole hands first
+  const nameOf = (key) => (key.endsWith("/") ? `${key.slice(0, -1)} hand` : key.slice(key.indexOf("/") + 1).replaceAll("_", " "));
+  const known = ([, summary]) => summary.lines.length || summary.requests.length, lines = [];
+  for (const [key, summary] of entries.filter(known)) {
+    const line = element("li", "", "");
+    line.append(element("b", "", nameOf(key)), ` ${summary.lines.join(" · ")}`);
+    for (const request of summary.requests) line.append(element("em", "", request));
+    line.title = summary.missing.join("\n");
+    lines.push(line);
+  }
+  const open = entries.filter((entry) => !known(entry)), line = element("li", "dim", "");
+  line.textContent = open.length ? `not determined yet: ${lines.length ? `${open.length} more` : open.length === 1 ? "one contact" : `${open.length} contacts`}` : "no percepts";
+  line.title = open.map(([key, summary]) => `${nameOf(key)}: ${summary.missing.join("; ")}`).join("\n");
+  byId("percepts").replaceChildren(...lines, ...(open.length || !lines.length ? [line] : []));
+}
+
+export function drawMessages({ messages }) {
+  const newest = [...messages].reverse();
+  byId("messages").replaceChildren(...newest.map(({ wall_s, links, text, status }) => {
+    const line = element("li", "", ""), time = wall_s ? new Date(1000 * wall_s).toLocaleTimeString("en-GB") : "";
+    line.style.borderColor = STATUS_COLOURS[status] ?? STATUS_COLOURS.starting;
+    line.append(element("time", "", time));
+    if (links.length) line.append(element("b", "", links.length > 3 ? `${links.length} pads` : links.join(", ")), " ");
+    line.append(text);
+    line.title = links.length > 3 ? links.join(", ") : "";
+    return line;
+  }));
+  byId("no-messages").hidden = messages.length > 0;
+}

@@ -1,0 +1,166 @@
+"""Inputs of the daemon from a robot: joint states, joint commands and reference forces.
+
+Public names: `JointState`, `JointCommand`, `LinkForces`, `encode`, `decode`, `INPUT_TOPICS`. The keys are in
+docs/wire.md, "Inputs". SI units; `t_ns` is of the host's monotonic clock, as that of samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, cast
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.wire.codec import SCHEMA_VERSION, WireError, check_fields, unpack
+from handtouch.wire.topics import Topic
+
+FloatArray = NDArray[np.float64]
+_MAX_NAMES = 1000
+_MAX_NAME_CHARACTERS = 200
+_MAX_T_NS = 2**63 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class JointState:
+    """`joints/<hand>`: measured joint positions; any subset of the hand's joints, and other joints too.
+
+    Raises ValueError for values that violate the contract.
+    """
+
+    hand: str
+    t_ns: int | None
+    """time of the measurement; None: when the daemon receives it"""
+    names: tuple[str, ...]
+    position_rad: FloatArray
+    """(m,) in the order of `names`, as the following; metres for a prismatic joint"""
+    velocity_rad_s: FloatArray | None = None
+    effort_nm: FloatArray | None = None
+    position_std_rad: FloatArray | None = None
+    """standard deviations of position_rad; included in the covariances in palm and base frame"""
+    gravity: FloatArray | None = None
+    """(3,) direction of gravity in the frame of the hand's base, of any length; for a base that moves"""
+
+    def __post_init__(self) -> None:
+        _check_time(self.t_ns)
+        _check_names("names", self.names)
+        for key in ("position_rad", "velocity_rad_s", "effort_nm", "position_std_rad"):
+            _check_column(key, getattr(self, key), "names", self.names)
+        _check_std("position_std_rad", self.position_std_rad)
+        if self.gravity is not None:
+            object.__setattr__(self, "gravity", _unit_vector("gravity", self.gravity))
+
+
+@dataclass(frozen=True, slots=True)
+class JointCommand:
+    """`command/<hand>`: commanded joint positions, for hands without joint encoders.
+
+    Raises ValueError for values that violate the contract.
+    """
+
+    hand: str
+    t_ns: int | None
+    """time from which the command is in effect"""
+    names: tuple[str, ...]
+    position_rad: FloatArray
+    """(m,) in the order of `names`; metres for a prismatic joint"""
+
+    def __post_init__(self) -> None:
+        _check_time(self.t_ns)
+        _check_names("names", self.names)
+        _check_column("position_rad", self.position_rad, "names", self.names)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkForces:
+    """`force/<hand>`: reference forces on links, from another sensor or from joint torques.
+
+    Raises ValueError for values that violate the contract.
+    """
+
+    hand: str
+    t_ns: int | None
+    links: tuple[str, ...]
+    """links that carry pads"""
+    force_n: FloatArray
+    std_n: FloatArray
+
+    def __post_init__(self) -> None:
+        _check_time(self.t_ns)
+        _check_names("links", self.links)
+        _check_column("force_n", self.force_n, "links", self.links)
+        _check_column("std_n", self.std_n, "links", self.links)
+        _check_std("std_n", self.std_n)
+
+
+InputMessage = JointState | JointCommand | LinkForces
+INPUT_TOPICS = (
+    Topic("joints", JointState, ("hand",), "at the rate of the robot's joint states"),
+    Topic("command", JointCommand, ("hand",), "at every command"),
+    Topic("force", LinkForces, ("hand",), "at the rate of the reference sensor"),
+)
+_TOPIC_OF_PREFIX = {topic.prefix: topic for topic in INPUT_TOPICS}
+_FORMATTERS = {topic.payload: topic.formatter() for topic in INPUT_TOPICS}
+
+
+def encode(message: InputMessage) -> list[bytes]:
+    """Return the two parts of a message, for a ZeroMQ multipart send; fields that are None are left out."""
+    payload: dict[str, Any] = {"v": SCHEMA_VERSION, "t_ns": message.t_ns}
+    for field in fields(message):
+        value = getattr(message, field.name)
+        if field.name == "hand" or value is None:
+            continue
+        payload[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
+    return [_FORMATTERS[type(message)](message).encode(), bytes(msgpack.packb(payload))]
+
+
+def decode(parts: Sequence[bytes]) -> InputMessage:
+    """Decode the two parts of a message; unknown keys are ignored. Raises WireError, for any bytes."""
+    received = unpack(parts, _TOPIC_OF_PREFIX)
+    payload = {"t_ns": None, **received.payload, **dict(zip(received.topic.keys, received.keys, strict=True))}
+    values = check_fields(received.name, payload, received.topic.payload)
+    try:
+        return cast(InputMessage, received.topic.payload(**values))
+    except ValueError as error:
+        raise WireError(f"{received.name}: {error}") from None
+
+
+def _check_time(t_ns: int | None) -> None:
+    if t_ns is not None and not 0 <= t_ns <= _MAX_T_NS:
+        raise ValueError("t_ns must be nanoseconds of the monotonic clock, from 0 to 2^63 - 1, or nil")
+
+
+def _check_names(key: str, names: tuple[str, ...]) -> None:
+    if not 0 < len(names) <= _MAX_NAMES:
+        raise ValueError(f"{key} must be a list of 1 to {_MAX_NAMES} names, not {len(names)}")
+    if any(len(name) > _MAX_NAME_CHARACTERS for name in names):
+        raise ValueError(f"{key} must be names of at most {_MAX_NAME_CHARACTERS} characters")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{key} must contain each name once")
+
+
+def _check_column(key: str, column: FloatArray | None, names_key: str, names: tuple[str, ...]) -> None:
+    if column is None:
+        return
+    if column.shape != (len(names),):
+        raise ValueError(f"{key} must be a list of {len(names)} numbers, one for each of {names_key}")
+    if not np.isfinite(column).all():
+        wrong = [name for name, value in zip(names, column, strict=True) if not np.isfinite(value)]
+        raise ValueError(f"{key} must be finite, but isn't for {', '.join(wrong)}; leave out unknown values")
+
+
+def _check_std(key: str, column: FloatArray | None) -> None:
+    if column is not None and (column < 0).any():
+        raise ValueError(f"{key} must not be negative")
+
+
+def _unit_vector(key: str, vector: FloatArray) -> FloatArray:
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{key} must be a list of 3 finite numbers")
+    largest = np.abs(vector).max()
+    if largest == 0:
+        raise ValueError(f"{key} must be a direction: not all components may be 0")
+    scaled = vector / largest  # its squares neither overflow nor underflow
+    return np.asarray(scaled / np.linalg.norm(scaled))

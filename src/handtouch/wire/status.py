@@ -1,0 +1,71 @@
+"""Status codes: numbers in columns, lower-case names in other messages (`status.text`).
+
+Public names: `PadState`, `PositionStatus`, `ForceStatus`, `FrameStatus`.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class _StatusCode(IntEnum):
+    @property
+    def text(self) -> str:
+        """Name of the code in messages without columns."""
+        return self.name.lower()
+
+
+class PadState(_StatusCode):
+    """State of a pad: "no contact" is CLEAR only, not STALE, LOST or FAULTED."""
+
+    CLEAR = 0
+    """sampled, without contact"""
+    TOUCHED = 1
+    """sampled, with a contact"""
+    STALE = 2
+    """no sample for three periods"""
+    LOST = 3
+    """heartbeat of its node timed out"""
+    FAULTED = 4
+    """samples are invalid; the pad's health has the reason"""
+    STARTING = 5
+    """its node isn't operational yet"""
+    OFF = 6
+    """switched off: in no scene, or disabled"""
+
+
+class PositionStatus(_StatusCode):
+    """Status of a contact's position."""
+
+    NOT_COMPUTED = 0
+    """no scene requests it, or no contact"""
+    VALID = 1
+    UNRELIABLE = 2
+    """published, but degraded by what `diagnoses` name"""
+    INVALID = 3
+    """no position agrees with the currents"""
+
+
+class ForceStatus(_StatusCode):
+    """Status of a contact's force."""
+
+    NOT_COMPUTED = 0
+    """no scene requests it, or no contact"""
+    VALID = 1
+    LOWER_BOUND = 2
+    """the pad is saturated: the force is at least `force_n`"""
+    UNRELIABLE = 3
+    """the pad's baseline, or the state of its sheet, is not known well enough yet"""
+    INVALID = 4
+
+
+class FrameStatus(_StatusCode):
+    """Status of a contact's position in the frame of the palm or the base."""
+
+    NOT_COMPUTED = 0
+    """no scene requests it, or no contact"""
+    VALID = 1
+    STALE = 2
+    """the joint states that it depends on are too old"""
+    INVALID = 3
+    """no position on the link, or joints without any joint state"""

@@ -1,0 +1,280 @@
+"""Gains from ordinary contacts: as good as the Fisher bound, honest about it, deaf to what is no point."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from handtouch.calibration.gains import (
+    BATCH_CONTACTS,
+    GainEstimator,
+    GainStatus,
+    fisher_covariance,
+    gain_deviation,
+)
+from handtouch.field import ElectrodeNetwork, Rectangle
+from handtouch.field.model import ForwardModel
+
+FloatArray = NDArray[np.float64]
+SQUARE = Rectangle(1.0, 1.0)
+TRUTH = np.array([0.03, -0.01, -0.025, 0.005])
+DAY_NS = 86_400_000_000_000
+
+
+def contacts(
+    model: ForwardModel,
+    count: int,
+    noise: float,
+    log_gains: FloatArray = TRUTH,
+    seed: int = 1,
+    apart: float = 0.0,
+) -> FloatArray:
+    """Currents (4, count) that `log_gains` correct; of points, or of two points `apart` along x."""
+    generator = np.random.default_rng(seed)
+    x, y = generator.uniform(0.15, 0.85, (2, count)) * [[model.a], [model.b]]
+    total = generator.uniform(0.5, 2.0, count)
+    fractions = (model.fractions(x - apart / 2, y) + model.fractions(x + apart / 2, y)) / 2
+    return np.asarray(
+        (fractions * total + noise * generator.normal(size=(4, count))) * np.exp(-log_gains)[:, None]
+    )
+
+
+def plain(model: ForwardModel = SQUARE, **options: float) -> GainEstimator:
+    return GainEstimator(model, **{"drift_per_day": 0.0, "model_error": 0.0, **options})
+
+
+def test_gains_are_exact_with_negligible_noise() -> None:
+    estimator = plain()
+    assert estimator.add_contacts(contacts(SQUARE, 128, 1e-7), 1e-7, 0) == 128
+    found = estimator.estimate
+    np.testing.assert_allclose(np.log(found.gains), TRUTH, atol=1e-6)
+    assert found.status == GainStatus.ESTIMATED
+    assert found.contacts == 128
+
+
+@pytest.mark.parametrize("model", [Rectangle(1.5, 1.0), ElectrodeNetwork(0.04, 0.03, 8e-4, 2400.0)])
+def test_any_pad_model_is_accepted(model: ForwardModel) -> None:
+    estimator = plain(model)
+    estimator.add_contacts(contacts(model, 96, 1e-5), 1e-5, 0)
+    found = estimator.estimate
+    assert np.abs(np.log(found.gains) - TRUTH).max() < 4 * found.std < 1e-3
+
+
+def test_errors_match_the_covariance_and_the_fisher_bound() -> None:
+    distances, ratios = [], []
+    for seed in range(20):
+        estimator = plain(tolerance=0.3)
+        estimator.add_contacts(contacts(SQUARE, 3 * BATCH_CONTACTS, 1e-3, seed=seed), 1e-3, 0)
+        found = estimator.estimate
+        error = np.log(found.gains) - TRUTH
+        distances.append(error @ np.linalg.pinv(found.covariance) @ error)
+        generator = np.random.default_rng(seed)
+        x, y = generator.uniform(0.15, 0.85, (2, 3 * BATCH_CONTACTS))
+        total = generator.uniform(0.5, 2.0, 3 * BATCH_CONTACTS)
+        ratios.append(found.std**2 / np.diag(fisher_covariance(SQUARE, x, y, (1e-3 / total)[None])).max())
+    assert 1.6 < np.mean(distances) < 5.0  # 99.8 % of means of 20 chi squared of three degrees of freedom
+    assert 0.95 < np.mean(ratios) < 1.3
+
+
+def test_fisher_bound_equals_that_of_the_joint_problem() -> None:
+    """Invert the joint information on gains, positions and totals, and select the gains."""
+    generator = np.random.default_rng(5)
+    x, y = generator.uniform(0.1, 0.9, (2, 6))
+    fractions, jacobian = SQUARE.fractions_with_jacobian(x, y)
+    design = np.zeros((4 * 6 + 1, 4 + 3 * 6))
+    for k in range(6):
+        rows = slice(4 * k, 4 * k + 4)
+        design[rows, :4] = np.diag(fractions[:, k])
+        design[rows, 4 + 3 * k : 7 + 3 * k] = np.column_stack([jacobian[:, :, k], fractions[:, k]])
+    design[-1, :4] = 100  # log gains sum to zero
+    whole = np.linalg.inv(design.T @ design)[:4, :4]
+    np.testing.assert_allclose(fisher_covariance(SQUARE, x, y, 1.0), whole, rtol=1e-4, atol=1e-4)
+
+
+def test_gain_deviation_of_shapes_matches_theory() -> None:
+    assert gain_deviation(SQUARE) == pytest.approx(1.5, abs=0.1)
+    assert gain_deviation(Rectangle(1.77, 1.0)) == pytest.approx(8.3, abs=0.3)
+    assert gain_deviation(Rectangle(3.0, 1.0)) == pytest.approx(284, rel=0.05)
+    assert gain_deviation(Rectangle(1.0, 1.77)) == pytest.approx(gain_deviation(Rectangle(1.77, 1.0)))
+
+
+def test_shape_without_observable_gains_is_refused_with_its_deviation() -> None:
+    estimator = GainEstimator(Rectangle(3.0, 1.0))
+    estimator.add_contacts(contacts(Rectangle(3.0, 1.0), 320, 1e-4), 1e-4, 0)
+    found = estimator.estimate
+    assert found.status == GainStatus.INVALID
+    assert "282 times the noise" in found.reason
+
+
+def test_status_is_undetermined_before_enough_contacts() -> None:
+    estimator = plain()
+    assert estimator.estimate.status == GainStatus.UNDETERMINED
+    estimator.add_contacts(contacts(SQUARE, BATCH_CONTACTS - 1, 1e-4), 1e-4, 0)
+    assert estimator.estimate.contacts == 0
+    estimator.process_pending()
+    assert estimator.estimate.contacts == BATCH_CONTACTS - 1
+    poor = plain()
+    poor.add_contacts(contacts(SQUARE, BATCH_CONTACTS, 1e-2), 1e-2, 0)
+    assert poor.estimate.status == GainStatus.UNDETERMINED
+    assert "touch the pad all over" in poor.estimate.reason
+
+
+def test_single_contacts_give_the_same_estimate_as_a_batch() -> None:
+    currents = contacts(SQUARE, 2 * BATCH_CONTACTS, 1e-3)
+    together, single = plain(), plain()
+    together.add_contacts(currents, 1e-3, 0)
+    for column in currents.T:
+        single.add_contacts(column, 1e-3, 0)
+    np.testing.assert_array_equal(together.estimate.gains, single.estimate.gains)
+
+
+def test_estimate_is_independent_of_the_current_scale() -> None:
+    currents = contacts(SQUARE, BATCH_CONTACTS, 1e-3)
+    one, other = plain(), plain()
+    one.add_contacts(currents, 1e-3, 0)
+    other.add_contacts(currents * 1e-6, 1e-9, 0)
+    np.testing.assert_allclose(one.estimate.gains, other.estimate.gains, rtol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_elongated_contacts_among_points_do_not_bias_the_gains(share: float) -> None:
+    count, worst = 320, []
+    for seed in range(6):
+        currents = contacts(SQUARE, count, 5e-4, seed=seed)
+        # all along x, so that their biases add up
+        currents[:, : int(share * count)] = contacts(SQUARE, int(share * count), 5e-4, seed=99, apart=0.25)
+        estimator = plain(tolerance=0.1)
+        estimator.add_contacts(currents[:, np.random.default_rng(seed).permutation(count)], 5e-4, 0)
+        found = estimator.estimate
+        worst.append(np.abs(np.log(found.gains) - TRUTH).max() / found.std)
+        assert found.status == GainStatus.ESTIMATED
+        assert found.point_fraction == pytest.approx(1 - share, abs=0.12)
+    assert np.median(worst) < 3
+
+
+def test_contacts_by_edges_only_make_the_estimate_invalid() -> None:
+    estimator = plain()
+    estimator.add_contacts(contacts(SQUARE, 64, 1e-4), 1e-4, 0)
+    before = np.log(estimator.estimate.gains)
+    generator = np.random.default_rng(3)
+    for apart in generator.uniform(0.1, 0.3, 400):
+        estimator.add_contacts(contacts(SQUARE, 1, 1e-4, seed=int(1e6 * apart), apart=apart), 1e-4, 0)
+    found = estimator.estimate
+    assert found.status == GainStatus.INVALID
+    assert "no points" in found.reason
+    assert np.abs(np.log(found.gains) - before).max() < 5e-3
+
+
+def test_gain_step_makes_the_estimate_invalid() -> None:
+    estimator = plain()
+    estimator.add_contacts(contacts(SQUARE, 256, 1e-4), 1e-4, 0)
+    estimator.add_contacts(contacts(SQUARE, 256, 1e-4, TRUTH[::-1]), 1e-4, 0)
+    assert estimator.estimate.status == GainStatus.INVALID
+    assert "jumped" in estimator.estimate.reason
+
+
+def test_drift_is_tracked() -> None:
+    estimator = plain(drift_per_day=2e-3)
+    for day in range(60):
+        gains = TRUTH + 1e-3 * day * np.array([1, -1, 0, 0])
+        estimator.add_contacts(contacts(SQUARE, BATCH_CONTACTS, 2e-4, gains, seed=day), 2e-4, day * DAY_NS)
+    found = estimator.estimate
+    assert np.abs(np.log(found.gains) - gains).max() < 2e-3
+    assert found.status == GainStatus.ESTIMATED
+
+
+def test_uncertainty_grows_without_contacts() -> None:
+    estimator = plain(drift_per_day=2e-3)
+    estimator.add_contacts(contacts(SQUARE, 256, 1e-4), 1e-4, 0)
+    fresh = estimator.estimate.std
+    estimator.add_contacts(np.zeros((4, 0)), 1e-4, 100 * DAY_NS)
+    assert fresh < 2e-4
+    assert estimator.estimate.std == pytest.approx(2e-2 * np.sqrt(3 / 4), rel=0.05)  # three of four are free
+    assert estimator.estimate.status == GainStatus.UNDETERMINED
+
+
+def test_information_from_one_position_is_limited_by_the_model_error() -> None:
+    here = SQUARE.fractions(np.full(2000, 0.35), np.full(2000, 0.35))
+    noisy = here + 1e-4 * np.random.default_rng(1).normal(size=here.shape)
+    estimator = GainEstimator(SQUARE, model_error=1e-3, drift_per_day=0)
+    estimator.add_contacts(noisy[:, :200], 1e-4, 0)
+    early, effective = estimator.estimate.std, estimator.estimate.effective_contacts
+    estimator.add_contacts(noisy[:, 200:], 1e-4, 0)
+    assert estimator.estimate.std == pytest.approx(early, rel=0.01)
+    assert estimator.estimate.effective_contacts == pytest.approx(effective, abs=0.5)
+    assert estimator.estimate.effective_contacts < 2
+    assert estimator.estimate.status == GainStatus.UNDETERMINED
+
+
+def test_position_dependent_model_errors_are_covered_by_the_covariance() -> None:
+    """Fraction errors of 1e-3 are equal for all contacts in a cell and don't average out."""
+    distances = []
+    for seed in range(12):
+        generator = np.random.default_rng(seed)
+        x, y = generator.uniform(0.1, 0.9, (2, 800))
+        wrong = 1e-3 * generator.normal(size=(4, 10, 10))
+        fractions = SQUARE.fractions(x, y) + wrong[:, (10 * x).astype(int), (10 * y).astype(int)]
+        currents = (fractions + 1e-4 * generator.normal(size=(4, 800))) * np.exp(-TRUTH)[:, None]
+        estimator = GainEstimator(SQUARE, model_error=1e-3, drift_per_day=0)
+        estimator.add_contacts(currents, 1e-4, 0)
+        error = np.log(estimator.estimate.gains) - TRUTH
+        distances.append(error @ np.linalg.pinv(estimator.estimate.covariance) @ error)
+    assert 0.5 < np.mean(distances) < 5.0
+
+
+def test_estimation_continues_from_stored_gains() -> None:
+    first = plain()
+    first.add_contacts(contacts(SQUARE, 320, 1e-3), 1e-3, 0)
+    found = first.estimate
+    second = plain(start=found.gains, covariance=found.covariance)  # type: ignore[arg-type]
+    np.testing.assert_allclose(second.estimate.gains, found.gains, rtol=1e-12)
+    np.testing.assert_allclose(second.estimate.covariance, found.covariance, rtol=1e-6, atol=1e-12)
+    second.add_contacts(contacts(SQUARE, 320, 1e-3, seed=2), 1e-3, 5)
+    assert second.estimate.std < 0.8 * found.std
+
+
+def test_weak_contacts_and_contacts_at_edges_are_ignored() -> None:
+    estimator = plain()
+    edge = SQUARE.fractions([0.01, 0.5, 0.5], [0.5, 0.98, 0.5])
+    assert estimator.add_contacts(edge, 1e-4, 0) == 1
+    assert estimator.add_contacts(0.01 * edge, 1e-3, 0) == 0
+    assert estimator.add_contacts(np.full((4, 2), np.nan), 1e-3, 0) == 0
+    assert estimator.add_contacts(-edge, 1e-3, 0) == 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.lists(st.floats(-1e3, 1e3), min_size=4, max_size=4), min_size=1, max_size=40))
+def test_any_currents_give_finite_estimates(readings: list[list[float]]) -> None:
+    estimator = GainEstimator(SQUARE)
+    estimator.add_contacts(np.array(readings).T, 1e-3, 0)
+    estimator.process_pending()
+    assert np.isfinite(estimator.estimate.gains).all()
+    assert np.isfinite(estimator.estimate.covariance).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"model_error": -1.0}, "model_error"),
+        ({"drift_per_day": float("nan")}, "drift_per_day"),
+        ({"required_std": 0.0}, "required_std"),
+        ({"start": (1.0, 1.0, 1.0)}, "four positive"),
+        ({"start": (1.0, 1.0, 1.0, 0.0)}, "four positive"),
+    ],
+)
+def test_invalid_parameters_are_refused_by_name(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        GainEstimator(SQUARE, **options)
+
+
+def test_invalid_calls_are_refused() -> None:
+    estimator = plain()
+    with pytest.raises(ValueError, match="shape"):
+        estimator.add_contacts(np.ones((3, 5)), 1e-3, 0)
+    estimator.add_contacts(np.ones(4), 1e-3, 10)
+    with pytest.raises(ValueError, match="now_ns = 9"):
+        estimator.add_contacts(np.ones(4), 1e-3, 9)

@@ -1,0 +1,112 @@
+"""Objects of the four channels, and error texts for unsuitable ones."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from handtouch.config import shipped
+from handtouch.config.channels import (
+    ELECTRODES,
+    STANDARD_CHANNELS,
+    Channel,
+    order_by_electrode,
+    parse_object,
+    parse_writable_object,
+    resolve_channels,
+)
+from handtouch.config.eds import EdsError
+
+FOLDER = Path(__file__).parent.parent / "data" / "eds"
+TACTOR = ("0x2110:0", "0x2120:0", "0x2130:0", "0x2140:0")
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("0x6401:1", (0x6401, 1, None)),
+        ("0x2001:0:u24", (0x2001, 0, (24, False))),
+        ("0x2001:0xFE:i32", (0x2001, 254, (32, True))),
+        ("0xABCD:17:u8", (0xABCD, 17, (8, False))),
+    ],
+)
+def test_objects_are_written_as_index_sub_and_type(text: str, found: object) -> None:
+    assert parse_object(text) == found
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "6401:1",
+        "0x6401",
+        "0x6401:255",
+        "0x6401:1:u12",
+        "0x6401:1:f32",
+        "0x0000:1",
+        "0x64010:1",
+        "0x6401:-1",
+    ],
+)
+def test_other_forms_are_refused_with_an_example(text: str) -> None:
+    with pytest.raises(EdsError, match=r'is no object; write INDEX:SUB such as "0x6401:1"'):
+        parse_object(text)
+
+
+@pytest.mark.parametrize(
+    ("objects", "eds", "bits", "signed"),
+    [
+        (("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"), None, 16, True),
+        (("0x9130:1", "0x9130:2", "0x9130:3", "0x9130:4"), None, 32, True),
+        (("0x8130:1", "0x8130:2", "0x8130:3", "0x8130:4"), "hapt24.dcf", 24, True),
+        (TACTOR, "tactor-q16.eds", 16, False),
+        (tuple(f"{text}:u16" for text in TACTOR), None, 16, False),
+    ],
+)
+def test_types_come_from_the_text_the_eds_or_the_profile(
+    objects: tuple[str, ...], eds: str | None, bits: int, signed: bool
+) -> None:
+    found = resolve_channels(objects, FOLDER / eds if eds else None)
+    assert {(channel.bits, channel.signed) for channel in found} == {(bits, signed)}
+
+
+@pytest.mark.parametrize(
+    ("objects", "eds", "expected"),
+    [
+        (TACTOR, None, r'"0x2110:0": its type is unknown; give the EDS, or the type: "0x2110:0:i16"'),
+        (("0x2110:0:i16", *TACTOR[1:]), "tactor-q16.eds", "has u16; leave the type out"),
+        (("0x2999:0", *TACTOR[1:]), "tactor-q16.eds", "has no such object"),
+        (("0x2110:0", "0x2110:0", *TACTOR[2:]), "tactor-q16.eds", '"0x2110:0" is given twice'),
+    ],
+)
+def test_channels_that_cannot_be_are_named_with_a_remedy(
+    objects: tuple[str, ...], eds: str | None, expected: str
+) -> None:
+    with pytest.raises(EdsError, match=expected):
+        resolve_channels(objects, FOLDER / eds if eds else None)
+
+
+def test_order_of_electrodes_is_that_of_the_pad_whatever_the_wiring() -> None:
+    for wired in itertools.permutations(ELECTRODES):
+        ordered = order_by_electrode(STANDARD_CHANNELS, wired)
+        assert [wired[channel.sub - 1] for channel in ordered] == list(ELECTRODES)
+
+
+def test_written_objects_need_their_type() -> None:
+    assert parse_writable_object("0x2100:0:u8").size_bytes == 1
+    with pytest.raises(EdsError, match=r'its type is missing; add it: "0x2100:0:u8"'):
+        parse_writable_object("0x2100:0")
+
+
+def test_shipped_node_is_the_standard_one() -> None:
+    found = resolve_channels(
+        ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"), shipped.path("handtouch-node.eds")
+    )
+    assert found == STANDARD_CHANNELS
+
+
+def test_channel_text_has_address_and_type() -> None:
+    assert str(Channel(0x2110, 0, 24, False)) == "0x2110:00 (unsigned 24 bit)"
+    assert str(Channel(0x6401, 4)) == "0x6401:04 (16 bit)"

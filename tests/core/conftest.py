@@ -1,0 +1,43 @@
+"""A small hand with and without series resistors, and the counts of contacts on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch.config import Deployment, parse
+from handtouch.core.pad_model import PadModel
+from tests.deployments import CYLINDER, deployment_text, pad_text
+
+DEPLOYMENT = deployment_text(
+    pad_text("plane", 1, extra="mount = { position_mm = [10.0, 0.0, 5.0], rpy_deg = [0.0, 0.0, 90.0] }"),
+    pad_text("round", 2, CYLINDER),
+    pad_text("resisted", 3, extra="series_ohm = [336.0, 336.0, 336.0, 336.0]"),
+)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A deployment and its model."""
+
+    deployment: Deployment
+    model: PadModel
+
+    def counts(self, pad: int, x: float, y: float, current_a: float) -> NDArray[np.int16]:
+        """Return the counts of a contact at (x, y), fractions of the pad's rectangle, with a current."""
+        side_a, side_b = self.model.locator.sides[pad]
+        at = np.array([pad]), np.array([x * side_a]), np.array([y * side_b])
+        fractions = self.model.locator.fractions(*at)[:, 0]
+        counts: NDArray[np.int16] = np.rint(
+            fractions * (current_a / self.model.ampere_per_count[pad])
+        ).astype(np.int16)
+        return counts
+
+
+@pytest.fixture(scope="session")
+def bench() -> Bench:
+    deployment = parse(DEPLOYMENT)
+    return Bench(deployment, PadModel(deployment))

@@ -1,0 +1,239 @@
+"""Compensation of creep and adaptation in forces: standard deviation and reliability."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch import sheet
+from handtouch.config import Behaviour
+from handtouch.core.sheet_force import (
+    ForceReference,
+    ForceReliability,
+    SheetForceCompensation,
+    sheet_behaviour_of,
+)
+
+FloatArray = NDArray[np.float64]
+PERIOD_NS, DT_S = 100_000_000, 0.1
+LIKE_S1 = sheet_behaviour_of(Behaviour(gain_std=0.0, back_force_std_n=0.0))
+
+
+class Rig:
+    """Sheets of a model under loads; the compensation knows `behaviour` only."""
+
+    def __init__(
+        self, pads: int, model: sheet.SheetModel, behaviour: object = LIKE_S1, seed: int = 1
+    ) -> None:
+        self.compensation = SheetForceCompensation([behaviour] * pads, PERIOD_NS)  # type: ignore[list-item]
+        self._state, self._step = model.initial_state(pads, seed), model.discretise(DT_S)
+        self.t_ns, self.touching = 10**9, np.zeros(pads, np.bool_)
+        self.compensation.compensate_forces(np.zeros(pads), np.zeros(pads), self.touching, self.t_ns)
+
+    def run(self, seconds: float, load_n: FloatArray) -> None:
+        for _ in range(round(seconds / DT_S)):
+            self.t_ns += PERIOD_NS
+            apparent = self._step.forward(self._state, load_n)
+            touching = apparent > 0.05
+            self.compensation.begin_contacts(np.flatnonzero(touching & ~self.touching))
+            self.touching = touching
+            self.apparent = apparent
+            self.compensation.compensate_forces(apparent, 0.0 * apparent, touching, self.t_ns)
+
+    def cycle(self, times: int, load_n: FloatArray) -> None:
+        for _ in range(times):
+            self.run(2.0, load_n)
+            self.run(0.5, 0 * load_n)
+
+
+def calm(model: sheet.SheetModel) -> sheet.SheetModel:
+    return replace(model, fluctuation=sheet.Fluctuation())
+
+
+QUICK = replace(calm(sheet.S1), adaptation=replace(sheet.S1.adaptation, time_s=300.0, fatigue_s=1000.0))
+LIKE_QUICK = sheet_behaviour_of(
+    Behaviour(gain_std=0.0, back_force_std_n=0.0, adaptation_time_s=300.0, fatigue_s=1000.0)
+)
+
+
+def test_the_load_on_a_known_sheet_is_recovered() -> None:
+    rig, load = Rig(1, QUICK, LIKE_QUICK), np.array([3.0])
+    rig.run(90.0, load)
+    assert rig.apparent[0] < 0.8 * load[0]
+    assert rig.compensation.force_n[0] == pytest.approx(load[0], rel=0.02)
+
+
+def test_a_force_is_reliable_after_evidence_and_again_after_a_new_calibration() -> None:
+    rig, load = Rig(2, calm(sheet.S1)), np.array([2.0, 2.0])
+    rig.cycle(2, load)
+    assert rig.compensation.state.tolist() == [ForceReliability.UNRELIABLE] * 2
+    rig.cycle(2, load)
+    rig.run(0.5, load)
+    assert rig.compensation.state.tolist() == [ForceReliability.RELIABLE] * 2
+    assert rig.compensation.contacts[0] == 5
+    assert rig.compensation.touched_s[0] == pytest.approx(8.4, abs=0.5)
+    rig.compensation.reset_evidence(0, new_sheet=True)
+    rig.run(0.5, load)
+    assert rig.compensation.state.tolist() == [ForceReliability.UNRELIABLE, ForceReliability.RELIABLE]
+    assert rig.compensation.back_force[0][0] < rig.compensation.back_force[0][1]
+
+
+def test_a_stored_back_force_is_reliable_at_once() -> None:
+    rig = Rig(1, calm(sheet.S1))
+    rig.compensation.set_back_force(0, 0.0, 0.05)
+    rig.run(0.5, np.array([2.0]))
+    assert rig.compensation.state[0] == ForceReliability.RELIABLE
+
+
+def test_a_force_with_unknown_back_force_is_invalid() -> None:
+    rig = Rig(1, calm(sheet.S1))
+    rig.compensation.set_back_force(0, 1.0, 3.0)
+    rig.run(0.5, np.array([2.0]))
+    assert rig.compensation.state[0] == ForceReliability.INVALID
+
+
+def test_a_pause_makes_the_back_force_uncertain() -> None:
+    rig, load = Rig(1, QUICK, LIKE_QUICK), np.array([3.0])
+    rig.run(60.0, load)
+    back, before = (float(value[0]) for value in rig.compensation.back_force)
+    rig.run(60.0, 0 * load)
+    rig.run(0.1, load)
+    fell = back - rig.compensation.back_force[0][0]
+    assert 0.2 * back < fell < 0.7 * back
+    assert rig.compensation.back_force[1][0] > max(0.4 * back, 1.2 * before)
+
+
+def test_the_std_of_the_back_force_never_exceeds_it_after_any_number_of_pauses() -> None:
+    rig, load = Rig(1, QUICK, LIKE_QUICK), np.array([3.0])
+    rig.run(60.0, load)
+    for _ in range(10):
+        rig.run(5.0, 0 * load)
+        rig.run(0.5, load)
+        back, std = (float(value[0]) for value in rig.compensation.back_force)
+    assert std < load[0] - back < load[0]
+
+
+def test_standard_deviations_cover_sheets_with_varied_parameters() -> None:
+    """200 sheets with parameters spread about the preset's, under many loads."""
+    pads, rng = 200, np.random.default_rng(5)
+    spread = np.exp(rng.normal(0, 0.2, (2, pads)))
+    adaptation = replace(sheet.S1.adaptation, time_s=3000.0 * spread[0], fatigue_s=1e4 * spread[1])
+    rig = Rig(
+        pads,
+        replace(sheet.S1, adaptation=adaptation),
+        sheet_behaviour_of(Behaviour(gain_std=0.0, back_force_std_n=0.0)),
+    )
+    inside, counted = 0, 0
+    for _ in range(25):
+        load = rng.uniform(0.3, 5.0, pads)
+        rig.run(rng.uniform(1.5, 20.0), load)
+        valid = rig.touching & (rig.compensation.state == ForceReliability.RELIABLE)
+        off = np.abs(rig.compensation.force_n - load) < 1.96 * rig.compensation.std_n
+        inside, counted = inside + int(off[valid].sum()), counted + int(valid.sum())
+        rig.run(rng.uniform(0.3, 3.0), 0 * load)
+    assert counted > 0.8 * 25 * pads
+    assert 0.9 < inside / counted < 0.99
+
+
+def test_standard_deviations_cover_a_long_hold_with_another_final_value() -> None:
+    """The final response of an S2 is off by a fifth: the error enters load and back force."""
+    pads, rng = 100, np.random.default_rng(8)
+    final = (1 - np.asarray(sheet.S2.adaptation.share)) * np.exp(rng.normal(0, 0.2, pads))
+    model = replace(sheet.S2, adaptation=replace(sheet.S2.adaptation, share=1 - final, time_s=60.0))
+    behaviour = Behaviour(
+        preset="S2",
+        adaptation_time_s=60.0,
+        gain_std=0.0,
+        back_force_std_n=0.0,
+        slow_creep=0.0,
+        press_std=0.05,
+    )
+    rig = Rig(
+        pads, replace(model, fluctuation=sheet.Fluctuation(press_std=0.05)), sheet_behaviour_of(behaviour)
+    )
+    load = rng.uniform(1.0, 4.0, pads)
+    rig.cycle(4, load)
+    rig.run(240.0, load)
+    off = np.abs(rig.compensation.force_n - load)
+    assert 0.9 < (off < 1.96 * rig.compensation.std_n).mean() <= 1
+    assert np.sqrt(np.mean(off**2)) > 0.33 * np.sqrt(np.mean(rig.compensation.std_n**2))
+
+
+def test_uncertainty_of_slow_creep_grows_with_the_logarithm_of_the_contact_time() -> None:
+    stds = []
+    for slow_creep in (0.0, 0.03):
+        behaviour = sheet_behaviour_of(
+            Behaviour(gain_std=0.0, back_force_std_n=0.0, parameter_std_fraction=0.0, slow_creep=slow_creep)
+        )
+        rig, load = Rig(1, calm(sheet.S1), behaviour), np.array([2.0])
+        std = []
+        for seconds in (5.0, 95.0):
+            rig.run(seconds, load)
+            std.append(rig.compensation.std_n[0] / rig.compensation.force_n[0])
+        stds.append(np.array(std))
+    added = np.sqrt(stds[1] ** 2 - stds[0] ** 2)
+    np.testing.assert_allclose(added, 0.03 * np.log1p([5.0, 100.0]), rtol=0.05)
+
+
+def test_reference_forces_estimate_the_gain_at_a_limited_rate() -> None:
+    behaviour = sheet_behaviour_of(Behaviour(gain_std=0.2, back_force_std_n=0.0))
+    rig, rng, load = Rig(2, calm(sheet.S1), behaviour), np.random.default_rng(6), np.array([2.0, 2.0])
+    true = 1.25
+    for _ in range(40):
+        rig.run(2.0, load)
+        measured = true * load * (1 + rng.normal(0, 0.05, 2))
+        reference = ForceReference(np.array([0]), measured[:1], np.array([0.05 * 2.5]), rig.t_ns)
+        before = rig.compensation.log_gain[0]
+        rig.compensation.update_gains(reference, np.full(2, rig.t_ns), rig.touching)
+        assert abs(rig.compensation.log_gain[0] - before) <= 0.02 * 60
+        rig.run(0.3, 0 * load)
+    rig.run(2.0, load)
+    assert rig.compensation.force_n[0] == pytest.approx(true * 2.0, rel=0.05)
+    assert rig.compensation.force_n[1] == pytest.approx(2.0, rel=0.05)
+    assert rig.compensation.log_gain_std[0] < 0.05 < rig.compensation.log_gain_std[1]
+
+
+@pytest.mark.parametrize(
+    ("force", "late_ns"), [(np.nan, 0), (0.0, 0), (-1.0, 0), (200.0, 0), (2.0, 80_000_000)]
+)
+def test_a_late_or_implausible_reference_is_ignored(force: float, late_ns: int) -> None:
+    rig = Rig(1, calm(sheet.S1), sheet_behaviour_of(Behaviour()))
+    rig.run(3.0, np.array([2.0]))
+    reference = ForceReference(np.array([0]), np.array([force]), np.array([0.1]), rig.t_ns + late_ns)
+    assert rig.compensation.update_gains(reference, np.full(1, rig.t_ns), rig.touching) == 0
+    assert rig.compensation.log_gain[0] == 0.0
+
+
+def test_sheets_of_two_behaviours_and_none_are_independent() -> None:
+    s2 = sheet_behaviour_of(Behaviour(preset="S2", hysteresis_width=0.1))
+    compensation = SheetForceCompensation([LIKE_S1, None, s2, LIKE_S1], PERIOD_NS)
+    raw, touching = np.array([1.0, 1.0, 1.0, 0.0]), np.array([True, True, True, False])
+    for t_ns in range(10**9, 2 * 10**9, PERIOD_NS):
+        pressed = compensation.compensate_forces(raw, 0.1 * raw, touching, t_ns)
+    assert pressed.tolist() == [0, 2]
+    assert np.isfinite(compensation.std_n[pressed]).all()
+    assert compensation.state[1] == ForceReliability.RELIABLE
+    again = compensation.with_behaviours([LIKE_S1, None, s2, LIKE_S1], [LIKE_S1, None, LIKE_S1, LIKE_S1])
+    assert again.touched_s[0] == compensation.touched_s[0] > 0
+    assert again.state[2] == ForceReliability.UNRELIABLE
+
+
+def test_the_keys_of_a_behaviour_change_its_preset() -> None:
+    made = sheet_behaviour_of(
+        Behaviour(
+            preset="S2",
+            adaptation_share=0.5,
+            adaptation_time_s=100.0,
+            creep_share=0.0,
+            hysteresis_width=0.1,
+            parameter_std_fraction=0.1,
+        )
+    )
+    assert (made.model.adaptation.share, made.model.adaptation.time_s) == (0.5, 100.0)
+    assert made.model.adaptation.recovery_s == sheet.S2.adaptation.recovery_s
+    assert made.model.creep.times_s == ()
+    assert made.model.hysteresis.widths_n
+    assert made.uncertainty.creep == 0.1

@@ -1,0 +1,118 @@
+"""Status columns of the hand frame agree with the statuses of contact messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from handtouch import columns, wire
+from handtouch.core.pipeline import Pipeline
+from handtouch.wire import ForceStatus, PadState, PositionStatus
+
+PERIOD_NS = 5_000_000
+PLANE, ROUND, RESISTED = range(3)
+
+
+class _Recorder:
+    """Subscribes to everything and keeps the messages."""
+
+    def __init__(self) -> None:
+        self.messages: list[Any] = []
+
+    def has_subscriber(self, topic: str) -> bool:  # noqa: ARG002
+        return True
+
+    def send(self, message: wire.OutgoingMessage) -> None:
+        self.messages.append(wire.decode(wire.encode(message)))
+
+
+class _Driver:
+    """A pipeline whose three pads are touched, or not."""
+
+    def __init__(self, bench: Any) -> None:
+        self.sent = _Recorder()
+        self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self.sent)
+        self.pipeline.node_state[:] = PadState.CLEAR
+        self.touched = [bench.counts(pad, 0.4, 0.6, 1e-3).tobytes() for pad in range(3)]
+        self.sync_ns = 10**9
+
+    def run_cycle(self, *pads: int) -> tuple[wire.HandFrame, dict[str, wire.Contact]]:
+        """Run a cycle with contacts on these pads; return the hand frame, and the contacts by link."""
+        self.sent.messages.clear()
+        self.sync_ns += PERIOD_NS
+        self.pipeline.begin_cycle(self.sync_ns, self.sync_ns)
+        for pad, data in enumerate(self.touched):
+            sample = data if pad in pads else bytes(len(data))
+            self.pipeline.slab.write_pdo(pad, sample, self.sync_ns + 1000)
+        self.pipeline.tick_if_due(self.sync_ns + PERIOD_NS - 1)
+        (frame,) = (m for m in self.sent.messages if isinstance(m, wire.HandFrame))
+        contacts = {m.link: m for m in self.sent.messages if isinstance(m, wire.Contact) and m.event != "end"}
+        return frame, contacts
+
+
+def _nothing(pipeline: Pipeline) -> None:
+    del pipeline
+
+
+def _unreliable_position(pipeline: Pipeline) -> None:
+    pipeline.model.position_unreliable[ROUND] = True
+
+
+def _saturated(pipeline: Pipeline) -> None:
+    pipeline.tick.columns.force_saturated[RESISTED] = True
+
+
+def _unknown_baseline(pipeline: Pipeline) -> None:
+    pipeline.tick.baseline.touching[PLANE], pipeline.tick.baseline.known[PLANE] = True, False
+
+
+def _position_only(pipeline: Pipeline) -> None:
+    pipeline.tick.linearisations.force_requested[ROUND] = False
+
+
+@pytest.mark.parametrize(
+    ("change", "link", "position", "force"),
+    [
+        (_nothing, "plane", PositionStatus.VALID, ForceStatus.VALID),
+        (_unreliable_position, "round", PositionStatus.UNRELIABLE, ForceStatus.VALID),
+        (_saturated, "resisted", PositionStatus.VALID, ForceStatus.LOWER_BOUND),
+        (_unknown_baseline, "plane", PositionStatus.VALID, ForceStatus.UNRELIABLE),
+        (_position_only, "round", PositionStatus.VALID, ForceStatus.NOT_COMPUTED),
+    ],
+)
+def test_codes_in_the_hand_frame_are_the_statuses_of_the_contacts(
+    bench: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Any,
+    link: str,
+    position: PositionStatus,
+    force: ForceStatus,
+) -> None:
+    driver = _Driver(bench)
+    for _ in range(4):
+        driver.run_cycle(PLANE, ROUND, RESISTED)
+    monkeypatch.setattr(bench.model, "position_unreliable", bench.model.position_unreliable.copy())
+    change(driver.pipeline)
+    frame, contacts = driver.run_cycle(PLANE, ROUND, RESISTED)
+    values = columns(frame)
+    row = frame.links.index(link)
+    assert (values["position_status"][row], values["force_status"][row]) == (position, force)
+    for row, name in enumerate(frame.links):
+        assert PositionStatus(values["position_status"][row]).text == contacts[name].position_status
+        assert ForceStatus(values["force_status"][row]).text == contacts[name].force_status
+
+
+def test_a_pad_without_a_contact_has_no_status(bench: Any) -> None:
+    driver = _Driver(bench)
+    for _ in range(4):
+        driver.run_cycle(PLANE)
+    frame, contacts = driver.run_cycle(PLANE)
+    assert list(contacts) == ["plane"]
+    values = columns(frame)
+    assert values["position_status"].tolist() == [PositionStatus.VALID, 0, 0]
+    assert values["force_status"].tolist() == [ForceStatus.VALID, 0, 0]
+    for _ in range(4):
+        frame, _ = driver.run_cycle()
+    assert not any(np.count_nonzero(columns(frame)[name]) for name in ("position_status", "force_status"))

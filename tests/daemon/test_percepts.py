@@ -1,0 +1,187 @@
+"""Percepts from ticks to messages: complete, at the documented rate, and nothing without a request."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from handtouch import wire
+from handtouch.config.tables import SceneRequest
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.scene import (
+    ActiveScenes,
+    Demand,
+    RequestedOutputs,
+)
+from handtouch.daemon.percepts import PerceptPublisher
+from handtouch.percept.shape import pair_distance
+from handtouch.view.message_lines import message_line
+from handtouch.wire import PERCEPT_KINDS, PadState
+
+PERIOD_NS, PLANE = 5_000_000, 0
+
+
+def _no_commands(hand: str, t_ns: int) -> None:
+    """Return no joint commands."""
+
+
+class Rig:
+    """A pad with a contact that starts to move, while some topics are subscribed."""
+
+    def __init__(self, bench: Any, subscriptions: frozenset[bytes], scene: SceneRequest) -> None:
+        self.subscriptions = subscriptions
+        self.sent: list[Any] = []
+        self._bench = bench
+        self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
+        self.pipeline.node_state[:] = PadState.CLEAR
+        self.percepts = PerceptPublisher(self.pipeline, self, session=7, commanded_joints_at=_no_commands)
+        names = list(zip(bench.model.hands, bench.model.links, strict=True))
+        self.demand = Demand(ActiveScenes(scene, names), self, 200.0, self._apply)
+        self.demand.transformable[:] = False
+        self.demand.update(0)
+        self.t_ns = 10**9
+
+    def has_subscriber(self, topic: str) -> bool:
+        return any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
+
+    def send(self, message: wire.OutgoingMessage) -> None:
+        self.sent.append(message)
+
+    def _apply(self, requested: RequestedOutputs, *_: object) -> None:
+        self.pipeline.apply_demand(requested)
+        self.percepts.set_requested(requested)
+
+    def run_contact(self, ticks: int, current_a: float = 1e-3, m_per_s: float = 0.0) -> list[wire.Percept]:
+        already = len(self.sent)
+        for k in range(ticks):
+            self.t_ns += PERIOD_NS
+            x = 0.4 + m_per_s * k * PERIOD_NS * 1e-9 / 0.03
+            counts = self._bench.counts(PLANE, x, 0.5, current_a)
+            self.pipeline.begin_cycle(self.t_ns, self.t_ns)
+            for pad in range(3):
+                touch = counts.tobytes() if pad == PLANE else bytes(8)
+                self.pipeline.slab.write_pdo(pad, touch, self.t_ns + 1000 + pad)
+            ticked = self.pipeline.tick_if_due(self.t_ns + PERIOD_NS * 7 // 10)
+            assert ticked is not None
+            if self.percepts.enabled:
+                self.percepts.process_tick(ticked)
+            self.pipeline.prepare_next_tick()
+        return [message for message in self.sent[already:] if isinstance(message, wire.Percept)]
+
+
+MOTION = frozenset([b"percept/h/motion"])
+PLAIN = SceneRequest()
+
+
+def test_slip_is_published_within_samples(bench: Any) -> None:
+    rig = Rig(bench, MOTION, PLAIN)
+    before = rig.run_contact(200)
+    assert {percept.label for percept in before[2:]} == {"sticking"}
+    onset_ns = rig.t_ns
+    after = rig.run_contact(20, m_per_s=20e-3)
+    slip = next(percept for percept in after if percept.label == "sliding")
+    assert slip.t_ns - onset_ns <= 4 * PERIOD_NS
+    assert (slip.link, slip.hand, slip.kind, slip.session) == ("plane", "h", "motion", 7)
+    assert slip.evidence["samples"] > 190
+    assert [percept.seq for percept in before + after] == list(range(1, 1 + len(before + after)))
+
+
+def test_percepts_survive_the_wire_and_format_as_text(bench: Any) -> None:
+    rig = Rig(bench, MOTION, PLAIN)
+    percepts = rig.run_contact(100) + rig.run_contact(3, current_a=0.0)
+    assert percepts[-1].label == "lift-off"
+    for percept in percepts:
+        assert wire.decode(wire.encode(percept)) == percept
+    assert "lift-off 100%" in message_line(percepts[-1])
+    assert "velocity (" in message_line(percepts[0])
+    assert " mm/s" in message_line(percepts[0])
+
+
+def test_no_percepts_without_a_request(bench: Any) -> None:
+    rig = Rig(bench, frozenset([b"contact/", b"hand/"]), PLAIN)
+    rig.run_contact(20)
+    assert not rig.percepts.enabled
+    assert rig.percepts._perceiver is None
+    assert rig.demand.requested.percepts is None
+
+
+def test_percepts_stop_with_the_last_subscriber(bench: Any) -> None:
+    rig = Rig(bench, MOTION, PLAIN)
+    rig.run_contact(20)
+    assert rig.percepts.enabled
+    rig.subscriptions = frozenset()
+    rig.demand.update(rig.t_ns)
+    assert not rig.percepts.enabled
+    assert rig.run_contact(20) == []
+
+
+def test_scene_without_subscriber_keeps_percepts_running(bench: Any) -> None:
+    rig = Rig(bench, frozenset(), SceneRequest(links=("plane",), outputs=("motion",)))
+    assert rig.run_contact(50) == []
+    rig.subscriptions = MOTION
+    rig.demand.update(rig.t_ns)
+    (first, *_) = rig.run_contact(20)
+    assert first.evidence["samples"] > 50
+
+
+@pytest.mark.parametrize(
+    ("topic", "kinds"), [(b"percept/h/shape", {"shape"}), (b"percept/h/action_request", set(PERCEPT_KINDS))]
+)
+def test_only_subscribed_percepts_of_pads_in_the_scene_are_requested(
+    bench: Any, topic: bytes, kinds: set[str]
+) -> None:
+    rig = Rig(bench, frozenset([topic]), SceneRequest(links=("plane",)))
+    percepts = rig.demand.requested.percepts
+    assert percepts is not None
+    assert {kind for kind, pads in zip(PERCEPT_KINDS, percepts, strict=True) if pads.any()} == kinds
+    assert not percepts[:, 1:].any()
+    assert rig.demand.requested.position[PLANE]
+    assert rig.demand.requested.action_requests is not None
+    assert np.array_equal(
+        rig.demand.requested.action_requests, [topic.endswith(b"action_request"), False, False]
+    )
+    computed = rig.demand.describe_pads()[PLANE]["computed"]
+    assert kinds <= set(computed)
+
+
+@pytest.mark.parametrize(("residual", "axis"), [(0.02, 0), (-0.02, 1)])
+def test_pair_distance_follows_from_the_residual(bench: Any, residual: float, axis: int) -> None:
+    """In metres on the surface, along x of the pad or along y."""
+    rig = Rig(bench, MOTION, PLAIN)
+    assert np.isinf(rig.percepts._pair_distance_m(PLANE, residual, 1e-3)[1])  # no contact, no position
+    rig.run_contact(20)
+    locator, (x, y) = bench.model.locator, rig.pipeline.tick.columns.xy[PLANE].tolist()
+    on_sheet, std = pair_distance(locator, PLANE, x, y, residual, 1e-3)
+    points = np.array([x, y]) + np.outer([-0.5, 0.5], np.eye(2)[axis]) * on_sheet
+    placed = bench.model.placement.to_link_frame(
+        np.full(2, PLANE), points[:, 0], points[:, 1], np.zeros((2, 2, 2))
+    ).position_m
+    distance_m, std_m = rig.percepts._pair_distance_m(PLANE, residual, 1e-3)
+    assert distance_m == pytest.approx(float(np.linalg.norm(placed[1] - placed[0])), rel=1e-6)
+    assert std_m == pytest.approx(std * distance_m / on_sheet)
+
+
+def test_commanded_motion_replaces_missing_joint_states(bench: Any) -> None:
+    """Motion along the outward normal since the contact began, of pads with requested stiffness."""
+    rig = Rig(bench, frozenset([b"percept/h/stiffness"]), PLAIN)
+    requests: list[tuple[list[int], int]] = []
+    outward = np.array([0.0, 0.0, 1.0])
+
+    def poses(pads: Any, t_ns: int, commands_at: Any) -> Any:
+        requests.append((pads.tolist(), t_ns))
+        assert commands_at is _no_commands
+        closed_m = 1e-3 * len(requests)
+        return np.tile(np.c_[np.eye(3), closed_m * outward], (len(pads), 1, 1))
+
+    rig.pipeline.transforms.poses_from_joints = poses  # type: ignore[method-assign,assignment]
+    rig.run_contact(30)
+    perceiver = rig.percepts._perceiver
+    assert perceiver is not None
+    window = perceiver.buffer.window(PLANE)
+    assert requests[-1] == ([PLANE], rig.t_ns)
+    facing = float(window["commanded_normal"][-1] @ outward)
+    motion = window["commanded_m"]
+    assert motion[0] == 0.0
+    assert np.diff(motion) == pytest.approx(np.full(len(motion) - 1, 1e-3 * facing))

@@ -1,0 +1,116 @@
+"""Log levels of node and bus events by severity."""
+
+from __future__ import annotations
+
+import logging
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from handtouch.canbus.bus.bus_state import ErrorState
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
+from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.status_reporter import StatusReporter
+
+PERIOD_NS = 5_000_000
+SECOND_NS = 1_000_000_000
+
+
+class Rig:
+    """A reporter with a master and a bus whose states the test sets."""
+
+    def __init__(self, bench: Any) -> None:
+        self.events: list[NodeEvent | SerialChanged] = []
+        self.bus_state = SimpleNamespace(error_state=ErrorState.ACTIVE, problem="")
+        pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
+        master = SimpleNamespace(drain_events=self._drain, states=np.full(3, NodeState.OPERATIONAL))
+        port = SimpleNamespace(bus_state=self.bus_state, counters=SimpleNamespace(bits=0, overflow=0))
+        publisher = SimpleNamespace(has_subscriber=lambda _: False)
+        parts: tuple[Any, ...] = (pipeline, master, {"can0": port}, SimpleNamespace(), publisher)
+        self.reporter = StatusReporter(
+            bench.deployment,
+            *parts,
+            started_ns=0,
+            wall_offset_ns=lambda: 0,
+            process_statistics=dict,
+            refusals=dict,
+            input_statistics=lambda _: {},
+        )
+        self.now_ns = SECOND_NS
+
+    def has_subscriber(self, _: str) -> bool:
+        return False
+
+    def send(self, _: object) -> None:
+        raise AssertionError("no subscriber")
+
+    def poll(self) -> None:
+        self.now_ns += SECOND_NS
+        self.reporter.poll(self.now_ns)
+
+    def _drain(self) -> list[NodeEvent | SerialChanged]:
+        events, self.events = self.events, []
+        return events
+
+
+@pytest.fixture
+def rig(bench: Any, caplog: pytest.LogCaptureFixture) -> Rig:
+    caplog.set_level("INFO", "handtouch")
+    return Rig(bench)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "level"),
+    [
+        (NodeState.OPERATIONAL, NodeState.FAULTED, logging.ERROR),
+        (NodeState.OPERATIONAL, NodeState.ABSENT, logging.WARNING),
+        (NodeState.OPERATIONAL, NodeState.STALE, logging.WARNING),
+        (NodeState.SETTLING, NodeState.OPERATIONAL, logging.INFO),
+        (NodeState.ABSENT, NodeState.BOOTING, logging.INFO),
+        (NodeState.ABSENT, NodeState.ABSENT, logging.INFO),
+    ],
+)
+def test_node_events_are_logged_by_severity(
+    rig: Rig, caplog: pytest.LogCaptureFixture, old: NodeState, new: NodeState, level: int
+) -> None:
+    rig.events = [NodeEvent(0, rig.now_ns, old, new, "no heartbeat for 352 ms")]
+    rig.poll()
+    (record,) = [record for record in caplog.records if record.name == "handtouch.health"]
+    assert record.levelno == level
+    assert "(h/plane): " in record.getMessage()
+    assert record.getMessage().startswith("node 0x")
+    assert "no heartbeat for 352 ms" in record.getMessage()
+
+
+def test_replaced_node_is_a_warning(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    rig.events = [SerialChanged(1, rig.now_ns, 11, 21)]
+    rig.poll()
+    assert [r.levelno for r in caplog.records if r.name == "handtouch.health"] == [logging.WARNING]
+
+
+@pytest.mark.parametrize(
+    ("state", "level"),
+    [
+        (ErrorState.WARNING, logging.WARNING),
+        (ErrorState.PASSIVE, logging.WARNING),
+        (ErrorState.BUS_OFF, logging.ERROR),
+        (ErrorState.DOWN, logging.ERROR),
+    ],
+)
+def test_bus_states_are_logged_once_by_severity(
+    rig: Rig, caplog: pytest.LogCaptureFixture, state: ErrorState, level: int
+) -> None:
+    rig.poll()
+    rig.bus_state.error_state, rig.bus_state.problem = state, "check the cable"
+    rig.poll()
+    rig.poll()
+    rig.bus_state.error_state, rig.bus_state.problem = ErrorState.ACTIVE, ""
+    rig.poll()
+    lines = [(r.levelno, r.getMessage()) for r in caplog.records if r.name == "handtouch.bus"]
+    assert lines == [
+        (level, f"bus can0: active -> {state.value}: check the cable"),
+        (logging.INFO, f"bus can0: {state.value} -> active"),
+    ]

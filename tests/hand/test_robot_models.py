@@ -1,0 +1,198 @@
+"""Errors of a deployment that doesn't fit its URDF name file, key, value and remedy."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from handtouch.config import (
+    ConfigError,
+    Deployment,
+    load,
+    shipped,
+)
+from handtouch.hand import kinematics, urdf
+from handtouch.hand.body_distance import signed_distance_m
+from handtouch.hand.robot_models import (
+    RobotModels,
+    check_urdfs,
+    drop_invalid_urdfs,
+    unchecked_items,
+)
+from handtouch.hand.urdf import BodyShape, UrdfError
+
+LINK = '<link name="{}"/>'
+JOINT = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/></joint>'
+
+
+def robot(*parts: str) -> str:
+    return f"<robot>{''.join(parts)}</robot>"
+
+
+AB, ABC = [LINK.format(name) for name in "ab"], [LINK.format(name) for name in "abc"]
+FIXED = JOINT.format("j", "fixed", "a", "b")
+MOUNT = "mount = { position_mm = [26.0, 0.0, 12.5] }"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<robot><link", "isn't valid XML"),
+        ("<launch/>", "no <robot>"),
+        (robot(), "has no link"),
+        (robot("<link/>"), "without a name"),
+        (robot(LINK.format("a"), LINK.format("a")), "names must differ"),
+        (robot(*AB), "has the roots 'a', 'b'"),
+        (robot(LINK.format("a"), FIXED), 'child "b", which does not exist'),
+        (
+            robot(*ABC, *(JOINT.format(f"j{p}", "fixed", p, "c") for p in "ab")),
+            'link "c" is the child of joints "ja" and "jb"',
+        ),
+        (
+            robot(*ABC, JOINT.format("j", "fixed", "b", "c"), JOINT.format("k", "fixed", "c", "b")),
+            "cycle",
+        ),
+        (robot(*AB, JOINT.format("j", "floating", "a", "b")), 'is of type "floating"'),
+        (
+            robot(*AB, FIXED.replace("<parent", '<origin xyz="0 x 0"/><parent')),
+            '<origin xyz="0 x 0"> must be 3 numbers',
+        ),
+        (
+            robot('<link name="a"><collision><geometry><cone/></geometry></collision></link>'),
+            "has a <cone>; known are box",
+        ),
+    ],
+)  # fmt: skip
+def test_unusable_urdf_is_rejected_with_a_remedy(text: str, said: str) -> None:
+    with pytest.raises(UrdfError, match=re.escape(said)):
+        urdf.parse_urdf(text)
+
+
+def changed(tmp_path: Path, *changes: tuple[str, str], robot_text: str | None = None) -> Deployment:
+    text = shipped.path("utah_mit.toml").read_text()
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after, 1)
+    (tmp_path / "hand.toml").write_text(text)
+    (tmp_path / "utah_mit.urdf").write_text(robot_text or shipped.path("utah_mit.urdf").read_text())
+    return load(tmp_path / "hand.toml")
+
+
+def test_shipped_hand_fits_its_urdf() -> None:
+    deployment = check_urdfs(load(shipped.path("utah_mit.toml")), "utah_mit.toml")
+    assert not list(unchecked_items(deployment))
+    robots = RobotModels(deployment)
+    assert robots.hands == ["right"]
+    body = urdf.read_urdf(Path(deployment.hands[0].urdf or "")).bodies
+    for pad in deployment.hands[0].pads:
+        middle = np.array([pad.mount.position_mm]) * 1e-3
+        assert abs(signed_distance_m(body[pad.link], middle, Path())[0]) < 2e-4, pad.link
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (('urdf = "utah_mit.urdf"', 'urdf = "gone.urdf"'), "urdf = .*gone.urdf.*: No such file.*its path"),
+        (('palm_link = "palm"', 'palm_link = "plam"'), 'palm_link = "plam": .*did you mean "palm"'),
+        (('base_link = "base"', 'joint_names = { index_mpc = "x" }'), 'joint_names = "index_mpc".*index_mcp'),
+        (('link = "ring_distal"', 'link = "ring_tip"'), 'link = "ring_tip".*no such link.*mount.link'),
+        (
+            (MOUNT, MOUNT.replace("{", '{ link = "nowhere",')),
+            'mount.link = "nowhere"',
+        ),
+        (
+            ("position_mm = [26.0, 0.0, 12.5]", "position_mm = [26.0, 0.0, 2.5]"),
+            r"position_mm = \[26.0, 0.0, 2.5\]: the pad's centre is 10.0 mm inside the body.*move it",
+        ),
+        (("position_mm = [26.0, 0.0, 12.5]", "position_mm = [26.0, 0.0, 32.5]"), "20.0 mm from the body"),
+        (
+            (MOUNT, MOUNT.replace("]", "], rpy_deg = [180.0, 0.0, 0.0]")),
+            "faces into the body",
+        ),
+        (('urdf = "utah_mit.urdf"', ""), 'palm_link = "palm": .*needs a URDF'),
+    ],
+)  # fmt: skip
+def test_misfit_is_reported_with_key_value_and_remedy(
+    tmp_path: Path, change: tuple[str, str], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        check_urdfs(changed(tmp_path, change), "hand.toml")
+
+
+def test_hand_that_does_not_fit_is_served_in_link_frames_only(tmp_path: Path) -> None:
+    scene = ("[touch]", '[scene]\noutputs = ["position", "palm"]\n\n[touch]')
+    wrong = changed(tmp_path, scene, ('palm_link = "palm"', 'palm_link = "plam"'))
+    deployment, (problem,) = drop_invalid_urdfs(wrong, "hand.toml")
+    assert 'did you mean "palm"' in str(problem)
+    assert RobotModels(deployment).hands == []
+    assert deployment.hands[0].pads == wrong.hands[0].pads
+    right = changed(tmp_path, scene)
+    assert drop_invalid_urdfs(right, "hand.toml") == (right, ())
+
+
+def test_palm_output_needs_a_urdf_and_pinocchio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = ("[touch]", '[scene]\noutputs = ["palm"]\n\n[touch]')
+    names = [("urdf =", "# urdf ="), ("palm_link", "# palm_link"), ("base_link", "# base_link")]
+    with pytest.raises(ConfigError, match=r"\[scene\]: outputs.*needs a hand with a URDF"):
+        check_urdfs(changed(tmp_path, scene, *names), "hand.toml")
+    monkeypatch.setattr(kinematics, "pinocchio_available", lambda: False)
+    with pytest.raises(ConfigError, match=r"pip install 'handtouch\[urdf\]'"):
+        check_urdfs(changed(tmp_path, scene), "hand.toml")
+    without = check_urdfs(changed(tmp_path), "hand.toml")
+    assert RobotModels(without).hands == []
+    assert any("handtouch[urdf]" in doubt for doubt in unchecked_items(without))
+
+
+def test_joint_states_may_use_other_names(tmp_path: Path) -> None:
+    given = 'base_link = "base"\njoint_prefix = "r_"\njoint_names = { index_pip = "second" }'
+    (names,) = RobotModels(changed(tmp_path, ('base_link = "base"', given))).joint_names
+    assert {"r_index_mcp", "second"} <= set(names)
+
+
+SQUARES = [
+    ((0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)),
+    ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
+    ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
+    ((0, 1, 0), (0, 1, 1), (1, 1, 1), (1, 1, 0)),
+    ((0, 0, 0), (0, 0, 1), (0, 1, 1), (0, 1, 0)),
+    ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
+]
+
+
+def cube() -> str:
+    """The unit cube as an STL file."""
+    facets = [corners for a, b, c, d in SQUARES for corners in ((a, b, c), (a, c, d))]
+    text = "".join(
+        "facet normal 0 0 0 outer loop "
+        + " ".join(f"vertex {x} {y} {z}" for x, y, z in corners)
+        + " endloop endfacet\n"
+        for corners in facets
+    )
+    return f"solid\n{text}endsolid\n"
+
+
+def test_distances_from_bodies_equal_those_from_their_shapes(tmp_path: Path) -> None:
+    points = np.random.default_rng(5).uniform(-2, 2, (200, 3))
+    here = np.eye(3), np.zeros(3)
+    box = signed_distance_m([BodyShape("box", (2.0, 2.0, 2.0), *here)], points, tmp_path)
+    mesh = BodyShape("mesh", (2.0, 2.0, 2.0), np.eye(3), np.full(3, -1.0), "package://some/cube.stl")
+    (tmp_path / "some").mkdir()
+    (tmp_path / "some/cube.stl").write_text(cube())
+    np.testing.assert_allclose(signed_distance_m([mesh], points, tmp_path), box, atol=1e-6)
+    distance = np.linalg.norm(points, axis=1)
+    np.testing.assert_allclose(
+        signed_distance_m([BodyShape("sphere", (0.5,), *here)], points, tmp_path), distance - 0.5
+    )
+    around, along = np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2])
+    found = signed_distance_m([BodyShape("cylinder", (0.5, 2.0), *here)], points, tmp_path)
+    beside = along < 1
+    np.testing.assert_allclose(found[beside & (around > 0.5)], around[beside & (around > 0.5)] - 0.5)
+    np.testing.assert_allclose(found[~beside & (around < 0.5)], along[~beside & (around < 0.5)] - 1)
+    both = signed_distance_m(
+        [BodyShape("box", (2.0, 2.0, 2.0), *here), BodyShape("sphere", (0.5,), *here)], points, tmp_path
+    )
+    np.testing.assert_allclose(both, np.minimum(box, distance - 0.5))
+    assert np.isinf(signed_distance_m([], points, tmp_path)).all()

@@ -1,0 +1,110 @@
+"""`handtouch check` summarises a deployment, and warns of valid but questionable values."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from handtouch import config
+from handtouch.cli import check_text
+from handtouch.config import shipped
+from handtouch.procedures.check import find_warnings
+
+HAND = shipped.path("utah_mit.toml")
+TEXT = HAND.read_text()
+
+
+def warnings_of(*changes: tuple[str, str]) -> list[str]:
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return list(find_warnings(config.parse(text)))
+
+
+def test_shipped_hand_has_no_warnings(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check_text.run(HAND, as_json=False, schema=False) == 0
+    output = capsys.readouterr().out
+    assert "15 pads, load 43%" in output
+    assert "no warnings" in output
+
+
+def test_json_has_the_same_content(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check_text.run(HAND, as_json=True, schema=False) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["ok"] is True
+    assert report["buses"][0]["load"] == pytest.approx(0.43, abs=0.01)
+    assert [pad["link"] for pad in report["hands"][0]["pads"]][:2] == ["thumb_proximal", "thumb_middle"]
+
+
+def test_invalid_file_exits_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(TEXT.replace("drive_v", "drive"))
+    assert check_text.run(path, as_json=False, schema=False) == 2
+    assert capsys.readouterr().err.startswith(f"{path}: [node.four_channel]: drive = 5.0: unknown key")
+    assert check_text.run(path, as_json=True, schema=False) == 2
+    report = json.loads(capsys.readouterr().out)
+    assert report["ok"] is False
+    assert report["problems"][0]["value"] == "5.0"
+
+
+def test_invalid_object_exits_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(TEXT.replace("drive_v = 5.0", 'drive_v = 5.0\nexcitation_object = "0x2100:0"'))
+    assert check_text.run(path, as_json=False, schema=False) == 2
+    assert capsys.readouterr().err.startswith(
+        f'{path}: [node.four_channel]: excitation_object: "0x2100:0": its type'
+    )
+
+
+def test_unreachable_full_scale_is_a_warning() -> None:
+    (warning,) = warnings_of(("drive_v = 5.0", "drive_v = 5.0\nfull_scale_counts = 40000"))
+    assert "full_scale_counts = 40000: its channels reach at most 32767" in warning
+
+
+def test_warnings_exit_with_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(TEXT.replace("serial = 1001\n", ""))
+    assert check_text.run(path, as_json=False, schema=False) == 1
+    assert "warning: right: no serial for thumb_proximal:" in capsys.readouterr().out
+
+
+def test_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check_text.run(None, as_json=False, schema=True) == 0
+    assert json.loads(capsys.readouterr().out) == config.json_schema()
+
+
+def test_missing_arguments_are_wrong_usage() -> None:
+    assert check_text.run(None, as_json=False, schema=False) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ([("sync_period_ms = 5.0", "sync_period_ms = 2.8")], "load 75%: above 70%"),
+        ([("sync_period_ms = 5.0", "sync_period_ms = 1.0")], "exceeds the bus"),
+        (
+            [("bitrate_bit_s = 1_000_000", "bitrate_bit_s = 500_000")],
+            "last ones are used one period late",
+        ),
+        (
+            [("heartbeat_timeout_ms = 350", "heartbeat_timeout_ms = 150")],
+            "two heartbeat periods of 100 ms",
+        ),
+        ([("length_mm = 42.0", "length_mm = 120.0")], "3.8 times longer along x than along y"),
+        ([("contact_radius_mm = 2.5", "contact_radius_mm = 8")], "large for a pad of 16.6 mm"),
+        (
+            [("end_threshold_n = 0.03", "end_threshold_n = 0.0005")],
+            "the force that noise alone can read",
+        ),
+        ([('sheet = "firm"', 'sheet = "soft"')], "[sheet.firm]: no pad uses it"),
+        (
+            [("[node.f", '[[bus]]\nname = "b"\ninterface = "virtual"\nchannel = "b"\n[node.f')],
+            '[[bus]] "b": no pad is on it',
+        ),
+    ],
+)
+def test_questionable_values_are_warnings(changes: list[tuple[str, str]], expected: str) -> None:
+    assert [warning for warning in warnings_of(*changes) if expected in warning]

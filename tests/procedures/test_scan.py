@@ -1,0 +1,638 @@
+"""`handtouch scan` finds all nodes, names what differs from the deployment, and changes no node."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from handtouch import cli, config
+from handtouch.canbus.find import survey
+from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, find_four_channels
+from handtouch.canbus.find.traffic import Traffic, describe_identifier
+from handtouch.cli import scan_text
+from handtouch.config import shipped
+from handtouch.device import DeviceBus
+from handtouch.procedures.scan import (
+    BusReport,
+    ScanRequest,
+    channel_names,
+    compare_nodes,
+    fragment,
+    scan_buses,
+)
+
+_numbers = itertools.count()
+QUICK = ScanRequest(listen_s=0.05)
+SHEET = """
+[sheet.firm]
+ohm_per_square = 2400.0
+contact_ohm_mm2 = 20_000.0
+alpha = 1.5
+contact_radius_mm = 2.5
+contact_radius_std_mm = 0.5
+"""
+STANDARD = tuple(0x6401 << 16 | sub << 8 | 16 for sub in (1, 2, 3, 4))
+
+
+class VirtualBus:
+    """A virtual bus with nodes, and a listener that receives all frames."""
+
+    def __init__(self) -> None:
+        self.channel = f"scan{next(_numbers)}"
+        self.bus = config.Bus(name="can0", interface="virtual", channel=self.channel)
+        self.option = f"can0=virtual:{self.channel}"
+        self._buses: list[can.BusABC] = []
+        self._hosts: list[DeviceBus] = []
+        self.listener = self.open()
+
+    def open(self) -> can.BusABC:
+        self._buses.append(can.Bus(interface="virtual", channel=self.channel))
+        return self._buses[-1]
+
+    def nodes(self) -> DeviceBus:
+        """A host of nodes, with samples for 128."""
+        host = DeviceBus(self.open(), lambda _: np.zeros((128, 4), np.int16))
+        self._hosts.append(host)
+        return host
+
+    def received(self) -> list[can.Message]:
+        return list(iter(lambda: self.listener.recv(0), None))
+
+    def close(self) -> None:
+        for host in self._hosts:
+            host.stop()
+        for bus in self._buses:
+            bus.shutdown()
+
+
+@pytest.fixture
+def wire() -> Iterator[VirtualBus]:
+    bus = VirtualBus()
+    yield bus
+    bus.close()
+
+
+def started(wire: VirtualBus, count: int = 3, **kind: Any) -> DeviceBus:
+    """Nodes 0x11 … with serial numbers 1001 … ."""
+    nodes = wire.nodes()
+    for number in range(count):
+        nodes.add(0x11 + number, serial=1001 + number, **kind)
+    nodes.start()
+    return nodes
+
+
+def deployment(wire: VirtualBus, pads: int = 3, *changes: tuple[str, str]) -> config.Deployment:
+    """The shipped hand's first pads (nodes 0x11 …, serial numbers 1001 …), on the virtual bus."""
+    text = shipped.path("utah_mit.toml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    whole = config.parse(text)
+    hand = whole.hands[0].model_copy(update={"pads": whole.hands[0].pads[:pads]})
+    return config.with_bus(whole.model_copy(update={"hands": (hand,)}), wire.option)
+
+
+def problems(expected: config.Deployment | None, reports: list[BusReport]) -> dict[int, str]:
+    return {node.node_id: node.problem for node in compare_nodes(expected, reports) if node.problem}
+
+
+def completed(text: str) -> str:
+    """A fragment with its FILL IN lines completed, and a sheet."""
+    return re.sub(r"(?m)^# (.* # FILL IN)", r"\1", text) + SHEET
+
+
+def on_thread(act: Callable[[threading.Event], None]) -> Callable[[], None]:
+    """Run `act` in a thread; call the result to end it."""
+    stop = threading.Event()
+    thread = threading.Thread(target=act, args=(stop,))
+    thread.start()
+
+    def end() -> None:
+        stop.set()
+        thread.join()
+
+    return end
+
+
+def test_every_node_is_found_with_its_identity(wire: VirtualBus) -> None:
+    started(wire, 15)
+    (report,) = scan_buses([wire.bus], QUICK)
+    assert [node.node_id for node in report.nodes] == list(range(0x11, 0x20))
+    assert [node.serial for node in report.nodes] == list(range(1001, 1016))
+    assert not report.problems
+    for node in report.nodes:
+        assert (node.vendor_id, node.product_code, node.revision) == (0, 0x401, 0x10000)
+        assert node.answers
+        assert node.name
+        assert node.error == node.conflict == ""
+        (tpdo,) = node.tpdos
+        assert (tpdo.number, tpdo.cob_id, tpdo.mapping) == (2, 0x280 + node.node_id, STANDARD)
+        assert channel_names(node) == ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4")
+
+
+def test_lowest_and_highest_node_ids_are_found(wire: VirtualBus) -> None:
+    nodes = wire.nodes()
+    nodes.add(1)
+    nodes.add(127)
+    nodes.start()
+    (report,) = scan_buses([wire.bus], QUICK)
+    assert [node.node_id for node in report.nodes] == [1, 127]
+
+
+def test_scan_queries_each_id_once_and_sends_only_sdo_uploads(wire: VirtualBus) -> None:
+    started(wire, 2)
+    wire.received()
+    scan_buses([wire.bus], QUICK)
+    received = wire.received()
+    requests = [m for m in received if 0x600 < m.arbitration_id < 0x680]
+    others = [m for m in received if m.arbitration_id < 0x580 or m.arbitration_id > 0x780]
+    assert {m.arbitration_id - 0x600 for m in requests} == set(range(1, 128))
+    assert {m.data[0] & 0xE0 for m in requests} <= {0x40, 0x60}
+    silent = [m for m in requests if m.arbitration_id not in (0x611, 0x612)]
+    assert len(silent) == 125
+    assert others == []
+
+
+def test_scan_does_not_change_nmt_states(wire: VirtualBus) -> None:
+    nodes = started(wire, 2)
+    wire.listener.send(can.Message(arbitration_id=0, data=[1, 0x11], is_extended_id=False))
+    while nodes.devices[0x11].state != "OPERATIONAL":
+        time.sleep(0.001)
+    scan_buses([wire.bus], QUICK)
+    assert [nodes.devices[i].state for i in (0x11, 0x12)] == ["OPERATIONAL", "PRE-OPERATIONAL"]
+
+
+def test_listen_only_sends_no_frame(wire: VirtualBus) -> None:
+    (report,) = scan_buses([wire.bus], ScanRequest(listen_only=True, listen_s=0.1))
+    assert wire.received() == []
+    assert report.nodes == []
+    listener = wire.bus.model_copy(update={"role": "listener"})
+    (report,) = scan_buses([listener], ScanRequest(lss=True, listen_s=0.1))
+    assert wire.received() == []
+    assert "listener" in report.problems[0]
+
+
+def test_listen_only_detects_heartbeats_and_other_traffic_with_its_rate(wire: VirtualBus) -> None:
+    def talk(stop: threading.Event) -> None:
+        stranger = can.Bus(interface="virtual", channel=wire.channel)
+        while not stop.wait(0.005):
+            for can_id, data in ((0x705, [5]), (0x123, [1, 2, 3]), (0x80, [])):
+                stranger.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            stranger.send(can.Message(arbitration_id=0x1234567, is_extended_id=True))
+        stranger.shutdown()
+
+    end = on_thread(talk)
+    try:
+        (report,) = scan_buses([wire.bus], ScanRequest(listen_only=True, listen_s=0.3))
+    finally:
+        end()
+    assert [(node.node_id, node.state, node.answers) for node in report.nodes] == [(5, "operational", False)]
+    assert report.streams.keys() == {0x705, 0x123, 0x80}
+    assert report.streams[0x123].data_lengths == {3}
+    assert 20 < report.streams[0x123].rate_hz(0.3) <= 210
+    assert report.bus_load > 0
+    assert report.other_frames > 0
+
+
+def test_node_without_sdo_response_is_reported(wire: VirtualBus) -> None:
+    bus = wire.open()
+    end = on_thread(lambda stop: _send_heartbeats(bus, 0x711, stop))
+    try:
+        expected = deployment(wire, 1)
+        reports = scan_buses(expected.buses, QUICK)
+    finally:
+        end()
+    assert problems(expected, reports) == {0x11: "frames received, but no SDO response"}
+
+
+def _send_heartbeats(bus: can.BusABC, can_id: int, stop: threading.Event) -> None:
+    while not stop.wait(0.01):
+        bus.send(can.Message(arbitration_id=can_id, data=[5], is_extended_id=False))
+
+
+def test_hand_as_configured_has_no_problems(wire: VirtualBus) -> None:
+    started(wire)
+    expected = deployment(wire)
+    assert problems(expected, scan_buses(expected.buses, QUICK)) == {}
+
+
+def test_missing_and_swapped_nodes_are_reported_with_their_location(wire: VirtualBus) -> None:
+    nodes = wire.nodes()
+    nodes.add(0x11, serial=1002)
+    nodes.add(0x12, serial=1001)
+    nodes.start()
+    expected = deployment(wire)
+    found = problems(expected, scan_buses(expected.buses, QUICK))
+    assert found[0x11] == (
+        "another device: serial number is 1002, configured is 1001; serial 1001 is that of node 18 on can0"
+    )
+    assert found[0x12].startswith("another device: serial number is 1001")
+    assert found[0x13] == "missing: no frame received, no SDO response"
+
+
+def test_node_of_another_kind_is_reported(wire: VirtualBus) -> None:
+    started(wire, 1)
+    expected = deployment(wire, 1, ("drive_v", "product_code = 7\ndrive_v"))
+    assert problems(expected, scan_buses(expected.buses, QUICK)) == {
+        0x11: "another device: product code is 1025, configured is 7"
+    }
+
+
+def test_unmapped_channels_are_a_problem_only_if_remapping_is_not_allowed(wire: VirtualBus) -> None:
+    started(wire, 1)
+    channels = 'channels = ["0x2000:1:i16", "0x6401:2", "0x6401:3", "0x6401:4"]\n'
+    for remap, count in (("true", 0), ("false", 1)):
+        expected = deployment(wire, 1, ("drive_v", f"{channels}allow_pdo_remapping = {remap}\ndrive_v"))
+        assert len(problems(expected, scan_buses(expected.buses, QUICK))) == count
+
+
+def test_additional_nodes_are_no_problem(wire: VirtualBus) -> None:
+    started(wire, 3)
+    expected = deployment(wire, 2)
+    reports = scan_buses(expected.buses, QUICK)
+    assert problems(expected, reports) == {}
+    (other,) = [v for v in compare_nodes(expected, reports) if not v.pad]
+    assert (other.node_id, other.remark) == (0x13, "not in the deployment")
+
+
+def test_duplicate_node_ids_are_reported(wire: VirtualBus) -> None:
+    nodes = wire.nodes()
+    nodes.add(0x11, serial=1001)
+    nodes.add_twin(0x11, serial=1999)
+    nodes.start()
+    found = problems(None, scan_buses([wire.bus], QUICK))
+    assert found == {0x11: "two nodes with this id: serial numbers 1001 and 1999"}
+
+
+def test_several_buses_are_scanned_together() -> None:
+    wires = [VirtualBus(), VirtualBus()]
+    try:
+        for wire in wires:
+            started(wire, 2)
+        reports = scan_buses([wire.bus for wire in wires], QUICK)
+        assert [[node.node_id for node in report.nodes] for report in reports] == [[0x11, 0x12]] * 2
+    finally:
+        for wire in wires:
+            wire.close()
+
+
+def test_duplicate_cob_ids_are_reported(wire: VirtualBus) -> None:
+    started(wire, 2)
+    for data in ([0x23, 0x01, 0x18, 0x01, 0x91, 0x02, 0, 0x80], [0x23, 0x01, 0x18, 0x01, 0x91, 0x02, 0, 0]):
+        wire.listener.send(can.Message(arbitration_id=0x612, data=data, is_extended_id=False))
+    (report,) = scan_buses([wire.bus], QUICK)
+    assert report.problems == ["can0: identifier 0x291 is used by TPDO2 of node 17 and TPDO2 of node 18"]
+
+
+def test_reboots_and_emergencies_are_reported(wire: VirtualBus) -> None:
+    nodes = started(wire, 1)
+
+    def disturb(stop: threading.Event) -> None:
+        while not stop.wait(0.02):
+            nodes.devices[0x11].reboot()
+            nodes.devices[0x11].send_emergency(0x3100, 1)
+
+    end = on_thread(disturb)
+    try:
+        (report,) = scan_buses([wire.bus], ScanRequest(listen_only=True, listen_s=0.2))
+    finally:
+        end()
+    (node,) = compare_nodes(None, [report])
+    assert re.search(r"booted \d+ times; EMCY 0x3100 mains voltage", node.remark)
+
+
+@pytest.mark.parametrize(
+    ("file", "objects", "names"),
+    [
+        ("feldmann-ai4w.eds", [(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
+        ("noname-4ch.eds", [(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
+        ("norsens-quad404.eds", [(0x9130, sub) for sub in (1, 2, 3, 4)], ("0x9130:1", "0x9130:4")),
+        (
+            "tactor-q16.eds",
+            [(i, 0) for i in (0x2110, 0x2120, 0x2130, 0x2140)],
+            ("0x2110:0:i16", "0x2140:0:i16"),
+        ),
+    ],
+)
+def test_channels_of_other_vendors_nodes_are_found(
+    wire: VirtualBus, file: str, objects: list[tuple[int, int]], names: tuple[str, str]
+) -> None:
+    nodes = wire.nodes()
+    nodes.add(9, eds=Path(__file__).parents[1] / "data/eds" / file, channels=tuple(objects))
+    nodes.start()
+    (report,) = scan_buses([wire.bus], QUICK)
+    (node,) = report.nodes
+    found = channel_names(node)
+    assert (found[0], found[-1]) == names
+    (kind,) = config.parse(completed(fragment([(report.bus, report.nodes)]))).nodes.values()
+    assert kind.channels == found
+
+
+# Nodes that misbehave
+
+
+def answering(wire: VirtualBus, node_id: int, answer: Callable[[bytes], bytes | None]) -> Callable[[], None]:
+    """Run a node whose SDO server is `answer`."""
+    bus = wire.open()
+
+    def serve(stop: threading.Event) -> None:
+        while not stop.is_set():
+            request = bus.recv(0.05)
+            data = (
+                answer(bytes(request.data)) if request and request.arbitration_id == 0x600 + node_id else None
+            )
+            if data is not None:
+                bus.send(can.Message(arbitration_id=0x580 + node_id, data=data, is_extended_id=False))
+
+    return on_thread(serve)
+
+
+def test_endless_sdo_transfer_does_not_block_the_scan(
+    wire: VirtualBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(survey, "READ_TIMEOUT_S", 0.5)
+
+    def endless(request: bytes) -> bytes | None:
+        if request[0] == 0x40:
+            return bytes((0x40,)) + request[1:4] + bytes(4)
+        return bytes((request[0] & 0x10,)) + b"for ever"[:7] if request[0] & 0xE0 == 0x60 else None
+
+    end = answering(wire, 9, endless)
+    try:
+        (report,) = scan_buses([wire.bus], QUICK)
+    finally:
+        end()
+    (node,) = report.nodes
+    assert "no answer" in node.error
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_scan_ends_whatever_a_node_answers(wire: VirtualBus, seed: int) -> None:
+    chance = random.Random(seed)
+
+    def babble(request: bytes) -> bytes | None:
+        command = chance.choice((0x40, 0x41, 0x43, 0x4F, 0x00, 0x01, 0x10, 0x80, chance.getrandbits(8)))
+        return bytes((command,)) + request[1:4] + chance.randbytes(chance.choice((0, 4, 4, 4)))
+
+    end = answering(wire, 9, babble)
+    try:
+        reports = scan_buses([wire.bus], QUICK)
+    finally:
+        end()
+    assert len(compare_nodes(None, reports)) == len(reports[0].nodes) <= 1
+    assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.05"]) == 1  # the node has stopped
+
+
+# Nodes without a node id
+
+
+def unconfigured(wire: VirtualBus, serials: list[int]) -> tuple[DeviceBus, list[Any]]:
+    nodes = wire.nodes()
+    nodes.add(0x20, serial=77)
+    made = [nodes.add_unconfigured(serial=serial) for serial in serials]
+    nodes.start()
+    return nodes, made
+
+
+def test_lss_lists_unconfigured_nodes_without_changing_them(wire: VirtualBus) -> None:
+    _, made = unconfigured(wire, [3001, 9, 0xFFFFFFFF])
+    (report,) = scan_buses([wire.bus], ScanRequest(lss=True, listen_s=0.05))
+    assert [address.serial for address in report.unconfigured] == [9, 3001, 0xFFFFFFFF]
+    assert not report.problems
+    assert [each.lss.node_id for each in made] == [None] * 3
+    assert [node.node_id for node in report.nodes] == [0x20]
+
+
+def test_node_ids_are_assigned_upwards_in_the_order_of_serial_numbers(wire: VirtualBus) -> None:
+    _, made = unconfigured(wire, [3001, 9, 2002])
+    (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=0x1F, listen_s=0.05))
+    assert [each.lss.stored_id for each in made] == [0x22, 0x1F, 0x21]  # 0x20 is in use
+    assert not report.problems
+    assert {node.node_id: node.serial for node in report.nodes} == {0x1F: 9, 0x20: 77, 0x21: 2002, 0x22: 3001}
+
+
+def test_configured_serial_number_gets_its_configured_node_id(wire: VirtualBus) -> None:
+    _, made = unconfigured(wire, [1002, 5])
+    expected = deployment(wire)
+    scan_buses(expected.buses, ScanRequest(lss=True, first_assigned_id=0x11, listen_s=0.05), expected)
+    assert [each.lss.node_id for each in made] == [0x12, 0x14]  # 0x11 and 0x13 are reserved for their nodes
+
+
+def test_node_that_cannot_store_its_id_is_reported(wire: VirtualBus) -> None:
+    _, made = unconfigured(wire, [5])
+    made[0].lss.can_store = False
+    (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=9, listen_s=0.05))
+    assert list(report.assigned.values()) == [9]
+    assert "can't store its node id" in report.problems[0]
+
+
+def test_exhausted_node_ids_are_reported(wire: VirtualBus) -> None:
+    unconfigured(wire, [5, 6])
+    (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=127, listen_s=0.05))
+    assert list(report.assigned.values()) == [127]
+    assert "no free node id from 127 upwards" in report.problems[0]
+
+
+# The command
+
+
+def test_fragment_of_an_unknown_bus_is_a_valid_deployment(
+    wire: VirtualBus, capsys: pytest.CaptureFixture[str]
+) -> None:
+    started(wire, 3)
+    assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.05", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    made = config.parse(completed(report["fragment"]))
+    assert made.buses == (wire.bus,)
+    assert [(pad.node_id, pad.serial) for pad in made.hands[0].pads] == [
+        (0x11 + n, 1001 + n) for n in range(3)
+    ]
+    (kind,) = made.nodes.values()
+    assert (kind.vendor_id, kind.product_code) == (0, 0x401)
+    assert problems(made, scan_buses(made.buses, QUICK)) == {}
+
+
+def test_fragment_for_a_deployment_has_only_new_nodes(
+    wire: VirtualBus, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    started(wire, 2)
+    nodes = wire.nodes()
+    nodes.add(0x70, serial=7001)
+    nodes.add(0x71, serial=1003)
+    nodes.start()
+    path = shipped.path("utah_mit.toml")
+    assert cli.main(["scan", str(path), "--bus", wire.option, "--seconds", "0.05", "--json"]) == 1
+    text = json.loads(capsys.readouterr().out)["fragment"]
+    assert "[[bus]]" not in text
+    assert "[node." not in text  # the deployment already has this kind
+    assert 'node = "four_channel"' in text
+    added = path.read_text() + completed(text).replace(SHEET, "")
+    file = tmp_path / "hand.toml"
+    file.write_text(added)
+    assert [pad.serial for pad in config.load(file).hands[0].pads[15:]] == [7001]  # 1003 already has a pad
+
+
+def test_zero_and_shared_serial_numbers_are_omitted(wire: VirtualBus) -> None:
+    nodes = wire.nodes()
+    for node_id, serial in ((1, 0), (2, 0), (3, 5), (4, 5), (5, 6)):
+        nodes.add(node_id, serial=serial)
+    nodes.start()
+    (report,) = scan_buses([wire.bus], QUICK)
+    made = config.parse(completed(fragment([(report.bus, report.nodes)])))
+    assert [pad.serial for pad in made.hands[0].pads] == [None, None, None, None, 6]
+
+
+def test_text_lists_nodes_traffic_and_problems(wire: VirtualBus, capsys: pytest.CaptureFixture[str]) -> None:
+    started(wire, 1)
+    assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.3"]) == 0
+    output = capsys.readouterr().out
+    assert re.search(r"17 0x11 .*0x401 .*1001 .*0x6401:1 to 4 in TPDO2 \(every SYNC\)", output)
+    assert "heartbeat of node 17" in output
+    assert "no problems" in output
+
+
+def test_empty_bus_exits_with_status_1_and_a_remedy(
+    wire: VirtualBus, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.05"]) == 1
+    output = " ".join(capsys.readouterr().out.split())
+    assert "no node found; check power, bit rate (1000000 bit/s) and termination" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "give a deployment file, or a bus such as --bus can0=socketcan:can0"),
+        (["--bus", "can0"], "must be NAME=INTERFACE:CHANNEL"),
+        (["--bus", "1x=virtual:a"], 'name = "1x"'),
+        (["--bus", "a=nonsense:a"], "python-can knows"),
+        (["--bus", "a=virtual:a", "--bus", "a=virtual:b"], "used twice"),
+        (["--bus", "a=virtual:a", "--bus", "b=virtual:a"], 'is also the channel of bus "a"'),
+        (["--bus", "a=virtual:a,bitrate=5"], "bitrate_bit_s = 5"),
+        (["/nowhere/hand.toml"], "/nowhere/hand.toml"),
+    ],
+)
+def test_wrong_usage_exits_with_status_2_and_is_named(
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["scan", *arguments]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--listen", "--lss"], ["--assign", "0"], ["--assign", "200"], ["--lss-wait-ms", "0"]]
+)
+def test_invalid_options_exit_with_status_2(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["scan", "--bus", "a=virtual:a", *arguments])
+    assert ended.value.code == 2
+
+
+def test_missing_bus_exits_with_status_1_and_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert scan_text.run_scan(None, ["a=slcan:/dev/nowhere"], QUICK) == 1
+    assert "/dev/nowhere" in capsys.readouterr().err
+
+
+def test_device_names_cannot_inject_toml() -> None:
+    evil = 'x"\n[daemon]\nlive = "y" [red]'
+    node = NodeFacts(5, answers=True, name=evil.replace("\n", " "), tpdos=(tpdo(2, STANDARD),))
+    bus = config.Bus(name="can0", interface="virtual", channel='a"b')
+    made = config.parse(completed(fragment([(bus, [node])])))
+    assert made.buses[0].channel == 'a"b'
+    assert list(made.nodes) == ["x_daemon_live_y_red"]
+
+
+# Which objects are the channels
+
+
+def tpdo(number: int, mapping: tuple[int, ...]) -> TpdoFacts:
+    return TpdoFacts(number, 0x180, True, 1, 0, 0, mapping)
+
+
+def entries(*objects: tuple[int, int], bits: int = 16) -> tuple[int, ...]:
+    return tuple(index << 16 | sub << 8 | bits for index, sub in objects)
+
+
+@pytest.mark.parametrize(
+    ("tpdos", "names"),
+    [
+        ([STANDARD], ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4")),
+        # 32 bits in two TPDOs, after digital inputs
+        (
+            [
+                (0x60000108,),
+                entries((0x9130, 1), (0x9130, 2), bits=32),
+                entries((0x9130, 3), (0x9130, 4), bits=32),
+            ],
+            ("0x9130:1", "0x9130:2", "0x9130:3", "0x9130:4"),
+        ),
+        # a vendor's own objects, each its own index, between gaps of dummies
+        (
+            [(0x00050008, *entries((0x2001, 0), (0x2002, 0), (0x2003, 0), (0x2004, 0), bits=8), 0x00050008)],
+            ("0x2001:0:i8", "0x2002:0:i8", "0x2003:0:i8", "0x2004:0:i8"),
+        ),
+        # the first four of eight; process values go before the vendor's
+        (
+            [entries(*((0x2500, n) for n in range(1, 5))), entries(*((0x7130, n) for n in range(1, 5)))],
+            ("0x2500:1:i16", "0x2500:2:i16", "0x2500:3:i16", "0x2500:4:i16"),
+        ),
+        ([entries((0x6401, 1), (0x6401, 2), (0x6401, 3))], ()),
+        ([(0x00070020,) * 4], ()),
+        ([], ()),
+    ],
+)
+def test_four_channels_are_found_in_any_mapping(tpdos: list[tuple[int, ...]], names: tuple[str, ...]) -> None:
+    node = NodeFacts(5, tpdos=tuple(tpdo(n, mapping) for n, mapping in enumerate(tpdos, 1)))
+    assert channel_names(node) == names
+
+
+def test_unmapped_analogue_inputs_are_named() -> None:
+    assert channel_names(NodeFacts(5, inputs=4))[0] == "0x6401:1"
+    assert channel_names(NodeFacts(5, inputs=3)) == ()
+
+
+@given(st.lists(st.lists(st.integers(0, 0xFFFFFFFF), max_size=8), max_size=4))
+def test_channels_are_four_of_the_mapped_objects(mappings: list[list[int]]) -> None:
+    tpdos = [tpdo(n, tuple(mapping)) for n, mapping in enumerate(mappings, 1)]
+    chosen = find_four_channels(tpdos)
+    if chosen is not None:
+        objects, numbers = chosen
+        assert len(objects) == 4
+        assert len({entry & 0xFF for entry in objects}) == 1
+        assert all(any(entry in t.mapping for t in tpdos if t.number in numbers) for entry in objects)
+
+
+# Conclusions from frames
+
+
+def test_node_is_detected_only_by_frames_unique_to_it() -> None:
+    traffic = Traffic()
+    for can_id in (0x0, 0x80, 0x100, 0x185, 0x205, 0x606, 0x7E4, 0x123):
+        traffic.handle_frame(can_id, b"", 1)
+    assert traffic.detected_nodes() == set()
+    for can_id in (0x707, 0x588, 0x89):
+        traffic.handle_frame(can_id, b"\0", 2)
+    assert traffic.detected_nodes() == {7, 8, 9}
+    assert traffic.boot_up_counts == {7: 1}
+
+
+@given(st.integers(0, 0x7FF), st.binary(max_size=8))
+def test_every_frame_is_handled_and_described(can_id: int, data: bytes) -> None:
+    traffic = Traffic()
+    traffic.handle_frame(can_id, data, 1)
+    assert traffic.frame_statistics[can_id].count == 1
+    assert isinstance(describe_identifier(can_id, {}, {can_id & 0x7F}), str)
+    assert describe_identifier(can_id, {can_id: "TPDO9 of node 3"}, set()) or can_id == 0

@@ -1,0 +1,77 @@
+"""Reference forces and gravity are inputs of a tick: recorded with it, and replayed bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from handtouch import wire
+from handtouch.config import parse
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.sheet_force import ForceReference
+from handtouch.record.exact_replay import ExactReplay
+from handtouch.record.recording import Recording
+
+from .conftest import DEPLOYMENT, PERIOD_NS, SESSION, CollectingSink, Hand, RecordingSession
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> RecordingSession:
+    deployment = parse(DEPLOYMENT.replace("[touch]", "[sheet.s.behaviour]\ngain_std = 0.2\n\n[touch]"))
+    model = PadModel(deployment)
+
+    def make(take: Callable[[list[bytes]], None]) -> Hand:
+        sink = CollectingSink(take)
+        return Hand(deployment, Pipeline(model, PERIOD_NS, 0.6, sink, SESSION), sink)
+
+    made = RecordingSession(make, tmp_path_factory.mktemp("external"))
+    made.hand.step({})  # publishes the state once
+    return made
+
+
+def test_external_inputs_are_replayed_from_ticks_without_additional_states(session: RecordingSession) -> None:
+    hand, random = session.hand, np.random.default_rng(3)
+    states = sum(isinstance(m, wire.StateSnapshot) for m in hand.sink.messages)
+    samples = {0: hand.counts(0, 0.4, 0.3, 1e-3), 1: hand.counts(1, 0.5, 0.6, 2e-3)}
+    for tick in range(600):
+        if tick % 20 == 0:
+            down = random.normal(size=(2, 3))
+            hand.pipeline.external_inputs.set_gravity(down / np.linalg.norm(down, axis=1, keepdims=True))
+        if tick == 300:  # so that gravity has an effect
+            hand.pipeline.tick.baseline.gravity_slope[:] = random.normal(0, 5, (2, 4, 3))
+            hand.pipeline.tick.state_changed = True
+        if tick % 30 == 15 and tick > 300:
+            force = 1.3 * hand.pipeline.tick.sheet_force.force_n
+            hand.pipeline.external_inputs.add_force_reference(
+                ForceReference(np.array([1, 0]), force[::-1], 0.02 * force, hand.t_ns)
+            )
+        if tick == 450:
+            hand.pipeline.tick.state_changed = True  # a state between an input and its tick
+            hand.pipeline.external_inputs.add_force_reference(
+                ForceReference(np.array([0]), np.ones(1), np.ones(1), hand.t_ns)
+            )
+        hand.step(samples if tick > 40 else {0: b"\0" * 8, 1: b"\0" * 8})
+    gains = hand.pipeline.tick.sheet_force.log_gain
+    assert (np.abs(gains) > 0.02).all()
+    assert hand.pipeline.tick.baseline.gravity is not None
+    hand.pipeline.end_session(hand.t_ns + PERIOD_NS)
+    session.recorder.finish()
+    messages = hand.sink.messages
+    assert sum(isinstance(m, wire.StateSnapshot) for m in messages) == states + 2
+    assert sum("external_inputs" in m.extra_inputs for m in messages if isinstance(m, wire.TickInputs)) < 60
+    entries = list(Recording(Path(session.paths[0])))
+    starts = [number for number, entry in enumerate(entries) if entry.topic == "state"]
+    config = next(entry for entry in entries if entry.topic == "config")
+    for start in starts:
+        contacts: list[wire.Contact] = []
+        replay = ExactReplay(contacts.append)
+        for entry in [config, *entries[start:]]:
+            replay.process_message(entry)
+        assert replay.result.first_difference is None
+        assert replay.result.equal == replay.result.compared == len(contacts) > 100
+        assert replay.pipeline is not None
+        np.testing.assert_array_equal(replay.pipeline.tick.sheet_force.log_gain, gains)

@@ -1,0 +1,145 @@
+"""Replay of CAN logs through the live pipeline: the same contacts every time and in every format."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections import Counter
+from pathlib import Path
+
+import can
+import pytest
+
+from handtouch.cli import main
+from handtouch.cli.replay import speed_limiter
+from handtouch.config import Deployment, load, shipped
+from handtouch.record.replay_log import LogReplaySummary, replay_log
+from handtouch.simulate.score import score_contacts
+from handtouch.simulate.truth import GroundTruth, read_records
+from handtouch.wire import Contact
+
+DATA = Path(__file__).parents[1] / "data"
+PERIOD_MS = 20.0
+
+
+@pytest.fixture(scope="module")
+def deployment() -> Deployment:
+    made = load(shipped.path("utah_mit.toml"))
+    daemon = made.daemon.model_copy(update={"sync_period_ms": PERIOD_MS})
+    return made.model_copy(update={"daemon": daemon})
+
+
+@pytest.fixture(scope="module")
+def session(deployment: Deployment) -> tuple[list[Contact], LogReplaySummary]:
+    contacts: list[Contact] = []
+    summary = replay_log(DATA / "session.log.gz", deployment, contacts.append)
+    return contacts, summary
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> list[GroundTruth]:
+    file = tmp_path_factory.mktemp("truth") / "session.truth"
+    file.write_bytes(gzip.decompress((DATA / "session.truth.gz").read_bytes()))
+    return read_records(file, wall=True)
+
+
+def test_contacts_of_a_recorded_session_are_within_the_noise_bound(
+    session: tuple[list[Contact], LogReplaySummary], truth: list[GroundTruth]
+) -> None:
+    contacts, summary = session
+    result = score_contacts(contacts, truth)
+    assert result.total.missed == 0
+    assert result.total.false_positives == 0
+    assert result.total.rms_error_m < 1.5 * result.total.rms_bound_m
+    assert result.total.rms_force_error_n < 0.05
+    assert summary.contacts == sum(contact.event == "begin" for contact in contacts) == 24
+    assert {contact.end_reason for contact in contacts if contact.event == "end"} == {"released"}
+    assert summary.buses["can0"].wrong_length == 0
+
+
+def test_the_same_log_gives_identical_contacts_each_time(
+    session: tuple[list[Contact], LogReplaySummary], deployment: Deployment
+) -> None:
+    repeated: list[Contact] = []
+    replay_log(DATA / "session.log.gz", deployment, repeated.append)
+    assert repeated == session[0]
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc", ".csv"])
+def test_other_formats_of_python_can_give_the_same_contacts(
+    session: tuple[list[Contact], LogReplaySummary], deployment: Deployment, tmp_path: Path, suffix: str
+) -> None:
+    copy = tmp_path / f"session{suffix}"
+    with can.LogReader(DATA / "session.log.gz") as reader, can.Logger(copy) as writer:
+        for message in reader:
+            message.channel = 0  # some formats know numbers only
+            writer.on_message_received(message)
+    contacts: list[Contact] = []
+    replay_log(copy, deployment, contacts.append)
+    assert Counter((c.link, c.event) for c in contacts) == Counter((c.link, c.event) for c in session[0])
+    for one, other in zip(contacts, session[0], strict=True):  # some round their stamps
+        assert one.position_m == pytest.approx(other.position_m, abs=1e-6)
+
+
+def test_an_unreadable_log_is_named_with_the_supported_formats(
+    deployment: Deployment, tmp_path: Path
+) -> None:
+    log = tmp_path / "session.txt"
+    log.write_text("not a log")
+    with pytest.raises(ValueError, match=r"session\.txt.*candump"):
+        replay_log(log, deployment, lambda _: None)
+    with pytest.raises(OSError, match="no such log"):
+        replay_log(tmp_path / "absent.log", deployment, lambda _: None)
+
+
+def test_pacing_sleeps_until_a_stamp_is_due(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("time.sleep", slept.append)
+    monkeypatch.setattr("time.monotonic_ns", lambda: 7_000_000_000)
+    pace = speed_limiter(2.0)
+    pace(1_000_000_000)
+    pace(3_000_000_000)
+    assert slept == [pytest.approx(1.0)]
+    speed_limiter(0)(10**18)
+    assert len(slept) == 1
+
+
+def test_the_period_is_taken_from_the_syncs_of_the_log(
+    session: tuple[list[Contact], LogReplaySummary],
+) -> None:
+    repeated: list[Contact] = []
+    summary = replay_log(
+        DATA / "session.log.gz", load(shipped.path("utah_mit.toml")), repeated.append
+    )  # states 5 ms
+    assert summary.period_s == pytest.approx(PERIOD_MS * 1e-3, rel=0.05)
+    assert [c.position_m for c in repeated] == [c.position_m for c in session[0]]
+
+
+def test_a_log_without_a_sample_of_the_deployment_is_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "other.log"
+    log.write_text("(1.000000) can7 080#\n(1.000500) can7 1F1#00\n(1.020000) can7 080#\n")
+    assert main(["replay", str(log), str(shipped.path("utah_mit.toml"))]) == 1
+    err = capsys.readouterr().err
+    assert "no frame is a sample" in err
+    assert "1 unknown" in err
+
+
+def test_a_log_without_sync_is_ticked_by_the_timer(deployment: Deployment, tmp_path: Path) -> None:
+    log = tmp_path / "event_driven.log"
+    with can.LogReader(DATA / "session.log.gz") as reader, can.Logger(log) as writer:
+        for message in reader:
+            if message.arbitration_id != 0x80:
+                writer.on_message_received(message)
+    contacts: list[Contact] = []
+    summary = replay_log(log, deployment, contacts.append)
+    assert summary.contacts == 24
+
+
+def test_replay_prints_contacts_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    config = str(shipped.path("utah_mit.toml"))
+    status = main(["replay", str(DATA / "session.log.gz"), config, "--json"])
+    assert status == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(json.loads(text)["event"] == "begin" for text in lines) == 24

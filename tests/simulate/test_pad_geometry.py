@@ -1,0 +1,52 @@
+"""The simulator's geometry agrees with that of `handtouch.field`, which is computed independently."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from handtouch.config import SurfaceTable
+from handtouch.field.surface import SURFACES
+from handtouch.simulate.grasp.projection import project_to_surface
+from handtouch.simulate.pad_geometry import simulated_surface
+from tests.simulate.surfaces import SURFACE_TABLES
+
+POSITIONS = [(0.0, 0.0), (0.5, 0.5), (0.02, 0.9), (0.7, 0.3), (1.0, 1.0)]
+tables = pytest.mark.parametrize("table", SURFACE_TABLES.values(), ids=list(SURFACE_TABLES))
+
+
+def test_every_surface_of_a_deployment_can_be_simulated() -> None:
+    assert {table.kind for table in SURFACE_TABLES.values()} == set(SURFACES)
+
+
+@tables
+def test_points_and_normals_agree_with_field(table: SurfaceTable) -> None:
+    shape, surface = simulated_surface(table), table.build()
+    assert shape.length_m == pytest.approx(surface.extent_m[0], rel=1e-12)
+    for x, y in POSITIONS:
+        s, phi = x * shape.length_m, y * shape.arc
+        rectangle = surface.to_rectangle(s, phi * shape.radius(s))
+        np.testing.assert_allclose(shape.point(s, phi), surface.point(*rectangle), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(shape.normal(s, phi), surface.normal(*rectangle), rtol=0, atol=1e-9)
+
+
+@tables
+def test_isothermal_map_is_conformal(table: SurfaceTable) -> None:
+    metric = simulated_surface(table).metric
+    s = np.linspace(0.1, 0.9, 9) * metric.length_m
+    step = 1e-4 * metric.length_m
+    slope = (metric.isothermal(s + step) - metric.isothermal(s - step)) / (2 * step)
+    np.testing.assert_allclose(slope, 1 / metric.radius(s), rtol=1e-6)
+    assert metric.isothermal(0.0) == 0.0
+
+
+@tables
+def test_point_above_a_surface_projects_to_its_foot(table: SurfaceTable) -> None:
+    shape = simulated_surface(table)
+    for x, y in ((0.5, 0.5), (0.1, 0.9), (0.7, 0.3)):
+        s, phi = x * shape.length_m, y * shape.arc
+        above = shape.point(s, phi) + 1e-3 * shape.normal(s, phi)
+        foot = project_to_surface(shape, above[None])
+        np.testing.assert_allclose(foot.fraction[0], (x, y), atol=1e-7)
+        np.testing.assert_allclose(foot.height_m, 1e-3, atol=1e-8)
+        np.testing.assert_allclose(foot.normal[0], shape.normal(s, phi), atol=1e-6)

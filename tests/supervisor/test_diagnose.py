@@ -1,0 +1,245 @@
+"""Each fault is diagnosed by its own signature; a held object is no fault."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.config import shipped
+from handtouch.simulate.faults import FAULTS
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.world import World
+from handtouch.supervisor.diagnose import (
+    DiagnosisModel,
+    HandDiagnostics,
+    HandSamples,
+    PadDiagnosis,
+)
+from handtouch.supervisor.diagnose.contact_faults import ContactFault, Hypothesis, HypothesisTables
+from handtouch.supervisor.diagnose.descriptions import describe_contact_fault
+from handtouch.wire.faults import FaultKind
+
+PAD, SECOND = 13, 1_000_000_000
+LINK = "palm_thumb"
+Counts = NDArray[np.float64]
+_TABLES: dict[int, HypothesisTables] = {}
+
+
+@lru_cache(maxsize=1)
+def model() -> DiagnosisModel:
+    whole = DiagnosisModel.from_deployment(config.load(shipped.path("utah_mit.toml")), "right")
+    rows = slice(PAD, PAD + 2)
+    return DiagnosisModel(**{name: value[rows] for name, value in vars(whole).items()})
+
+
+def play(
+    contacts: Callable[[float, np.random.Generator], Counts], length_s: float, seed: int = 1
+) -> tuple[HandDiagnostics, list[PadDiagnosis]]:
+    """Half-second blocks at 100 Hz of two pads; `contacts` gives what the first reads at a time."""
+    rng, diagnosis, changes = np.random.default_rng(seed), HandDiagnostics(model(), tables=_TABLES), []
+    for first in np.arange(0, length_s, 0.5):
+        times = first + np.arange(50) / 100
+        counts = rng.normal(size=(50, 2, 4))
+        counts[:, 0] += [contacts(t, rng) for t in times]
+        stamps = np.repeat(np.rint((times + 1) * SECOND).astype(np.int64)[:, None], 2, axis=1)
+        read = np.clip(np.rint(counts), -32768, 32767).astype(np.int64)
+        changes += diagnosis.process_block(HandSamples(stamps, read, np.ones((50, 2), np.bool_)))
+    return diagnosis, changes
+
+
+def run(diagnosis: HandDiagnostics, counts: Callable[[Counts], NDArray[np.int64]], length_s: float) -> None:
+    """Half-second blocks at 100 Hz of counts (50, n, 4) by times (50,)."""
+    for first in np.arange(0, length_s, 0.5):
+        times = first + np.arange(50) / 100
+        read = counts(times)
+        stamps = np.repeat(np.rint((times + 1) * SECOND).astype(np.int64)[:, None], read.shape[1], axis=1)
+        diagnosis.process_block(HandSamples(stamps, read, np.ones(stamps.shape, np.bool_)))
+
+
+def simulate(
+    fault: dict[str, object], length_s: float, series_ohm: tuple[float, ...] = (0.0,) * 4
+) -> list[PadDiagnosis]:
+    """Return the diagnoses of one pad of the virtual hand, pressed all over while it has a fault."""
+    whole = config.load(shipped.path("utah_mit.toml"))
+    (hand,) = whole.hands
+    (pad,) = (pad for pad in hand.pads if pad.link == LINK)
+    pad = pad.model_copy(update={"series_ohm": series_ohm})
+    alone = whole.model_copy(update={"hands": (hand.model_copy(update={"pads": (pad,)}),)})
+    rng = np.random.default_rng(1)
+    touches = tuple(
+        ScenarioTouch(
+            link=LINK, from_s=at, duration_s=0.7, path=(tuple(rng.uniform(0.08, 0.92, 2)),), force_n=(2.0,)
+        )
+        for at in np.arange(0.5, length_s - 1, 1.0).tolist()
+    )
+    acting = FAULTS[str(fault["kind"])].model_validate(fault)
+    virtual = VirtualHand(alone, Scenario(touch=touches), World(3), faults=(acting,))
+    diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(alone, "right"))
+    run(diagnosis, lambda times: virtual.counts(0, times)[:, None], length_s)
+    return diagnosis.diagnoses()
+
+
+def fractions(x: float, y: float) -> Counts:
+    network = model().networks[0]
+    return np.asarray(network.fractions(x * network.a, y * network.b))
+
+
+def presses(t: float) -> Counts:
+    """One a second, half a second long, anywhere: the same at the same time."""
+    number, part = divmod(t, 1.0)
+    if part > 0.5:
+        return np.zeros(4)
+    rng = np.random.default_rng(int(number))
+    return np.asarray(fractions(*rng.uniform(0.1, 0.9, 2)) * np.exp(rng.uniform(6, 9)))
+
+
+def test_ordinary_presses_give_no_diagnosis() -> None:
+    diagnosis, changes = play(lambda t, _: presses(t), 40)
+    assert diagnosis.diagnoses() == []
+    assert changes == []
+
+
+@pytest.mark.parametrize("gains", [(0.96, 1, 1, 1), (0.98, 0.98, 1.02, 1.02)])
+def test_gains_within_tolerance_give_no_diagnosis_after_many_contacts(
+    gains: tuple[float, ...],
+) -> None:
+    _, changes = play(lambda t, _: presses(t) * gains, 100)
+    assert changes == []
+
+
+def test_gain_beyond_tolerance_is_a_gain_step() -> None:
+    diagnosis, _ = play(lambda t, _: presses(t) * (0.87, 1, 1, 1), 100)
+    assert [found.kind for found in diagnosis.diagnoses()] == [FaultKind.GAIN_STEP]
+
+
+def test_static_contact_without_tremor_is_gum() -> None:
+    diagnosis, _ = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 60)
+    (found,) = diagnosis.diagnoses()
+    assert found.kind == FaultKind.GUM
+    assert found.is_fault
+    assert found.link == model().links[0]
+    assert abs(found.published.since_ns - 6 * SECOND) <= SECOND
+    assert found.published.pad_m is not None
+    assert found.published.size_m is not None
+    assert found.published.pad_m[0] == pytest.approx(0.3 * 0.042, abs=1e-3)
+    assert found.published.pad_m[1] == pytest.approx(0.6 * 0.032, abs=1e-3)
+
+
+def test_static_contact_with_tremor_is_a_held_object() -> None:
+    def held(t: float, _: np.random.Generator) -> Counts:
+        rng = np.random.default_rng(int(3 * t))
+        x, y = 0.4 + 0.01 * rng.normal(size=2)
+        return fractions(x, y) * 2000 * np.exp(0.05 * rng.normal()) if t > 5 else np.zeros(4)
+
+    diagnosis, _ = play(held, 40)
+    (found,) = diagnosis.diagnoses()
+    assert found.kind == FaultKind.HELD_OBJECT
+    assert not found.is_fault
+
+
+@pytest.mark.parametrize("size", [-400.0, 400.0])
+def test_static_signal_of_one_channel_is_an_offset(size: float) -> None:
+    diagnosis, _ = play(lambda t, _: np.array([0, size if t > 5 else 0, 0, 0]), 40)
+    assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [(FaultKind.OFFSET, ("xa",))]
+
+
+def test_slowly_growing_leakage_is_moisture() -> None:
+    diagnosis, _ = play(lambda t, _: fractions(0.4, 0.4) * 2000 * max(0.0, -np.expm1(-(t - 5) / 30)), 60)
+    assert [f.kind for f in diagnosis.diagnoses()] == [FaultKind.MOISTURE]
+
+
+def test_open_electrode_is_a_dead_electrode() -> None:
+    network = model().networks[0]
+    broken = network.with_series_ohm([0, 0, np.inf, 0])
+
+    def read(t: float, _: np.random.Generator) -> Counts:
+        number, part = divmod(t, 1.0)
+        rng = np.random.default_rng(int(number))
+        x, y = rng.uniform(0.1, 0.9, 2)
+        return broken.fractions(x * network.a, y * network.b) * 3000 * (part < 0.5)
+
+    diagnosis, _ = play(read, 40)
+    assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [(FaultKind.DEAD_ELECTRODE, ("y0",))]
+
+
+def test_swapped_cables_are_named() -> None:
+    diagnosis, _ = play(lambda t, _: presses(t)[[0, 3, 2, 1]], 40)
+    assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [
+        (FaultKind.SWAPPED_CABLES, ("xa", "yb"))
+    ]
+
+
+def test_gain_step_is_diagnosed_with_its_factor() -> None:
+    diagnosis, _ = play(lambda t, _: presses(t) * [1, 1, 1.6, 1], 60)
+    (found,) = diagnosis.diagnoses()
+    assert (found.kind, found.electrodes) == (FaultKind.GAIN_STEP, ("y0",))
+    assert found.values["factor"] == pytest.approx(1.6, rel=0.1)
+
+
+def test_saturated_channel_ends_when_it_recovers() -> None:
+    diagnosis, changes = play(lambda t, _: np.array([0, 0, 0, 1e6 if 5 < t < 15 else 0]), 25)
+    assert diagnosis.diagnoses() == []
+    assert [f.kind for f in changes if f.until_ns is None] == [FaultKind.SATURATED_CHANNEL]
+    assert [f.electrodes for f in changes if f.until_ns is not None] == [("yb",)]
+
+
+def test_block_of_another_hand_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"must be \(m, 2, 4\)"):
+        HandDiagnostics(model()).process_block(
+            HandSamples(np.zeros((5, 3), np.int64), np.zeros((5, 3, 4), np.int64), np.ones((5, 3), np.bool_))
+        )
+
+
+def test_torn_corner_is_diagnosed_with_its_size() -> None:
+    fault = {"kind": "torn_corner", "link": LINK, "from_s": 0.0, "corner": "x0yb"}
+    fault |= {"along_x_mm": 17.0, "along_y_mm": 14.0}
+    (found,) = simulate(fault, 60)
+    assert (found.kind, found.electrodes) == (FaultKind.TORN_CORNER, ("x0", "yb"))
+    assert found.values["along_x_mm"] == pytest.approx(17, abs=5)
+    assert found.values["along_y_mm"] == pytest.approx(14, abs=5)
+
+
+def test_shorted_electrodes_are_observable_with_resistors() -> None:
+    fault = {"kind": "shorted_electrode", "link": LINK, "from_s": 0.0, "electrode": "x0", "to": "y0"}
+    (found,) = simulate(fault, 60, series_ohm=(500.0,) * 4)
+    assert (found.kind, found.electrodes) == (FaultKind.SHORTED_ELECTRODE, ("x0", "y0"))
+
+
+def test_drift_of_several_pads_is_common_drift() -> None:
+    whole = config.load(shipped.path("utah_mit.toml"))
+    (hand,) = whole.hands
+    few = whole.model_copy(update={"hands": (hand.model_copy(update={"pads": hand.pads[-5:]}),)})
+    late = ScenarioTouch(link=LINK, from_s=1000.0, duration_s=1.0, path=((0.5, 0.5),), force_n=(1.0,))
+    world = World(3, temperature_drift_k_per_s=0.4, offset_counts_per_k=8.0)
+    virtual = VirtualHand(few, Scenario(touch=(late,)), world)
+    diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(few, "right"))
+    run(diagnosis, lambda times: np.stack([virtual.counts(row, times) for row in range(5)], axis=1), 60)
+    faults = [found.kind for found in diagnosis.diagnoses() if found.is_fault]
+    assert len(faults) >= 2
+    assert set(faults) == {FaultKind.COMMON_DRIFT}
+
+
+def test_contacts_that_no_fault_explains_are_unexplained() -> None:
+    def nowhere(t: float, _: np.random.Generator) -> Counts:
+        rng = np.random.default_rng(int(t))
+        return rng.dirichlet(np.ones(4)) * 5000 * (t % 1 < 0.5)
+
+    diagnosis, _ = play(nowhere, 120)
+    assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [(FaultKind.UNEXPLAINED, ())]
+
+
+def test_ambiguous_gain_step_and_torn_corner_are_both_named() -> None:
+    gain = Hypothesis(FaultKind.GAIN_STEP, ("x0",), 0.7)
+    cut = Hypothesis(FaultKind.TORN_CORNER, ("x0", "yb"), 1.0, (0.5, 0.5))
+    fault = ContactFault(cut, (), 41.0, 0.6, SECOND, 20, gain)
+    found = describe_contact_fault(model(), 0, fault)
+    assert found.kind == FaultKind.UNEXPLAINED
+    assert "channel x0 collects too little" in found.published.cause
+    assert "torn at the corner of x0 and yb" in found.published.cause

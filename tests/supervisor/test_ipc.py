@@ -1,0 +1,104 @@
+"""Messages between daemon and supervisor process round-trip; anything else is refused."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from handtouch.calibration.auto_calibration import CalibrationState
+from handtouch.supervisor.ipc import (
+    CalibrationAssessment,
+    CalibrationUpdate,
+    WorkerConfig,
+    WorkerMessage,
+    WorkerMessageError,
+    WorkerStatus,
+    pack_worker_message,
+    unpack_block,
+    unpack_worker_message,
+)
+from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.faults import FaultKind
+
+from .conftest import Bench
+
+DIAGNOSIS = Diagnosis(
+    kind=FaultKind.GUM, cause="gum", evidence="40 s", remedy="wipe", since_ns=5, pad_m=(0.01, 0.02)
+)
+MESSAGES: list[WorkerMessage] = [
+    WorkerStatus(processed_ns=7, summary="2 calibrated"),
+    CalibrationUpdate(
+        pad=1, serial=9, calibration_id="9-3", gains=(1, 1, 1, 1.1), covariance=(0.0,) * 16, back_n=0.4
+    ),
+    CalibrationAssessment(
+        pad=0,
+        serial=None,
+        calibration_state=CalibrationState.MANUAL_REQUIRED,
+        calibration_progress="no number",
+        diagnoses=(DIAGNOSIS,),
+    ),
+]
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda message: message.kind)
+def test_message_round_trips(message: WorkerMessage) -> None:
+    assert unpack_worker_message(pack_worker_message(message)) == message
+
+
+@given(st.binary(max_size=200))
+def test_other_bytes_are_refused(data: bytes) -> None:
+    with pytest.raises(WorkerMessageError):
+        unpack_worker_message(data)
+
+
+@given(
+    st.sampled_from(MESSAGES),
+    st.sampled_from(
+        [
+            "kind",
+            "pad",
+            "serial",
+            "gains",
+            "covariance",
+            "calibration_state",
+            "diagnoses",
+            "processed_ns",
+            "extra",
+        ]
+    ),
+    st.none()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.lists(st.floats(), max_size=5)
+    | st.text(),
+)
+def test_message_with_any_other_value_is_valid_or_refused(
+    message: WorkerMessage, key: str, value: Any
+) -> None:
+    record = json.loads(pack_worker_message(message))
+    record[key] = value
+    try:
+        made = unpack_worker_message(json.dumps(record).encode())
+    except WorkerMessageError:
+        return
+    assert getattr(made, key) is not None or value is None
+    for gain in getattr(made, "gains", ()):
+        assert 0.1 <= gain <= 10
+
+
+def test_configuration_and_block_round_trip(bench: Bench) -> None:
+    again = WorkerConfig.load(bench.start.dump())
+    assert again.deployment == bench.deployment
+    assert again.default_calibration_ids == bench.start.default_calibration_ids
+    assert (again.ampere_per_count == bench.start.ampere_per_count).all()
+    counts = np.arange(60.0).reshape(5, 3, 4)
+    contact = np.arange(15, dtype=np.uint32).reshape(5, 3)
+    block = unpack_block(bench.block(counts, contact, 100), 3)
+    assert (block.counts == counts).all()
+    assert (block.contact_id == contact).all()
+    assert np.isnan(block.back_n).all()

@@ -1,0 +1,332 @@
+"""Supervisor worker: nodes are calibrated by contacts or from the store, and in quarantine until then."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from handtouch.calibration.calibration import (
+    Calibration,
+    Gains,
+    LawParameters,
+    Provenance,
+    matrix,
+)
+from handtouch.calibration.store import Store
+from handtouch.calibration.store_client import StoreClient
+from handtouch.supervisor.ipc import (
+    CalibrationAssessment,
+    CalibrationUpdate,
+    WorkerMessage,
+    WorkerStatus,
+    pack_manual_calibration,
+)
+from handtouch.supervisor.worker import SupervisorWorker
+
+from .conftest import LINKS, NOW, PERIOD_NS, Bench
+
+Session = list[Any]
+Swapped = tuple[list[WorkerMessage], Path]
+
+
+def make_worker(bench: Bench, path: Path) -> SupervisorWorker:
+    return SupervisorWorker(bench.start, StoreClient(path))
+
+
+def play(worker: SupervisorWorker, bench: Bench, session: Session, since: int = 0) -> list[WorkerMessage]:
+    """Return all messages while the recording is played."""
+    messages: list[WorkerMessage] = []
+    for number, (counts, contact) in enumerate(session):
+        message = bench.block(counts, contact, (since + number) * 13 * PERIOD_NS)
+        messages += worker.process_message(message, NOW)
+    return messages
+
+
+def assessment(messages: list[WorkerMessage], pad: int) -> CalibrationAssessment:
+    return [
+        message for message in messages if isinstance(message, CalibrationAssessment) and message.pad == pad
+    ][-1]
+
+
+def calibrations(messages: list[WorkerMessage], pad: int) -> list[CalibrationUpdate]:
+    return [message for message in messages if isinstance(message, CalibrationUpdate) and message.pad == pad]
+
+
+@pytest.fixture(scope="module")
+def swapped(
+    bench: Bench, session: Session, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[WorkerMessage], Path]:
+    """Replace three nodes; return the messages while their pads were touched, and the store."""
+    path = tmp_path_factory.mktemp("swapped") / "c.db"
+    worker = make_worker(bench, path)
+    messages = worker.process_message(bench.introduce([11, 12, 13], [1, 2, 3]), NOW)
+    messages += play(worker, bench, session)
+    worker.finish(NOW)
+    return messages, path
+
+
+def test_replaced_node_is_in_quarantine_with_a_remedy(bench: Bench, tmp_path: Path) -> None:
+    messages = make_worker(bench, tmp_path / "c.db").process_message(
+        bench.introduce([11, 2, 3], [1, None, None]), NOW
+    )
+    reported = assessment(messages, 0)
+    assert reported.calibration_state == "quarantined"
+    assert reported.diagnoses[0].kind == "node_replaced"
+    assert "node replaced: serial 1 -> 11" in reported.diagnoses[0].cause
+    assert "touch the pad all over" in reported.diagnoses[0].remedy
+    assert [assessment(messages, pad).calibration_state for pad in (1, 2)] == ["default", "default"]
+
+
+def test_contacts_calibrate_a_replaced_node(bench: Bench, swapped: Swapped) -> None:
+    messages, path = swapped
+    for pad in (0, 1):
+        assert assessment(messages, pad).calibration_state == "calibrated"
+        assert assessment(messages, pad).diagnoses == ()
+        last = calibrations(messages, pad)[-1]
+        off = np.log(last.gains) - np.log(bench.gains[pad])
+        deviation = np.sqrt(np.diag(np.reshape(last.covariance, (4, 4))))
+        assert np.abs(off).max() < 0.01
+        assert (np.abs(off) < 4 * deviation).all()
+    with Store(path) as store:
+        stored = store.versions(11)[0]
+    assert stored.provenance.method == "gains from contacts"
+    assert stored.provenance.contacts >= 32
+    assert 0 < stored.provenance.residual < 2  # less than 1: the model is better than assumed
+    assert (stored.provenance.hand, stored.provenance.link, stored.config) == (
+        "h",
+        "square",
+        "nominal-square",
+    )
+
+
+def test_gains_are_corrected_before_the_node_is_calibrated(bench: Bench, swapped: Swapped) -> None:
+    messages, _ = swapped
+    first = calibrations(messages, 1)[0]
+    assert first.calibration_id == "12-learning"
+    before = np.abs(np.log(bench.gains[1])).max()
+    assert np.abs(np.log(first.gains) - np.log(bench.gains[1])).max() < before / 2
+
+
+def test_pad_without_observable_gains_requires_manual_calibration(swapped: Swapped) -> None:
+    messages, _ = swapped
+    reported = assessment(messages, LINKS.index("strip"))
+    assert reported.calibration_state == "manual_required"
+    assert "can't be calibrated by contacts" in reported.diagnoses[0].evidence
+    assert "handtouch calibrate" in reported.diagnoses[0].remedy
+    assert calibrations(messages, 2) == []
+
+
+def test_stored_calibration_is_applied_at_once(bench: Bench, swapped: Swapped) -> None:
+    _, path = swapped
+    worker = make_worker(bench, path)
+    messages = worker.process_message(bench.introduce([11, 12, 5], [7, None, None]), NOW + timedelta(hours=1))
+    for pad, serial in ((0, 11), (1, 12)):
+        assert assessment(messages, pad).calibration_state == "calibrated"
+        (recalled,) = calibrations(messages, pad)
+        assert recalled.calibration_id.startswith(f"{serial}-")
+        assert np.log(recalled.gains) == pytest.approx(np.log(bench.gains[pad]), abs=0.01)
+        assert recalled.offset_counts == (0.0,) * 4
+
+
+def test_replacement_while_not_running_is_detected_by_the_store(bench: Bench, swapped: Swapped) -> None:
+    _, path = swapped
+    messages = make_worker(bench, path).process_message(bench.introduce([99, 12, 13]), NOW)
+    assert assessment(messages, 0).calibration_state == "quarantined"
+    assert "node replaced: serial 11 -> 99" in assessment(messages, 0).diagnoses[0].cause
+
+
+def test_calibration_under_other_tables_is_refused_and_reported(bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "c.db"
+    gains = Gains((1.1, 1.0, 1.0, 1.0), tuple((0.0,) * 4 for _ in range(4)))
+    with Store(path) as store:
+        store.write(11, "nominal-other", Calibration(gains), Provenance("by hand"), NOW)
+    messages = make_worker(bench, path).process_message(bench.introduce([11, 2, 3]), NOW)
+    assert calibrations(messages, 0) == []
+    assert assessment(messages, 0).calibration_state == "default"
+    assert "it was made under nominal-other" in assessment(messages, 0).calibration_progress
+
+
+def later(bench: Bench, worker: SupervisorWorker, seconds: float) -> list[WorkerMessage]:
+    """Return the messages after some seconds without contact."""
+    nothing = np.zeros((13, 3, 4)), np.zeros((13, 3), np.uint32)
+    return worker.process_message(bench.block(*nothing, round(seconds * 1e9)), NOW)
+
+
+def test_version_stored_by_another_process_is_applied_within_seconds(bench: Bench, swapped: Swapped) -> None:
+    """Applied as after a rollback: its gains are applied, and contacts refine them."""
+    worker = make_worker(bench, swapped[1])
+    worker.process_message(bench.introduce([11, 12, 5]), NOW)
+    assert all(isinstance(message, WorkerStatus) for message in later(bench, worker, 3.0))
+    gains = Gains((1.2, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
+    with Store(swapped[1]) as store:
+        newest = store.newest(11)
+        assert newest is not None
+        made = store.write(11, newest.config, Calibration(gains), Provenance("by hand"), NOW)
+    (applied,) = calibrations(later(bench, worker, 6.0), 0)
+    assert applied.calibration_id == made.calibration_id
+    assert applied.gains == pytest.approx(gains.factors)
+    with Store(swapped[1]) as store:  # for the tests after this one
+        store.roll_back(11, newest.number, Provenance(""), NOW)
+    (applied,) = calibrations(later(bench, worker, 9.0), 0)
+    assert newest.calibration.gains is not None
+    assert applied.gains == pytest.approx(newest.calibration.gains.factors)
+
+
+def test_manual_gains_end_quarantine_and_are_refined(bench: Bench, session: Session, tmp_path: Path) -> None:
+    worker = make_worker(bench, tmp_path / "c.db")
+    worker.process_message(bench.introduce([11, 12, 13], [1, 2, 3]), NOW)
+    gains, wide = (1.5, 1.0, 1.0, 1.0), tuple((1e-4 * (np.eye(4) - 0.25)).ravel().tolist())
+    message = CalibrationUpdate(pad=2, serial=13, calibration_id="bench.1", gains=gains, covariance=wide)
+    messages = worker.process_message(msgpack.unpackb(pack_manual_calibration(message, ["gains"])), NOW)
+    assert calibrations(messages, 2) == [message]  # sent again, as a stored version may have replaced it
+    assert (assessment(messages, 2).calibration_state, assessment(messages, 2).diagnoses) == (
+        "calibrated",
+        (),
+    )
+    assert "gains set or stored, known to 0.87 %" in assessment(messages, 2).calibration_progress
+    near = CalibrationUpdate(
+        pad=0, serial=11, calibration_id="bench", gains=tuple(1.1 * bench.gains[0]), covariance=wide
+    )
+    worker.process_message(msgpack.unpackb(pack_manual_calibration(near, ["gains"])), NOW)
+    last = calibrations(play(worker, bench, session), 0)[-1]
+    assert np.log(last.gains) == pytest.approx(np.log(near.gains), abs=0.01)  # with their common factor
+    assert (
+        worker.process_message(
+            msgpack.unpackb(pack_manual_calibration(near.model_copy(update={"serial": 99}), ["gains"])), NOW
+        )
+        == []
+    )
+
+
+def test_gains_out_of_range_are_reported_and_never_applied(
+    bench: Bench, session: Session, tmp_path: Path
+) -> None:
+    worker = make_worker(bench, tmp_path / "c.db")
+    worker.process_message(bench.introduce([11, 12, 13]), NOW)
+    wide = tuple((1e-2 * (np.eye(4) - 0.25)).ravel().tolist())
+    manual = CalibrationUpdate(pad=0, serial=11, calibration_id="bench", gains=(9.9,) * 4, covariance=wide)
+    worker.process_message(msgpack.unpackb(pack_manual_calibration(manual, ["gains"])), NOW)
+    messages = play(worker, bench, session)
+    assert all(max(message.gains) <= 10 for message in calibrations(messages, 0))
+    in_quarantine = [
+        message
+        for message in messages
+        if isinstance(message, CalibrationAssessment) and message.pad == 0 and message.diagnoses
+    ]
+    assert "beyond any amplifier's" in in_quarantine[0].diagnoses[0].cause
+
+
+def test_measured_law_ends_quarantine_of_a_pad_without_observable_gains(bench: Bench, tmp_path: Path) -> None:
+    worker = make_worker(bench, tmp_path / "c.db")
+    assert (
+        assessment(worker.process_message(bench.introduce([11, 12, 13], [1, 2, 3]), NOW), 2).calibration_state
+        == "manual_required"
+    )
+    law = LawParameters(21_000.0, 1.4, 2400.0, matrix(np.diag([1e-4, 1e-4, 1e-6])))
+    with Store(tmp_path / "c.db") as store:
+        store.write(13, "nominal-strip", Calibration(law=law), Provenance("guided session"), NOW)
+    messages = later(bench, worker, 3.0)
+    (applied,) = calibrations(messages, 2)
+    assert applied.law is not None
+    assert applied.law.alpha == 1.4
+    assert np.diag(np.reshape(applied.covariance, (4, 4))) == pytest.approx([0.05**2 * 0.75] * 4)
+    assert assessment(messages, 2).calibration_state == "calibrated"
+
+
+def test_calibration_taken_over_from_another_node_is_applied_and_reported(
+    bench: Bench, tmp_path: Path
+) -> None:
+    gains = Gains((1.1, 1.0, 1.0, 1.0), matrix(1e-6 * np.eye(4)))
+    taken = Provenance("gains from contacts", foreign="it was made for serial 9, not for 11")
+    with Store(tmp_path / "c.db") as store:
+        store.write(11, "nominal-square", Calibration(gains), taken, NOW)
+    worker = make_worker(bench, tmp_path / "c.db")
+    messages = worker.process_message(bench.introduce([11, 12, 13], [1, None, None]), NOW)
+    (applied,) = calibrations(messages, 0)
+    assert applied.covariance[0] > 0.04**2 * 0.75
+    (diagnosis,) = assessment(messages, 0).diagnoses
+    assert assessment(messages, 0).calibration_state == "default"
+    assert (diagnosis.kind, diagnosis.evidence) == ("foreign_calibration", taken.foreign)
+    assert "rollback" in diagnosis.remedy
+
+
+def test_nodes_without_a_unique_serial_number_are_not_calibrated(
+    bench: Bench, session: Session, tmp_path: Path
+) -> None:
+    worker = make_worker(bench, tmp_path / "c.db")
+    messages = worker.process_message(bench.introduce([7, 7, 0], [None, None, 3]), NOW)
+    assert "2 nodes have the serial number 7" in assessment(messages, 0).calibration_progress
+    assert assessment(messages, 2).calibration_state == "manual_required"
+    assert "no serial number" in assessment(messages, 2).calibration_progress
+    messages = play(worker, bench, session[:40])
+    assert not any(isinstance(message, CalibrationUpdate) for message in messages)
+    worker.finish(NOW)
+    with Store(tmp_path / "c.db") as store:
+        assert store.node_histories() == []
+
+
+def test_gain_step_puts_a_node_into_quarantine_until_recalibrated(
+    bench: Bench, session: Session, swapped: Swapped
+) -> None:
+    worker = make_worker(bench, swapped[1])
+    worker.process_message(bench.introduce([11, 12, 5]), NOW)
+    jump = np.array([1.3, 1.0, 1.0, 0.8])
+    messages = play(worker, bench, [(counts * jump, contact) for counts, contact in session])
+    reported = [
+        message for message in messages if isinstance(message, CalibrationAssessment) and message.pad == 0
+    ]
+    changed = next(message for message in reported if message.calibration_state == "quarantined")
+    assert changed.diagnoses[0].kind == "gains_changed"
+    assert reported[-1].calibration_state == "calibrated"
+
+
+def test_damaged_store_is_reported_moved_aside_and_replaced(bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "c.db"
+    with Store(path) as store:
+        store.write(11, "nominal-square", Calibration(), Provenance("by hand"), NOW)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
+    path.write_bytes(data)
+    client = StoreClient(path)
+    worker = SupervisorWorker(bench.start, client)
+    messages = worker.process_message(bench.introduce([11, 2, 3]), NOW)
+    assert "is damaged" in client.error
+    assert any("store" in diagnosis.kind for diagnosis in assessment(messages, 0).diagnoses)
+    assert len(list(tmp_path.glob("c.db.damaged-*"))) == 1
+    assert (
+        client.store_parts(11, worker._pads[0].mounting_point, Provenance("x"), NOW, gains=None) is not None
+    )
+
+
+def test_calibration_works_without_a_usable_store(bench: Bench, session: Session, tmp_path: Path) -> None:
+    path = tmp_path / "c.db"
+    path.write_text("not a store")
+    worker = make_worker(bench, path)
+    messages = worker.process_message(bench.introduce([11, 2, 3], [1, None, None]), NOW) + play(
+        worker, bench, session
+    )
+    assert assessment(messages, 0).calibration_state == "calibrated"
+    assert path.read_text() == "not a store"
+
+
+def test_storing_gains_keeps_parts_stored_before(bench: Bench, tmp_path: Path) -> None:
+    """A measured law, stored by another process meanwhile, stays when new gains are stored."""
+    client, mounting_point = (
+        StoreClient(tmp_path / "c.db"),
+        make_worker(bench, tmp_path / "c.db")._pads[0].mounting_point,
+    )
+    law = LawParameters(21_000.0, 1.4, 2400.0, matrix(np.diag([1e-4, 1e-4, 1e-6])))
+    gains = Gains((1.1, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
+    assert client.store_parts(11, mounting_point, Provenance("gains from contacts"), NOW, gains=gains)
+    with Store(tmp_path / "c.db") as store:
+        store.write(11, mounting_point.config, Calibration(gains=gains, law=law), Provenance("weights"), NOW)
+    later = Gains((1.2, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
+    stored = client.store_parts(11, mounting_point, Provenance("gains from contacts"), NOW, gains=later)
+    assert stored is not None
+    assert (stored.calibration.gains, stored.calibration.law) == (later, law)
+    client.close()

@@ -1,0 +1,130 @@
+"""Import graph: layers of docs/architecture.md, no cycle, no private module of another package."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src"
+PAGE = (ROOT / "docs" / "architecture.md").read_text()
+HEAVY = {"core": ("can", "canopen", "zmq"), "canbus": ("scipy",), "wire": ("can", "canopen", "zmq", "scipy")}
+"""Libraries that a package must not import."""
+
+Graph = dict[str, dict[str, int]]
+
+
+def _name(path: Path) -> str:
+    name = ".".join(path.relative_to(SOURCE).with_suffix("").parts)
+    return name.removesuffix(".__init__")
+
+
+FILES = {_name(path): path for path in SOURCE.rglob("*.py")}
+
+
+def _imports(module: str) -> Iterator[tuple[str, int]]:
+    """Yield every module that a module imports, at any depth, with its line."""
+    path = FILES[module]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                folder = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
+                parts = folder[: len(folder) - node.level + 1]
+                base = ".".join([*parts, *([node.module] if node.module else [])])
+            for alias in node.names:
+                full = f"{base}.{alias.name}"
+                yield (full if full in FILES else base), node.lineno
+
+
+@pytest.fixture(scope="module")
+def graph() -> Graph:
+    """Module -> imported module of handtouch -> line."""
+    found: Graph = defaultdict(dict)
+    for module in FILES:
+        for imported, line in _imports(module):
+            if imported.split(".")[0] == "handtouch" and imported != module:
+                found[module].setdefault(imported, line)
+    return found
+
+
+def _layers() -> dict[str, int]:
+    block = re.search(r"## Layers.*?```text\n(.*?)```", PAGE, re.DOTALL)
+    assert block is not None
+    return {package: level for level, line in enumerate(block[1].splitlines()) for package in line.split()}
+
+
+def _package(module: str) -> str:
+    """The package of a module; empty for handtouch itself, whose lazy imports are its public interface."""
+    return "" if module.count(".") == 0 or module == "handtouch.__main__" else module.split(".")[1]
+
+
+def _across(graph: Graph) -> Iterator[tuple[str, str, int]]:
+    for module, imported in graph.items():
+        for other, line in imported.items():
+            if _package(module) and _package(other) and _package(module) != _package(other):
+                yield module, other, line
+
+
+def test_every_package_has_a_layer_and_a_row_on_the_architecture_page() -> None:
+    packages = {_package(module) for module in FILES} - {""}
+    assert packages == _layers().keys()
+    assert packages == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))
+
+
+def test_imports_go_down_the_layers_only(graph: Graph) -> None:
+    level = _layers()
+    wrong = [
+        f"{module}:{line} imports {other}"
+        for module, other, line in _across(graph)
+        if level[_package(other)] >= level[_package(module)]
+    ]
+    assert not wrong
+
+
+def test_no_module_imports_a_private_module_of_another_package(graph: Graph) -> None:
+    wrong = [
+        f"{module}:{line} imports {other}"
+        for module, other, line in _across(graph)
+        if any(part.startswith("_") for part in other.split("."))
+    ]
+    assert not wrong
+
+
+def test_modules_import_each_other_in_no_cycle(graph: Graph) -> None:
+    """Also under TYPE_CHECKING and inside functions."""
+    try:
+        TopologicalSorter(
+            {module: set(imported) & FILES.keys() for module, imported in graph.items()}
+        ).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+@pytest.mark.parametrize("package", sorted(HEAVY))
+def test_a_package_imports_no_library_of_another_concern(package: str) -> None:
+    wrong = [
+        f"{module}:{line} imports {imported}"
+        for module in FILES
+        if _package(module) == package
+        for imported, line in _imports(module)
+        if imported.split(".")[0] in HEAVY[package]
+    ]
+    assert not wrong
+
+
+def test_class_names_are_unique() -> None:
+    places: dict[str, list[str]] = defaultdict(list)
+    for module, path in FILES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(f"{module}:{node.lineno}")
+    assert not {name: where for name, where in places.items() if len(where) > 1}
