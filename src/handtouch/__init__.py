@@ -31,3 +31,7 @@ def __getattr__(name: str) -> Any:
 
         return Robot
     raise AttributeError(f"module 'handtouch' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any, assert_type
@@ -200,3 +202,8 @@ def test_a_closed_subscriber_leaves_no_reader_in_the_event_loop(
                     publisher.send_multipart(_parts(seq))
 
     asyncio.run(main())
+
+
+def test_the_public_names_are_listed_before_their_first_use() -> None:
+    fresh = "import handtouch; assert set(handtouch.__all__) < set(dir(handtouch))"
+    subprocess.run([sys.executable, "-c", fresh], check=True, timeout=60)

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -125,6 +126,12 @@ def test_any_arguments_get_a_reply_and_ticks_continue(
         ("scene", {"links": ["thumb*"]}, "no pad is named"),
         ("scene", {"reset": True, "rate_hz": 5.0}, "send two requests"),
         ("scene", {"name": "a\nb"}, "name"),
+        (
+            "scene",
+            {"lease_s": 5.0, "rate_hz": 5.0},
+            "lease_s needs a name",
+        ),
+        ("scene", {"links": []}, 'to switch pads off, send disable with pads = ["*"]'),
         ("calibrate", {"pad": "*", "name": "c", "gains": [1] * 4, "offset_counts": [0] * 4}, "3 pads"),
         ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 3, "offset_counts": [0] * 4}, "gains"),
         ("calibrate", {"pad": "plane", "name": "c", "gains": [11] * 4, "offset_counts": [0] * 4}, "gains"),
@@ -328,3 +335,12 @@ def _change_sheet(served: Bench) -> None:
     sheet = served.deployment.sheets["s"].model_copy(update={"ohm_per_square": 3000.0})
     changed = served.deployment.model_copy(update={"sheets": {"s": sheet}})
     served.reloaded = lambda: changed
+
+
+def test_the_session_is_random_and_exact_as_a_double(served: Bench, tmp_path: Path) -> None:
+    endpoints = {stream: f"ipc://{tmp_path}/{stream}" for stream in ("live", "complete", "control", "inputs")}
+    again = Bench(served.deployment, PadModel(served.deployment), endpoints)
+    sessions = [made.daemon.publisher.session for made in (served, again)]
+    again.daemon.close()
+    assert sessions[0] != sessions[1]
+    assert all(0 <= session < 2**53 and abs(session - time.time()) > 1e6 for session in sessions)

@@ -40,7 +40,8 @@ def test_gravity_is_normalised_and_the_newest_value_holds(inputs: InputReceiver)
 @pytest.fixture
 def inputs() -> Any:
     with zmq.Context() as context:
-        states = {"right": JointStateBuffer(("a", "b"))}
+        limits = np.array([[-0.5, 1.5], [-np.inf, np.inf]])
+        states = {"right": JointStateBuffer(("a", "b"), limits=limits)}
         made = InputReceiver.open(context, "tcp://127.0.0.1:*", Authenticator.open(context), states, PADS)
         yield made
         made.close()
@@ -55,12 +56,20 @@ def joints(hand: str = "right", t_ns: int | None = NOW, names: tuple[str, ...] =
     [
         ([b"joints/right", b"\xc1"], "malformed", "msgpack"),
         ([b"joints/right"], "malformed", "1 parts"),
+        (
+            [b"joint/right", b""],
+            "unknown_topic",
+            "'joint/right'; the topics are joints/*, command/*, force/*",
+        ),
+        ([b"joints", b""], "unknown_topic", "'joints'; the topics are"),
         (joints("third"), "unknown_hand", "joints/third; the hands are left, right"),
         (joints("left"), "no_urdf", "joints/left"),
         (joints(names=("x", "y")), "unknown_joints", "joints/right has x, y; the URDF has a, b"),
         (joints(t_ns=NOW + 10**15), "clock", "s off; send nil"),
         (joints(t_ns=5), "clock", "s off"),
         (encode(JointCommand("right", NOW, ("x",), np.ones(1))), "unknown_joints", "command/right has x"),
+        (encode(JointState("right", NOW, ("a",), np.array([45.0]))), "joint_limits", "joints/right: a = 45"),
+        (encode(JointCommand("right", NOW, ("a",), np.array([1e6]))), "joint_limits", "command/right: a = 1"),
         (encode(LinkForces("right", NOW, ("toe",), np.ones(1), np.ones(1))), "unknown_link", "'toe'"),
     ],
 )
@@ -72,6 +81,13 @@ def test_unusable_message_is_counted_and_described(
     assert statistics["dropped"] == {cause: 1}
     assert detail in statistics["problem"]
     assert not statistics["received"]
+
+
+def test_the_problem_is_the_latest_one(inputs: Any) -> None:
+    inputs.process_message(joints(names=("x",)), NOW)
+    inputs.process_message([b"joints/right", b""], NOW)
+    inputs.process_message(joints(names=("y",)), NOW)
+    assert "joints/right has y" in inputs.problem
 
 
 def test_repeated_time_is_late_and_missing_time_means_now(inputs: Any) -> None:
@@ -117,6 +133,26 @@ def test_messages_read_per_period_are_bounded(inputs: Any) -> None:
             inputs.poll(NOW)
             assert sum(inputs.received.values()) - max(before, 0) <= 32
             before = sum(inputs.received.values())
+
+
+def test_misspelt_topic_is_counted_by_the_endpoint(inputs: Any) -> None:
+    with zmq.Context() as context, context.socket(zmq.PUB) as robot:
+        robot.connect(inputs.endpoint)
+        while not inputs.dropped:
+            robot.send_multipart([b"joint/right", b""])
+            inputs.poll(NOW)
+    assert inputs.dropped.keys() == {"unknown_topic"}
+
+
+def test_robot_client_refuses_an_unknown_hand(inputs: Any) -> None:
+    with Robot(inputs.endpoint, key="") as robot:
+        while not robot.wait_connected(0.05):
+            inputs.poll(NOW)
+        with pytest.raises(ValueError, match=r"'rihgt' is unknown; the hands of the daemon are left, right"):
+            robot.send_joints("rihgt", {"a": 0.1})
+        with pytest.raises(ValueError, match="unknown"):
+            robot.send_forces("rihgt", {"tip": 1.0}, 0.1)
+        robot.send_joints("right", {"a": 0.1})
 
 
 def test_robot_client_refuses_nan_and_missing_values(inputs: Any) -> None:

@@ -15,6 +15,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -223,14 +224,19 @@ def test_sigterm_ends_contacts_and_stops_the_configured_nodes(rig: Any) -> None:
     rig.simulate()
     rig.start("run")
     rig.wait_operational()
-    with rig.subscribe("contact/*/*") as messages:
-        begun = next(message for message in messages if message.event == "begin")
+    with rig.subscribe("contact/*/*", "service") as messages:
+        begun = next(message for message in messages if isinstance(message, wire.Contact))
         assert rig.end("run") == 0
-        last = begun
+        received = []
         while (message := messages.recv(1.0)) is not None:
-            if message.link == begun.link:
-                last = message
-        assert (last.event, last.end_reason) == ("end", "stopped")
+            received.append(message)
+    last = [message for message in received if getattr(message, "link", "") == begun.link][-1]
+    assert (last.event, last.end_reason) == ("end", "stopped")
+    services = [message for message in received if isinstance(message, wire.Service)]
+    assert [service.stopping for service in services] == [False] * (len(services) - 1) + [True]
+    ends = [getattr(message, "end_reason", "") == "stopped" for message in received]
+    assert received.index(services[-1]) < ends.index(True)
+    assert not any(Path(endpoint.removeprefix("ipc://")).exists() for endpoint in rig.endpoints.values())
     assert "Traceback" not in rig.all_printed()
     rig.start("run")  # which finds the nodes stopped, and wakes them
     rig.wait_operational()

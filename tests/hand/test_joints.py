@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.hand.joints import JointStateBuffer
+from handtouch.hand.joints import JointLimitsError, JointStateBuffer
 
 MS = 1_000_000
 NAMES = ("a", "b", "c")
@@ -86,3 +86,17 @@ def test_memory_is_bounded() -> None:
         states.add_state((1000 + number) * MS, ("a",), np.zeros(1))
     assert len(states._sources) <= 16
     assert max(len(kept) for _, _, kept in states._sources.values()) <= 64
+
+
+def test_positions_far_beyond_the_limits_are_rejected_and_leave_no_trace() -> None:
+    limits = np.array([[-0.5, 1.5], [0.0, 0.0], [-np.inf, np.inf]])  # b: a URDF without values
+    states = JointStateBuffer(NAMES, limits=limits)
+    for degrees in (30.0, -10.0):
+        with pytest.raises(JointLimitsError, match=rf"a = {degrees:.0f}, limits -0.5 to 1.5; send radians"):
+            states.add_state(100 * MS, NAMES, np.array([degrees, 0.0, 0.0]))
+    assert np.isnan(states.interpolate(100 * MS).position_rad).all()
+    for accepted in (-2.5, 3.5):  # an encoder's zero may be off
+        assert states.add_state(round(100 + accepted) * MS, ("a",), np.array([accepted]))
+    assert states.add_state(100 * MS, NAMES, np.array([0.0, 1e3, 1e3]))
+    with pytest.raises(JointLimitsError):
+        states.empty_copy().add_state(100 * MS, ("x", "a"), np.array([0.0, 1e6]))

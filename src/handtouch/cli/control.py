@@ -156,7 +156,7 @@ def _add_scene(commands: Subparsers) -> None:
         "--links",
         type=comma_separated,
         metavar="PATTERNS",
-        help='links in use, such as "thumb_*,index_*"; "" for none: their pads are switched off',
+        help='links in use, such as "thumb_*,index_*"; the other pads are switched off',
     )
     scene.add_argument(
         "--outputs",

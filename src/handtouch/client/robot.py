@@ -25,6 +25,7 @@ from handtouch.wire.inputs import (
     JointState,
     LinkForces,
     encode,
+    hands_in_prefix,
 )
 
 _QUEUE_MESSAGES = 16
@@ -37,12 +38,13 @@ class Robot:
     Messages sent before the connection is up are lost: call `wait_connected` where the first one matters.
     `key` as for `connect`; it needs the right `control`. Messages that the daemon can't use are counted by
     cause in `inputs` of its `service` message. Raises ValueError for an invalid endpoint or an unusable key
-    file; sending raises PermissionError when the daemon rejects this client.
+    file; sending raises PermissionError when the daemon rejects this client, and, once connected, ValueError
+    for a hand that the daemon doesn't have.
     """
 
     def __init__(self, endpoint: str = INPUTS_ENDPOINT, key: Path | str | None = None) -> None:
         self.endpoint = endpoint
-        self._subscribed: set[bytes] = set()
+        self._hands: frozenset[str] = frozenset()  # of the connected daemon
         options = {zmq.SNDHWM: _QUEUE_MESSAGES, zmq.LINGER: _LINGER_MS, **RECONNECT_OPTIONS}
         self._connection = Connection.open(zmq.XPUB, endpoint, key, options)
 
@@ -103,12 +105,12 @@ class Robot:
         Raises PermissionError when the daemon rejects this client.
         """
         end_s = time.monotonic() + timeout_s
-        while not self._subscribed:
+        while not self._hands:
             left_ms = max(0, round((end_s - time.monotonic()) * 1000))
             if not self._connection.poll(left_ms) and left_ms == 0:
                 break
             self._read_subscriptions()
-        return bool(self._subscribed)
+        return bool(self._hands)
 
     def __enter__(self) -> Self:
         return self
@@ -123,6 +125,9 @@ class Robot:
     def _send(self, message: InputMessage) -> None:
         self._connection.poll(0)
         self._read_subscriptions()
+        if self._hands and message.hand not in self._hands:
+            known = ", ".join(sorted(self._hands))
+            raise ValueError(f"hand {message.hand!r} is unknown; the hands of the daemon are {known}")
         self._connection.socket.send_multipart(encode(message), zmq.NOBLOCK)  # dropped when the queue is full
 
     def _read_subscriptions(self) -> None:
@@ -131,7 +136,8 @@ class Robot:
                 request = self._connection.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            (self._subscribed.add if request[:1] == b"\x01" else self._subscribed.discard)(request[1:])
+            if hands := hands_in_prefix(request[1:].decode("utf-8", "replace")):
+                self._hands = hands if request[:1] == b"\x01" else frozenset()
 
 
 def _to_array(values: Mapping[str, float], names: tuple[str, ...]) -> NDArray[np.float64]:

@@ -149,6 +149,8 @@ class ControlCommands:
             given["rate_hz"] = None
         if given and request.reset:
             raise RefusedError("reset can't be combined with other changes; send two requests")
+        if request.name is None:
+            _check_base_scene(request)
         scenes = self._demand.scenes
         try:
             if request.name is not None:
@@ -294,3 +296,16 @@ class ControlCommands:
             return select_pads(patterns, self._pad_names)
         except ValueError as error:
             raise RefusedError(str(error)) from error
+
+
+def _check_base_scene(request: _SceneArguments) -> None:
+    """Raise RefusedError for changes of the base scene that only a client's scene should make."""
+    if "lease_s" in request.model_fields_set:
+        raise RefusedError(
+            'lease_s needs a name: the base scene lasts until reset; for your own scene add name = "NAME"'
+        )
+    if request.links == ():
+        raise RefusedError(
+            "links = [] would switch off every pad until reset; to switch pads off, send disable with "
+            'pads = ["*"]; for a scene of your own add name = "NAME" and lease_s'
+        )

@@ -49,6 +49,7 @@ from handtouch.daemon import stage_timer
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.commands import ControlCommands
 from handtouch.daemon.control import ControlServer, open_control_socket
+from handtouch.daemon.endpoints import remove_socket_file
 from handtouch.daemon.inputs import InputReceiver
 from handtouch.daemon.joint_messages import JointPublisher
 from handtouch.daemon.metrics import MetricsExporter
@@ -78,7 +79,7 @@ _BACKGROUND_PERIOD_NS = 4_000_000
 _MESSAGE_PATH_THREADS = 3
 """Threads that a message passes, each waking the next: ZeroMQ's on both sides, and the subscriber's"""
 _GIL_SWITCH_INTERVAL_S = 0.0005  # limits how long a thread that boots a node or builds a model holds the GIL
-_SESSION_BITS = 48  # exact in every language's numbers
+_SESSION_BITS = 53  # exact where numbers are doubles
 
 
 class StartError(Exception):
@@ -169,6 +170,8 @@ class HandtouchDaemon:
         files = deployment_files(deployment)
         pipeline.journal.publish_config(deployment, files, build_info(), now_ns)
         self.demand.update(now_ns)
+        for endpoint in (*publisher.endpoints.values(), self.control.endpoint, inputs.endpoint):
+            self._stack.callback(remove_socket_file, endpoint)
 
     @classmethod
     def open(
@@ -242,6 +245,8 @@ class HandtouchDaemon:
             self._loop(stop, on_tick)
         finally:
             now_ns = time.monotonic_ns()
+            self.publisher.release()
+            self.reporter.publish_stopping(now_ns)
             self.sync.stop()
             self.pipeline.end_session(now_ns)
             self.master.stop(now_ns)
@@ -464,7 +469,7 @@ def _open_resources(
     opened.callback(control_socket[0].close)
     pipeline = Pipeline(model, period_ns, settings.sample_window_fraction, publisher, session, robots)
     parts = zip(robots.hands, robots.joint_names, robots.kinematics, strict=True)
-    joints = {hand: JointStateBuffer(names, kinematics.continuous) for hand, names, kinematics in parts}
+    joints = {hand: JointStateBuffer(names, of.continuous, of.limits) for hand, names, of in parts}
     inputs = InputReceiver.open(
         context,
         settings.inputs,

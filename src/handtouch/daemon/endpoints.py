@@ -1,10 +1,11 @@
 """ZeroMQ endpoints of the daemon: bind a socket with access control, or raise an error that names a remedy.
 
-Public names: `bind_endpoint`, `is_readable`.
+Public names: `bind_endpoint`, `remove_socket_file`, `is_readable`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import socket as stdlib_socket
 from pathlib import Path
 from typing import Protocol
@@ -42,6 +43,16 @@ def bind_endpoint(
         socket.close()
         raise
     return socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+
+def remove_socket_file(endpoint: str) -> None:
+    """Remove the file of an ipc endpoint, which ZeroMQ leaves behind; call it before the socket is closed.
+
+    Until then no other daemon can have replaced the file by its own.
+    """
+    if endpoint.startswith("ipc://") and not endpoint.startswith("ipc://@"):
+        with contextlib.suppress(OSError):
+            Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
 
 
 def is_readable(socket: zmq.Socket[bytes]) -> bool:

@@ -20,15 +20,24 @@ from handtouch.core.sheet_force import ForceReference
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.cause_counter import CauseCounter
 from handtouch.daemon.endpoints import bind_endpoint, is_readable
-from handtouch.hand.joints import JointSnapshot, JointStateBuffer
-from handtouch.wire import WireError
-from handtouch.wire.inputs import InputMessage, JointCommand, JointState, LinkForces, decode
+from handtouch.hand.joints import JointLimitsError, JointSnapshot, JointStateBuffer
+from handtouch.wire import UnknownTopicError, WireError
+from handtouch.wire.inputs import (
+    InputMessage,
+    JointCommand,
+    JointState,
+    LinkForces,
+    decode,
+    hands_prefix,
+)
 
 DROP_CAUSES = {
+    "unknown_topic": "no such topic",
     "malformed": "message is malformed",
     "unknown_hand": "hand is not in the deployment",
     "no_urdf": "joint states of a hand without URDF",
     "unknown_joints": "none of the joints belongs to the hand",
+    "joint_limits": "joint position is far beyond its limits in the URDF",
     "unknown_link": "link has no pad",
     "clock": "t_ns is not of this host's monotonic clock",
     "late": "t_ns is not newer than in the previous message with these names",
@@ -83,8 +92,8 @@ class InputReceiver:
         socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.RCVHWM, _QUEUE_MESSAGES)
-        for prefix in ("joints/", "command/", "force/"):
-            socket.subscribe(prefix)
+        socket.subscribe("")  # everything, to count misspelt topics
+        socket.subscribe(hands_prefix(hand for hand, _ in pads))
         bound = bind_endpoint(socket, endpoint, "the inputs endpoint", authenticator, "inputs")
         return cls(socket, bound, joints, pads, on_force_reference)
 
@@ -95,7 +104,7 @@ class InputReceiver:
 
     @property
     def problem(self) -> str:
-        """Text of the problem logged last, empty before the first."""
+        """Cause of the message dropped last, as text; empty before the first."""
         return self._drops.last_problem
 
     def poll(self, now_ns: int) -> None:
@@ -111,7 +120,8 @@ class InputReceiver:
         try:
             message = decode(parts)
         except WireError as error:
-            self._drops.add("malformed", str(error), now_ns)
+            cause = "unknown_topic" if isinstance(error, UnknownTopicError) else "malformed"
+            self._drops.add(cause, str(error), now_ns)
             return
         topic = parts[0].decode()
         if message.hand not in self._hands:
@@ -175,12 +185,15 @@ class InputReceiver:
         self, message: JointState | JointCommand, states: JointStateBuffer, topic: str, t_ns: int, now_ns: int
     ) -> bool:
         late, names, position = states.late_count, message.names, message.position_rad
-        if isinstance(message, JointState):
-            kept = states.add_state(t_ns, names, position, message.velocity_rad_s, message.position_std_rad)
-            if kept and message.gravity is not None:
-                self._gravity_by_hand[message.hand] = message.gravity
-        else:
-            kept = states.add_state(t_ns, names, position)
+        measured = message if isinstance(message, JointState) else None
+        velocity, std = (measured.velocity_rad_s, measured.position_std_rad) if measured else (None, None)
+        try:
+            kept = states.add_state(t_ns, names, position, velocity, std)
+        except JointLimitsError as error:
+            self._drops.add("joint_limits", f"{topic}: {error}", now_ns)
+            return False
+        if kept and measured and measured.gravity is not None:
+            self._gravity_by_hand[message.hand] = measured.gravity
         if not kept and states.late_count > late:
             self._drops.add("late", topic, now_ns)
         elif not kept:

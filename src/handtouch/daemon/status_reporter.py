@@ -155,6 +155,11 @@ class StatusReporter:
             self._service_seq += 1
             self._publish("service", partial(self._make_service, now_ns))
 
+    def publish_stopping(self, now_ns: int) -> None:
+        """Publish the last `service` message of the session."""
+        self._service_seq += 1
+        self._publish("service", lambda: replace(self._make_service(now_ns), stopping=True))
+
     def retained_messages(self) -> dict[str, Callable[[int], wire.OutgoingMessage | None]]:
         """Return, by topic, functions that make the retained message at a time [ns]."""
         pads = {topic: partial(self._retained_health, pad) for pad, topic in enumerate(self._topics)}

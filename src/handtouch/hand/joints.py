@@ -1,7 +1,7 @@
 """Joint states reported by a robot, interpolated to the times of touch samples.
 
-Public names: `JointStateBuffer`, `JointSnapshot`. Times are ns of the host's monotonic clock; positions are
-radians, metres for prismatic joints.
+Public names: `JointStateBuffer`, `JointSnapshot`, `JointLimitsError`. Times are ns of the host's monotonic
+clock; positions are radians, metres for prismatic joints.
 """
 
 from __future__ import annotations
@@ -46,22 +46,37 @@ class _JointState(NamedTuple):
     std_rad: FloatArray | None
 
 
+class JointLimitsError(ValueError):
+    """Joint positions that are far beyond the limits; the text names joint, value, limits and remedy."""
+
+
 class JointStateBuffer:
     """Recent states of the joints `names` (m), from several sources, each of which may report any joints.
 
-    `continuous` (m,) joints have no limits and are interpolated along the shorter way. `late_count` counts
-    states discarded because they were older than the last one of the same source.
+    `continuous` (m,) joints have no limits and are interpolated along the shorter way. `limits` (m, 2) are
+    the lower and upper limits of the others; a position that exceeds one by more than the range between them
+    is rejected. `late_count` counts states discarded because they were older than the last one of the same
+    source.
     """
 
-    def __init__(self, names: Sequence[str], continuous: NDArray[np.bool_] | None = None) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        continuous: NDArray[np.bool_] | None = None,
+        limits: FloatArray | None = None,
+    ) -> None:
         self.names = tuple(names)
         self.late_count = 0
         self._continuous = np.zeros(len(self.names), dtype=np.bool_) if continuous is None else continuous
+        self._limits = np.full((len(self.names), 2), (-np.inf, np.inf)) if limits is None else limits
+        ranges = np.subtract(*self._limits.T[::-1])
+        ranges[ranges <= 0] = np.inf  # limits that a URDF leaves at their default, 0
+        self._accepted = self._limits + ranges[:, None] * (-1, 1)
         self._sources: dict[tuple[str, ...], tuple[IntArray, IntArray, deque[_JointState]]] = {}
 
     def empty_copy(self) -> JointStateBuffer:
         """Return an empty buffer of the same joints."""
-        return JointStateBuffer(self.names, self._continuous)
+        return JointStateBuffer(self.names, self._continuous, self._limits)
 
     def add_state(
         self,
@@ -71,8 +86,9 @@ class JointStateBuffer:
         velocity_rad_s: FloatArray | None = None,
         std_rad: FloatArray | None = None,
     ) -> bool:
-        """Add a state, arrays as `names`; return whether it holds a known joint and is newer than the
-        last.
+        """Add a state, arrays as `names`; return whether it holds a known joint and is newer than the last.
+
+        Raises JointLimitsError for a position far beyond its joint's limits.
         """
         source = self._sources.get(names)
         if source is None:
@@ -82,18 +98,21 @@ class JointStateBuffer:
             if len(known) == 0:
                 return False
             source = columns, source_columns, deque[_JointState](maxlen=_STATES_PER_SOURCE)
-            if len(self._sources) >= _MAX_SOURCES:
-                self._sources.pop(min(self._sources, key=lambda s: self._sources[s][2][-1].state_ns))
-            self._sources[names] = source
-        _, source_columns, states = source
+        columns, source_columns, states = source
+        position = position_rad[source_columns]
+        self._check_limits(columns, position)
         if states and t_ns <= states[-1].state_ns:
             self.late_count += 1
             return False
+        if not states:
+            if len(self._sources) >= _MAX_SOURCES:
+                self._sources.pop(min(self._sources, key=lambda s: self._sources[s][2][-1].state_ns))
+            self._sources[names] = source
         velocity = None if velocity_rad_s is None else velocity_rad_s[source_columns]
         states.append(
             _JointState(
                 t_ns,
-                position_rad[source_columns],
+                position,
                 velocity,
                 None if std_rad is None else std_rad[source_columns],
             )
@@ -113,6 +132,17 @@ class JointStateBuffer:
             found.position_rad[columns], found.age_s[columns] = position, age_ns * 1e-9
             found.std_rad[columns] = 0.0 if std is None else std
         return found
+
+    def _check_limits(self, columns: IntArray, position: FloatArray) -> None:
+        lowest, highest = self._accepted[columns].T
+        beyond = (position < lowest) | (position > highest)
+        if np.count_nonzero(beyond):
+            first = int(np.flatnonzero(beyond)[0])
+            lower, upper = self._limits[columns[first]]
+            raise JointLimitsError(
+                f"{self.names[columns[first]]} = {position[first]:.6g}, limits {lower:.4g} to {upper:.4g}; "
+                "send radians, for a prismatic joint metres"
+            )
 
     def _interpolate_source(
         self, states: deque[_JointState], t_ns: int, continuous: NDArray[np.bool_]

@@ -37,7 +37,8 @@ class HandKinematics:
     """Poses of `links` (n names of the URDF) in the frames of the links `palm` and `base`.
 
     Call `set_joint_positions` before querying poses. `joints` (m names of the URDF) are those that move some
-    link against palm or base; mimicking joints aren't among them. `continuous` (m,) have no limits.
+    link against palm or base; mimicking joints aren't among them. `continuous` (m,) have no limits,
+    `limits` (m, 2) are the lower and upper limits of all [rad, m if prismatic], infinite where there is none.
     `palm_joint_mask`, `base_joint_mask` (n, m): which joints a link's pose in the palm or base frame depends
     on. Raises KeyError for a link that the URDF lacks.
     """
@@ -62,6 +63,7 @@ class HandKinematics:
         self.continuous = np.array(
             [robot.joints[n].kind == "continuous" for n in self.joints], dtype=np.bool_
         )
+        self.limits = np.array([robot.joints[n].limits for n in self.joints]).reshape(-1, 2)
         self.palm_joint_mask, self.base_joint_mask = (
             np.array(
                 [

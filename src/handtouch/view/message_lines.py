@@ -188,5 +188,6 @@ def message_line(message: wire.Message) -> str:
         return (
             f"{head}service handtouch {message.version}, up {message.uptime_s:.0f} s, "
             f"{message.rate_hz:.0f} ticks/s, {message.overruns} overruns"
+            f"{', stopping' if message.stopping else ''}"
         )
     return f"{head}{wire.topic_of(message)}"

@@ -8,7 +8,7 @@ docs/wire.md describes every field for readers in other languages. SI units; `t_
 clock; an unknown number is nil, never NaN. Optional fields are left out where they have their default.
 """
 
-from handtouch.wire.codec import SCHEMA_VERSION, WireError, decode, encode, to_map
+from handtouch.wire.codec import SCHEMA_VERSION, UnknownTopicError, WireError, decode, encode, to_map
 from handtouch.wire.columns import Column
 from handtouch.wire.contact import PERCEPT_KINDS, Contact, HandFrame, Matrix3, Percept, Vector3
 from handtouch.wire.health import Health, JointPositions, Service
@@ -55,6 +55,7 @@ __all__ = [
     "StateSnapshot",
     "TickInputs",
     "Topic",
+    "UnknownTopicError",
     "Vector3",
     "WireError",
     "decode",

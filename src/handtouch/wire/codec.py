@@ -23,6 +23,10 @@ class WireError(ValueError):
     """A message that violates the wire contract; the text names topic and key."""
 
 
+class UnknownTopicError(WireError):
+    """A message of no known topic; the text lists the topics."""
+
+
 _TOPIC_OF_PREFIX = {topic.prefix: topic for topic in TOPICS}
 _DEFAULTS = {
     topic.payload: {f.name: f.default for f in fields(topic.payload) if f.default is not MISSING}
@@ -105,7 +109,7 @@ def unpack(parts: Sequence[bytes], topics: Mapping[str, Topic]) -> Received:
     topic = topics.get(prefix)
     if topic is None or len(keys) != len(topic.keys) or not all(keys):
         known = ", ".join(t.pattern for t in topics.values())
-        raise WireError(f"unknown topic {name[:80]!r}; the topics are {known}")
+        raise UnknownTopicError(f"unknown topic {name[:80]!r}; the topics are {known}")
     try:
         payload = msgpack.unpackb(parts[1])
     except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:

@@ -109,3 +109,5 @@ class Service:
     """state of the supervisor process; None without supervision"""
     inputs: dict[str, Any] | None = None
     """statistics of the inputs endpoint: received, age_s, dropped, problem"""
+    stopping: bool = False
+    """the last message of the session: the daemon was asked to stop"""

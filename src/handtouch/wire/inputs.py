@@ -1,12 +1,13 @@
 """Inputs of the daemon from a robot: joint states, joint commands and reference forces.
 
-Public names: `JointState`, `JointCommand`, `LinkForces`, `encode`, `decode`, `INPUT_TOPICS`. The keys are in
-docs/wire.md, "Inputs". SI units; `t_ns` is of the host's monotonic clock, as that of samples.
+Public names: `JointState`, `JointCommand`, `LinkForces`, `encode`, `decode`, `INPUT_TOPICS`, `hands_prefix`,
+`hands_in_prefix`. The keys are in docs/wire.md, "Inputs". SI units; `t_ns` is of the host's monotonic clock,
+as that of samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, cast
 
@@ -21,6 +22,8 @@ FloatArray = NDArray[np.float64]
 _MAX_NAMES = 1000
 _MAX_NAME_CHARACTERS = 200
 _MAX_T_NS = 2**63 - 1
+_MAX_NEGATIVE_SIGMA = 3
+_HANDS_PREFIX = "hands/"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +96,10 @@ class LinkForces:
         _check_column("force_n", self.force_n, "links", self.links)
         _check_column("std_n", self.std_n, "links", self.links)
         _check_std("std_n", self.std_n)
+        if (self.force_n < -_MAX_NEGATIVE_SIGMA * self.std_n).any():
+            raise ValueError(
+                f"force_n must not be below 0 by more than {_MAX_NEGATIVE_SIGMA} std_n: a pad can't be pulled"
+            )
 
 
 InputMessage = JointState | JointCommand | LinkForces
@@ -127,6 +134,16 @@ def decode(parts: Sequence[bytes]) -> InputMessage:
         raise WireError(f"{received.name}: {error}") from None
 
 
+def hands_prefix(hands: Iterable[str]) -> str:
+    """Return the subscription by which a daemon names its hands to the sender, which sees it on its XPUB."""
+    return _HANDS_PREFIX + "/".join(sorted(set(hands)))
+
+
+def hands_in_prefix(prefix: str) -> frozenset[str]:
+    """Return the hands that such a subscription names; empty for any other."""
+    return frozenset(prefix[len(_HANDS_PREFIX) :].split("/") if prefix.startswith(_HANDS_PREFIX) else ())
+
+
 def _check_time(t_ns: int | None) -> None:
     if t_ns is not None and not 0 <= t_ns <= _MAX_T_NS:
         raise ValueError("t_ns must be nanoseconds of the monotonic clock, from 0 to 2^63 - 1, or nil")
@@ -152,8 +169,8 @@ def _check_column(key: str, column: FloatArray | None, names_key: str, names: tu
 
 
 def _check_std(key: str, column: FloatArray | None) -> None:
-    if column is not None and (column < 0).any():
-        raise ValueError(f"{key} must not be negative")
+    if column is not None and not (column > 0).all():
+        raise ValueError(f"{key} must be greater than 0")
 
 
 def _unit_vector(key: str, vector: FloatArray) -> FloatArray:
