@@ -193,12 +193,20 @@ def test_scrape_returns_the_latest_messages(exporter: MetricsExporter) -> None:
         scrape(exporter, "/")
 
 
-def test_idle_clients_do_not_block_scrapes(exporter: MetricsExporter) -> None:
+def test_300_half_open_requests_hold_few_threads_and_block_no_scrape(exporter: MetricsExporter) -> None:
     host, _, port = exporter.address.rpartition(":")
+    assert "handtouch_up" in scrape(exporter)
     with contextlib.ExitStack() as idle:
-        for _ in range(20):
-            idle.enter_context(socket.create_connection((host, int(port))))
+        for _ in range(300):
+            idle.enter_context(socket.create_connection((host, int(port)))).sendall(b"GET /metrics")
         assert "handtouch_up" in scrape(exporter)
+        assert len(os.listdir(f"/proc/{exporter.process_id}/task")) < 80
+
+
+def test_a_scrape_by_another_host_name_is_rejected(exporter: MetricsExporter) -> None:
+    request = urllib.request.Request(f"http://{exporter.address}/metrics", headers={"Host": "evil.example"})
+    with pytest.raises(urllib.error.HTTPError, match="421"):
+        urllib.request.urlopen(request, timeout=LONGEST_S)
 
 
 def test_stopped_process_drops_messages_and_killed_one_is_restarted(

@@ -7,19 +7,19 @@ page for every scrape.
 from __future__ import annotations
 
 import contextlib
-import http.server
 import os
 import signal
 import socket
 import sys
 import threading
 import time
+from http import HTTPStatus
 
 from handtouch import wire
 from handtouch.daemon.metrics_page import CONTENT_TYPE, METRICS_PATH, render_metrics
+from handtouch.host.http_server import BoundedHttpServer, BoundedRequestHandler
 
 _MAX_PACKET_BYTES = 1 << 20
-_CLIENT_TIMEOUT_S = 5.0
 
 
 class _LatestMessages:
@@ -46,36 +46,16 @@ class _LatestMessages:
         return render_metrics(service, [m for m in messages if isinstance(m, wire.Health)], age_s).encode()
 
 
-class _MetricsRequestHandler(http.server.BaseHTTPRequestHandler):
+class _MetricsRequestHandler(BoundedRequestHandler):
     latest: _LatestMessages
-    timeout = _CLIENT_TIMEOUT_S
 
-    def do_GET(self) -> None:
-        if self.path.partition("?")[0] != METRICS_PATH:
-            self.send_error(404, f"metrics are at {METRICS_PATH}")
+    def answer_get(self, path: str) -> None:
+        if path != METRICS_PATH:
+            self.send_error(HTTPStatus.NOT_FOUND, f"metrics are at {METRICS_PATH}")
             return
         page = self.latest.render_page(time.monotonic())
-        self.send_response(200)
-        self.send_header("Content-Type", CONTENT_TYPE)
-        self.send_header("Content-Length", str(len(page)))
-        self.end_headers()
+        self.send_headers(CONTENT_TYPE, len(page))
         self.wfile.write(page)
-
-    def log_message(self, *_: object) -> None:
-        """Do nothing: scrapes don't belong in the daemon's log."""
-
-
-class _MetricsHttpServer(http.server.ThreadingHTTPServer):
-    daemon_threads = True
-
-    def __init__(self, listener: socket.socket, latest: _LatestMessages) -> None:
-        handler = type("Handler", (_MetricsRequestHandler,), {"latest": latest})
-        super().__init__(listener.getsockname()[:2], handler, bind_and_activate=False)
-        self.socket.close()
-        self.socket = listener
-
-    def handle_error(self, *_: object) -> None:
-        """Ignore clients that disconnect early."""
 
 
 def main(listener: int, feed: int) -> None:
@@ -84,7 +64,9 @@ def main(listener: int, feed: int) -> None:
     with contextlib.suppress(OSError):
         os.nice(10)
     latest = _LatestMessages()
-    server = _MetricsHttpServer(socket.socket(fileno=listener), latest)
+    listening = socket.socket(fileno=listener)
+    handler = type("Handler", (_MetricsRequestHandler,), {"latest": latest})
+    server = BoundedHttpServer(listening.getsockname()[:2], handler, listening)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     messages = socket.socket(fileno=feed)
     while packet := messages.recv(_MAX_PACKET_BYTES):

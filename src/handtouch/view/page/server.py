@@ -11,10 +11,10 @@ import socket
 import threading
 from functools import partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any, Self
 
+from handtouch.host.http_server import BoundedHttpServer, BoundedRequestHandler
 from handtouch.view.page.model import VersionedValues
 
 _MEDIA_TYPES = {
@@ -45,19 +45,15 @@ class PageServer:
         self.closing = False
         self.notifications = 0
         self.url = ""
-        self.allowed_hosts: set[str] | None = None
-        """accepted Host headers, None: any; other names are DNS rebinding from another site"""
         self._address = host, port
-        self._http: _PageHttpServer | None = None
+        self._http: BoundedHttpServer | None = None
 
     def start(self) -> Self:
         """Listen at the address; port 0 takes a free port. Raises OSError or OverflowError if that fails."""
         host, port = self._address
-        self._http = _PageHttpServer((host, port), partial(_PageHandler, self))
+        self._http = BoundedHttpServer((host, port), partial(_PageHandler, self))
         port = self._http.server_address[1]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
-        names = {host, "localhost", "127.0.0.1", "[::1]"}
-        self.allowed_hosts = {f"{name}:{port}" for name in names} if _is_loopback(host) else None
         serve = partial(self._http.serve_forever, poll_interval=0.1)
         threading.Thread(target=serve, name="handtouch-page", daemon=True).start()
         return self
@@ -84,32 +80,13 @@ class PageServer:
         self.close()
 
 
-class _PageHttpServer(ThreadingHTTPServer):
-    daemon_threads = True
-    allow_reuse_port = False
-
-    def __init__(self, address: tuple[str, int], handler: Any) -> None:
-        if ":" in address[0]:
-            self.address_family = socket.AF_INET6
-        super().__init__(address, handler)
-
-    def handle_error(self, *_: Any) -> None:
-        """Log nothing when a browser disconnects."""
-
-
-class _PageHandler(BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"
-
+class _PageHandler(BoundedRequestHandler):
     def __init__(self, owner: PageServer, *arguments: Any) -> None:
         self._owner = owner
         super().__init__(*arguments)
 
-    def do_GET(self) -> None:
-        allowed = self._owner.allowed_hosts
-        if allowed is not None and self.headers.get("Host") not in allowed:
-            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
-            return
-        name = self.path.partition("?")[0].lstrip("/") or "index.html"
+    def answer_get(self, path: str) -> None:
+        name = path.lstrip("/") or "index.html"
         if name == "changes":
             self._send_changes()
             return
@@ -118,24 +95,16 @@ class _PageHandler(BaseHTTPRequestHandler):
         if media_type is None or "/" in name or not file.is_file():
             self.send_error(HTTPStatus.NOT_FOUND)
             return
-        self._send_headers(media_type, len(body := file.read_bytes()))
+        self._send_page_headers(media_type, len(body := file.read_bytes()))
         self.wfile.write(body)
 
-    def _send_headers(self, media_type: str, length: int | None) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", f"{media_type}; charset=utf-8")
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("Content-Security-Policy", "default-src 'self'")
-        if length is None:
-            self.send_header("Connection", "close")
-        else:
-            self.send_header("Content-Length", str(length))
-        self.end_headers()
+    def _send_page_headers(self, media_type: str, length: int | None = None) -> None:
+        policy = {"Cache_Control": "no-store", "Content_Security_Policy": "default-src 'self'"}
+        self.send_headers(f"{media_type}; charset=utf-8", length, **policy)
 
     def _send_changes(self) -> None:
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
-        self._send_headers("text/event-stream", None)
-        self.close_connection = True
+        self._send_page_headers("text/event-stream")
         self.wfile.write(f"retry: {_RETRY_MS}\n\n".encode())
         owner, version, notification = self._owner, 0, -1
         with owner.condition:
@@ -158,10 +127,3 @@ class _PageHandler(BaseHTTPRequestHandler):
         finally:
             with owner.condition:
                 owner.open_pages -= 1
-
-    def log_message(self, *_: Any) -> None:
-        """Log no requests."""
-
-
-def _is_loopback(host: str) -> bool:
-    return host in ("localhost", "::1") or host.startswith("127.")
