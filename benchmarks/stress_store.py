@@ -273,7 +273,7 @@ def main() -> None:
             ),
             "Journal modes of SQLite": ("500 transactions each, a row of 2 kB.", modes(folder)),
             "The store": (
-                "A whole calibration a write; opening checks every digest.",
+                "A whole calibration a write; opening checks the digest of all rows.",
                 writes_and_openings(folder),
             ),
         }

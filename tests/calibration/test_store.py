@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
 import shutil
 import sqlite3
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from handtouch.calibration import store_file
 from handtouch.calibration.calibration import (
     Calibration,
     CalibrationVersion,
@@ -32,15 +35,15 @@ from handtouch.calibration.calibration import (
 )
 from handtouch.calibration.store import (
     DamagedStoreError,
-    NewerStoreError,
     Store,
     StoreError,
+    damaged_files,
     store_path,
 )
+from handtouch.calibration.store_file import SCHEMA_VERSION
 
 NOW = datetime(2026, 3, 1, 12, 0, tzinfo=UTC)
 CONFIG = "nominal-0123456789ab"
-DATA = Path(__file__).parents[1] / "data"
 
 
 def calibration(seed: int) -> Calibration:
@@ -70,7 +73,7 @@ def filled(path: Path, count: int = 6) -> list[CalibrationVersion]:
 def content(path: Path) -> list[CalibrationVersion]:
     with Store(path, create=False) as store:
         return sorted(
-            (version for node in store.node_histories() for version in store.versions(node.serial)),
+            (version for newest in store.newest_of_all() for version in store.versions(newest.serial)),
             key=lambda version: version.written_utc,
         )
 
@@ -139,7 +142,7 @@ def test_serial_number_out_of_range_is_refused(tmp_path: Path, serial: int) -> N
     with Store(tmp_path / "store.db") as store:
         with pytest.raises(ValueError, match="serial = "):
             store.write(serial, CONFIG, calibration(1), provenance(1), NOW)
-        assert store.node_histories() == []
+        assert store.newest_of_all() == []
 
 
 def test_calibration_of_another_node_or_other_tables_needs_explicit_acceptance() -> None:
@@ -195,13 +198,12 @@ def test_file_truncated_anywhere_is_moved_aside_and_never_read_as_empty(tmp_path
         path.write_bytes(data[:length])
         with pytest.raises(DamagedStoreError, match="damaged") as caught:
             Store(path)
-        assert caught.value.moved_to is not None
-        assert caught.value.moved_to.read_bytes() == data[:length]
-        assert str(caught.value.moved_to) in str(caught.value)
+        (moved,) = damaged_files(path)
+        assert moved.read_bytes() == data[:length]
+        assert str(moved) in str(caught.value)
         assert not path.exists()
-        with Store(path) as fresh:  # empty, and lists the damaged file
-            assert fresh.node_histories() == []
-            assert fresh.damaged_files == [caught.value.moved_to]
+        with Store(path) as fresh:
+            assert fresh.newest_of_all() == []
 
 
 def test_flipped_byte_is_detected_or_has_no_effect(tmp_path: Path) -> None:
@@ -213,13 +215,11 @@ def test_flipped_byte_is_detected_or_has_no_effect(tmp_path: Path) -> None:
     for k in [*used[:300], *used[300::7]]:
         path = tmp_path / f"{k}.db"
         path.write_bytes(data[:k] + bytes([data[k] ^ (1 << k % 8)]) + data[k + 1 :])
-        moved_to = ""
         try:
             assert content(path) == written, k
-        except DamagedStoreError as damage:
+        except DamagedStoreError:
             found += 1
-            moved_to = str(damage.moved_to)
-        assert path.exists() != Path(moved_to).is_file(), k
+        assert path.exists() != (len(damaged_files(path)) == 1), k
         path.unlink(missing_ok=True)
     assert found > 500
 
@@ -247,10 +247,9 @@ def test_removed_or_edited_row_is_detected(tmp_path: Path) -> None:
 
 
 _TORN = """
-import os, sys
-from handtouch.calibration.store import Store
-store = Store(sys.argv[1])
-connection = store._connection
+import os, sqlite3, sys
+connection = sqlite3.connect(sys.argv[1], isolation_level=None)
+connection.execute("PRAGMA synchronous = EXTRA")
 connection.execute("PRAGMA cache_size = 1")  # so that pages are spilled before the commit
 connection.execute("PRAGMA cache_spill = 1")
 connection.execute("BEGIN IMMEDIATE")
@@ -305,12 +304,49 @@ def test_journal_without_its_store_is_not_applied_to_a_new_one(
     torn: tuple[Path, list[CalibrationVersion]],
 ) -> None:
     path, _ = torn
+    journal = path.with_name("store.db-journal")
+    data = journal.read_bytes()
     path.unlink()
-    with pytest.raises(DamagedStoreError, match="journal without its store"):
-        Store(path)
-    with Store(path) as fresh:
-        assert fresh.node_histories() == []
-        assert len(list(path.parent.glob("*.damaged-*-journal"))) == 1
+    for earlier in range(2):
+        with pytest.raises(DamagedStoreError, match="journal without its store"):
+            Store(path)
+        kept = list(path.parent.glob("*.damaged-*-journal"))
+        assert [file.read_bytes() for file in kept] == [data] * (earlier + 1)  # none replaces another
+        with Store(path) as fresh:
+            assert fresh.newest_of_all() == []
+        path.unlink()
+        journal.write_bytes(data)
+
+
+def _open_count(path: Path) -> int:
+    """Return how many descriptors of this process refer to the file at `path`."""
+    inode, found = path.stat().st_ino, 0
+    for name in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            found += os.fstat(int(name)).st_ino == inode
+    return found
+
+
+def test_store_that_replaced_a_damaged_one_meanwhile_is_not_moved_aside(tmp_path: Path) -> None:
+    path = tmp_path / "store.db"
+    filled(path)
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("DELETE FROM calibration WHERE id = 2")
+    other.execute("BEGIN EXCLUSIVE")
+    before = _open_count(path)
+    with ThreadPoolExecutor(1) as pool:
+        opening = pool.submit(Store, path)  # waits for the lock
+        open_since = time.monotonic()
+        while time.monotonic() - open_since < 0.1:
+            if _open_count(path) == before:
+                open_since = time.monotonic()
+            time.sleep(0.005)
+        path.rename(tmp_path / "damaged")
+        written = filled(path)
+        other.close()
+        with pytest.raises(DamagedStoreError, match="another process moved it"):
+            opening.result()
+    assert content(path) == written
 
 
 @pytest.mark.parametrize(
@@ -337,44 +373,24 @@ def test_database_of_another_program_stays_unchanged(tmp_path: Path) -> None:
 # --- schemas
 
 
-def test_older_schema_is_migrated_and_the_old_file_kept(tmp_path: Path) -> None:
-    path = tmp_path / "store.db"
-    shutil.copy(DATA / "calibrations_schema1.db", path)
-    versions = content(path)
-    assert [(v.serial, v.number) for v in versions] == [(1001, 1), (1002, 1), (1001, 2)]
-    assert versions[2].calibration.gains is not None
-    assert versions[2].calibration.gains.factors == (1.02, 0.99, 1.0, 0.99)
-    assert versions[2].provenance.link == "thumb_distal"
-    assert all(version.calibration.sheet is None for version in versions)
-    old = tmp_path / "store.db.schema-1"
-    connection = sqlite3.connect(old)
-    assert connection.execute("PRAGMA user_version").fetchone() == (1,)
-    assert connection.execute("SELECT count(*) FROM calibration").fetchone() == (3,)
-    connection.close()
-    with Store(path) as store:
-        store.write(1001, CONFIG, calibration(1), provenance(1), NOW)
-    assert len(content(path)) == 4
-
-
-def test_damaged_store_of_an_older_schema_is_not_migrated(tmp_path: Path) -> None:
-    path = tmp_path / "store.db"
-    path.write_bytes((DATA / "calibrations_schema1.db").read_bytes().replace(b"0.99", b"0.98", 1))
-    with pytest.raises(DamagedStoreError):
-        Store(path)
-
-
-def test_newer_schema_is_refused_with_the_remedy_and_stays_unchanged(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("schema", "remedy"), [(1, "move it away"), (SCHEMA_VERSION + 1, "update handtouch")]
+)
+def test_store_of_another_schema_is_refused_with_the_remedy_and_stays_unchanged(
+    tmp_path: Path, schema: int, remedy: str
+) -> None:
     path = tmp_path / "store.db"
     filled(path)
     connection = sqlite3.connect(path)
-    connection.execute(f"PRAGMA user_version = {store_file.SCHEMA_VERSION + 1}")
-    connection.execute("UPDATE head SET schema = ?", (store_file.SCHEMA_VERSION + 1,))
+    connection.execute(f"PRAGMA user_version = {schema}")
+    connection.execute("UPDATE head SET schema = ?", (schema,))
     connection.commit()
     connection.close()
     before = path.read_bytes()
-    with pytest.raises(NewerStoreError, match="update handtouch"):
+    with pytest.raises(StoreError, match=f"has schema {schema}, .*: {remedy}"):
         Store(path)
     assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 # --- several processes, permissions, paths
@@ -402,7 +418,7 @@ def test_readers_see_complete_versions_during_concurrent_writes(tmp_path: Path) 
             assert len(numbers) >= seen
             seen = len(numbers)
             with Store(path) as other:  # checks everything
-                assert len(other.node_histories()) >= 2
+                assert len(other.newest_of_all()) >= 2
     assert [writer.returncode for writer in writers] == [0, 0]
     with Store(path) as store:
         assert [version.number for version in store.versions(5)] == list(range(1, 81))
@@ -419,13 +435,15 @@ def test_store_that_was_moved_while_open_refuses_writes(tmp_path: Path) -> None:
 def test_failed_write_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "store.db"
     written = filled(path)
+    large = Calibration(sheet=StoredSheetState("creep", 1, bytes(100_000)))
     with Store(path) as store:
-        pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
-        store._connection.execute(f"PRAGMA max_page_count = {pages}")  # as on a full disk
-        large = Calibration(sheet=StoredSheetState("creep", 1, bytes(100_000)))
-        with pytest.raises(StoreError, match="full"):
-            store.write(7, CONFIG, large, provenance(1), NOW)
-        store._connection.execute("PRAGMA max_page_count = 1000000")
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size, before[1]))  # as on a full disk
+        try:
+            with pytest.raises(StoreError, match="can't be written"):
+                store.write(7, CONFIG, large, provenance(1), NOW)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
         store.write(7, CONFIG, calibration(1), provenance(1), NOW + timedelta(days=1))
     assert content(path)[:-1] == written
 

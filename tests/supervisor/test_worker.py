@@ -267,7 +267,7 @@ def test_nodes_without_a_unique_serial_number_are_not_calibrated(
     assert not any(isinstance(message, CalibrationUpdate) for message in messages)
     worker.finish(NOW)
     with Store(tmp_path / "c.db") as store:
-        assert store.node_histories() == []
+        assert store.newest_of_all() == []
 
 
 def test_gain_step_puts_a_node_into_quarantine_until_recalibrated(

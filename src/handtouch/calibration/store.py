@@ -1,7 +1,7 @@
 """Calibration store: every calibration of every node, in one SQLite file; nothing is overwritten.
 
-Public: `Store` (open, write, read, roll back), `NodeHistory` and `store_path`. Readers and one writer at a
-time may be different processes. The errors are those of `store_file`.
+Public: `Store` (open, write, read, roll back) and `store_path`; `damaged_files` and the errors of
+`store_file`. Readers and one writer at a time may be different processes.
 """
 
 from __future__ import annotations
@@ -11,25 +11,16 @@ import json
 import os
 import sqlite3
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
 from handtouch.calibration import store_file
 from handtouch.calibration.calibration import Calibration, CalibrationVersion, Provenance
-from handtouch.calibration.store_file import DamagedStoreError, NewerStoreError, StoreError
+from handtouch.calibration.store_file import DamagedStoreError, StoreError, damaged_files
 
-__all__ = ["DamagedStoreError", "NewerStoreError", "NodeHistory", "Store", "StoreError", "store_path"]
-
-
-@dataclass(frozen=True)
-class NodeHistory:
-    """A node in the store: number of versions, and the newest."""
-
-    serial: int
-    version_count: int
-    newest: CalibrationVersion
+__all__ = ["DamagedStoreError", "Store", "StoreError", "damaged_files", "store_path"]
 
 
 def store_path(configured: str | None = None, folder: Path | None = None) -> Path:
@@ -52,8 +43,8 @@ class Store:
     def __init__(self, path: Path | str, *, create: bool = True) -> None:
         """Open and verify a store; create it if there is none and `create`.
 
-        Raises DamagedStoreError (the file is then moved aside, and opening again creates a new one),
-        NewerStoreError, or StoreError; an older schema is migrated, and a copy of the old file kept.
+        Raises DamagedStoreError (the file is then moved aside, and opening again creates a new one), or
+        StoreError.
         """
         self.path = Path(path)
         if not self.path.exists():
@@ -62,7 +53,7 @@ class Store:
             store_file.create(self.path)
         self._connection = store_file.connect(self.path)
         self._inode = self.path.stat().st_ino
-        self._seen_data_version = self._data_version()
+        self._seen_data_version: int | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -74,16 +65,12 @@ class Store:
         """Close the file."""
         self._connection.close()
 
-    @property
-    def damaged_files(self) -> list[Path]:
-        """Return damaged stores that were moved aside here, oldest first; they may hold what this one
-        lacks."""
-        return store_file.damaged_files(self.path)
-
     def changed(self) -> bool:
-        """Return whether another process has written since the last call, or since opening."""
-        before, self._seen_data_version = self._seen_data_version, self._data_version()
-        return self._seen_data_version != before
+        """Return whether another process has written since the last call; True at the first call."""
+        with self._translate_errors("read"):
+            (version,) = self._connection.execute("PRAGMA data_version").fetchone()
+        before, self._seen_data_version = self._seen_data_version, version
+        return bool(version != before)
 
     def write(
         self, serial: int, config: str, calibration: Calibration, provenance: Provenance, now: datetime
@@ -101,13 +88,17 @@ class Store:
         if now.tzinfo is None:
             raise ValueError("now: needs a time zone")
         written = now.astimezone(UTC).isoformat(timespec="milliseconds")
-        with self._transaction() as connection:
-            (newest,) = connection.execute(
-                "SELECT coalesce(max(number), 0) FROM calibration WHERE serial = ?", (serial,)
-            ).fetchone()
-            version = CalibrationVersion(serial, config, newest + 1, written, provenance, calibration)
-            text = json.dumps(version.to_json(), sort_keys=True)
-            store_file.append(connection, (serial, config, version.number, text))
+        with self._translate_errors("written"):
+            if not self.path.exists() or self.path.stat().st_ino != self._inode:
+                raise StoreError(f"{self.path}: was replaced or moved since it was opened; open it again")
+            with self._connection as connection:  # commits, or rolls back after an error
+                connection.execute("BEGIN IMMEDIATE")
+                (newest,) = connection.execute(
+                    "SELECT coalesce(max(number), 0) FROM calibration WHERE serial = ?", (serial,)
+                ).fetchone()
+                version = CalibrationVersion(serial, config, newest + 1, written, provenance, calibration)
+                text = json.dumps(version.to_json(), sort_keys=True)
+                store_file.append(connection, (serial, config, version.number, text))
         return version
 
     def roll_back(
@@ -125,53 +116,32 @@ class Store:
 
     def get(self, serial: int, number: int) -> CalibrationVersion:
         """Return one version. Raises StoreError listing the existing ones."""
-        if found := self._select("serial = ? AND number = ?", serial, number):
+        if found := self._select("WHERE serial = ? AND number = ?", serial, number):
             return found[0]
         known = [str(version.number) for version in self.versions(serial)]
         existing = f"there are: {', '.join(known)}" if known else "there is none of that serial"
         raise StoreError(f"{self.path}: no version {number} of serial {serial}; {existing}")
 
     def versions(self, serial: int) -> list[CalibrationVersion]:
-        """Return all versions of a node, oldest first."""
-        return self._select("serial = ?", serial)
+        """Return all versions of a node, oldest first; their numbers count from 1."""
+        return self._select("WHERE serial = ? ORDER BY number", serial)
 
-    def newest(self, serial: int, config: str | None = None) -> CalibrationVersion | None:
+    def newest(self, serial: int, config: str = "") -> CalibrationVersion | None:
         """Return the newest version of a node: under the tables `config` if there is one, else under any.
 
         `check_match` refuses a version of other tables.
         """
         order = "ORDER BY config = ? DESC, number DESC LIMIT 1"
-        found = self._select(f"serial = ? {order}", serial, config or "")
-        return found[0] if found else None
+        return next(iter(self._select(f"WHERE serial = ? {order}", serial, config)), None)
 
-    def node_histories(self) -> list[NodeHistory]:
-        """Return all nodes, by serial number."""
-        with self._translate_errors("read"):
-            counts = self._connection.execute(
-                "SELECT serial, count(*), max(number) FROM calibration GROUP BY serial ORDER BY serial"
-            ).fetchall()
-        return [NodeHistory(serial, count, self.get(serial, newest)) for serial, count, newest in counts]
-
-    def _data_version(self) -> int:
-        with self._translate_errors("read"):
-            return int(self._connection.execute("PRAGMA data_version").fetchone()[0])
+    def newest_of_all(self) -> list[CalibrationVersion]:
+        """Return the newest version of every node, by serial number."""
+        return self._select("WHERE id IN (SELECT max(id) FROM calibration GROUP BY serial) ORDER BY serial")
 
     def _select(self, condition: str, *values: object) -> list[CalibrationVersion]:
-        order = "" if "ORDER BY" in condition else "ORDER BY number"
         with self._translate_errors("read"):
-            rows = self._connection.execute(
-                f"SELECT version FROM calibration WHERE {condition} {order}", values
-            ).fetchall()
+            rows = self._connection.execute(f"SELECT version FROM calibration {condition}", values).fetchall()
         return [CalibrationVersion.from_json(json.loads(text)) for (text,) in rows]
-
-    @contextlib.contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._translate_errors("written"):
-            if not self.path.exists() or self.path.stat().st_ino != self._inode:
-                raise StoreError(f"{self.path}: was replaced or moved since it was opened; open it again")
-            with self._connection:  # commits, or rolls back after an error
-                self._connection.execute("BEGIN IMMEDIATE")
-                yield self._connection
 
     @contextlib.contextmanager
     def _translate_errors(self, action: str) -> Iterator[None]:

@@ -1,5 +1,4 @@
-"""Access to the calibration store that survives its faults: failures are logged, and the store reopened
-later.
+"""Access to the calibration store that survives its faults: failures are logged, the store reopened later.
 
 Public: `StoreClient`, `MountingPoint`. Without a store, nodes are calibrated all the same, and not stored.
 """
@@ -49,7 +48,6 @@ class StoreClient:
         self._path = path
         self._store: Store | None = None
         self._retry_at: datetime | None = None
-        self._just_opened = False
 
     def close(self) -> None:
         """Close the store."""
@@ -58,10 +56,8 @@ class StoreClient:
         self._store = None
 
     def changed(self, now: datetime) -> bool:
-        """Return whether other processes may have written since the last call."""
-        changed = self._try(lambda store: store.changed(), False, now)
-        just_opened, self._just_opened = self._just_opened and self._store is not None, False
-        return changed or just_opened
+        """Return whether other processes may have written since the last call, or since reopening."""
+        return self._try(lambda store: store.changed(), False, now)
 
     def newest_applicable(
         self, serial: int, mounting_point: MountingPoint, now: datetime
@@ -70,31 +66,22 @@ class StoreClient:
 
         Another node's calibration that an operator took over may be applied; its provenance states it.
         """
-
-        def find(store: Store) -> tuple[CalibrationVersion | None, str]:
-            version = store.newest(serial, mounting_point.config)
-            if version is None:
-                return None, ""
-            taken_over = replace(version, provenance=replace(version.provenance, foreign=""))
-            try:
-                check_match(taken_over, serial, mounting_point.config)
-            except MismatchError as error:
-                return None, str(error)
-            return version, ""
-
-        nothing: tuple[CalibrationVersion | None, str] = (None, "")
-        return self._try(find, nothing, now)
+        version = self._try(lambda store: store.newest(serial, mounting_point.config), None, now)
+        if version is None:
+            return None, ""
+        taken_over = replace(version, provenance=replace(version.provenance, foreign=""))
+        try:
+            check_match(taken_over, serial, mounting_point.config)
+        except MismatchError as error:
+            return None, str(error)
+        return version, ""
 
     def last_serial_at(self, mounting_point: MountingPoint, now: datetime) -> int | None:
         """Return the serial number of the node that was calibrated at this position last, if any."""
-
-        def find(store: Store) -> int | None:
-            position = (mounting_point.hand, mounting_point.link)
-            newest = [node.newest for node in store.node_histories()]
-            here = [one for one in newest if (one.provenance.hand, one.provenance.link) == position]
-            return max(here, key=lambda version: version.written_utc).serial if here else None
-
-        return self._try(find, None, now)
+        newest: list[CalibrationVersion] = self._try(lambda store: store.newest_of_all(), [], now)
+        position = (mounting_point.hand, mounting_point.link)
+        here = [one for one in newest if (one.provenance.hand, one.provenance.link) == position]
+        return max(here, key=lambda version: version.written_utc).serial if here else None
 
     def store_parts(
         self, serial: int, mounting_point: MountingPoint, provenance: Provenance, now: datetime,
@@ -125,7 +112,7 @@ class StoreClient:
             if self._store is None:
                 if self._retry_at is not None and now < self._retry_at:
                     return default
-                self._store, self.error, self._just_opened = *self._open(), True
+                self._store, self.error = self._open()
             return action(self._store)
         except (StoreError, OSError, ValueError) as error:
             self.error, self._retry_at = str(error), now + _RETRY_PERIOD
