@@ -159,7 +159,8 @@ def fields_of(datagram: bytes) -> dict[str, bytes]:
 def test_journald_sink_sends_records_with_fields(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as journal:
         journal.bind(str(tmp_path / "journal"))
-        sink = JournaldSink(str(tmp_path / "journal"))
+        sender = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        sink = JournaldSink(sender, str(tmp_path / "journal"))
         sink.write(record("lost\nreally = so", logging.ERROR, hand="left", link="thumb_tip"))
         got = fields_of(journal.recv(65536))
         sink.close()
@@ -193,9 +194,9 @@ def test_level_is_set_at_start_and_changes_at_run_time() -> None:
 
 def test_stderr_is_the_journal_only_if_journal_stream_names_it() -> None:
     status = os.fstat(2)
-    assert logs._is_journal(2, f"{status.st_dev}:{status.st_ino}")
-    assert not logs._is_journal(2, f"{status.st_dev}:{status.st_ino + 1}")
-    assert not logs._is_journal(2, "")
+    assert logs.is_journal(2, f"{status.st_dev}:{status.st_ino}")
+    assert not logs.is_journal(2, f"{status.st_dev}:{status.st_ino + 1}")
+    assert not logs.is_journal(2, "")
 
 
 def test_causes_beyond_the_limit_share_one_and_memory_stays_bounded() -> None:

@@ -258,7 +258,7 @@ class ControlCommands:
             raise RefusedError("this daemon was not started from a deployment file")
         if self._reload_job is not None and not self._reload_job.done:
             raise RefusedError("another reload is in progress; retry when it has finished")
-        self._reload_job = ReloadJob(
+        self._reload_job = ReloadJob.start(
             self.deployment, self._read_deployment, self._apply_reload, request.dry_run
         )
         return self._reload_job

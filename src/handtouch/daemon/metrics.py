@@ -27,14 +27,14 @@ class MetricsExporter:
     `dropped` counts messages that the process was too slow to read.
     """
 
-    def __init__(self, listener: socket.socket) -> None:
+    def __init__(self, listener: socket.socket, pipe: tuple[socket.socket, socket.socket]) -> None:
+        """Serve at `listener`; `pipe`: the non-blocking end of `send`, and that of the server process."""
         self.dropped = 0
         self.address = "{}:{}".format(*listener.getsockname())
         self.process_id: int | None = None
         """id of the server process, once it runs"""
         self._listener = listener
-        self._parent_socket, self._child_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._parent_socket.setblocking(False)
+        self._parent_socket, self._child_socket = pipe
         self._closing = threading.Event()
         self._restart_thread = threading.Thread(
             target=self._keep_running, name="handtouch-metrics", daemon=True
@@ -45,12 +45,15 @@ class MetricsExporter:
         """Listen at HOST:PORT and start the server process. Raises OSError naming address and remedy."""
         host, _, port = address.rpartition(":")
         try:
-            exporter = cls(socket.create_server((host, int(port))))
+            listener = socket.create_server((host, int(port)))
         except OSError as error:
             raise OSError(
                 f"[daemon] metrics can't be served at {address}: {error.strerror}; is another daemon running "
                 "there? Set another port, or remove the key"
             ) from error
+        pipe = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        pipe[0].setblocking(False)
+        exporter = cls(listener, pipe)
         exporter.start()
         return exporter
 

@@ -34,19 +34,29 @@ class DeploymentChange:
 
 
 class ReloadJob:
-    """Reads a deployment with `read`; passes it to `apply` with the time [ns], unless it is a `dry_run`."""
+    """Passes a change that is being prepared to `apply` with the time [ns], unless it is a `dry_run`.
+
+    Created by `start`.
+    """
 
     def __init__(
-        self,
+        self, future: Future[DeploymentChange], apply: Callable[[DeploymentChange, int], None], dry_run: bool
+    ) -> None:
+        self._future, self._apply, self._dry_run = future, apply, dry_run
+
+    @classmethod
+    def start(
+        cls,
         present: Deployment,
         read: Callable[[], Deployment],
         apply: Callable[[DeploymentChange, int], None],
         dry_run: bool,
-    ) -> None:
-        self._apply, self._dry_run, self._current = apply, dry_run, present
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="reload")
-        self._future: Future[DeploymentChange] = self._worker.submit(_prepare, present, read, dry_run)
-        self._worker.shutdown(wait=False)
+    ) -> ReloadJob:
+        """Start a thread that reads a deployment with `read` and compares it with the present one."""
+        worker = ThreadPoolExecutor(1, thread_name_prefix="reload")
+        future = worker.submit(_prepare, present, read, dry_run)
+        worker.shutdown(wait=False)
+        return cls(future, apply, dry_run)
 
     @property
     def done(self) -> bool:

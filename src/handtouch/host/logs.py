@@ -1,6 +1,6 @@
 """Log output: text lines on stderr or records with fields in the systemd journal, without delaying a tick.
 
-Public names: `start_logging`, `BoundedLogHandler`, `set_level`, `LEVELS`.
+Public names: `start_logging`, `is_journal`, `BoundedLogHandler`, `set_level`, `LEVELS`.
 
 Loggers put records into a bounded queue that a separate thread writes, as slowly as disk or pipe allow.
 Records that the queue can't take are dropped and counted. Repeated messages are limited: the first ones are
@@ -60,10 +60,10 @@ def set_level(level: str) -> None:
 def start_logging(level: str = "info", environment: Mapping[str, str] = os.environ) -> BoundedLogHandler:
     """Log to the journal if stderr is connected to it, else to stderr; `close` the handler at the end."""
     sink: LogSink
-    if not _is_journal(2, environment.get("JOURNAL_STREAM", "")):
+    if not is_journal(2, environment.get("JOURNAL_STREAM", "")):
         sink = LineLogSink(2)
     elif Path(_JOURNALD_SOCKET).exists():
-        sink = JournaldSink(_JOURNALD_SOCKET)
+        sink = JournaldSink(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM), _JOURNALD_SOCKET)
     else:
         sink = LineLogSink(2, with_fields=True)
     handler = BoundedLogHandler(sink)
@@ -216,9 +216,9 @@ class LineLogSink:
 class JournaldSink:
     """Sends records with fields in journald's native protocol, for `journalctl HANDTOUCH_LINK=...`."""
 
-    def __init__(self, address: str) -> None:
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._address = address
+    def __init__(self, datagram_socket: socket.socket, address: str) -> None:
+        """Send by a Unix datagram socket, which `close` closes, to the journal's socket at `address`."""
+        self._socket, self._address = datagram_socket, address
         self._formatter = logging.Formatter("%(message)s")
         self._fallback = LineLogSink(2, with_fields=True)
 
@@ -266,7 +266,7 @@ def _fields(record: logging.LogRecord) -> dict[str, str]:
     return {key: str(value) for key, value in fields.items()}
 
 
-def _is_journal(file: int, stream: str) -> bool:
+def is_journal(file: int, stream: str) -> bool:
     """Return True if the file is `stream` (DEVICE:INODE), systemd's connection to the journal."""
     try:
         status = os.fstat(file)
