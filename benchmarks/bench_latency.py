@@ -282,7 +282,7 @@ def losses(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
         return figure(after) - figure(before)
 
     return {
-        "messages_lost": grown(lambda status: sum(status["service"]["drops"].values())),
+        "congestion_episodes": grown(lambda status: sum(status["service"]["congestion_episodes"].values())),
         "samples_missed": grown(lambda status: sum(pad["missed"] for pad in status["pads"])),
         "overruns": grown(lambda status: status["service"]["overruns"]),
     }
@@ -483,7 +483,7 @@ def section(results: dict[str, Any]) -> str:
             ratios.append(f"* {motion}, {who}, to {FLOORS[who]}: median {median:.2f}, p99 {p99:.2f}")
     served = [row for row in results["turns"] if row["who"] == "daemon"]
     lost, missed, overruns = (
-        sum(row[key] for row in served) for key in ("messages_lost", "samples_missed", "overruns")
+        sum(row[key] for row in served) for key in ("congestion_episodes", "samples_missed", "overruns")
     )
     ticks, count = sum(row["n"] for row in served), len(served) // len(PATHS)
     parts = "\n".join(f"| {part} | {us:.0f} |" for part, us in results["parts_us"].items())
@@ -504,7 +504,7 @@ same size, and computes nothing:
 
 {chr(10).join(ratios)}
 
-Of {ticks} ticks of the daemon: {lost} messages lost, {missed} samples missed, {overruns} overruns.
+Of {ticks} ticks of the daemon: {lost} congestion episodes, {missed} samples missed, {overruns} overruns.
 
 Parts of the daemon's latency with sliding contacts, from a traced pass (medians, us):
 

@@ -121,7 +121,7 @@ class Loop:
             rejected={},
             process={},
             buses={},
-            drops=dict(self.publisher.drops),
+            congestion_episodes=dict(self.publisher.congestion_episodes),
             subscriptions=(),
             retained=False,
         )
@@ -160,7 +160,7 @@ def recorded(loop: Loop, options: list[str], seconds: float, folder: Path) -> di
         "ticks_hz": result["ticks"] / result["seconds"],
         "mb_per_minute": size / seconds * 60 / 1e6,
         "lost": sum(map(int, re.findall(r"\S+: (\d+) messages lost", summary))),
-        "drops": loop.publisher.drops["complete"],
+        "congestion_episodes": loop.publisher.congestion_episodes["complete"],
         "status": process.returncode,
         "compared": result["compared"],
         "equal": result["equal"],
@@ -218,7 +218,7 @@ def write(results: dict[str, Any]) -> str:
             recorder_us = _median(of_case, "recorder_us")
             lines.append(
                 f"{line}| {recorder_us:.0f} | {recorder_us * RATE_HZ / 1e6:.0%} "
-                f"| {_median(of_case, 'mb_per_minute'):.1f} | {sum(r['lost'] + r['drops'] for r in of_case)} "
+                f"| {_median(of_case, 'mb_per_minute'):.1f} | {sum(r['lost'] for r in of_case)} "
                 f"| {sum(r['equal'] for r in of_case)} of {sum(r['compared'] for r in of_case)} "
                 f"| {_median(of_case, 'replay_times_real'):.1f} |"
             )

@@ -142,7 +142,8 @@ def case(config: Path, pid: int, stamps: Any, seconds: float, name: str) -> dict
         "loop_share": (busy[1] - busy[0]) / took_s,
         "share": share,
         "lost": int(np.count_nonzero(np.diff(known[:, 0]) > 1.5 * np.median(np.diff(known[:, 0])))),
-        "drops": after["service"]["drops"]["live"] - before["service"]["drops"]["live"],
+        "congestion_episodes": after["service"]["congestion_episodes"]["live"]
+        - before["service"]["congestion_episodes"]["live"],
     }
 
 
@@ -196,11 +197,11 @@ def page_of(results: dict[str, Any]) -> str:
             for key in ("p50_us", "p99_us", "tick_us", "send_us", "loop_share", "share")
         }
         spread = max(row["p50_us"] for row in rows) - min(row["p50_us"] for row in rows)
-        lost, drops = (sum(row[key] for row in rows) for key in ("lost", "drops"))
+        lost, episodes = (sum(row[key] for row in rows) for key in ("lost", "congestion_episodes"))
         lines.append(
             f"| {name} | {middle['p50_us']:.0f} | {spread:.0f} | {middle['p99_us']:.0f} | {lost} "
             f"| {middle['tick_us']:.0f} | {middle['send_us']:.0f} | {middle['loop_share']:.1%} "
-            f"| {middle['share']:.1%} | {drops} |"
+            f"| {middle['share']:.1%} | {episodes} |"
         )
     turns = 1 + max(row["turn"] for row in results["rows"])
     return f"""# Subscribers
@@ -209,12 +210,12 @@ One subscriber to a hand of 15 pads at 200 Hz, 5 touched by sliding contacts, be
 Medians of {turns} passes over all cases, {results["seconds"]:.0f} s each; spread is that of the
 medians per pass. Latency is from the last frame of a SYNC to the message; periods lost are those of the
 measured subscriber. Tick and send are means per period; the daemon's share of a core is the loop's thread
-alone, and all threads with those of ZeroMQ, which write to every connection. Drops are messages
-dropped by a full queue, such as that of the stalled subscriber. All run on one
+alone, and all threads with those of ZeroMQ, which write to every connection. Congestion counts the times
+that a queue was found full, such as that of the stalled subscriber. All run on one
 machine, so a hundred readers also compete for its CPUs.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
-| subscribers | p50, us | spread | p99, us | periods lost | tick, us | send, us | loop | daemon | drops |
+| subscribers | p50, us | spread | p99, us | periods lost | tick, us | send, us | loop | daemon | congestion |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(lines)}
 

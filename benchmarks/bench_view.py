@@ -168,7 +168,8 @@ def shares(control: str, pid: int, view_pid: int | None, seconds: float) -> dict
         "latency_ms": median_ms(counts[0], counts[1]),
         "ticks_hz": ticks / took_s,
         "overruns": after["overruns"] - before["overruns"],
-        "drops": sum(after["drops"].values()) - sum(before["drops"].values()),
+        "congestion_episodes": sum(after["congestion_episodes"].values())
+        - sum(before["congestion_episodes"].values()),
     }
 
 

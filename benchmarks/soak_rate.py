@@ -320,7 +320,7 @@ def remember(hours: float) -> dict[str, Any]:
                 )
                 print(f"{step / steps:4.0%} of the hour: {rows[-1][1]:.1f} MB", flush=True)
         begun = pipeline.tick.contacts.begun_count
-        drops = dict(publisher.drops)
+        episodes = dict(publisher.congestion_episodes)
         reader.close(0)
         publisher.close()
     figures = np.array(rows)
@@ -331,7 +331,7 @@ def remember(hours: float) -> dict[str, Any]:
         "ticks": steps,
         "contacts": begun,
         "messages": received,
-        "drops": drops,
+        "congestion_episodes": episodes,
         "mb_first": rows[1][1],
         "mb_third": float(late[0, 1]),
         "mb_last": rows[-1][1],
@@ -377,7 +377,8 @@ def write(new: dict[str, Any]) -> str:
             "",
             f"{memory['hours']:g} h of 15 pads at 1 kHz, compressed: {memory['ticks']} ticks through",
             f"pipeline and publisher, {memory['contacts']} contacts begun, {memory['messages']} messages",
-            f"received by a subscriber to everything, {sum(memory['drops'].values())} dropped. Resident",
+            "received by a subscriber to everything,",
+            f"{sum(memory['congestion_episodes'].values())} congestion episodes. Resident",
             f"{memory['mb_first']:.1f} MB at first, {memory['mb_third']:.1f} after a third,",
             f"{memory['mb_last']:.1f} at the end: {memory['mb_per_hour']:+.2f} MB an hour from there on",
             "(least squares). Descriptors",

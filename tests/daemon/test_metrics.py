@@ -37,7 +37,7 @@ def service(**changes: object) -> wire.Service:
         "v": 1, "session": 1, "seq": 1, "t_ns": 1, "wall_offset_ns": 0, "version": "1.2", "pid": 7,
         "uptime_s": 60.5, "period_s": 0.005, "hands": {"left": ["thumb_tip"]}, "ticks": 12_000, "overruns": 2,
         "rate_hz": 199.5, "tick_us": {}, "loop": StageTimer(0).statistics(), "contacts": 17,
-        "rejected": {"no_key": 3, "request": 1}, "buses": {"can0": BUS}, "drops": {"live": 9},
+        "rejected": {"no_key": 3, "request": 1}, "buses": {"can0": BUS}, "congestion_episodes": {"live": 9},
         "process": {
             "memory_bytes": 10**8, "cpu_s": 3.5, "loop_cpu_s": 3.0, "collections": [100, 10, 1],
             "log_dropped": 2, "log_suppressed": 5,
@@ -115,7 +115,7 @@ def test_all_statistics_of_the_daemon_are_exported() -> None:
     assert one(values, "bus_errors_total", bus="can0", cause="overflow") == 7
     assert one(values, "bus_error_frames_total", bus="can0", cause="bit error") == 3
     assert one(values, "sync_jitter_seconds", bus="can0", quantile="0.99") == pytest.approx(50e-6)
-    assert one(values, "dropped_messages_total", stream="live") == 9
+    assert one(values, "congestion_episodes_total", stream="live") == 9
     assert one(values, "refused_total", cause="no_key") == 3
     assert one(values, "memory_bytes") == 10**8
     assert one(values, "gc_collections_total", generation="0") == 100

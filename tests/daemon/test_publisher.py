@@ -221,7 +221,7 @@ def test_stalled_subscriber_loses_messages_and_others_do_not(publisher: Publishe
             publisher.send(_health(publisher, "thumb", text, 1 + number))
             got.append(awake.recv().seq)
         assert got == list(range(1, count + 1))
-    assert publisher.drops["live"] > 0
+    assert publisher.congestion_episodes["live"] > 0
 
 
 def test_unsubscribing_ends_encoding(publisher: Publisher) -> None:

@@ -126,7 +126,7 @@ def test_a_late_subscriber_gets_the_current_state_once(working: Any, stream: str
         assert seqs == list(range(seqs[0], seqs[0] + len(seqs))), topic
 
 
-def test_drops_of_both_streams_are_named_in_service(rig: Any) -> None:
+def test_congestion_episodes_of_both_streams_are_named_in_service(rig: Any) -> None:
     rig.start("run")
     with rig.subscribe("service") as messages:
-        assert messages.recv().drops == {"live": 0, "complete": 0}
+        assert messages.recv().congestion_episodes == {"live": 0, "complete": 0}

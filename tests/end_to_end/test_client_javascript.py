@@ -144,7 +144,10 @@ def test_javascript_and_python_read_the_same_from_the_daemon(rig: Any, program: 
 
 def _service(seq: int, session: int = 1, retained: bool = False) -> wire.Service:
     values: dict[str, Any] = dict.fromkeys(wire.Service.__dataclass_fields__, 0)
-    values |= {name: {} for name in ("hands", "tick_us", "loop", "rejected", "process", "buses", "drops")}
+    values |= {
+        name: {}
+        for name in ("hands", "tick_us", "loop", "rejected", "process", "buses", "congestion_episodes")
+    }
     values |= {"v": 1, "session": session, "seq": seq, "t_ns": 2**62 + seq, "wall_offset_ns": -(2**60)}
     values |= {"version": "x", "uptime_s": 1.0, "period_s": 0.1, "rate_hz": 0.0, "subscriptions": ()}
     values |= {"inputs": {}, "supervisor": None}

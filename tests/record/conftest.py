@@ -118,7 +118,7 @@ def service(seq: int, t_ns: int, session: int = SESSION) -> list[bytes]:
         v=wire.SCHEMA_VERSION, session=session, seq=seq, t_ns=t_ns, wall_offset_ns=WALL_NS, version="0",
         pid=1, uptime_s=1.0, period_s=5e-3, hands={"h": ["plane", "round"]}, ticks=1, overruns=0,
         rate_hz=200.0, tick_us={}, loop={}, contacts=0, rejected={}, process={}, buses={},
-        drops={"complete": 0},
+        congestion_episodes={"complete": 0},
         subscriptions=(), retained=False,
     )  # fmt: skip
     return wire.encode(message)

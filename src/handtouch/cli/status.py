@@ -92,9 +92,9 @@ def _print_status(answer: dict[str, Any], console: Console) -> None:
         f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
         + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
     )
-    drops = ", ".join(f"{count} on {stream}" for stream, count in service["drops"].items() if count) or "none"
+    episodes = _counts_text(service["congestion_episodes"])
     console.print(
-        f"messages dropped: {drops}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
+        f"congestion episodes: {episodes}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
     )
     _print_loop(service, console)
     for name, bus in service["buses"].items():

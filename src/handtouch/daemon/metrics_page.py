@@ -124,10 +124,11 @@ def _add_bus_metrics(page: _MetricsPage, buses: Mapping[str, Any]) -> None:
 
 
 def _add_loss_metrics(page: _MetricsPage, service: wire.Service) -> None:
-    rows: list[tuple[Labels, float]] = [({"stream": stream}, n) for stream, n in service.drops.items()]
-    page.add_values(
-        "dropped_messages_total", "counter", "messages dropped by a subscriber's full queue", rows
-    )
+    rows: list[tuple[Labels, float]] = [
+        ({"stream": stream}, n) for stream, n in service.congestion_episodes.items()
+    ]
+    text = "times that a subscriber's queue was found full; it loses messages until it has caught up"
+    page.add_values("congestion_episodes_total", "counter", text, rows)
     rows = [({"cause": cause}, n) for cause, n in service.rejected.items()]
     page.add_values("refused_total", "counter", "refused connections and requests", rows)
 

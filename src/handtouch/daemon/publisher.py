@@ -27,12 +27,12 @@ RetainedMessages = dict[str, Callable[[int], wire.OutgoingMessage | None]]
 
 
 class Publisher:
-    """Two XPUB sockets with the same topics; never blocks, counts messages dropped by full queues.
+    """Two XPUB sockets with the same topics; never blocks, counts how often a queue was found full.
 
-    `endpoints` (stream -> endpoint as bound, with its real port), `drops` (stream -> messages that the full
-    queue of a subscriber dropped), `subscriptions` (subscribed prefixes), `session` (identifies this session
-    of the daemon in every message), `retained_messages` (sent to late subscribers; the owner of the mapping
-    may add topics). Created by `open`.
+    `endpoints` (stream -> endpoint as bound, with its real port), `congestion_episodes` (stream -> times
+    that a message found the queue of a subscriber full), `subscriptions` (subscribed prefixes), `session`
+    (identifies this session of the daemon in every message), `retained_messages` (sent to late subscribers;
+    the owner of the mapping may add topics). Created by `open`.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Publisher:
     ) -> None:
         self.session = session
         self.retained_messages: RetainedMessages = {} if retained_messages is None else retained_messages
-        self.drops: Counter[str] = Counter(live=0, complete=0)
+        self.congestion_episodes: Counter[str] = Counter(live=0, complete=0)
         self.subscriptions: frozenset[bytes] = frozenset()
         self.endpoints = dict(endpoints)
         self._sockets = dict(sockets)
@@ -165,8 +165,9 @@ class Publisher:
         try:
             socket.send_multipart(parts, zmq.NOBLOCK)
         except zmq.Again:
-            # XPUB_NODROP reports that one queue is full, but sends to no subscriber: send again without it
-            self.drops[stream] += 1
+            # XPUB_NODROP reports that one queue is full, but sends to no subscriber: send again without it.
+            # That subscriber gets nothing more, and causes no more reports, until half of its queue is sent
+            self.congestion_episodes[stream] += 1
             socket.setsockopt(zmq.XPUB_NODROP, 0)
             socket.send_multipart(parts, zmq.NOBLOCK)
             socket.setsockopt(zmq.XPUB_NODROP, 1)

@@ -313,7 +313,7 @@ class StatusReporter:
                 }
                 for name, port in self._ports.items()
             },
-            drops=dict(self._publisher.drops),
+            congestion_episodes=dict(self._publisher.congestion_episodes),
             subscriptions=tuple(
                 sorted(prefix.decode("utf-8", "replace") for prefix in self._publisher.subscriptions)
             ),

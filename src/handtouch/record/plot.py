@@ -93,7 +93,7 @@ class PlotData:
     )
     health: dict[str, list[tuple[float, str]]] = field(default_factory=lambda: defaultdict(list))
     service: list[tuple[float, float, int, int]] = field(default_factory=list)
-    """time [s], ticks per second, overruns and drops so far"""
+    """time [s], ticks per second, overruns and congestion episodes so far"""
     end_s: float = 0.0
 
     @property
@@ -122,8 +122,8 @@ def read_plot_data(recording: Recording, from_s: float = 0.0, to_s: float | None
             state = payload["state"].replace("touched", "clear")  # one sample a second doesn't show contacts
             data.health[pad].append((t_s, state))
         elif prefix == "service":
-            drops = sum(payload["drops"].values())
-            data.service.append((t_s, payload["rate_hz"], payload["overruns"], drops))
+            episodes = sum(payload["congestion_episodes"].values())
+            data.service.append((t_s, payload["rate_hz"], payload["overruns"], episodes))
     for pad in [*data.contacts, *data.health]:
         data.pads.setdefault(pad, (float("nan"), float("nan")))
     if not data.service and not data.contacts:
@@ -311,7 +311,8 @@ def _draw_pads(data: PlotData) -> Figure:
 
 
 def _draw_health(data: PlotData) -> Figure:
-    """Draw the state of every pad over time, and below it the daemon's tick rate, overruns and drops."""
+    """Draw the state of every pad over time, and below it the daemon's tick rate, overruns
+    and congestion episodes."""
     from matplotlib.patches import Patch
 
     pads = list(data.pads)
@@ -333,10 +334,10 @@ def _draw_health(data: PlotData) -> Figure:
     handles = [Patch(color=color, label=state) for state, color in seen.items()]
     figure.legend(handles=handles, loc="outside upper right", ncols=max(1, len(handles)), fontsize=7)
     if data.service:
-        t_s, ticks_hz, overruns, drops = np.array(data.service).T
+        t_s, ticks_hz, overruns, episodes = np.array(data.service).T
         rate.plot(t_s, ticks_hz, color=_BLUE, linewidth=0.9)
         _mark_increments(rate, t_s, overruns, ticks_hz, "overrun")
-        _mark_increments(rate, t_s, drops, ticks_hz, "dropped message")
+        _mark_increments(rate, t_s, episodes, ticks_hz, "congestion episode")
     fastest = max((hz for _, hz, *_ in data.service), default=1.0)
     rate.set(xlabel="time [s]", ylabel="ticks / s", ylim=(0, 1.15 * max(fastest, 1.0)))
     return figure

@@ -146,7 +146,7 @@ class HandView:
             f"   touched {len(self._contacts)}",
             f"   {service.rate_hz:.0f} ticks/s",
             f"   bus load {load}",
-            f"   dropped {sum(service.drops.values())}",
+            f"   congestion episodes {sum(service.congestion_episodes.values())}",
             f"   tick {tick_us:.0f} us" if tick_us is not None else "",
         )
 

@@ -101,8 +101,8 @@ class Service:
     """memory, CPU time, garbage collections, suppressed log messages"""
     buses: dict[str, Any]
     """bus -> load (fraction of the bit rate) and counters by cause"""
-    drops: dict[str, Any]
-    """stream -> messages dropped because a subscriber's queue was full"""
+    congestion_episodes: dict[str, Any]
+    """stream -> times that a message found the queue of a subscriber full"""
     subscriptions: tuple[str, ...]
     retained: bool
     supervisor: dict[str, Any] | None = None

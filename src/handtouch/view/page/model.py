@@ -224,7 +224,7 @@ def _service_values(service: wire.Service) -> dict[str, Any]:
         "version": service.version,
         "rate_hz": round(service.rate_hz),
         "tick_us": service.tick_us.get("p50"),
-        "drops": sum(service.drops.values()),
+        "congestion_episodes": sum(service.congestion_episodes.values()),
         "overruns": service.overruns,
         "supervisor": supervisor.get("state"),
         "buses": {
