@@ -399,10 +399,12 @@ def test_scan_ends_whatever_a_node_answers(wire: VirtualBus, seed: int) -> None:
 # Nodes without a node id
 
 
-def unconfigured(wire: VirtualBus, serials: list[int]) -> tuple[DeviceBus, list[Any]]:
+def unconfigured(
+    wire: VirtualBus, serials: list[int], compares: Callable[[int], bool] = lambda _: True
+) -> tuple[DeviceBus, list[Any]]:
     nodes = wire.nodes()
     nodes.add(0x20, serial=77)
-    made = [nodes.add_unconfigured(serial=serial) for serial in serials]
+    made = [nodes.add_unconfigured(serial=serial, lss_compares=compares(serial)) for serial in serials]
     nodes.start()
     return nodes, made
 
@@ -422,6 +424,29 @@ def test_node_ids_are_assigned_upwards_in_the_order_of_serial_numbers(wire: Virt
     assert [each.lss.stored_id for each in made] == [0x22, 0x1F, 0x21]  # 0x20 is in use
     assert not report.problems
     assert {node.node_id: node.serial for node in report.nodes} == {0x1F: 9, 0x20: 77, 0x21: 2002, 0x22: 3001}
+
+
+@pytest.mark.parametrize("serials", [[3], [101, 102, 70103], [5, 0xFFFFFFFF, 80, 680, 2097152, 9, 0, 10]])
+@pytest.mark.parametrize("compares", [lambda _: False, lambda serial: serial % 2 == 1], ids=["none", "mixed"])
+def test_nodes_that_do_not_compare_lss_requests_all_get_ids_in_one_scan(
+    wire: VirtualBus, serials: list[int], compares: Callable[[int], bool]
+) -> None:
+    _, made = unconfigured(wire, serials, compares)
+    (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=1, listen_s=0.05))
+    assert not report.problems
+    expected = {serial: node_id for node_id, serial in enumerate(sorted(serials), 1)}
+    assert {each.lss.address.serial: each.lss.stored_id for each in made} == expected
+    assert {node.serial: node.node_id for node in report.nodes} == {**expected, 77: 0x20}
+    assert {address.serial for address in report.unconfigured} == set(serials)
+
+
+def test_an_unconfigured_node_with_the_identity_of_another_gets_no_id(wire: VirtualBus) -> None:
+    nodes, made = unconfigured(wire, [77, 78])
+    (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=1, listen_s=0.05))
+    assert [each.lss.node_id for each in made] == [None, 1]
+    assert 0x20 in nodes.devices
+    (problem,) = report.problems
+    assert "serial 77: node 32 has the same identity" in problem
 
 
 def test_configured_serial_number_gets_its_configured_node_id(wire: VirtualBus) -> None:

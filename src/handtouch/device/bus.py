@@ -128,11 +128,14 @@ class DeviceBus:
         product_code: int | None = None,
         serial: int | None = None,
         channels: tuple[Address, ...] = ANALOGUE_INPUTS,
+        lss_compares: bool = True,
     ) -> UnconfiguredDevice:
-        """Add a node without an id, which boots when LSS has assigned one; parameters as in `add`."""
-        unconfigured = UnconfiguredDevice(
-            self, self._rows, DeviceSpec(_eds_path(eds), vendor_id, product_code, serial, channels)
-        )
+        """Add a node without an id, which boots when LSS has assigned one; parameters as in `add`.
+
+        `lss_compares` : as `LssSlave.compares`
+        """
+        spec = DeviceSpec(_eds_path(eds), vendor_id, product_code, serial, channels)
+        unconfigured = UnconfiguredDevice(self, self._rows, spec, lss_compares=lss_compares)
         self._rows += 1
         with self.lock:
             self._unconfigured.append(unconfigured)

@@ -7,6 +7,8 @@ import struct
 from handtouch.canbus import cia305
 from handtouch.canbus.cia305 import LssAddress
 
+_UNCOMPARED = {cia305.FAST_SCAN: cia305.IS_SLAVE, cia305.SELECT[-1]: cia305.SELECTED}
+
 
 class LssSlave:
     """State machine of CiA 305: requests in, responses out.
@@ -14,13 +16,23 @@ class LssSlave:
     `node_id` : the id in use, None before it has one
     `stored_id` : the id after the next `power_on`
     `can_store` : False for a node that can't store its id
+    `compares` : False for a node that in the configuration state responds to every fast scan and every
+    selection whatever its data, as several stacks do
     `rejected` : number of malformed requests
     """
 
-    def __init__(self, address: LssAddress, node_id: int | None = None, *, can_store: bool = True) -> None:
+    def __init__(
+        self,
+        address: LssAddress,
+        node_id: int | None = None,
+        *,
+        can_store: bool = True,
+        compares: bool = True,
+    ) -> None:
         self.address = address
         self.stored_id = node_id
         self.can_store = can_store
+        self.compares = compares
         self.rejected = 0
         self.power_on()
 
@@ -44,6 +56,8 @@ class LssSlave:
         command = data[0]
         if command == cia305.SWITCH_GLOBAL:
             self._switch(data[1])
+        elif self.configuring and not self.compares and command in _UNCOMPARED:
+            return struct.pack("<B7x", _UNCOMPARED[command])
         elif command in cia305.SELECT:
             return self._select(command, data)
         elif command in cia305.IDENTIFY:

@@ -28,8 +28,8 @@ class UnconfiguredDevice:
     `lss` is its LSS slave, `device` the node with its present id, None while it has none.
     """
 
-    def __init__(self, bus: DeviceRegistry, row: int, spec: DeviceSpec) -> None:
-        self.lss = LssSlave(_lss_address(spec, spec.load_dictionary(1)))
+    def __init__(self, bus: DeviceRegistry, row: int, spec: DeviceSpec, *, lss_compares: bool = True) -> None:
+        self.lss = LssSlave(_lss_address(spec, spec.load_dictionary(1)), compares=lss_compares)
         self.device: Device | None = None
         self.plugged = False
         self._bus, self._row, self._spec = bus, row, spec

@@ -6,7 +6,7 @@ Public names: `ScanRequest`, `BusReport`, `scan_buses`, `scan_bus`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -24,6 +24,7 @@ from handtouch.canbus.find.traffic import FrameStatistics
 from handtouch.core.slab import Slab
 
 _BOOT_TIMEOUT_S = 3.0  # time limit for the boot-up message of a node with a new id
+_MAX_ASSIGNMENT_ROUNDS = 3
 
 Progress = Callable[[str], None]
 
@@ -99,7 +100,7 @@ def scan_bus(
             )
         if request.lss:
             with _measure_duration(report, "lss"):
-                _assign_node_ids(survey, report, request, deployment, progress)
+                _find_unconfigured(survey, report, request, deployment, progress)
     report.nodes += [
         survey.observed_facts(node_id)
         for node_id in sorted(survey.traffic.detected_nodes() - _node_ids(report))
@@ -144,7 +145,7 @@ def _listen(survey: BusSurvey, seconds: float, report: BusReport) -> None:
     }
 
 
-def _assign_node_ids(
+def _find_unconfigured(
     survey: BusSurvey,
     report: BusReport,
     request: ScanRequest,
@@ -161,38 +162,90 @@ def _assign_node_ids(
         _without_none([node.product_code for node in kinds]),
         _without_none([node.revision for node in report.nodes]),
     )
-    if master.problem:
-        report.problems.append(f"{name}: LSS: {master.problem}")
-    if request.first_assigned_id is None:
-        return
-    pads = {entry.pad.node_id: entry for entry in deployment.pads_on(name)} if deployment else {}
-    taken = _node_ids(report) | survey.traffic.detected_nodes()
-    boots = dict(survey.traffic.boot_up_counts)
-    for address in sorted(report.unconfigured, key=lambda each: each.serial):
-        node_id = _free_id(address, pads, taken, request.first_assigned_id)
-        if node_id is None:
-            report.problems.append(
-                f"{name}: no free node id from {request.first_assigned_id} upwards for {address}"
+    problems = master.problems
+    if request.first_assigned_id is not None:
+        boots = dict(survey.traffic.boot_up_counts)
+        assignment = _Assignment(survey, report, request.first_assigned_id, deployment, progress)
+        for _ in range(_MAX_ASSIGNMENT_ROUNDS):
+            assignment.assign_all(master)
+            left = set(master.scan())  # assigned nodes don't respond any more, and hide no other
+            problems = master.problems
+            assignment.report_remaining(left)
+            found = left - set(report.unconfigured)
+            report.unconfigured = sorted(found.union(report.unconfigured))
+            if not found:
+                break
+        problems = [*problems, *assignment.failures.values()]
+        new = set(report.assigned.values())
+        survey.receive(
+            _BOOT_TIMEOUT_S,
+            lambda: all(survey.traffic.boot_up_counts.get(i, 0) > boots.get(i, 0) for i in new),
+        )
+        report.nodes += survey.read_nodes(sorted(survey.probe_ids(sorted(new))))
+    report.problems += [f"{name}: LSS: {problem}" for problem in problems]
+
+
+class _Assignment:
+    """Assignment of node ids to the unconfigured nodes of a report; `failures`: reason for each node."""
+
+    def __init__(
+        self,
+        survey: BusSurvey,
+        report: BusReport,
+        first_id: int,
+        deployment: config.Deployment | None,
+        progress: Progress,
+    ) -> None:
+        self.failures: dict[LssAddress, str] = {}
+        self._report, self._first_id, self._progress = report, first_id, progress
+        self._pads = (
+            {entry.pad.node_id: entry for entry in deployment.pads_on(report.bus.name)} if deployment else {}
+        )
+        self._taken = _node_ids(report) | survey.traffic.detected_nodes()
+        self._owners = {
+            (node.vendor_id, node.product_code, node.revision, node.serial): node.node_id
+            for node in report.nodes
+        }
+
+    def assign_all(self, master: LssMaster) -> None:
+        """Assign an id to each node that was not tried yet, one by one in the order of the serial numbers."""
+        for address in sorted(self._report.unconfigured, key=lambda each: each.serial):
+            if address in self._report.assigned or address in self.failures:
+                continue
+            if problem := self._assign(master, address):
+                self.failures[address] = problem
+
+    def report_remaining(self, left: Collection[LssAddress]) -> None:
+        """Report nodes that still respond as unconfigured ones although an id was assigned to them."""
+        for address, node_id in self._report.assigned.items():
+            if address in left:
+                self.failures[address] = (
+                    f"{address}: a node without an id still responds after id {node_id} was assigned; it "
+                    "doesn't use the id, or another node has its address (0x1018)"
+                )
+
+    def _assign(self, master: LssMaster, address: LssAddress) -> str:
+        """Assign an id to a node; return the problem, empty if there is none."""
+        owner = self._owners.get(address.parts)
+        if owner is not None:
+            return (
+                f"{address}: node {owner} has the same identity and would change its id, too; give each its "
+                "own serial number (0x1018 sub 4)"
             )
-            continue
-        progress(f"{name}: node id {node_id} for serial {address.serial}")
+        node_id = _free_id(address, self._pads, self._taken, self._first_id)
+        if node_id is None:
+            return f"{address}: no free node id from {self._first_id} upwards"
+        self._progress(f"{self._report.bus.name}: node id {node_id} for serial {address.serial}")
         try:
             lost = master.assign_node_id(address, node_id)
         except LssError as error:
-            report.problems.append(f"{name}: LSS: {error}")
-            continue
-        taken.add(node_id)
-        report.assigned[address] = node_id
-        if lost:
-            report.problems.append(
-                f"{name}: node {node_id} (serial {address.serial}) can't store its node id, which is lost "
-                f"at power-off: {lost}"
-            )
-    new = set(report.assigned.values())
-    survey.receive(
-        _BOOT_TIMEOUT_S, lambda: all(survey.traffic.boot_up_counts.get(i, 0) > boots.get(i, 0) for i in new)
-    )
-    report.nodes += survey.read_nodes(sorted(survey.probe_ids(sorted(new))))
+            return str(error)
+        self._taken.add(node_id)
+        self._report.assigned[address] = node_id
+        return lost and (
+            f"node {node_id} (serial {address.serial}) can't store its node id, which is lost at power-off: "
+            f"{lost}"
+        )
 
 
 def _free_id(
