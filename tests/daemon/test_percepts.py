@@ -103,7 +103,7 @@ def test_no_percepts_without_a_request(bench: Any) -> None:
     rig = Rig(bench, frozenset([b"contact/", b"hand/"]), PLAIN)
     rig.run_contact(20)
     assert not rig.percepts.enabled
-    assert rig.percepts._perceiver is None
+    assert rig.percepts.contacts is None
     assert rig.demand.requested.percepts is None
 
 
@@ -150,7 +150,7 @@ def test_only_subscribed_percepts_of_pads_in_the_scene_are_requested(
 def test_pair_distance_follows_from_the_residual(bench: Any, residual: float, axis: int) -> None:
     """In metres on the surface, along x of the pad or along y."""
     rig = Rig(bench, MOTION, PLAIN)
-    assert np.isinf(rig.percepts._pair_distance_m(PLANE, residual, 1e-3)[1])  # no contact, no position
+    assert np.isinf(rig.percepts.pair_distance_m(PLANE, residual, 1e-3)[1])  # no contact, no position
     rig.run_contact(20)
     locator, (x, y) = bench.model.locator, rig.pipeline.tick.columns.xy[PLANE].tolist()
     on_sheet, std = pair_distance(locator, PLANE, x, y, residual, 1e-3)
@@ -158,7 +158,7 @@ def test_pair_distance_follows_from_the_residual(bench: Any, residual: float, ax
     placed = bench.model.placement.to_link_frame(
         np.full(2, PLANE), points[:, 0], points[:, 1], np.zeros((2, 2, 2))
     ).position_m
-    distance_m, std_m = rig.percepts._pair_distance_m(PLANE, residual, 1e-3)
+    distance_m, std_m = rig.percepts.pair_distance_m(PLANE, residual, 1e-3)
     assert distance_m == pytest.approx(float(np.linalg.norm(placed[1] - placed[0])), rel=1e-6)
     assert std_m == pytest.approx(std * distance_m / on_sheet)
 
@@ -177,9 +177,8 @@ def test_commanded_motion_replaces_missing_joint_states(bench: Any) -> None:
 
     rig.pipeline.transforms.poses_from_joints = poses  # type: ignore[method-assign,assignment]
     rig.run_contact(30)
-    perceiver = rig.percepts._perceiver
-    assert perceiver is not None
-    window = perceiver.buffer.window(PLANE)
+    assert rig.percepts.contacts is not None
+    window = rig.percepts.contacts.window(PLANE)
     assert requests[-1] == ([PLANE], rig.t_ns)
     facing = float(window["commanded_normal"][-1] @ outward)
     motion = window["commanded_m"]

@@ -86,8 +86,13 @@ class Rig:
         self.pipeline = Pipeline(type(bench.model)(bench.deployment), PERIOD_NS, 0.6, self.published)
         self.pipeline.node_state[:] = PadState.CLEAR
         self.nodes, self.process = Nodes([11, 12, 13]), FakeProcess()
-        arguments: tuple[Any, ...] = (bench.deployment, self.pipeline, self.nodes, "", self.process)
-        self.supervisor = SupervisorClient(*arguments)
+        make: Any = SupervisorClient  # nodes and process are stand-ins
+        self.switched_ns: list[int] = []
+        """times when the excitation of pads was switched"""
+        self.supervisor: SupervisorClient = make(
+            bench.deployment, self.pipeline, self.nodes, "", self.process,
+            on_excitation_changed=self.switched_ns.append,
+        )  # fmt: skip
         self.t_ns = SECOND_NS
         self.touched = False
         """True while the first pad is touched"""
@@ -282,8 +287,6 @@ def test_excitation_of_a_fading_sheet_is_off_until_the_hand_is_touched(bench: An
     scene = bench.deployment.scene.model_copy(update={"excitation_off_after_s": 1.0})
     fading = bench.deployment.model_copy(update={"sheets": {"s": sheet}, "scene": scene})
     rig = Rig(replace(bench, deployment=fading))
-    switched: list[int] = []
-    rig.supervisor._on_excitation_changed = switched.append
     rig.pipeline.tick.sheet_force.set_back_force(1, 2.0, 0.1)
     for _ in range(450):
         rig.step()
@@ -300,7 +303,7 @@ def test_excitation_of_a_fading_sheet_is_off_until_the_hand_is_touched(bench: An
     assert not rig.supervisor.excitation.off.any()
     assert rig.supervisor.health_fields(1)["diagnoses"] == ()
     assert "h/round: excitation on again" in caplog.text
-    assert len(switched) == 2
+    assert len(rig.switched_ns) == 2
 
 
 def test_state_of_the_process_is_published(rig: Rig) -> None:

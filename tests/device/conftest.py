@@ -50,7 +50,7 @@ class Bench:
         self.counts: NDArray[np.int64] = np.array([[10, 20, 30, 40]] * 3)
         self.samples: list[int] = []
         self.wire = Wire(self)
-        self.bus = DeviceBus(self.wire, self._sample, clock=lambda: self.t_ns)  # type: ignore[arg-type]
+        self.bus = DeviceBus(self.wire, self.read_channels, clock=lambda: self.t_ns)  # type: ignore[arg-type]
 
     def running(self, node_id: int = 1, **kind: Any) -> Device:
         """A node that is operational."""
@@ -111,7 +111,7 @@ class Bench:
         assert data[0] in (0x60, 0x80)
         return int.from_bytes(data[4:], "little")
 
-    def _sample(self, t_ns: int) -> NDArray[np.int64]:
+    def read_channels(self, t_ns: int) -> NDArray[np.int64]:
         self.samples.append(t_ns)
         return self.counts
 

@@ -52,7 +52,7 @@ def test_any_mapping_carries_the_counts_clipped_to_their_types(
     kind: Any, bench: Any, write_eds: Callable[..., Path]
 ) -> None:
     channels, pdos, counts = kind
-    bench.bus = DeviceBus(bench.wire, bench._sample, clock=lambda: 0)
+    bench.bus = DeviceBus(bench.wire, bench.read_channels, clock=lambda: 0)
     bench.counts = np.array([counts])
     bench.running(5, eds=write_eds(channels, pdos), channels=FOUR)
     sent = bench.sync()

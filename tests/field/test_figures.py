@@ -55,5 +55,5 @@ def test_truncation_of_eq_2_acts_as_a_contact_radius() -> None:
     fraction = np.linspace(0.1, 0.9, 33)
     closed = np.log(Rectangle(1.0, 1.0).conformal_radius(fraction, 0.5)) / (2 * np.pi)
     for limit, ripple in ((45, 0.01), (531, 0.001)):
-        difference = figures._double_sum(fraction, limit) - closed
+        difference = figures.truncated_double_sum(fraction, limit) - closed
         assert np.ptp(difference) < ripple

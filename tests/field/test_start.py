@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from scipy.special import i0e, i1e
 
-from handtouch.field._stack import bessel_ratio
+from handtouch.field.contact_stack import bessel_ratio
 from handtouch.field.spline import spline_operator
 from handtouch.hand.pads import rotation_from_rpy
 

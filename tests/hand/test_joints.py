@@ -82,10 +82,10 @@ def test_memory_is_bounded() -> None:
     states = JointStateBuffer(("a",))
     for number in range(200):
         states.add_state((100 + number) * MS, ("a", f"x{number}"), np.zeros(2))
+    assert len(states) == 16
     for number in range(500):
         states.add_state((1000 + number) * MS, ("a",), np.zeros(1))
-    assert len(states._sources) <= 16
-    assert max(len(kept) for _, _, kept in states._sources.values()) <= 64
+    assert len(states) == 15 + 64
 
 
 def test_positions_far_beyond_the_limits_are_rejected_and_leave_no_trace() -> None:

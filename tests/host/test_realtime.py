@@ -38,7 +38,7 @@ assert os.sched_getaffinity(0) == {cpu}
 if not any("realtime_priority" in text for text in refused):
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
     assert os.sched_getparam(0).sched_priority == 12
-    io_threads = realtime._zmq_io_threads()
+    io_threads = realtime.zmq_io_threads()
     assert io_threads
     assert {os.sched_getparam(thread).sched_priority for thread in io_threads} == {11}
     pid = os.fork()

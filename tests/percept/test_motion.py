@@ -196,8 +196,7 @@ def test_evidence_near_the_threshold_does_not_chatter() -> None:
         motion.slip_test.log_odds[0] = (
             even + (0.8 if k % 6 < 3 else -1.5 if k < 100 else -9.0) if k < 106 else 0.0
         )
-        motion._update_slip_log_odds(pad, one)
-        now = bool(motion._quick_classify(pad)[0] == MOTION_CLASSES.index("incipient"))
+        now = bool(motion.classify(pad, one)[0] == MOTION_CLASSES.index("incipient"))
         alarms, before = alarms + (now and not before), now
     assert alarms == 1
     assert not before

@@ -57,7 +57,7 @@ class Pads:
         self._pads = pads
         self._networks = [electrode_network(pad, whole.sheets[pad.sheet]) for pad in pads]
         self._rng = np.random.default_rng(1)
-        self._currents = np.zeros((len(pads), 4))
+        self.currents = np.zeros((len(pads), 4))
         self.offset = np.zeros((len(pads), 4))
         self.noise = np.ones((len(pads), 4))
         self._bus = can.Bus(interface="virtual", channel=channel)
@@ -72,18 +72,18 @@ class Pads:
         surface = pad_surface(self._pads[row])
         s, t = (0.5, 0.5) if near is None else PRESS_TARGETS[near]
         x, _ = surface.to_rectangle(s * surface.extent_m[0], 0.0)
-        self._currents[row] = total * self._networks[row].fractions(float(x), t * surface.b)
+        self.currents[row] = total * self._networks[row].fractions(float(x), t * surface.b)
 
     def release(self) -> None:
-        self._currents = np.zeros_like(self._currents)
+        self.currents = np.zeros_like(self.currents)
 
     def close(self) -> None:
         self.nodes.stop()
         self._bus.shutdown()
 
     def _sample(self, _: int) -> NDArray[np.int64]:
-        noise = self.noise * self._rng.standard_normal(self._currents.shape)
-        return np.rint(self.offset + self._currents + noise).astype(np.int64)
+        noise = self.noise * self._rng.standard_normal(self.currents.shape)
+        return np.rint(self.offset + self.currents + noise).astype(np.int64)
 
 
 class SteppedSource:
@@ -418,7 +418,7 @@ def test_unequal_channel_scales_are_taken_into_account(made: Callable[..., Pads]
 
     def press(near: ElectrodeName | None) -> None:
         pads.press("palm_heel", near)
-        pads._currents[0] /= [electrode_scale[name] for name in ELECTRODES]
+        pads.currents[0] /= [electrode_scale[name] for name in ELECTRODES]
 
     outcomes, _ = run_commissioning(pads, SimulatedUser(pads, instead={"palm_heel": press}))
     assert outcomes["palm_heel"].electrodes == order

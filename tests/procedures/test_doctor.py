@@ -22,13 +22,12 @@ from handtouch.host.machine import Machine
 from handtouch.procedures import doctor
 from handtouch.procedures.doctor import HostCheck
 
-RAW_SOCKET_PROBLEM = doctor._raw_socket_problem
 HAND = shipped.path("utah_mit.toml")
 
 
 @dataclass(frozen=True)
 class Fake(Machine):
-    """A machine with an interface can0 with a given answer of `ip`."""
+    """A machine that permits raw sockets, with an interface can0 with a given answer of `ip`."""
 
     link: dict[str, Any] | None = None
 
@@ -36,16 +35,13 @@ class Fake(Machine):
         del name
         return self.link
 
+    def raw_socket_problem(self) -> None:
+        return None
+
 
 def fake(root: Path, link: dict[str, Any] | None = None) -> Fake:
     (root / "sys/class/net/can0").mkdir(parents=True)
     return Fake(root / "proc", root / "sys", link)
-
-
-@pytest.fixture(autouse=True)
-def _permit_raw_sockets(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    if not request.node.get_closest_marker("socketcan"):
-        monkeypatch.setattr(doctor, "_raw_socket_problem", lambda: None)
 
 
 def bus(interface: str = "socketcan", channel: str = "can0", **options: int) -> config.Bus:
@@ -184,9 +180,8 @@ def test_kernel_without_socketcan_is_one_failure_with_a_remedy(
     def refuse(*_: object) -> None:
         raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
 
-    monkeypatch.setattr(doctor, "_raw_socket_problem", RAW_SOCKET_PROBLEM)
     monkeypatch.setattr(socket, "socket", refuse)
-    (check,) = doctor.check_bus(bus(channel="can7"), fake(tmp_path))
+    (check,) = doctor.check_bus(bus(channel="can7"), Machine(tmp_path / "proc", tmp_path / "sys"))
     assert (check.state, "no SocketCAN" in check.detail) == ("fail", True)
     assert "udp_multicast" in check.remedy
 

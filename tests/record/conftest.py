@@ -33,7 +33,7 @@ class CollectingSink:
 
     def __init__(self, take: Callable[[list[bytes]], None] = lambda _: None) -> None:
         self.messages: list[Any] = []
-        self._take = take
+        self.take = take
 
     def has_subscriber(self, topic: str) -> bool:
         return not topic.startswith("raw/")
@@ -41,7 +41,7 @@ class CollectingSink:
     def send(self, message: wire.OutgoingMessage) -> None:
         sent = wire.encode(message)
         self.messages.append(wire.decode(sent))
-        self._take(sent)
+        self.take(sent)
 
     def contacts(self) -> list[wire.Contact]:
         return [message for message in self.messages if isinstance(message, wire.Contact)]

@@ -35,7 +35,7 @@ class Daemon:
         journal.publish_config(hand.deployment, {}, {}, 0)
         self.publisher.retained_messages.update(journal.retained_messages())
         hand.sink.has_subscriber = self.publisher.has_subscriber  # type: ignore[method-assign]
-        hand.sink._take = lambda parts: self.publisher.send(wire.decode(parts))
+        hand.sink.take = lambda parts: self.publisher.send(wire.decode(parts))
 
     def tick(self) -> None:
         self.hand.stroke(1, seed=self._seq)

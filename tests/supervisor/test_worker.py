@@ -18,7 +18,7 @@ from handtouch.calibration.calibration import (
     matrix,
 )
 from handtouch.calibration.store import Store
-from handtouch.calibration.store_client import StoreClient
+from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
@@ -30,6 +30,7 @@ from handtouch.supervisor.worker import SupervisorWorker
 
 from .conftest import LINKS, NOW, PERIOD_NS, Bench
 
+MOUNTING_POINT = MountingPoint("h", LINKS[0], f"nominal-{LINKS[0]}")
 Session = list[Any]
 Swapped = tuple[list[WorkerMessage], Path]
 
@@ -298,9 +299,7 @@ def test_damaged_store_is_reported_moved_aside_and_replaced(bench: Bench, tmp_pa
     assert "is damaged" in client.error
     assert any("store" in diagnosis.kind for diagnosis in assessment(messages, 0).diagnoses)
     assert len(list(tmp_path.glob("c.db.damaged-*"))) == 1
-    assert (
-        client.store_parts(11, worker._pads[0].mounting_point, Provenance("x"), NOW, gains=None) is not None
-    )
+    assert client.store_parts(11, MOUNTING_POINT, Provenance("x"), NOW, gains=None) is not None
 
 
 def test_calibration_works_without_a_usable_store(bench: Bench, session: Session, tmp_path: Path) -> None:
@@ -314,12 +313,9 @@ def test_calibration_works_without_a_usable_store(bench: Bench, session: Session
     assert path.read_text() == "not a store"
 
 
-def test_storing_gains_keeps_parts_stored_before(bench: Bench, tmp_path: Path) -> None:
+def test_storing_gains_keeps_parts_stored_before(tmp_path: Path) -> None:
     """A measured law, stored by another process meanwhile, stays when new gains are stored."""
-    client, mounting_point = (
-        StoreClient(tmp_path / "c.db"),
-        make_worker(bench, tmp_path / "c.db")._pads[0].mounting_point,
-    )
+    client, mounting_point = StoreClient(tmp_path / "c.db"), MOUNTING_POINT
     law = LawParameters(21_000.0, 1.4, 2400.0, matrix(np.diag([1e-4, 1e-4, 1e-6])))
     gains = Gains((1.1, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
     assert client.store_parts(11, mounting_point, Provenance("gains from contacts"), NOW, gains=gains)

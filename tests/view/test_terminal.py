@@ -260,12 +260,30 @@ def test_status_shows_diagnoses_the_supervisor_and_the_store(capsys: pytest.Capt
         "dropped": 0, "malformed": 0, "late": 0, "summary": "3 calibrated",
         "store_error": "it is damaged",
     }  # fmt: skip
-    answer = {"service": {"supervisor": figures}, "pads": [asdict(replace(HEALTH, diagnoses=(GUM,)))]}
-    status._print_supervisor(answer, Console(width=200))
+    bus = {
+        "state": "active", "load": 0.43, "problem": "no acknowledge", "causes": {"ack": 2}, "lost": 1,
+        "sync": {"by": "daemon", "problem": "", "jitter_us": {"p99": 80.0, "max": 90.0}},
+    }  # fmt: skip
+    service = asdict(SERVICE) | {
+        "supervisor": figures, "buses": {"can0": bus}, "congestion_episodes": {"live": 3},
+        "loop": {"stages": {"tick": {"sum_s": 0.004, "counts": [3, 1]}}, "late": {"report": 2}},
+        "process": {"memory_bytes": 10**8, "cpu_s": 3.5, "loop_cpu_s": 3.0},
+    }  # fmt: skip
+    pads = [asdict(replace(HEALTH, diagnoses=(GUM,))), asdict(replace(HEALTH, sampling="event"))]
+    answer = {"service": service, "scene": {"scenes": [], "pads": []}, "pads": pads}
+    status.print_status(answer, Console(width=200))
     printed = capsys.readouterr().out
     assert (
         "supervisor running, process 7, 0.3 s behind, 1 restarts (last exit: killed by signal 9)" in printed
     )
     assert "calibration store: it is damaged" in printed
     assert "right/thumb_tip: chewing gum, 10 mm from x0 (it stands" in printed
-    assert not status._is_ok({"state": "clear", "calibration_state": "quarantined"})
+    assert "600 ticks at 200 Hz, 0 overruns, tick 250 us (p99 400, max 500)" in printed
+    assert "congestion episodes: live 3; subscriptions: none" in printed
+    assert "mean time per cycle, ms: tick 1.00; late ticks: report 2" in printed
+    assert (
+        "bus can0: active, load 43 %, SYNC by daemon (jitter p99 80 us, max 90), lost 1; "
+        "error frames: ack 2 no acknowledge" in printed
+    )
+    assert "operational (event)" in printed
+    assert not status.is_ok({"state": "clear", "calibration_state": "quarantined"})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
@@ -15,6 +16,19 @@ from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
 
 _PIPE_WIDTH_COLUMNS = 200
 """Width without a terminal: one line per pad, for grep."""
+_COLUMNS: tuple[tuple[str, bool, Callable[[dict[str, Any]], str]], ...] = (
+    ("link", False, lambda pad: f"{pad['hand']}/{pad['link']}"),
+    ("pad", False, lambda pad: pad["state"] + _calibration_note(pad)),
+    ("node", False, lambda pad: pad["node_state"] + " (event)" * (pad["sampling"] == "event")),
+    ("id", True, lambda pad: str(pad["node_id"])),
+    ("serial", True, lambda pad: "" if pad["serial"] is None else str(pad["serial"])),
+    ("Hz", True, lambda pad: f"{pad['rate_hz']:.0f}"),
+    ("missed", True, lambda pad: str(pad["missed_samples"])),
+    ("heartbeats missed", True, lambda pad: str(pad["heartbeats_missed"])),
+    ("reboots", True, lambda pad: str(pad["reboots"])),
+    ("reason", False, lambda pad: "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]]))),
+)
+"""Columns of the table of pads: header, number, text of a pad."""
 
 
 def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bool = False) -> int:
@@ -30,15 +44,77 @@ def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bo
     if as_json:
         print(json.dumps(answer, indent=2))
     else:
-        _print_status(answer, Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH_COLUMNS))
-    return 0 if all(map(_is_ok, answer["pads"])) else 1
+        print_status(answer, Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH_COLUMNS))
+    return 0 if all(map(is_ok, answer["pads"])) else 1
 
 
-def _is_ok(pad: dict[str, Any]) -> bool:
-    return (
-        pad["state"] in ("clear", "touched", "off")
-        and pad.get("calibration_state") not in UNCALIBRATED_STATES
+def is_ok(pad: dict[str, Any]) -> bool:
+    """Return True for a calibrated pad that works or is switched off."""
+    return pad["state"] in ("clear", "touched", "off") and not _calibration_note(pad)
+
+
+def print_status(answer: dict[str, Any], console: Console) -> None:
+    """Print the reply to the control command `status`."""
+    service = answer["service"]
+    _print_daemon(service, console)
+    for name, bus in service["buses"].items():
+        _print_bus(name, bus, console)
+    for line in scene_lines(answer["scene"]):
+        console.print(line, highlight=False, markup=False)
+    _print_pads(answer["pads"], console)
+    _print_supervisor(answer, console)
+
+
+def _print_daemon(service: dict[str, Any], console: Console) -> None:
+    """Print ticks, congestion, mean durations of the stages of a cycle, resources and rejections."""
+    tick, loop, process = service["tick_us"], service["loop"], service["process"]
+    console.print(
+        f"handtouch {service['version']}, process {service['pid']}, up {service['uptime_s']:.0f} s: "
+        f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
+        + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
     )
+    episodes = _counts_text(service["congestion_episodes"])
+    console.print(
+        f"congestion episodes: {episodes}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
+    )
+    means = (
+        f"{stage} {1e3 * figures['sum_s'] / sum(figures['counts']):.2f}"
+        for stage, figures in loop["stages"].items()
+        if figures["counts"]
+    )
+    console.print(
+        f"mean time per cycle, ms: {', '.join(means) or 'none yet'}; late ticks: {_counts_text(loop['late'])}"
+    )
+    console.print(
+        f"memory {process['memory_bytes'] / 1e6:.0f} MB, {process['cpu_s']:.0f} s of CPU time, "
+        f"of which the main loop {process['loop_cpu_s']:.0f} s; rejected: {_counts_text(service['rejected'])}"
+    )
+
+
+def _print_bus(name: str, bus: dict[str, Any], console: Console) -> None:
+    sync = bus["sync"]
+    counts = ", ".join(
+        f"{key} {value}" for key, value in bus.items() if isinstance(value, int) and key != "since_ns"
+    )
+    causes = [f"{cause} {count}" for cause, count in bus["causes"].items()]
+    problems = "; ".join(filter(None, [bus["problem"], sync["problem"]]))
+    jitter = sync["jitter_us"]
+    console.print(
+        f"bus {name}: {bus['state']}, load {100 * bus['load']:.0f} %, SYNC by {sync['by']}"
+        + (f" (jitter p99 {jitter['p99']:.0f} us, max {jitter['max']:.0f})" if jitter else "")
+        + f", {counts}"
+        + (f"; error frames: {', '.join(causes)}" if causes else "")
+        + (f" [red]{problems}[/red]" if problems else "")
+    )
+
+
+def _print_pads(pads: list[dict[str, Any]], console: Console) -> None:
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for header, number, _ in _COLUMNS:
+        table.add_column(header, justify="right" if number else "left", no_wrap=header != "reason")
+    for pad in pads:
+        table.add_row(*(text(pad) for _, _, text in _COLUMNS))
+    console.print(table)
 
 
 def _print_supervisor(answer: dict[str, Any], console: Console) -> None:
@@ -63,89 +139,10 @@ def _print_supervisor(answer: dict[str, Any], console: Console) -> None:
             console.print(text, highlight=False, markup=False, style="yellow")
 
 
-def _print_loop(service: dict[str, Any], console: Console) -> None:
-    """Print mean durations of the stages of a cycle, late ticks, resources and rejections."""
-    loop, process = service["loop"], service["process"]
-    means = (
-        f"{stage} {1e3 * figures['sum_s'] / sum(figures['counts']):.2f}"
-        for stage, figures in loop["stages"].items()
-        if figures["counts"]
-    )
-    console.print(
-        f"mean time per cycle, ms: {', '.join(means) or 'none yet'}; late ticks: {_counts_text(loop['late'])}"
-    )
-    console.print(
-        f"memory {process['memory_bytes'] / 1e6:.0f} MB, {process['cpu_s']:.0f} s of CPU time, "
-        f"of which the main loop {process['loop_cpu_s']:.0f} s; rejected: {_counts_text(service['rejected'])}"
-    )
+def _calibration_note(pad: dict[str, Any]) -> str:
+    state = pad.get("calibration_state")
+    return f" ({state})" if state in UNCALIBRATED_STATES else ""
 
 
 def _counts_text(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "none"
-
-
-def _print_status(answer: dict[str, Any], console: Console) -> None:
-    service = answer["service"]
-    tick = service["tick_us"]
-    console.print(
-        f"handtouch {service['version']}, process {service['pid']}, up {service['uptime_s']:.0f} s: "
-        f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
-        + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
-    )
-    episodes = _counts_text(service["congestion_episodes"])
-    console.print(
-        f"congestion episodes: {episodes}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
-    )
-    _print_loop(service, console)
-    for name, bus in service["buses"].items():
-        sync = bus["sync"]
-        counts = ", ".join(
-            f"{key} {value}" for key, value in bus.items() if isinstance(value, int) and key != "since_ns"
-        )
-        causes = [f"{cause} {count}" for cause, count in bus["causes"].items()]
-        problems = "; ".join(filter(None, [bus["problem"], sync["problem"]]))
-        jitter = sync["jitter_us"]
-        console.print(
-            f"bus {name}: {bus['state']}, load {100 * bus['load']:.0f} %, SYNC by {sync['by']}"
-            + (f" (jitter p99 {jitter['p99']:.0f} us, max {jitter['max']:.0f})" if jitter else "")
-            + f", {counts}"
-            + (f"; error frames: {', '.join(causes)}" if causes else "")
-            + (f" [red]{problems}[/red]" if problems else "")
-        )
-    for line in scene_lines(answer["scene"]):
-        console.print(line, highlight=False, markup=False)
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in (
-        "link",
-        "pad",
-        "node",
-        "id",
-        "serial",
-        "Hz",
-        "missed",
-        "heartbeats missed",
-        "reboots",
-        "reason",
-    ):
-        number = column in ("id", "serial", "Hz", "missed", "heartbeats missed", "reboots")
-        table.add_column(column, justify="right" if number else "left", no_wrap=column != "reason")
-    for pad in answer["pads"]:
-        table.add_row(
-            f"{pad['hand']}/{pad['link']}",
-            pad["state"]
-            + (
-                f" ({pad['calibration_state']})"
-                if pad.get("calibration_state") in UNCALIBRATED_STATES
-                else ""
-            ),
-            pad["node_state"] + (" (event)" if pad["sampling"] == "event" else ""),
-            str(pad["node_id"]),
-            "" if pad["serial"] is None else str(pad["serial"]),
-            f"{pad['rate_hz']:.0f}",
-            str(pad["missed_samples"]),
-            str(pad["heartbeats_missed"]),
-            str(pad["reboots"]),
-            "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]])),
-        )
-    console.print(table)
-    _print_supervisor(answer, console)

@@ -47,6 +47,8 @@ class PerceptPublisher:
         commanded_joints_at: Callable[[str, int], JointSnapshot | None] = lambda _, __: None,
     ) -> None:
         self.enabled = False
+        self.contacts: ContactBuffer | None = None
+        """latest samples of every contact; None while no percept is requested"""
         self._pipeline, self._publisher, self._session = pipeline, publisher, session
         self._perceiver: PerceptPipeline | None = None
         self._hands = list(pipeline.model.rows_of_hand)
@@ -62,7 +64,7 @@ class PerceptPublisher:
         """Compute the requested percepts from now on."""
         self.enabled = requested.percepts is not None
         if requested.percepts is None:
-            self._perceiver = None  # its state goes stale: start afresh with the next request
+            self._perceiver = self.contacts = None  # goes stale: start afresh with the next request
             self._last_published.clear()
             return
         if self._perceiver is None:
@@ -93,13 +95,14 @@ class PerceptPublisher:
         hand_of = np.zeros(self._pipeline.model.size, dtype=np.intp)
         for hand, pads in enumerate(rows):
             hand_of[pads] = hand
+        self.contacts = ContactBuffer(len(hand_of), hand_of.tolist())
         return build_percept_pipeline(
-            ContactBuffer(len(hand_of), hand_of.tolist()),
+            self.contacts,
             self._pipeline.cycle.period_ns,
-            self._pair_distance_m,
+            self.pair_distance_m,
         )
 
-    def _pair_distance_m(self, pad: int, residual: float, residual_std: float) -> tuple[float, float]:
+    def pair_distance_m(self, pad: int, residual: float, residual_std: float) -> tuple[float, float]:
         """Return `pair_distance` and its standard deviation in metres on the surface."""
         from handtouch.percept.shape import pair_distance
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field._stack import stack_factor, stack_inverse
+from handtouch.field.contact_stack import stack_factor, stack_inverse
 
 FloatArray = npt.NDArray[np.float64]
 

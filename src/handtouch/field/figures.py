@@ -223,7 +223,7 @@ def _resistance_of_the_plane() -> Figure:
     pad = ElectrodeNetwork(SQUARE_M, SQUARE_M, GAP_M, SHEET_OHM)
     radius = pad.spreading_radius(fraction * SQUARE_M, np.full_like(fraction, SQUARE_M / 2))
     for limit, colour, shade_of_sum in ((45, INK, "#c9c9c9"), (531, ACCENT, "#bcd9ef")):
-        plane = _double_sum(fraction, limit)
+        plane = truncated_double_sum(fraction, limit)
         contact = radius[120] * np.exp(-2 * np.pi * plane[120])  # the disc of equal resistance at the centre
         closed = np.log(radius / contact) / (2 * np.pi)
         for curve, shade, width, text in (
@@ -246,7 +246,7 @@ def _resistance_of_the_plane() -> Figure:
     return figure
 
 
-def _double_sum(fraction: FloatArray, limit: int) -> FloatArray:
+def truncated_double_sum(fraction: FloatArray, limit: int) -> FloatArray:
     """U / J0 of eq. 2 at the source, per ohm per square, mid-line of a square, both sums to `limit`."""
     order = np.arange(1, limit + 1)
     along = np.sin(np.pi * np.outer(fraction, order)) ** 2

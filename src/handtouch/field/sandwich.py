@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field._stack import stack_inverse
 from handtouch.field.contact_law import (
     BOUND_SIGMA,
     MAX_CURRENT_FRACTION,
@@ -18,6 +17,7 @@ from handtouch.field.contact_law import (
     ForceEstimateStatus,
     contact_stack_resistance,
 )
+from handtouch.field.contact_stack import stack_inverse
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -74,6 +74,10 @@ class JointStateBuffer:
         self._accepted = self._limits + ranges[:, None] * (-1, 1)
         self._sources: dict[tuple[str, ...], tuple[IntArray, IntArray, deque[_JointState]]] = {}
 
+    def __len__(self) -> int:
+        """Return the number of states in memory."""
+        return sum(len(states) for _, _, states in self._sources.values())
+
     def empty_copy(self) -> JointStateBuffer:
         """Return an empty buffer of the same joints."""
         return JointStateBuffer(self.names, self._continuous, self._limits)

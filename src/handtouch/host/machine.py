@@ -5,8 +5,10 @@ Public name: `Machine`.
 
 from __future__ import annotations
 
+import errno
 import json
 import re
+import socket
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +51,23 @@ class Machine:
         link = self.read_link(name) or {}
         rate = link.get("linkinfo", {}).get("info_data", {}).get("bittiming", {}).get("bitrate")
         return rate if isinstance(rate, int) else None
+
+    def raw_socket_problem(self) -> tuple[str, str] | None:
+        """Return why a raw CAN socket can't be opened, with the remedy."""
+        try:
+            socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+        except OSError as error:
+            if error.errno in (errno.EPERM, errno.EACCES):
+                return (
+                    "raw CAN sockets are not permitted",
+                    "run outside the sandbox, or allow AF_CAN in it",
+                )
+            return (
+                f"the kernel has no SocketCAN ({error.strerror})",
+                "modprobe can_raw; if the kernel is built without it, as in many containers, use another "
+                "interface: --bus NAME=udp_multicast:239.74.163.2, or slcan with a serial adapter",
+            )
+        return None
 
     def has_net_admin(self) -> bool:
         """Check for CAP_NET_ADMIN, with which socket buffers may exceed rmem_max."""

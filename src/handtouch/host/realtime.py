@@ -1,6 +1,6 @@
 """Real-time scheduling, CPU affinity and memory locking for the calling thread.
 
-Public names: `apply_realtime_settings`, `check_realtime_settings`.
+Public names: `apply_realtime_settings`, `check_realtime_settings`, `zmq_io_threads`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def apply_realtime_settings(settings: RealtimeSettings) -> list[str]:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         try:
             os.sched_setscheduler(0, policy, os.sched_param(settings.realtime_priority))
-            for thread in _zmq_io_threads():
+            for thread in zmq_io_threads():
                 os.sched_setscheduler(thread, policy, os.sched_param(max(1, settings.realtime_priority - 1)))
         except OSError as error:
             refused.append(_priority_refused(settings.realtime_priority, error.strerror))
@@ -73,7 +73,7 @@ def check_realtime_settings(settings: RealtimeSettings) -> list[str]:
     return found
 
 
-def _zmq_io_threads() -> list[int]:
+def zmq_io_threads() -> list[int]:
     """Return ids of ZeroMQ's I/O threads in this process, found by name (libzmq 4.2 and later)."""
     threads = Path("/proc/self/task").iterdir()
     return [int(thread.name) for thread in threads if (thread / "comm").read_text().startswith("ZMQbg/IO/")]

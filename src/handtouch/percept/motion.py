@@ -106,8 +106,7 @@ class MotionEstimator:
             alarm = self.slip_test.process_samples(pads, dt_s[go], position[go], variance[go], press[go])
             self._start_slip(pads[alarm & ~self.slipping[pads]], buffer)
             self._detect_rest(pads, dt_s[go], position[go], variance[go], press[go])
-        self._update_slip_log_odds(sample.pads, dt_s)
-        quick_labels = self._quick_classify(sample.pads)
+        quick_labels = self.classify(sample.pads, dt_s)
         rows = self._rows_to_report(sample, quick_labels)
         if not len(rows):
             return ()
@@ -252,8 +251,12 @@ class MotionEstimator:
                 pads[at_rest], position[at_rest], variance[at_rest], press[at_rest], keep=True
             )
 
-    def _quick_classify(self, pads: IntArray) -> NDArray[np.intp]:
-        """Return the most probable class (k,) without joint states."""
+    def classify(self, pads: IntArray, dt_s: FloatArray) -> NDArray[np.intp]:
+        """Update contacts (k,) with the slip test's odds; return their likeliest class without joint states.
+
+        dt_s: times (k,) since their previous samples [s].
+        """
+        self._update_slip_log_odds(pads, dt_s)
         odds, runs = self._slip_log_odds[pads], self.slipping[pads]
         self._slip_uncertain[pads] = (odds > _MIN_QUESTION_LOG_ODDS) & ~runs
         quick_labels = np.where(runs, 2, np.where(odds > 0, 1, 0))

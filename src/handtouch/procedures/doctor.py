@@ -6,7 +6,6 @@ deployment only the machine and the default endpoints are checked.
 
 from __future__ import annotations
 
-import errno
 import importlib.metadata
 import importlib.util
 import os
@@ -179,7 +178,7 @@ def check_endpoints(daemon: config.Daemon) -> Iterator[HostCheck]:
 
 
 def _check_socketcan(subject: str, bus: config.Bus, machine: Machine) -> Iterator[HostCheck]:
-    if problem := _raw_socket_problem():  # whatever the interface
+    if problem := machine.raw_socket_problem():  # whatever the interface
         yield HostCheck(subject, "fail", *problem)
         return
     name = str(bus.channel)
@@ -234,24 +233,6 @@ def _check_adapter(subject: str, bus: config.Bus, data: dict[str, Any], bring_up
         )
     if not data.get("restart_ms") and state != "BUS-OFF":
         yield HostCheck(subject, "warn", f"{name} does not restart after a bus-off", bring_up)
-
-
-def _raw_socket_problem() -> tuple[str, str] | None:
-    """Return why a raw CAN socket can't be opened, with the remedy."""
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError as error:
-        if error.errno in (errno.EPERM, errno.EACCES):
-            return (
-                "raw CAN sockets are not permitted",
-                "run outside the sandbox, or allow AF_CAN in it",
-            )
-        return (
-            f"the kernel has no SocketCAN ({error.strerror})",
-            "modprobe can_raw; if the kernel is built without it, as in many containers, use another "
-            "interface: --bus NAME=udp_multicast:239.74.163.2, or slcan with a serial adapter",
-        )
-    return None
 
 
 def _check_multicast(subject: str, bus: config.Bus) -> HostCheck:
