@@ -101,8 +101,8 @@ def other_sync(fault: Fault) -> bool:
 
 
 _LOST = matches("lost: no heartbeat")
-_STALE = matches("heartbeats arrive, samples don't|no sample for .* heartbeat present")
-_GONE = matches("lost: no heartbeat|heartbeats arrive, samples don't|no sample for")
+_STALE = matches("no sample for three SYNC periods|no sample for .* heartbeat present")
+_GONE = matches("lost: no heartbeat|no sample for")
 _REFUSED = matches("refused by the node")
 _NO_ANSWER = matches("no answer within 200 ms in 2 attempts")
 

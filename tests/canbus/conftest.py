@@ -56,7 +56,8 @@ class Wire:
 
     def __init__(self, rig: Rig) -> None:
         self.fault: BusFault | None = None
-        self.to_master: deque[can.Message] = deque()
+        self.backlog_ns: int | None = None
+        self.to_master: deque[tuple[can.Message, int]] = deque()  # with arrival
         self.sent: list[tuple[int, bytes]] = []  # by the master
         self.asked: list[int] = []  # identifiers of its remote frames
         self.down = False
@@ -72,7 +73,7 @@ class Wire:
         if len(frame) == 1:
             identifier = frame[0].arbitration_id
             if identifier & 0x7F not in self.cut and identifier not in self.lose:
-                self.to_master.append(_copy(frame[0]))
+                self.to_master.append((_copy(frame[0]), self._rig.t_ns))
         else:
             self._from_master(*frame)
 
@@ -89,7 +90,7 @@ class Wire:
     def drain(self, router: Router) -> list[CanFrame]:
         others = []
         while self.to_master:
-            frame = router.accept_message(self.to_master.popleft(), self._rig.t_ns)
+            frame = router.accept_message(*self.to_master.popleft())
             if frame is not None:
                 others.append(frame)
         return others
@@ -115,9 +116,9 @@ class Wire:
         sdo = self._rig.sdo_of(can_id - 0x580)
         if sdo is None or not sdo.awaiting_response:
             return
-        for message in [m for m in self.to_master if m.arbitration_id == can_id]:
-            self.to_master.remove(message)
-            sdo.deliver_response(bytes(message.data))
+        for entry in [entry for entry in self.to_master if entry[0].arbitration_id == can_id]:
+            self.to_master.remove(entry)
+            sdo.deliver_response(bytes(entry[0].data))
 
 
 class Rig:
@@ -210,6 +211,7 @@ class Rig:
     def sync(self) -> None:
         """Send a SYNC, of the master or of another producer."""
         self.slab.begin_cycle(self.t_ns)
+        self.port.last_sync_ns = self.t_ns
         if self.foreign_sync:
             self.devices.handle_frame(can.Message(arbitration_id=0x80, is_extended_id=False), self.t_ns)
         else:
@@ -221,8 +223,19 @@ class Rig:
 
     def inject(self, can_id: int, data: bytes) -> None:
         """Receive a frame of another device."""
-        self.wire.to_master.append(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        self.wire.to_master.append((message, self.t_ns))
         self.pump()
+
+    def pause(self, ms: int, kernel_sync: bool) -> None:
+        """Stop the master for a time in which the nodes go on, and the kernel's SYNC if there is one."""
+        for _ in range(ms):
+            self.t_ns += MS
+            if kernel_sync and self.t_ns // MS % SYNC_PERIOD_MS == 0:
+                self.devices.handle_frame(can.Message(arbitration_id=0x80, is_extended_id=False), self.t_ns)
+                self.port.last_sync_ns = self.t_ns
+            self.devices.advance(self.t_ns)
+        self.master.excuse_pause((ms - SYNC_PERIOD_MS) * MS, self.t_ns)
 
     def _sample(self, t_ns: int) -> NDArray[np.int64]:  # noqa: ARG002
         return self.counts

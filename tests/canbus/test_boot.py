@@ -236,7 +236,7 @@ def test_node_without_heartbeat_gets_it_as_guard_time() -> None:
     assert configure_node(
         node.sdo, PdoMapping((found(),), STANDARD_LAYOUT), Settings(150), lambda: None
     ).guarded
-    assert node.writes == [(0x100C, 0, 150), (0x100D, 0, 3)]
+    assert node.writes == [(0x100C, 0, 150), (0x100D, 0, 30)]
 
 
 def test_node_without_heartbeat_and_guard_time_is_guarded_all_the_same() -> None:

@@ -40,7 +40,7 @@ def rig(make_guarded: Make) -> Any:
 def test_guarding_request_is_sent_once_a_period(rig: Any) -> None:
     assert rig.status(1).guarded
     assert rig.node(1).read_object(0x100C, 0) == 100
-    assert rig.node(1).read_object(0x100D, 0) == 3
+    assert rig.node(1).read_object(0x100D, 0) == 30
     before = rig.status(1).heartbeats
     rig.run(1000)
     assert rig.wire.asked.count(0x701) == rig.wire.asked.count(0x702) == 10
@@ -155,3 +155,10 @@ def test_two_guarded_nodes_with_one_id_are_reported(rig: Any) -> None:
     rig.run(4000)
     assert rig.state(1) is NodeState.FAULTED
     assert "two nodes have its id" in rig.status(1).reason
+
+
+def test_guarded_nodes_survive_a_pause_without_requests(rig: Any) -> None:
+    assert rig.status(1).guarded
+    for _ in range(3):
+        rig.pause(1500, False)
+        assert rig.run(500) == []

@@ -23,7 +23,7 @@ from can.interfaces.udp_multicast.utils import pack_message
 from handtouch.canbus.bus import receivers
 from handtouch.canbus.bus.bus_state import ErrorState
 from handtouch.canbus.bus.port import BusError, Port
-from handtouch.canbus.bus.receivers import ReopenBackoff, ThreadReceiver, valid_arrival_ns
+from handtouch.canbus.bus.receivers import ReopenBackoff, ThreadReceiver, bounded_arrival_ns
 from handtouch.canbus.bus.router import Router
 from handtouch.canbus.bus.sockets import DatagramReceiver
 from handtouch.config import Bus
@@ -517,12 +517,11 @@ def test_delays_between_attempts_grow_to_a_limit() -> None:
     assert retry.due(t_ns)
 
 
-@pytest.mark.parametrize(
-    ("stamp_s", "t_ns"), [(99.0, 49 * 10**9), (101.0, 50 * 10**9), (0.0, 50 * 10**9), (89.0, 50 * 10**9)]
-)
-def test_implausible_stamps_are_replaced_by_now(stamp_s: float, t_ns: int) -> None:
-    now_ns, offset_ns = 50 * 10**9, -50 * 10**9  # the wall clock shows 100 s
-    assert valid_arrival_ns(round(stamp_s * 1e9) + offset_ns, now_ns) == t_ns
+def test_step_of_the_wall_clock_moves_no_stamp_beyond_the_time_of_reading() -> None:
+    emptied_ns = time.monotonic_ns()
+    assert bounded_arrival_ns(emptied_ns + 1, emptied_ns) == emptied_ns + 1
+    assert bounded_arrival_ns(emptied_ns - 3600 * 10**9, emptied_ns) == emptied_ns
+    assert emptied_ns <= bounded_arrival_ns(emptied_ns + 3600 * 10**9, emptied_ns) <= time.monotonic_ns()
 
 
 OVERFLOW = """

@@ -71,7 +71,7 @@ def test_guest_distinguishes_a_started_node_without_samples_from_one_not_started
     guest.nmt(START, 0)
     guest.run(1200)
     assert guest.state(1) is STALE
-    assert "is there a SYNC?" in guest.status(1).reason
+    assert "no SYNC on bus can" in guest.status(1).reason
 
 
 def test_guest_waits_for_a_node_that_the_other_master_holds_stopped(make_rig: Make) -> None:

@@ -158,11 +158,11 @@ def produce(sync: Sync, port: Port, seconds: float) -> int:
     cycles, end_s = 0, time.monotonic() + seconds
     while time.monotonic() < end_s:
         now_ns = time.monotonic_ns()
-        cycles += sync.poll(now_ns) is not None
         select.select([port.fileno()], [], [], max(0.0, (sync.wake_ns - now_ns) * 1e-9))
         for can_id, _, t_ns in port.drain():
             assert can_id == 0x80
-            cycles += sync.handle_sync(port.name, t_ns, time.monotonic_ns()) is not None
+            sync.handle_sync(port.name, t_ns)
+        cycles += len(sync.poll(time.monotonic_ns(), port.received_until_ns))
         port.update_state(time.monotonic_ns())
     return cycles
 

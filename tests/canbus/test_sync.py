@@ -28,6 +28,7 @@ class Kernel:
 
     def __init__(self, able: bool = True) -> None:
         self.fault: BusFault | None = None
+        self.backlog_ns: int | None = None
         self.able = able
         self.broken = False  # takes tasks, sends nothing
         self.sent: list[int] = []  # by us, at these times
@@ -93,24 +94,20 @@ class Rig:
         while self.now_ns < end_ns:
             for kernel in self.kernels:
                 kernel.now_ns = self.now_ns
-            self._took(self.sync.poll(self.now_ns))
             for port, kernel in zip(self.ports, self.kernels, strict=True):
                 while kernel.period_ns is not None and kernel.next_ns <= self.now_ns - self.delay_ns:
                     t_ns, kernel.next_ns = kernel.next_ns, kernel.next_ns + kernel.period_ns
                     if not kernel.broken:
-                        self._took(self.sync.handle_sync(port.name, t_ns, self.now_ns))
+                        self.sync.handle_sync(port.name, t_ns)
             if foreign_ns and self.now_ns >= next_foreign_ns:
                 next_foreign_ns += foreign_ns
-                self._took(self.sync.handle_sync("can0", self.now_ns, self.now_ns))
+                self.sync.handle_sync("can0", self.now_ns)
+            self.cycles += self.sync.poll(self.now_ns, self.now_ns)
             if self.now_ns < self.sync.wake_ns:
                 self.now_ns += step_ns
 
     def figures(self, bus: str = "can0") -> dict[str, Any]:
         return self.sync.report(bus, self.now_ns)
-
-    def _took(self, t_ns: int | None) -> None:
-        if t_ns is not None:
-            self.cycles.append(t_ns)
 
 
 def intervals(times: list[int]) -> set[int]:
@@ -270,6 +267,45 @@ def test_no_sync_is_sent_after_stop() -> None:
     assert rig.kernels[0].period_ns is None
 
 
+@pytest.mark.parametrize("pause_s", [0.3, 0.6, 2.0])
+def test_backlog_of_syncs_after_a_pause_is_no_other_producer(pause_s: float) -> None:
+    """The kernel's SYNCs wait in the queue, with their stamps, while the loop is stopped."""
+    rig = Rig(Kernel())
+    rig.run(1.4)
+    for _ in range(3):
+        rig.now_ns += round(pause_s * 1e9)
+        cycles, overruns = len(rig.cycles), rig.sync.overruns
+        rig.sync.excuse_pause(round(pause_s * 1e9) - P)
+        rig.run(0.0001)
+        assert len(rig.cycles) == cycles + 2  # of the SYNCs that the newest samples answer
+        assert rig.cycles[-1] - rig.cycles[-2] == P
+        assert rig.sync.overruns - overruns == pytest.approx(pause_s * 1e9 / P - 2, abs=1)
+        rig.run(1.3)
+        assert rig.figures() == {
+            "by": "kernel", "jitter_us": {"p50": 0, "p99": 0, "max": 0}, "other_syncs": 0, "problem": ""
+        }  # fmt: skip
+    assert rig.kernels[0].started == 1
+
+
+def test_kernel_that_was_stopped_with_its_host_is_kept() -> None:
+    rig = Rig(Kernel())
+    rig.run(0.5)
+    rig.now_ns += 600 * MS
+    rig.kernels[0].next_ns = rig.now_ns + P  # it sent nothing meanwhile
+    rig.sync.excuse_pause(600 * MS - P)
+    rig.run(1.0)
+    assert (rig.figures()["by"], rig.kernels[0].started) == ("kernel", 1)
+
+
+def test_syncs_read_late_are_no_reason_to_replace_the_kernel() -> None:
+    """A flood keeps frames in the queue: what arrived until then decides."""
+    rig = Rig(Kernel())
+    rig.run(0.5)
+    late_ns = rig.now_ns + 600 * MS
+    assert list(rig.sync.poll(late_ns, rig.now_ns)) == []
+    assert rig.figures()["by"] == "kernel"
+
+
 @pytest.mark.parametrize("bus", [{"sync": "consumer"}, {"role": "listener"}])
 def test_other_producers_sync_is_followed_and_its_jitter_measured(bus: dict[str, Any]) -> None:
     rig = Rig(Kernel(), Kernel(), **bus)
@@ -310,7 +346,7 @@ def test_echo_of_our_own_sync_is_not_another_producer() -> None:
             rig.run(0.01, foreign_ns=foreign_ns)
             while echoed < len(sent) - 1:  # the last one is still on its way
                 echoed += 1
-                assert rig.sync.handle_sync("can0", rig.now_ns, rig.now_ns) is None
+                rig.sync.handle_sync("can0", rig.now_ns)
         assert rig.figures()["other_syncs"] == pytest.approx(others, rel=0.4)
 
 

@@ -159,7 +159,8 @@ class TickProcessor:
         self.max_sample_period_ns = np.full(model.size, period_ns, dtype=np.int64)
         """longest time between two samples of a pad"""
         self.period_since_ns = np.zeros(model.size, dtype=np.int64)
-        """time at which `max_sample_period_ns` was set"""
+        """time since which samples are awaited: `max_sample_period_ns` was set, or later by the loop's
+        pauses"""
         self.synchronous = np.ones(model.size, dtype=np.bool_)
         """pads sampled by SYNC; the others are event-driven and not waited for"""
         self.position_requested = np.ones(model.size, dtype=np.bool_)
@@ -225,6 +226,11 @@ class TickProcessor:
     def position_noise_covariance(self, pads: IntArray) -> FloatArray:
         """Return the covariance (k, 2, 2) of arc lengths on pads (k,) that is independent in each sample."""
         return self.linearisations.position_noise_covariance(pads, self._currents.take(pads, axis=0))
+
+    def excuse_pause(self, excused_ns: int) -> None:
+        """Make pads stale later, since the loop or the whole host paused for so long."""
+        reference_ns = np.maximum(self.columns.sample_ns, self.period_since_ns)
+        np.add(reference_ns, excused_ns, out=self.period_since_ns)
 
     def solve_all(self) -> None:
         """Compute position and force of every touched pad, requested or not; valid until `set_requested`."""

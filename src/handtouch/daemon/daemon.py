@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from handtouch import wire
 from handtouch.calibration.store import store_path
 from handtouch.canbus import cia301
+from handtouch.canbus.bus.loop_pause import LoopPause
 from handtouch.canbus.bus.port import BusError, Port
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.master import Master
@@ -76,6 +77,7 @@ _REHEARSE_BEFORE_SYNC_NS, _REHEARSE_BEFORE_TICK_NS = 400_000, 250_000
 _NEVER_NS = 1 << 62
 _BACKGROUND_PERIOD_NS = 4_000_000
 """Least period of polling nodes, buses, health and requests, which is longer than a tick's at high rates"""
+_LOGGED_PAUSE_NS = 100_000_000
 _MESSAGE_PATH_THREADS = 3
 """Threads that a message passes, each waking the next: ZeroMQ's on both sides, and the subscriber's"""
 _GIL_SWITCH_INTERVAL_S = 0.0005  # limits how long a thread that boots a node or builds a model holds the GIL
@@ -263,25 +265,32 @@ class HandtouchDaemon:
         busy_poll = self._busy_poll
         sync, sampling, master, stages = self.sync, self.sampling, self.master, self.reporter.stage_timer
         pipeline.on_tick_computed = self._on_tick_computed
+        pause = LoopPause(sync.period_ns)
         sync.start(time.monotonic_ns())
         stages.start(time.monotonic_ns())
         while not stop.is_set():
             now_ns = time.monotonic_ns()
-            if (sync_ns := sync.poll(now_ns)) is not None:
-                self._begin_cycle(sync_ns, now_ns)
             wake_ns = min(sync.wake_ns, master.wake_ns)  # node time-outs may come before a slow SYNC
             if not cycle.ticked:
                 sleep_ns = busy_poll.max_sleep_ns(cycle.sync_ns, now_ns)
                 wake_ns = min(wake_ns, cycle.sync_ns + cycle.window_ns, now_ns + sleep_ns)
             wait_s = max(0, min(wake_ns, self._next_rehearsal_ns) - now_ns) * 1e-9
+            pause.begin_wait(now_ns)
             readable = select.select(descriptors, (), (), wait_s)[0]
             woke_ns = time.monotonic_ns()
             stages.record_wait(wake_ns, woke_ns)
-            # a disconnected port is never readable; `drain` reopens it
-            drain_all = queues or not readable or woke_ns >= self._next_background_ns
+            if paused_ns := pause.end_wait(wake_ns, woke_ns):
+                self._excuse_pause(paused_ns, woke_ns)
+            # when a timeout is due, all frames are read first; a disconnected port is never readable, and
+            # `drain` reopens it
+            drain_all = queues or not readable or woke_ns >= min(wake_ns, self._next_background_ns)
             self._receive_frames(ports if drain_all else [by_descriptor[ready] for ready in readable])
             now_ns = time.monotonic_ns()
             stages.lap(stage_timer.RECEIVE, now_ns)
+            if paused_ns := pause.end_receive(now_ns):
+                self._excuse_pause(paused_ns, now_ns)
+            for sync_ns in sync.poll(now_ns, self._received_until_ns):
+                self._begin_cycle(sync_ns, now_ns)
             ticked = pipeline.tick_if_due(now_ns)
             if ticked is None and sampling.slow_sync and pipeline.slab.fresh_count:
                 ticked = pipeline.tick_without_sync(now_ns)
@@ -298,7 +307,7 @@ class HandtouchDaemon:
                     stages.lap(stage_timer.PERCEIVE, time.monotonic_ns())
                 self._after_tick(on_tick)
             elif now_ns >= master.wake_ns:
-                master.poll(now_ns)
+                master.poll(self._received_until_ns)
             elif now_ns >= self._next_rehearsal_ns:
                 self._rehearse()
 
@@ -339,11 +348,23 @@ class HandtouchDaemon:
         for port in ports:
             for can_id, data, arrival_ns in port.drain():
                 if can_id == cia301.SYNC:
-                    now_ns = time.monotonic_ns()
-                    if (sync_ns := self.sync.handle_sync(port.name, arrival_ns, now_ns)) is not None:
-                        self._begin_cycle(sync_ns, now_ns)
+                    self.sync.handle_sync(port.name, arrival_ns)
                 else:
                     self.master.handle_frame(port.name, can_id, data, arrival_ns)
+
+    @property
+    def _received_until_ns(self) -> int:
+        """Time before which all frames that arrived have been handled."""
+        return min(port.received_until_ns for port in self.ports.values())
+
+    def _excuse_pause(self, paused_ns: int, now_ns: int) -> None:
+        """Extend timeouts by a pause of this loop, in which it may have sent no SYNC and read no frame."""
+        self.sync.excuse_pause(paused_ns)
+        self.master.excuse_pause(paused_ns, now_ns)
+        self.pipeline.tick.excuse_pause(paused_ns)
+        if paused_ns > _LOGGED_PAUSE_NS:
+            text = "the loop was late by %.0f ms; timeouts of nodes and pads are extended by that time"
+            _log.warning(text, paused_ns * 1e-6)
 
     def _apply_demand(
         self, requested: RequestedOutputs, needs: SceneRequirements, enabled: NDArray[np.bool_], now_ns: int
@@ -388,7 +409,7 @@ class HandtouchDaemon:
 
     def _run_background_tasks(self, now_ns: int) -> None:
         lap = self.reporter.stage_timer.lap
-        self.master.poll(now_ns)
+        self.master.poll(self._received_until_ns)
         for port in self.ports.values():
             port.update_state(now_ns)
         lap(stage_timer.NODES, time.monotonic_ns())

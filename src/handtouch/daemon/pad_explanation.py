@@ -37,4 +37,4 @@ def explain_pad_state(
             f"channel {min(channels, key=channels.__getitem__)} reads {min(channels.values())} counts, but "
             "electrode currents can't be negative: check its amplifier and wiring"
         )
-    return "heartbeats arrive, samples don't: check the node's SYNC and PDO settings and the bus load"
+    return node_reason or "no sample for three SYNC periods"

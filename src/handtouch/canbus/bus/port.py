@@ -9,6 +9,7 @@ import errno
 import json
 import subprocess
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -48,6 +49,8 @@ class Port:
     """A bus in use. Receive in one thread; `send` may be called from any thread.
 
     `echoes`: sent frames are received, too.
+    `last_sync_ns` : time of the last SYNC sent or received, 0 before the first; `Sync` sets it
+    `received_until_ns` : all frames that arrived before this time have been read by `drain`
     """
 
     def __init__(self, bus: Bus, receiver: Receiver, slab: Slab) -> None:
@@ -56,6 +59,7 @@ class Port:
         self.bus = bus
         self.router = Router(slab, BusState(bus.interface, str(bus.channel)))
         self.echoes = bus.interface in _ECHOING_INTERFACES
+        self.last_sync_ns = self.received_until_ns = 0
         self._receiver = receiver
         self._send_lock = threading.Lock()
         self._was_bus_off = False
@@ -124,7 +128,11 @@ class Port:
         Samples are written to the slab; all other data frames are returned. Call it when `fileno` is readable
         and at least once a tick, since it also reopens a disconnected bus.
         """
-        return self._receiver.drain(self.router)
+        now_ns = time.monotonic_ns()
+        frames = self._receiver.drain(self.router)
+        backlog_ns = self._receiver.backlog_ns
+        self.received_until_ns = now_ns if backlog_ns is None else min(backlog_ns, now_ns)
+        return frames
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> bool:
         """Send a frame; return False, and count it, if the queue is full or the bus is down.

@@ -36,7 +36,7 @@ from handtouch.canbus.bus.router import CanFrame, Router
 
 RECEIVE_BUFFER_BYTES = 4 << 20
 """Requested receive buffer of a socket. The kernel doubles it and accounts 768 bytes per frame: 10,900 frames
-or 1.3 s of a fully loaded 1 Mbit/s bus. After a longer pause every heartbeat is overdue anyway.
+or 1.3 s of a fully loaded 1 Mbit/s bus. After a longer pause the newest frames are lost, and counted.
 """
 MAX_DRAIN_FRAMES = 4096
 """Most frames read by one `drain`, so that a flood of frames doesn't delay the caller's tick."""
@@ -52,7 +52,6 @@ _MAX_CONSECUTIVE_ERRORS = (
 )
 _SO_RCVBUFFORCE = 33
 _DISCONNECTED_ERRNOS = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is unusable
-_MAX_STAMP_AGE_NS = 10_000_000_000
 _MAX_CLOCK_READ_NS = 5_000
 
 # Unlike os.eventfd_write these keep the GIL, so no other thread runs in the middle of a burst.
@@ -81,6 +80,7 @@ class Receiver(Protocol):
     """Interface of an open receiver to its port."""
 
     fault: BusFault | None  # present fault of the bus, if any
+    backlog_ns: int | None  # arrival of the last frame that `drain` read if more are waiting, else None
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while frames are waiting."""
@@ -124,9 +124,12 @@ class ReopenBackoff:
         self._due_ns = 0
 
 
-def valid_arrival_ns(arrival_ns: int, now_ns: int) -> int:
-    """Return a receive stamp, or `now_ns` where the stamp is implausible (in the future or too old)."""
-    return arrival_ns if now_ns - _MAX_STAMP_AGE_NS < arrival_ns <= now_ns else now_ns
+def bounded_arrival_ns(arrival_ns: int, emptied_ns: int) -> int:
+    """Return a receive stamp, not before the queue was empty last and not after now.
+
+    A step of the wall clock between arrival and reading would falsify it.
+    """
+    return min(max(arrival_ns, emptied_ns), time.monotonic_ns())
 
 
 def clock_offset_ns() -> int:
@@ -143,6 +146,7 @@ class QueuedReceiver:
 
     def __init__(self, opener: Opener) -> None:
         self.fault: BusFault | None = None
+        self.backlog_ns: int | None = None
         self._opener = opener
         self._queue: deque[tuple[can.Message, int]] = deque(maxlen=MAX_QUEUE_FRAMES)  # with arrival_ns
         self._lost = 0
@@ -177,11 +181,14 @@ class QueuedReceiver:
         self._lower_signal()
         popleft, accept = self._queue.popleft, router.accept_message
         count = min(len(self._queue), MAX_DRAIN_FRAMES)
+        self.backlog_ns = None
         for _ in range(count):
-            frame = accept(*popleft())
+            message, arrival_ns = popleft()
+            frame = accept(message, arrival_ns)
             if frame is not None:
                 others.append(frame)
         if count == MAX_DRAIN_FRAMES:
+            self.backlog_ns = arrival_ns
             self._raise_signal()
         lost, errors = self._lost, self._errors
         router.counters.overflow += lost - self._reported_counts[0]

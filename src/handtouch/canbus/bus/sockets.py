@@ -23,12 +23,12 @@ from handtouch.canbus.bus.receivers import (
     CyclicSender,
     Opener,
     ReopenBackoff,
+    bounded_arrival_ns,
     clock_offset_ns,
     closed_bus_fault,
     grow_receive_buffer,
     make_message,
     must_reopen,
-    valid_arrival_ns,
 )
 from handtouch.canbus.bus.router import IDENTIFIER_COUNT, CanFrame, Router
 
@@ -47,12 +47,14 @@ class _SocketReceiver:
 
     def __init__(self, opener: Opener) -> None:
         self.fault: BusFault | None = None
+        self.backlog_ns: int | None = None
         self._opener = opener
         self._epoll: select.epoll | None = None
         self._backoff = ReopenBackoff()
         self._consecutive_errors = 0
         self._bus: can.BusABC | None = None
         self._dropped = 0
+        self._emptied_ns = 0  # begin of the last `drain` that emptied the queue
 
     def open(self) -> Self:
         """Open the bus and the epoll."""
@@ -74,6 +76,7 @@ class _SocketReceiver:
 
     def drain(self, router: Router) -> list[CanFrame]:
         others: list[CanFrame] = []
+        self.backlog_ns = None
         bus = self._bus or self._reopen(router)
         if bus is None:
             return others
@@ -107,7 +110,7 @@ class _SocketReceiver:
         bus.send(make_message(can_id, data, remote))
 
     def _attach_bus(self, bus: can.BusABC) -> None:
-        self._bus = bus
+        self._bus, self._emptied_ns = bus, time.monotonic_ns()
         self._socket = socket.socket(fileno=os.dup(bus.fileno()))  # udp_multicast doesn't expose its socket
         self._dropped = _dropped_frames(self._socket)
         grow_receive_buffer(self._socket)
@@ -171,17 +174,20 @@ class SocketcanReceiver(_SocketReceiver):
     def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:  # noqa: ARG002
         recvmsg, unpack, accept = self._socket.recvmsg, _FRAME.unpack_from, router.accept_frame
         stamp = _TIMESPEC.unpack_from
-        offset_ns = clock_offset_ns()
+        offset_ns, emptied_ns, now_ns = clock_offset_ns(), self._emptied_ns, time.monotonic_ns()
+        arrival_ns = now_ns
         for _ in range(MAX_DRAIN_FRAMES):
             try:
                 frame, ancillary, _, _ = recvmsg(16, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
+                self._emptied_ns = now_ns
                 return
-            arrival_ns = 0
             for _, kind, value in ancillary:
                 if kind == _SO_TIMESTAMPNS:
                     seconds, nanoseconds = stamp(value)
                     arrival_ns = seconds * 1_000_000_000 + nanoseconds + offset_ns
+            if not emptied_ns <= arrival_ns <= now_ns:
+                arrival_ns = bounded_arrival_ns(arrival_ns, emptied_ns)
             can_id, size, data = unpack(frame)
             if can_id >= 0x800:
                 if can_id & _ERROR_FLAG:
@@ -195,6 +201,7 @@ class SocketcanReceiver(_SocketReceiver):
                 data = data[:size]
             if not accept(can_id, data, arrival_ns):
                 others.append((can_id, data, arrival_ns))
+        self.backlog_ns = arrival_ns
 
     def _send(self, bus: can.BusABC, can_id: int, data: bytes, remote: bool) -> None:  # noqa: ARG002
         frame = _FRAME.pack(can_id | _REMOTE_FLAG if remote else can_id, len(data), data)
@@ -231,17 +238,20 @@ class DatagramReceiver(_SocketReceiver):
             router.accept_frame,
             _TIMESPEC.unpack,
         )
-        offset_ns = clock_offset_ns()
+        offset_ns, emptied_ns, now_ns = clock_offset_ns(), self._emptied_ns, time.monotonic_ns()
+        arrival_ns = now_ns
         for _ in range(MAX_DRAIN_FRAMES):
             try:
                 packet, ancillary, _, _ = recvmsg(_MAX_DATAGRAM_BYTES, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
+                self._emptied_ns = now_ns
                 return
-            arrival_ns = now_ns = time.monotonic_ns()
             for _, kind, value in ancillary:
                 if kind == _SO_TIMESTAMPNS:
                     seconds, nanoseconds = stamp(value)
-                    arrival_ns = valid_arrival_ns(seconds * 1_000_000_000 + nanoseconds + offset_ns, now_ns)
+                    arrival_ns = seconds * 1_000_000_000 + nanoseconds + offset_ns
+            if not emptied_ns <= arrival_ns <= now_ns:
+                arrival_ns = bounded_arrival_ns(arrival_ns, emptied_ns)
             fields = unpack(packet)
             if _is_data_frame(fields):
                 can_id, data = fields["arbitration_id"], fields["data"]
@@ -251,6 +261,7 @@ class DatagramReceiver(_SocketReceiver):
             frame = router.accept_message(unpack_message(packet, check=True), arrival_ns)
             if frame is not None:
                 others.append(frame)
+        self.backlog_ns = arrival_ns
 
 
 def _is_data_frame(fields: Any) -> bool:

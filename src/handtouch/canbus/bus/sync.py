@@ -33,6 +33,7 @@ _MIN_CYCLE_PERIODS = 0.25
 """Shortest cycle; SYNCs that follow sooner belong to the same cycle, so that a flood of SYNCs causes no flood
 of ticks.
 """
+_MAX_CYCLES_PER_POLL = 2
 _KERNEL_RETRY_NS = 5 * _SECOND_NS
 _WINDOW_TOLERANCE_SYNCS = 2  # more SYNCs than a window's length allows: one at either end
 _MAX_INTERVALS = 4096  # a second
@@ -83,12 +84,12 @@ def percentiles_us(durations_ns: NDArray[np.int64]) -> dict[str, float]:
 
 
 class Sync:
-    """SYNC of a deployment's buses: `start`, `poll` at `wake_ns` at the latest, `handle_sync` per SYNC
-    received, `stop`.
+    """SYNC of a deployment's buses: `start`; `handle_sync` per SYNC received, then `poll`, at the latest at
+    `wake_ns`; `stop`.
 
     SYNC is produced on buses with sync = "producer" unless their role is "listener"; without such a bus the
     first bus's SYNC is followed. Times in ns of the host's monotonic clock. `overruns` counts the periods
-    without a SYNC because the loop was late.
+    without a SYNC or a cycle because the loop was late.
     """
 
     def __init__(self, ports: Sequence[Port], period_ns: int) -> None:
@@ -98,7 +99,7 @@ class Sync:
         self._produced_buses = [bus for bus in self._buses.values() if bus.is_producer]
         self._reference_bus: _SyncBus | None = None  # its SYNC begins the cycle; None: the loop's timer does
         self._due_ns = self._cycle_sync_ns = 0
-        self._late_sync_checked = False  # the received frames were searched for a late SYNC
+        self._received_ns: list[int] = []  # arrivals of SYNCs that begin cycles at the next poll
 
     def start(self, now_ns: int) -> None:
         """Schedule the first SYNC for the next `poll`."""
@@ -130,19 +131,29 @@ class Sync:
                 self._fall_back_to_loop(bus, now_ns)
         self._due_ns = max(now_ns, self._next_due_ns(self._cycle_sync_ns))
 
-    def poll(self, now_ns: int) -> int | None:
-        """Send the SYNCs that are due; return the SYNC time of a cycle that begins now, None if none does."""
-        if now_ns < self._due_ns:
-            return None
-        if self._reference_bus is not None and not self._late_sync_checked:
-            self._late_sync_checked = True  # after a pause of the loop the SYNC may be among unread frames
-            self._due_ns = now_ns
-            return None
+    def excuse_pause(self, excused_ns: int) -> None:
+        """Expect the next SYNC later, since the loop or the whole host paused for so long."""
+        if self._reference_bus is not None:
+            self._due_ns += excused_ns
+        for bus in self._buses.values():
+            bus.port.last_sync_ns += excused_ns if bus.port.last_sync_ns else 0
+
+    def poll(self, now_ns: int, received_until_ns: int) -> Sequence[int]:
+        """Send the SYNCs that are due; return the SYNC times of the cycles that begin now.
+
+        After a pause of the loop several SYNCs are waiting: the two latest begin cycles, since the newest
+        samples answer one of them. `received_until_ns`: all frames that arrived before were handled.
+        """
+        if received := self._received_ns:
+            self._received_ns = []
+            self.overruns += max(len(received) - _MAX_CYCLES_PER_POLL, 0)
+            self._begin_cycle(now_ns, received[-1])
+            return received[-_MAX_CYCLES_PER_POLL:]
+        if (now_ns if self._reference_bus is None else received_until_ns) < self._due_ns:
+            return ()
         for bus in self._produced_buses:
-            if (
-                bus.kernel_sender is not None
-                and now_ns - bus.last_sync_ns > _MAX_MISSING_SYNC_PERIODS * self.period_ns
-            ):
+            silent_ns = received_until_ns - bus.port.last_sync_ns
+            if bus.kernel_sender is not None and silent_ns > _MAX_MISSING_SYNC_PERIODS * self.period_ns:
                 self._fall_back_to_loop(bus, now_ns)
         if self._reference_bus is None:
             late = (now_ns - self._due_ns) // self.period_ns
@@ -150,20 +161,18 @@ class Sync:
             self._begin_cycle(now_ns, self._due_ns + late * self.period_ns)
         else:
             self._begin_cycle(now_ns, now_ns)
-        return now_ns
+        return (now_ns,)
 
-    def handle_sync(self, bus_name: str, arrival_ns: int, now_ns: int) -> int | None:
-        """Count a received SYNC; return `arrival_ns` if it begins a cycle, else None."""
+    def handle_sync(self, bus_name: str, arrival_ns: int) -> None:
+        """Count a received SYNC; `poll` begins its cycle if it is the reference."""
         bus = self._buses[bus_name]
-        bus.received_syncs += 1
+        bus.count_received(arrival_ns)
         if not bus.is_producer or bus.kernel_sender is not None:
-            bus.last_sync_ns = arrival_ns
+            bus.port.last_sync_ns = max(arrival_ns, bus.port.last_sync_ns)
             bus.jitter.add_sync(arrival_ns, self.period_ns)
-        min_cycle_ns = _MIN_CYCLE_PERIODS * self.period_ns
-        if bus is not self._reference_bus or arrival_ns - self._cycle_sync_ns < min_cycle_ns:
-            return None
-        self._begin_cycle(now_ns, arrival_ns)
-        return arrival_ns
+        previous_ns = self._received_ns[-1] if self._received_ns else self._cycle_sync_ns
+        if bus is self._reference_bus and arrival_ns - previous_ns >= _MIN_CYCLE_PERIODS * self.period_ns:
+            self._received_ns.append(arrival_ns)
 
     def report(self, bus_name: str, now_ns: int) -> dict[str, Any]:
         """Return a bus's SYNC producer, jitter, number of other producers' SYNCs and problem."""
@@ -187,7 +196,6 @@ class Sync:
         for bus in self._produced_buses:
             bus.detect_other_producer(now_ns, self.period_ns)
         self._select_reference_bus()
-        self._late_sync_checked = False
         self._cycle_sync_ns = sync_ns
         self._due_ns = self._next_due_ns(sync_ns)
 
@@ -221,15 +229,15 @@ class _SyncBus:
         self.is_producer = port.bus.sync == "producer" and port.bus.role != "listener"
         self.kernel_sender: CyclicSender | None = None
         self.jitter = SyncJitter()
-        self.last_sync_ns = 0  # sent or received
         self.kernel_retry_ns = 0
-        self.received_syncs = self.other_syncs = 0
+        self.other_syncs = 0
         self.problem = ""
-        self._window_start_ns = self._sent_syncs = 0
+        self._window_start_ns = self._received_syncs = self._sent_syncs = 0
 
     def send_sync(self, now_ns: int, period_ns: int) -> None:
         """Send SYNC now; have the kernel send it cyclically from now on if a retry is due."""
-        port, self.last_sync_ns = self.port, now_ns
+        port = self.port
+        port.last_sync_ns = now_ns
         self.jitter.add_sync(now_ns, period_ns)
         if now_ns >= self.kernel_retry_ns:
             self.kernel_retry_ns = now_ns + _KERNEL_RETRY_NS
@@ -264,8 +272,12 @@ class _SyncBus:
                 _log.warning("bus %s: kernel SYNC sender not stopped: %s", self.port.name, error)
 
     def start_window(self, now_ns: int, in_flight: int = 0) -> None:
-        """Count SYNCs from now on, except `in_flight` that were sent before."""
-        self._window_start_ns, self._sent_syncs, self.received_syncs = now_ns, 0, -in_flight
+        """Count SYNCs that arrive from now on, except `in_flight` that were sent before."""
+        self._window_start_ns, self._sent_syncs, self._received_syncs = now_ns, 0, -in_flight
+
+    def count_received(self, arrival_ns: int) -> None:
+        """Count a received SYNC, unless it arrived before the window and was only read late."""
+        self._received_syncs += arrival_ns >= self._window_start_ns
 
     def detect_other_producer(self, now_ns: int, period_ns: int) -> None:
         """Check once a second for more received SYNCs than this host can have sent."""
@@ -277,7 +289,7 @@ class _SyncBus:
             ours = passed_ns // period_ns + _WINDOW_TOLERANCE_SYNCS
         elif self.port.echoes:
             ours = self._sent_syncs + _WINDOW_TOLERANCE_SYNCS
-        others = max(0, self.received_syncs - ours)
+        others = max(0, self._received_syncs - ours)
         self.other_syncs += others
         if others and self.problem != _OTHER_PRODUCER_PROBLEM:
             _log.warning("bus %s: %s", self.port.name, _OTHER_PRODUCER_PROBLEM)

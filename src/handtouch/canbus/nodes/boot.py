@@ -16,8 +16,10 @@ from handtouch.canbus.objects.mapping import NodeTpdo, PdoMapping
 from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient
 from handtouch.config.channels import WritableObject
 
-LIFE_TIME_FACTOR = 3
-"""Guard times without a guarding request after which a guarded node reports an error."""
+LIFE_TIME_FACTOR = 30
+"""Guard times without a guarding request after which a guarded node leaves OPERATIONAL; longer than a pause
+of the host.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from handtouch.canbus.nodes.lifecycle_types import (
     HeartbeatReceived,
     Lifecycle,
     LifecycleEvent,
+    LoopPaused,
     NodeAction,
     NodeState,
     NodeTiming,
@@ -47,6 +48,7 @@ _BABBLING_REASON = (
     "babbling: it sends {} samples per SYNC, or another device sends with its identifier; "
     "power-cycle or unplug it"
 )
+_TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF)"
 _STANDBY_REASON = "outside the scene: in standby until needed"
 
 _BOOT_STEPS = frozenset({NodeAction.IDENTIFY, NodeAction.READ_MAPPING, NodeAction.CONFIGURE})
@@ -71,16 +73,18 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
             return _on_step_failed(life, event, now_ns, timing)
         case SampleReceived():
             return _on_sample(life, now_ns, timing)
-        case SamplesMissing(age_ns):
-            return _on_samples_missing(life, age_ns, now_ns)
+        case SamplesMissing(age_ns, bus_cause):
+            return _on_samples_missing(life, age_ns, bus_cause, now_ns)
         case HeartbeatRate(doubled):
             return _on_heartbeat_rate(life, doubled, now_ns, timing)
         case SampleRate(samples_per_sync):
             return _on_sample_rate(life, samples_per_sync, now_ns, timing)
         case StandbyRequested(standby):
             return _on_standby_requested(life, standby, now_ns, timing)
-        case TimerExpired():
-            return _on_timer_expired(life, now_ns, timing)
+        case TimerExpired(bus_cause):
+            return _on_timer_expired(life, bus_cause, now_ns, timing)
+        case LoopPaused(excused_ns):
+            return _extend_timeouts(life, excused_ns), ()
         case StopRequested():
             # a wrong device at its id is left alone
             stop = timing.role is BusRole.MASTER and not life.wrong_device
@@ -142,7 +146,7 @@ def _identify_actions(life: Lifecycle, timing: NodeTiming) -> tuple[NodeAction, 
 
 def _on_heartbeat(life: Lifecycle, nmt: int, now_ns: int, timing: NodeTiming) -> Transition:
     if life.last_heartbeat_ns is not None or timing.role is BusRole.LISTENER:
-        life = replace(life, last_heartbeat_ns=now_ns)
+        life = replace(life, last_heartbeat_ns=max(now_ns, life.last_heartbeat_ns or 0))
     just_stopped = nmt == cia301.STOPPED != life.nmt_state
     left_stopped = life.nmt_state == cia301.STOPPED != nmt
     report = f"heartbeat: node is {cia301.NMT_NAMES.get(nmt, f'in NMT state {nmt}')}"
@@ -286,12 +290,20 @@ def _on_sample(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     ), ()
 
 
-def _on_samples_missing(life: Lifecycle, age_ns: int, now_ns: int) -> Transition:
+def _extend_timeouts(life: Lifecycle, excused_ns: int) -> Lifecycle:
+    if life.last_heartbeat_ns is not None:
+        life = replace(life, last_heartbeat_ns=life.last_heartbeat_ns + excused_ns)
+    if life.state is NodeState.SETTLING and life.due_ns != _NEVER_NS:
+        life = replace(life, due_ns=life.due_ns + excused_ns)
+    return life
+
+
+def _on_samples_missing(life: Lifecycle, age_ns: int, bus_cause: str, now_ns: int) -> Transition:
     if life.state is not NodeState.OPERATIONAL:
         return life, ()
     heartbeat = "heartbeat present" if life.last_heartbeat_ns is not None else "no heartbeat either"
-    reason = f"no sample for {age_ns / 1e6:.0f} ms, {heartbeat}; is there a SYNC?"
-    return _enter(life, NodeState.STALE, now_ns, reason), ()
+    cause = bus_cause or f"{heartbeat}; {_TPDO_REMEDY}"
+    return _enter(life, NodeState.STALE, now_ns, f"no sample for {age_ns / 1e6:.0f} ms, {cause}"), ()
 
 
 def _on_standby_requested(life: Lifecycle, standby: bool, now_ns: int, timing: NodeTiming) -> Transition:
@@ -326,11 +338,11 @@ def _on_sample_rate(life: Lifecycle, samples_per_sync: int, now_ns: int, timing:
     return replace(life, babbling=True, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns), ()
 
 
-def _on_timer_expired(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
+def _on_timer_expired(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTiming) -> Transition:
     if life.last_heartbeat_ns is not None and is_supervised(life):
         quiet_ns = now_ns - life.last_heartbeat_ns
         if quiet_ns > timing.heartbeat_timeout_ns:
-            return _on_heartbeat_timeout(life, quiet_ns, now_ns, timing), ()
+            return _on_heartbeat_timeout(life, quiet_ns, bus_cause, now_ns, timing), ()
     if now_ns < life.due_ns:
         return life, ()
     if life.state is NodeState.ABSENT and timing.role is BusRole.LISTENER:
@@ -345,19 +357,23 @@ def _on_timer_expired(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Trans
         life = replace(life, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns)
         return life, () if life.duplicate_id or life.babbling else _identify_actions(life, timing)
     if life.state is NodeState.SETTLING:
-        return _enter(life, NodeState.STALE, now_ns, "started, but no sample received; is there a SYNC?"), ()
+        cause = f", {bus_cause}" if bus_cause else f"; {_TPDO_REMEDY}"
+        return _enter(life, NodeState.STALE, now_ns, f"started, but no sample received{cause}"), ()
     return life, ()
 
 
-def _on_heartbeat_timeout(life: Lifecycle, quiet_ns: int, now_ns: int, timing: NodeTiming) -> Lifecycle:
+def _on_heartbeat_timeout(
+    life: Lifecycle, quiet_ns: int, bus_cause: str, now_ns: int, timing: NodeTiming
+) -> Lifecycle:
     """Return the lifecycle of a node whose heartbeat has timed out."""
-    if life.heartbeat_required and timing.role is not BusRole.LISTENER:
+    if life.heartbeat_required and timing.role is not BusRole.LISTENER and not bus_cause:
         # present, since it was just configured: retried with growing delays
         failures = life.failures + 1
         life = _enter(life, NodeState.FAULTED, now_ns, _NO_HEARTBEAT_REASON)
         return replace(
             life, last_heartbeat_ns=None, failures=failures, due_ns=now_ns + timing.retry_delay_ns(failures)
         )
-    reason = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms; {CONNECTION_REMEDY}"
+    cause = f", {bus_cause}" if bus_cause else f"; {CONNECTION_REMEDY}"
+    reason = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms{cause}"
     life = replace(_enter(life, NodeState.ABSENT, now_ns, reason), last_heartbeat_ns=None, nmt_state=None)
     return replace(life, heartbeat_required=True, failures=0, due_ns=now_ns + timing.retry_delay_ns(0))

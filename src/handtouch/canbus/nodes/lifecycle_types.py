@@ -137,9 +137,10 @@ class SampleReceived:
 
 @dataclass(frozen=True, slots=True)
 class SamplesMissing:
-    """The last sample is too old, by `age_ns`."""
+    """No sample for `age_ns`; `bus_cause`: cause of it in the host or the bus, empty if it is the node's."""
 
     age_ns: int
+    bus_cause: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +159,16 @@ class SampleRate:
 
 @dataclass(frozen=True, slots=True)
 class TimerExpired:
-    """The time returned by `lifecycle.due_ns` has come."""
+    """The time returned by `lifecycle.due_ns` has come; `bus_cause` as in `SamplesMissing`."""
+
+    bus_cause: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopPaused:
+    """The receiving loop paused: timeouts are extended by `excused_ns`."""
+
+    excused_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,5 +195,6 @@ LifecycleEvent = (
     | SampleRate
     | StandbyRequested
     | TimerExpired
+    | LoopPaused
     | StopRequested
 )

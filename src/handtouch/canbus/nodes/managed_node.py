@@ -106,9 +106,8 @@ def make_managed_node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns:
         settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
         role=BusRole(port.bus.role),
     )
-    node = ManagedNode(
-        spec, port, timing, tpdo_numbers(spec.eds, spec.channels), SdoTransport(spec.node_id, port.send)
-    )
+    sdo = SdoTransport(spec.node_id, port.send, received_until_ns=lambda: port.received_until_ns)
+    node = ManagedNode(spec, port, timing, tpdo_numbers(spec.eds, spec.channels), sdo)
     if timing.role is BusRole.LISTENER:  # it can't be read from the node
         node.mapping = mapping_from_eds(spec.eds, spec.node_id, spec.channels)
     return node

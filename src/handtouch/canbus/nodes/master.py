@@ -18,6 +18,7 @@ from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.router import IDENTIFIER_COUNT, NO_SLOT
 from handtouch.canbus.nodes import boot
+from handtouch.canbus.nodes.bus_cause import BusCauses
 from handtouch.canbus.nodes.lifecycle import advance, due_ns, is_supervised
 from handtouch.canbus.nodes.lifecycle_types import (
     BootUpReceived,
@@ -25,6 +26,7 @@ from handtouch.canbus.nodes.lifecycle_types import (
     HeartbeatRate,
     HeartbeatReceived,
     LifecycleEvent,
+    LoopPaused,
     NodeAction,
     NodeState,
     ProbeAnswered,
@@ -92,7 +94,8 @@ class Master:
     `sample_period_ns` : (slots,) int64, longest regular time between two samples: the SYNC period, or longer
     for an event-driven node
     `idle` : (slots,) bool, event-driven nodes
-    `transmission_since_ns` : (slots,) int64, time of the last change of `idle`
+    `transmission_since_ns` : (slots,) int64, time since which samples are awaited: last change of `idle`, or
+    later by the loop's pauses
     `transmission_changes` : number of these changes
     """
 
@@ -120,6 +123,7 @@ class Master:
         self._nodes = [make_managed_node(spec, ports, sync_period_ns or 0) for spec in nodes]
         self._by_slot = {node.spec.slot: node for node in self._nodes}
         self._owners = _owners(ports, self._nodes)
+        self._bus_causes = BusCauses(ports, self._nodes, sync_period_ns or 0)
         self._awaited_samples: dict[int, int] = {}  # slot -> arrival of its last sample
         self._next_due_ns = 0
         self._repeat_window = (0, self._slab.repeat_counts.copy())  # its start, and the counts then
@@ -159,8 +163,20 @@ class Master:
         if self._results:
             self._collect_results(now_ns)
 
+    def excuse_pause(self, excused_ns: int, now_ns: int) -> None:
+        """Extend all timeouts by a pause of the loop or the whole host; before its frames are handled."""
+        reference_ns = np.maximum(self._slab.arrival_ns, self.transmission_since_ns)
+        np.add(reference_ns, excused_ns, out=self.transmission_since_ns)
+        self._bus_causes.record_pause(excused_ns, now_ns)
+        for node in self._nodes:
+            self._advance(node, LoopPaused(excused_ns), now_ns)
+        self._next_due_ns = now_ns
+
     def poll(self, now_ns: int) -> None:
-        """Run timeouts and retries and collect the workers' results; once a tick, after `handle_frame`."""
+        """Run timeouts and retries and collect the workers' results; once a tick, after `handle_frame`.
+
+        Timeouts are assessed at `now_ns`: all frames that arrived before must have been handled.
+        """
         if self._workers is None:
             return
         if self._results:
@@ -289,8 +305,11 @@ class Master:
             timeout_ns = np.maximum(STALE_PERIODS * self.sample_period_ns, _MIN_STALE_NS)
             stale = (self.states == NodeState.OPERATIONAL) & (ages_ns > timeout_ns)
             if stale.any():
+                states = self.states.copy()
                 for slot in np.flatnonzero(stale).tolist():
-                    self._advance(self._by_slot[slot], SamplesMissing(int(ages_ns[slot])), now_ns)
+                    node = self._by_slot[slot]
+                    cause = self._bus_causes.of_missing_samples(node, states, ages_ns, now_ns)
+                    self._advance(node, SamplesMissing(int(ages_ns[slot]), cause), now_ns)
 
     def _check_sample_rates(self, now_ns: int) -> None:
         """Detect nodes that send far more than one sample per SYNC.
@@ -316,7 +335,8 @@ class Master:
         for node in self._nodes:
             due = due_ns(node.lifecycle, node.timing)
             if due is not None and due <= now_ns:
-                self._advance(node, TimerExpired(), now_ns)
+                cause = self._bus_causes.of_timeout(node, now_ns)
+                self._advance(node, TimerExpired(cause), now_ns)
                 due = due_ns(node.lifecycle, node.timing)
             if node.guarded and is_supervised(node.lifecycle):
                 self._send_guard_request(node, now_ns)

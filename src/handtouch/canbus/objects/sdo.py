@@ -7,6 +7,7 @@ responses on from the receiving thread.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from canopen import ObjectDictionary
@@ -18,6 +19,7 @@ SDO_TIMEOUT_S = 0.2
 MAX_SDO_ATTEMPTS = 2
 """A lost frame costs one timeout; a node that responds to neither attempt is silent."""
 
+_MAX_RECEIVER_POLLS = 20
 _COMMANDS_WITH_OBJECT = (0x40, 0x60, 0x80)  # responses with index and sub-index: upload, download, abort
 _NO_OBJECT_ABORT_CODES = frozenset({0x06020000, 0x06090011, 0x060A0023, 0x08000024})
 
@@ -48,15 +50,50 @@ class _SdoNetwork:
         self._send(can_id, bytes(data))
 
 
+class _SdoClient(SdoClient):  # type: ignore[misc]  # canopen has no types
+    """canopen's client, whose timeout expires only once the frames that arrived before it have been read."""
+
+    received_until_ns: Callable[[], int] | None = None
+
+    def read_response(self) -> bytes:
+        deadline_ns = time.monotonic_ns() + round(self.RESPONSE_TIMEOUT * 1e9)
+        try:
+            return bytes(super().read_response())
+        except SdoCommunicationError:
+            if self.received_until_ns is None or not self._wait_for_receiver(deadline_ns):
+                raise
+            return bytes(super().read_response())
+
+    def _wait_for_receiver(self, deadline_ns: int) -> bool:
+        """Wait while the receiving thread is behind the deadline, for one more timeout at most.
+
+        Return True if a response has come.
+        """
+        assert self.received_until_ns is not None
+        for _ in range(_MAX_RECEIVER_POLLS):
+            if not self.responses.empty() or self.received_until_ns() >= deadline_ns:
+                break
+            time.sleep(self.RESPONSE_TIMEOUT / _MAX_RECEIVER_POLLS)
+        return not self.responses.empty()
+
+
 class SdoTransport:
-    """SDO channel of one node: one transfer at a time, responses from another thread."""
+    """SDO channel of one node: one transfer at a time, responses from another thread.
+
+    `received_until_ns` returns the time before which all arrived frames have been read, None: unknown.
+    """
 
     def __init__(
-        self, node_id: int, send: Callable[[int, bytes], bool], timeout_s: float | None = None
+        self,
+        node_id: int,
+        send: Callable[[int, bytes], bool],
+        timeout_s: float | None = None,
+        received_until_ns: Callable[[], int] | None = None,
     ) -> None:
-        self._client = SdoClient(
+        self._client = _SdoClient(
             cia301.SDO_REQUEST + node_id, cia301.SDO_RESPONSE + node_id, ObjectDictionary()
         )
+        self._client.received_until_ns = received_until_ns
         self._client.network = _SdoNetwork(send)
         self._client.RESPONSE_TIMEOUT = self._timeout_s = SDO_TIMEOUT_S if timeout_s is None else timeout_s
         self.awaiting_response = False

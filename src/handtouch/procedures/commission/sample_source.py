@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.canbus import cia301
+from handtouch.canbus.bus.loop_pause import LoopPause
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.lifecycle_types import NodeState
@@ -88,22 +89,26 @@ class CanSampleSource:
 
     def samples(self) -> Iterator[HandSample]:
         """Yield a sample every SYNC period, whether or not a node answers, without end."""
+        pause = LoopPause(self._sync.period_ns)
         while True:
+            now_ns, wake_ns = time.monotonic_ns(), self._sync.wake_ns
+            pause.begin_wait(now_ns)
+            select.select(list(self._ports.values()), (), (), max(0, wake_ns - now_ns) * 1e-9)
             now_ns = time.monotonic_ns()
-            if (sync_ns := self._sync.poll(now_ns)) is not None:
-                yield self._make_sample(sync_ns)
-            wait_s = max(0, self._sync.wake_ns - time.monotonic_ns()) * 1e-9
-            select.select(list(self._ports.values()), (), (), wait_s)
+            if paused_ns := pause.end_wait(wake_ns, now_ns):
+                self._sync.excuse_pause(paused_ns)
+                self._master.excuse_pause(paused_ns, now_ns)
             for port in self._ports.values():
                 for can_id, data, arrival_ns in port.drain():
-                    if can_id != cia301.SYNC:
+                    if can_id == cia301.SYNC:
+                        self._sync.handle_sync(port.name, arrival_ns)
+                    else:
                         self._master.handle_frame(port.name, can_id, data, arrival_ns)
-                        continue
-                    sync_ns = self._sync.handle_sync(port.name, arrival_ns, time.monotonic_ns())
-                    if sync_ns is not None:
-                        yield self._make_sample(sync_ns)
+            received_until_ns = min(port.received_until_ns for port in self._ports.values())
+            for sync_ns in self._sync.poll(time.monotonic_ns(), received_until_ns):
+                yield self._make_sample(sync_ns)
+            self._master.poll(received_until_ns)
             now_ns = time.monotonic_ns()
-            self._master.poll(now_ns)
             for port in self._ports.values():
                 port.update_state(now_ns)
 
