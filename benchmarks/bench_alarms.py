@@ -29,12 +29,11 @@ from section import table
 
 from handtouch import config
 from handtouch.config import shipped
-from handtouch.sheet import S1, S2
 from handtouch.simulate.faults import INFLUENCES, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import SHEET_KINDS, WORLDS
 from handtouch.supervisor.diagnose import DiagnosisModel, HandDiagnostics, HandSamples
 
 ROOT = Path(__file__).parent.parent
@@ -83,7 +82,9 @@ class Hour:
             bouts[name](at, at + lasts)
             self.busy.append((at, at + lasts + LINGER_S))
             at += lasts + LINGER_S + float(self._rng.exponential(lasts * (1 / IN_USE - 1)))
-        self._world = World.with_drift(FIRST_SEED + seed, (S1, S2)[seed % 2])
+        self._world = (
+            WORLDS["default"].with_sheets(SHEET_KINDS[("S1", "S2")[seed % 2]]).draw(FIRST_SEED + seed)
+        )
 
     def blocks(self) -> Iterator[HandSamples]:
         """Samples of all pads, block after block: dense while in use, sparse while at rest."""

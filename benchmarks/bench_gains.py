@@ -12,7 +12,7 @@ import json
 import os
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from handtouch.hand import electrode_network
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import DrawnWorld, PartSpread, Uniform, World
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -48,9 +48,10 @@ GAIN_STD = 0.02
 SWAP_COUNTS = (0, 32, 64, 128, 256, 512)
 SWAP_SEEDS = (1, 2)
 HELD = 10  # samples of a contact that are averaged
+GAINS = Uniform(1 - GAIN_STD * 3**0.5, 1 + GAIN_STD * 3**0.5)
 WORLDS = {
-    "parts as configured": World(gain_tolerance=GAIN_STD * 3**0.5, gap_tolerance_mm=0, resistor_tolerance=0),
-    "gaps +- 0.2 mm": World(gain_tolerance=GAIN_STD * 3**0.5, gap_tolerance_mm=0.2, resistor_tolerance=0),
+    "parts as configured": World("gains", PartSpread(gain_ratio=GAINS)),
+    "gaps +- 0.2 mm": World("gaps", PartSpread(gain_ratio=GAINS, gap_offset_mm=Uniform(-0.2, 0.2))),
 }
 
 
@@ -125,8 +126,8 @@ def swapped(label: str) -> list[dict[str, Any]]:
     gain_errors: dict[int, list[FloatArray]] = {count: [] for count in SWAP_COUNTS}
     inside: dict[int, list[FloatArray]] = {count: [] for count in SWAP_COUNTS}
     for seed in SWAP_SEEDS:
-        world = replace(WORLDS[label], seed=seed)
-        true = np.array([1 / np.array(world.parts(hand.name, pad).gain) for hand, pad in pads])
+        world = WORLDS[label].draw(seed)
+        true = np.array([1 / np.array(world.pad(hand.name, pad).gain_ratio) for hand, pad in pads])
         learn = _readings(deployment, model, world, max(SWAP_COUNTS), (seed, 1))
         test = _readings(deployment, model, world, 100, (seed, 2))
         for row, network in enumerate(networks):
@@ -167,7 +168,7 @@ class Readings:
 
 
 def _readings(
-    deployment: config.Deployment, model: PadModel, world: World, count: int, seed: tuple[int, int]
+    deployment: config.Deployment, model: PadModel, world: DrawnWorld, count: int, seed: tuple[int, int]
 ) -> list[Readings]:
     """Return readings of `count` contacts of 0.5 to 5 N anywhere on every pad."""
     generator = np.random.default_rng(seed)

@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
-from grasp_run import PARTS, Served, Setting, against, at_best, served
+from grasp_run import PARTS, Served, against, at_best, served, usual
 from numpy.typing import NDArray
 
 from handtouch.config import (
@@ -31,6 +31,7 @@ from handtouch.config import (
 )
 from handtouch.simulate.grasp.event_score import EventScore
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
+from handtouch.simulate.worlds import WORLDS
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -383,12 +384,12 @@ def main() -> None:
     ideal, unstated = [], []
     for seed in range(1, args.seeds + 1):
         for name in args.objects:
-            setting = Setting.usual(seed)
+            setting = usual(seed)
             run = served(stated, name, seed, setting)
             runs[name].append(run)
             assumed.append(served(stated, name, seed, setting, assumed_radius=True, done=run.grasp))
             if seed == 1:
-                ideal.append(served(deployment, name, seed, Setting.ideal(seed)))
+                ideal.append(served(deployment, name, seed, WORLDS["ideal"].draw(seed)))
                 unstated.append(served(deployment, name, seed, setting, done=run.grasp))
             print(f"seed {seed}: {name}, {len(run.step)} contact samples", flush=True)
     figures = {"mujoco": mujoco.__version__} | collect(deployment, runs, assumed, ideal)

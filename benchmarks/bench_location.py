@@ -24,7 +24,7 @@ from handtouch.core.pipeline import Pipeline
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import Score, score_contacts
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld
 from handtouch.wire import PadState
 
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
@@ -49,7 +49,7 @@ class Collector:
             self.contacts.append(message)
 
 
-def play(deployment: Deployment, model: PadModel, scenario: Scenario, world: World) -> Score:
+def play(deployment: Deployment, model: PadModel, scenario: Scenario, world: DrawnWorld) -> Score:
     """The session through the pipeline, as fast as it goes."""
     hand = VirtualHand(deployment, scenario, world)
     taken = Collector()
@@ -118,8 +118,11 @@ def main() -> None:
     model = PadModel(deployment)
     seeds = range(1, asked.seeds + 1)
     results = {
-        "noise and quantisation": [play(deployment, model, scenario, World.ideal_parts(s)) for s in seeds],
-        "tolerances of parts too": [play(deployment, model, scenario, World(seed=s)) for s in seeds],
+        "noise and quantisation": [play(deployment, model, scenario, WORLDS["ideal"].draw(s)) for s in seeds],
+        "tolerances of parts too": [
+            play(deployment, model, scenario, WORLDS["default"].only("parts", "contacts").draw(s))
+            for s in seeds
+        ],
     }
     print(write(results, next(iter(results.values()))[0].total.samples))
 

@@ -36,11 +36,10 @@ from handtouch.percept.registry import build_percept_pipeline
 from handtouch.percept.samples import ContactBuffer, ContactSamples
 from handtouch.percept.spectrum import estimate_texture
 from handtouch.percept.stiffness import estimate_stiffness, estimate_stiffness_from_area
-from handtouch.sheet import S1, S2, SheetModel
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, World, world_with
 from handtouch.wire import PERCEPT_KINDS
 
 matplotlib.use("Agg")
@@ -54,7 +53,12 @@ PERIOD_NS, RATE_HZ = 5_000_000, 200.0
 SQUEEZE_S, PAUSE_S, PRESSES = 2.4, 0.6, 4
 ENCODER_M = 10e-6  # noise of depth: 0.25 mrad at 40 mm
 STIFFNESSES = np.geomspace(100, 1e5, 7)
-SHEETS = {"ideal": None, "S1": S1, "S2": S2}
+TOLERANCES = WORLDS["default"].only("parts", "contacts")
+SHEETS = {
+    "ideal": TOLERANCES,
+    "S1": world_with(TOLERANCES, sheet="S1"),
+    "S2": world_with(TOLERANCES, sheet="S2"),
+}
 CONTACTS = (1, 5, 20, 100)
 SPEEDS, RATES = (5e-3, 20e-3, 100e-3), (100.0, 200.0, 500.0, 1000.0)
 OF_NYQUIST = (0.8, 0.95, 1.05, 1.2, 1.4, 1.7, 2.0, 3.0)
@@ -93,7 +97,7 @@ def squeezes(links: list[str]) -> Scenario:
     return Scenario(touch=tuple(touches))
 
 
-def play(deployment: Deployment, world: World) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def play(deployment: Deployment, world: DrawnWorld) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Times, true forces, forces and deviations (ticks, pads) as published by the daemon's tick."""
     model = PadModel(deployment)
     scenario = squeezes(model.links)
@@ -124,14 +128,14 @@ def stiffnesses(seeds: int) -> Rows:
     """A row a sheet, compensation and stiffness."""
     plain = load(shipped.path("utah_mit.toml"))
     rows: Rows = []
-    for name, sheet in SHEETS.items():
-        for compensated in (False, True) if sheet else (False,):
+    for name, world in SHEETS.items():
+        for compensated in (False, True) if world.sheets.tuning_kinds else (False,):
             deployment = plain
             if compensated:
                 behaviour = Behaviour(preset="S2" if name == "S2" else "S1")
                 sheets = {k: s.model_copy(update={"behaviour": behaviour}) for k, s in plain.sheets.items()}
                 deployment = plain.model_copy(update={"sheets": sheets})
-            runs = [play(deployment, World(seed, sheet=sheet)) for seed in range(101, 101 + seeds)]
+            runs = [play(deployment, world.draw(seed)) for seed in range(101, 101 + seeds)]
             for k in STIFFNESSES:
                 rows.append(
                     {"sheet": name, "compensated": compensated, "k": float(k), **assess(runs, float(k))}
@@ -411,7 +415,7 @@ def slid(
     rate: float,
     periods: list[float],
     seed: int,
-    sheet: SheetModel | None,
+    world: World,
 ) -> list[tuple[FloatArray, FloatArray, float]]:
     """Total currents, ways with encoder noise, and the true period: one slide a period, on one pad."""
     chance = np.random.default_rng((seed, int(rate), int(1e4 * speed)))
@@ -433,7 +437,7 @@ def slid(
                 ramp_s=ramp,
             )
         )
-    hand = VirtualHand(deployment, Scenario(touch=tuple(touches)), World(seed + 1, sheet=sheet))
+    hand = VirtualHand(deployment, Scenario(touch=tuple(touches)), world.draw(seed + 1))
     row = model.links.index(link)
     found = []
     for begin, period in zip(begins, periods, strict=True):

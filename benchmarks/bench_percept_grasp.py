@@ -18,7 +18,7 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from grasp_run import Served, Setting, served
+from grasp_run import Served, served, usual
 from numpy.typing import NDArray
 
 from handtouch import wire
@@ -494,7 +494,7 @@ def main() -> None:
     runs = []
     for seed in range(1, args.seeds + 1):
         for name in args.objects:
-            runs.append(served(deployment, name, seed, Setting.usual(seed), perceive=True))
+            runs.append(served(deployment, name, seed, usual(seed), perceive=True))
             print(f"seed {seed}: {name}, {len(runs[-1].percepts)} percepts", flush=True)
     runs.sort(key=lambda run: args.objects.index(run.grasp.grasped_object.name))
     print(write({"mujoco": mujoco.__version__} | collect(runs), args.seeds))

@@ -10,7 +10,6 @@ import json
 import math
 import os
 import platform
-from dataclasses import replace
 from typing import Any
 
 import matplotlib
@@ -18,9 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from slip_runs import DEPLOYMENT, ROOT, Record, pads_of, run
 
-from handtouch.sheet import S1, S2
 from handtouch.simulate.grip_touch import GripTouch
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, DrawnWorld
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -28,7 +26,10 @@ from matplotlib import pyplot as plt
 FloatArray = npt.NDArray[np.float64]
 PADS = pads_of(DEPLOYMENT)
 SPEEDS, FORCES = (1.0, 3.0, 10.0, 30.0, 100.0), (0.5, 2.0, 5.0)
-WORLDS = {name: replace(World(21), sheet=sheet) for name, sheet in (("ideal", None), ("S1", S1), ("S2", S2))}
+SHEETS = {
+    name: WORLDS["default"].only("parts", "contacts", "sheets").with_sheets(*kinds).draw(21)
+    for name, kinds in (("ideal", ()), ("S1", (SHEET_KINDS["S1"],)), ("S2", (SHEET_KINDS["S2"],)))
+}
 LOADS = {0: 1.0, 1: 0.7}
 GRIPPED_S, SLIPS_S, RUN_S, LATEST_S = 0.3, 1.8, 2.3, 0.5
 SMOOTH_S = (0.0, 0.01, 0.03)
@@ -37,7 +38,7 @@ INK, FAINT, ACCENT = "#1a1a1a", "#8a8a8a", "#1f6fb4"
 Rows = list[dict[str, Any]]
 
 
-def slip_all(world: World, hz: float, repeats: int) -> list[tuple[float, float, Record, int]]:
+def slip_all(world: DrawnWorld, hz: float, repeats: int) -> list[tuple[float, float, Record, int]]:
     """Speed, force, record and pad of every slip; all speeds and forces go round all pads."""
     found = []
     for repeat in range(repeats):
@@ -62,7 +63,7 @@ def slip_all(world: World, hz: float, repeats: int) -> list[tuple[float, float, 
     return found
 
 
-def hold(world: World, hz: float, seconds: float) -> Record:
+def hold(world: DrawnWorld, hz: float, seconds: float) -> Record:
     """A firm grip that doesn't slip."""
     grips = [grip(k, 0.0, seconds + 1, FORCES[k % 3], 9000) for k in range(len(PADS))]
     return run(grips, world, hz, seconds)
@@ -148,7 +149,7 @@ def measure(quick: bool) -> dict[str, Any]:
     results: dict[str, Any] = {"latency": [], "false": [], "curves": {}, "cost": []}
     cases = [("ideal", 200.0), ("S1", 200.0), ("S2", 200.0), ("ideal", 500.0), ("S1", 500.0), ("S1", 1000.0)]
     for name, hz in cases[: 1 if quick else None]:
-        made, firm = slip_all(WORLDS[name], hz, repeats), hold(WORLDS[name], hz, min(seconds, 2e4 / hz))
+        made, firm = slip_all(SHEETS[name], hz, repeats), hold(SHEETS[name], hz, min(seconds, 2e4 / hz))
         alarms = firm.running & ~np.vstack([firm.running[:1], firm.running[:-1]])
         lasting = firm.t_s > GRIPPED_S + 1.0
         minutes = alarms.shape[1] * float(firm.t_s[-1] - GRIPPED_S - 1.0) / 60

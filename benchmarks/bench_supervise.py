@@ -32,7 +32,8 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import SheetForceCompensation, sheet_behaviour_of
 from handtouch.core.slab import Slab
 from handtouch.core.tick import TickProcessor
-from handtouch.simulate.world import ElectronicsDrift, World
+from handtouch.simulate.electronics_drift import ElectronicsDrift
+from handtouch.simulate.worlds import WORLDS
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -41,7 +42,7 @@ FloatArray = NDArray[np.float64]
 Rows = list[dict[str, Any]]
 OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PERIOD_NS, TICK_NS = 100_000_000, 5_000_000
-DRIFT = World(seed=71, zero_drift_counts_per_s=0.05, temperature_drift_k_per_s=0.01, offset_counts_per_k=2.0)
+DRIFT = WORLDS["default"].only("electronics").draw(71)
 SPAN_S = 60.0  # of drift that is drawn at once
 HELD = 5  # pads
 FULL_N = 5.0
@@ -69,7 +70,7 @@ class Rig:
         self.cycle = Cycle(PERIOD_NS, 0.6)
         self._rng = np.random.default_rng(seed)
         names = list(zip(model.hands, model.links, strict=True))
-        self._climate = ElectronicsDrift(DRIFT if drifts else World.ideal_parts(), names)
+        self._climate = ElectronicsDrift(DRIFT if drifts else WORLDS["ideal"].draw(1), names)
         self._zeros = np.zeros((0, model.size, 4))
         self._at = 0
         pads = np.arange(model.size)
@@ -438,10 +439,11 @@ def notes(hours: float, held_s: float) -> dict[str, str]:
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
+    drift = DRIFT.world.electronics
     return {
         "Held object": f"""Five pads of fifteen hold something for {held_s:g} s. The drift is the
-simulator's: each zero wanders by {DRIFT.zero_drift_counts_per_s:g} counts a second at most, and the hand's
-temperature by {DRIFT.temperature_drift_k_per_s:g} K a second, for {DRIFT.offset_counts_per_k:g} counts/K
+simulator's: each zero wanders by {drift.zero_drift_counts_per_s} counts a second at most, and the hand's
+temperature by {drift.temperature_drift_k_per_s} K a second, for {drift.offset_counts_per_k.std:g} counts/K
 of either
 sign. The error is that of the force at the end against the same grip at its start; below, without parts of
 the compensation. With so slow a drift it matters only that it isn't tracked in contact; the next two

@@ -26,7 +26,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import DrawnWorld, PartSpread, Uniform, World
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
@@ -139,7 +139,9 @@ def block_of(hand: VirtualHand, number: int, pads: int) -> dict[str, Any]:
     return message
 
 
-def test_set(deployment: config.Deployment, model: PadModel, world: World) -> tuple[FloatArray, FloatArray]:
+def test_set(
+    deployment: config.Deployment, model: PadModel, world: DrawnWorld
+) -> tuple[FloatArray, FloatArray]:
     """Counts (100, pads, 4) of other contacts, as single samples, and where they are (100, pads, 3) [m]."""
     hand = VirtualHand(deployment, touches(model, 100, 77), world)
     times = [number * STEP_S + 0.5 * STEP_S for number in range(100)]
@@ -167,7 +169,12 @@ def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
     """Rows of the table."""
     deployment = deployment_of(units)
     model = PadModel(deployment)
-    world = World(5, gain_tolerance=GAIN_TOLERANCE, gap_tolerance_mm=0.1, resistor_tolerance=0)
+    world = World(
+        "gains and gaps",
+        PartSpread(
+            gain_ratio=Uniform(1 - GAIN_TOLERANCE, 1 + GAIN_TOLERANCE), gap_offset_mm=Uniform(-0.1, 0.1)
+        ),
+    ).draw(5)
     hand = VirtualHand(deployment, touches(model, max(counts), 3), world)
     readings, places = test_set(deployment, model, world)
     start = WorkerConfig(
@@ -197,7 +204,7 @@ def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                 words = slow.process_message(block_of(hand, number, model.size), NOW)
         slow.finish(NOW)
     for pad, (name, entry) in enumerate(hand.pads):
-        model.set_gains_and_law(pad, 1 / np.array(world.parts(name, entry).gain), "true")
+        model.set_gains_and_law(pad, 1 / np.array(world.pad(name, entry).gain_ratio), "true")
     least = errors_mm(model, readings, places)
     rows = []
     for first, shape in enumerate(SHAPES):

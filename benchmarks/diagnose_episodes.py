@@ -15,7 +15,7 @@ from handtouch.simulate.faults import FAULTS, INFLUENCES, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 from handtouch.supervisor.diagnose import HandSamples
 from handtouch.wire.faults import FaultKind
 
@@ -112,7 +112,12 @@ def episode(name: str, seed: int) -> Episode:
         for pad in PADS:
             play.use(pad, 0.5, LENGTH_S)
     touches = tuple(play.touches)
-    hand = VirtualHand(deployment(), Scenario(touch=touches), World(hand_of(seed)), faults=tuple(faults))
+    hand = VirtualHand(
+        deployment(),
+        Scenario(touch=touches),
+        WORLDS["default"].only("parts", "contacts").draw(hand_of(seed)),
+        faults=tuple(faults),
+    )
     return Episode(name, seed, link, begin_s, details, hand)
 
 

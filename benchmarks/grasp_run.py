@@ -1,13 +1,14 @@
 """Process one MuJoCo grasp with the daemon's pipeline, and compare the output with MuJoCo's ground truth.
 
-Public names: `Setting`, `served` -> `Served`; `against` and `at_best` score its contacts. Samples enter at
+Public names: `usual` (world), `served` -> `Served`; `against` and `at_best` score its contacts. Samples enter
+at
 200 Hz, joint states at 100 Hz through the decoder of the inputs endpoint, in the order of their arrival, not
 in real time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches, contact_patches
 from handtouch.simulate.grasp.simulation import DURATION_S, GraspRecord, simulate_grasp
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld
 from handtouch.wire import PERCEPT_KINDS, PadState
 from handtouch.wire.inputs import JointState, encode
 
@@ -49,23 +50,9 @@ _START_NS = 1_000_000_000
 _PER_TICK = 5  # steps of MuJoCo
 
 
-@dataclass(frozen=True)
-class Setting:
-    """World and encoders, which the daemon doesn't know."""
-
-    world: World
-    encoders: EncoderErrors
-
-    @classmethod
-    def usual(cls, seed: int) -> Setting:
-        """Return tolerances of parts, misaligned pads and encoders, and delayed joint states."""
-        world = replace(World(seed=seed), mount_std_mm=0.2, mount_std_deg=0.5)
-        return cls(world, EncoderErrors(seed, offset_deg=0.2, noise_deg=0.05, delay_s=0.003))
-
-    @classmethod
-    def ideal(cls, seed: int) -> Setting:
-        """Return noise of the channels only."""
-        return cls(World.ideal_parts(seed), EncoderErrors(seed))
+def usual(seed: int) -> DrawnWorld:
+    """Return a world of tolerances of parts, misaligned pads and encoders, and delayed joint states."""
+    return WORLDS["default"].only("parts", "mounts", "contacts").draw(seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +90,7 @@ def served(
     deployment: Deployment,
     name: str,
     seed: int,
-    setting: Setting,
+    world: DrawnWorld,
     *,
     assumed_radius: bool = False,
     perceive: bool = False,
@@ -116,17 +103,17 @@ def served(
     `perceive` requests all percepts; `done` is the grasp if it has been simulated already.
     """
     hand = deployment.hands[0]
-    grasp = done or simulate_grasp(hand, name, seed, setting.world, duration_s=duration_s)
+    grasp = done or simulate_grasp(hand, name, seed, world, duration_s=duration_s)
     patches = contact_patches(grasp)
-    stimulus = GraspStimulus.from_grasp(grasp, patches, setting.encoders)
+    stimulus = GraspStimulus.from_grasp(grasp, patches, EncoderErrors.of_world(world, grasp))
     if assumed_radius:
         radii = [deployment.sheets[pad.sheet].contact_radius_mm * 1e-3 for pad in hand.pads]
         stimulus = stimulus.with_single_discs(np.array(radii))
-    virtual = VirtualHand(deployment, stimulus, setting.world)
+    virtual = VirtualHand(deployment, stimulus, world)
     steps = np.arange(0, len(grasp.times_s), _PER_TICK)
     counts = np.stack([virtual.counts(row, steps * TIME_STEP_S) for row in range(len(hand.pads))], axis=1)
     with zmq.Context() as context:
-        run = _Run(deployment, context, grasp, setting, perceive)
+        run = _Run(deployment, context, grasp, world, perceive)
         for step, now in zip(steps.tolist(), counts, strict=True):
             run.tick(step, now)
         run.inputs.close()
@@ -142,7 +129,7 @@ class _Run:
         deployment: Deployment,
         context: zmq.Context[Any],
         grasp: GraspRecord,
-        setting: Setting,
+        world: DrawnWorld,
         perceive: bool = False,
     ) -> None:
         model, robots = PadModel(deployment), RobotModels(deployment)
@@ -150,8 +137,9 @@ class _Run:
         hand, names = deployment.hands[0].name, self.kinematics.joints
         self._order = np.array([grasp.joints.index(name) for name in names])
         self._names, self._hand = robots.joint_names[0], hand
-        self._reported, self._std = setting.encoders.readings(grasp.joint_rad), setting.encoders.std_rad
-        self._clean = setting.encoders.delayed_only(grasp.joint_rad)
+        encoders = EncoderErrors.of_world(world, grasp)
+        self._reported, self._std = encoders.readings(grasp.joint_rad), encoders.std_rad
+        self._clean = encoders.delayed_only(grasp.joint_rad)
         states, self._timely = JointStateBuffer(self._names), JointStateBuffer(self._names)
         pads = list(zip(model.hands, model.links, strict=True))
         self.inputs = InputReceiver.open(

@@ -20,7 +20,7 @@ from handtouch.percept.motion import MotionEstimator
 from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import DrawnWorld
 from handtouch.wire import PERCEPT_KINDS, PadState
 
 FloatArray = npt.NDArray[np.float64]
@@ -85,7 +85,7 @@ def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:
 
 def run(
     grips: list[GripTouch],
-    world: World,
+    world: DrawnWorld,
     hz: float,
     seconds: float,
     from_s: float = 0.0,

@@ -25,7 +25,7 @@ LOADED = (
     "handtouch.bridge.runner",
     "handtouch.daemon.daemon",
     "handtouch.simulate.simulated_hand",
-    "handtouch.simulate.world",
+    "handtouch.simulate.worlds",
     "handtouch.cli.status",
     "can.interfaces.socketcan",
     "can.interfaces.udp_multicast",

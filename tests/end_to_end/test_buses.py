@@ -18,7 +18,7 @@ from handtouch.config import Deployment, load, shipped
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.simulated_hand import SimulatedHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 
 PERIOD_S = 0.02
 LONGEST_S = 60.0
@@ -63,7 +63,7 @@ def _deployment(hands: int, sync: str = "producer") -> Deployment:
 @contextmanager
 def _running(deployment: Deployment) -> Iterator[HandtouchDaemon]:
     stop = threading.Event()
-    nodes = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), World.ideal_parts(), record=False)
+    nodes = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), WORLDS["ideal"].draw(1), record=False)
     with nodes, HandtouchDaemon.open(deployment) as daemon:
         nodes.start()
         thread = threading.Thread(target=daemon.run, args=(stop,))

@@ -31,7 +31,7 @@ from handtouch.config.channels import ELECTRODES
 from handtouch.device import DeviceBus
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 
 REQUESTED = {
     "anywhere": (0.5, 0.5),
@@ -71,7 +71,7 @@ class PressableHand:
                     }
                 )
         scenario = Scenario.model_validate({"touch": touches})
-        self._hand = VirtualHand(deployment, scenario, World(seed=seed))
+        self._hand = VirtualHand(deployment, scenario, WORLDS["default"].only("parts", "contacts").draw(seed))
         self._idle_s = self._now_s = len(touches) + 10.0
         self._bus = open_bus(deployment.buses[0])
         self.nodes = DeviceBus(self._bus, self._sample)

@@ -24,7 +24,7 @@ from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.truth import GroundTruth
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 from tests.deployments import deployment_text, pad_text
 
 PERIOD_MS = 5.0
@@ -133,7 +133,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     settings = deployment.daemon.model_copy(update={"supervise": True})
     deployment = deployment.model_copy(update={"daemon": settings})
     stop = threading.Event()
-    hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), World.ideal_parts())
+    hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), WORLDS["ideal"].draw(1))
     with hand, HandtouchDaemon.open(deployment, folder=folder) as daemon:
         for number, device in enumerate(hand.devices.values()):
             device.replace_device(1001 + number)
@@ -249,7 +249,7 @@ def test_replaced_node_is_refused_if_configured(tmp_path: Path) -> None:
     settings = deployment.daemon.model_copy(update={"supervise": True, "on_node_replaced": "refuse"})
     deployment = deployment.model_copy(update={"daemon": settings})
     stop = threading.Event()
-    hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), World.ideal_parts())
+    hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), WORLDS["ideal"].draw(1))
     with hand, HandtouchDaemon.open(deployment, folder=tmp_path) as daemon:
         next(iter(hand.devices.values())).replace_device(2002)
         hand.start()

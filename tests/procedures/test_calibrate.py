@@ -46,7 +46,7 @@ from handtouch.sheet import S1, SheetHistory
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 from tests.deployments import deployment_text, pad_text
 
 TRUE = {"contact_ohm_mm2": 14_000.0, "alpha": 1.62, "ohm_per_square": 2900.0}
@@ -96,7 +96,7 @@ class Table:
             for k, weight in enumerate(weights)
         )
         hidden = deployed(**{**TRUE, **law})
-        self.hand = VirtualHand(hidden, Scenario(touch=touches), World.ideal_parts(seed))
+        self.hand = VirtualHand(hidden, Scenario(touch=touches), WORLDS["ideal"].draw(seed))
         self.weights = weights
 
     def readings(self) -> list[WeightReading]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TypeVar
 
 import numpy as np
@@ -33,9 +32,9 @@ from handtouch.simulate.faults import (
 )
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, World
 
-CALM = dataclasses.replace(World.ideal_parts(3), noise_counts=0.0)
+CALM = World("calm", electronics=ElectronicsSpread(noise_ratio=Fixed(0.0))).draw(3)
 FULL_MA = 0.02  # fine enough that rounding doesn't matter
 HELD = np.array([10.0])
 AT: dict[str, object] = {"link": "flat", "from_s": 5.0}
@@ -234,7 +233,12 @@ def test_offset_gain_stuck_and_saturated_channels_follow_the_scenario(deployment
     stepped = currents(deployment, scenario, on_flat(GainStep, electrode="yb", factor=1.5))
     np.testing.assert_allclose(stepped / whole, [1, 1, 1, 1.5], rtol=2e-4)
     assert currents(deployment, scenario, on_flat(SaturatedChannel, electrode="y0"))[2] == 32767
-    stuck = VirtualHand(deployment, scenario, World(3), faults=(on_flat(StuckChannel, electrode="x0"),))
+    stuck = VirtualHand(
+        deployment,
+        scenario,
+        WORLDS["default"].only("parts", "contacts").draw(3),
+        faults=(on_flat(StuckChannel, electrode="x0"),),
+    )
     counts = stuck.counts(0, np.arange(4.0, 8.0, 0.01))
     assert np.ptp(counts[:90, 0]) > 0
     assert np.ptp(counts[110:, 0]) == 0
@@ -255,7 +259,7 @@ def test_counts_at_many_times_equal_single_samples(deployment: config.Deployment
     pad = deployment.hands[0].pads[0]
     played = draw_episode(name, 2, pad, 20.0)
     assert (played.fault is None) == (name in HARD_CASES)
-    hand = VirtualHand(deployment, played.scenario, World.with_drift(2), "near", played.active_faults)
+    hand = VirtualHand(deployment, played.scenario, WORLDS["default"].draw(2), "near", played.active_faults)
     times = np.linspace(0.0, 20.0, 41)
     np.testing.assert_array_equal(hand.counts(0, times), [hand.sample(t)[0] for t in times])
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ from handtouch.simulate.grasp.projection import project_to_surface
 from handtouch.simulate.grasp.simulation import GraspRecord, hand_contacts, simulate_grasp
 from handtouch.simulate.pad_geometry import simulated_surface
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, World
 from tests.simulate.surfaces import SURFACE_TABLES
 
 FloatArray = NDArray[np.float64]
@@ -166,7 +165,7 @@ def test_grasp_is_reproducible_by_seed(ball: GraspRecord) -> None:
 
 
 def test_reported_contacts_on_a_ball_lie_within_their_covariance(run: Any, ball: GraspRecord) -> None:
-    served = run.served(HAND, "ball", 1, run.Setting.ideal(1), done=ball)
+    served = run.served(HAND, "ball", 1, WORLDS["ideal"].draw(1), done=ball)
     strong = served.true_n > 0.3
     still = strong & (served.moving_rad_s < 0.2)  # the state of a moving joint is a little old
     assert still.sum() > 500
@@ -195,9 +194,8 @@ def test_reported_contacts_on_a_ball_lie_within_their_covariance(run: Any, ball:
 
 
 def test_error_components_are_attributed_to_their_causes(run: Any) -> None:
-    world = replace(World.ideal_parts(1), mount_std_mm=0.2, mount_std_deg=0.5)
-    usual = run.Setting(world, run.Setting.usual(1).encoders)
-    served = run.served(HAND, "ball", 1, usual, duration_s=1.9)
+    world = WORLDS["default"].only("mounts").draw(1)
+    served = run.served(HAND, "ball", 1, world, duration_s=1.9)
     length = {part: np.linalg.norm(error, axis=1) for part, error in served.error_m.items()}
     for row in np.unique(served.pad):
         mine = served.pad == row
@@ -212,8 +210,11 @@ def test_error_components_are_attributed_to_their_causes(run: Any) -> None:
 
 
 def test_grasp_stimulus_contacts_agree_with_samples(ball: GraspRecord, pressed: ContactPatches) -> None:
-    timeline = GraspStimulus.from_grasp(ball, pressed, EncoderErrors(1, 0.2, 0.05, 0.003), repeat=True)
-    virtual = VirtualHand(HAND, timeline, replace(World.ideal_parts(1), noise_counts=0.0))
+    encoders = EncoderErrors.of_world(WORLDS["default"].draw(1), ball)
+    timeline = GraspStimulus.from_grasp(ball, pressed, encoders, repeat=True)
+    virtual = VirtualHand(
+        HAND, timeline, World("silent", electronics=ElectronicsSpread(noise_ratio=Fixed(0.0))).draw(1)
+    )
     counts = np.stack([virtual.counts(row, [0.1, HELD_S]) for row in range(len(PADS))], axis=1)
     touched = (counts[1] > 20).any(axis=1)
     assert np.array_equal(touched, pressed.total_n[round(HELD_S / TIME_STEP_S)] > 0)
@@ -282,7 +283,7 @@ def test_event_score_counts_late_missed_and_false_contacts() -> None:
 
 
 def test_impossible_grasp_is_reported_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World.ideal_parts(1)
+    world = WORLDS["ideal"].draw(1)
     with pytest.raises(ValueError, match="known: ball, box, pen, cup"):
         grasping.grasp_stimulus(HAND, "bottle", world)
     bare = HAND.model_copy(update={"hands": (HAND.hands[0].model_copy(update={"urdf": None}),)})
@@ -305,7 +306,9 @@ def test_unknown_object_gives_exit_status_2(
 def test_pads_of_every_surface_fit_into_a_scene(kind: str) -> None:
     hand = HAND.hands[0]
     pads = (hand.pads[0].model_copy(update={"surface": SURFACE_TABLES[kind]}), *hand.pads[1:])
-    scene = MujocoScene(hand.model_copy(update={"pads": pads}), World.ideal_parts(1), GRASP_OBJECTS["ball"])
+    scene = MujocoScene(
+        hand.model_copy(update={"pads": pads}), WORLDS["ideal"].draw(1), GRASP_OBJECTS["ball"]
+    )
     geom = scene.model.geom(f"pad {pads[0].link}")
     assert scene.pad_row_by_geom[geom.id] == 0
     assert scene.pads[0].shape == simulated_surface(SURFACE_TABLES[kind])

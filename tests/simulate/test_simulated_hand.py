@@ -21,9 +21,9 @@ from handtouch.simulate import truth as truth_file
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 
-IDEAL = World.ideal_parts(seed=2)
+IDEAL = WORLDS["ideal"].draw(2)
 SESSION = """
 [[touch]]
 link = "tip"
@@ -240,9 +240,8 @@ def test_buses_without_sync_are_listed_until_their_first_sync(deployment: config
 
 
 def test_negative_seed_is_rejected() -> None:
-    for make in (World, World.ideal_parts):
-        with pytest.raises(ValueError, match="seed = -1: must be 0 or more"):
-            make(seed=-1)
+    with pytest.raises(ValueError, match="seed = -1: must lie between 0 and 1999999"):
+        WORLDS["ideal"].draw(-1)
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,11 @@ from handtouch.field.contact_law import contact_stack_resistance
 from handtouch.hand import electrode_network, mount_transform, pad_surface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 from tests.simulate.surfaces import SURFACE_TABLES
 
 LINKS = ("flat", "round", "tapered", "tip")
-IDEAL = World.ideal_parts(seed=3)
+IDEAL = WORLDS["ideal"].draw(3)
 
 
 def press(link: str, place: tuple[float, float] = (0.4, 0.7), force_n: float = 1.0) -> Scenario:
@@ -111,7 +111,7 @@ def test_samples_are_reproducible_by_time_and_seed(
     np.testing.assert_array_equal(one.sample(3.0), again.sample(3.0))
     np.testing.assert_array_equal(one.sample(3.0), one.sample(3.0))
     assert (one.sample(3.0) != one.sample(3.005)).any()
-    other = VirtualHand(deployment, press("tip"), World.ideal_parts(seed=4))
+    other = VirtualHand(deployment, press("tip"), WORLDS["ideal"].draw(4))
     assert (one.sample(3.0) != other.sample(3.0)).any()
 
 
@@ -136,32 +136,39 @@ def test_hand_without_contact_reads_noise_only(deployment: config.Deployment) ->
 
 
 def test_parts_differ_within_tolerances(deployment: config.Deployment) -> None:
-    world = World(seed=5, gap_tolerance_mm=0.3)
+    world = WORLDS["default"].draw(5)
     pads = deployment.hands[0].pads
-    parts = [world.parts("right", pad) for pad in pads]
+    parts = [world.pad("right", pad) for pad in pads]
     for pad, part in zip(pads, parts, strict=True):
-        assert np.abs(np.array(part.gain) - 1).max() <= 0.02
+        assert np.abs(np.array(part.gain_ratio) - 1).max() <= 0.02
         gaps = np.array(part.gap_before_mm + part.gap_after_mm)
-        assert np.abs(gaps - pad.gap_mm).max() <= 0.3
+        assert np.abs(gaps - pad.gap_mm).max() <= 0.2
         series = np.array(part.series_ohm)
         assert (np.abs(series - pad.series_ohm) <= 0.05 * np.array(pad.series_ohm)).all()
-        assert len(set(part.gain)) == 4
+        assert len(set(part.gain_ratio)) == 4
     assert len(set(parts)) == len(parts)
-    assert World(seed=6).parts("right", pads[0]) != World(seed=5).parts("right", pads[0])
+    assert WORLDS["default"].draw(6).pad("right", pads[0]) != world.pad("right", pads[0])
 
 
 def test_ideal_parts_are_as_configured(deployment: config.Deployment) -> None:
     pad = deployment.hands[0].pads[1]
-    part = IDEAL.parts("right", pad)
-    assert part.gain == (1, 1, 1, 1)
+    part = IDEAL.pad("right", pad)
+    assert part.gain_ratio == (1, 1, 1, 1)
     assert part.series_ohm == pad.series_ohm
     assert part.gap_before_mm == part.gap_after_mm == (pad.gap_mm,) * 4
-    assert IDEAL.contact_radius_mm(deployment.sheets["firm"], 7) == 2.0
+    assert IDEAL.contact(deployment.sheets["firm"], 7).radius_mm == 2.0
 
 
 def test_contact_radii_have_configured_spread(deployment: config.Deployment) -> None:
     radii = np.array(
-        [World(seed=1).contact_radius_mm(deployment.sheets["firm"], touch) for touch in range(2000)]
+        [
+            WORLDS["default"]
+            .only("parts", "contacts")
+            .draw(1)
+            .contact(deployment.sheets["firm"], touch)
+            .radius_mm
+            for touch in range(2000)
+        ]
     )
     assert radii.mean() == pytest.approx(2.0, abs=0.03)
     assert radii.std() == pytest.approx(0.4, rel=0.06)
@@ -170,7 +177,7 @@ def test_contact_radii_have_configured_spread(deployment: config.Deployment) -> 
 
 def test_tolerances_shift_position_far_beyond_noise(deployment: config.Deployment) -> None:
     ideal = VirtualHand(deployment, press("flat"), IDEAL).truth(10.0)[0]
-    real_hand = VirtualHand(deployment, press("flat"), World(seed=3))
+    real_hand = VirtualHand(deployment, press("flat"), WORLDS["default"].only("parts", "contacts").draw(3))
     pad = deployment.hands[0].pads[0]
     counts = np.mean([real_hand.sample(10 + k * 0.005)[0] for k in range(400)], axis=0)
     found = electrode_network(pad, deployment.sheets["firm"]).estimate(counts * 10e-3 / 32767, 1e-6)

@@ -18,22 +18,39 @@ from handtouch.sheet import (
     SheetModel,
 )
 from handtouch.simulate import noise
+from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Gum
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.virtual_pad import VirtualPad
-from handtouch.simulate.world import ElectronicsDrift, World
+from handtouch.simulate.worlds import (
+    SHEET_KINDS,
+    WORLDS,
+    DrawnWorld,
+    ElectronicsSpread,
+    Fixed,
+    Normal,
+    PartSpread,
+    SheetKind,
+    Uniform,
+    World,
+)
 
 
-def calm(model: SheetModel) -> SheetModel:
-    """Return the model without fluctuation."""
-    return dataclasses.replace(model, fluctuation=Fluctuation())
+def kind_of(law: SheetLaw) -> SheetKind:
+    return dataclasses.replace(SHEET_KINDS["S1"], name="test", law=law)
 
 
-def world(model: SheetModel, **other: float) -> World:
-    """Return a world that differs from the file only in its sheets."""
-    ideal = World.ideal_parts(3)
-    return dataclasses.replace(ideal, noise_counts=0.0, sheet=model, sheet_relative_std=0.0, **other)  # type: ignore[arg-type]
+def calm(name: str) -> SheetLaw:
+    """Return the law of a kind without fluctuation."""
+    return dataclasses.replace(SHEET_KINDS[name].law, press_std=0.0, noise_std=0.0)
+
+
+def drawn(law: SheetLaw) -> DrawnWorld:
+    """Return a world that differs from the file only in its sheets, and has no noise."""
+    silent = World("silent", electronics=ElectronicsSpread(noise_ratio=Fixed(0.0)))
+    return silent.with_sheets(kind_of(law)).draw(3)
 
 
 def presses(*touches: tuple[float, float, float], **other: object) -> Scenario:
@@ -49,16 +66,21 @@ def presses(*touches: tuple[float, float, float], **other: object) -> Scenario:
     )
 
 
-def built(deployment: config.Deployment, scenario: Scenario, of: World) -> VirtualPad:
+def built(deployment: config.Deployment, scenario: Scenario, of: DrawnWorld) -> VirtualPad:
     return VirtualPad.build(deployment, "right", deployment.hands[0].pads[0], scenario, of, ())
 
 
-@pytest.mark.parametrize("model", [S1, S2])
-def test_held_force_reads_as_in_sheet_model(deployment: config.Deployment, model: SheetModel) -> None:
+@pytest.mark.parametrize(("kind", "model"), [("S1", S1), ("S2", S2)])
+def test_held_force_reads_as_in_sheet_model(
+    deployment: config.Deployment, kind: str, model: SheetModel
+) -> None:
     scenario = presses((1.0, 3.0, 2.0), (6.0, 30.0, 1.0), (37.0, 5.0, 3.0))
-    pad = built(deployment, scenario, world(calm(model)))
+    pad = built(deployment, scenario, drawn(calm(kind)))
     track = SheetHistory(
-        calm(model), 1, lambda t: [sum(touch.force_at(t) for touch in scenario.touches)], step_s=1e-3
+        dataclasses.replace(model, fluctuation=Fluctuation()),
+        1,
+        lambda t: [sum(touch.force_at(t) for touch in scenario.touches)],
+        step_s=1e-3,
     )
     times = np.concatenate([np.arange(1.2, 4, 0.3), np.arange(6.3, 35.5, 1.3), np.arange(37.2, 41.8, 0.4)])
     expected = [track.load_ratio(t)[0] for t in times]
@@ -67,7 +89,7 @@ def test_held_force_reads_as_in_sheet_model(deployment: config.Deployment, model
 
 def test_sheet_adapts_under_load_and_recovers_without_excitation(deployment: config.Deployment) -> None:
     scenario = presses(*((20.0 * k, 15.0, 2.0) for k in range(400)))
-    hand = VirtualHand(deployment, scenario, world(calm(S1)))
+    hand = VirtualHand(deployment, scenario, drawn(calm("S1")))
     fresh = hand.counts(0, [10.0])[0].sum()
     tired = hand.counts(0, [3010.0])[0].sum()
     under_potential = hand.counts(0, [7990.0])[0].sum()
@@ -81,7 +103,7 @@ def test_sheet_adapts_under_load_and_recovers_without_excitation(deployment: con
 
 def test_results_do_not_depend_on_order_of_requests(deployment: config.Deployment) -> None:
     scenario = presses((1.0, 3.0, 2.0), (6.0, 3.0, 1.0), repeat=True)
-    of = dataclasses.replace(World.with_drift(5), sheet=S1)
+    of = WORLDS["harsh"].draw(5)
     times = np.random.default_rng(1).uniform(0, 60, 300)
     whole = VirtualHand(deployment, scenario, of).counts(0, times)
     alone = VirtualHand(deployment, scenario, of)
@@ -90,9 +112,9 @@ def test_results_do_not_depend_on_order_of_requests(deployment: config.Deploymen
 
 def test_presses_vary_as_in_sheet_model(deployment: config.Deployment) -> None:
     scenario = presses(*((2.0 * k, 1.5, 1.0) for k in range(600)))
-    only = dataclasses.replace(calm(S1), fluctuation=Fluctuation(press_std=0.072))
-    slow = dataclasses.replace(only, adaptation=dataclasses.replace(S1.adaptation, time_s=1e9))
-    pad = built(deployment, scenario, world(slow))
+    lasting = dataclasses.replace(SHEET_KINDS["S1"].law.adaptation, times_s=(1e9,))
+    slow = dataclasses.replace(calm("S1"), press_std=0.072, adaptation=lasting)
+    pad = built(deployment, scenario, drawn(slow))
     factors = pad.force_ratio(np.arange(1.2, 1200.0, 2.0))
     assert np.log(factors).std() == pytest.approx(0.072, rel=0.1)
     assert np.ptp(pad.force_ratio(np.linspace(0.9, 1.3, 20))) < 0.05
@@ -100,7 +122,7 @@ def test_presses_vary_as_in_sheet_model(deployment: config.Deployment) -> None:
 
 def test_gum_adapts_the_sheet_like_a_touch(deployment: config.Deployment) -> None:
     gum = Gum(link="flat", from_s=5.0, place=(0.3, 0.6), force_n=1.0, press_n=0, relax=0.0)
-    hand = VirtualHand(deployment, presses((0.0, 1.0, 1.0)), world(calm(S1)), faults=(gum,))
+    hand = VirtualHand(deployment, presses((0.0, 1.0, 1.0)), drawn(calm("S1")), faults=(gum,))
     first, later = hand.counts(0, [10.0, 4000.0]).sum(1)
     assert later < 0.7 * first
 
@@ -114,7 +136,7 @@ def test_random_walk_never_exceeds_its_rate(seed: int, t_s: float, dt_s: float) 
 
 
 def test_zeros_drift_independently_and_temperature_is_common() -> None:
-    of = World(seed=3, zero_drift_counts_per_s=0.1)
+    of = World("zeros", electronics=ElectronicsSpread(zero_drift_counts_per_s=Fixed(0.1))).draw(3)
     times = np.arange(0, 86_400, 60.0)
     zeros = (
         ElectronicsDrift(of, [("right", "flat"), ("right", "tip")]).zero_counts(times).reshape(len(times), 8)
@@ -123,7 +145,8 @@ def test_zeros_drift_independently_and_temperature_is_common() -> None:
     assert zeros.std(0).min() > 3
     assert np.abs(np.diff(zeros, axis=0)).max() <= 6.0
     assert np.abs(np.corrcoef(zeros.T) - np.eye(8)).max() < 0.9
-    warm = World(seed=3, temperature_drift_k_per_s=0.01, offset_counts_per_k=2.0)
+    climate = ElectronicsSpread(temperature_drift_k_per_s=Fixed(0.01), offset_counts_per_k=Normal(0.0, 2.0))
+    warm = World("warm", electronics=climate).draw(3)
     zeros = (
         ElectronicsDrift(warm, [("right", "flat"), ("right", "tip")])
         .zero_counts(times)
@@ -146,22 +169,25 @@ def test_noise_is_normal_and_white() -> None:
 def test_replaced_node_has_gains_by_serial_number(deployment: config.Deployment) -> None:
     swap = {"link": "flat", "at_s": 50.0, "serial": 77}
     scenario = presses((0.0, 1000.0, 2.0), swap=(swap,))
-    of = dataclasses.replace(World(seed=4, noise_counts=0.0), gap_tolerance_mm=0, resistor_tolerance=0)
+    silent = ElectronicsSpread(noise_ratio=Fixed(0.0))
+    gains = PartSpread(gain_ratio=Uniform(0.98, 1.02))
+    of = World("gains", gains, electronics=silent).draw(4)
     hand = VirtualHand(deployment, scenario, of)
     before, after = hand.counts(0, [20.0, 60.0])
-    parts = of.parts("right", deployment.hands[0].pads[0])
-    expected = np.array(of.replacement_gain(77)) / np.array(parts.gain)
+    hidden = of.pad("right", deployment.hands[0].pads[0])
+    expected = np.array(of.replacement_gain(77)) / np.array(hidden.gain_ratio)
     np.testing.assert_allclose(after / before, expected, atol=3 / before.min())
     assert of.replacement_gain(77) != of.replacement_gain(78)
     given_gains = presses((0.0, 1000.0, 2.0), swap=(swap | {"gain": (1.0, 1.1, 0.9, 1.0)},))
-    ideal = dataclasses.replace(World.ideal_parts(4), noise_counts=0.0)
+    ideal = World("silent", electronics=silent).draw(4)
     before, after = VirtualHand(deployment, given_gains, ideal).counts(0, [20.0, 60.0])
     np.testing.assert_allclose(after / before, [1.0, 1.1, 0.9, 1.0], atol=3 / before.min())
 
 
-def test_sheets_of_a_hand_differ_and_remain_stable() -> None:
-    models = [World(seed=2, sheet=S1).sheet_model("right", link) for link in ("flat", "round", "tip")]
-    times = [float(model.adaptation.time_s) for model in models if model is not None]  # type: ignore[arg-type]
-    assert len(set(times)) == 3
-    assert all(model is not None and model.adaptation.share == 1.0 for model in models)
-    assert World(seed=2).sheet_model("right", "flat") is None
+def test_sheets_of_a_hand_differ_and_remain_stable(deployment: config.Deployment) -> None:
+    world = WORLDS["default"].with_sheets(SHEET_KINDS["S1"]).draw(2)
+    laws = [world.pad("right", pad).sheet_law for pad in deployment.hands[0].pads]
+    assert len({law.adaptation.times_s for law in laws if law}) == len(laws) == 4
+    assert all(law is not None and law.adaptation.shares == (1.0,) for law in laws)
+    ideal = WORLDS["default"].with_sheets().draw(2)
+    assert ideal.pad("right", deployment.hands[0].pads[0]).sheet_law is None

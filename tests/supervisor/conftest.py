@@ -15,7 +15,7 @@ from handtouch.config import Deployment, parse
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 from handtouch.supervisor.ipc import SampleBlock, WorkerConfig, pack_serials
 from tests.deployments import deployment_text, pad_text
 
@@ -91,7 +91,7 @@ def session(bench: Bench) -> list[tuple[NDArray[np.float64], NDArray[np.uint32]]
             LINKS, *generator.uniform(0.08, 0.92, (2, 3)), generator.uniform(0.5, 4.0, 3), strict=True
         )
     ]
-    hand = VirtualHand(bench.deployment, Scenario(touch=tuple(touches)), World.ideal_parts())
+    hand = VirtualHand(bench.deployment, Scenario(touch=tuple(touches)), WORLDS["ideal"].draw(1))
     made = []
     for number in range(count):
         counts = np.array([hand.sample(number * 0.065 + (k + 0.5) * step_s) for k in range(13)])

@@ -15,7 +15,7 @@ from handtouch.simulate.faults import FAULTS
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, Normal, World
 from handtouch.supervisor.diagnose import (
     DiagnosisModel,
     HandDiagnostics,
@@ -80,7 +80,9 @@ def simulate(
         for at in np.arange(0.5, length_s - 1, 1.0).tolist()
     )
     acting = FAULTS[str(fault["kind"])].model_validate(fault)
-    virtual = VirtualHand(alone, Scenario(touch=touches), World(3), faults=(acting,))
+    virtual = VirtualHand(
+        alone, Scenario(touch=touches), WORLDS["default"].only("parts", "contacts").draw(3), faults=(acting,)
+    )
     diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(alone, "right"))
     run(diagnosis, lambda times: virtual.counts(0, times)[:, None], length_s)
     return diagnosis.diagnoses()
@@ -217,7 +219,12 @@ def test_drift_of_several_pads_is_common_drift() -> None:
     (hand,) = whole.hands
     few = whole.model_copy(update={"hands": (hand.model_copy(update={"pads": hand.pads[-5:]}),)})
     late = ScenarioTouch(link=LINK, from_s=1000.0, duration_s=1.0, path=((0.5, 0.5),), force_n=(1.0,))
-    world = World(3, temperature_drift_k_per_s=0.4, offset_counts_per_k=8.0)
+    world = World(
+        "warm",
+        electronics=ElectronicsSpread(
+            temperature_drift_k_per_s=Fixed(0.4), offset_counts_per_k=Normal(0.0, 8.0)
+        ),
+    ).draw(3)
     virtual = VirtualHand(few, Scenario(touch=(late,)), world)
     diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(few, "right"))
     run(diagnosis, lambda times: np.stack([virtual.counts(row, times) for row in range(5)], axis=1), 60)

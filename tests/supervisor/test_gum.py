@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from handtouch.calibration.store_client import StoreClient
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS
 from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
 from handtouch.supervisor.ipc import CalibrationAssessment, SampleBlock
 from handtouch.supervisor.worker import SupervisorWorker
@@ -62,7 +62,9 @@ def block(counts: NDArray[np.int64], since: int) -> dict[str, Any]:
 
 
 def test_gum_is_diagnosed_with_position_size_and_begin(bench: Bench, tmp_path: Path) -> None:
-    hand = VirtualHand(bench.deployment, Scenario.parse(SCENARIO), World(seed=8))
+    hand = VirtualHand(
+        bench.deployment, Scenario.parse(SCENARIO), WORLDS["default"].only("parts", "contacts").draw(8)
+    )
     worker = SupervisorWorker(
         bench.start, StoreClient(tmp_path / "c.db"), DeploymentDiagnostics(bench.deployment)
     )

@@ -47,7 +47,7 @@ def _add_demo(commands: Subparsers) -> None:
     stimulus = demo.add_mutually_exclusive_group()
     _add_scenario(stimulus, "scenario_path", "faults and replaced nodes are explained in the output")
     _add_grasp(stimulus)
-    _add_world(demo)
+    _add_world(demo, "default")
 
 
 def _add_simulate(commands: Subparsers) -> None:
@@ -80,7 +80,7 @@ def _add_simulate(commands: Subparsers) -> None:
     simulate.add_argument(
         "--seconds", type=positive_number, metavar="S", help="duration (default: until Ctrl-C)"
     )
-    _add_world(simulate)
+    _add_world(simulate, "ideal")
 
 
 def _add_scenario(parser: argparse._ActionsContainer, dest: str, text: str) -> None:
@@ -109,24 +109,35 @@ def _add_grasp(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def _add_world(parser: argparse.ArgumentParser) -> None:
+def _add_world(parser: argparse.ArgumentParser, default_world: str) -> None:
     parser.add_argument(
-        "--tolerances",
+        "--world",
+        choices=("ideal", "default", "harsh"),
+        default=default_world,
+        help="true properties of the hand, unknown to the daemon: ideal, exactly as in the file, with noise; "
+        "default, the tolerances, sheets and drift that a careful builder gets; harsh, two to three times "
+        f"wider (default: {default_world})",
+    )
+    parser.add_argument(
+        "--sheet",
+        choices=("S1", "S2"),
+        help="simulate creep and adaptation of this sheet of the paper, instead of the world's sheets",
+    )
+    parser.add_argument(
+        "--drift",
         action="store_true",
-        help="simulate tolerances of gains, resistors and mounts, unknown to the daemon",
+        help="simulate drift of offsets, temperature and supply voltage also in an ideal world",
     )
     parser.add_argument(
-        "--sheet", choices=("S1", "S2"), help="simulate creep and adaptation of this sheet of the paper"
-    )
-    parser.add_argument(
-        "--drift", action="store_true", help="simulate drift of offsets, temperature and supply voltage"
-    )
-    parser.add_argument(
-        "--seed", type=_seed, default=1, metavar="N", help="random seed of noise and tolerances (default: 1)"
+        "--seed",
+        type=_seed,
+        default=1,
+        metavar="N",
+        help="random seed of the world and of the noise, below 2000000 (default: 1)",
     )
 
 
 def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text}: must be an integer, 0 or above")
+    if not text.isdecimal() or int(text) >= 2_000_000:
+        raise argparse.ArgumentTypeError(f"{text}: must be an integer from 0 to 1999999")
     return int(text)

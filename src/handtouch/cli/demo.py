@@ -22,7 +22,6 @@ from typing import Literal, Self
 from handtouch import wire
 from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load, shipped
-from handtouch.config.tables import Behaviour
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.hand import kinematics
 from handtouch.host.signals import stop_on_signals
@@ -31,7 +30,7 @@ from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import score_contacts
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.stimulus import Stimulus
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, world_with
 from handtouch.view.displays import (
     Display,
     LineDisplay,
@@ -54,7 +53,7 @@ def run(
     config_path: Path | None = None,
     seconds: float | None = None,
     plain: bool = False,
-    tolerances: bool = False,
+    world: str = "default",
     seed: int = 1,
     view: bool = False,
     grasp: str | None = None,
@@ -64,20 +63,22 @@ def run(
 ) -> int:
     """Play the scenario to its end, for `seconds`, or until Ctrl-C; then print the accuracy.
 
-    With `grasp`, an object, the hand grasps it instead. `scenario_path`, `sheet` (behaviour) and `drift`
-    start the supervisor, with a temporary store. With `view` the scenario repeats until `seconds` have passed
-    or Ctrl-C. Exit status 0; 1 if no contact was received; 2 for an unusable configuration.
+    With `grasp`, an object, the hand grasps it instead. `world` is one of `WORLDS`; `sheet` and `drift` change
+    it as in `world_with`. The deployment gets the nominal behaviour of its sheets. Worlds other than the ideal
+    one, and `scenario_path`, start the supervisor, with a temporary store. With `view` the scenario repeats
+    until `seconds` have passed or Ctrl-C. Exit status 0; 1 if no contact was received; 2 for an unusable
+    configuration.
     """
     logging.basicConfig(level=logging.ERROR)
     try:
         deployment = _with_palm_output(
             in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))
         )
-        if scenario_path or sheet or drift:
-            deployment = _with_supervisor(deployment, sheet)
-        world = World.from_options(seed, tolerances=tolerances, sheet=sheet, drift=drift)
+        hidden = world_with(WORLDS[world], sheet=sheet, drift=drift).draw(seed)
+        if scenario_path or hidden.world != WORLDS["ideal"]:
+            deployment = _with_supervisor(hidden.describe(deployment))
         file = scenario_path or (None if config_path else shipped.path(DEFAULT_SCENARIO))
-        scenario = _scenario(deployment, file, grasp=grasp, world=world, repeat=view)
+        scenario = _scenario(deployment, file, grasp=grasp, world=hidden, repeat=view)
     except ValueError as error:  # of a file, or of an impossible grasp
         print(error, file=sys.stderr)
         return 2
@@ -87,7 +88,7 @@ def run(
     sys.setswitchinterval(_GIL_SWITCH_INTERVAL_S)
     print("building the simulated hand ...", file=sys.stderr)
     try:
-        hand = SimulatedHand.open(deployment, scenario, world, record=not endless)
+        hand = SimulatedHand.open(deployment, scenario, hidden, record=not endless)
         with (
             hand,
             TemporaryDirectory(prefix="handtouch-demo-") as folder,
@@ -134,7 +135,7 @@ def _choose_display(plain: bool, url: str) -> Display:
 
 
 def _scenario(
-    deployment: Deployment, file: Path | None, *, grasp: str | None, world: World, repeat: bool
+    deployment: Deployment, file: Path | None, *, grasp: str | None, world: DrawnWorld, repeat: bool
 ) -> Stimulus:
     """Return the stimulus: a grasp, a scenario file, or a tour of all pads."""
     if grasp:
@@ -201,8 +202,8 @@ def _with_palm_output(deployment: Deployment) -> Deployment:
     return deployment.model_copy(update={"scene": scene})
 
 
-def _with_supervisor(deployment: Deployment, sheet: Literal["S1", "S2"] | None) -> Deployment:
-    """Return the deployment with a supervisor, serial numbers for it, and the sheet behaviour of a preset."""
+def _with_supervisor(deployment: Deployment) -> Deployment:
+    """Return the deployment with a supervisor, and serial numbers for it."""
     first = 1001
     hands = []
     for hand in deployment.hands:
@@ -210,11 +211,7 @@ def _with_supervisor(deployment: Deployment, sheet: Literal["S1", "S2"] | None) 
         hands.append(hand.model_copy(update={"pads": pads}))
         first += len(pads)
     daemon = deployment.daemon.model_copy(update={"supervise": True, "store": "calibrations.db"})
-    sheets = deployment.sheets
-    if sheet:
-        behaviour = Behaviour(preset=sheet)
-        sheets = {name: old.model_copy(update={"behaviour": behaviour}) for name, old in sheets.items()}
-    return deployment.model_copy(update={"hands": tuple(hands), "daemon": daemon, "sheets": sheets})
+    return deployment.model_copy(update={"hands": tuple(hands), "daemon": daemon})
 
 
 def in_process_deployment(deployment: Deployment) -> Deployment:

@@ -22,7 +22,7 @@ from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.stimulus import Stimulus
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, world_with
 
 DEFAULT_SCENARIO = "utah_mit_session.toml"
 _STATUS_PERIOD_S = 5.0
@@ -32,15 +32,21 @@ _POLL_PERIOD_S = 0.5
 def run_command(
     config_path: Path,
     *,
+    world: str,
     seed: int,
-    tolerances: bool,
     sheet: str | None,
     drift: bool,
+    gripper: str | None = None,
     **options: Any,
 ) -> int:
     """Run the command with the world of its options; the others are those of `run`."""
-    world = World.from_options(seed, tolerances=tolerances, sheet=sheet, drift=drift)
-    return run(config_path, world=world, **options)
+    if gripper and sheet:
+        print("--gripper excludes --sheet, which needs the contacts in advance", file=sys.stderr)
+        return 2
+    hidden = world_with(WORLDS[world], sheet=sheet, drift=drift)
+    if gripper:
+        hidden = hidden.with_sheets()
+    return run(config_path, world=hidden.draw(seed), gripper=gripper, **options)
 
 
 def run(
@@ -51,7 +57,7 @@ def run(
     gripper: str | None = None,
     grasp: str | None = None,
     truth: Path | None = None,
-    world: World | None = None,
+    world: DrawnWorld | None = None,
     seconds: float | None = None,
     stop: threading.Event | None = None,
     status_period_s: float = _STATUS_PERIOD_S,
@@ -69,9 +75,9 @@ def run(
         for other in buses:
             deployment = config.with_bus(deployment, other)
         check_nodes(deployment, str(config_path))
-        world = world or World.ideal_parts()
-        if gripper and (truth or world.sheet):
-            raise ValueError("--gripper excludes --truth and --sheet, which need the contacts in advance")
+        world = world or WORLDS["ideal"].draw(1)
+        if gripper and truth:
+            raise ValueError("--gripper excludes --truth, which needs the contacts in advance")
         stimulus: Stimulus
         if grasp:
             stimulus = grasp_stimulus(deployment, grasp, world, repeat=True)

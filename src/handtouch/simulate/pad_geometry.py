@@ -71,6 +71,22 @@ class SimulatedSurface(SheetMetric):
         """Length of s in `metric` relative to that on the surface."""
         return math.sqrt(self.resistivity_ratio)
 
+    def resized(self, longer_m: float, wider_m: float) -> SimulatedSurface:
+        """Return a pad longer along x, and wider along y in its middle, which stays where it is."""
+        if not (longer_m or wider_m):
+            return self
+        wider_arc = wider_m / float(self.radius(self.length_m / 2))
+        start_rad = self.sphere_from_rad
+        if start_rad is not None:
+            start_rad -= longer_m / 2 / self.start_radius_m
+        return replace(
+            self,
+            length_m=self.length_m + longer_m,
+            arc=self.arc + wider_arc,
+            start_radius_m=self.start_radius_m - self.slope * longer_m / 2,
+            sphere_from_rad=start_rad,
+        )
+
     def radius(self, s_m: ArrayLike) -> FloatArray:
         """Return metres along the surface per unit of phi at `s_m` (...)."""
         s = np.asarray(s_m, np.float64)
@@ -145,6 +161,12 @@ class SimulatedPrism(SimulatedSurface):
     corners_m: tuple[tuple[float, float], ...] = ()
     """Corners (aside, up) of the cross-section from electrode y0 to yb."""
 
+    def resized(self, longer_m: float, wider_m: float) -> SimulatedPrism:
+        """Return a longer strip, and a wider one by the same ratio for every face."""
+        ratio = 1 + wider_m / self.arc
+        corners = tuple((ratio * aside, ratio * up) for aside, up in self.corners_m)
+        return replace(self, length_m=self.length_m + longer_m, arc=ratio * self.arc, corners_m=corners)
+
     def point(self, s_m: float, phi: float) -> FloatArray:
         """Return a position (3,) [m] in the pad's frame."""
         aside, up = self._to_middle(self._section(phi) - self._section(self.arc / 2))
@@ -186,6 +208,19 @@ class SimulatedRevolution(SimulatedSurface):
 
     points_m: tuple[tuple[float, float], ...] = ()
     """Points (axial, radius) from electrode x0 to xa; the axis points from the first to the last."""
+
+    def resized(self, longer_m: float, wider_m: float) -> SimulatedRevolution:
+        """Return a similar profile of another length, with the arc of another width in its middle."""
+        ratio = 1 + longer_m / self.length_m
+        points = tuple((ratio * axial, ratio * radius) for axial, radius in self.points_m)
+        middle_m = float(self.radius(self.length_m / 2))
+        return replace(
+            self,
+            length_m=ratio * self.length_m,
+            arc=(self.arc + wider_m / middle_m) / ratio,
+            start_radius_m=ratio * self.start_radius_m,
+            points_m=points,
+        )
 
     def radius(self, s_m: ArrayLike) -> FloatArray:
         """Return metres along the surface per unit of phi at `s_m` (...)."""

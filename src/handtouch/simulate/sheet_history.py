@@ -1,6 +1,6 @@
 """History of a pad's sheet under load: ratio of apparent to true force over time.
 
-Public name: `SimulatedSheetHistory`. It integrates the laws of `handtouch.sheet` between knots that are dense
+Public name: `SimulatedSheetHistory`. It integrates a `SheetLaw` between knots that are dense
 where the load changes and sparse elsewhere; the laws are exact under constant load, so an idle hour is a
 single step. It is integrated only as far as requested; results don't depend on the order of requests.
 """
@@ -8,15 +8,12 @@ single step. It is integrated only as far as requested; results don't depend on 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.sheet import Fluctuation, SheetModel, SheetModelState
-from handtouch.sheet.behaviour import SheetStep
 from handtouch.simulate import noise
+from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +34,7 @@ class SimulatedSheetHistory:
 
     def __init__(
         self,
-        model: SheetModel,
+        law: SheetLaw,
         key: np.uint64,
         total_force_n: Callable[[FloatArray], FloatArray],
         temperature_rise_k: Callable[[FloatArray], FloatArray],
@@ -46,15 +43,13 @@ class SimulatedSheetHistory:
         press_begins_s: FloatArray,
         repeat_period_s: float,
     ) -> None:
-        self._fluctuation, self._noise_key = model.fluctuation, key
-        self._model = replace(model, fluctuation=Fluctuation())
-        self._sheet_step = lru_cache(maxsize=4096)(self._model.discretise)
+        self._law, self._noise_key = law, key
         self._total_force_n, self._temperature_rise_k = total_force_n, temperature_rise_k
         self._repeat_period_s, self._press_begins_s = repeat_period_s, np.sort(press_begins_s)
         times = np.concatenate([force_times_s, (settling_times_s[:, None] + _SETTLING_KNOTS_S).ravel()])
         self._knots = np.unique(np.ceil(times / _MIN_KNOT_INTERVAL_S) * _MIN_KNOT_INTERVAL_S)
         self._excitation_switches: list[tuple[float, bool]] = []
-        self._checkpoints: list[tuple[float, SheetModelState]] = [(0.0, self._model.initial_state(1))]
+        self._checkpoints: list[tuple[float, SheetState]] = [(0.0, SheetState.fresh(self._law))]
         self._segments: list[tuple[FloatArray, FloatArray]] = []  # after each checkpoint: times, ratios
         self._force_ratios: tuple[FloatArray, FloatArray] | None = None
 
@@ -66,7 +61,7 @@ class SimulatedSheetHistory:
         keep = max(int(np.searchsorted([time_s for time_s, _ in self._checkpoints], t_s, side="right")), 1)
         del self._checkpoints[keep:], self._segments[keep - 1 :]
         if t_s < self._checkpoints[0][0]:
-            self._checkpoints, self._segments = [(0.0, self._model.initial_state(1))], []
+            self._checkpoints, self._segments = [(0.0, SheetState.fresh(self._law))], []
         self._excitation_switches.append((t_s, on))
         self._force_ratios = None
 
@@ -75,7 +70,7 @@ class SimulatedSheetHistory:
         if len(times_s) == 0:
             return np.ones(0)
         if times_s.min() < self._checkpoints[0][0]:  # before the oldest checkpoint: start again
-            self._checkpoints, self._segments = [(0.0, self._model.initial_state(1))], []
+            self._checkpoints, self._segments = [(0.0, SheetState.fresh(self._law))], []
         self._extend_to(float(times_s.max()))
         if self._force_ratios is None:
             whole = (np.concatenate(parts) for parts in zip(*self._segments, strict=True))
@@ -102,9 +97,15 @@ class SimulatedSheetHistory:
         excited = self._excitation_on(times)
         state = state.copy()
         apparent = np.empty(len(times))
-        for i, dt_s in enumerate(np.diff(times, prepend=reached).round(6).tolist()):
-            step: SheetStep = self._sheet_step(dt_s)
-            apparent[i] = step.forward(state, force_n[i : i + 1], excited[i], rise_k[i])[0]
+        steps = zip(
+            np.diff(times, prepend=reached).round(6).tolist(),
+            force_n.tolist(),
+            excited.tolist(),
+            rise_k.tolist(),
+            strict=True,
+        )
+        for i, (dt_s, load_n, is_excited, warmer_k) in enumerate(steps):
+            apparent[i] = advance(self._law, state, dt_s, load_n, is_excited, warmer_k)
         pressed = force_n > 0
         self._segments.append((times[pressed], apparent[pressed] / force_n[pressed]))
         self._checkpoints.append((end, state))
@@ -133,22 +134,22 @@ class SimulatedSheetHistory:
 
     def _random_factor(self, times_s: FloatArray, apparent_n: FloatArray) -> FloatArray:
         """Return the random part of the ratio: variation between presses, and contact noise."""
-        fluctuation = self._fluctuation
+        law = self._law
         factor = np.ones(len(times_s))
-        if fluctuation.press_std and len(self._press_begins_s):
+        if law.press_std and len(self._press_begins_s):
             press = np.searchsorted(self._press_begins_s, self._scenario_time_s(times_s), side="right")
             if np.isfinite(self._repeat_period_s):
                 press = press + (len(self._press_begins_s) + 1) * (times_s // self._repeat_period_s).astype(
                     np.int64
                 )
-            factor *= np.exp(fluctuation.press_std * noise.standard_normal(self._noise_key, press))
-        if fluctuation.noise_std:
-            steps = times_s / fluctuation.noise_time_s
+            factor *= np.exp(law.press_std * noise.standard_normal(self._noise_key, press))
+        if law.noise_std:
+            steps = times_s / law.noise_time_s
             before = np.floor(steps)
             part, first = steps - before, before.astype(np.int64)
             low, high = (noise.standard_normal(self._noise_key + np.uint64(1), first + i) for i in (0, 1))
             flicker = ((1 - part) * low + part * high) / np.hypot(part, 1 - part)
-            factor *= np.exp(fluctuation.noise_std / np.sqrt(np.maximum(apparent_n, 1e-3)) * flicker)
+            factor *= np.exp(law.noise_std / np.sqrt(np.maximum(apparent_n, 1e-3)) * flicker)
         return factor
 
     def _scenario_time_s(self, times_s: FloatArray) -> FloatArray:

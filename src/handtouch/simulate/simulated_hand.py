@@ -26,7 +26,7 @@ from handtouch.simulate.joint_feed import JointFeed
 from handtouch.simulate.stimulus import NodeReplacement, Stimulus
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import DrawnWorld
 
 
 class ScenarioClock:
@@ -65,7 +65,7 @@ class SimulatedHand:
 
     @classmethod
     def open(
-        cls, deployment: config.Deployment, stimulus: Stimulus, world: World, *, record: bool = True
+        cls, deployment: config.Deployment, stimulus: Stimulus, world: DrawnWorld, *, record: bool = True
     ) -> Self:
         """Build the hand and open the buses of its pads; `record` keeps the ground truth of every SYNC.
 

@@ -20,13 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
 from handtouch.simulate import noise
+from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.pad_circuit import contact_layer_ohm
 from handtouch.simulate.sheet_solver import SheetMapBank
 from handtouch.simulate.stimulus import AppliedContact, Stimulus
 from handtouch.simulate.truth import GroundTruth, Vector
 from handtouch.simulate.virtual_pad import VirtualPad
-from handtouch.simulate.world import ElectronicsDrift, World
+from handtouch.simulate.worlds import DrawnWorld
 
 FloatArray = NDArray[np.float64]
 _QUANTISATION_VARIANCE = 1 / 12  # counts^2, by rounding
@@ -43,7 +44,7 @@ class VirtualHand:
         self,
         deployment: config.Deployment,
         stimulus: Stimulus,
-        world: World,
+        world: DrawnWorld,
         bus: str | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
@@ -67,7 +68,7 @@ class VirtualHand:
         ]
         self._touch_pads = [
             [
-                (number, radius_m or 1e-3 * world.contact_radius_mm(row.sheet, index))
+                (number, radius_m or 1e-3 * world.contact(row.sheet, index).radius_mm)
                 for number, row in enumerate(self._virtual_pads)
                 if row.pad.link == link
             ]
@@ -83,7 +84,7 @@ class VirtualHand:
         gains, times_s = self._gains, np.array([t_s])
         if not self._drift.is_constant:
             counts += self._drift.zero_counts(times_s)[0]
-            gains = gains * self._drift.gain_ratio(times_s) * self._drift.supply_ratio(times_s)
+            gains = gains * self._drift.gain_ratio(times_s)[0] * self._drift.supply_ratio(times_s)
         all_contacts = self._contacts_at(t_s)
         contact_counts = Counter(contact.row for contact in all_contacts)
         special = {*self._special_rows, *(row for row, number in contact_counts.items() if number > 1)}

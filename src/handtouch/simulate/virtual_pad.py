@@ -14,15 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
 from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
-from handtouch.sheet import SheetModel
 from handtouch.simulate import noise
+from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault, Gum, StuckChannel
 from handtouch.simulate.pad_circuit import PadCircuit
-from handtouch.simulate.pad_geometry import SimulatedSurface, simulated_surface
+from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
+from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.sheet_solver import ElectrodeGaps, solve_sheet
 from handtouch.simulate.stimulus import PadStimulus, Stimulus
-from handtouch.simulate.world import ElectronicsDrift, PadParts, World
+from handtouch.simulate.worlds import DrawnWorld, HiddenPad
 
 FloatArray = NDArray[np.float64]
 CountArray = NDArray[np.int64]
@@ -52,7 +53,7 @@ class VirtualPad:
     """Times of node replacements [s], with the gains (4,) of the new node relative to the first one's."""
     drift: ElectronicsDrift
     """Drift of this pad."""
-    sheet_model: SheetModel | None
+    sheet_law: SheetLaw | None
     repeat_period_s: float
     """Period after which the scenario repeats; infinite: it doesn't."""
 
@@ -63,24 +64,25 @@ class VirtualPad:
         hand: str,
         pad: config.Pad,
         stimulus: Stimulus,
-        world: World,
+        world: DrawnWorld,
         faults: Sequence[Fault],
     ) -> VirtualPad:
         """Build a pad with the touches, faults and replacements of its link."""
-        node, sheet, parts = deployment.nodes[pad.node], deployment.sheets[pad.sheet], world.parts(hand, pad)
+        node, hidden = deployment.nodes[pad.node], world.pad(hand, pad)
+        sheet = world.sheet(hand, pad, deployment.sheets[pad.sheet])
         channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad.electrodes)
         limits = np.array([channel.limits for channel in channels])
         scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES])
         full = np.array([node.full_scale_counts or high for high in limits[:, 1]])
-        per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(parts.gain)
-        shape = simulated_surface(pad.surface)
-        gaps = _gaps_from_parts(shape, parts)
+        per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(hidden.gain_ratio)
+        shape = world.surface(hand, pad)
+        gaps = _true_gaps(shape, hidden)
         circuit = PadCircuit(
             shape,
             gaps,
             solve_sheet(shape, gaps),
             sheet,
-            np.array(parts.series_ohm),
+            np.array(hidden.series_ohm),
             node.drive_v,
             limits[:, 1] / per_ampere,
         )
@@ -90,20 +92,23 @@ class VirtualPad:
             pad,
             sheet,
             circuit,
-            stimulus.pad_stimulus(pad.link, lambda number: 1e-3 * world.contact_radius_mm(sheet, number)),
+            stimulus.pad_stimulus(pad.link, lambda number: 1e-3 * world.contact(sheet, number).radius_mm),
             tuple(fault for fault in faults if fault.link == pad.link),
             *world.mount(hand, pad),
-            node.noise_counts if world.noise_counts is None else world.noise_counts,
+            node.noise_counts * hidden.noise_ratio,
             np.array(keys),
             limits,
             per_ampere,
             tuple(
-                (node.at_s, np.array(node.gain or world.replacement_gain(node.serial)) / np.array(parts.gain))
+                (
+                    node.at_s,
+                    np.array(node.gain or world.replacement_gain(node.serial)) / np.array(hidden.gain_ratio),
+                )
                 for node in sorted(stimulus.node_replacements, key=lambda node: node.at_s)
                 if node.link == pad.link
             ),
             ElectronicsDrift(world, [(hand, pad.link)]),
-            world.sheet_model(hand, pad.link),
+            hidden.sheet_law,
             stimulus.duration_s if stimulus.repeat else np.inf,
         )
 
@@ -128,7 +133,7 @@ class VirtualPad:
     @property
     def is_ideal(self) -> bool:
         """True if apparent and true force are always the same."""
-        return self.sheet_model is None and self.drift.is_constant and not self.faults
+        return self.sheet_law is None and self.drift.is_constant and not self.faults
 
     def force_ratio(self, times_s: FloatArray) -> FloatArray:
         """Return apparent over true force (n,)."""
@@ -141,14 +146,14 @@ class VirtualPad:
     @cached_property
     def history(self) -> SimulatedSheetHistory | None:
         """History of the sheet; None for an ideal sheet."""
-        if self.sheet_model is None:
+        if self.sheet_law is None:
             return None
         force_times, settling, begins = self.touches.event_times_s
         gum = [fault.from_s for fault in self.faults if isinstance(fault, Gum)]
         ends = [fault.until_s for fault in self.faults if isinstance(fault, Gum) and fault.until_s]
         after = [from_s + step for from_s in gum for step in np.arange(0, 4, 0.05)]
         return SimulatedSheetHistory(
-            self.sheet_model,
+            self.sheet_law,
             self.noise_keys[0] + np.uint64(7),
             self._total_force_n,
             self._temperature_rise_k,
@@ -189,7 +194,7 @@ class VirtualPad:
         for fault in faults:
             if order := fault.channel_permutation:
                 amperes = np.where(fault.is_active(scenario_s)[:, None], amperes[:, order], amperes)
-        counts = amperes * self.counts_per_ampere * self.drift.gain_ratio(times_s)[:, None]
+        counts = amperes * self.counts_per_ampere * self.drift.gain_ratio(times_s)[:, 0]
         for from_s, gains in self.replacement_gains:
             later = [at_s for at_s, _ in self.replacement_gains if at_s > from_s]
             counts[(times_s >= from_s) & (times_s < min(later, default=np.inf))] *= gains
@@ -228,12 +233,12 @@ class VirtualPad:
         return [fault for fault in self.faults if fault not in self._stuck_faults]
 
 
-def _gaps_from_parts(shape: SimulatedSurface, parts: PadParts) -> ElectrodeGaps:
+def _true_gaps(shape: SimulatedSurface, hidden: HiddenPad) -> ElectrodeGaps:
     """Return the gaps in the coordinates of the surface."""
     ends = shape.radius([0.0, shape.length_m])
     units = (*ends.tolist(), 1.0, 1.0)  # metres per unit of the coordinate along the side
     x0, xa, y0, yb = (
         (1e-3 * before / unit, 1e-3 * after / unit)
-        for before, after, unit in zip(parts.gap_before_mm, parts.gap_after_mm, units, strict=True)
+        for before, after, unit in zip(hidden.gap_before_mm, hidden.gap_after_mm, units, strict=True)
     )
     return ElectrodeGaps(x0, xa, y0, yb)

@@ -8,10 +8,10 @@ from importlib.util import find_spec
 
 from handtouch import config
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
-from handtouch.simulate.grasp.grasp_stimulus import GraspStimulus
+from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
 from handtouch.simulate.grasp.patches import contact_patches
 from handtouch.simulate.grasp.simulation import GraspRecord, simulate_grasp
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import DrawnWorld
 
 INSTALL_COMMAND = "pip install 'handtouch[mujoco]'"
 
@@ -24,7 +24,7 @@ def available() -> bool:
 
 
 def grasp_stimulus(
-    deployment: config.Deployment, object_name: str, world: World, *, repeat: bool = False
+    deployment: config.Deployment, object_name: str, world: DrawnWorld, *, repeat: bool = False
 ) -> GraspStimulus:
     """Let the first hand of a deployment grasp an object, randomised by the world's seed.
 
@@ -37,4 +37,5 @@ def grasp_stimulus(
     if object_name not in GRASP_OBJECTS:
         raise ValueError(f"--grasp {object_name}: unknown object; known: {', '.join(GRASP_OBJECTS)}")
     grasp = simulate_grasp(deployment.hands[0], object_name, world.seed, world)
-    return GraspStimulus.from_grasp(grasp, contact_patches(grasp), repeat=repeat)
+    encoders = EncoderErrors.of_world(world, grasp)
+    return GraspStimulus.from_grasp(grasp, contact_patches(grasp), encoders, repeat=repeat)

@@ -19,6 +19,7 @@ from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches
 from handtouch.simulate.grasp.simulation import GraspRecord
 from handtouch.simulate.stimulus import AppliedContact, JointTrajectory, NodeReplacement
+from handtouch.simulate.worlds import DrawnWorld, HiddenJoints
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -29,32 +30,30 @@ _ROUNDING_STEPS = 1e-6  # tolerance for rounded times of steps
 
 @dataclass(frozen=True)
 class EncoderErrors:
-    """Errors of the joint positions that a robot reports; every seed is another robot."""
+    """Errors of the joint positions that a robot reports in a world; the seed is of the noise."""
 
+    joints: HiddenJoints
     seed: int = 1
-    offset_deg: float = 0.0
-    """Standard deviation, between joints, of the calibration error."""
-    noise_deg: float = 0.0
-    """Standard deviation of a reading."""
-    delay_s: float = 0.0
-    """Delay of a reading with respect to its time stamp."""
+
+    @classmethod
+    def of_world(cls, world: DrawnWorld, grasp: GraspRecord) -> EncoderErrors:
+        """Return the errors of the hand that grasps."""
+        return cls(world.joints(grasp.hand, len(grasp.joints)), world.seed)
 
     def readings(self, position_rad: FloatArray) -> FloatArray:
         """Return readings (n, m) of true positions at 1 kHz."""
-        rng = np.random.default_rng((self.seed, 31))
-        n, m = position_rad.shape
-        offset, noise = self.offset_deg * rng.normal(size=m), self.noise_deg * rng.normal(size=(n, m))
-        return self.delayed_only(position_rad) + np.radians(offset + noise)
+        noise = self.joints.noise_deg * np.random.default_rng((self.seed, 31)).normal(size=position_rad.shape)
+        return self.delayed_only(position_rad) + np.radians(np.array(self.joints.offset_deg) + noise)
 
     def delayed_only(self, position_rad: FloatArray) -> FloatArray:
         """Return `readings` without offset and noise."""
-        delay_steps = round(self.delay_s / TIME_STEP_S)
+        delay_steps = round(self.joints.delay_s / TIME_STEP_S)
         return np.asarray(position_rad[np.maximum(np.arange(len(position_rad)) - delay_steps, 0)])
 
     @property
     def std_rad(self) -> float:
         """Standard deviation of a reading, as in a data sheet."""
-        return float(np.radians(np.hypot(self.offset_deg, self.noise_deg)))
+        return float(np.radians(self.joints.std_deg))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +82,7 @@ class GraspStimulus:
         repeat: bool = False,
     ) -> GraspStimulus:
         """Return the stimulus of a grasp; without `encoders` the joint positions are exact."""
-        reported_rad = (encoders or EncoderErrors()).readings(grasp.joint_rad)
+        reported_rad = encoders.readings(grasp.joint_rad) if encoders else grasp.joint_rad
         return cls(patches, tuple(pad.link for pad in grasp.pads), grasp.joints, reported_rad, repeat)
 
     def with_single_discs(self, radius_m: FloatArray) -> GraspStimulus:

@@ -21,9 +21,8 @@ from handtouch.simulate.pad_geometry import (
     SimulatedPrism,
     SimulatedRevolution,
     SimulatedSurface,
-    simulated_surface,
 )
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import DrawnWorld
 
 FloatArray = NDArray[np.float64]
 TIME_STEP_S = 1e-3
@@ -55,7 +54,7 @@ class MujocoScene:
     `joints` and `pads` are in the order of URDF and deployment. Raises ValueError for an unfit hand.
     """
 
-    def __init__(self, hand: config.Hand, world: World, grasp_object: GraspObject) -> None:
+    def __init__(self, hand: config.Hand, world: DrawnWorld, grasp_object: GraspObject) -> None:
         import mujoco
 
         if not hand.urdf:
@@ -71,8 +70,11 @@ class MujocoScene:
         for geom in spec.geoms:
             _shrink_geom(mujoco, geom)
         mounts = {pad.link: world.mount(hand.name, pad) for pad in hand.pads}
+        shapes = {pad.link: world.surface(hand.name, pad) for pad in hand.pads}
         for pad in hand.pads:
-            _add_pad(mujoco, spec, spec.body(pad.mount.link or pad.link), pad, *mounts[pad.link])
+            _add_pad(
+                mujoco, spec, spec.body(pad.mount.link or pad.link), pad, shapes[pad.link], *mounts[pad.link]
+            )
         for geom in spec.geoms:
             geom.contype, geom.conaffinity, geom.friction[0] = (
                 _HAND_COLLISION_BIT,
@@ -98,7 +100,7 @@ class MujocoScene:
                 pad.link,
                 self.model.body(pad.mount.link or pad.link).id,
                 *mounts[pad.link],
-                simulated_surface(pad.surface),
+                shapes[pad.link],
             )
             for pad in hand.pads
         )
@@ -122,11 +124,16 @@ def _shrink_geom(mujoco: Any, geom: Any) -> None:
 
 
 def _add_pad(
-    mujoco: Any, spec: Any, body: Any, pad: config.Pad, rotation: FloatArray, translation: FloatArray
+    mujoco: Any,
+    spec: Any,
+    body: Any,
+    pad: config.Pad,
+    shape: SimulatedSurface,
+    rotation: FloatArray,
+    translation: FloatArray,
 ) -> None:
     geom = body.add_geom(name=f"pad {pad.link}", density=0.0)
-    shape, radius_m = simulated_surface(pad.surface), 0.0
-    turn = rotation
+    radius_m, turn = 0.0, rotation
     if pad.surface.kind == "plane":
         geom.type, radius_m = mujoco.mjtGeom.mjGEOM_BOX, _PLATE_HALF_THICKNESS_M
         geom.size = [shape.length_m / 2, shape.arc / 2, _PLATE_HALF_THICKNESS_M]

@@ -17,7 +17,7 @@ from handtouch import config
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS, GraspObject
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad, MujocoScene
 from handtouch.simulate.smoothstep import smoothstep_array
-from handtouch.simulate.world import World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -70,17 +70,17 @@ def simulate_grasp(
     hand: config.Hand,
     name: str,
     seed: int = 1,
-    world: World | None = None,
+    world: DrawnWorld | None = None,
     *,
     duration_s: float = DURATION_S,
     watch: Callable[[MujocoScene, int], None] = lambda *_: None,
 ) -> GraspRecord:
-    """Grasp an object of `GRASP_OBJECTS`; `world` defines the true mounting of the pads.
+    """Grasp an object of `GRASP_OBJECTS`; `world` defines the true mounting and size of the pads.
 
     `watch` is called after every step, with its number. Raises KeyError for an unknown object, ValueError for
     a hand without URDF, ImportError without MuJoCo.
     """
-    scene = MujocoScene(hand, world or World.ideal_parts(seed), GRASP_OBJECTS[name].randomised(seed))
+    scene = MujocoScene(hand, world or WORLDS["ideal"].draw(seed), GRASP_OBJECTS[name].randomised(seed))
     controller = _GraspController(scene, seed)
     recorder = _GraspRecorder(scene, round(duration_s / TIME_STEP_S))
     for number in range(recorder.step_count):

@@ -1,0 +1,77 @@
+"""Drift of the electronics of a simulated hand.
+
+Public name: `ElectronicsDrift`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.config.channels import ELECTRODES
+from handtouch.simulate import noise
+from handtouch.simulate.worlds import DrawnWorld
+
+FloatArray = NDArray[np.float64]
+
+
+class ElectronicsDrift:
+    """Drift of the electronics: zeros of each channel, and temperature and supply of the whole hand.
+
+    Rows are pads. All methods are functions of times (n,) since the start.
+    """
+
+    def __init__(self, world: DrawnWorld, names: Sequence[tuple[str, str]]) -> None:
+        """names: hand and link of each row."""
+        electronics, pads = world.world.electronics, ["/".join(name) for name in names]
+        self._zero_counts_per_s, self._temperature_k_per_s, self._supply_per_s = (
+            world.hand_rate(getattr(electronics, rate), rate)
+            for rate in ("zero_drift_counts_per_s", "temperature_drift_k_per_s", "supply_drift_per_s")
+        )
+        self.is_constant = not (self._zero_counts_per_s or self._temperature_k_per_s or self._supply_per_s)
+        self._zero_keys = np.array(
+            [
+                noise.stream_key(world.seed, "zero", *name, channel)
+                for name in names
+                for channel in ELECTRODES
+            ],
+            np.uint64,
+        )
+        self._offset_counts_per_k = np.array([world.offset_counts_per_k(pad) for pad in pads])
+        self._gain_per_k = np.array([world.gain_per_k(pad) for pad in pads])
+        self._temperature_key, self._supply_key = (
+            np.array([noise.stream_key(world.seed, name)]) for name in ("warmth", "supply")
+        )
+
+    def temperature_rise_k(self, times_s: FloatArray) -> FloatArray:
+        """Return the hand's temperature (n,) relative to that at the start."""
+        return np.asarray(self._bounded_walk(self._temperature_k_per_s, self._temperature_key, times_s)[0])
+
+    def supply_ratio(self, times_s: FloatArray) -> FloatArray:
+        """Return the supply voltage (n,) relative to the nominal one."""
+        return np.asarray(1 + self._bounded_walk(self._supply_per_s, self._supply_key, times_s)[0])
+
+    def gain_ratio(self, times_s: FloatArray) -> FloatArray:
+        """Return the gains of the channels (n, rows, 4) relative to those at the start."""
+        return 1 + self._gain_per_k * self.temperature_rise_k(times_s)[:, None, None]
+
+    def zero_counts(self, times_s: FloatArray) -> FloatArray:
+        """Return the counts (n, rows, 4) of channels without current."""
+        walk = self._bounded_walk(self._zero_counts_per_s, self._zero_keys, times_s)
+        zeros = walk.T.reshape(len(times_s), len(self._zero_keys) // 4, 4)
+        return np.asarray(zeros + self._offset_counts_per_k * self.temperature_rise_k(times_s)[:, None, None])
+
+    @staticmethod
+    def _bounded_walk(rate: float, keys: NDArray[np.uint64], times_s: FloatArray) -> FloatArray:
+        """Return random walks (keys, n) that start at 0 and never exceed the rate."""
+        if not rate:
+            return np.zeros((len(keys), len(times_s)))
+        return np.asarray(rate * (noise.random_walk(keys, times_s) - _walk_at_start(keys.tobytes())))
+
+
+@lru_cache(maxsize=1024)
+def _walk_at_start(keys: bytes) -> FloatArray:
+    return noise.random_walk(np.frombuffer(keys, np.uint64), 0.0)

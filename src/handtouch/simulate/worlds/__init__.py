@@ -1,0 +1,56 @@
+"""Worlds of a simulated hand: its true properties, which its deployment file and the daemon don't know.
+
+`WORLDS[name].draw(seed)` is the world of one seed, a `DrawnWorld`; seeds belong to a `Family`.
+"""
+
+from handtouch.simulate.worlds.distributions import (
+    Distribution,
+    Fixed,
+    LogNormal,
+    LogUniform,
+    Normal,
+    Uniform,
+)
+from handtouch.simulate.worlds.families import Family
+from handtouch.simulate.worlds.named import WORLDS, world_with
+from handtouch.simulate.worlds.sheet_kinds import SHEET_KINDS, SheetKind
+from handtouch.simulate.worlds.spreads import (
+    ContactSpread,
+    ElectronicsSpread,
+    MountSpread,
+    PartSpread,
+    SheetSpread,
+)
+from handtouch.simulate.worlds.world import (
+    UNEVEN_MODES,
+    DrawnWorld,
+    HiddenContact,
+    HiddenJoints,
+    HiddenPad,
+    World,
+)
+
+__all__ = [
+    "SHEET_KINDS",
+    "UNEVEN_MODES",
+    "WORLDS",
+    "ContactSpread",
+    "Distribution",
+    "DrawnWorld",
+    "ElectronicsSpread",
+    "Family",
+    "Fixed",
+    "HiddenContact",
+    "HiddenJoints",
+    "HiddenPad",
+    "LogNormal",
+    "LogUniform",
+    "MountSpread",
+    "Normal",
+    "PartSpread",
+    "SheetKind",
+    "SheetSpread",
+    "Uniform",
+    "World",
+    "world_with",
+]

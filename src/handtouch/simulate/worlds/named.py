@@ -1,0 +1,127 @@
+"""The named worlds. docs/worlds.md states the source of each number.
+
+Public names: `WORLDS`, `world_with`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+from handtouch.simulate.worlds.distributions import Fixed, LogNormal, LogUniform, Normal, Uniform
+from handtouch.simulate.worlds.sheet_kinds import SHEET_KINDS, SheetKind
+from handtouch.simulate.worlds.spreads import (
+    ONE,
+    ContactSpread,
+    ElectronicsSpread,
+    MountSpread,
+    PartSpread,
+    SheetSpread,
+)
+from handtouch.simulate.worlds.world import World
+
+
+def _kinds(*names: str) -> tuple[SheetKind, ...]:
+    return tuple(SHEET_KINDS[name] for name in names)
+
+
+_IDEAL = World("ideal")
+
+_DEFAULT = World(
+    "default",
+    PartSpread(
+        gain_ratio=Uniform(0.98, 1.02),
+        gap_offset_mm=Uniform(-0.2, 0.2),
+        resistor_ratio=Uniform(0.95, 1.05),
+        sheet_ohm_ratio=LogNormal(1.0, 0.1),
+        anisotropy_ratio=LogNormal(1.0, 0.02),
+        length_offset_mm=Uniform(-0.1, 0.1),
+        width_offset_mm=Uniform(-0.1, 0.1),
+    ),
+    MountSpread(
+        position_mm=Normal(0.0, 0.2),
+        orientation_deg=Normal(0.0, 0.5),
+        joint_offset_deg=Normal(0.0, 0.2),
+        joint_noise_deg=Fixed(0.05),
+        joint_delay_s=Fixed(0.003),
+    ),
+    ContactSpread(radius_sigma=Normal(0.0, 1.0)),
+    SheetSpread(
+        contact_ohm_ratio=LogNormal(1.0, 0.06),
+        alpha_offset=Normal(0.0, 0.05),
+        tuning_kinds=_kinds("S1", "S2"),
+        reporting_kinds=_kinds("fsr", "flexiforce", "conductive_film"),
+        parameter_ratio=LogNormal(1.0, 0.15),
+    ),
+    ElectronicsSpread(
+        noise_ratio=LogNormal(1.0, 0.1),
+        zero_drift_counts_per_s=Fixed(0.05),
+        temperature_drift_k_per_s=Fixed(0.01),
+        offset_counts_per_k=Normal(0.0, 2.0),
+        gain_per_k=Normal(0.0, 1e-4),
+        supply_drift_per_s=Fixed(1e-5),
+    ),
+)
+
+_HARSH = World(
+    "harsh",
+    PartSpread(
+        gain_ratio=Uniform(0.95, 1.05),
+        gap_offset_mm=Uniform(-0.5, 0.5),
+        resistor_ratio=Uniform(0.88, 1.12),
+        sheet_ohm_ratio=LogNormal(1.0, 0.25),
+        anisotropy_ratio=LogNormal(1.0, 0.05),
+        unevenness=Normal(0.0, 0.05),
+        length_offset_mm=Uniform(-0.25, 0.25),
+        width_offset_mm=Uniform(-0.25, 0.25),
+    ),
+    MountSpread(
+        position_mm=Normal(0.0, 0.5),
+        orientation_deg=Normal(0.0, 1.25),
+        joint_offset_deg=Normal(0.0, 0.5),
+        joint_noise_deg=Fixed(0.12),
+        joint_delay_s=Fixed(0.008),
+    ),
+    ContactSpread(radius_sigma=Normal(0.0, 2.0), elongation=LogUniform(1.0, 3.0)),
+    SheetSpread(
+        contact_ohm_ratio=LogNormal(1.0, 0.15),
+        alpha_offset=Normal(0.0, 0.12),
+        tuning_kinds=_kinds("power_creep", "two_speeds"),
+        reporting_kinds=_kinds(
+            "steep_creep",
+            "fast_and_slow",
+            "preisach_without_adaptation",
+            "preisach_and_power_creep",
+        ),
+        parameter_ratio=LogNormal(1.0, 0.35),
+    ),
+    ElectronicsSpread(
+        noise_ratio=LogNormal(1.0, 0.25),
+        zero_drift_counts_per_s=Fixed(0.12),
+        temperature_drift_k_per_s=Fixed(0.025),
+        offset_counts_per_k=Normal(0.0, 5.0),
+        gain_per_k=Normal(0.0, 2.5e-4),
+        supply_drift_per_s=Fixed(2.5e-5),
+    ),
+)
+
+WORLDS: Mapping[str, World] = MappingProxyType({world.name: world for world in (_IDEAL, _DEFAULT, _HARSH)})
+"""`ideal` (exactly as in the file, with noise and quantisation), `default` (that of a careful builder),
+`harsh` (two to three times wider, with sheets and patches that estimators have no model of)."""
+
+
+def world_with(world: World, *, sheet: str | None = None, drift: bool = False) -> World:
+    """Return a world with sheets of one kind, and with drift if it has none.
+
+    In a world of ideal sheets or electronics they vary and drift as in `default`. `sheet` is one of
+    `SHEET_KINDS`.
+    """
+    if sheet:
+        world = world.with_sheets(SHEET_KINDS[sheet])
+        if world.sheets.parameter_ratio == ONE:
+            varied = replace(world.sheets, parameter_ratio=_DEFAULT.sheets.parameter_ratio)
+            world = replace(world, sheets=varied)
+    if drift and world.electronics == ElectronicsSpread():
+        world = replace(world, electronics=replace(_DEFAULT.electronics, noise_ratio=ONE))
+    return world

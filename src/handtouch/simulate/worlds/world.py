@@ -1,0 +1,262 @@
+"""World: distributions of all hidden quantities of a simulated hand, and draws from them.
+
+Public names: `World`; `DrawnWorld` (the world of one seed) with its records `HiddenPad`, `HiddenContact`,
+`HiddenJoints`.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.hand.pads import mount_transform, rotation_from_rpy
+from handtouch.simulate.pad_geometry import SimulatedSurface, simulated_surface
+from handtouch.simulate.sheet_physics import SheetLaw
+from handtouch.simulate.worlds.distributions import Distribution
+from handtouch.simulate.worlds.families import Family
+from handtouch.simulate.worlds.sheet_kinds import SheetKind
+from handtouch.simulate.worlds.spreads import (
+    ContactSpread,
+    ElectronicsSpread,
+    MountSpread,
+    PartSpread,
+    SheetSpread,
+)
+
+FloatArray = NDArray[np.float64]
+Four = tuple[float, float, float, float]
+_MIN_RADIUS_RATIO = 0.3
+UNEVEN_MODES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
+"""Waves (m, n), cos(m pi x) cos(n pi y), of the logarithm of an uneven sheet's resistance."""
+
+
+@dataclass(frozen=True)
+class World:
+    """Distributions of all hidden quantities; `WORLDS` has the named ones."""
+
+    name: str
+    parts: PartSpread = field(default_factory=PartSpread)
+    mounts: MountSpread = field(default_factory=MountSpread)
+    contacts: ContactSpread = field(default_factory=ContactSpread)
+    sheets: SheetSpread = field(default_factory=SheetSpread)
+    electronics: ElectronicsSpread = field(default_factory=ElectronicsSpread)
+
+    def draw(self, seed: int) -> DrawnWorld:
+        """Return the world of one seed; raises ValueError for a seed of no `Family`."""
+        return DrawnWorld(self, seed)
+
+    def only(self, *groups: str) -> World:
+        """Return a world with these groups of this one, such as "parts"; the others are ideal."""
+        return World(self.name, **{group: getattr(self, group) for group in groups})
+
+    def with_sheets(self, *kinds: SheetKind) -> World:
+        """Return this world with the behaviour of these kinds, for both families; none: ideal sheets.
+
+        Their parameters vary between pads as in this world.
+        """
+        return replace(self, sheets=replace(self.sheets, tuning_kinds=kinds, reporting_kinds=kinds))
+
+
+@dataclass(frozen=True)
+class HiddenPad:
+    """True properties of a pad; electrodes in the order x0, xa, y0, yb. Ratios are to values of the file."""
+
+    gain_ratio: Four
+    series_ohm: Four
+    gap_before_mm: Four
+    """Bare length of each electrode's side, along the surface, at its low end (y = 0 or x = 0)."""
+    gap_after_mm: Four
+    """Bare length at its high end."""
+    sheet_ohm_ratio: float
+    anisotropy_ratio: float
+    unevenness: tuple[float, ...]
+    """Amplitudes of the waves `UNEVEN_MODES` of the logarithm of the sheet resistance."""
+    length_offset_mm: float
+    width_offset_mm: float
+    mount_offset_mm: tuple[float, float, float]
+    mount_rotation_deg: tuple[float, float, float]
+    contact_ohm_ratio: float
+    alpha_offset: float
+    sheet_law: SheetLaw | None
+    """Behaviour of the sheet; None: ideal."""
+    noise_ratio: float
+    offset_counts_per_k: Four
+    gain_per_k: Four
+
+
+@dataclass(frozen=True)
+class HiddenContact:
+    """True patch of a touch: an ellipse with half axes radius sqrt(elongation), radius / sqrt(elongation)."""
+
+    radius_mm: float
+    elongation: float
+    direction_rad: float
+    """Angle between the long axis and x on the pad."""
+
+
+@dataclass(frozen=True)
+class HiddenJoints:
+    """Errors of the joint positions that a robot reports."""
+
+    offset_deg: tuple[float, ...]
+    """Error of each joint's zero."""
+    noise_deg: float
+    """Standard deviation of a reading."""
+    delay_s: float
+    """Age of a reading at its time stamp."""
+    std_deg: float
+    """Standard deviation of zero and noise, as the data sheet of the encoders has it."""
+
+
+@dataclass(frozen=True)
+class DrawnWorld:
+    """World of one seed. All methods are functions of their arguments; the same seed gives the same world.
+
+    Raises ValueError for a seed of no `Family`.
+    """
+
+    world: World
+    seed: int
+    family: Family = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "family", Family.of_seed(self.seed))
+
+    def pad(self, hand: str, pad: config.Pad) -> HiddenPad:
+        """Return the properties of a pad; they depend only on the seed, the names and the pad's own table."""
+        parts, mounts, sheets = self.world.parts, self.world.mounts, self.world.sheets
+        electronics, link = self.world.electronics, f"{hand}/{pad.link}"
+        rng = self._stream(link)
+        gain = parts.gain_ratio.sample(rng, 4)
+        resistors = parts.resistor_ratio.sample(rng, 4)
+        gaps = np.maximum(pad.gap_mm + parts.gap_offset_mm.sample(rng, 8), 0.0)
+        mount = self._stream("mount", link)
+        return HiddenPad(
+            gain_ratio=_four(gain),
+            series_ohm=_four(np.array(pad.series_ohm) * resistors),
+            gap_before_mm=_four(gaps[:4]),
+            gap_after_mm=_four(gaps[4:]),
+            sheet_ohm_ratio=self._number(parts.sheet_ohm_ratio, "sheet_ohm", link),
+            anisotropy_ratio=self._number(parts.anisotropy_ratio, "anisotropy", link),
+            unevenness=tuple(self._numbers(parts.unevenness, len(UNEVEN_MODES), "unevenness", link).tolist()),
+            length_offset_mm=self._number(parts.length_offset_mm, "length", link),
+            width_offset_mm=self._number(parts.width_offset_mm, "width", link),
+            mount_offset_mm=_three(mounts.position_mm.sample(mount, 3)),
+            mount_rotation_deg=_three(mounts.orientation_deg.sample(mount, 3)),
+            contact_ohm_ratio=self._number(sheets.contact_ohm_ratio, "contact_ohm", link),
+            alpha_offset=self._number(sheets.alpha_offset, "alpha", link),
+            sheet_law=self._sheet_law(link, pad.sheet),
+            noise_ratio=self._number(electronics.noise_ratio, "noise_ratio", link),
+            offset_counts_per_k=_four(self.offset_counts_per_k(link)),
+            gain_per_k=_four(self.gain_per_k(link)),
+        )
+
+    def mount(self, hand: str, pad: config.Pad) -> tuple[FloatArray, FloatArray]:
+        """Return the true rotation (3, 3) and translation (3,) [m] of the pad's frame in its link's frame."""
+        hidden = self.pad(hand, pad)
+        rotation, translation = mount_transform(pad)
+        turned = rotation @ rotation_from_rpy(np.radians(hidden.mount_rotation_deg))
+        return turned, translation + rotation @ (1e-3 * np.array(hidden.mount_offset_mm))
+
+    def surface(self, hand: str, pad: config.Pad) -> SimulatedSurface:
+        """Return the true shape of a pad, with its anisotropy."""
+        hidden = self.pad(hand, pad)
+        shape = simulated_surface(pad.surface)
+        sized = shape.resized(1e-3 * hidden.length_offset_mm, 1e-3 * hidden.width_offset_mm)
+        return replace(sized, resistivity_ratio=shape.resistivity_ratio * hidden.anisotropy_ratio)
+
+    def sheet(self, hand: str, pad: config.Pad, sheet: config.Sheet) -> config.Sheet:
+        """Return the true sheet resistance and contact law of a pad whose table names `sheet`."""
+        hidden = self.pad(hand, pad)
+        return sheet.model_copy(
+            update={
+                "ohm_per_square": sheet.ohm_per_square * hidden.sheet_ohm_ratio,
+                "contact_ohm_mm2": sheet.contact_ohm_mm2 * hidden.contact_ohm_ratio,
+                "alpha": sheet.alpha + hidden.alpha_offset,
+            }
+        )
+
+    def contact(self, sheet: config.Sheet, touch: int) -> HiddenContact:
+        """Return the patch of a touch; `touch` is its number in the scenario."""
+        contacts = self.world.contacts
+        sigma = contacts.radius_sigma.sample(np.random.default_rng((self.seed, touch)), 1)[0]
+        radius_mm = sheet.contact_radius_mm + float(sigma) * sheet.contact_radius_std_mm
+        patch = self._stream("patch", str(touch))
+        elongation = float(contacts.elongation.sample(patch, 1)[0])
+        return HiddenContact(
+            max(radius_mm, _MIN_RADIUS_RATIO * sheet.contact_radius_mm),
+            elongation,
+            float(patch.uniform(0, np.pi)),
+        )
+
+    def joints(self, hand: str, count: int) -> HiddenJoints:
+        """Return the errors of a hand's joint positions."""
+        mounts, rng = self.world.mounts, self._stream("joints", hand)
+        noise_deg, delay_s = mounts.joint_noise_deg.sample(rng, 1)[0], mounts.joint_delay_s.sample(rng, 1)[0]
+        offsets = mounts.joint_offset_deg.sample(rng, count)
+        std_deg = float(np.hypot(mounts.joint_offset_deg.std, noise_deg))
+        return HiddenJoints(tuple(offsets.tolist()), float(noise_deg), float(delay_s), std_deg)
+
+    def replacement_gain(self, serial: int) -> Four:
+        """Return the channel gains of a replacement node."""
+        return _four(self.world.parts.gain_ratio.sample(np.random.default_rng((self.seed, serial, 1)), 4))
+
+    def sheet_kind(self, sheet: str) -> SheetKind | None:
+        """Return the kind of the file's sheets of a name; None: ideal."""
+        kinds = self.world.sheets.kinds(self.family)
+        return kinds[int(self._stream("kind", sheet).integers(len(kinds)))] if kinds else None
+
+    def describe(self, deployment: config.Deployment) -> config.Deployment:
+        """Return the deployment with the nominal behaviour of the drawn kinds, as its builder writes it."""
+        described = {
+            name: sheet.model_copy(update={"behaviour": kind.behaviour})
+            for name, sheet in deployment.sheets.items()
+            if (kind := self.sheet_kind(name))
+        }
+        return deployment.model_copy(update={"sheets": {**deployment.sheets, **described}})
+
+    def offset_counts_per_k(self, pad_name: str) -> FloatArray:
+        """Return the temperature coefficients (4,) of the zeros of a pad, "hand/link"."""
+        return self._numbers(self.world.electronics.offset_counts_per_k, 4, "offset_counts_per_k", pad_name)
+
+    def gain_per_k(self, pad_name: str) -> FloatArray:
+        """Return the relative temperature coefficients (4,) of the gains of a pad, "hand/link"."""
+        return self._numbers(self.world.electronics.gain_per_k, 4, "gain_per_k", pad_name)
+
+    def hand_rate(self, rate: Distribution, name: str) -> float:
+        """Return a quantity with one value per hand, such as a drift rate."""
+        return self._number(rate, name)
+
+    def sheet_factors(self, pad_name: str) -> list[float]:
+        """Return the factors of `SheetKind.varied` for the sheet of a pad, "hand/link"."""
+        factors = self._numbers(self.world.sheets.parameter_ratio, 6, "sheet", pad_name)
+        return [float(factor) for factor in factors]
+
+    def _sheet_law(self, pad_name: str, sheet: str) -> SheetLaw | None:
+        if (kind := self.sheet_kind(sheet)) is None:
+            return None
+        return kind.varied(*self.sheet_factors(pad_name))
+
+    def _number(self, distribution: Distribution, *names: str) -> float:
+        return float(self._numbers(distribution, 1, *names)[0])
+
+    def _numbers(self, distribution: Distribution, count: int, *names: str) -> FloatArray:
+        return distribution.sample(self._stream(*names), count)
+
+    def _stream(self, *names: str) -> np.random.Generator:
+        """Return the random stream of some quantities of an object, independent of all others."""
+        return np.random.default_rng((self.seed, zlib.crc32("/".join(names).encode())))
+
+
+def _four(values: FloatArray) -> Four:
+    x0, xa, y0, yb = values.tolist()
+    return x0, xa, y0, yb
+
+
+def _three(values: FloatArray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
