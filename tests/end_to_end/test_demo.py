@@ -13,7 +13,7 @@ from pathlib import Path
 
 def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "handtouch", "demo", "--seconds", "9"],
+        [sys.executable, "-m", "handtouch", "demo", "--world", "ideal", "--seconds", "9"],
         capture_output=True,
         text=True,
         timeout=100,
