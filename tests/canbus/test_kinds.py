@@ -23,6 +23,8 @@ KINDS = {  # objects of the channels, counts that need their full width, identif
     "tactor-q16.eds": ("0x21{}0:0", (0, 65_535, 32_768, 1), (0x181, 0x381)),
     "hapt24.dcf": ("0x8130:{}", (-(2**23), 2**23 - 1, -70_000, 1), (0x181, 0x281)),
     "noname-4ch.eds": ("0x6401:{}", (-32768, 32767, -1, 2), (0x181,)),
+    "ambit-f401.eds": ("0x6403:{}:f32/1000", (-8_000_000, 8_388_607, -1, 2), (0x181, 0x281)),
+    "ambit-f404.eds": ("0x6130:{}:f32/0.25", (-8_000_000, 8_388_607, -1, 2), (0x181, 0x281)),
 }
 
 
@@ -34,7 +36,11 @@ def make_kind(make_rig: Make, kind: str, size: int = 2, **more: Any) -> Any:
     """A hand of nodes of a kind, its spec as a deployment gives it."""
     path = str(FOLDER / kind)
     channels = resolve_channels(objects(kind), path)
-    device = {"eds": path, "channels": tuple((c.index, c.sub) for c in channels)} | more.pop("device", {})
+    device = {
+        "eds": path,
+        "channels": tuple((c.index, c.sub) for c in channels),
+        "counts_per_unit": tuple(c.counts_per_unit for c in channels),
+    } | more.pop("device", {})
     electrodes = more.pop("electrodes", ELECTRODES)
     rig = make_rig(
         size, device=device, **{"eds": path, "channels": order_by_electrode(channels, electrodes)} | more
@@ -200,6 +206,15 @@ def test_listener_refuses_invalid_identifiers(
     path = tmp_path / "fixed.eds"
     path.write_text(text.replace("180h+$NODEID", identifier), encoding="latin-1")
     with pytest.raises(error, match=expected):
+        make_rig(2, role="listener", eds=str(path))
+
+
+def test_listener_refuses_a_29_bit_cob_id(make_rig: Make, tmp_path: Path) -> None:
+    """Its node would never be operational: handtouch receives 11-bit identifiers."""
+    text = (FOLDER / "noname-4ch.eds").read_text(encoding="latin-1")
+    path = tmp_path / "extended.eds"
+    path.write_text(text.replace("180h+$NODEID", "0x20000181"), encoding="latin-1")
+    with pytest.raises(EdsError, match=r"TPDO1 has no 11-bit identifier \(0x1800:01 is 0x20000181\)"):
         make_rig(2, role="listener", eds=str(path))
 
 

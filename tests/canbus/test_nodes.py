@@ -54,6 +54,7 @@ def test_idling_is_timed_by_the_sync_period() -> None:
     assert made[0].idle == IdleSettings(40, 200, 50, deltas, WritableObject(0x6423, 0, 1))
 
 
+REAL = "channels = [" + ", ".join(f'"0x6403:{n}:f32/1000"' for n in (1, 2, 3, 4)) + "]"
 IDLE = "\n[node.four_channel.idle]\ndelta_counts = 256\n"
 SMALL = 'delta_objects = ["0x6426:1:u8", "0x6426:2:u32", "0x6426:3:u32", "0x6426:4:u32"]'
 
@@ -77,6 +78,12 @@ SMALL = 'delta_objects = ["0x6426:1:u8", "0x6426:2:u32", "0x6426:3:u32", "0x6426
             "channels: .* its type is unknown",
         ),
         (
+            'channels = ["0x6403:1", "0x6403:2", "0x6403:3", "0x6403:4"]',
+            "",
+            'channels: "0x6403:1" is REAL32; add its counts per unit',
+        ),
+        (REAL, "", "full_scale_counts: missing; REAL32 channels have no greatest count"),
+        (
             'excitation_object = "0x2100:0"',
             "",
             'excitation_object: "0x2100:0": its type is missing; add it',
@@ -96,6 +103,10 @@ def test_invalid_objects_are_named_with_file_section_and_key(more: str, tables: 
     ) as error:
         check_nodes(deployment(more, tables), str(PATH))
     assert len(error.value.problems) == 1
+
+
+def test_real32_channels_with_a_full_scale_are_accepted() -> None:
+    check_nodes(deployment(REAL + "\nfull_scale_counts = 10_000"), "hand.toml")
 
 
 def test_listener_without_a_usable_eds_is_refused() -> None:

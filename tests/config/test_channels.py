@@ -17,19 +17,22 @@ from handtouch.config.channels import (
     parse_writable_object,
     resolve_channels,
 )
-from handtouch.config.eds import EdsError
+from handtouch.config.eds import REAL32, EdsError, ValueType
 
 FOLDER = Path(__file__).parent.parent / "data" / "eds"
+FLOATS = ("0x6403:1", "0x6403:2", "0x6403:3", "0x6403:4")
 TACTOR = ("0x2110:0", "0x2120:0", "0x2130:0", "0x2140:0")
 
 
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("0x6401:1", (0x6401, 1, None)),
-        ("0x2001:0:u24", (0x2001, 0, (24, False))),
-        ("0x2001:0xFE:i32", (0x2001, 254, (32, True))),
-        ("0xABCD:17:u8", (0xABCD, 17, (8, False))),
+        ("0x6401:1", (0x6401, 1, None, None)),
+        ("0x2001:0:u24", (0x2001, 0, ValueType(24, False), None)),
+        ("0x2001:0xFE:i32", (0x2001, 254, ValueType(32), None)),
+        ("0xABCD:17:u8", (0xABCD, 17, ValueType(8, False), None)),
+        ("0x6403:1:f32/1000", (0x6403, 1, REAL32, 1000.0)),
+        ("0x6403:1:f32/2.5e-3", (0x6403, 1, REAL32, 0.0025)),
     ],
 )
 def test_objects_are_written_as_index_sub_and_type(text: str, found: object) -> None:
@@ -79,6 +82,10 @@ def test_types_come_from_the_text_the_eds_or_the_profile(
         (("0x2110:0:i16", *TACTOR[1:]), "tactor-q16.eds", "has u16; leave the type out"),
         (("0x2999:0", *TACTOR[1:]), "tactor-q16.eds", "has no such object"),
         (("0x2110:0", "0x2110:0", *TACTOR[2:]), "tactor-q16.eds", '"0x2110:0" is given twice'),
+        (FLOATS, None, '"0x6403:1" is REAL32; add its counts per unit: "0x6403:1:f32/1000"'),
+        (FLOATS, "ambit-f401.eds", '"0x6403:1" is REAL32; add its counts per unit'),
+        (tuple(f"{text}:i32" for text in FLOATS), "ambit-f401.eds", "has f32; leave the type out"),
+        (("0x6403:1:f32/0", *FLOATS[1:]), None, "the counts per unit must be above 0"),
     ],
 )
 def test_channels_that_cannot_be_are_named_with_a_remedy(
@@ -86,6 +93,11 @@ def test_channels_that_cannot_be_are_named_with_a_remedy(
 ) -> None:
     with pytest.raises(EdsError, match=expected):
         resolve_channels(objects, FOLDER / eds if eds else None)
+
+
+def test_real32_channels_have_their_counts_per_unit() -> None:
+    found = resolve_channels([f"{text}:f32/1000" for text in FLOATS], FOLDER / "ambit-f401.eds")
+    assert found[3] == Channel(0x6403, 4, 32, True, 1000.0)
 
 
 def test_order_of_electrodes_is_that_of_the_pad_whatever_the_wiring() -> None:
@@ -98,6 +110,8 @@ def test_written_objects_need_their_type() -> None:
     assert parse_writable_object("0x2100:0:u8").size_bytes == 1
     with pytest.raises(EdsError, match=r'its type is missing; add it: "0x2100:0:u8"'):
         parse_writable_object("0x2100:0")
+    with pytest.raises(EdsError, match="is REAL32; only integers are written"):
+        parse_writable_object("0x6429:1:f32/1000")
 
 
 def test_shipped_node_is_the_standard_one() -> None:
@@ -110,3 +124,4 @@ def test_shipped_node_is_the_standard_one() -> None:
 def test_channel_text_has_address_and_type() -> None:
     assert str(Channel(0x2110, 0, 24, False)) == "0x2110:00 (unsigned 24 bit)"
     assert str(Channel(0x6401, 4)) == "0x6401:04 (16 bit)"
+    assert str(Channel(0x6403, 4, 32, counts_per_unit=10.0)) == "0x6403:04 (REAL32)"

@@ -16,11 +16,13 @@ from hypothesis import strategies as st
 
 from handtouch.config import shipped
 from handtouch.config.eds import (
+    REAL32,
     EdsError,
     TpdoDefault,
+    ValueType,
     default_tpdos,
-    integer_type,
     load_eds,
+    value_type,
 )
 from handtouch.config.eds_file import parse_eds
 
@@ -48,13 +50,23 @@ CARRIED = {
         TpdoDefault(3, 0x385, False, 254, ((0x6130, 1, 32), (0x6130, 2, 32)), True),
     ),
     "noname-4ch.eds": (TpdoDefault(1, 0x185, True, 255, CURRENTS, True),),
+    "ambit-f401.eds": (
+        TpdoDefault(1, 0x185, True, 255, ((0x6403, 1, 32), (0x6403, 2, 32)), False),
+        TpdoDefault(2, 0x285, True, 255, ((0x6403, 3, 32), (0x6403, 4, 32)), False),
+    ),
+    "ambit-f404.eds": (
+        TpdoDefault(1, 0x185, True, 255, ((0x6130, 1, 32), (0x6130, 2, 32)), False),
+        TpdoDefault(2, 0x285, True, 255, ((0x6130, 3, 32), (0x6130, 4, 32)), False),
+    ),
 }
 CHANNELS = {
-    "feldmann-ai4w.eds": ([(0x6401, sub) for sub in (1, 2, 3, 4)], (16, True)),
-    "norsens-quad404.eds": ([(0x9130, sub) for sub in (1, 2, 3, 4)], (32, True)),
-    "tactor-q16.eds": ([(index, 0) for index in (0x2110, 0x2120, 0x2130, 0x2140)], (16, False)),
-    "hapt24.dcf": ([(0x8130, sub) for sub in (1, 2, 3, 4)], (24, True)),
-    "noname-4ch.eds": ([(0x6401, sub) for sub in (1, 2, 3, 4)], (16, True)),
+    "feldmann-ai4w.eds": ([(0x6401, sub) for sub in (1, 2, 3, 4)], ValueType(16)),
+    "norsens-quad404.eds": ([(0x9130, sub) for sub in (1, 2, 3, 4)], ValueType(32)),
+    "tactor-q16.eds": ([(index, 0) for index in (0x2110, 0x2120, 0x2130, 0x2140)], ValueType(16, False)),
+    "hapt24.dcf": ([(0x8130, sub) for sub in (1, 2, 3, 4)], ValueType(24)),
+    "noname-4ch.eds": ([(0x6401, sub) for sub in (1, 2, 3, 4)], ValueType(16)),
+    "ambit-f401.eds": ([(0x6403, sub) for sub in (1, 2, 3, 4)], REAL32),
+    "ambit-f404.eds": ([(0x6130, sub) for sub in (1, 2, 3, 4)], REAL32),
 }
 
 OBJECT = "[{}]\nParameterName=x\nDataType={}\nAccessType=rw\nDefaultValue={}\n"
@@ -110,7 +122,7 @@ def test_tpdos_are_those_of_the_file(path: Path) -> None:
 def test_channels_have_the_types_of_the_file(path: Path) -> None:
     dictionary = load_eds(path, NODE_ID)
     places, kind = CHANNELS[path.name]
-    assert [integer_type(dictionary, *place) for place in places] == [kind] * 4
+    assert [value_type(dictionary, *place) for place in places] == [kind] * 4
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
@@ -256,7 +268,7 @@ def test_mistakes_elsewhere_cost_only_the_value() -> None:
 def test_defaults_of_channels_need_not_fit_their_type() -> None:
     dictionary = read("[1A00sub1]\nDefaultValue=0x64010110\n[6401sub1]\nDataType=3\nDefaultValue=99999\n")
     assert dictionary[0x6401][1].default is None
-    assert integer_type(dictionary, 0x6401, 1) == (16, True)
+    assert value_type(dictionary, 0x6401, 1) == ValueType(16)
 
 
 def test_of_keys_and_sections_that_come_twice_the_first_counts() -> None:
@@ -283,7 +295,7 @@ def test_types_left_out_of_communication_objects_are_those_of_cia_301() -> None:
 
 def test_types_of_canfestival_are_found_in_their_own_object() -> None:
     text = "[A0]\nObjectType=7\n[A0sub1]\nDataType=5\nDefaultValue=0x03\n[A0sub2]\nDataType=3\n"
-    assert integer_type(read(text + OBJECT.format("2000", "0x00A0", 0)), 0x2000, 0) == (16, True)
+    assert value_type(read(text + OBJECT.format("2000", "0x00A0", 0)), 0x2000, 0) == ValueType(16)
 
 
 def test_compact_objects_have_all_their_members() -> None:
@@ -296,7 +308,7 @@ def test_compact_objects_have_all_their_members() -> None:
     assert 5 in dictionary  # a PDO with gaps can't be served without
     big = read("[1000]\n[2000]\nObjectType=8\nDataType=5\nCompactSubObj=255\n[2000sub3]\nDataType=6\n")
     assert len(big[0x2000]) == 255
-    assert integer_type(big, 0x2000, 3) == (16, False)
+    assert value_type(big, 0x2000, 3) == ValueType(16, False)
 
 
 def test_values_of_a_dcf_count_before_defaults() -> None:
@@ -309,6 +321,7 @@ def test_cob_ids() -> None:
     assert tpdo("1 0x80000185").cob_id == 0x185
     assert tpdo("1 0x40000185").enabled is True  # no remote requests
     assert tpdo("1 0x20000185").enabled is False  # 29 bits
+    assert (tpdo("1 0xE0012345").extended_cob_id, tpdo("1 0x185").extended_cob_id) == (0x20012345, 0)
     assert tpdo("1 0").enabled is False
     assert tpdo("1 0x180").cob_id == 0x185  # the firmware adds the node id
     assert tpdo("1 ", number=2).cob_id == tpdo("", number=2).cob_id == 0x285  # predefined connection set
@@ -340,18 +353,19 @@ def test_a_mapping_can_be_changed_only_if_count_and_entries_can_be_written() -> 
     assert default_tpdos(read("[1800]\n"))[0].remappable is False
 
 
-def test_integer_types_are_all_known_and_others_named() -> None:
+def test_number_types_are_all_known_and_others_named() -> None:
     kinds = {0x02: 8, 0x03: 16, 0x10: 24, 0x04: 32, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
     plain = {0x05: 8, 0x06: 16, 0x16: 24, 0x07: 32, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
     for signed, table in ((True, kinds), (False, plain)):
         for kind, bits in table.items():
-            assert integer_type(read(OBJECT.format("2000", kind, 0)), 0x2000, 0) == (bits, signed)
-    for kind, name in ((8, "REAL32"), (0x11, "REAL64"), (1, "BOOLEAN"), (9, "VISIBLE_STRING")):
-        with pytest.raises(EdsError, match=rf'object 0x2000 sub 0 "x" is {name}'):
-            integer_type(read(OBJECT.format("2000", kind, "")), 0x2000, 0)
+            assert value_type(read(OBJECT.format("2000", kind, 0)), 0x2000, 0) == ValueType(bits, signed)
+    assert value_type(read(OBJECT.format("2000", 8, 0.5)), 0x2000, 0) == REAL32
+    for kind, name in ((0x11, "REAL64"), (1, "BOOLEAN"), (9, "VISIBLE_STRING")):
+        with pytest.raises(EdsError, match=rf':\d+: object 0x2000 sub 0 "x" is {name}'):
+            value_type(read(OBJECT.format("2000", kind, "")), 0x2000, 0)
     array = read("[2000]\nObjectType=8\n[2000sub1]\nDataType=3\n[3000]\nDataType=3\n")
     absent = [(0x2000, 2), (0x3000, 1), (0x4000, 0)]
-    assert [integer_type(array, *place) for place in absent] == [None, None, None]
+    assert [value_type(array, *place) for place in absent] == [None, None, None]
 
 
 def test_a_tpdo_without_mapping_can_be_served() -> None:
@@ -422,4 +436,15 @@ def test_a_mangled_file_loads_or_is_named(raw: bytes) -> None:
         assert 0 <= found.cob_id < 0x800
         for index, sub, _ in found.entries:
             with contextlib.suppress(EdsError):
-                integer_type(dictionary, index, sub)
+                value_type(dictionary, index, sub)
+
+
+@pytest.mark.parametrize("start", ["<?xml version='1.0'?>\n<ISO15745Profile>", "\ufeff\n <ISO15745Profile>"])
+def test_an_xdd_file_is_named_as_such(start: str) -> None:
+    with pytest.raises(EdsError, match=r"^pad\.xdd: .*XDD isn't read; export an EDS$"):
+        parse_eds("pad.xdd", start.encode(), NODE_ID)
+
+
+def test_a_key_without_equals_sign_is_one_message_with_one_line() -> None:
+    with pytest.raises(EdsError, match=r'^[^:]*:2: DataType is followed by no "="; add it$'):
+        read("[1000]\nDataType 7\n")

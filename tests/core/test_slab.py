@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 
 import numpy as np
 import pytest
@@ -171,6 +172,27 @@ def test_saturation_is_either_end_of_a_signed_channel_and_the_top_of_an_unsigned
             slab.write_pdo(1, frame, 1, pdo)
         found = slab.saturated(slab.unpack_counts())
         assert found.tolist() == [[False] * 4, [saturated] * 4], count
+
+
+@given(st.lists(st.floats(width=32), min_size=4, max_size=4), st.sampled_from([0.25, 1000.0, 1e7]))
+def test_real32_values_are_scaled_to_counts_and_what_is_no_number_is_saturated(
+    values: list[float], counts_per_unit: float
+) -> None:
+    x0, xa, y0, yb = (ChannelField(n // 2, 32 * (n % 2), 32, True, counts_per_unit) for n in range(4))
+    slab = Slab(2)  # the other slot has integers
+    slab.set_layout(1, (x0, xa, y0, yb))
+    for pdo in (0, 1):
+        slab.write_pdo(1, struct.pack("<2f", *values[2 * pdo : 2 * pdo + 2]), 1, pdo)
+    slab.write_pdo(0, struct.pack("<4h", 1, -2, 3, 4), 1)
+    integers, counts = slab.unpack_counts().tolist()
+    assert integers == [1, -2, 3, 4]
+    saturated = slab.saturated(slab.unpack_counts())[1].tolist()
+    low, high = integer_limits(32, True)
+    for value, count, is_saturated in zip(values, counts, saturated, strict=True):
+        scaled = value * counts_per_unit
+        assert is_saturated == (not low + 1.5 < scaled < high - 0.5)  # NaN compares false
+        if not is_saturated:
+            assert count == round(scaled)
 
 
 def test_unpacking_reuses_one_array() -> None:

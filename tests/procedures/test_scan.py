@@ -325,6 +325,11 @@ def test_reboots_and_emergencies_are_reported(wire: VirtualBus) -> None:
             [(i, 0) for i in (0x2110, 0x2120, 0x2130, 0x2140)],
             ("0x2110:0:i16", "0x2140:0:i16"),
         ),
+        (
+            "ambit-f401.eds",
+            [(0x6403, sub) for sub in (1, 2, 3, 4)],
+            ("0x6403:1:f32/1000", "0x6403:4:f32/1000"),
+        ),
     ],
 )
 def test_channels_of_other_vendors_nodes_are_found(
@@ -603,6 +608,14 @@ def entries(*objects: tuple[int, int], bits: int = 16) -> tuple[int, ...]:
                 entries((0x9130, 3), (0x9130, 4), bits=32),
             ],
             ("0x9130:1", "0x9130:2", "0x9130:3", "0x9130:4"),
+        ),
+        # REAL32 of CiA 401
+        (
+            [
+                entries((0x6403, 1), (0x6403, 2), bits=32),
+                entries((0x6403, 3), (0x6403, 4), bits=32),
+            ],
+            ("0x6403:1:f32/1000", "0x6403:2:f32/1000", "0x6403:3:f32/1000", "0x6403:4:f32/1000"),
         ),
         # a vendor's own objects, each its own index, between gaps of dummies
         (

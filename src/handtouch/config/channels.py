@@ -1,4 +1,6 @@
-"""Objects of a node's four channels, with their integer types, from configuration and EDS.
+"""Objects of a node's four channels, with their types, from configuration and EDS.
+
+A channel is an integer, its count, or REAL32: count = value x counts per unit, rounded.
 
 Public names: `Channel`, `Channels`, `WritableObject`, `STANDARD_CHANNELS`, `ELECTRODES`, `PROFILE_TYPES`,
 `resolve_channels`, `order_by_electrode`, `parse_object`, `parse_writable_object`, `full_scale_counts`,
@@ -7,26 +9,34 @@ Public names: `Channel`, `Channels`, `WritableObject`, `STANDARD_CHANNELS`, `ELE
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from handtouch.config import Node, eds
+from handtouch.config.eds import REAL32, ValueType
 
 ELECTRODES = ("x0", "xa", "y0", "yb")
 MAX_CHANNEL_BITS = 32
-_OBJECT_PATTERN = re.compile(r"0x([0-9A-Fa-f]{4}):(0x[0-9A-Fa-f]{1,2}|\d{1,3})(?::([iu])(8|16|24|32))?")
-PROFILE_TYPES = {  # (bits, signed); CiA 401 and CiA 404: read analogue input, process and field values
-    0x6400: (8, True),
-    0x6401: (16, True),
-    0x6402: (32, True),
-    0x7100: (16, True),
-    0x7130: (16, True),
-    0x8100: (24, True),
-    0x8130: (24, True),
-    0x9100: (32, True),
-    0x9130: (32, True),
+_OBJECT_PATTERN = re.compile(
+    r"0x([0-9A-Fa-f]{4}):(0x[0-9A-Fa-f]{1,2}|\d{1,3})"
+    r"(?::(?:([iu])(8|16|24|32)|f32/(\d+(?:\.\d+)?(?:e[+-]?\d+)?)))?"
+)
+PROFILE_TYPES = {  # CiA 401 and CiA 404: read analogue input, process and field values
+    0x6100: REAL32,
+    0x6130: REAL32,
+    0x6400: ValueType(8),
+    0x6401: ValueType(16),
+    0x6402: ValueType(32),
+    0x6403: REAL32,
+    0x7100: ValueType(16),
+    0x7130: ValueType(16),
+    0x8100: ValueType(24),
+    0x8130: ValueType(24),
+    0x9100: ValueType(32),
+    0x9130: ValueType(32),
 }
 
 
@@ -37,12 +47,16 @@ def integer_limits(bits: int, signed: bool) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Object that carries one channel: its address and its integer type."""
+    """Object that carries one channel: its address and its type.
+
+    `counts_per_unit` : of a REAL32 object, None for an integer
+    """
 
     index: int
     sub: int
     bits: int = 16
     signed: bool = True
+    counts_per_unit: float | None = None
 
     @property
     def mapping_entry(self) -> int:
@@ -55,7 +69,9 @@ class Channel:
         return integer_limits(self.bits, self.signed)
 
     def __str__(self) -> str:
-        return f"0x{self.index:04X}:{self.sub:02X} ({'' if self.signed else 'unsigned '}{self.bits} bit)"
+        integer = f"{'' if self.signed else 'unsigned '}{self.bits} bit"
+        kind = integer if self.counts_per_unit is None else "REAL32"
+        return f"0x{self.index:04X}:{self.sub:02X} ({kind})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,65 +94,67 @@ STANDARD_CHANNELS: Channels = (
 """CiA 401's analogue inputs."""
 
 
-def parse_object(text: str) -> tuple[int, int, tuple[int, bool] | None]:
-    """Return index, sub-index and type (bits, signed) or None of INDEX:SUB[:TYPE], such as "0x2001:0:u24".
+def parse_object(text: str) -> tuple[int, int, ValueType | None, float | None]:
+    """Return index, sub-index, type and counts per unit of INDEX:SUB[:TYPE].
 
-    Raises EdsError for any other form.
+    "0x2001:0:u24" is an integer, "0x6403:1:f32/1000" REAL32 with 1000 counts per unit; the type is None where
+    it is left out, the counts per unit are None for all but REAL32. Raises EdsError for any other form.
     """
     form = _OBJECT_PATTERN.fullmatch(text)
     if form is None or not int(form[1], 16) >= 1 or int(form[2], 0) > 254:
         raise eds.EdsError(
             f'"{text}" is no object; write INDEX:SUB such as "0x6401:1", or with its type "0x2001:1:u24"'
         )
-    kind = (int(form[4]), form[3] == "i") if form[3] else None
-    return int(form[1], 16), int(form[2], 0), kind
+    counts_per_unit = float(form[5]) if form[5] else None
+    if counts_per_unit is not None and not 0 < counts_per_unit < math.inf:
+        raise eds.EdsError(f'"{text}": the counts per unit must be above 0 and finite')
+    kind = ValueType(int(form[4]), form[3] == "i") if form[3] else REAL32 if form[5] else None
+    return int(form[1], 16), int(form[2], 0), kind, counts_per_unit
 
 
 def resolve_channels(objects: Sequence[str], path: Path | str | None) -> Channels:
     """Return the four channels of a kind of node, with types from the text, the EDS or the CiA profiles.
 
     Raises EdsError for a form unknown to `parse_object`, an object given twice, an unreadable EDS, and a type
-    that is unknown, isn't an integer, is wider than 32 bits or contradicts the EDS.
+    that is unknown, neither an integer nor REAL32, wider than 32 bits or contradicts the EDS.
     """
     dictionary = eds.load_eds(path, 1) if path else None
     channels: list[Channel] = []
     for text in objects:
-        index, sub, given = parse_object(text)
-        listed = eds.integer_type(dictionary, index, sub) if dictionary is not None else None
+        index, sub, given, counts_per_unit = parse_object(text)
+        listed = eds.value_type(dictionary, index, sub) if dictionary is not None else None
         if dictionary is not None and listed is None and given is None:
             raise eds.EdsError(f'"{text}": {path} has no such object; correct the object or the EDS')
         if given and listed and given != listed:
-            raise eds.EdsError(
-                f'"{text}": {path} has {_type_name(*listed)}; leave the type out, or correct the EDS'
-            )
+            raise eds.EdsError(f'"{text}": {path} has {listed}; leave the type out, or correct the EDS')
         kind = given or listed or PROFILE_TYPES.get(index)
         if kind is None:
             raise eds.EdsError(f'"{text}": its type is unknown; give the EDS, or the type: "{text}:i16"')
-        if kind[0] > MAX_CHANNEL_BITS:
-            raise eds.EdsError(f'"{text}" has {kind[0]} bits; at most {MAX_CHANNEL_BITS} are supported')
+        if kind.bits > MAX_CHANNEL_BITS:
+            raise eds.EdsError(f'"{text}" has {kind.bits} bits; at most {MAX_CHANNEL_BITS} are supported')
+        if kind.is_real and counts_per_unit is None:
+            raise eds.EdsError(f'"{text}" is REAL32; add its counts per unit: "{text}:f32/1000"')
         if any((channel.index, channel.sub) == (index, sub) for channel in channels):
             raise eds.EdsError(f'"{text}" is given twice; each channel needs its own object')
-        channels.append(Channel(index, sub, *kind))
+        channels.append(Channel(index, sub, kind.bits, kind.signed, counts_per_unit))
     first, second, third, fourth = channels
     return first, second, third, fourth
 
 
 def parse_writable_object(text: str) -> WritableObject:
     """Parse an object to write, INDEX:SUB:TYPE. Raises EdsError if the type is missing."""
-    index, sub, kind = parse_object(text)
+    index, sub, kind, _ = parse_object(text)
     if kind is None:
         raise eds.EdsError(f'"{text}": its type is missing; add it: "{text}:u8"')
-    return WritableObject(index, sub, kind[0] // 8)
+    if kind.is_real:
+        raise eds.EdsError(f'"{text}" is REAL32; only integers are written')
+    return WritableObject(index, sub, kind.bits // 8)
 
 
 def order_by_electrode(channels: Channels, electrodes: Sequence[str]) -> Channels:
     """Return the channels of the electrodes x0, xa, y0, yb; `electrodes` lists each channel's electrode."""
     x0, xa, y0, yb = (channels[electrodes.index(name)] for name in ELECTRODES)
     return x0, xa, y0, yb
-
-
-def _type_name(bits: int, signed: bool) -> str:
-    return f"{'i' if signed else 'u'}{bits}"
 
 
 def full_scale_counts(node: Node) -> int:

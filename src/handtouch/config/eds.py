@@ -1,14 +1,17 @@
 """Electronic data sheets (CiA 306): a node's objects, its default TPDOs and the types of objects.
 
-Public names: `load_eds`, `default_tpdos`, `TpdoDefault`, `integer_type`, `EdsError`.
+Public names: `load_eds`, `default_tpdos`, `TpdoDefault`, `ValueType`, `REAL32`, `value_type`,
+`EdsError`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from canopen import ObjectDictionary
+from canopen.objectdictionary import datatypes
 
 from handtouch.config.eds_file import (
     INTEGER_TYPES,
@@ -22,10 +25,24 @@ from handtouch.config.eds_file import (
     variable_at,
 )
 
-__all__ = ["EdsError", "TpdoDefault", "default_tpdos", "integer_type", "load_eds"]
+__all__ = ["REAL32", "EdsError", "TpdoDefault", "ValueType", "default_tpdos", "load_eds", "value_type"]
 
 _PREDEFINED_TPDO_COUNT = 4
 _EVENT_DRIVEN = 255
+
+
+class ValueType(NamedTuple):
+    """Type of an object: an integer, or REAL32 (`is_real`)."""
+
+    bits: int
+    signed: bool = True
+    is_real: bool = False
+
+    def __str__(self) -> str:
+        return f"{'f' if self.is_real else 'i' if self.signed else 'u'}{self.bits}"
+
+
+REAL32 = ValueType(32, is_real=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +57,7 @@ class TpdoDefault:
     leaves empty;
         indices 1 to 7 are dummy entries, gaps of that length
     `remappable` : its mapping may be written
+    `extended_cob_id` : its 29-bit COB-ID, with bit 29; 0 if it has an 11-bit one
     """
 
     number: int
@@ -48,6 +66,7 @@ class TpdoDefault:
     transmission_type: int
     entries: tuple[tuple[int, int, int], ...]
     remappable: bool
+    extended_cob_id: int = 0
 
 
 def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
@@ -72,21 +91,25 @@ def default_tpdos(dictionary: ObjectDictionary) -> tuple[TpdoDefault, ...]:
     )
 
 
-def integer_type(dictionary: ObjectDictionary, index: int, sub: int) -> tuple[int, bool] | None:
-    """Return (bits, signed) of an integer object; None if the dictionary doesn't have the object.
+def value_type(dictionary: ObjectDictionary, index: int, sub: int) -> ValueType | None:
+    """Return the type of a number; None if the dictionary doesn't have the object.
 
-    8 to 64 bits in steps of 8. Raises EdsError for any other type, naming object and type.
+    Integers of 8 to 64 bits in steps of 8, and REAL32. Raises EdsError for any other type, with file, line,
+    object and type.
     """
     variable = variable_at(dictionary, index, sub)
     if variable is None:
         return None
     kind = variable.data_type
+    if kind == datatypes.REAL32:
+        return REAL32
     if kind not in INTEGER_TYPES:
         name = TYPE_NAMES.get(kind, f"of type {kind}")
         raise EdsError(
-            f'object 0x{index:04X} sub {sub} "{variable.name}" is {name}; an integer is needed here'
+            f'{variable.location}: object 0x{index:04X} sub {sub} "{variable.name}" is {name}; an integer or '
+            "REAL32 is needed here"
         )
-    return INTEGER_TYPES[kind]
+    return ValueType(*INTEGER_TYPES[kind])
 
 
 def _default_tpdo(dictionary: ObjectDictionary, number: int) -> TpdoDefault:
@@ -108,4 +131,5 @@ def _default_tpdo(dictionary: ObjectDictionary, number: int) -> TpdoDefault:
         transmission_type=_EVENT_DRIVEN if transmission is None else transmission,
         entries=tuple(mapping_entries(dictionary, mapping)),
         remappable=bool(writable) and all(writable),
+        extended_cob_id=cob_id & 0x3FFF_FFFF if cob_id & 1 << 29 else 0,
     )

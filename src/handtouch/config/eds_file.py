@@ -1,8 +1,7 @@
 """Parser of EDS and DCF files (CiA 306), tolerant of vendors' deviations, into `canopen`'s object dictionary.
 
-Public names: `parse_eds`, `EdsError`; `mapping_entries`, `raw_value` and `variable_at` look into a
-dictionary;
-`TPDO_INDICES`, `TPDO_MAPPING_INDICES`, `INTEGER_TYPES`, `TYPE_NAMES`.
+Public names: `parse_eds`, `EdsError`, `EdsVariable`; `mapping_entries`, `raw_value` and `variable_at` look
+into a dictionary; `TPDO_INDICES`, `TPDO_MAPPING_INDICES`, `INTEGER_TYPES`, `TYPE_NAMES`.
 
 Read strictly are the objects that the master uses: 0x1000 to 0x1018, TPDOs and what these carry. A mistake
 there is an error that names the line; elsewhere what can't be understood is left out and logged. The parser
@@ -60,9 +59,20 @@ class EdsError(ValueError):
     """An EDS can't be used; `str` is "file:line: problem; remedy", the line where known."""
 
 
+class EdsVariable(ODVariable):  # type: ignore[misc]  # canopen is untyped
+    """Variable of a file; `location` is "file:line" of its type."""
+
+    def __init__(self, name: str, index: int, sub: int, location: str) -> None:
+        super().__init__(name, index, sub)
+        self.location = location
+
+
 def parse_eds(path: str, raw: bytes, node_id: int) -> ObjectDictionary:
     """Parse a file's bytes into an object dictionary; `path` is for messages. Raises EdsError."""
-    return _EdsReader(path, node_id, _decode(raw)).build_dictionary()
+    text = _decode(raw)
+    if text.lstrip().startswith("<"):
+        raise EdsError(f"{path}: is XML, as XDD and XDC files (CiA 311) are; XDD isn't read; export an EDS")
+    return _EdsReader(path, node_id, text).build_dictionary()
 
 
 def mapping_entries(dictionary: ObjectDictionary, mapping: int) -> Iterator[tuple[int, int, int]]:
@@ -185,7 +195,7 @@ class _EdsReader:
         usage = self._sections.get("dummyusage", _EdsSection(0))
         for kind in _DUMMY_TYPES:
             if kind in self._mapped or self._parse_number(usage, f"dummy{kind:04d}", strict=False):
-                dummy = ODVariable(f"Dummy{kind:04d}", kind)
+                dummy = EdsVariable(f"Dummy{kind:04d}", kind, 0, self._path)
                 dummy.data_type, dummy.access_type = kind, "const"
                 result.add_object(dummy)
         return result
@@ -236,7 +246,7 @@ class _EdsReader:
     ) -> ODVariable:
         strict = self._is_required(index)
         values_matter = strict and index not in self._mapped
-        result = ODVariable(name, index, sub)
+        result = EdsVariable(name, index, sub, f"{self._path}:{section.get('DataType')[0]}")
         result.data_type = self._parse_type(index, sub, section, grouped=grouped)
         result.access_type = self._parse_access(section, strict)
         result.pdo_mappable = bool(self._parse_number(section, "PDOMapping", strict=False))
@@ -291,8 +301,9 @@ class _EdsReader:
             return None
 
     def _parse_number(self, section: _EdsSection, key: str, strict: bool) -> int | None:
+        text = self._get_text(section, key, strict)
         try:
-            return _parse_integer(self._get_text(section, key, strict), self._node_id)
+            return _parse_integer(text, self._node_id)
         except ValueError as error:
             self._report_problem(section.get(key)[0], f"{key} {error}; correct it or leave it empty", strict)
             return None

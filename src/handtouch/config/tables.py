@@ -138,7 +138,8 @@ class Node(Table):
     )
     channels: Annotated[tuple[str, str, str, str], Field(strict=False)] = Field(
         ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"),
-        description="objects of the four channels, INDEX:SUB; with a type (i16, u24 …) where no EDS gives it",
+        description="objects of the four channels, INDEX:SUB; with a type (i16, u24) where no EDS gives it, "
+        "REAL32 as f32/1000 for 1000 counts per unit",
     )
     allow_pdo_remapping: bool = Field(
         True, description="map the channels to a TPDO over SDO if no TPDO of the node carries them"

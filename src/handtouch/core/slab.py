@@ -24,12 +24,16 @@ _SAMPLE_BYTES = MAX_PDOS * PDO_BYTES
 
 @dataclass(frozen=True, slots=True)
 class ChannelField:
-    """Bit field of a channel: PDO of its pad (0 to 3), first bit, and integer type."""
+    """Bit field of a channel: PDO of its pad (0 to 3), first bit, and type.
+
+    `counts_per_unit` : of a REAL32 field, None for an integer
+    """
 
     pdo: int
     first_bit: int
     bits: int
     signed: bool
+    counts_per_unit: float | None = None
 
     @property
     def limits(self) -> tuple[int, int]:
@@ -80,6 +84,8 @@ class Slab:
         self._left_shifts = np.zeros((size, 4), dtype=np.int64)
         self._right_shifts = np.zeros((size, 4), dtype=np.int64)
         self._unsigned_masks: NDArray[np.int64] | None = None  # applied after the shifts
+        self._counts_per_unit = np.zeros((size, 4))  # of REAL32 fields, 0 for integers
+        self._is_real: NDArray[np.bool_] | None = None
         self._low_limits = np.zeros((size, 4), dtype=np.int64)
         self._high_limits = np.zeros((size, 4), dtype=np.int64)
         self._counts = np.zeros((size, 4), dtype=np.int64)
@@ -92,6 +98,7 @@ class Slab:
             self._word_indices[slot, channel] = slot * MAX_PDOS + field.pdo
             self._left_shifts[slot, channel] = _WORD_BITS - field.first_bit - field.bits
             self._right_shifts[slot, channel] = _WORD_BITS - field.bits
+            self._counts_per_unit[slot, channel] = field.counts_per_unit or 0.0
             low, high = field.limits
             # an amplifier at its limit gives either of the two lowest counts; a current of zero is no limit
             self._low_limits[slot, channel] = low + 1 if field.signed else -1
@@ -106,6 +113,8 @@ class Slab:
         if required != 1:
             self._partial_samples[slot] = _PartialSample(frozenset(field.pdo for field in layout))
         self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = bytes(_SAMPLE_BYTES)
+        is_real = self._counts_per_unit > 0
+        self._is_real = is_real if is_real.any() else None
         unsigned = self._low_limits == -1
         self._unsigned_masks = np.where(unsigned, self._high_limits, -1) if unsigned.any() else None
 
@@ -140,7 +149,17 @@ class Slab:
         np.right_shift(counts, self._right_shifts, out=counts)
         if self._unsigned_masks is not None:
             np.bitwise_and(counts, self._unsigned_masks, out=counts)
+        if self._is_real is not None:
+            self._convert_real(counts, self._is_real)
         return counts
+
+    def _convert_real(self, counts: NDArray[np.int64], is_real: NDArray[np.bool_]) -> None:
+        """Convert the bits of REAL32 fields to counts; NaN becomes the lower limit, which is saturated."""
+        low, high = self._low_limits[is_real], self._high_limits[is_real]
+        with np.errstate(invalid="ignore"):  # signalling NaN
+            values = counts[is_real].astype(np.int32).view(np.float32).astype(np.float64)
+            rounded = np.rint(values * self._counts_per_unit[is_real])
+        counts[is_real] = np.where(np.isnan(rounded), low, np.clip(rounded, low, high))
 
     def saturated(self, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which of the counts (size, 4) are at a limit of their channel's range."""

@@ -86,6 +86,7 @@ class DeviceBus:
         product_code: int | None = None,
         serial: int | None = None,
         channels: tuple[Address, ...] = ANALOGUE_INPUTS,
+        counts_per_unit: tuple[float | None, ...] = (None,) * CHANNELS,
         excitation: Address | None = None,
         strict_pdo: bool = False,
     ) -> Device:
@@ -94,6 +95,7 @@ class DeviceBus:
         `eds` : by default the one shipped with handtouch
         `vendor_id`, `product_code`, `serial` : by default those of the EDS
         `channels` : the objects (index, sub-index) of the four channels
+        `counts_per_unit` : channels that are REAL32 carry the count divided by this, by default by 1
         `excitation` : the object that switches the sheet's excitation, by default 0x2100 if it has that name
         in the EDS
         `strict_pdo` : the node refuses to change a PDO's transmission type, timers or identifier while the
@@ -104,7 +106,9 @@ class DeviceBus:
         """
         if not 1 <= node_id <= 127 or node_id in self.devices:
             raise ValueError(f"node_id must be 1 to 127 and used once, got {node_id}")
-        spec = DeviceSpec(_eds_path(eds), vendor_id, product_code, serial, channels, excitation, strict_pdo)
+        spec = DeviceSpec(
+            _eds_path(eds), vendor_id, product_code, serial, channels, counts_per_unit, excitation, strict_pdo
+        )
         device = Device(self, self._rows, node_id, spec)
         self._rows += 1
         self.join(device)

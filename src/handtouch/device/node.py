@@ -74,11 +74,22 @@ class Device(FaultSwitches):
         self._objects = ObjectValues(dictionary, self._measured_value, self._check_write, self._handle_write)
         spec.write_identity(self._objects)
         self._limits = spec.channel_limits(self._objects)
+        self._counts_per_unit = [
+            (counts_per_unit or 1.0) if self._objects.is_real32(*address) else None
+            for address, counts_per_unit in zip(spec.channels, spec.counts_per_unit, strict=True)
+        ]
         self._excitation = spec.find_excitation(self._objects)
         self._excited_sample: int | None = -inputs.SETTLE_SAMPLES - 1
         self.sdo = DeviceSdoServer(node_id, self._objects, self._send)
         self._tpdos = [
-            DeviceTpdo(default, self._objects, self._channels, self.channel_counts, spec.strict_pdo)
+            DeviceTpdo(
+                default,
+                self._objects,
+                self._channels,
+                self.channel_counts,
+                self._encode_channel,
+                spec.strict_pdo,
+            )
             for default in eds.default_tpdos(dictionary)
         ]
         self._load_objects()
@@ -338,9 +349,19 @@ class Device(FaultSwitches):
 
     # Objects with side effects.
 
-    def _measured_value(self, index: int, sub: int) -> int | None:
+    def _measured_value(self, index: int, sub: int) -> float | None:
         channel = self._channels.get((index, sub))
-        return None if channel is None else self.channel_counts()[channel]
+        if channel is None:
+            return None
+        count, counts_per_unit = self.channel_counts()[channel], self._counts_per_unit[channel]
+        return count if counts_per_unit is None else count / counts_per_unit
+
+    def _encode_channel(self, channel: int, count: int) -> int:
+        """Return the bits of a channel's object at a count."""
+        counts_per_unit = self._counts_per_unit[channel]
+        if counts_per_unit is None:
+            return count
+        return int.from_bytes(struct.pack("<f", count / counts_per_unit), "little")
 
     def _check_write(self, index: int, sub: int, value: int) -> None:
         for tpdo in self._tpdos:

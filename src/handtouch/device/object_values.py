@@ -29,7 +29,7 @@ class ObjectValues:
     def __init__(
         self,
         dictionary: ObjectDictionary,
-        measured_value: Callable[[int, int], int | None],
+        measured_value: Callable[[int, int], float | None],
         check_write: Callable[[int, int, int], None],
         on_written: Callable[[int, int, int], None],
     ) -> None:
@@ -49,6 +49,11 @@ class ObjectValues:
         """Return bits and signedness; None if there is no such integer."""
         variable = self.find_variable(index, sub)
         return None if variable is None else INTEGER_TYPES.get(variable.data_type)
+
+    def is_real32(self, index: int, sub: int) -> bool:
+        """Return True for a REAL32 object."""
+        variable = self.find_variable(index, sub)
+        return variable is not None and variable.data_type == datatypes.REAL32
 
     def set_default(self, index: int, sub: int, value: int) -> None:
         """Set the default of an integer, which a reset restores."""

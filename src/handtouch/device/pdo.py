@@ -49,6 +49,7 @@ class DeviceTpdo:
         objects: ObjectValues,
         channels: Mapping[Address, int],
         sample: Callable[[], Sequence[int]],
+        encode: Callable[[int, int], int],
         strict: bool,
     ) -> None:
         """Set the defaults of its objects.
@@ -56,12 +57,14 @@ class DeviceTpdo:
         `default` : its state after power-on
         `channels` : the objects of the channels
         `sample` : returns the counts of the four channels
+        `encode` : bits of a channel at a count, as in its object
         `strict` : refuse changes while it is valid
         """
         self.message = can.Message(is_extended_id=False, data=bytes(8))
         self._communication = cia301.TPDO_COMMUNICATION + default.number - 1
         self._mapping = cia301.TPDO_MAPPING + default.number - 1
         self._objects, self._channels, self._sample, self._is_strict = objects, channels, sample, strict
+        self._encode = encode
         self._deltas = [0] * len(channels)
         cob_id = default.cob_id | objects.get_integer(self._communication, 1) & cia301.NO_RTR_BIT
         self._defaults = (
@@ -193,7 +196,7 @@ class DeviceTpdo:
         counts = self._sample()
         word = 0
         for channel, first_bit, mask in self._channel_entries:
-            word |= (counts[channel] & mask) << first_bit
+            word |= (self._encode(channel, counts[channel]) & mask) << first_bit
         for address, first_bit, mask in self._object_entries:
             word |= (self._objects.get_integer(*address) & mask) << first_bit
         self._last_counts, self._sent_ns = counts, now_ns

@@ -9,6 +9,7 @@ from canopen import ObjectDictionary
 from handtouch.canbus import cia301
 from handtouch.config import eds
 from handtouch.config.channels import integer_limits
+from handtouch.config.eds import REAL32
 from handtouch.device.inputs import CHANNELS, ChannelLimits
 from handtouch.device.object_values import Address, ObjectValues
 
@@ -22,6 +23,7 @@ class DeviceSpec:
     """Kind and identity of a node; identity fields that are None are those of the EDS.
 
     `channels` : the objects of the four channels
+    `counts_per_unit` : those that are REAL32 carry the count divided by this
     `excitation` : the object that switches the excitation, None for 0x2100 if it has that name in the EDS
     `strict_pdo` : a valid PDO can't be changed
     """
@@ -31,6 +33,7 @@ class DeviceSpec:
     product_code: int | None = None
     serial: int | None = None
     channels: tuple[Address, ...] = ANALOGUE_INPUTS
+    counts_per_unit: tuple[float | None, ...] = (None,) * CHANNELS
     excitation: Address | None = None
     strict_pdo: bool = False
 
@@ -69,10 +72,10 @@ class DeviceSpec:
             raise ValueError(f"channels must be four different objects, got {self.channels}")
         limits = []
         for index, sub in self.channels:
-            kind = objects.integer_type(index, sub)
+            kind = REAL32[:2] if objects.is_real32(index, sub) else objects.integer_type(index, sub)
             if kind is None:
                 raise ValueError(
-                    f"{self.eds}: has no integer 0x{index:04X}:{sub:02X} to carry a channel; "
+                    f"{self.eds}: has no integer or REAL32 0x{index:04X}:{sub:02X} to carry a channel; "
                     "name the objects of the channels in `channels`"
                 )
             limits.append(integer_limits(*kind))

@@ -173,13 +173,15 @@ class _SimulatedBus:
         self.nodes = DeviceBus(port, self._sample_at)
         for hand, pad in virtual_hand.pads:
             node = deployment.nodes[pad.node]
+            channels = resolve_channels(node.channels, node.eds)
             device = self.nodes.add(
                 pad.node_id,
                 eds=node.eds,
                 vendor_id=node.vendor_id,
                 product_code=node.product_code,
                 serial=pad.serial,
-                channels=tuple((c.index, c.sub) for c in resolve_channels(node.channels, node.eds)),
+                channels=tuple((c.index, c.sub) for c in channels),
+                counts_per_unit=tuple(c.counts_per_unit for c in channels),
                 excitation=parse_object(node.excitation_object)[:2] if node.excitation_object else None,
             )
             device.wiring = tuple(map(ELECTRODES.index, pad.electrodes))

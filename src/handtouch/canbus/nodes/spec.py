@@ -107,6 +107,10 @@ def _find_problems(deployment: Deployment) -> Iterator[Problem]:
                         mapping_from_eds(kind.eds, pad.node_id, channels)
         except EdsError as error:
             yield Problem(f"{prefix}channels", "", str(error))
+        else:
+            if any(channel.counts_per_unit for channel in channels) and kind.full_scale_counts is None:
+                text = "missing; REAL32 channels have no greatest count"
+                yield Problem(f"{prefix}full_scale_counts", "", text)
         if kind.excitation_object is not None:
             yield from _find_unwritable(f"{prefix}excitation_object", kind.excitation_object)
         if kind.idle is not None:

@@ -72,7 +72,9 @@ def find_channels(tpdos: Sequence[NodeTpdo], channels: Channels) -> PdoMapping |
         return None
     used = sorted({row for row in rows if row is not None})
     fields = [
-        ChannelField(used.index(row), offsets[row][channel], channel.bits, channel.signed)
+        ChannelField(
+            used.index(row), offsets[row][channel], channel.bits, channel.signed, channel.counts_per_unit
+        )
         for row, channel in zip(rows, channels, strict=True)
         if row is not None
     ]
@@ -92,6 +94,8 @@ def mapping_from_eds(path: Path | str | None, node_id: int, channels: Channels) 
         if mapping is None or standard.size_bytes > PDO_BYTES:
             raise eds.EdsError("channels of more than 64 bits need several PDOs; give the node's eds")
         return mapping
+    listed = eds.default_tpdos(eds.load_eds(path, node_id))
+    cob_ids = {t.number: t.extended_cob_id or t.cob_id for t in listed}
     defaults = [
         NodeTpdo(
             t.number,
@@ -100,13 +104,13 @@ def mapping_from_eds(path: Path | str | None, node_id: int, channels: Channels) 
             t.transmission_type,
             tuple(i << 16 | s << 8 | b for i, s, b in t.entries),
         )
-        for t in eds.default_tpdos(eds.load_eds(path, node_id))
-        if t.cob_id
+        for t in listed
+        if cob_ids[t.number]
     ]
     try:
         mapping = find_channels(defaults, channels)
         for tpdo in mapping.tpdos if mapping else ():
-            _check_identifier(tpdo.number, tpdo.cob_id, tpdo.cob_id)
+            _check_identifier(tpdo.number, cob_ids[tpdo.number], tpdo.cob_id)
     except BootStepError as error:
         raise eds.EdsError(f"{path}: {error}") from error
     if mapping is None:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from handtouch import config
 from handtouch.canbus.find.survey import NodeFacts, find_four_channels
-from handtouch.config.channels import PROFILE_TYPES
+from handtouch.config.channels import PROFILE_TYPES, parse_object
 
 FILL_IN = "FILL IN"
 """Mark of lines to be completed by the user; they are comments until then."""
@@ -23,6 +23,7 @@ _NODE_FILL_INS = (
     ("full_scale_ma = 10.0", "electrode current at the greatest count; see the node's manual"),
     ("noise_counts = 1.0", "noise of one channel (1 sigma); see the node's manual"),
 )
+_REAL32_FILL_IN = ("full_scale_counts = 10_000", "count of full_scale_ma: value x counts per unit")
 _PAD_FILL_INS = (
     ('sheet = "firm"', "name of the pad's [sheet.NAME] table"),
     ('surface = { kind = "plane", length_mm = 30.0, width_mm = 20.0 }', "shape and size of the pad"),
@@ -60,7 +61,8 @@ def fragment(found: FoundNodes, deployment: config.Deployment | None = None) -> 
 def channel_names(node: NodeFacts) -> tuple[str, ...]:
     """Return the objects of a node's four channels as a deployment lists them, empty if there are none.
 
-    A type is added where the object doesn't imply it; its sign is a guess then.
+    A type is added where the object doesn't imply it; its sign is a guess then, and so are the counts per
+    unit of REAL32.
     """
     chosen = find_four_channels(node.tpdos)
     if chosen is None:
@@ -70,8 +72,14 @@ def channel_names(node: NodeFacts) -> tuple[str, ...]:
 
 def _object_name(entry: int) -> str:
     name = f"0x{entry >> 16:04X}:{entry >> 8 & 0xFF}"
-    bits, _ = PROFILE_TYPES.get(entry >> 16, (0, True))
-    return name if bits == entry & 0xFF else f"{name}:i{entry & 0xFF}"
+    kind = PROFILE_TYPES.get(entry >> 16)
+    if kind is None or kind.bits != entry & 0xFF:
+        return f"{name}:i{entry & 0xFF}"
+    return f"{name}:f32/1000" if kind.is_real else name
+
+
+def _addresses(channels: Iterable[str]) -> list[tuple[int, int]]:
+    return [parse_object(text)[:2] for text in channels]
 
 
 class _NodeKinds:
@@ -87,7 +95,7 @@ class _NodeKinds:
         channels = channel_names(node)
         for name, kind in self._existing.items():
             same = kind.vendor_id in (None, node.vendor_id) and kind.product_code in (None, node.product_code)
-            if same and kind.channels == channels:
+            if same and _addresses(kind.channels) == _addresses(channels):
                 return name
         key = (node.vendor_id, node.product_code, channels)
         if key not in self._added:
@@ -121,8 +129,10 @@ def _node_lines(node: NodeFacts, channels: tuple[str, ...]) -> Iterator[str]:
         yield f"product_code = 0x{node.product_code:X}"
     if channels != _DEFAULT_CHANNELS:
         guessed = any(name.count(":") > 1 for name in channels)
-        remark = "  # i: signed, u: unsigned; see its manual or EDS" if guessed else ""
+        remark = "  # i: signed, u: unsigned, f: REAL32/counts per unit; see its manual" if guessed else ""
         yield f"channels = [{', '.join(map(json.dumps, channels))}]{remark}"
+    if any(":f32/" in name for name in channels):
+        yield from _fill_in_lines([_REAL32_FILL_IN])
     yield from _fill_in_lines(_NODE_FILL_INS)
 
 
