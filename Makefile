@@ -52,7 +52,7 @@ examples: $(VENV)/.dev ## run examples/, each a control loop with a simulated gr
 
 # --- test
 
-.PHONY: test lint types unit coverage socketcan docs
+.PHONY: test lint types unit coverage socketcan docs tables
 test: ## run everything that CI runs
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan lint types docs
 	@$(MAKE) --no-print-directory unit
@@ -66,6 +66,9 @@ types: $(VENV)/.dev ## check static types
 
 docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
+
+tables: $(VENV)/.dev ## write the tables of docs/wire.md and docs/wire.schema.json from the code
+	$(BIN)/python -m handtouch.wire.tables docs
 
 unit: $(VENV)/.dev ## run all tests that need no SocketCAN
 	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

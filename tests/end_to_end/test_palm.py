@@ -8,14 +8,17 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
+import zmq
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handtouch import Robot, columns, wire
 from handtouch.config import shipped
 from handtouch.hand import urdf
+from tests.wire.schema_check import SchemaCheck
 
 LINK, MOUNT_M = "index_distal", (0.01716, 0.0, 0.00976)
 ROBOT = urdf.read_urdf(shipped.path("utah_mit.urdf"))
@@ -121,6 +124,28 @@ def test_touch_on_moving_finger_is_reported_in_palm_until_joints_are_stale(
             message = messages.recv(60)
         assert message.inputs is not None
         assert message.inputs["received"]["joints/right"] > 40
+    robot.clear()
+    _check_messages_of_all_topics(rig)
+
+
+def _check_messages_of_all_topics(rig: Any) -> None:
+    """Compare messages of every topic with the schema."""
+    check, topics = SchemaCheck("published"), {topic.prefix for topic in wire.TOPICS}
+    events: set[str] = set()
+    end_s = time.monotonic() + 60
+    with zmq.Context() as context, context.socket(zmq.SUB) as messages:
+        messages.subscribe("")
+        messages.connect(rig.endpoints["complete"])
+        while topics or events < {"begin", "update", "end"}:
+            assert messages.poll(round(1000 * (end_s - time.monotonic()))), (
+                topics,
+                events,
+                rig.all_printed(),
+            )
+            parts = messages.recv_multipart()
+            assert check.errors(parts) == []
+            topics.discard(parts[0].decode().split("/")[0])
+            events.add(msgpack.unpackb(parts[1]).get("event", ""))
 
 
 def _excess(contact: wire.Contact) -> float:

@@ -26,6 +26,7 @@ from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.worlds import WORLDS
 from tests.deployments import deployment_text, pad_text
+from tests.wire.schema_check import SchemaCheck
 
 PERIOD_MS = 5.0
 MAX_WAIT_S = 60.0
@@ -213,6 +214,11 @@ def test_fault_is_diagnosed_while_it_lasts(bench: Bench) -> None:
     bench.wait("over", lambda: any(h.t_ns > health.t_ns and not h.diagnoses for h in bench.health))
     others = [f["kind"] for h in bench.health for f in h.diagnoses if h.link != "broken"]
     assert set(others) <= {"node_replaced"}
+    check = SchemaCheck("published")
+    with connect("service", endpoint=bench.daemon.publisher.endpoints["live"], key="") as services:
+        parts = services.recv_parts(MAX_WAIT_S)
+    assert parts is not None
+    assert check.errors(parts) == check.errors(wire.encode(health)) == []
 
 
 def test_killing_the_supervisor_process_affects_no_contact_and_no_tick(bench: Bench) -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
 import typing
 from dataclasses import MISSING, fields, replace
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -115,26 +113,6 @@ def test_a_payload_on_the_topic_of_another_link_is_rejected(contact: wire.Contac
         wire.decode([f"contact/{contact.hand}/{contact.link}_other".encode(), payload])
 
 
-def test_the_documentation_describes_every_field_of_every_topic() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
-    sections = dict(re.findall(r"^## `(\w+)[^\n]*\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S))
-    for topic in wire.TOPICS:
-        described = set(re.findall(r"^\| `(\w+)`", sections[topic.prefix], flags=re.M))
-        envelope = {"v", "session", "seq", "t_ns", "retained"}
-        assert described | envelope == {field.name for field in fields(topic.payload)}, topic.prefix
-
-
-def test_the_documentation_lists_every_topic_and_status_code() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
-    for topic in wire.TOPICS:
-        name = "/".join([topic.prefix, *(f"<{key}>" for key in topic.keys)])
-        assert f"| `{name}` | {topic.published}" in text
-    codes = (wire.PadState, wire.PositionStatus, wire.ForceStatus, wire.FrameStatus)
-    for number in range(max(map(len, codes))):
-        cells = [f"`{kind(number).text}`" if number < len(kind) else "" for kind in codes]
-        assert f"| {number} | {' | '.join(cells)} |".replace("  ", " ") in text
-
-
 def test_an_error_names_the_key_the_expected_and_the_received_type() -> None:
     topic, payload = wire.encode(HEALTH)
     content = msgpack.unpackb(payload)
@@ -165,15 +143,6 @@ def test_lost_messages_are_the_gaps_within_a_session(received: list[tuple[int, i
             lost += max(0, seq - last - 1) if last is not None else 0
             last = seq
     assert tracker.lost.total() == lost
-
-
-def test_the_documentation_lists_the_type_of_every_column() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
-    kinds = {"<u1": "uint8", "<u4": "uint32", "<i8": "int64", "<f4": "float32"}
-    for topic in wire.TOPICS:
-        for name, column in wire.COLUMNS.get(topic.payload, {}).items():
-            many = f"{column.elements} " if column.elements > 1 else ""
-            assert f"| `{name}` | column of {many}{kinds[column.dtype]} |" in text
 
 
 @given(any_message, st.data())

@@ -16,16 +16,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+_TYPE_NAMES = {"<u1": "uint8", "<u4": "uint32", "<i8": "int64", "<f4": "float32"}
+
+
 @dataclass(frozen=True)
 class Column:
     """Layout of a column."""
 
     dtype: str
-    """numpy name of the element type, with its byte order"""
+    """numpy name of the element type, little-endian: <u1, <u4, <i8 or <f4"""
     elements: int = 1
     """per row"""
     codes: type[IntEnum] | None = None
     """meaning of the values, for a column of status codes"""
+
+    @property
+    def type_name(self) -> str:
+        """Name of the element type: uint8, uint32, int64 or float32."""
+        return _TYPE_NAMES[self.dtype]
 
     @property
     def row_bytes(self) -> int:

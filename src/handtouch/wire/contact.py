@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from handtouch.wire.columns import Column
+from handtouch.wire.declarations import Values
 from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus
 
 Vector3 = tuple[float, float, float]
@@ -21,64 +22,92 @@ class Contact:
 
     v: int
     session: int
-    """random number of the daemon's session; in another session, `seq` and `id` start over"""
     seq: int
-    """counts the messages of the topic, sent or not: gaps are messages lost to this subscriber"""
     t_ns: int
-    event: str
-    """begin, update or end"""
+    """the sample; in `end` the SYNC of the tick in which the contact ended"""
+    event: Annotated[str, Values("begin", "update", "end", closed=True)]
+    """`begin`, `update` or `end`"""
     id: int
-    """constant from begin to end, unique in the session"""
+    """constant from begin to end; unique in the `session`"""
     hand: str
+    """name of the hand"""
     link: str
+    """link that carries the pad"""
     frame: str
-    """frame of position_m, normal and covariance_m2: the link's name"""
+    """frame of `position_m`, `normal` and `covariance_m2`: the link's name"""
     begin_ns: int
+    """first sample above the upper threshold; `begin` is published some samples later, and describes the
+    sample at its own `t_ns`"""
     duration_s: float
+    """from `begin_ns` to `t_ns`"""
     age_s: float
-    """from the sample to the publication of this message"""
+    """age of the newest sample at publication"""
     position_m: Vector3 | None
+    """contact position in the link's frame"""
     normal: Vector3 | None
+    """outward unit normal of the pad at the position"""
     covariance_m2: Matrix3 | None
-    """of position_m, row by row"""
+    """covariance of `position_m`, row by row; singular along the normal; larger than from noise alone where
+    `residual` indicates that the contact is no point, or that gains are wrong"""
     pad_m: tuple[float, float] | None
-    """arc lengths on the pad from the electrodes x0 and y0"""
-    position_status: str
-    """PositionStatus, as text"""
+    """arc lengths on the pad, from the electrodes x0 and y0"""
+    position_status: Annotated[str, PositionStatus]
+    """status of the position"""
     force_n: float | None
+    """normal force, for a single contact patch of the radius configured in the deployment; a lower bound
+    where `force_status` is `lower_bound`"""
     force_std_n: float | None
+    """standard deviation of `force_n`; nil unless `force_status` is `valid` or `unreliable`"""
     peak_force_n: float | None
-    force_status: str
-    """ForceStatus, as text"""
+    """maximum force since the contact began"""
+    force_status: Annotated[str, ForceStatus]
+    """status of the force"""
     total_current_a: float
+    """total current of the pad"""
     residual: float | None
-    """excess of the two x currents over those of a point, part of the total; positive: elongated along x"""
+    """excess of the two x currents over those of a point contact there, as a fraction of the total; positive:
+    elongated along x"""
     residual_std: float | None
+    """its standard deviation for a point contact: beyond a few of these, the contact is not a point"""
     begin_threshold_n: float
+    """force above which a contact begins"""
     end_threshold_n: float
+    """force below which it ends"""
     calibration_id: str
-    end_reason: str
-    """released, stale, lost, faulted, off, restarted or stopped; empty before the end"""
+    """the calibration by which currents were converted to newtons"""
+    end_reason: Annotated[
+        str, Values("released", "stale", "lost", "faulted", "off", "restarted", "stopped", "")
+    ]
+    """`released`; `stale`, `lost`, `faulted` or `off` as its pad; `restarted` (the node), `stopped` (the
+    daemon); empty before the end"""
     retained: bool
-    """the current state for a late subscriber, with the latest seq of the topic"""
     group: int = 0
-    """the same for contacts that one object may bridge; 0: no scene requests palm or base"""
-    palm_status: str = FrameStatus.NOT_COMPUTED.text
-    """FrameStatus of the three that follow, as text"""
+    """the same for contacts on one hand that are so close that one object may bridge them; the id of one of
+    its contacts, constant while any of them lasts"""
+    palm_status: Annotated[str, FrameStatus] = FrameStatus.NOT_COMPUTED.text
+    """status of the three that follow"""
     palm_position_m: Vector3 | None = None
+    """in the palm's frame, with the joint positions at the sample; nil unless `palm_status` is `valid`"""
     palm_normal: Vector3 | None = None
+    """outward unit normal, in the palm's frame"""
     palm_covariance_m2: Matrix3 | None = None
-    base_status: str = FrameStatus.NOT_COMPUTED.text
-    """FrameStatus of the three that follow, as text"""
+    """covariance of `palm_position_m`, row by row; includes the stated uncertainty of mounts and joints"""
+    base_status: Annotated[str, FrameStatus] = FrameStatus.NOT_COMPUTED.text
+    """status of the three that follow"""
     base_position_m: Vector3 | None = None
+    """in the base's frame"""
     base_normal: Vector3 | None = None
+    """outward unit normal, in the base's frame"""
     base_covariance_m2: Matrix3 | None = None
+    """covariance of `base_position_m`, row by row"""
     joints_age_s: float | None = None
-    """from the sample to the nearest joint state, of the joint with the oldest one"""
+    """time from the sample to the nearest joint state, of the joint in between with the oldest one"""
     uncompensated_force_n: float | None = None
-    """without compensation of the sheet's behaviour; None where that isn't modelled"""
+    """force by the contact law alone, without compensation of the sheet's behaviour; nil where none is
+    configured"""
     diagnoses: tuple[str, ...] = ()
-    """kinds of the diagnoses (see `Health`) that make position or force unreliable or invalid"""
+    """kinds of the `diagnoses` in `health` that make position or force unreliable or invalid; absent if there
+    are none"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,41 +121,62 @@ class HandFrame:
     session: int
     seq: int
     t_ns: int
+    """the tick's SYNC; `sample_ns` has the samples"""
     tick: int
+    """number of the tick"""
     hand: str
+    """name of the hand"""
     links: tuple[str, ...]
+    """row names of all columns"""
     state: Annotated[bytes, Column("<u1", codes=PadState)]
+    """state of the pad"""
     contact_id: Annotated[bytes, Column("<u4")]
-    """0 for none"""
+    """id of the contact, 0 for none"""
     sample_ns: Annotated[bytes, Column("<i8")]
-    """sample time of each pad, 0 before the first"""
+    """time of the row's sample, 0 before the first; its age is `t_ns` minus this"""
     total_current_a: Annotated[bytes, Column("<f4")]
+    """total current of the newest sample"""
     position_m: Annotated[bytes, Column("<f4", 3)]
-    """in the link frame; this and the following are NaN without contact"""
+    """in the link's frame; this and the following are NaN without contact"""
     normal: Annotated[bytes, Column("<f4", 3)]
+    """outward unit normal of the pad at the position"""
     covariance_m2: Annotated[bytes, Column("<f4", 9)]
-    """of position_m, row by row"""
+    """covariance of `position_m`, row by row"""
     pad_m: Annotated[bytes, Column("<f4", 2)]
-    """arc lengths on the pad"""
+    """arc lengths on the pad, from the electrodes x0 and y0"""
     position_status: Annotated[bytes, Column("<u1", codes=PositionStatus)]
+    """status of the position"""
     force_n: Annotated[bytes, Column("<f4")]
+    """normal force"""
     force_std_n: Annotated[bytes, Column("<f4")]
-    """NaN where force_n is a lower bound or NaN"""
+    """its standard deviation; NaN where `force_n` is a lower bound"""
     force_status: Annotated[bytes, Column("<u1", codes=ForceStatus)]
+    """status of the force"""
     residual: Annotated[bytes, Column("<f4")]
+    """as in `contact`"""
     residual_std: Annotated[bytes, Column("<f4")]
+    """as in `contact`"""
     retained: bool
     group: Annotated[bytes, Column("<u4")] = b""
-    """0 for none; this and the following are optional, as in `Contact`"""
+    """as in `contact`, 0 without contact"""
     palm_status: Annotated[bytes, Column("<u1", codes=FrameStatus)] = b""
+    """status in the palm's frame"""
     palm_position_m: Annotated[bytes, Column("<f4", 3)] = b""
+    """in the palm's frame"""
     palm_normal: Annotated[bytes, Column("<f4", 3)] = b""
+    """outward unit normal, in the palm's frame"""
     palm_covariance_m2: Annotated[bytes, Column("<f4", 9)] = b""
+    """covariance of `palm_position_m`, row by row"""
     base_status: Annotated[bytes, Column("<u1", codes=FrameStatus)] = b""
+    """status in the base's frame"""
     base_position_m: Annotated[bytes, Column("<f4", 3)] = b""
+    """in the base's frame"""
     base_normal: Annotated[bytes, Column("<f4", 3)] = b""
+    """outward unit normal, in the base's frame"""
     base_covariance_m2: Annotated[bytes, Column("<f4", 9)] = b""
+    """covariance of `base_position_m`, row by row"""
     joints_age_s: Annotated[bytes, Column("<f4")] = b""
+    """as in `contact`"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,29 +187,33 @@ class Percept:
     session: int
     seq: int
     t_ns: int
+    """publication"""
     hand: str
-    kind: str
-    """motion, stiffness, shape, texture or action_request"""
+    """name of the hand"""
+    kind: Annotated[str, Values(*PERCEPT_KINDS, "action_request")]
+    """as in the topic"""
     link: str
-    """link of its contact; empty: the whole hand"""
+    """link that carries the pad; empty: the whole hand"""
     contact_id: int
-    """0 for none"""
-    state: str
-    """undetermined (reason says what is missing), estimated or invalid; action request: open"""
+    """id of the contact, 0 for none"""
+    state: Annotated[str, Values("undetermined", "estimated", "invalid", "open")]
+    """`undetermined`: too little data yet, `reason` states what is missing; `estimated`; `invalid`; of an
+    action request `open`"""
     label: str
-    """the most probable class; action request: the action; empty where there are no classes"""
+    """the most probable class, of an action request the action; empty where there are no classes"""
     confidence: float | None
-    """probability of the label"""
-    probabilities: dict[str, Any]
-    """class -> probability; action request: the hypotheses that it would separate"""
+    """probability of `label`"""
+    probabilities: Annotated[dict[str, Any], dict[str, float]]
+    """class -> probability; of an action request: the hypotheses that it would separate"""
     values: dict[str, Any]
-    """by name with its unit; action request: parameters of the action"""
-    evidence: dict[str, Any]
-    """counts of what it is based on"""
+    """name, ending with its unit, -> float, list of floats, str or nil; of an action request: the action's
+    parameters and `expected_information_bits`"""
+    evidence: Annotated[dict[str, Any], dict[str, float]]
+    """counts of what the estimate is based on: `samples`, `contacts`, `span_s` ..."""
     reason: str
-    """what is missing, or why the action is requested, as text"""
+    """what is missing; of an action request: why it is requested, as text"""
     retained: bool
     question: str = ""
-    """this and the next of an action request only: the question that the action would answer"""
+    """of an action request only: the question that it would answer"""
     expires_ns: int = 0
-    """the request is void from then on"""
+    """of an action request only: it is void from then on"""

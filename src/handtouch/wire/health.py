@@ -1,9 +1,13 @@
-"""Payloads about the state of pads, joints and the daemon: `Health`, `JointPositions`, `Service`."""
+"""Payloads about the state of pads and joints: `Health`, `JointPositions`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from handtouch.wire.declarations import Values
+from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.status import PadState
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,41 +18,60 @@ class Health:
     session: int
     seq: int
     t_ns: int
+    """publication"""
     hand: str
+    """name of the hand"""
     link: str
+    """link that carries the pad"""
     bus: str
+    """bus of its node, as named in the deployment"""
     node_id: int
-    state: str
-    """PadState, as text"""
-    node_state: str
-    """absent, booting, identified, configuring, settling, operational, stale, faulted or stopped"""
+    """CANopen node id"""
+    state: Annotated[str, PadState]
+    """state of the pad"""
+    node_state: Annotated[
+        str,
+        Values(
+            *("absent", "booting", "identified", "configuring", "settling"),
+            *("operational", "stale", "faulted", "stopped"),
+        ),
+    ]
+    """`absent`, `booting`, `identified`, `configuring`, `settling`, `operational`, `stale`, `faulted` or
+    `stopped`"""
     node_state_since_ns: int
-    """when the node entered this state"""
-    sampling: str
-    """sync: samples with every SYNC; event: on change; off: switched off"""
+    """when the node entered that state"""
+    sampling: Annotated[str, Values("sync", "event", "off")]
+    """`sync`: with every SYNC; `event`: on change and ten times a second, while untouched; `off`: switched
+    off"""
     reason: str
     """cause and remedy as text; empty without a fault"""
     serial: int | None
+    """the node's serial number (0x1018 sub 4), once read"""
     rate_hz: float
-    """samples per second over the last second"""
+    """samples per second, over the last second"""
     samples: int
+    """since the daemon started"""
     missed_samples: int
-    """ticks without the sample of their SYNC: late or lost"""
+    """ticks without the sample of their SYNC: it was late, for the next tick, or lost"""
     age_s: float | None
+    """age of the newest sample"""
     reboots: int
     """boot-up messages of its node after the first"""
     heartbeats_missed: int
+    """heartbeats of its node that timed out"""
     emergencies: tuple[str, ...]
     """latest EMCY messages as text, newest last"""
     retained: bool
-    calibration_state: str = ""
-    """default, calibrated, quarantined or manual_required; this and the next are empty without supervision"""
+    calibration_state: Annotated[str, Values("default", "calibrated", "quarantined", "manual_required")] = ""
+    """`default`: the deployment's values; `calibrated`; `quarantined`: not relied on after its node was
+    replaced; `manual_required`: automatic calibration failed. This and the following are absent where
+    `[daemon] supervise` is false"""
     calibration_id: str = ""
-    """the active calibration, as in its contacts"""
+    """the active calibration, as in `contact`"""
     calibration_progress: str = ""
     """progress of the automatic calibration, as text"""
-    diagnoses: tuple[dict[str, Any], ...] = ()
-    """maps of kind, cause, evidence, remedy, since_ns, confidence, pad_m, size_m"""
+    diagnoses: Annotated[tuple[dict[str, Any], ...], tuple[Diagnosis, ...]] = ()
+    """active diagnoses"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,55 +82,13 @@ class JointPositions:
     session: int
     seq: int
     t_ns: int
+    """publication, and the time at which the joints have these positions"""
     hand: str
+    """name of the hand"""
     names: tuple[str, ...]
-    """joints that move the hand's links, as named in the URDF"""
+    """joints that move its links, as named in the URDF"""
     position_rad: tuple[float | None, ...]
-    """in the order of names; metres for a prismatic joint, None without any joint state"""
+    """in the order of `names`; metres for a prismatic joint, nil without any joint state"""
     age_s: tuple[float | None, ...]
-    """of the nearest joint state"""
+    """age of the nearest joint state"""
     retained: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Service:
-    """`service`: the daemon's heartbeat, twice a second; after three missed ones it is disconnected."""
-
-    v: int
-    session: int
-    seq: int
-    t_ns: int
-    wall_offset_ns: int
-    """add to a t_ns for nanoseconds since 1970 UTC"""
-    version: str
-    pid: int
-    uptime_s: float
-    period_s: float
-    hands: dict[str, Any]
-    """hand -> list of its links"""
-    ticks: int
-    overruns: int
-    """periods without a tick because the daemon was late"""
-    rate_hz: float
-    tick_us: dict[str, Any]
-    """median, p99 and max of the last half second's ticks, from the last sample to the last message"""
-    loop: dict[str, Any]
-    """time of the loop's stages: histograms, and the stages that made ticks late"""
-    contacts: int
-    """begun since the daemon started"""
-    rejected: dict[str, Any]
-    """cause -> rejected connections and requests"""
-    process: dict[str, Any]
-    """memory, CPU time, garbage collections, suppressed log messages"""
-    buses: dict[str, Any]
-    """bus -> load (fraction of the bit rate) and counters by cause"""
-    congestion_episodes: dict[str, Any]
-    """stream -> times that a message found the queue of a subscriber full"""
-    subscriptions: tuple[str, ...]
-    retained: bool
-    supervisor: dict[str, Any] | None = None
-    """state of the supervisor process; None without supervision"""
-    inputs: dict[str, Any] | None = None
-    """statistics of the inputs endpoint: received, age_s, dropped, problem"""
-    stopping: bool = False
-    """the last message of the session: the daemon was asked to stop"""

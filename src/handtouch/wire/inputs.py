@@ -30,21 +30,29 @@ _HANDS_PREFIX = "hands/"
 class JointState:
     """`joints/<hand>`: measured joint positions; any subset of the hand's joints, and other joints too.
 
-    Raises ValueError for values that violate the contract.
+    Arrays are (m,), `gravity` is (3,). Raises ValueError for values that violate the contract.
     """
 
     hand: str
     t_ns: int | None
-    """time of the measurement; None: when the daemon receives it"""
+    """time of the measurement, on the monotonic clock of the daemon's machine (`CLOCK_MONOTONIC`); nil: when
+    the daemon reads it"""
     names: tuple[str, ...]
+    """joints, as named in the URDF or as the deployment names them for joint states; any subset, unknown ones
+    are ignored"""
     position_rad: FloatArray
-    """(m,) in the order of `names`, as the following; metres for a prismatic joint"""
+    """in the order of `names`; metres for a prismatic joint. The message is dropped if a position exceeds a
+    limit in the URDF by more than the range between the limits, as degrees do"""
     velocity_rad_s: FloatArray | None = None
+    """used to extrapolate beyond the newest state"""
     effort_nm: FloatArray | None = None
+    """torque in newton metres, for a prismatic joint newtons; not used"""
     position_std_rad: FloatArray | None = None
-    """standard deviations of position_rad; included in the covariances in palm and base frame"""
+    """standard deviations, above 0; included in `palm_covariance_m2` and `base_covariance_m2` instead of the
+    deployment's values"""
     gravity: FloatArray | None = None
-    """(3,) direction of gravity in the frame of the hand's base, of any length; for a base that moves"""
+    """x, y, z: direction of gravity in the frame of the hand's base, of any length; for a base that moves,
+    instead of the deployment's `gravity`"""
 
     def __post_init__(self) -> None:
         _check_time(self.t_ns)
@@ -58,17 +66,18 @@ class JointState:
 
 @dataclass(frozen=True, slots=True)
 class JointCommand:
-    """`command/<hand>`: commanded joint positions, for hands without joint encoders.
+    """`command/<hand>`: commanded joint positions (m,), for hands without joint encoders.
 
     Raises ValueError for values that violate the contract.
     """
 
     hand: str
     t_ns: int | None
-    """time from which the command is in effect"""
+    """time from which the command is in effect, as above"""
     names: tuple[str, ...]
+    """as above"""
     position_rad: FloatArray
-    """(m,) in the order of `names`; metres for a prismatic joint"""
+    """as above"""
 
     def __post_init__(self) -> None:
         _check_time(self.t_ns)
@@ -78,17 +87,20 @@ class JointCommand:
 
 @dataclass(frozen=True, slots=True)
 class LinkForces:
-    """`force/<hand>`: reference forces on links, from another sensor or from joint torques.
+    """`force/<hand>`: reference forces (m,) on links, from another sensor or from joint torques.
 
     Raises ValueError for values that violate the contract.
     """
 
     hand: str
     t_ns: int | None
+    """time of the measurement, as above"""
     links: tuple[str, ...]
     """links that carry pads"""
     force_n: FloatArray
+    """normal force on each; at most 3 `std_n` below 0"""
     std_n: FloatArray
+    """its standard deviation, above 0"""
 
     def __post_init__(self) -> None:
         _check_time(self.t_ns)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict
 
 from handtouch.wire.columns import Column
 from handtouch.wire.status import PadState
@@ -17,12 +17,17 @@ class Raw:
     session: int
     seq: int
     t_ns: int
+    """the tick's SYNC; `sample_ns` has the samples"""
     tick: int
+    """number of the tick"""
     hand: str
+    """name of the hand"""
     links: tuple[str, ...]
+    """row names of all columns"""
     counts: Annotated[bytes, Column("<i8", 4)]
-    """x0, xa, y0, yb"""
+    """electrodes x0, xa, y0, yb; for any width of the node's channels"""
     sample_ns: Annotated[bytes, Column("<i8")]
+    """time of the row's sample, 0 before the first"""
     fresh: Annotated[bytes, Column("<u1")]
     """1 where the sample belongs to this tick"""
     retained: bool
@@ -39,28 +44,35 @@ class TickInputs:
     session: int
     seq: int
     t_ns: int
-    """SYNC of the tick's cycle"""
+    """the tick's SYNC"""
     tick: int
+    """number of the tick"""
     previous_sync_ns: int
-    """SYNC of the previous cycle"""
+    """SYNC of the cycle before that of `t_ns`"""
     now_ns: int
     """time of the tick"""
     cycle_end_ns: int | None
-    """samples that arrived from then on belong to the next cycle"""
+    """samples that arrived from then on belong to the next cycle; nil: none"""
     stopped: bool
-    """no tick, but the end of all contacts because the daemon stopped"""
+    """no tick, but the end of all contacts because the daemon stops"""
     counts: Annotated[bytes, Column("<i8", 4)]
+    """as in `raw`"""
     arrival_ns: Annotated[bytes, Column("<i8")]
+    """arrival of the newest sample, 0 before the first"""
     fresh: Annotated[bytes, Column("<u1")]
+    """as in `raw`"""
     node_state: Annotated[bytes, Column("<u1", codes=PadState)]
-    """CLEAR where the node is operational, else the resulting state of its pad"""
+    """0 where the node is operational, else the resulting state of its pad"""
     synchronous: Annotated[bytes, Column("<u1")]
+    """1 where the node samples with SYNC"""
     period_ns: Annotated[bytes, Column("<i8")]
+    """maximum time between two samples"""
     period_since_ns: Annotated[bytes, Column("<i8")]
+    """since when `period_ns` is valid"""
     limits: bytes | None
-    """int64 x 8: lower, then upper limits of the four channels, in counts; None: unchanged"""
+    """8 int64 per pad: limits of the four channels' ranges, all lower ones first; nil: unchanged"""
     extra_inputs: dict[str, Any]
-    """inputs of other kinds, by name"""
+    """other inputs, by name; those without any are left out"""
     retained: bool
 
 
@@ -72,12 +84,33 @@ class StateSnapshot:
     session: int
     seq: int
     t_ns: int
+    """publication"""
     tick: int
+    """number of that tick"""
     state: bytes
-    """msgpack map: path of each value in the pipeline -> value; valid for the same build only"""
+    """msgpack map of every value inside the pipeline by its path; valid for the same build only"""
     limits: bytes
     """as in `tick`"""
     retained: bool
+
+
+class BuildInfo(TypedDict):
+    """`build`: what decides on the last bit of a result."""
+
+    handtouch: str
+    """version of handtouch"""
+    source: str
+    """hash of its code"""
+    python: str
+    """version of Python"""
+    numpy: str
+    """version of numpy"""
+    scipy: str
+    """version of scipy"""
+    processor: str
+    """name of the processor"""
+    features: list[str]
+    """features of the processor that are used"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +121,11 @@ class Config:
     session: int
     seq: int
     t_ns: int
+    """publication"""
     deployment: str
-    """as JSON, with the keys of the deployment file"""
-    files: dict[str, Any]
-    """path of each file named in the deployment -> its bytes"""
-    build: dict[str, Any]
-    """versions of handtouch and of the numerical libraries, and the processor"""
+    """JSON, with the keys of the deployment file"""
+    files: Annotated[dict[str, Any], dict[str, bytes]]
+    """path of each EDS and URDF that it names -> its bytes"""
+    build: Annotated[dict[str, Any], BuildInfo]
+    """versions and processor"""
     retained: bool

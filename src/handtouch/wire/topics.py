@@ -14,8 +14,9 @@ from typing import Any, cast
 
 from handtouch.wire.columns import Column, columns_of
 from handtouch.wire.contact import Contact, HandFrame, Percept
-from handtouch.wire.health import Health, JointPositions, Service
+from handtouch.wire.health import Health, JointPositions
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
+from handtouch.wire.service import Service
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +79,17 @@ class Topic:
         return lambda message: f"{prefix}/{first(message)}/{second(message)}"
 
 
-JOINTS = Topic("joints", JointPositions, ("hand",), "while the hand has a URDF", min_period_s=0.033)
-SERVICE = Topic("service", Service, (), "twice a second", period_s=0.5, min_period_s=0.5)
+JOINTS = Topic(
+    "joints", JointPositions, ("hand",), "at most 30 a second, while the hand has a URDF", min_period_s=0.033
+)
+SERVICE = Topic("service", Service, (), "twice a second; timeout 1.5 s", period_s=0.5, min_period_s=0.5)
 TOPICS = (
-    Topic("contact", Contact, ("hand", "link"), "at begin and end of a contact, and per tick in between"),
+    Topic(
+        "contact",
+        Contact,
+        ("hand", "link"),
+        "at begin and end of a contact; in between per tick, or at the scene's rate",
+    ),
     Topic("hand", HandFrame, ("hand",), "per tick"),
     Topic("health", Health, ("hand", "link"), "at every change, and once a second", period_s=1.0),
     Topic("percept", Percept, ("hand", "kind"), "at every change, and while a contact lasts"),

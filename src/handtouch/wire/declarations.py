@@ -1,0 +1,122 @@
+"""Declarations of payload fields: type, meaning and values.
+
+Public names: `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`,
+`input_fields`, `is_array`.
+
+The declarations are the only source of the tables in docs/wire.md (`handtouch.wire.tables`) and of
+docs/wire.schema.json (`handtouch.wire.schema`). A field's docstring is its meaning. Metadata refine the type
+that the code sees:
+
+    state: Annotated[str, PadState]                           # texts of a status
+    event: Annotated[str, Values("begin", "update", "end")]   # names
+    force_n: Annotated[bytes, Column("<f4")]                  # a column
+    buses: Annotated[dict[str, Any], dict[str, BusStatistics]]    # maps inside of a map
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+import types
+import typing
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from typing import Annotated, Any, NamedTuple, Union
+
+from handtouch.wire.columns import Column
+
+
+class Values:
+    """Values of a text field; a later version may add some unless they are `closed`."""
+
+    def __init__(self, *names: str, closed: bool = False) -> None:
+        self.names, self.closed = names, closed
+
+
+class FieldDeclaration(NamedTuple):
+    """A field of a payload, or of a map inside of one."""
+
+    name: str
+    hint: Any
+    """precise type, without None"""
+    is_nilable: bool
+    is_optional: bool
+    """absent from the map where it has its default"""
+    meaning: str
+    column: Column | None
+    values: Values | None
+    codes: type[Enum] | None
+    """status codes, of a column or as text"""
+
+
+def declared_fields(kind: type[Any]) -> tuple[FieldDeclaration, ...]:
+    """Return the fields of a dataclass or TypedDict, in order; its source must be readable."""
+    meanings = _docstrings(kind)
+    hints = typing.get_type_hints(kind, include_extras=True)
+    if is_dataclass(kind):
+        optional = {field.name for field in fields(kind) if field.default is not MISSING}
+    else:
+        optional = set(kind.__optional_keys__)
+    return tuple(_declaration(name, hint, name in optional, meanings) for name, hint in hints.items())
+
+
+def inner_fields(kind: type[Any]) -> tuple[FieldDeclaration, ...]:
+    """Return the keys of a map inside of a payload; of a dataclass all are present, unlike in a payload."""
+    declared = declared_fields(kind)
+    return tuple(field._replace(is_optional=False) for field in declared) if is_dataclass(kind) else declared
+
+
+def input_fields(kind: type[Any]) -> tuple[FieldDeclaration, ...]:
+    """Return the keys of a message that a robot sends; its hand is in the topic, not in the map."""
+    version = FieldDeclaration("v", int, False, False, "schema version", None, None, None)
+    declared = (field for field in declared_fields(kind) if field.name != "hand")
+    return version, *(field._replace(is_optional=field.is_nilable) for field in declared)
+
+
+def is_array(hint: Any) -> bool:
+    """Return True for the type of a numpy array, without importing numpy."""
+    return getattr(typing.get_origin(hint), "__name__", "") == "ndarray"
+
+
+def _declaration(name: str, hint: Any, is_optional: bool, meanings: dict[str, str]) -> FieldDeclaration:
+    column: Column | None = None
+    values: Values | None = None
+    codes: type[Enum] | None = None
+    is_nilable, hint = _without_none(hint)
+    if typing.get_origin(hint) is Annotated:
+        hint, *metadata = typing.get_args(hint)
+        for extra in metadata:
+            if isinstance(extra, Column):
+                column, codes = extra, extra.codes
+            elif isinstance(extra, Values):
+                values = extra
+            elif isinstance(extra, type) and issubclass(extra, Enum):
+                codes = extra
+            else:
+                hint = extra
+    also_nilable, hint = _without_none(hint)
+    meaning = meanings.get(name, "")
+    return FieldDeclaration(
+        name, hint, is_nilable or also_nilable, is_optional, meaning, column, values, codes
+    )
+
+
+def _without_none(hint: Any) -> tuple[bool, Any]:
+    """Return whether a type includes None, and the type without it."""
+    if typing.get_origin(hint) not in (Union, types.UnionType):
+        return False, hint
+    (other,) = (argument for argument in typing.get_args(hint) if argument is not type(None))
+    return True, other
+
+
+def _docstrings(kind: type[Any]) -> dict[str, str]:
+    """Return the docstrings of a class' attributes, each on one line."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for attribute, text in zip(definition.body, definition.body[1:], strict=False):
+        match attribute, text:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(docstring))):
+                found[name] = " ".join(docstring.split())
+    return found
