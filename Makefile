@@ -91,7 +91,7 @@ stress: ## run sweeps that are too slow for the tests
 bench soak stress: $(VENV)/.dev
 	@set -e; for program in benchmarks/$@_$(ONLY).py; do \
 		test -e "$$program" || { echo "there is no $$program"; exit 1; }; \
-		echo "== $$program"; $(BIN)/python "$$program" $(ARGS); done
+		echo "== $$program"; PYTHONPATH=. $(BIN)/python "$$program" $(ARGS); done
 
 # --- maintain
 

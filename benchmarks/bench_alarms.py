@@ -44,7 +44,7 @@ LINGER_S = 5.0
 BLOCK_S = 0.5
 IN_USE = 0.15
 """Of the time that the hand is in use, pauses of seconds included."""
-_TABLES: dict[int, Any] = {}
+_TABLES: dict[Any, Any] = {}
 Place = tuple[float, float]
 Spans = list[tuple[float, float]]
 

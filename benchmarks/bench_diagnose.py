@@ -45,7 +45,7 @@ NAMES = (*FAULTY, *FAULT_FREE)
 NOTHING = "nothing"
 SETTLED_S = 15.0
 """Time from the naming of a fault to the end of its episode, without a wrong diagnosis."""
-_TABLES: dict[int, Any] = {}
+_TABLES: dict[Any, Any] = {}
 _MODEL: list[DiagnosisModel] = []
 
 

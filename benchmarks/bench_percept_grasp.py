@@ -25,7 +25,6 @@ from handtouch import wire
 from handtouch.config import Deployment, load, shipped
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad
-from handtouch.simulate.grasp.projection import project_to_surface
 from handtouch.simulate.grasp.simulation import GraspRecord
 
 FloatArray = NDArray[np.float64]
@@ -71,12 +70,8 @@ def speeds(grasp: GraspRecord) -> FloatArray:
     normal = np.empty_like(point)
     for row, model_pad in enumerate(grasp.pads):
         at_pad = pad == row
-        on_pad = (
-            project_to_surface(
-                model_pad.shape, (on_link[at_pad] - model_pad.translation_m) @ model_pad.rotation
-            ).normal
-            @ model_pad.rotation.T
-        )
+        foot = model_pad.shape.project((on_link[at_pad] - model_pad.translation_m) @ model_pad.rotation)
+        on_pad = foot.normal @ model_pad.rotation.T
         normal[at_pad] = np.einsum("kij,kj->ki", grasp.link_rotation[step[at_pad], row], on_pad)
     force = np.maximum(-np.einsum("ki,ki->k", grasp.force_n[on_pads], normal), 0.0)
     relative = object_velocity - link

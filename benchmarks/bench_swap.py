@@ -35,6 +35,7 @@ from handtouch.supervisor.ipc import (
     pack_serials,
 )
 from handtouch.supervisor.worker import SupervisorWorker
+from tests.deployments import deployment_text, pad_text
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -52,46 +53,19 @@ TICKS = 12
 PERIOD_NS = 5_000_000
 STEP_S = (TICKS + 1) * PERIOD_NS * 1e-9
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
-DEPLOYMENT = """
-[[bus]]
-name = "can0"
-interface = "virtual"
-channel = "bench"
-
-[node.n]
-drive_v = 5.0
-full_scale_ma = 10.0
-noise_counts = 2.0
-
-[sheet.s]
-ohm_per_square = 2400.0
-contact_ohm_mm2 = 20000.0
-alpha = 1.5
-contact_radius_mm = 2.0
-contact_radius_std_mm = 0.4
-
-[[hand]]
-name = "h"
-"""
-PAD = """
-[[hand.pad]]
-link = "{link}"
-bus = "can0"
-node_id = {node_id}
-node = "n"
-sheet = "s"
-surface = {{ kind = "plane", length_mm = {length}, width_mm = 20.0 }}
-gap_mm = 0.6
-"""
 
 
 def deployment_of(units: int) -> config.Deployment:
     """Return a deployment with this many pads of each shape."""
     rows = [(shape, unit) for shape in SHAPES for unit in range(units)]
-    pads = "".join(
-        PAD.format(link=f"p{k}", node_id=k + 1, length=SHAPES[shape]) for k, (shape, _) in enumerate(rows)
+    pads = [
+        pad_text(f"p{k}", k + 1, f'{{ kind = "plane", length_mm = {SHAPES[shape]}, width_mm = {WIDTH_MM} }}')
+        for k, (shape, _) in enumerate(rows)
+    ]
+    text = deployment_text(
+        *pads, daemon="", noise_counts=2.0, contact_radius_mm=2.0, contact_radius_std_mm=0.4, touch=""
     )
-    return config.parse(DEPLOYMENT + pads)
+    return config.parse(text)
 
 
 def touches(model: PadModel, count: int, seed: int) -> Scenario:
@@ -184,7 +158,7 @@ def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
         model.ampere_per_count.copy(),
         model.noise_counts,
     )
-    trust = ["nominal"] * model.size
+    trust = ["default"] * model.size
     deviation = np.full(model.size, np.nan)
     taken: dict[int, tuple[FloatArray, list[str], FloatArray]] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -218,7 +192,7 @@ def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                     "position error, rms mm": float(np.sqrt(np.mean(error[own] ** 2))),
                     "95 % below, mm": float(np.quantile(error[own], 0.95)),
                     "with the true gains, rms mm": float(np.sqrt(np.mean(least[own] ** 2))),
-                    "calibrated, %": 100 * state[own].count("trusted") / units,
+                    "calibrated, %": 100 * state[own].count("calibrated") / units,
                     "stated std of the gains, %": _percent(float(np.mean(std[own]))),
                 }
             )

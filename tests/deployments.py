@@ -1,6 +1,8 @@
-"""Text of small deployments for tests: one virtual bus, one kind of node, one sheet, one hand `h`."""
+"""Text of small deployments for tests and benchmarks: one kind of node, one sheet, one hand."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 PLANE = '{ kind = "plane", length_mm = 30.0, width_mm = 24.0 }'
 CYLINDER = '{ kind = "cylinder", radius_mm = 10.0, length_mm = 30.0, arc_deg = 150.0 }'
@@ -21,17 +23,22 @@ def deployment_text(
     contact_radius_mm: float = 2.5,
     contact_radius_std_mm: float = 0.5,
     touch: str = TOUCH,
+    buses: Mapping[str, str] | None = None,
+    hand: str = "h",
 ) -> str:
-    """Return the text of a deployment with pads of `pad_text`; `daemon`, `touch`: keys of these tables."""
+    """Return the text of a deployment with pads of `pad_text`; `daemon`, `touch`: keys of these tables.
+
+    `buses`: channels by name; one bus `can0` at `channel` if left out.
+    """
+    bus_tables = "".join(
+        f'[[bus]]\nname = "{name}"\ninterface = "virtual"\nchannel = "{at}"\n\n'
+        for name, at in (buses or {"can0": channel}).items()
+    )
     return f"""
 [daemon]
 {daemon}
 
-[[bus]]
-name = "can0"
-interface = "virtual"
-channel = "{channel}"
-
+{bus_tables}
 [node.n]
 drive_v = 5.0
 full_scale_ma = {full_scale_ma}
@@ -48,20 +55,22 @@ contact_radius_std_mm = {contact_radius_std_mm}
 {touch.strip()}
 
 [[hand]]
-name = "h"
+name = "{hand}"
 """ + "".join(pads)
 
 
-def pad_text(link: str, node_id: int, surface: str = PLANE, extra: str = "") -> str:
+def pad_text(
+    link: str, node_id: int, surface: str = PLANE, extra: str = "", *, bus: str = "can0", gap_mm: float = 0.6
+) -> str:
     """Return the table of a pad; `extra`: further keys, one per line."""
     return f"""
 [[hand.pad]]
 link = "{link}"
-bus = "can0"
+bus = "{bus}"
 node_id = {node_id}
 node = "n"
 sheet = "s"
 surface = {surface}
-gap_mm = 0.6
+gap_mm = {gap_mm}
 {extra}
 """

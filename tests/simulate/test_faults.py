@@ -72,10 +72,8 @@ def currents(
     full_ma: float = FULL_MA,
 ) -> NDArray[np.float64]:
     """Return counts of the flat pad, with a converter too fine for rounding to matter."""
-    node = deployment.nodes["plain"]
-    fine = deployment.model_copy(
-        update={"nodes": {"plain": node.model_copy(update={"full_scale_ma": full_ma})}}
-    )
+    node = deployment.nodes["n"]
+    fine = deployment.model_copy(update={"nodes": {"n": node.model_copy(update={"full_scale_ma": full_ma})}})
     counts = VirtualHand(fine, scenario, CALM, faults=faults).counts(0, [t_s])[0]
     return np.asarray(counts, np.float64)
 
@@ -91,7 +89,7 @@ def test_dead_electrode_leaves_all_current_to_the_other_three(
     assert abs(left[electrode]) <= 1
     assert (left[others] > whole[others]).all()
     assert 0.85 * whole.sum() < left.sum() <= whole.sum()  # a little less, through more sheet
-    conductance = electrode_network(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
+    conductance = electrode_network(deployment.hands[0].pads[0], deployment.sheets["s"]).conductance
     taken = conductance[electrode, others] / -conductance[electrode, electrode]
     shares = (whole[others] + taken * whole[electrode]) / whole.sum()  # Kirchhoff at the floating electrode
     assert shares.sum() == pytest.approx(1, abs=1e-3)
@@ -121,7 +119,7 @@ def test_electrode_shorted_to_layer_saturates_and_drives_neighbours_without_cont
     hand = VirtualHand(deployment, FAR, CALM, faults=(on_flat(ShortedElectrode, electrode="x0"),))
     counts = hand.counts(0, HELD)[0]
     assert counts[0] == 32767
-    conductance = electrode_network(deployment.hands[0].pads[0], deployment.sheets["firm"]).conductance
+    conductance = electrode_network(deployment.hands[0].pads[0], deployment.sheets["s"]).conductance
     drive = counts[1:] * 10e-3 / 32767 * 2400.0 / -conductance[0, 1:]
     assert np.ptp(drive) < 1e-2 * drive.mean()  # one potential drives all three
     assert 4.5 < drive.mean() < 5.0  # all of the supply but what the short takes
@@ -161,7 +159,7 @@ def test_torn_off_area_senses_nothing(deployment: config.Deployment) -> None:
 
 def residual(deployment: config.Deployment, counts: NDArray[np.float64]) -> float:
     """Return the residual of a point contact fitted to the four currents, relative to their sum."""
-    network = electrode_network(deployment.hands[0].pads[0], deployment.sheets["firm"])
+    network = electrode_network(deployment.hands[0].pads[0], deployment.sheets["s"])
     found = network.estimate(counts, 1.0)
     expected = network.fractions(found.x, found.y)
     return float(np.abs(counts / counts.sum() - expected / expected.sum()).max())

@@ -32,7 +32,6 @@ from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad, MujocoScene
 from handtouch.simulate.grasp.patches import ContactPatches, clip_to_pad, contact_patches
-from handtouch.simulate.grasp.projection import project_to_surface
 from handtouch.simulate.grasp.simulation import GraspRecord, hand_contacts, simulate_grasp
 from handtouch.simulate.pad_geometry import simulated_surface
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -79,7 +78,7 @@ def test_point_above_a_surface_projects_to_its_foot(
     shape = simulated_surface(pad.surface)
     at = x * shape.length_m, y * shape.arc
     normal = shape.normal(*at)
-    found = project_to_surface(shape, (shape.point(*at) + height_m * normal)[None])
+    found = shape.project((shape.point(*at) + height_m * normal)[None])
     np.testing.assert_allclose(found.fraction[0], (x, y), atol=1e-12)
     np.testing.assert_allclose(found.height_m[0], height_m, atol=1e-12)
     np.testing.assert_allclose(found.normal[0], normal, atol=1e-12)

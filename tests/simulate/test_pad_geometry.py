@@ -7,7 +7,6 @@ import pytest
 
 from handtouch.config import SurfaceTable
 from handtouch.field.surface import SURFACES
-from handtouch.simulate.grasp.projection import project_to_surface
 from handtouch.simulate.pad_geometry import simulated_surface
 from tests.simulate.surfaces import SURFACE_TABLES
 
@@ -46,7 +45,7 @@ def test_point_above_a_surface_projects_to_its_foot(table: SurfaceTable) -> None
     for x, y in ((0.5, 0.5), (0.1, 0.9), (0.7, 0.3)):
         s, phi = x * shape.length_m, y * shape.arc
         above = shape.point(s, phi) + 1e-3 * shape.normal(s, phi)
-        foot = project_to_surface(shape, above[None])
+        foot = shape.project(above[None])
         np.testing.assert_allclose(foot.fraction[0], (x, y), atol=1e-7)
         np.testing.assert_allclose(foot.height_m, 1e-3, atol=1e-8)
         np.testing.assert_allclose(foot.normal[0], shape.normal(s, phi), atol=1e-6)

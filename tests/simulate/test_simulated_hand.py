@@ -161,10 +161,10 @@ def test_unsupported_deployment_is_rejected_before_any_node_starts(
         )
     eds = tmp_path / "other.eds"
     eds.write_text("[FileInfo]\nFileName=other.eds\n[DeviceInfo]\nVendorName=x\n")
-    node = deployment.nodes["plain"].model_copy(update={"eds": str(eds)})
+    node = deployment.nodes["n"].model_copy(update={"eds": str(eds)})
     with pytest.raises(ValueError, match="has no objects"):
         SimulatedHand.open(
-            deployment.model_copy(update={"nodes": {"plain": node}}), Scenario.tour(deployment), IDEAL
+            deployment.model_copy(update={"nodes": {"n": node}}), Scenario.tour(deployment), IDEAL
         )
 
 

@@ -98,7 +98,7 @@ def test_current_rises_with_force_up_to_full_scale(deployment: config.Deployment
     ]
     assert totals == sorted(totals)
     strong = deployment.model_copy(
-        update={"nodes": {"plain": deployment.nodes["plain"].model_copy(update={"drive_v": 500.0})}}
+        update={"nodes": {"n": deployment.nodes["n"].model_copy(update={"drive_v": 500.0})}}
     )
     assert VirtualHand(strong, press("flat", (0.05, 0.5), 10.0), IDEAL).sample(10.0)[0, 0] == 32767
 
@@ -156,7 +156,7 @@ def test_ideal_parts_are_as_configured(deployment: config.Deployment) -> None:
     assert part.gain_ratio == (1, 1, 1, 1)
     assert part.series_ohm == pad.series_ohm
     assert part.gap_before_mm == part.gap_after_mm == (pad.gap_mm,) * 4
-    assert IDEAL.contact(deployment.sheets["firm"], 7).radius_mm == 2.0
+    assert IDEAL.contact(deployment.sheets["s"], 7).radius_mm == 2.0
 
 
 def test_contact_radii_have_configured_spread(deployment: config.Deployment) -> None:
@@ -165,7 +165,7 @@ def test_contact_radii_have_configured_spread(deployment: config.Deployment) -> 
             WORLDS["default"]
             .only("parts", "contacts")
             .draw(1)
-            .contact(deployment.sheets["firm"], touch)
+            .contact(deployment.sheets["s"], touch)
             .radius_mm
             for touch in range(2000)
         ]
@@ -180,6 +180,6 @@ def test_tolerances_shift_position_far_beyond_noise(deployment: config.Deploymen
     real_hand = VirtualHand(deployment, press("flat"), WORLDS["default"].only("parts", "contacts").draw(3))
     pad = deployment.hands[0].pads[0]
     counts = np.mean([real_hand.sample(10 + k * 0.005)[0] for k in range(400)], axis=0)
-    found = electrode_network(pad, deployment.sheets["firm"]).estimate(counts * 10e-3 / 32767, 1e-6)
+    found = electrode_network(pad, deployment.sheets["s"]).estimate(counts * 10e-3 / 32767, 1e-6)
     off = np.linalg.norm(pad_surface(pad).point(found.x, found.y) - ideal.position_m)
     assert 2 * ideal.bound_m < off < 1e-3

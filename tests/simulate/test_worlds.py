@@ -55,7 +55,7 @@ def gap_offset(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
 
 
 def radius_sigma(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
-    sheet = deployment.sheets["firm"]  # 0.4 of 2 mm: the lower limit is 3.5 standard deviations away
+    sheet = deployment.sheets["s"]  # 0.4 of 2 mm: the lower limit is 3.5 standard deviations away
     return (drawn.contact(sheet, 5).radius_mm - sheet.contact_radius_mm) / sheet.contact_radius_std_mm
 
 
@@ -78,7 +78,7 @@ DRAWS: dict[str, Draw] = {
     "mounts.joint_noise_deg": lambda drawn, _: drawn.joints("right", 3).noise_deg,
     "mounts.joint_delay_s": lambda drawn, _: drawn.joints("right", 3).delay_s,
     "contacts.radius_sigma": radius_sigma,
-    "contacts.elongation": lambda drawn, deployment: drawn.contact(deployment.sheets["firm"], 5).elongation,
+    "contacts.elongation": lambda drawn, deployment: drawn.contact(deployment.sheets["s"], 5).elongation,
     "sheets.contact_ohm_ratio": pad_value("contact_ohm_ratio"),
     "sheets.alpha_offset": pad_value("alpha_offset"),
     "sheets.parameter_ratio": lambda drawn, _: drawn.sheet_factors("right/round"),
@@ -184,7 +184,7 @@ def test_families_have_disjoint_seeds_and_sheets() -> None:
 @pytest.mark.parametrize("world", ["default", "harsh"])
 def test_every_kind_of_its_family_is_drawn_equally_often(world: str, family: Family) -> None:
     kinds = WORLDS[world].sheets.kinds(family)
-    drawn = [WORLDS[world].draw(family.seed(number)).sheet_kind("firm") for number in range(SEEDS)]
+    drawn = [WORLDS[world].draw(family.seed(number)).sheet_kind("s") for number in range(SEEDS)]
     for kind in kinds:
         share = 1 / len(kinds)
         assert abs(drawn.count(kind) / SEEDS - share) < 4.5 * math.sqrt(share * (1 - share) / SEEDS)
@@ -219,7 +219,7 @@ def test_default_is_as_wide_as_the_tolerances_of_parts_it_replaces() -> None:
 
 def test_a_builder_describes_the_nominal_kind_of_his_sheets(deployment: config.Deployment) -> None:
     drawn = WORLDS["default"].draw(Family.REPORTING.seed(3))
-    kind = drawn.sheet_kind("firm")
+    kind = drawn.sheet_kind("s")
     assert kind is not None
-    assert drawn.describe(deployment).sheets["firm"].behaviour == kind.behaviour
+    assert drawn.describe(deployment).sheets["s"].behaviour == kind.behaviour
     assert WORLDS["ideal"].draw(3).describe(deployment) == deployment

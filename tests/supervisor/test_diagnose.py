@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.config import shipped
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.simulate.faults import FAULTS
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
@@ -29,7 +30,7 @@ from handtouch.wire.faults import FaultKind
 PAD, SECOND = 13, 1_000_000_000
 LINK = "palm_thumb"
 Counts = NDArray[np.float64]
-_TABLES: dict[int, HypothesisTables] = {}
+_TABLES: dict[ElectrodeNetwork, HypothesisTables] = {}
 
 
 @lru_cache(maxsize=1)

@@ -31,6 +31,7 @@ from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.wire import PadState
 
 _SECOND_NS = 1_000_000_000
+_HEALTH_PERIOD_NS = round(wire.HEALTH.period_s * _SECOND_NS)
 _SERVICE_PERIOD_NS = round(wire.SERVICE.period_s * _SECOND_NS)
 _log = logging.getLogger("handtouch.health")
 _loop_log = logging.getLogger("handtouch.loop")
@@ -99,7 +100,7 @@ class StatusReporter:
         self._started_ns = started_ns
         self.stage_timer = StageTimer(self._started_ns)
         self._sample_rate_window = _RateWindow(self._started_ns, np.zeros(n, dtype=np.int64))
-        self._published_this_second = 0  # pads are published in turn, as all at once would delay a tick
+        self._published_this_period = 0  # pads are published in turn, as all at once would delay a tick
         self._seq: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
         self._service_seq = 0
         self._service_window = _RateWindow(self._started_ns, self._totals())
@@ -204,15 +205,15 @@ class StatusReporter:
             _bus_log.log(level, "bus %s: %s", name, text, extra=extra)
 
     def _pads_due(self, now_ns: int) -> range:
-        """Return the pads due to be published: each once a second, spread over the second."""
-        passed_ns, first = now_ns - self._sample_rate_window.since_ns, self._published_this_second
-        self._published_this_second = min(len(self._pads), len(self._pads) * passed_ns // _SECOND_NS)
-        due = range(first, self._published_this_second)
-        if passed_ns >= _SECOND_NS:
+        """Return the pads due to be published: each once a period, spread over the period."""
+        passed_ns, first = now_ns - self._sample_rate_window.since_ns, self._published_this_period
+        self._published_this_period = min(len(self._pads), len(self._pads) * passed_ns // _HEALTH_PERIOD_NS)
+        due = range(first, self._published_this_period)
+        if passed_ns >= _HEALTH_PERIOD_NS:
             self._sample_rate_hz = self._sample_rate_window.per_second(
                 now_ns, self._pipeline.tick.sample_counts
             )
-            self._published_this_second = 0
+            self._published_this_period = 0
         return due
 
     def _publish(self, topic: str, make: Callable[[], wire.Health | wire.Service]) -> None:

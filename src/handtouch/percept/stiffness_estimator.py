@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 
 from handtouch.percept.action_request import CandidateAction, Question
 from handtouch.percept.indentation import Indentation, estimate_indentation, other_contacts_of_hand
-from handtouch.percept.samples import (
-    ContactBuffer,
-    ContactSamples,
-    FitSchedule,
-    IntArray,
-    PerceptEstimate,
-    SampleWindow,
-)
+from handtouch.percept.samples import ContactBuffer, PerceptEstimate, SampleWindow
 from handtouch.percept.stiffness import (
     CLASS_BOUNDS_N_PER_M,
     PRIOR_RANGE_N_PER_M,
@@ -30,6 +23,7 @@ from handtouch.percept.stiffness import (
     StiffnessEstimate,
     estimate_stiffness,
 )
+from handtouch.percept.window_estimator import WindowEstimator
 
 FloatArray = NDArray[np.float64]
 
@@ -40,38 +34,19 @@ _MAX_OBJECT_MOTION_FRACTION = 0.75  # of the depth: beyond this, squeezing doesn
 _OBJECT_MOTION_FRACTION_LIMIT = 2.0  # upper limit passed to the fit: nothing is known
 
 
-class StiffnessEstimator:
-    """Estimates the stiffness of what each pad presses on; the best squeeze of a contact is kept."""
+class StiffnessEstimator(WindowEstimator[tuple[int, int, StiffnessEstimate, Indentation]]):
+    """Estimates the stiffness of what each pad presses on; the best squeeze of a contact is kept.
+
+    Kept are contact id, hand, estimate and its indentation.
+    """
 
     kind = "stiffness"
 
     def __init__(self, pads: int, skin_m_per_n: float = 0.0, skin_std_m_per_n: float = 0.0) -> None:
-        self.requested = np.zeros(pads, dtype=np.bool_)
-        self._schedule = FitSchedule(pads, _FIT_PERIOD_NS)
-        self._best: dict[int, tuple[int, int, StiffnessEstimate, Indentation]] = {}
-        """pad -> contact id, hand, best estimate so far, and its indentation"""
+        super().__init__(pads, _FIT_PERIOD_NS, _MIN_SAMPLES)
         self._skin_compliance = {"skin_m_per_n": skin_m_per_n, "skin_std_m_per_n": skin_std_m_per_n}
 
-    def process_samples(
-        self,
-        buffer: ContactBuffer,  # noqa: ARG002
-        sample: ContactSamples,  # noqa: ARG002
-        began: IntArray,
-    ) -> Sequence[PerceptEstimate]:
-        """Discard the estimates of contacts that ended."""
-        for pad in began.tolist():
-            self._best.pop(pad, None)
-        return ()
-
-    def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:
-        """Return the pad that has waited longest."""
-        return self._schedule.next_pad(
-            self.requested & (buffer.contact_id > 0) & (buffer.sample_count >= _MIN_SAMPLES), now_ns
-        )
-
-    def fit_contact(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
-        """Fit the pad's window."""
-        self._schedule.mark_fitted(pad, now_ns)
+    def _fit_window(self, buffer: ContactBuffer, pad: int, now_ns: int) -> PerceptEstimate:
         contact, hand = int(buffer.contact_id[pad]), int(buffer.hand_index[pad])
         window = buffer.window(pad)
         indentation = estimate_indentation(window, other_contacts_of_hand(buffer, pad))
@@ -91,7 +66,7 @@ class StiffnessEstimator:
             found, indentation = before[2:]
         self._best[pad] = contact, hand, found, indentation
         compensated = bool(np.isfinite(window["uncompensated_force_n"]).any())
-        return [_percept(found, hand, pad, contact, now_ns, compensated, indentation.source)]
+        return _percept(found, hand, pad, contact, now_ns, compensated, indentation.source)
 
     def _fit_squeeze(self, window: SampleWindow, indentation: Indentation) -> StiffnessEstimate:
         """Fit stiffness; undetermined if most of the depth may be motion of the object."""
@@ -103,15 +78,6 @@ class StiffnessEstimator:
             reason = "other contacts move the object: the indentation of this one isn't known"
             return replace(found, state="undetermined", reason=reason)
         return found
-
-    def end_contacts(self, buffer: ContactBuffer, pads: IntArray, now_ns: int) -> Sequence[PerceptEstimate]:
-        """Fit the windows of ended contacts once more, so that the end of a squeeze counts."""
-        last: list[PerceptEstimate] = []
-        for pad in pads.tolist():
-            if buffer.sample_count[pad] >= _MIN_SAMPLES:
-                last += self.fit_contact(buffer, pad, now_ns)
-            self._best.pop(pad, None)
-        return last
 
     def open_questions(self, now_ns: int) -> Sequence[Question]:  # noqa: ARG002
         """Return a question for each contact of undetermined stiffness."""

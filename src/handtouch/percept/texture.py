@@ -12,20 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.percept.action_request import CandidateAction, Question
-from handtouch.percept.samples import (
-    ContactBuffer,
-    ContactSamples,
-    FitSchedule,
-    IntArray,
-    PerceptEstimate,
-    SampleWindow,
-)
+from handtouch.percept.samples import ContactBuffer, PerceptEstimate, SampleWindow
 from handtouch.percept.spectrum import (
     TEXTURE_CLASSES,
     TextureEstimate,
     detrended,
     estimate_texture,
 )
+from handtouch.percept.window_estimator import WindowEstimator
 
 FloatArray = NDArray[np.float64]
 
@@ -88,39 +82,21 @@ def _cubic_trend(way: FloatArray) -> FloatArray:
     return way - detrended(way, np.linspace(0, 1, len(way)))
 
 
-class TextureEstimator:
-    """Estimates the texture of surfaces that slide over each pad."""
+class TextureEstimator(WindowEstimator[tuple[int, int, TextureEstimate, str]]):
+    """Estimates the texture of surfaces that slide over each pad; the best slide of a contact is kept.
+
+    Kept are contact id, hand, estimate and the source of its slide distance.
+    """
 
     kind = "texture"
 
     def __init__(self, pads: int) -> None:
-        self.requested = np.zeros(pads, dtype=np.bool_)
-        self._schedule = FitSchedule(pads, _FIT_PERIOD_NS)
-        self._best: dict[int, tuple[int, int, TextureEstimate, str]] = {}
+        super().__init__(pads, _FIT_PERIOD_NS, _MIN_SAMPLES)
         self._noise: dict[int, float] = {}
         self._rate_hz = np.full(pads, np.nan)
 
-    def process_samples(
-        self,
-        buffer: ContactBuffer,  # noqa: ARG002
-        sample: ContactSamples,  # noqa: ARG002
-        began: IntArray,
-    ) -> Sequence[PerceptEstimate]:
-        """Discard the estimates of contacts that ended."""
-        for pad in began.tolist():
-            self._best.pop(pad, None)
-            self._noise.pop(pad, None)
-        return ()
-
-    def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:
-        """Return the pad that has waited longest."""
-        return self._schedule.next_pad(
-            self.requested & (buffer.contact_id > 0) & (buffer.sample_count >= _MIN_SAMPLES), now_ns
-        )
-
-    def fit_contact(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
+    def _fit_window(self, buffer: ContactBuffer, pad: int, now_ns: int) -> PerceptEstimate:
         """Analyse the pad's window: noise while it is at rest, texture while it slides."""
-        self._schedule.mark_fitted(pad, now_ns)
         contact, hand = int(buffer.contact_id[pad]), int(buffer.hand_index[pad])
         window = buffer.window(pad)
         others = np.flatnonzero((buffer.hand_index == hand) & (buffer.contact_id > 0))
@@ -141,16 +117,11 @@ class TextureEstimator:
         if before is not None and before[0] == contact and _quality(before[2]) > _quality(found):
             found, by = before[2], before[3]
         self._best[pad] = contact, hand, found, by
-        return [_texture_percept(found, by, hand, pad, contact, now_ns)]
+        return _texture_percept(found, by, hand, pad, contact, now_ns)
 
-    def end_contacts(self, buffer: ContactBuffer, pads: IntArray, now_ns: int) -> Sequence[PerceptEstimate]:
-        """Analyse the last slides of ended contacts."""
-        last: list[PerceptEstimate] = []
-        for pad in pads.tolist():
-            if buffer.sample_count[pad] >= _MIN_SAMPLES:
-                last += self.fit_contact(buffer, pad, now_ns)
-            self._best.pop(pad, None)
-        return last
+    def _discard(self, pad: int) -> None:
+        super()._discard(pad)
+        self._noise.pop(pad, None)
 
     def open_questions(self, now_ns: int) -> Sequence[Question]:  # noqa: ARG002
         """Return a question for each contact that slid too fast, too little, or not at all."""

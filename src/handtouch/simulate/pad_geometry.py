@@ -1,18 +1,19 @@
 """Geometry of a simulated pad, directly from the millimetres of the deployment.
 
-Public names: `SimulatedSurface` and its subclasses, `SheetMetric`, `simulated_surface`. It is independent of
-`handtouch.field.surface`, so that a mistake in either shows as a position error instead of cancelling.
+Public names: `SimulatedSurface` and its subclasses, `SurfaceProjection`, `SheetMetric`, `simulated_surface`.
+It is independent of `handtouch.field.surface`, so that a mistake in either shows as a position error instead
+of cancelling.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,20 @@ from handtouch import config
 
 FloatArray = NDArray[np.float64]
 _ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(20)
+_PROFILE_CELLS, _NEWTON_STEPS = 400, 3  # of a projection to a spline profile
+_HULL_CIRCLE_POINTS, _HULL_PROFILE_CIRCLES = 96, 24
+_PLATE_THICKNESS_M = 4e-3
+
+
+class SurfaceProjection(NamedTuple):
+    """Feet of the normals from n points to a surface."""
+
+    fraction: FloatArray
+    """(n, 2), fractions from electrodes x0 and y0; outside 0 to 1 the foot isn't on the pad."""
+    height_m: FloatArray
+    """(n,), height of the points above the surface, negative below."""
+    normal: FloatArray
+    """(n, 3), outward normals in the pad's frame."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +131,47 @@ class SimulatedSurface(SheetMetric):
             -math.sin(climb), math.cos(climb) * math.sin(angle), math.cos(climb) * math.cos(angle)
         )
 
+    def project(self, points_m: FloatArray) -> SurfaceProjection:
+        """Project points (n, 3) in the pad's frame; for points on the surface's axis any foot is correct."""
+        if self.flat:
+            x, y, z = points_m.T
+            along = np.stack([x / self.length_m + 0.5, y / self.arc + 0.5], axis=1)
+            return SurfaceProjection(along, z.copy(), np.tile([0.0, 0.0, 1.0], (len(x), 1)))
+        middle_axial, middle_radius = self._profile(self.length_m / 2)
+        tilt = self._profile_angle(self.length_m / 2)
+        cos, sin = math.cos(tilt), math.sin(tilt)
+        x, y, z = points_m.T
+        axial, outward = cos * x - sin * z + middle_axial, sin * x + cos * z + middle_radius
+        angle, away = np.arctan2(y, outward), np.hypot(y, outward)
+        s, height, climb = self._project_to_profile(axial, away)
+        across, up, along_axis = np.cos(climb) * np.sin(angle), np.cos(climb) * np.cos(angle), -np.sin(climb)
+        normal = [cos * along_axis + sin * up, across, cos * up - sin * along_axis]
+        return SurfaceProjection(
+            np.stack([s / self.length_m, angle / self.arc + 0.5], axis=1), height, np.stack(normal, axis=1)
+        )
+
+    def hull_points(self) -> list[FloatArray]:
+        """Return points (3,) in the pad's frame whose convex hull is the body under the surface."""
+        around = 2 * np.pi * np.arange(_HULL_CIRCLE_POINTS) / _HULL_CIRCLE_POINTS
+        return [self.point(s, phi) for s in self._hull_lengths_m() for phi in around]
+
+    def _hull_lengths_m(self) -> Sequence[float]:
+        return 0.0, self.length_m
+
+    def _project_to_profile(
+        self, axial: FloatArray, away: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return arc length, height and profile angle (n,) of points along the axis and away from it."""
+        if self.sphere_from_rad is None:
+            climb = math.asin(self.slope)
+            rise = away - self.start_radius_m
+            s = axial * math.cos(climb) + rise * math.sin(climb)
+            height = rise * math.cos(climb) - axial * math.sin(climb)
+            return s, height, np.full(np.shape(s), climb)
+        latitude = np.arctan2(axial, away)
+        s = self.start_radius_m * (latitude - self.sphere_from_rad)
+        return s, np.hypot(axial, away) - self.start_radius_m, -latitude
+
     def _profile(self, s_m: float) -> tuple[float, float]:
         """Return the position along the axis and the distance from it [m]."""
         if self.sphere_from_rad is None:
@@ -177,7 +233,32 @@ class SimulatedPrism(SimulatedSurface):
         aside, up = self._to_middle(self._direction(phi))
         return np.array([0.0, -up, aside])
 
-    def faces(self) -> list[tuple[float, float, FloatArray, FloatArray]]:
+    def project(self, points_m: FloatArray) -> SurfaceProjection:
+        """Project points (n, 3) in the pad's frame to the nearest face."""
+        nearest = np.full(len(points_m), np.inf)
+        phi, height = np.zeros(len(points_m)), np.zeros(len(points_m))
+        normal = np.zeros((len(points_m), 3))
+        section = points_m[:, 1:]
+        for begin, end, first, last in self._faces():
+            along = (last - first) / (end - begin)
+            outward = np.array([-along[1], along[0]])
+            into = np.clip((section - first) @ along, 0.0, end - begin)
+            distance = np.linalg.norm(section - first - into[:, None] * along, axis=1)
+            closer = distance < nearest
+            nearest[closer], phi[closer] = distance[closer], begin + into[closer]
+            height[closer] = ((section - first) @ outward)[closer]
+            normal[closer] = np.append(0.0, outward)
+        s = points_m[:, 0] + self.length_m / 2
+        return SurfaceProjection(np.stack([s / self.length_m, phi / self.arc], axis=1), height, normal)
+
+    def hull_points(self) -> list[FloatArray]:
+        """Return the corners (3,) of the plate under the surface, in the pad's frame."""
+        under = np.array([0.0, 0.0, -_PLATE_THICKNESS_M])
+        corners = [0.0, *(end for _, end, _, _ in self._faces())]
+        top = [self.point(s, phi) for s in (0.0, self.length_m) for phi in corners]
+        return [*top, *(point + under for point in top)]
+
+    def _faces(self) -> list[tuple[float, float, FloatArray, FloatArray]]:
         """Return begin and end [m] of each face along the section, and its ends (2,) in the pad's frame."""
         ends = [0.0, *np.cumsum(self._widths()).tolist()]
         middle = self._section(self.arc / 2)
@@ -230,17 +311,32 @@ class SimulatedRevolution(SimulatedSurface):
         """Return the integral of ds / radius from electrode x0 to `s_m` (...); with phi, a conformal map."""
         return np.asarray(_profile(self.points_m).isothermal(self._parameter(s_m)))
 
-    def profile_point(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return axial position and radius at `s_m` (...) [m]."""
+    def _hull_lengths_m(self) -> Sequence[float]:
+        return [self.length_m * k / (_HULL_PROFILE_CIRCLES - 1) for k in range(_HULL_PROFILE_CIRCLES)]
+
+    def _project_to_profile(
+        self, axial: FloatArray, away: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Find the nearest point of the profile for each point, by Newton's method."""
+        cells = np.linspace(0.0, self.length_m, _PROFILE_CELLS + 1)
+        on_profile = np.stack(self._profile_points(cells))
+        squared = ((np.stack([axial, away])[:, :, None] - on_profile[:, None]) ** 2).sum(0)
+        s = cells[squared.argmin(axis=1)]
+        for _ in range(_NEWTON_STEPS):
+            at_axial, at_radius = self._profile_points(s)
+            climb = self._profile_angles(s)
+            s = s + np.cos(climb) * (axial - at_axial) + np.sin(climb) * (away - at_radius)
+            s = np.clip(s, 0.0, self.length_m)
+        at_axial, at_radius = self._profile_points(s)
+        climb = self._profile_angles(s)
+        height = np.cos(climb) * (away - at_radius) - np.sin(climb) * (axial - at_axial)
+        return s, height, climb
+
+    def _profile_points(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         axial, radius = np.moveaxis(_profile(self.points_m).curve(self._parameter(s_m)), -1, 0)
         return axial, radius
 
-    def profile_angle(self, s_m: float) -> float:
-        """Return the angle between profile and axis."""
-        return self._profile_angle(s_m)
-
-    def profile_angles(self, s_m: FloatArray) -> FloatArray:
-        """Return the angles (...) between profile and axis at `s_m` (...)."""
+    def _profile_angles(self, s_m: FloatArray) -> FloatArray:
         axial, radius = np.moveaxis(_profile(self.points_m).curve(self._parameter(s_m), 1), -1, 0)
         return np.asarray(np.arctan2(radius, axial))
 
@@ -248,12 +344,11 @@ class SimulatedRevolution(SimulatedSurface):
         return np.asarray(_profile(self.points_m).from_length(np.asarray(s_m, np.float64)))
 
     def _profile(self, s_m: float) -> tuple[float, float]:
-        axial, radius = _profile(self.points_m).curve(self._parameter(s_m)).tolist()
-        return axial, radius
+        axial, radius = self._profile_points(np.array(s_m))
+        return float(axial), float(radius)
 
     def _profile_angle(self, s_m: float) -> float:
-        axial, radius = _profile(self.points_m).curve(self._parameter(s_m), 1).tolist()
-        return math.atan2(radius, axial)
+        return float(self._profile_angles(np.array(s_m)))
 
 
 @dataclass(frozen=True)

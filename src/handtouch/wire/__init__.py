@@ -18,6 +18,7 @@ from handtouch.wire.service import Service
 from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus
 from handtouch.wire.topics import (
     COLUMNS,
+    HEALTH,
     JOINTS,
     SERVICE,
     TOPICS,
@@ -30,6 +31,7 @@ from handtouch.wire.topics import (
 
 __all__ = [
     "COLUMNS",
+    "HEALTH",
     "JOINTS",
     "PERCEPT_KINDS",
     "SCHEMA_VERSION",

@@ -1,7 +1,7 @@
 """The table of topics: payload, keys and rate of each; everything else about topics is derived from it.
 
-Public names: `Topic`, `TOPICS`, `COLUMNS`, `JOINTS`, `SERVICE`, `topic_of`, `EncodedMessage`, `Message`,
-`OutgoingMessage`.
+Public names: `Topic`, `TOPICS`, `COLUMNS`, `HEALTH`, `JOINTS`, `SERVICE`, `topic_of`, `EncodedMessage`,
+`Message`, `OutgoingMessage`.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ class Topic:
         return lambda message: f"{prefix}/{first(message)}/{second(message)}"
 
 
+HEALTH = Topic("health", Health, ("hand", "link"), "at every change, and once a second", period_s=1.0)
 JOINTS = Topic(
     "joints", JointPositions, ("hand",), "at most 30 a second, while the hand has a URDF", min_period_s=0.033
 )
@@ -91,7 +92,7 @@ TOPICS = (
         "at begin and end of a contact; in between per tick, or at the scene's rate",
     ),
     Topic("hand", HandFrame, ("hand",), "per tick"),
-    Topic("health", Health, ("hand", "link"), "at every change, and once a second", period_s=1.0),
+    HEALTH,
     Topic("percept", Percept, ("hand", "kind"), "at every change, and while a contact lasts"),
     Topic("raw", Raw, ("hand",), "per tick"),
     JOINTS,

@@ -17,19 +17,14 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.hand.pads import rotation_from_rpy
 from handtouch.simulate.grasp.grasp_objects import GraspObject
-from handtouch.simulate.pad_geometry import (
-    SimulatedPrism,
-    SimulatedRevolution,
-    SimulatedSurface,
-)
+from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.worlds import DrawnWorld
 
 FloatArray = NDArray[np.float64]
 TIME_STEP_S = 1e-3
 _SKIN_THICKNESS_M = 1.5e-3  # URDF bodies are shrunk by this, so that objects touch the pads
 _PLATE_HALF_THICKNESS_M = 2e-3
-_PROFILE_RINGS = 24  # of a surface of revolution
-_CIRCLE_VERTICES = 96  # of a cone's circles
+_CIRCLE_VERTICES = 96  # of a frustum's circles
 _HAND_COLLISION_BIT, _OBJECT_COLLISION_BIT = 1, 2
 _STIFFNESS_NM, _DAMPING_NM_S = 1.5, 0.03
 _CONTACT_TIME_CONSTANT_S = 5e-3  # soft contact, as of a skin
@@ -133,35 +128,40 @@ def _add_pad(
     translation: FloatArray,
 ) -> None:
     geom = body.add_geom(name=f"pad {pad.link}", density=0.0)
-    radius_m, turn = 0.0, rotation
-    if pad.surface.kind == "plane":
-        geom.type, radius_m = mujoco.mjtGeom.mjGEOM_BOX, _PLATE_HALF_THICKNESS_M
-        geom.size = [shape.length_m / 2, shape.arc / 2, _PLATE_HALF_THICKNESS_M]
-    elif pad.surface.kind == "cylinder":
-        geom.type, radius_m = mujoco.mjtGeom.mjGEOM_CYLINDER, shape.start_radius_m
-        geom.size = [radius_m, shape.length_m / 2, 0.0]
-        turn = rotation @ rotation_from_rpy([0.0, np.pi / 2, 0.0])
-    elif pad.surface.kind == "sphere":
-        geom.type, radius_m = mujoco.mjtGeom.mjGEOM_SPHERE, shape.start_radius_m
-        geom.size = [radius_m, 0.0, 0.0]
+    if make := _GEOMS.get(pad.surface.kind):
+        depth_m, turn = make(mujoco, geom, shape)
     else:
-        geom.type = mujoco.mjtGeom.mjGEOM_MESH
-        spec.add_mesh(name=f"pad {pad.link}", uservert=np.ravel(_hull_points(shape)))
-        geom.meshname = f"pad {pad.link}"
-    geom.pos = translation - radius_m * rotation[:, 2]
-    geom.quat = _quaternion(mujoco, turn)
+        depth_m, turn = 0.0, np.eye(3)
+        geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, geom.name
+        spec.add_mesh(name=geom.name, uservert=np.ravel(shape.hull_points()))
+    geom.pos = translation - depth_m * rotation[:, 2]
+    geom.quat = _quaternion(mujoco, rotation @ turn)
 
 
-def _hull_points(shape: SimulatedSurface) -> list[FloatArray]:
-    """Return points (3,) in the pad's frame whose convex hull is the body under the surface."""
-    if isinstance(shape, SimulatedPrism):
-        under = np.array([0.0, 0.0, -2 * _PLATE_HALF_THICKNESS_M])
-        corners = [shape.faces()[0][0], *(end for _, end, _, _ in shape.faces())]
-        top = [shape.point(s, phi) for s in (0.0, shape.length_m) for phi in corners]
-        return [*top, *(point + under for point in top)]
-    rings = _PROFILE_RINGS if isinstance(shape, SimulatedRevolution) else 2
-    around = 2 * np.pi * np.arange(_CIRCLE_VERTICES) / _CIRCLE_VERTICES
-    return [shape.point(s, phi) for s in np.linspace(0.0, shape.length_m, rings).tolist() for phi in around]
+def _box(mujoco: Any, geom: Any, shape: SimulatedSurface) -> tuple[float, FloatArray]:
+    geom.type = mujoco.mjtGeom.mjGEOM_BOX
+    geom.size = [shape.length_m / 2, shape.arc / 2, _PLATE_HALF_THICKNESS_M]
+    return _PLATE_HALF_THICKNESS_M, np.eye(3)
+
+
+def _cylinder(mujoco: Any, geom: Any, shape: SimulatedSurface) -> tuple[float, FloatArray]:
+    geom.type = mujoco.mjtGeom.mjGEOM_CYLINDER
+    geom.size = [shape.start_radius_m, shape.length_m / 2, 0.0]
+    return shape.start_radius_m, rotation_from_rpy([0.0, np.pi / 2, 0.0])
+
+
+def _sphere(mujoco: Any, geom: Any, shape: SimulatedSurface) -> tuple[float, FloatArray]:
+    geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
+    geom.size = [shape.start_radius_m, 0.0, 0.0]
+    return shape.start_radius_m, np.eye(3)
+
+
+_GEOMS = {"plane": _box, "cylinder": _cylinder, "sphere": _sphere}
+"""Functions for kinds of surface under which MuJoCo has a geom; any other is a mesh.
+
+They set type and size, and return the depth [m] of the geom's centre below that of the pad, and the geom's
+orientation (3, 3) in the pad's frame.
+"""
 
 
 def _add_object(

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.simulate.grasp.mujoco_scene import MujocoPad
-from handtouch.simulate.grasp.projection import project_to_surface
 from handtouch.simulate.grasp.simulation import GraspRecord
 
 FloatArray = NDArray[np.float64]
@@ -85,7 +84,7 @@ def _sensed_points(
     steps = grasp.step_index[indices]
     rotation = grasp.link_rotation[steps, row]
     on_link = np.einsum("kji,kj->ki", rotation, grasp.point_m[indices] - grasp.link_m[steps, row])
-    foot = project_to_surface(pad.shape, (on_link - pad.translation_m) @ pad.rotation)
+    foot = pad.shape.project((on_link - pad.translation_m) @ pad.rotation)
     force_vector = np.einsum("kji,kj->ki", rotation, grasp.force_n[indices]) @ pad.rotation
     force = -np.einsum("ki,ki->k", force_vector, foot.normal)
     rim = 0.5 + _MAX_OVERHANG_M / _side_lengths_m(pad, 0.5)

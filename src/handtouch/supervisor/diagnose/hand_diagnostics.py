@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.supervisor.diagnose.channel_faults import ChannelFaultDetector
 from handtouch.supervisor.diagnose.contact_faults import (
     ContactCurrents,
@@ -49,7 +50,7 @@ class HandDiagnostics:
         self,
         model: DiagnosisModel,
         offset_counts: ArrayLike | None = None,
-        tables: dict[int, HypothesisTables] | None = None,
+        tables: dict[ElectrodeNetwork, HypothesisTables] | None = None,
     ) -> None:
         self._model = model
         offsets = model.offset_counts if offset_counts is None else offset_counts
@@ -133,9 +134,9 @@ class HandDiagnostics:
         """Return the detector of a pad, made on first use: tables take a quarter of a second per design."""
         if pad not in self._contact_detectors:
             network = self._model.networks[pad]
-            if id(network) not in self._tables:
-                self._tables[id(network)] = HypothesisTables(network, self._model.surfaces[pad])
-            self._contact_detectors[pad] = ContactFaultDetector(self._tables[id(network)])
+            if network not in self._tables:
+                self._tables[network] = HypothesisTables(network, self._model.surfaces[pad])
+            self._contact_detectors[pad] = ContactFaultDetector(self._tables[network])
         return self._contact_detectors[pad]
 
     def _collect_diagnoses(self) -> dict[tuple[int, FaultKind], PadDiagnosis]:
