@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config.problems import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.gripper_objects import (
     GRIPPER_OBJECTS,
     CurvedEdge,
@@ -184,7 +185,7 @@ class GripperStimulus:
                 contacts.append(AppliedContact(number, x, y, contact.force_n))
         return contacts
 
-    def pad_stimulus(self, link: str, radius_m: Callable[[int], float]) -> LivePadStimulus:  # noqa: ARG002
+    def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> LivePadStimulus:  # noqa: ARG002
         """Return a stimulus without any contact known in advance."""
         return LivePadStimulus()
 
@@ -236,7 +237,7 @@ class LivePadStimulus:
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one contact without force."""
         n = len(times_s)
-        return np.full((1, 2, n), 0.5), np.zeros((1, n)), np.ones((1, n))
+        return np.full((1, 2, n), 0.5), np.zeros((1, n)), np.tile([[1.0], [0.0], [0.0]], (1, 1, n))
 
 
 def _create_object(object_name: str, parameters: Mapping[str, float]) -> SoftBlock | CurvedEdge:

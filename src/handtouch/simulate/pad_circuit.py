@@ -10,6 +10,7 @@ solved together.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import i0e, i1e
 
 from handtouch import config
+from handtouch.simulate.contact_patch import effective_patch, look_up_patches
 from handtouch.simulate.faults import Fault, FaultContacts
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_circuit import SheetCircuit, Wiring
@@ -59,6 +61,9 @@ class _ContactSeries:
     position: FloatArray
     """(2, n), fractions of the pad."""
     radius_m: FloatArray
+    """(n,), of the equivalent disc."""
+    focus: FloatArray
+    """(2, n), of its patch, in fractions of the pad; 0: a disc."""
     contact_ohm: FloatArray
     """(n,), of the contact itself, without the sheet around it; infinite without contact."""
     is_static: bool
@@ -158,8 +163,9 @@ class PadCircuit:
         sheet_ohm = self.sheet.ohm_per_square
         shares, own = [], []
         for contact in contacts:
-            position = contact.position[:, :1] if contact.is_static else contact.position[:, rows]
-            values, _ = bank.look_up(np.zeros(position.shape[1], np.intp), *position)
+            at = rows[:1] if contact.is_static else rows
+            sheet = np.zeros(len(at), np.intp)
+            values, _ = look_up_patches(bank, sheet, contact.position[:, at], contact.focus[:, at])
             shares.append(np.broadcast_to(values[:4].T, (len(rows), 4)))
             spreading = np.maximum(values[4] - np.log(contact.radius_m[rows]), 0.0)
             own.append(contact.contact_ohm[rows] + sheet_ohm / (2 * math.pi) * spreading)
@@ -206,9 +212,9 @@ class PadCircuit:
     def _collect_contacts(
         self, times_s: FloatArray, touches: PadStimulus, faults: Sequence[Fault], force_ratio: FloatArray
     ) -> list[_ContactSeries]:
-        position, force, radius = touches.contacts(times_s)
+        position, force, patches = touches.contacts(times_s)
         contacts = [
-            self._pressed_contact(position[lane], radius[lane], force[lane] * force_ratio, False)
+            self._pressed_contact(position[lane], patches[lane], force[lane] * force_ratio, False)
             for lane in range(len(force))
             if force[lane].any()
         ]
@@ -222,18 +228,24 @@ class PadCircuit:
         contacts = []
         disc_ohm = self.sheet.ohm_per_square * _UNIFORM_DISC_RESISTANCE / (2 * math.pi)
         for position, radius_m in zip(discs.position, discs.radius_m, strict=True):
-            positions, radii = np.repeat(position[:, None], n, axis=1), np.full(n, radius_m)
+            positions, focus = np.repeat(position[:, None], n, axis=1), np.zeros((2, n))
+            radii = np.full(n, radius_m)
             if discs.force_n is not None and discs.force_n.any():
-                contacts.append(self._pressed_contact(positions, radii, discs.force_n * force_ratio, True))
+                contacts.append(
+                    self._pressed_contact(
+                        positions, np.stack([radii, *focus]), discs.force_n * force_ratio, True
+                    )
+                )
             elif discs.conductance_s is not None and discs.conductance_s.any():
                 with np.errstate(divide="ignore"):
                     leak_ohm = len(discs.position) / discs.conductance_s
-                contacts.append(_ContactSeries(positions, radii, leak_ohm + disc_ohm, True))
+                contacts.append(_ContactSeries(positions, radii, focus, leak_ohm + disc_ohm, True))
         return contacts
 
     def _pressed_contact(
-        self, position: FloatArray, radius_m: FloatArray, force_n: FloatArray, is_static: bool
+        self, position: FloatArray, patch: FloatArray, force_n: FloatArray, is_static: bool
     ) -> _ContactSeries:
+        radius_m, (equivalent_m, focus) = patch[0], self.patch_on_sheet(position, patch)
         sheet, own = self.sheet, np.full(len(force_n), np.inf)
         on = force_n > 0
         own[on] = contact_layer_ohm(
@@ -244,7 +256,15 @@ class PadCircuit:
             1e3 * sheet.reference_kpa,
             sheet.alpha,
         )
-        return _ContactSeries(position, radius_m, own, is_static)
+        return _ContactSeries(position, equivalent_m, focus, own, is_static)
+
+    def patch_on_sheet(self, position: FloatArray, patch: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return equivalent radii (n,) [m], and foci (2, n) as fractions, of patches (3, n) [m]."""
+        radius_m, focus_m = effective_patch(patch[0], patch[1:], self.shape.stretch)
+        if not focus_m.any():
+            return radius_m, focus_m
+        across_m = self.shape.arc * self.shape.radius(position[0] * self.shape.length_m)
+        return radius_m, focus_m / np.stack([np.full_like(across_m, self.shape.length_m), across_m])
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -259,4 +279,4 @@ def _changes_circuit(fault: Fault) -> bool:
 
 def _remove_where(contact: _ContactSeries, mask: NDArray[np.bool_]) -> _ContactSeries:
     contact_ohm = np.where(mask, np.inf, contact.contact_ohm)
-    return _ContactSeries(contact.position, contact.radius_m, contact_ohm, contact.is_static)
+    return dataclasses.replace(contact, contact_ohm=contact_ohm)

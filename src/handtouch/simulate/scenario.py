@@ -16,6 +16,7 @@ from handtouch.config import Deployment
 from handtouch.config.base import Table
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import FAULTS, INFLUENCES, AnyFault, Fault
 from handtouch.simulate.joints import JointMotion, ScenarioJoints
 from handtouch.simulate.stimulus import AppliedContact, NodeReplacement
@@ -97,11 +98,11 @@ class Scenario(Table):
         """Link of each touch, and its radius [m] where the touch defines one."""
         return [(t.link, None if t.radius_mm is None else 1e-3 * t.radius_mm) for t in self.touches]
 
-    def pad_stimulus(self, link: str, radius_m: Callable[[int], float]) -> ScheduledTouches:
-        """Return the touches of one pad; `radius_m(number)` is for touches that define no radius."""
+    def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> ScheduledTouches:
+        """Return the touches of one pad; `patch(number)` is for touches that define no radius."""
         return ScheduledTouches(
             [
-                (touch, 1e-3 * touch.radius_mm if touch.radius_mm else radius_m(number))
+                (touch, ContactPatch(1e-3 * touch.radius_mm) if touch.radius_mm else patch(number))
                 for number, touch in enumerate(self.touches)
                 if touch.link == link
             ]

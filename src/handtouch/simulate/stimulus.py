@@ -17,6 +17,7 @@ from pydantic import Field
 from handtouch.config.base import Table
 from handtouch.config.tables import Name, PositivePerChannel, Unsigned32
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import Fault
 
 FloatArray = NDArray[np.float64]
@@ -30,7 +31,7 @@ class AppliedContact(NamedTuple):
     y: float
     force_n: float
     radius_m: float | None = None
-    """None: the touch's radius, or the world's."""
+    """Radius of a disc; None: the touch's radius, or the world's patch."""
 
 
 class NodeReplacement(Table):
@@ -64,9 +65,9 @@ class PadStimulus(Protocol):
         """Times [s]: to sample the force at; after which the sheet settles; at which touches begin."""
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and radii (k, n) [m].
+        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and patches (k, 3, n) [m].
 
-        k is `max_contacts`, n the number of times.
+        k is `max_contacts`, n the number of times. A patch is the radius and focus of a `ContactPatch`.
         """
 
 
@@ -90,8 +91,8 @@ class Stimulus(Protocol):
     def contacts_at(self, t_s: float) -> list[AppliedContact]:
         """Return the contacts of all pads at `t_s`."""
 
-    def pad_stimulus(self, link: str, radius_m: Callable[[int], float]) -> PadStimulus:
-        """Return the contacts of one pad; `radius_m(number)` is for touches that define no radius."""
+    def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> PadStimulus:
+        """Return the contacts of one pad; `patch(number)` is for touches that define no radius."""
 
     def joint_trajectory(self, robot: RobotDescription) -> JointTrajectory | None:
         """Return the joint motion of a hand; None if its joints don't move."""

@@ -18,6 +18,7 @@ from pydantic import Field
 
 from handtouch.config.base import Table
 from handtouch.config.tables import Name, Positive
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.smoothstep import smoothstep, smoothstep_array
 
 FloatArray = NDArray[np.float64]
@@ -117,15 +118,15 @@ class ScenarioTouch(Table):
 class ScheduledTouches:
     """The touches of one pad, arranged in lanes of touches that don't overlap in time."""
 
-    def __init__(self, touches: Sequence[tuple[ScenarioTouch, float]]) -> None:
-        """touches: each with its radius [m]."""
-        self._lanes: list[list[tuple[ScenarioTouch, float]]] = []
-        for touch, radius_m in sorted(touches, key=lambda pair: pair[0].from_s):
+    def __init__(self, touches: Sequence[tuple[ScenarioTouch, ContactPatch]]) -> None:
+        """touches: each with its patch."""
+        self._lanes: list[list[tuple[ScenarioTouch, ContactPatch]]] = []
+        for touch, patch in sorted(touches, key=lambda pair: pair[0].from_s):
             free = (lane for lane in self._lanes if lane[-1][0].until_s <= touch.from_s)
             lane = next(free, None)
             if lane is None:
                 self._lanes.append(lane := [])
-            lane.append((touch, radius_m))
+            lane.append((touch, patch))
 
     @property
     def max_contacts(self) -> int:
@@ -144,16 +145,18 @@ class ScheduledTouches:
         return np.concatenate([np.zeros(0), *force_times]), np.array(settling), begins
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and radii (k, n) [m]."""
+        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and patches (k, 3, n) [m]."""
         order = np.argsort(times_s, kind="stable")
         ordered = times_s[order]
         k, n = len(self._lanes), len(times_s)
-        position, force, radius = np.full((k, 2, n), 0.5), np.zeros((k, n)), np.ones((k, n))
+        position, force = np.full((k, 2, n), 0.5), np.zeros((k, n))
+        patches = np.tile([[1.0], [0.0], [0.0]], (k, 1, n))
         for row, lane in enumerate(self._lanes):
-            for touch, radius_m in lane:
+            for touch, patch in lane:
                 first, last = np.searchsorted(ordered, (touch.from_s, touch.until_s))
                 if first < last:
                     during = order[first:last]
                     position[row][:, during] = touch.positions(times_s[during])
-                    force[row, during], radius[row, during] = touch.forces(times_s[during]), radius_m
-        return position, force, radius
+                    force[row, during] = touch.forces(times_s[during])
+                    patches[row][:, during] = np.array([patch.radius_m, *patch.focus_m])[:, None]
+        return position, force, patches

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
 from handtouch.simulate import noise
+from handtouch.simulate.contact_patch import ContactPatch, look_up_patches
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.pad_circuit import contact_layer_ohm
@@ -68,7 +69,7 @@ class VirtualHand:
         ]
         self._touch_pads = [
             [
-                (number, radius_m or 1e-3 * world.contact(row.sheet, index).radius_mm)
+                (number, ContactPatch(radius_m) if radius_m else world.contact(row.sheet, index).patch)
                 for number, row in enumerate(self._virtual_pads)
                 if row.pad.link == link
             ]
@@ -126,26 +127,40 @@ class VirtualHand:
 
     def _contacts_at(self, t_s: float) -> list[_PadContact]:
         return [
-            _PadContact(row, contact, contact.radius_m or radius_m)
+            _PadContact(row, contact, ContactPatch(contact.radius_m) if contact.radius_m else patch)
             for contact in self._stimulus.contacts_at(t_s)
-            for row, radius_m in self._touch_pads[contact.touch_number]
+            for row, patch in self._touch_pads[contact.touch_number]
         ]
 
     def _currents(self, contacts: Sequence[_PadContact], t_s: float) -> tuple[FloatArray, FloatArray]:
         """Return currents (k, 4) [A], and derivatives (k, 4, 3) by x, y [fractions] and total current."""
         rows = np.array([contact.row for contact in contacts])
-        x, y, force, radius = np.array(
-            [(c.contact.x, c.contact.y, c.contact.force_n, c.radius_m) for c in contacts]
-        ).T
+        position = np.array([(contact.contact.x, contact.contact.y) for contact in contacts]).T
+        patch = np.array([(contact.patch.radius_m, *contact.patch.focus_m) for contact in contacts]).T
+        force = np.array([contact.contact.force_n for contact in contacts])
         times_s = np.array([t_s])
         pads = [self._virtual_pads[contact.row] for contact in contacts]
         force = force * [1.0 if pad.is_ideal else pad.force_ratio(times_s)[0] for pad in pads]
-        values, slopes = self._bank.look_up(rows, x, y)
-        shares, log_radius = values[:4].T, values[4]
-        collected, total = self._circuits.solve_contacts(rows, shares, log_radius, force, radius)
+        equivalent_m, focus = self._patches_on_sheets(pads, position, patch)
+        values, slopes = look_up_patches(self._bank, rows, position, focus)
+        shares, log_ratio = values[:4].T, values[4] - np.log(equivalent_m)
+        collected, total = self._circuits.solve_contacts(rows, shares, log_ratio, force, patch[0])
         by_position = self._circuits.share_to_channel[rows] @ slopes[:4].transpose(2, 0, 1)
         jacobian = np.concatenate([total[:, None, None] * by_position, collected[:, :, None]], axis=2)
         return total[:, None] * collected, jacobian
+
+    @staticmethod
+    def _patches_on_sheets(
+        pads: Sequence[VirtualPad], position: FloatArray, patch: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return equivalent radii (k,) [m], and foci (2, k) as fractions, of patches (3, k) [m]."""
+        if not patch[1:].any():
+            return patch[0], np.zeros_like(position)
+        found = [
+            pad.circuit.patch_on_sheet(position[:, [number]], patch[:, [number]])
+            for number, pad in enumerate(pads)
+        ]
+        return np.concatenate([radius for radius, _ in found]), np.hstack([focus for _, focus in found])
 
     def _truth(
         self, contact: _PadContact, currents: FloatArray, jacobian: FloatArray, sync_ns: int
@@ -168,7 +183,7 @@ class VirtualHand:
             _vector(row.rotation @ shape.point(s_m, phi) + row.translation),
             _vector(row.rotation @ shape.normal(s_m, phi)),
             applied.force_n,
-            contact.radius_m,
+            contact.patch.radius_m,
             tuple(currents.tolist()),
             math.sqrt(covariance[0, 0] + covariance[1, 1]),
         )
@@ -178,7 +193,7 @@ class VirtualHand:
 class _PadContact:
     row: int
     contact: AppliedContact
-    radius_m: float
+    patch: ContactPatch
 
 
 class _HealthyCircuits:
@@ -199,11 +214,15 @@ class _HealthyCircuits:
         self,
         rows: NDArray[np.intp],
         shares: FloatArray,
-        log_radius: FloatArray,
+        log_ratio: FloatArray,
         force_n: FloatArray,
         radius_m: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the shares (k, 4) of the channels in each contact's current, and these currents (k,) [A]."""
+        """Return the shares (k, 4) of the channels in each contact's current, and these currents (k,) [A].
+
+        log_ratio: (k,), logarithm of the conformal radius over that of the equivalent disc. radius_m: (k,),
+        of the disc of the same area.
+        """
         column = shares[:, :, None]
         collected = (self.share_to_channel[rows] @ column)[:, :, 0]
         sheet_ohm = self._sheet_ohm[rows]
@@ -215,7 +234,7 @@ class _HealthyCircuits:
             self._reference_pa[rows],
             self._alpha[rows],
         )
-        ohm += sheet_ohm / (2 * math.pi) * np.maximum(log_radius - np.log(radius_m), 0.0)
+        ohm += sheet_ohm / (2 * math.pi) * np.maximum(log_ratio, 0.0)
         ohm += (column.transpose(0, 2, 1) @ self._impedance_ohm[rows] @ column)[:, 0, 0]
         return collected, self._drive_v[rows] / ohm
 

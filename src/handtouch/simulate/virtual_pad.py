@@ -92,7 +92,7 @@ class VirtualPad:
             pad,
             sheet,
             circuit,
-            stimulus.pad_stimulus(pad.link, lambda number: 1e-3 * world.contact(sheet, number).radius_mm),
+            stimulus.pad_stimulus(pad.link, lambda number: world.contact(sheet, number).patch),
             tuple(fault for fault in faults if fault.link == pad.link),
             *world.mount(hand, pad),
             node.noise_counts * hidden.noise_ratio,

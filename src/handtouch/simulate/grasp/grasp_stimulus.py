@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from handtouch.config import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches
@@ -126,7 +127,7 @@ class GraspStimulus:
             for x, y in [position[pad, lane].tolist()]
         ]
 
-    def pad_stimulus(self, link: str, radius_m: Callable[[int], float]) -> _GraspPadStimulus:  # noqa: ARG002
+    def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> _GraspPadStimulus:  # noqa: ARG002
         """Return the discs of one pad."""
         row = self.pads.index(link)
         return _GraspPadStimulus(self, row, int((self.patches.force_n[:, row] > 0).any(axis=0).sum()))
@@ -183,13 +184,14 @@ class _GraspPadStimulus:
         return _times_s(sampled), _times_s(settling), _times_s(begins)
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and radii (k, n) [m]."""
+        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and discs (k, 3, n) [m]."""
         patches, lanes = self.stimulus.patches, np.arange(self.max_contacts)
         steps = self.stimulus.step_indices(times_s)
         force = patches.force_n[steps, self.row][:, lanes].T * (steps >= 0)
         position = patches.position[steps, self.row][:, lanes].transpose(1, 2, 0)
-        radius = patches.radius_m[steps, self.row][:, lanes].T
-        return np.asarray(position), np.asarray(force), np.asarray(radius)
+        radius = np.asarray(patches.radius_m[steps, self.row][:, lanes].T)
+        discs = np.stack([radius, np.zeros_like(radius), np.zeros_like(radius)], axis=1)
+        return np.asarray(position), np.asarray(force), discs
 
 
 def _times_s(steps: IntArray) -> FloatArray:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.hand.pads import mount_transform, rotation_from_rpy
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.pad_geometry import SimulatedSurface, simulated_surface
 from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.worlds.distributions import Distribution
@@ -96,6 +97,11 @@ class HiddenContact:
     elongation: float
     direction_rad: float
     """Angle between the long axis and x on the pad."""
+
+    @property
+    def patch(self) -> ContactPatch:
+        """The patch, in metres."""
+        return ContactPatch.ellipse(1e-3 * self.radius_mm, self.elongation, self.direction_rad)
 
 
 @dataclass(frozen=True)
