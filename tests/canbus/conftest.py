@@ -18,6 +18,7 @@ from handtouch.canbus.bus.router import CanFrame, Router
 from handtouch.canbus.nodes import master
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import (
+    ErrorChanged,
     Master,
     NodeEvent,
     NodeSpec,
@@ -141,6 +142,7 @@ class Rig:
         bus = Bus(name="can", interface="virtual", channel="rig", role=role)  # type: ignore[arg-type]
         self.port = Port(bus, self.wire, self.slab)
         self.specs = [self.spec(number, **spec) for number in range(1, size + 1)]
+        self.errors: list[ErrorChanged] = []
         self.syncs = True
         self.foreign_sync = role == "listener"
         self.restart()
@@ -188,15 +190,18 @@ class Rig:
     def nmt(self, command: int, node_id: int) -> None:
         """Send a command of another NMT master."""
         message = can.Message(arbitration_id=0, data=bytes((command, node_id)), is_extended_id=False)
+        self.wire.to_master.append((message, self.t_ns))  # received before the node's response
         self.devices.handle_frame(message, self.t_ns)
-        self.inject(0, bytes(message.data))
+        self.pump()
 
     def run(self, ms: int) -> list[NodeEvent | SerialChanged]:
-        """Advance the time in steps of a millisecond; return the nodes' events."""
+        """Advance the time in steps of a millisecond; return the nodes' events, and add EMCY to `errors`."""
         for _ in range(ms):
             self.t_ns += MS
             self.step()
-        return self.master.drain_events()
+        events = self.master.drain_events()
+        self.errors += [event for event in events if isinstance(event, ErrorChanged)]
+        return [event for event in events if not isinstance(event, ErrorChanged)]
 
     def step(self) -> None:
         """Run what is due now."""

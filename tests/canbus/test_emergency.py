@@ -31,8 +31,9 @@ def test_code_and_register_are_described(code: int, register: int, text: str) ->
 def test_decoding_keeps_every_field(code: int, register: int, detail: bytes) -> None:
     message = decode_emergency(code.to_bytes(2, "little") + bytes((register,)) + detail, 7)
     assert message is not None
-    assert str(message) == message.text == describe_emergency(code, register)
-    assert (message.arrival_ns, message.code, message.register, message.detail) == (7, code, register, detail)
+    assert message.text == describe_emergency(code, register)
+    assert (message.code, message.register, message.arrival_ns) == (code, register, 7)
+    assert bytes.fromhex(message.manufacturer) == detail
 
 
 @given(st.binary(max_size=20).filter(lambda data: len(data) != 8))

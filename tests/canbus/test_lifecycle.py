@@ -14,6 +14,8 @@ from handtouch.canbus.nodes.lifecycle import advance, due_ns
 from handtouch.canbus.nodes.lifecycle_types import (
     BootUpReceived,
     BusRole,
+    ErrorsReported,
+    ForeignNmtCommand,
     HeartbeatRate,
     HeartbeatReceived,
     Lifecycle,
@@ -49,6 +51,8 @@ def life(state: NodeState, **changes: object) -> Lifecycle:
         due_ns=NOW + 1000 * MS,
         attempt=1,
         samples_to_discard=3 if state is S else 0,
+        identified=state not in (A, B),
+        confirmed=state in (O, T),
     )
     return replace(usual, **changes)  # type: ignore[arg-type]  # whatever fields a test names
 
@@ -58,7 +62,7 @@ def failed(step: NodeAction, **changes: object) -> StepFailed:
 
 
 IDENTIFY, MAPPING, CONFIGURE = NodeAction.IDENTIFY, NodeAction.READ_MAPPING, NodeAction.CONFIGURE
-WAKE = NodeAction.ENTER_PREOPERATIONAL
+WAKE, READ_ERRORS = NodeAction.ENTER_PREOPERATIONAL, NodeAction.READ_ERRORS
 QUIET = NOW - 400 * MS
 
 TRANSITIONS: list[tuple[str, Lifecycle, LifecycleEvent, NodeState, tuple[NodeAction, ...]]] = [
@@ -134,7 +138,8 @@ TRANSITIONS: list[tuple[str, Lifecycle, LifecycleEvent, NodeState, tuple[NodeAct
     ("refuses to be event-driven", life(O), failed(NodeAction.SET_TRANSMISSION), O, ()),
     ("no sample", life(S, due_ns=NOW), TimerExpired(), T, ()),
     ("old heartbeat", life(S, started_ns=NOW - MS), HeartbeatReceived(cia301.PREOPERATIONAL), S, ()),
-    ("start command lost", life(S), HeartbeatReceived(cia301.PREOPERATIONAL), B, (IDENTIFY,)),
+    ("start without effect", life(S), HeartbeatReceived(cia301.PREOPERATIONAL), F, (READ_ERRORS,)),
+    ("start without effect, stopped", life(S), HeartbeatReceived(cia301.STOPPED), F, (WAKE, READ_ERRORS)),
     # operational
     ("sample", life(O), SampleReceived(), O, ()),
     ("heartbeat", life(O), HeartbeatReceived(cia301.OPERATIONAL), O, ()),
@@ -142,9 +147,9 @@ TRANSITIONS: list[tuple[str, Lifecycle, LifecycleEvent, NodeState, tuple[NodeAct
     ("heartbeat late, not too late", life(O, last_heartbeat_ns=NOW - 350 * MS), TimerExpired(), O, ()),
     ("lost", life(O, last_heartbeat_ns=NOW - 351 * MS), TimerExpired(), A, ()),
     ("rebooted", life(O), BootUpReceived(), B, (IDENTIFY,)),
-    ("stopped by another master", life(O), HeartbeatReceived(cia301.STOPPED), B, (WAKE, IDENTIFY)),
+    ("stopped by itself", life(O), HeartbeatReceived(cia301.STOPPED), B, (WAKE, IDENTIFY)),
     (
-        "made pre-operational by another master",
+        "pre-operational by itself",
         life(O),
         HeartbeatReceived(cia301.PREOPERATIONAL),
         B,
@@ -225,9 +230,11 @@ TRANSITIONS: list[tuple[str, Lifecycle, LifecycleEvent, NodeState, tuple[NodeAct
     *(
         (f"stop from {state.name}", life(state), StopRequested(), X, (NodeAction.STOP,))
         for state in NodeState
-        if state is not X
+        if state not in (A, B, X)
     ),
-    ("stop a stranger", life(F, wrong_device=True), StopRequested(), X, ()),
+    ("stop a node never identified", life(A), StopRequested(), X, ()),
+    ("stop a node being identified", life(B), StopRequested(), X, ()),
+    ("stop a stranger", life(F, identified=False), StopRequested(), X, ()),
     *(
         (f"{type(event).__name__} after stop", life(X, due_ns=0), event, X, ())
         for event in (
@@ -349,10 +356,15 @@ def test_failure_to_enter_standby_is_reported() -> None:
 
 
 # Attempts are counted back from the present one.
-STEPS = [IDENTIFY, MAPPING, CONFIGURE, NodeAction.ENTER_STANDBY, NodeAction.SET_TRANSMISSION]
+STEPS = [
+    *(IDENTIFY, MAPPING, CONFIGURE, READ_ERRORS),
+    *(NodeAction.CHECK_SETTINGS, NodeAction.ENTER_STANDBY, NodeAction.SET_TRANSMISSION),
+]
 EVENTS = st.one_of(
     st.just(BootUpReceived()),
     st.builds(HeartbeatReceived, st.sampled_from([4, 5, 127, 99])),
+    st.builds(ForeignNmtCommand, st.sampled_from([1, 2, 128, 129, 130])),
+    st.builds(ErrorsReported, st.sampled_from(["", "error register 0x01 (generic)"])),
     st.just(ProbeAnswered()),
     st.builds(StepDone, st.sampled_from(STEPS), st.sampled_from([0, 0, 0, 1])),
     st.builds(
@@ -370,7 +382,9 @@ EVENTS = st.one_of(
     st.just(TimerExpired()),
 )
 HISTORIES = st.lists(st.tuples(EVENTS, st.integers(0, 500)), max_size=60)
-COMMANDS = {NodeAction.ENTER_PREOPERATIONAL, NodeAction.START, NodeAction.STOP, NodeAction.ENTER_STANDBY}
+COMMANDS = {
+    *(WAKE, NodeAction.START, NodeAction.STOP, NodeAction.ENTER_STANDBY, NodeAction.RESET_COMMUNICATION)
+}
 ALLOWED = {  # by what a state can be preceded
     O: {S, T},
     C: {I},
@@ -452,6 +466,9 @@ class Answering:
         for action in actions:
             if action is NodeAction.PROBE:
                 self.report(HeartbeatReceived(self.nmt) if self.nmt == cia301.STOPPED else ProbeAnswered())
+            elif action is NodeAction.RESET_COMMUNICATION:
+                self.nmt, self.beats = cia301.PREOPERATIONAL, False
+                self.report(BootUpReceived())
             elif action in COMMANDS:
                 self.nmt = {WAKE: cia301.PREOPERATIONAL, NodeAction.START: cia301.OPERATIONAL}.get(
                     action, cia301.STOPPED

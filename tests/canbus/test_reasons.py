@@ -21,7 +21,7 @@ from handtouch.canbus.nodes.lifecycle_types import (
 
 def test_status_has_the_boot_reason_until_the_node_is_operational(rig: Any) -> None:
     rig.boot()
-    rig.node(1).handle_nmt(128)
+    rig.nmt(128, 1)
     expected = set()
     for _ in range(300):
         rig.run(1)
@@ -29,7 +29,7 @@ def test_status_has_the_boot_reason_until_the_node_is_operational(rig: Any) -> N
     up = (NodeState.OPERATIONAL, NodeState.STALE)
     reasons = [reason for state, reason in expected if state not in up]
     assert len(reasons) >= 2
-    assert all("node is pre-operational, although it was started" in reason for reason in reasons)
+    assert all("made pre-operational by an NMT command of another master" in reason for reason in reasons)
     assert rig.status(1).reason == ""
 
 

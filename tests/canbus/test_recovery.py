@@ -28,6 +28,8 @@ OBJECTS = [  # all that are read or written when a node boots, and whether it ca
     ((0x1018, 2), False),
     ((0x1018, 3), False),
     ((0x1018, 4), False),
+    ((0x1001, 0), True),
+    ((0x1003, 0), True),
     ((0x1A01, 0), False),
     ((0x1A01, 1), False),
     ((0x1A01, 4), False),
@@ -41,7 +43,8 @@ OBJECTS = [  # all that are read or written when a node boots, and whether it ca
     ((0x2100, 0), False),
     ((0x1017, 0), False),
 ]
-REQUESTS = range(1, 43)
+DIAGNOSTIC = {(0x1001, 0), (0x1003, 0)}
+REQUESTS = range(1, 45)
 
 
 def booted(rig: Any, ms: int) -> None:
@@ -73,7 +76,7 @@ def test_failing_object_is_named_and_retried(
     assert rig.state(2) is OPERATIONAL
     if optional and code is not None:
         assert rig.state(1) is OPERATIONAL
-        assert not rig.master.can_idle(0)
+        assert rig.master.can_idle(0) == (where in DIAGNOSTIC)
         return
     assert rig.state(1) is FAULTED
     assert f"0x{where[0]:04X}:{where[1]:02X}" in rig.status(1).reason
@@ -209,15 +212,16 @@ def test_heartbeat_without_data_is_reported_once(rig: Any) -> None:
     rig.boot()
     rig.node(1).send_data = False
     events = rig.run(10_000)
-    assert [e.new_state for e in events] == [NodeState.STALE]
+    assert [e.new_state for e in events] == [NodeState.STALE] * 2
     assert "heartbeat present" in events[0].reason
+    assert "; its PDO and heartbeat settings are as configured" in events[1].reason
 
 
 def test_node_whose_samples_are_too_short_is_stale_and_they_are_counted(rig: Any) -> None:
     rig.boot()
     rig.node(1).frame_bytes = 7
     events = rig.run(1000)
-    assert [e.new_state for e in events] == [NodeState.STALE]
+    assert {e.new_state for e in events} == {NodeState.STALE}
     assert rig.port.counters.wrong_length >= 199
     rig.node(1).frame_bytes = None
     rig.run(10)

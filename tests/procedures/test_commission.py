@@ -113,6 +113,8 @@ class SteppedSource:
                 heartbeats_missed=0,
                 reboots=0,
                 emergencies=(),
+                error_register=None,
+                error_history=(),
             )
             for slot, ((hand, pad), device) in enumerate(zip(configured, self._devices, strict=True))
         ]

@@ -147,7 +147,7 @@ def health(seq: int, t_ns: int, state: str = "clear", reason: str = "") -> list[
         age_s=None,
         reboots=0,
         heartbeats_missed=0,
-        emergencies=("low supply", "hot"),
+        emergencies=({"text": "0x3100 mains voltage"}, {"text": "0x4200 device temperature"}),
         retained=False,
     )
     return wire.encode(message)

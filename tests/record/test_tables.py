@@ -62,7 +62,7 @@ def test_hand_frames_are_rows_with_empty_cells_for_unknown_values(tables: Path) 
 def test_lists_of_health_are_one_cell(tables: Path) -> None:
     rows = _rows(tables, "health")
     assert [row["state"] for row in rows] == ["clear", "lost"]
-    assert rows[0]["emergencies"] == "low supply; hot"
+    assert rows[0]["emergencies"] == "0x3100 mains voltage; 0x4200 device temperature"
 
 
 def test_parquet_holds_the_same_rows_with_types(tables: Path) -> None:

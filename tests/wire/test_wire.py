@@ -119,7 +119,7 @@ def test_an_error_names_the_key_the_expected_and_the_received_type() -> None:
     for key, value, text in (
         ("rate_hz", "fast", "rate_hz must be a number, not a string"),
         ("serial", 1.5, "serial must be an integer or nil, not a number"),
-        ("emergencies", [1], "emergencies must be a list of strings, not a list of 1"),
+        ("emergencies", [1], "emergencies must be a list of maps, not a list of 1"),
         ("retained", None, "retained must be true or false, not nil"),
     ):
         with pytest.raises(wire.WireError, match=f"health/h/x: {text}"):

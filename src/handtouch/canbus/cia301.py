@@ -30,6 +30,8 @@ START_NODE, STOP_NODE, ENTER_PREOPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1
 # communication profile area
 DEVICE_TYPE = 0x1000
 ERROR_REGISTER = 0x1001
+ERROR_HISTORY = 0x1003
+"""Pre-defined error field; sub-index 0: number of errors, 1: the latest."""
 DEVICE_NAME, HARDWARE_VERSION, SOFTWARE_VERSION = 0x1008, 0x1009, 0x100A
 GUARD_TIME = 0x100C
 LIFE_TIME_FACTOR = 0x100D
@@ -38,6 +40,10 @@ HEARTBEAT_TIME = 0x1017
 IDENTITY = 0x1018
 """Sub-indices 1 to 4: vendor id, product code, revision, serial number."""
 SERIAL_SUB = 4
+ERROR_BEHAVIOUR = 0x1029
+"""Sub-index 1: reaction to a communication error."""
+ERROR_REACTIONS = {0: "pre-operational", 1: "no change", 2: "stopped"}
+"""Values of 0x1029: the NMT state that a node enters by itself upon an error."""
 TPDO_COMMUNICATION = 0x1800
 """Sub-indices 1 to 5: identifier, transmission type, inhibit time, (reserved), event timer."""
 TPDO_MAPPING = 0x1A00

@@ -26,7 +26,7 @@ _COLUMNS: tuple[tuple[str, bool, Callable[[dict[str, Any]], str]], ...] = (
     ("missed", True, lambda pad: str(pad["missed_samples"])),
     ("heartbeats missed", True, lambda pad: str(pad["heartbeats_missed"])),
     ("reboots", True, lambda pad: str(pad["reboots"])),
-    ("reason", False, lambda pad: "; ".join(filter(None, [pad["reason"], *pad["emergencies"][-1:]]))),
+    ("reason", False, lambda pad: "; ".join(filter(None, [pad["reason"], *_active_errors(pad)]))),
 )
 """Columns of the table of pads: header, number, text of a pad."""
 
@@ -115,6 +115,12 @@ def _print_pads(pads: list[dict[str, Any]], console: Console) -> None:
     for pad in pads:
         table.add_row(*(text(pad) for _, _, text in _COLUMNS))
     console.print(table)
+
+
+def _active_errors(pad: dict[str, Any]) -> list[str]:
+    """Return the errors that the node has reported by EMCY and not cleared, unless the reason names them."""
+    active = [error for error in pad["emergencies"] if error["cleared_ns"] is None]
+    return [f"EMCY {e['text']}" for e in active[-2:] if f"0x{e['code']:04X}" not in pad["reason"]]
 
 
 def _print_supervisor(answer: dict[str, Any], console: Console) -> None:

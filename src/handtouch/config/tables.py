@@ -144,6 +144,10 @@ class Node(Table):
     allow_pdo_remapping: bool = Field(
         True, description="map the channels to a TPDO over SDO if no TPDO of the node carries them"
     )
+    allow_nmt_reset: bool = Field(
+        True,
+        description="send one NMT reset communication to a node that refuses OPERATIONAL; role master only",
+    )
     revision: Unsigned32 | None = Field(
         None, description="expected revision number (0x1018 sub 3); default: any"
     )

@@ -21,7 +21,7 @@ from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.sync import Sync, percentiles_us
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master
-from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
+from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent
 from handtouch.config import Deployment
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.pad_explanation import explain_pad_state
@@ -129,7 +129,8 @@ class StatusReporter:
                 self._log_event(event)
             self._update_node_states()
             if self.supervisor is not None:
-                self.supervisor.handle_node_events(events, now_ns)
+                changes = [event for event in events if not isinstance(event, ErrorChanged)]
+                self.supervisor.handle_node_events(changes, now_ns)
         state = self._pipeline.tick.columns.state
         visible = np.where(state == PadState.TOUCHED, PadState.CLEAR, state)  # contacts have their own topic
         changed = self._previous_event_pads | set(np.flatnonzero(visible != self._published_state).tolist())
@@ -181,13 +182,17 @@ class StatusReporter:
         hands = ", ".join(hand.name for hand in self._deployment.hands)
         return f"{hands}: {up} of {len(self._pads)} nodes up, {self._rates_hz.get('ticks', 0.0):.0f} ticks/s"
 
-    def _log_event(self, event: NodeEvent | SerialChanged) -> None:
+    def _log_event(self, event: MasterEvent) -> None:
         hand, link = self._names[event.slot]
         node_id = self._pads[event.slot][1].node_id
         level, state = logging.WARNING, "node replaced"
         if isinstance(event, NodeEvent):
             level = _event_level(event)
             state = f"{event.new_state.name} {event.reason.translate(_WITHOUT_DIGITS)}"
+        elif isinstance(event, ErrorChanged):
+            cleared = event.emergency.cleared_ns is not None
+            level = logging.INFO if cleared else logging.WARNING
+            state = f"EMCY 0x{event.emergency.code:04X}{' cleared' if cleared else ''}"
         extra = {"fields": {"hand": hand, "link": link}, "state": state}
         _log.log(level, "node 0x%02X (%s/%s): %s", node_id, hand, link, event, extra=extra)
 
@@ -274,8 +279,10 @@ class StatusReporter:
             age_s=(now_ns - sample_ns) * 1e-9 if sample_ns else None,
             reboots=status.reboots,
             heartbeats_missed=status.heartbeats_missed,
-            emergencies=tuple(str(emergency) for emergency in status.emergencies),
+            emergencies=tuple(emergency.to_map() for emergency in status.emergencies),
             retained=False,
+            error_register=status.error_register,
+            error_history=status.error_history,
             **(self.supervisor.health_fields(pad) if self.supervisor is not None else {}),
         )
 

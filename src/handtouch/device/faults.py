@@ -99,6 +99,10 @@ class FaultSwitches:
 
     send_heartbeat = FaultSwitch(True)
     """False: no heartbeats, and no responses to node guarding; data continue."""
+    heartbeat_state: FaultSwitch[int | None] = FaultSwitch(
+        None, lambda state: state is None or 0 <= state <= 127, "an NMT state, 0 to 127, or None"
+    )
+    """NMT state in its heartbeats and guarding responses, whatever its own is."""
     send_data = FaultSwitch(True)
     """False: no TPDOs; heartbeats continue."""
     frame_bytes: FaultSwitch[int | None] = FaultSwitch(

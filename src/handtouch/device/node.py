@@ -23,10 +23,13 @@ from handtouch.device.spec import DeviceSpec
 
 RESETS = (cia301.RESET_NODE, cia301.RESET_COMMUNICATION)
 NMT_COMMANDS = (cia301.START_NODE, cia301.STOP_NODE, cia301.ENTER_PREOPERATIONAL, *RESETS)
+_NO_CHANGE, _STOPS = 1, 2
+"""0x1029: an error doesn't change the NMT state, or stops the node."""
 _ERROR_REGISTER, _EMCY_COB_ID = (cia301.ERROR_REGISTER, 0), (cia301.EMCY_COB_ID, 0)
 _GUARD_TIME, _LIFE_TIME_FACTOR = (cia301.GUARD_TIME, 0), (cia301.LIFE_TIME_FACTOR, 0)
 _HEARTBEAT_TIME = (cia301.HEARTBEAT_TIME, 0)
 _LIFE_GUARD_ERROR = 0x8130
+_HISTORY_LENGTH = 8
 _MAX_BACKLOG_NS = 100_000_000  # of a babbling node, after a pause of the program
 
 
@@ -67,7 +70,8 @@ class Device(FaultSwitches):
         self._noise = random.Random(node_id)
         # jobs of an earlier generation are void
         self._power_generation = self._heartbeat_generation = 0
-        self._babble_generation = self._guard_generation = 0
+        self._babble_generation = self._guard_generation = self._boot_loop_generation = 0
+        self._latched_error: tuple[int, int, bytes] | None = None
         self._toggle_bit = 0
         self._channels = {address: channel for channel, address in enumerate(spec.channels)}
         dictionary = spec.load_dictionary(node_id)
@@ -185,9 +189,43 @@ class Device(FaultSwitches):
         """Send an EMCY message; `data` are up to five manufacturer-specific bytes."""
         with self._bus.lock:
             self._objects.set_integer(*_ERROR_REGISTER, register)
+            if code:
+                self._add_to_history(code | int.from_bytes(data[:2].ljust(2, b"\0"), "little") << 16)
             cob_id = self._objects.get_integer(*_EMCY_COB_ID) or cia301.EMCY + self.node_id
             if self._serves_sdo and not cob_id & cia301.INVALID_BIT:
                 self._send(cob_id & cia301.IDENTIFIER_MASK, struct.pack("<HB5s", code, register, data))
+
+    def latch_error(self, code: int, register: int = 1, data: bytes = b"") -> None:
+        """Have an error until `clear_error`, through resets too: EMCY, and as 0x1029 sub 1 has it.
+
+        Unless that is "no change", it leaves operational, and refuses it.
+        """
+        with self._bus.lock:
+            self._latched_error = code, register, data
+            self.send_emergency(code, register, data)
+            if self._nmt_state == cia301.OPERATIONAL and self._is_inhibited:
+                stops = self._objects.get_integer(cia301.ERROR_BEHAVIOUR, 1) == _STOPS
+                self._enter_nmt_state(cia301.STOPPED if stops else cia301.PREOPERATIONAL)
+
+    def clear_error(self) -> None:
+        """Clear the error of `latch_error`: EMCY 0x0000, error register 0."""
+        with self._bus.lock:
+            if self._latched_error is not None:
+                self._latched_error = None
+                self.send_emergency(0)
+
+    def start_boot_loop(self, period_ns: int) -> None:
+        """Restart now and every `period_ns`, as by a watchdog or a weak supply, until `stop_boot_loop`."""
+        if period_ns <= 0:
+            raise ValueError(f"need period_ns > 0, got {period_ns}")
+        with self._bus.lock:
+            self._boot_loop_generation += 1
+            loop = partial(self._reboot_repeatedly, self._boot_loop_generation, period_ns)
+            self._bus.schedule(self._bus.now_ns, loop)
+
+    def stop_boot_loop(self) -> None:
+        """Stop what `start_boot_loop` started."""
+        self._boot_loop_generation += 1
 
     def start_babbling(self, rate_hz: float, identifier: int | None = None, data: bytes = bytes(8)) -> None:
         """Send a frame at a high rate in any NMT state, by default with the identifier of its first TPDO."""
@@ -270,6 +308,8 @@ class Device(FaultSwitches):
             self._boot(power=command == cia301.RESET_NODE)
             return
         state = COMMAND_TO_STATE[command]
+        if state == cia301.OPERATIONAL and self._is_inhibited:
+            return
         if state != self._nmt_state:
             self._enter_nmt_state(state)
 
@@ -284,7 +324,8 @@ class Device(FaultSwitches):
         if not is_guarded or not self.plugged or self._is_bus_off:
             return
         if self.send_heartbeat:
-            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((self._toggle_bit | self._nmt_state,)))
+            state = self._nmt_state if self.heartbeat_state is None else self.heartbeat_state
+            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((self._toggle_bit | state,)))
         self._toggle_bit ^= 0x80
         life_ms = self._objects.get_integer(*_GUARD_TIME) * self._objects.get_integer(*_LIFE_TIME_FACTOR)
         self._guard_generation += 1
@@ -311,6 +352,12 @@ class Device(FaultSwitches):
                 self._bus.transmit(frame)
 
     @property
+    def _is_inhibited(self) -> bool:
+        """True while an error keeps it from being operational."""
+        behaviour = self._objects.get_integer(cia301.ERROR_BEHAVIOUR, 1)
+        return self._latched_error is not None and behaviour != _NO_CHANGE
+
+    @property
     def _serves_sdo(self) -> bool:
         """True in pre-operational and operational, in which SDO and EMCY work."""
         states = (cia301.OPERATIONAL, cia301.PREOPERATIONAL)
@@ -327,6 +374,17 @@ class Device(FaultSwitches):
         self._send(cia301.NMT_ERROR_CONTROL + self.node_id, b"\0")
         self._enter_nmt_state(cia301.PREOPERATIONAL)
         self._start_heartbeat(self._objects.get_integer(*_HEARTBEAT_TIME))
+        if self._latched_error is not None:
+            self.send_emergency(*self._latched_error)
+
+    def _add_to_history(self, entry: int) -> None:
+        """Put an error first in the pre-defined error field, 0x1003."""
+        index, get = cia301.ERROR_HISTORY, self._objects.get_integer
+        kept = min(get(index, 0), _HISTORY_LENGTH - 1)
+        for sub in range(kept, 0, -1):
+            self._objects.set_integer(index, sub + 1, get(index, sub))
+        self._objects.set_integer(index, 1, entry)
+        self._objects.set_integer(index, 0, kept + 1)
 
     def _enter_nmt_state(self, state: int) -> None:
         self._nmt_state = state
@@ -391,7 +449,8 @@ class Device(FaultSwitches):
         if generation != self._heartbeat_generation or not self.plugged:
             return None
         if self.send_heartbeat:
-            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((self._nmt_state,)))
+            state = self._nmt_state if self.heartbeat_state is None else self.heartbeat_state
+            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((state,)))
         return due_ns + period_ns * (1 + (now_ns - due_ns) // period_ns)
 
     def _handle_guard_timeout(self, generation: int, *_: int) -> None:
@@ -401,6 +460,12 @@ class Device(FaultSwitches):
         self.send_emergency(_LIFE_GUARD_ERROR, 0x11)
         if self._nmt_state == cia301.OPERATIONAL:
             self._enter_nmt_state(cia301.PREOPERATIONAL)
+
+    def _reboot_repeatedly(self, generation: int, period_ns: int, _due_ns: int, now_ns: int) -> int | None:
+        if generation != self._boot_loop_generation:
+            return None
+        self.reboot()
+        return now_ns + period_ns
 
     def _send_babble(
         self, generation: int, frame: can.Message, period_ns: int, due_ns: int, now_ns: int

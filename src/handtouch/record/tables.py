@@ -75,10 +75,15 @@ def flatten_payload(payload: dict[str, Any]) -> Row:
             parts = value if value is not None else [None] * length
             row |= dict(zip(component_names(name, length), parts, strict=True))
         elif isinstance(value, list):
-            row[name] = "; ".join(map(str, value))
+            row[name] = "; ".join(map(_item_text, value))
         elif isinstance(value, _SCALAR_TYPES):
             row[name] = value
     return row
+
+
+def _item_text(item: Any) -> str:
+    """Return an item of a list as text; of an EMCY message its text, of a diagnosis its kind."""
+    return str(item.get("text", item.get("kind", ""))) if isinstance(item, dict) else str(item)
 
 
 def component_names(name: str, length: int) -> list[str]:

@@ -84,7 +84,7 @@ class LineDisplay:
                 message.reason,
                 message.calibration_state,
                 *kinds,
-                *message.emergencies,
+                *(str(error.get("text")) for error in message.emergencies if error.get("cleared_ns") is None),
             )
             pad = (message.hand, message.link)
             known, self._health[pad] = self._health.get(pad), state

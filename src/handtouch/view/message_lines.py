@@ -66,6 +66,8 @@ def health_line(health: wire.Health) -> str:
     if health.calibration_state in UNCALIBRATED_STATES:
         mode += f" {health.calibration_state}"
     why += "".join(f"; {diagnosis_text(diagnosis)}" for diagnosis in health.diagnoses)
+    active = [error for error in health.emergencies if error.get("cleared_ns") is None]
+    why += "".join(f"; EMCY {error.get('text')}" for error in active)
     return (
         f"{health.t_ns * 1e-9:14.4f}  health  {health.hand}/{health.link:<16}  {health.state:8} "
         f"node {health.node_id} on {health.bus} {health.node_state}{mode}{serial}, {health.rate_hz:.0f} Hz, "

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from handtouch.wire.declarations import Values
 from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.emergency import Emergency
 from handtouch.wire.status import PadState
 
 
@@ -59,9 +60,15 @@ class Health:
     """boot-up messages of its node after the first"""
     heartbeats_missed: int
     """heartbeats of its node that timed out"""
-    emergencies: tuple[str, ...]
-    """latest EMCY messages as text, newest last"""
+    emergencies: Annotated[tuple[dict[str, Any], ...], tuple[Emergency, ...]]
+    """the latest 16 errors that the node has reported by EMCY, newest last; error resets (code 0x00xx) end
+    errors and aren't listed"""
     retained: bool
+    error_register: int | None = None
+    """error register (0x1001), from EMCY or as read at boot; absent before"""
+    error_history: tuple[int, ...] = ()
+    """pre-defined error field (0x1003) as read at boot and after a failure, the latest error first: error
+    code in bits 0 to 15, manufacturer's information in bits 16 to 31"""
     calibration_state: Annotated[str, Values("default", "calibrated", "quarantined", "manual_required")] = ""
     """`default`: the deployment's values; `calibrated`; `quarantined`: not relied on after its node was
     replaced; `manual_required`: automatic calibration failed. This and the following are absent where

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from handtouch.canbus import cia301
+from handtouch.canbus.objects.emergency import ReportedErrors
 from handtouch.canbus.objects.mapping import NodeTpdo, PdoMapping
 from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient
 from handtouch.config.channels import WritableObject
@@ -20,6 +21,9 @@ LIFE_TIME_FACTOR = 30
 """Guard times without a guarding request after which a guarded node leaves OPERATIONAL; longer than a pause
 of the host.
 """
+
+MAX_HISTORY = 8
+"""Entries of the error history that are read; the latest come first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,14 @@ class Identity:
     product_code: int | None = None
     revision: int | None = None
     serial: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """Result of `identify_node`."""
+
+    identity: Identity
+    errors: ReportedErrors
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +99,8 @@ class NodeConfigured:
     """it can be made event-driven"""
     refusal: str = ""
     """setting that it refused, and the one used instead"""
+    event_timed: bool = False
+    """it is sent by its event timer, not with SYNC"""
 
 
 def read_identity(sdo: NodeSdoClient) -> Identity:
@@ -97,6 +111,11 @@ def read_identity(sdo: NodeSdoClient) -> Identity:
         sdo.read_optional(cia301.IDENTITY, 3, "revision"),
         sdo.read_optional(cia301.IDENTITY, 4, "serial number"),
     )
+
+
+def identify_node(sdo: NodeSdoClient) -> Identification:
+    """Read 0x1018, and the errors that the node reports."""
+    return Identification(read_identity(sdo), read_errors(sdo))
 
 
 def check_identity(identity: Identity, expected: ExpectedIdentity) -> None:
@@ -110,15 +129,59 @@ def check_identity(identity: Identity, expected: ExpectedIdentity) -> None:
         if configured is not None and actual != configured:
             value = "none" if actual is None else f"{actual} (0x{actual:X})"
             raise BootStepError(
-                f"another device: {name} is {value}, configured is {configured} (0x{configured:X}); "
+                f"identity mismatch: {name} is {value}, configured is {configured} (0x{configured:X}); "
                 f"connect the configured node, or correct {key} in the deployment",
                 wrong_device=True,
             )
     if identity.serial in expected.serials_of_other_pads:
         raise BootStepError(
-            f"another pad's device: serial number {identity.serial} is configured for another pad; "
+            f"identity mismatch: serial number {identity.serial} is configured for another pad; "
             "connect the nodes as configured, or correct serial in the deployment",
             wrong_device=True,
+        )
+
+
+def read_errors(sdo: NodeSdoClient, with_behaviour: bool = False) -> ReportedErrors:
+    """Read error register and history, and `with_behaviour` 0x1029; refusals count as missing objects."""
+    register = sdo.read_or_none(cia301.ERROR_REGISTER, 0, "error register")
+    count = sdo.read_or_none(cia301.ERROR_HISTORY, 0, "error history") or 0
+    entries = (
+        sdo.read_or_none(cia301.ERROR_HISTORY, sub, "error history")
+        for sub in range(1, min(count, MAX_HISTORY) + 1)
+    )
+    history = tuple(entry for entry in entries if entry is not None)
+    behaviour = sdo.read_or_none(cia301.ERROR_BEHAVIOUR, 1, "error behaviour") if with_behaviour else None
+    return ReportedErrors(register, history, behaviour)
+
+
+def check_settings(
+    sdo: NodeSdoClient, mapping: PdoMapping, heartbeat_ms: int | None, event_driven: bool
+) -> None:
+    """Raise BootStepError with the object that isn't as configured: mapping, PDO parameters, heartbeat time.
+
+    `heartbeat_ms` is None for a guarded node; `event_driven` if its TPDO isn't sent with SYNC.
+    """
+    for tpdo in mapping.tpdos:
+        index, number = cia301.TPDO_MAPPING + tpdo.number - 1, tpdo.number
+        _check_value(sdo, index, 0, len(tpdo.entries), f"number of objects mapped in TPDO{number}")
+        for sub, entry in enumerate(tpdo.entries, 1):
+            _check_value(sdo, index, sub, entry, f"mapping of TPDO{number}")
+        index = cia301.TPDO_COMMUNICATION + number - 1
+        _check_value(sdo, index, 1, tpdo.enabled_entry, f"COB-ID of TPDO{number}")
+        allowed = cia301.EVENT_DRIVEN_TYPES if event_driven else (cia301.SYNCHRONOUS,)
+        _check_value(sdo, index, 2, allowed[-1], f"transmission type of TPDO{number}", allowed)
+    if heartbeat_ms is not None:
+        _check_value(sdo, cia301.HEARTBEAT_TIME, 0, heartbeat_ms, "heartbeat time")
+
+
+def _check_value(
+    sdo: NodeSdoClient, index: int, sub: int, expected: int, name: str, allowed: tuple[int, ...] = ()
+) -> None:
+    value = sdo.read(index, sub, name)
+    if value != expected and value not in allowed:
+        form = "0x{:08X}" if max(value, expected) > 0xFFFF else "{}"
+        raise BootStepError(
+            f"0x{index:04X}:{sub:02X}, {name}, is {form.format(value)} instead of {form.format(expected)}"
         )
 
 
@@ -139,7 +202,8 @@ def configure_node(
     """
     if any(not tpdo.enabled or tpdo.transmission_type != cia301.SYNCHRONOUS for tpdo in mapping.tpdos):
         enter_preoperational()
-    refusal, single = "", len(mapping.tpdos) == 1  # several event-driven PDOs would not form one sample
+    refusal, event_timed = "", False
+    single = len(mapping.tpdos) == 1  # several event-driven PDOs would not form one sample
     for tpdo in mapping.tpdos:
         if tpdo.transmission_type != cia301.SYNCHRONOUS:
             try:
@@ -148,6 +212,7 @@ def configure_node(
                 if error.timed_out or not single or tpdo.transmission_type not in cia301.EVENT_DRIVEN_TYPES:
                     raise
                 _set_event_timer(sdo, tpdo, settings.event_timer_ms)
+                event_timed = True
                 refusal = (
                     f"sends every {settings.event_timer_ms} ms by its event timer, not with SYNC: {error}"
                 )
@@ -163,7 +228,8 @@ def configure_node(
             can_idle, refusal = False, f"stays synchronous while idle: {error}"
             _enable_tpdo(sdo, mapping.tpdos[0])
     set_excitation(sdo, settings.excitation, True)
-    return NodeConfigured(_set_up_supervision(sdo, settings.heartbeat_ms, booted), can_idle, refusal)
+    guarded = _set_up_supervision(sdo, settings.heartbeat_ms, booted)
+    return NodeConfigured(guarded, can_idle, refusal, event_timed)
 
 
 def prepare_idle(

@@ -1,7 +1,7 @@
 """Types of a CANopen node's lifecycle: states, events, actions, timing.
 
-Public names: `Lifecycle` with its `NodeState`; `LifecycleEvent`, a union of the event classes; `NodeAction`;
-`BusRole` and `NodeTiming`, the parameters of `lifecycle.advance`. Times are in ns.
+Public names: `Lifecycle` with its `NodeState` and `NodeFault`; `LifecycleEvent`, a union of the event
+classes; `NodeAction`; `BusRole` and `NodeTiming`, the parameters of `lifecycle.advance`. Times are in ns.
 """
 
 from __future__ import annotations
@@ -35,7 +35,17 @@ class NodeAction(Enum):
     START = auto()
     STOP = auto()
     ENTER_STANDBY = auto()  # excitation off, where the node supports it, then STOP
+    RESET_COMMUNICATION = auto()  # NMT reset communication to this node alone
+    READ_ERRORS = auto()  # error register and history over SDO, to explain a refusal
+    CHECK_SETTINGS = auto()  # read back what was configured; a StepFailed names the difference
     SET_TRANSMISSION = auto()  # event-driven or synchronous; started by the master itself
+
+
+class NodeFault(Enum):
+    """Fault in a node's NMT behaviour; its reason ends with the errors that the node reports."""
+
+    REFUSES_OPERATIONAL = "refuses OPERATIONAL"
+    LEAVES_OPERATIONAL = "leaves OPERATIONAL by itself"
 
 
 class BusRole(Enum):
@@ -57,6 +67,8 @@ class NodeTiming:
     settle_timeout_ns: int = 1_000_000_000
     min_retry_ns: int = 100_000_000
     max_retry_ns: int = 5_000_000_000
+    """also: a node that has operated for so long is stable, and its next restart is the first again"""
+    allow_nmt_reset: bool = True
 
     def retry_delay_ns(self, failures: int) -> int:
         """Return the delay after that many consecutive failures: doubled with each, up to `max_retry_ns`."""
@@ -87,6 +99,22 @@ class Lifecycle:
     wrong_device: bool = False  # not the configured node, at its last identification
     duplicate_id: bool = False  # two nodes have its id
     babbling: bool = False  # sends many samples per SYNC
+    identified: bool = False  # as the configured node, since its last boot-up
+    fault: NodeFault | None = None
+    errors: str = ""  # errors that the node reports, as text
+    confirmed: bool = False  # it was operational after its start
+    operational_ns: int = 0  # when it became operational after its start, 0 before
+    restarts: int = 0  # consecutive boot-ups, refusals and departures of an unstable node
+    boot_ups: int = 0  # those of them that are boot-ups
+    unstable_ns: int = 0  # time of the first of them
+    start_pending: bool = False  # FAULTED, and started again: its next heartbeat shows the effect
+    reset_sent: bool = False  # one NMT reset communication, since it was last stable
+    reset_pending: bool = False  # its boot-up message hasn't arrived
+    foreign_nmt: int | None = None  # last NMT command of another master, and its time
+    foreign_nmt_ns: int = 0
+    checks: int = 0  # of its settings, since it was stale
+    first_check_ns: int = -(1 << 62)  # time of the first of them
+    repairs: int = 0  # of changed settings
     boot_reason: str = ""  # cause of the present boot
     standby: bool = False  # not needed now: configured, but stopped instead of started
 
@@ -101,6 +129,20 @@ class HeartbeatReceived:
     """Heartbeat with the node's NMT state."""
 
     nmt_state: int
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignNmtCommand:
+    """NMT command of another master to this node, or to all."""
+
+    command: int
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorsReported:
+    """Errors that the node reports, by EMCY, error register and history; empty for none."""
+
+    errors: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +228,8 @@ class StopRequested:
 LifecycleEvent = (
     BootUpReceived
     | HeartbeatReceived
+    | ForeignNmtCommand
+    | ErrorsReported
     | ProbeAnswered
     | StepDone
     | StepFailed

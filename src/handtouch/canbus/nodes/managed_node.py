@@ -6,7 +6,6 @@ Public names: `ManagedNode`, `make_managed_node`, `run_step`, `send_nmt`, `StepO
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -23,18 +22,18 @@ from handtouch.canbus.nodes.lifecycle_types import (
     StepFailed,
 )
 from handtouch.canbus.nodes.spec import NodeSpec, NodeStatus
-from handtouch.canbus.objects import emergency
+from handtouch.canbus.objects.emergency import ErrorLog, ReportedErrors
 from handtouch.canbus.objects.mapping import PdoMapping, mapping_from_eds, read_mapping, tpdo_numbers
 from handtouch.canbus.objects.sdo import BootStepCancelled, BootStepError, NodeSdoClient, SdoTransport
 
-MAX_EMERGENCIES = 16
 StepOutcome = StepDone | StepFailed
-StepResult = boot.Identity | PdoMapping | boot.NodeConfigured | boot.TransmissionSet
+StepResult = boot.Identification | ReportedErrors | PdoMapping | boot.NodeConfigured | boot.TransmissionSet
 
 NMT_COMMANDS = {
     NodeAction.START: cia301.START_NODE,
     NodeAction.STOP: cia301.STOP_NODE,
     NodeAction.ENTER_PREOPERATIONAL: cia301.ENTER_PREOPERATIONAL,
+    NodeAction.RESET_COMMUNICATION: cia301.RESET_COMMUNICATION,
 }
 _STATES_WITH_BOOT_REASON = (NodeState.IDENTIFIED, NodeState.CONFIGURING, NodeState.SETTLING)
 _INACTIVE_STATES = (NodeState.ABSENT, NodeState.STOPPED)
@@ -65,7 +64,8 @@ class ManagedNode:
     request_data: bytes = b""  # data of that request
     heartbeat_window: tuple[int, int] | None = None  # its start, and `heartbeats` then
     doubled_windows: int = 0  # consecutive windows with a doubled heartbeat rate
-    emergencies: deque[emergency.Emergency] = field(default_factory=lambda: deque(maxlen=MAX_EMERGENCIES))
+    event_timed: bool = False  # it sends by its event timer, not with SYNC
+    errors: ErrorLog = field(default_factory=ErrorLog)
 
     def status(self) -> NodeStatus:
         """Return the present status."""
@@ -87,7 +87,9 @@ class ManagedNode:
             self.heartbeats,
             self.missed_heartbeats,
             self.lifecycle.reboots,
-            tuple(self.emergencies),
+            self.errors.emergencies,
+            self.errors.register,
+            self.errors.history,
         )
 
 
@@ -105,6 +107,7 @@ def make_managed_node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns:
         heartbeat_timeout_ns=spec.heartbeat_timeout_ms * 1_000_000,
         settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
         role=BusRole(port.bus.role),
+        allow_nmt_reset=spec.allow_nmt_reset,
     )
     sdo = SdoTransport(spec.node_id, port.send, received_until_ns=lambda: port.received_until_ns)
     node = ManagedNode(spec, port, timing, tpdo_numbers(spec.eds, spec.channels), sdo)
@@ -130,8 +133,8 @@ def run_step(
     outcome: StepOutcome = StepDone(step, attempt)
     try:
         result = _perform_step(node, NodeSdoClient(node.sdo, is_cancelled), step, idle)
-        if isinstance(result, boot.Identity):  # published even if it is that of a wrong device
-            boot.check_identity(result, _expected_identity(node.spec))
+        if isinstance(result, boot.Identification):  # published even if it is that of a wrong device
+            boot.check_identity(result.identity, _expected_identity(node.spec))
     except BootStepCancelled:
         return None, None
     except BootStepError as error:
@@ -150,7 +153,9 @@ def _expected_identity(spec: NodeSpec) -> boot.ExpectedIdentity:
 def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle: bool) -> StepResult | None:
     spec = node.spec
     if step is NodeAction.IDENTIFY:
-        return boot.read_identity(sdo)
+        return boot.identify_node(sdo)
+    if step is NodeAction.READ_ERRORS:
+        return boot.read_errors(sdo, with_behaviour=True)
 
     def enter_preoperational() -> None:
         if node.lifecycle.nmt_state != cia301.PREOPERATIONAL and node.timing.role is BusRole.MASTER:
@@ -168,6 +173,11 @@ def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle:
         return None
     if node.mapping is None:
         raise BootStepError("no PDO mapping to configure")
+    if step is NodeAction.CHECK_SETTINGS:
+        if not node.transmission_pending:
+            heartbeat_ms = None if node.guarded else spec.heartbeat_ms
+            boot.check_settings(sdo, node.mapping, heartbeat_ms, node.idle or node.event_timed)
+        return None
     if step is NodeAction.SET_TRANSMISSION:
         boot.set_transmission(sdo, node.mapping.tpdos[0], idle)
         return boot.TransmissionSet(idle)

@@ -1,6 +1,6 @@
 """CANopen master of a hand's nodes: boots, supervises and recovers each of them.
 
-Public names: `Master`, `NodeSpec`, `NodeState`, `NodeStatus`, `NodeEvent`, `SerialChanged`. One thread
+Public names: `Master`, `NodeSpec`, `NodeState`, `NodeStatus`, and the events that it reports. One thread
 receives and calls `handle_frame` and `poll`; steps that wait for a node's response run in worker threads, so
 that a silent node doesn't delay the others. Nodes are addressed one by one, never by a broadcast.
 """
@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.router import IDENTIFIER_COUNT, NO_SLOT
+from handtouch.canbus.bus.router import NO_SLOT
 from handtouch.canbus.nodes import boot
 from handtouch.canbus.nodes.bus_cause import BusCauses
 from handtouch.canbus.nodes.lifecycle import advance, due_ns, is_supervised
 from handtouch.canbus.nodes.lifecycle_types import (
     BootUpReceived,
     BusRole,
+    ErrorsReported,
+    ForeignNmtCommand,
     HeartbeatRate,
     HeartbeatReceived,
     LifecycleEvent,
@@ -47,17 +49,30 @@ from handtouch.canbus.nodes.managed_node import (
     run_step,
     send_nmt,
 )
+from handtouch.canbus.nodes.owners import NMT_COMMAND, UNKNOWN_SENDER, find_owners
+from handtouch.canbus.nodes.sample_rates import SampleRates
 from handtouch.canbus.nodes.spec import (
+    ErrorChanged,
+    MasterEvent,
     NodeEvent,
     NodeSpec,
     NodeStatus,
     SerialChanged,
 )
-from handtouch.canbus.objects import emergency
+from handtouch.canbus.objects.emergency import ReportedErrors, decode_emergency
 from handtouch.canbus.objects.mapping import PdoMapping
-from handtouch.config.eds import EdsError
+from handtouch.wire.emergency import Emergency
 
-__all__ = ["Master", "NodeEvent", "NodeSpec", "NodeState", "NodeStatus", "SerialChanged"]
+__all__ = [
+    "ErrorChanged",
+    "Master",
+    "MasterEvent",
+    "NodeEvent",
+    "NodeSpec",
+    "NodeState",
+    "NodeStatus",
+    "SerialChanged",
+]
 
 STALE_PERIODS = 3
 """Periods without a sample after which an operational node is stale."""
@@ -68,22 +83,17 @@ HEARTBEAT_WINDOW_PERIODS = 10
 MIN_DOUBLED_WINDOWS = 2
 """Consecutive windows with a doubled rate that show a duplicate id; delayed heartbeats double one at most."""
 _MIN_DOUBLED_RATIO = 1.6
-MAX_EXTRA_SAMPLES_PER_SYNC = 2
-"""Samples beyond one per SYNC from which a node counts as babbling; duplicated frames cause one at most."""
-_SAMPLE_RATE_WINDOW_NS = 500_000_000
 _MAX_WORKERS = 32
 _MAX_EVENTS = 1024
 _NEVER_NS = 1 << 62
 _REQUEST_TIMEOUT_NS = 30_000_000
 """Timeout of a request sent by the receiving thread itself."""
+_NMT_BYTES = 2
 _SDO_WRITTEN, _SDO_REFUSED = 0x60, 0x80
 
-_SHARED_IDS = (cia301.NMT, cia301.SYNC, cia301.TIME, cia301.LSS_RESPONSE, cia301.LSS_REQUEST)
-_PDO_IDS = range(0x180, 0x501, 0x80)
 _PROBE_REQUEST = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 """SDO upload of the device type, 0x1000, which every node has."""
 
-_UNKNOWN_SENDER, _IGNORED = -1, -2
 _STARTED_STATES = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
 
 
@@ -122,18 +132,12 @@ class Master:
         self.transmission_changes = 0
         self._nodes = [make_managed_node(spec, ports, sync_period_ns or 0) for spec in nodes]
         self._by_slot = {node.spec.slot: node for node in self._nodes}
-        self._owners = _owners(ports, self._nodes)
+        self._owners = find_owners(ports, self._nodes)
         self._bus_causes = BusCauses(ports, self._nodes, sync_period_ns or 0)
         self._awaited_samples: dict[int, int] = {}  # slot -> arrival of its last sample
         self._next_due_ns = 0
-        self._repeat_window = (0, self._slab.repeat_counts.copy())  # its start, and the counts then
-        self._babbling: set[int] = set()
-        self._slots_by_bus = [  # slots of each bus's nodes, and if its SYNC is produced here
-            (np.array(slots), port.bus.sync == "producer")
-            for port in ports.values()
-            if (slots := [node.spec.slot for node in self._nodes if node.port is port])
-        ]
-        self._events: deque[NodeEvent | SerialChanged] = deque(maxlen=_MAX_EVENTS)
+        self._sample_rates = SampleRates(self._slab, ports, self._nodes, sync_period_ns or 0)
+        self._events: deque[MasterEvent] = deque(maxlen=_MAX_EVENTS)
         # from the workers
         self._results: deque[tuple[ManagedNode, StepOutcome | None, StepResult | None]] = deque()
         self._workers: ThreadPoolExecutor | None = None
@@ -158,7 +162,9 @@ class Master:
         owner = self._owners[bus_name][can_id]
         if owner >= 0 and self._workers is not None:
             self._handle_node_frame(self._nodes[owner], can_id & 0x780, data, now_ns)
-        elif owner == _UNKNOWN_SENDER:
+        elif owner == NMT_COMMAND:
+            self._handle_nmt_command(bus_name, data, now_ns)
+        elif owner == UNKNOWN_SENDER:
             self._ports[bus_name].counters.unknown_frames += 1
         if self._results:
             self._collect_results(now_ns)
@@ -182,8 +188,8 @@ class Master:
         if self._results:
             self._collect_results(now_ns)
         self._check_samples(now_ns)
-        if now_ns - self._repeat_window[0] >= _SAMPLE_RATE_WINDOW_NS and self._sync_period_ns:
-            self._check_sample_rates(now_ns)
+        for slot, samples_per_sync in self._sample_rates.check(now_ns).items():
+            self._advance(self._by_slot[slot], SampleRate(samples_per_sync), now_ns)
         if now_ns >= self._next_due_ns:
             self._run_timers(now_ns)
 
@@ -233,7 +239,7 @@ class Master:
         """Return the status of the node of a slot."""
         return self._by_slot[slot].status()
 
-    def drain_events(self) -> list[NodeEvent | SerialChanged]:
+    def drain_events(self) -> list[MasterEvent]:
         """Return the events since the last call, oldest first; at most the latest 1024."""
         events = list(self._events)
         self._events.clear()
@@ -255,14 +261,28 @@ class Master:
         elif service == cia301.NMT_ERROR_CONTROL:
             self._handle_heartbeat(node, data[0] & 0x7F, now_ns)
         elif service == cia301.EMCY:
-            if (message := emergency.decode_emergency(data, now_ns)) is not None:
-                node.emergencies.append(message)
+            if (message := decode_emergency(data, now_ns)) is not None:
+                self._report_errors(node, node.errors.add_emergency(message), now_ns)
         elif node.sdo.awaiting_response:
             node.sdo.deliver_response(data)
         else:
             if node.request_ns and data[1:4] == node.request_data[1:4]:
                 self._handle_transmission_response(node, data[0], now_ns)
             self._advance(node, ProbeAnswered(), now_ns)
+
+    def _handle_nmt_command(self, bus_name: str, data: bytes, now_ns: int) -> None:
+        """Note a command of another NMT master: its effect is that of no fault."""
+        if len(data) != _NMT_BYTES or self._workers is None:
+            return
+        command, node_id = data
+        for node in self._nodes:
+            if node.spec.bus == bus_name and node_id in (0, node.spec.node_id):
+                self._advance(node, ForeignNmtCommand(command), now_ns)
+
+    def _report_errors(self, node: ManagedNode, changed: tuple[Emergency, ...], now_ns: int) -> None:
+        """Report errors that are new or cleared, and pass the present ones on to the lifecycle."""
+        self._events.extend(ErrorChanged(node.spec.slot, now_ns, error) for error in changed)
+        self._advance(node, ErrorsReported(node.errors.describe()), now_ns)
 
     def _handle_heartbeat(self, node: ManagedNode, nmt: int, now_ns: int) -> None:
         if nmt == cia301.BOOT_UP:
@@ -310,25 +330,6 @@ class Master:
                     node = self._by_slot[slot]
                     cause = self._bus_causes.of_missing_samples(node, states, ages_ns, now_ns)
                     self._advance(node, SamplesMissing(int(ages_ns[slot]), cause), now_ns)
-
-    def _check_sample_rates(self, now_ns: int) -> None:
-        """Detect nodes that send far more than one sample per SYNC.
-
-        Extra SYNCs, or SYNCs of another producer at any rate, show in most nodes of a bus and are subtracted.
-        """
-        since_ns, before = self._repeat_window
-        self._repeat_window = (now_ns, self._slab.repeat_counts.copy())
-        extra = self._slab.repeat_counts - before
-        periods = max((now_ns - since_ns) / self._sync_period_ns, 1.0)
-        babbling: set[int] = set()
-        for slots, is_producer in self._slots_by_bus:
-            alone = len(slots) == 1 and is_producer
-            median = 0 if alone else np.sort(extra[slots])[(len(slots) - 1) // 2]
-            babbling.update(slots[extra[slots] - median > MAX_EXTRA_SAMPLES_PER_SYNC * periods].tolist())
-        for slot in babbling | self._babbling:
-            samples_per_sync = 1 + round(extra[slot] / periods) if slot in babbling else 0
-            self._advance(self._by_slot[slot], SampleRate(samples_per_sync), now_ns)
-        self._babbling = babbling
 
     def _run_timers(self, now_ns: int) -> None:
         self._next_due_ns = _NEVER_NS
@@ -399,11 +400,14 @@ class Master:
             if outcome.step is NodeAction.SET_TRANSMISSION:
                 self._finish_transmission(node, outcome, result, now_ns)
                 continue
-            if isinstance(result, boot.Identity):
-                self._update_identity(node, result, now_ns)
+            errors = result.errors if isinstance(result, boot.Identification) else result
+            if isinstance(errors, ReportedErrors):
+                self._report_errors(node, node.errors.add_report(errors, now_ns), now_ns)
+            if isinstance(result, boot.Identification):
+                self._update_identity(node, result.identity, now_ns)
             elif isinstance(result, boot.NodeConfigured):
                 node.guarded = result.guarded
-                node.booted, node.can_idle = False, result.can_idle
+                node.booted, node.can_idle, node.event_timed = False, result.can_idle, result.event_timed
                 self._record_transmission(node, False, now_ns)
                 self._next_due_ns = now_ns
                 if node.heartbeat_window is None:
@@ -472,30 +476,3 @@ class Master:
             router.route(tpdo.cob_id, slot, number, tpdo.size_bytes)
         node.mapping = mapping
         return ""
-
-
-def _owners(ports: Mapping[str, Port], nodes: Sequence[ManagedNode]) -> dict[str, list[int]]:
-    """Return for each bus and identifier the index in `nodes`, _IGNORED or _UNKNOWN_SENDER."""
-    owners = {name: [_UNKNOWN_SENDER] * IDENTIFIER_COUNT for name in ports}
-    for table in owners.values():
-        for can_id in _SHARED_IDS:
-            table[can_id] = _IGNORED
-    slots: set[int] = set()
-    senders: dict[tuple[str, int], str] = {}  # nodes on listener buses by the identifiers of their samples
-    for number, node in enumerate(nodes):
-        spec, table = node.spec, owners[node.spec.bus]
-        if table[cia301.NMT_ERROR_CONTROL + spec.node_id] != _UNKNOWN_SENDER or spec.slot in slots:
-            raise ValueError(f'node "{spec.name}": node id {spec.node_id} or slot {spec.slot} is given twice')
-        slots.add(spec.slot)
-        for tpdo in node.mapping.tpdos if node.mapping else ():
-            other = senders.setdefault((spec.bus, tpdo.cob_id), spec.name)
-            if other != spec.name:
-                raise EdsError(
-                    f'nodes "{other}" and "{spec.name}" both send 0x{tpdo.cob_id:X} by their EDS; '
-                    "give each an EDS or DCF with its own identifiers"
-                )
-        for service in (cia301.EMCY, cia301.SDO_RESPONSE, cia301.NMT_ERROR_CONTROL):
-            table[service + spec.node_id] = number
-        for service in (cia301.SDO_REQUEST, *_PDO_IDS):  # echoes of requests; PDOs before they are routed
-            table[service + spec.node_id] = _IGNORED
-    return owners

@@ -1,6 +1,7 @@
 """Nodes of a deployment as the master gets them, and their status and events as it reports them.
 
-Public names: `NodeSpec`, `node_specs`, `check_nodes`, `NodeStatus`, `NodeEvent`, `SerialChanged`.
+Public names: `NodeSpec`, `node_specs`, `check_nodes`, `NodeStatus`; `MasterEvent`, a union of `NodeEvent`,
+`ErrorChanged` and `SerialChanged`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ from dataclasses import dataclass
 
 from handtouch.canbus.nodes.boot import Identity, IdleSettings
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.objects.emergency import Emergency
 from handtouch.canbus.objects.mapping import mapping_from_eds
 from handtouch.config import (
     ConfigError,
@@ -27,6 +27,7 @@ from handtouch.config.channels import (
     resolve_channels,
 )
 from handtouch.config.eds import EdsError
+from handtouch.wire.emergency import Emergency
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,7 @@ class NodeSpec:
 
     `channels` : those of the electrodes x0, xa, y0, yb
     `allow_pdo_remapping` : they may be mapped to a TPDO over SDO
+    `allow_nmt_reset` : one NMT reset communication may be sent when it refuses to run
     `event_timer_ms` : period of a node that can't follow SYNC
     `serials_of_other_pads` : serial numbers configured for other pads
     """
@@ -51,6 +53,7 @@ class NodeSpec:
     revision: int | None = None
     channels: Channels = STANDARD_CHANNELS
     allow_pdo_remapping: bool = True
+    allow_nmt_reset: bool = True
     idle: IdleSettings | None = None
     excitation: WritableObject | None = None
     heartbeat_ms: int = 100
@@ -77,6 +80,7 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
                 serial=pad.serial,
                 channels=order_by_electrode(resolve_channels(kind.channels, kind.eds), pad.electrodes),
                 allow_pdo_remapping=kind.allow_pdo_remapping,
+                allow_nmt_reset=kind.allow_nmt_reset,
                 idle=_idle_settings(kind, deployment.daemon.sync_period_ms),
                 excitation=parse_writable_object(kind.excitation_object) if kind.excitation_object else None,
                 heartbeat_ms=kind.heartbeat_ms,
@@ -149,6 +153,7 @@ def _idle_settings(kind: Node, sync_period_ms: float) -> IdleSettings | None:
 class NodeStatus:
     """Present status of a node. `identity` and `cob_ids` are as last read from it, None and () before.
 
+    `error_register` (0x1001) and `error_history` (0x1003, the latest first): as last received.
     `guarded`: it has no heartbeat and is guarded instead. `idle`: it is event-driven now.
     """
 
@@ -167,6 +172,8 @@ class NodeStatus:
     heartbeats_missed: int
     reboots: int
     emergencies: tuple[Emergency, ...]  # the latest, oldest first
+    error_register: int | None
+    error_history: tuple[int, ...]
 
     @property
     def serial(self) -> int | None:
@@ -185,7 +192,25 @@ class NodeEvent:
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.old_state.name.lower()} -> {self.new_state.name.lower()}: {self.reason}"
+        states = [self.old_state.name.lower(), self.new_state.name.lower()]
+        change = " -> ".join(dict.fromkeys(states))
+        return f"{change}: {self.reason}" if self.reason else change
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorChanged:
+    """An error that a node has reported by EMCY, or has cleared (`emergency.cleared_ns` is set)."""
+
+    slot: int
+    event_ns: int
+    emergency: Emergency
+
+    def __str__(self) -> str:
+        error = self.emergency
+        text = f"EMCY {error.text}"
+        if error.cleared_ns is None:
+            return f"{text}, manufacturer-specific {error.manufacturer}"
+        return f"{text}: cleared after {(error.cleared_ns - error.arrival_ns) * 1e-9:.1f} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,3 +224,6 @@ class SerialChanged:
 
     def __str__(self) -> str:
         return f"node replaced: serial number {self.old_serial} -> {self.new_serial}, uncalibrated"
+
+
+MasterEvent = NodeEvent | ErrorChanged | SerialChanged

@@ -1,33 +1,114 @@
-"""EMCY messages of CANopen nodes (CiA 301): decoding, and error codes and registers as text."""
+"""Errors that a CANopen node reports (CiA 301): EMCY messages, error register 0x1001, error history 0x1003.
+
+Public names: `decode_emergency`, `describe_emergency`, `describe_register`, `ReportedErrors`, `ErrorLog`.
+"""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, replace
 
+from handtouch.canbus import cia301
+from handtouch.wire.emergency import Emergency
+
+MAX_EMERGENCIES = 16
 _LAYOUT = struct.Struct("<HB5s")
-
-
-@dataclass(frozen=True, slots=True)
-class Emergency:
-    """One EMCY message: error code, error register (object 0x1001), five manufacturer-specific bytes."""
-
-    arrival_ns: int
-    code: int
-    register: int
-    detail: bytes
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
+_GENERIC = 1
+"""Bit of the error register that is set with every error."""
 
 
 def decode_emergency(data: bytes, arrival_ns: int) -> Emergency | None:
     """Decode an EMCY message; None unless it has eight bytes."""
     if len(data) != _LAYOUT.size:
         return None
-    code, register, detail = _LAYOUT.unpack(data)
-    return Emergency(arrival_ns, code, register, detail, describe_emergency(code, register))
+    code, register, manufacturer = _LAYOUT.unpack(data)
+    return Emergency(code, register, manufacturer.hex(), describe_emergency(code, register), arrival_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedErrors:
+    """Error objects read from a node; None for a missing one.
+
+    `history` : entries of 0x1003, the latest first: error code, and manufacturer's information in bits 16-31
+    `behaviour` : 0x1029 sub 1, the reaction to a communication error
+    """
+
+    register: int | None
+    history: tuple[int, ...] = ()
+    behaviour: int | None = None
+
+
+class ErrorLog:
+    """Errors that one node has reported: the latest EMCY messages, error register and history.
+
+    `register` : error register as last received, None before
+    `history` : 0x1003 as last read, the latest error first
+    """
+
+    def __init__(self) -> None:
+        self.register: int | None = None
+        self.history: tuple[int, ...] = ()
+        self._behaviour: int | None = None
+        self._emergencies: deque[Emergency] = deque(maxlen=MAX_EMERGENCIES)
+
+    @property
+    def emergencies(self) -> tuple[Emergency, ...]:
+        """The latest EMCY messages, oldest first; without the error resets."""
+        return tuple(self._emergencies)
+
+    def add_emergency(self, message: Emergency) -> tuple[Emergency, ...]:
+        """Add an EMCY message; return the errors that are new or cleared by it.
+
+        Code 0x00xx resets errors. An error is cleared when the error register, which every message carries,
+        has none of its bits any more besides the generic one, or is 0. A repetition is counted.
+        """
+        is_reset = message.code >> 8 == 0
+        latest = self._emergencies[-1] if self._emergencies else None
+        if latest is not None and not is_reset and _is_repetition(message, latest):
+            self._emergencies[-1] = replace(latest, count=latest.count + 1)
+            return ()
+        cleared = self._update_register(message.register, message.arrival_ns)
+        if is_reset:
+            return cleared
+        self._emergencies.append(message)
+        return (*cleared, message)
+
+    def add_report(self, report: ReportedErrors, read_ns: int) -> tuple[Emergency, ...]:
+        """Add what was read from the node at `read_ns`; return the errors that the register clears."""
+        self.history = report.history
+        if report.behaviour is not None:
+            self._behaviour = report.behaviour
+        return () if report.register is None else self._update_register(report.register, read_ns)
+
+    def describe(self) -> str:
+        """Describe the present errors: register, EMCY messages or else the latest of the history."""
+        active = [emergency for emergency in self._emergencies if emergency.cleared_ns is None]
+        parts = [describe_register(self.register)] if self.register else []
+        parts += [f"EMCY {describe_emergency(error.code, 0)}" for error in reversed(active[-2:])]
+        if self.register and not active and self.history:
+            parts.append(f"latest in 0x1003: EMCY {describe_emergency(self.history[0] & 0xFFFF, 0)}")
+        if parts and self._behaviour is not None:
+            reaction = cia301.ERROR_REACTIONS.get(self._behaviour, "manufacturer specific")
+            parts.append(f"0x1029:01 = {self._behaviour} ({reaction} after a communication error)")
+        return ", ".join(parts)
+
+    def _update_register(self, register: int, now_ns: int) -> tuple[Emergency, ...]:
+        """Set the register; return the errors that it clears."""
+        self.register = register
+        cleared = []
+        for number, error in enumerate(self._emergencies):
+            specific = error.register & ~_GENERIC
+            remains = register & specific if specific else register
+            if error.cleared_ns is None and not remains:
+                self._emergencies[number] = replace(error, cleared_ns=now_ns)
+                cleared.append(self._emergencies[number])
+        return tuple(cleared)
+
+
+def _is_repetition(message: Emergency, latest: Emergency) -> bool:
+    fields = (message.code, message.register, message.manufacturer)
+    return latest.cleared_ns is None and fields == (latest.code, latest.register, latest.manufacturer)
 
 
 def describe_emergency(code: int, register: int) -> str:
@@ -36,6 +117,12 @@ def describe_emergency(code: int, register: int) -> str:
     # The generic bit is set with every error; another bit makes it redundant.
     bits = [name for bit, name in enumerate(_REGISTER_BITS) if register >> bit & 1 and (bit or register == 1)]
     return f"0x{code:04X} {text}" + (f" (register: {', '.join(bits)})" if bits else "")
+
+
+def describe_register(register: int) -> str:
+    """Describe the error register, 0x1001, with the names of its bits."""
+    bits = [name for bit, name in enumerate(_REGISTER_BITS) if register >> bit & 1]
+    return f"error register 0x{register:02X} ({', '.join(bits) or 'no error'})"
 
 
 _REGISTER_BITS = (

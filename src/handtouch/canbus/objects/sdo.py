@@ -172,6 +172,15 @@ class NodeSdoClient:
                 return None
             raise
 
+    def read_or_none(self, index: int, sub: int, name: str) -> int | None:
+        """Read an object that the node's operation doesn't depend on; None if the node refuses."""
+        try:
+            return self.read(index, sub, name)
+        except BootStepError as error:
+            if isinstance(error.__cause__, SdoAbortedError):
+                return None
+            raise
+
     def write_verified(self, index: int, sub: int, value: int, size: int, name: str) -> None:
         """Write an object of `size` bytes and read it back."""
         data = value.to_bytes(size, "little")
