@@ -172,3 +172,44 @@ def test_empty_calls_and_unsupported_models() -> None:
     three = [Electrode("x0", 0.0, 1.0), Electrode("xa", 0.0, 1.0), Electrode("y0", 0.1, 0.9)]
     with pytest.raises(ValueError, match="four channels"):
         LocatorBank([ElectrodeNetwork.from_electrodes(1.0, 1.0, three, 1.0)])
+
+
+@pytest.mark.parametrize("index", [0.5, 1.0, True, -1, 2, np.nan, "0"])
+def test_only_numbers_of_pads_are_taken_as_index(index: object) -> None:
+    bank = LocatorBank([Rectangle(1.0, 1.0), Rectangle(2.0, 1.0)])
+    half = np.array([0.5])
+    for call in (
+        lambda: bank.fractions([index], half, half),  # type: ignore[list-item]
+        lambda: bank.conformal_radius([index], half, half),  # type: ignore[list-item]
+        lambda: bank.tangent([index], half, half),  # type: ignore[list-item]
+        lambda: bank.estimate([index], np.ones((4, 1)), 0.1),  # type: ignore[list-item]
+    ):
+        with pytest.raises(ValueError, match="index of pads: whole numbers from 0 to 1"):
+            call()
+
+
+@pytest.mark.parametrize("aspect", [1 / 20, 20.0])
+def test_a_bank_of_a_long_network_agrees_with_it_where_currents_are_observable(aspect: float) -> None:
+    """Warnings are errors here: fractions of far electrodes are rounding, also negative."""
+    pad = ElectrodeNetwork(aspect, 1.0, 0.02 * min(aspect, 1.0), 1.0)
+    x, y = np.random.default_rng(1).uniform(0.03, 0.97, (2, 200)) * [[pad.a], [pad.b]]
+    currents = pad.fractions(x, y)
+    banked = LocatorBank([pad]).estimate(np.zeros(200, np.intp), currents, 1e-4)
+    own = pad.estimate(currents, 1e-4)
+    short, long = ("y", "x") if aspect > 1 else ("x", "y")
+    assert getattr(banked, short) == pytest.approx({"x": x, "y": y}[short], abs=1e-4 * min(aspect, 1.0))
+    axis = "xy".index(long)
+    stds = [np.sqrt(found.covariance[:, axis, axis]) for found in (banked, own)]
+    observable = np.max(stds, axis=0) < 0.1
+    assert observable.sum() > 20
+    off = np.abs(getattr(banked, long) - {"x": x, "y": y}[long])[observable]
+    assert (off < 0.2 * stds[1][observable]).all()
+
+
+def test_electrodes_of_two_percent_of_a_side_are_solved_and_tabulated_quickly() -> None:
+    pad = ElectrodeNetwork(1.0, 1.0, 0.49, 1.0)
+    begin = time.process_time()
+    bank = LocatorBank([pad])
+    assert time.process_time() - begin < 8.0  # 1 s on an idle machine, 20 s by a sum over pairs of terms
+    x, y = np.random.default_rng(1).uniform(0.1, 0.9, (2, 50))
+    assert bank.fractions(np.zeros(50, np.intp), x, y) == pytest.approx(pad.fractions(x, y), abs=1e-5)

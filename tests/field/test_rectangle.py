@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from handtouch.field import Rectangle
@@ -206,3 +206,34 @@ def test_impossible_sides_are_named(bad: float) -> None:
         Rectangle(bad, 1.0)
     with pytest.raises(ValueError, match="b = "):
         Rectangle(1.0, bad)
+
+
+sides = st.floats(1e-320, 1.7e308)
+
+
+@given(sides, sides)
+@example(1e-308, 1e308)
+@example(1e308, 1e-308)
+@example(1e300, 1.0)
+def test_any_positive_sides_make_a_pad_or_are_refused(a: float, b: float) -> None:
+    if max(a, b) / 1e100 > min(a, b):
+        with pytest.raises(ValueError, match="times as long as the other"):
+            Rectangle(a, b)
+        return
+    pad = Rectangle(a, b)
+    fractions = pad.side_fractions(a / 2, b / 2)
+    assert fractions.sum() == pytest.approx(1, rel=1e-15)
+    assert fractions[[0, 2]] == pytest.approx(fractions[[1, 3]], abs=1e-3)  # halves of subnormal sides round
+    assert 0 < pad.conformal_radius(a / 2, b / 2) <= 1.1 * min(a, b)
+    assert not np.isnan(pad.fractions_with_jacobian(a / 2, b / 2)[0]).any()
+
+
+def test_a_strip_of_any_length_ends_as_a_half_infinite_one() -> None:
+    """Side x0 is seen under 2 / pi atan(sin(pi y) / sinh(pi x)) from a strip of unit width."""
+    for length in (1e3, 1e10, 1e50, 1e100):
+        pad = Rectangle(length, 1.0)
+        fractions = pad.side_fractions(0.7, 0.3)
+        expected = 2 / np.pi * np.arctan(np.sin(0.3 * np.pi) / np.sinh(0.7 * np.pi))
+        assert fractions[0] == pytest.approx(expected, rel=1e-14)
+        found = pad.locate(fractions)
+        assert (found.x, found.y) == pytest.approx((0.7, 0.3), rel=1e-13)

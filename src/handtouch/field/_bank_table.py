@@ -18,6 +18,7 @@ POLYNOMIAL_TERMS = 6  # coefficients of a quintic
 TABLE_COLUMNS = 5  # four fractions and ln of the spreading radius
 RATIO_TABLE_CELLS = 128  # of the start table
 RATIO_TABLE_SPAN = 16.0  # it covers |ln(T0 / T1)| up to this
+_MIN_FRACTION = float(np.finfo(np.float64).eps)  # smaller ones are rounding, also negative, on long pads
 EDGE_MARGIN = 0.03  # of a side: from here inwards the error is promised
 
 
@@ -81,8 +82,10 @@ def start_table(model: ForwardModel, grid: Grid) -> FloatArray:
     s = np.linspace(0, grid.cells, 8 * grid.cells + 1)
     side = grid.fraction(s)
     middle = np.full_like(s, 0.5)
-    along_x = log_ratios(model.fractions(model.a * side, model.b * middle))[0]
-    along_y = log_ratios(model.fractions(model.a * middle, model.b * side))[1]
+    along_x, along_y = (
+        log_ratios(np.maximum(model.fractions(model.a * x, model.b * y), _MIN_FRACTION))[axis]
+        for axis, (x, y) in enumerate(((side, middle), (middle, side)))
+    )
     targets = np.linspace(-RATIO_TABLE_SPAN, RATIO_TABLE_SPAN, RATIO_TABLE_CELLS + 1)
     return np.stack([np.interp(targets, np.maximum.accumulate(-line), s) for line in (along_x, along_y)])
 

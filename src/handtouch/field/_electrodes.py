@@ -102,7 +102,7 @@ class ElectrodePotentials:
         spread = 2 * own.sum(axis=0)
         if self.terms:
             data = _powers(inner, self.terms).imag.reshape(self.count * self.terms, -1)
-            spread += np.einsum("ip,ij,jp->p", data, self._mutual, data)
+            spread += (data * (self._mutual @ data)).sum(axis=0)
         return np.asarray(spread.reshape(defects.shape[1:]))
 
     def _roots(self, flat: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -153,7 +153,7 @@ class ElectrodePotentials:
             total = first + last
             logs = project @ np.log(np.abs(total)).T
             powers = _powers((first - last) / total, terms).real  # (terms, gaps, nodes)
-            fields = np.einsum("kq,nlq->knl", project, powers)
+            fields = np.tensordot(project, powers, axes=(1, 2))
             fields[:, :, gap] = 0.0
             system[:, gap], influence[gap] = fields[1:], fields[0]
             drive[:, gap], level[gap] = logs[1:], logs[0]

@@ -53,7 +53,7 @@ class LocatorBank:
     edges.
 
     Contacts are kept 0.15 % of a side inside the edges, where the tables end. Raises ValueError for a model
-    with other channels.
+    with other channels, and in every method for an `index` that isn't the number of a pad.
     """
 
     def __init__(self, models: Sequence[ForwardModel], tolerance: float = 1e-6) -> None:
@@ -85,7 +85,7 @@ class LocatorBank:
 
     def fractions(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the measured fractions (4, n) of points (n,) on the pads `index` (n,)."""
-        index = np.asarray(index, dtype=np.intp)
+        index = self._checked_index(index)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
             return np.ascontiguousarray(self._read_tables(self._first_row(index), s)[:, 0, :4].T)
@@ -96,14 +96,14 @@ class LocatorBank:
         The conformal radius of an ideal pad, in the unit of its sides, and the spreading radius of one with
         gaps.
         """
-        index = np.asarray(index, dtype=np.intp)
+        index = self._checked_index(index)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
             return np.exp(self._read_tables(self._first_row(index), s)[:, 0, 4])
 
     def tangent(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> TableTangent:
         """Return values and slopes of all tabulated quantities, at points (n,) of the pads `index` (n,)."""
-        index = np.asarray(index, dtype=np.intp)
+        index = self._checked_index(index)
         with np.errstate(all="ignore"):
             s = self._coordinates(index, np.stack([x, y], axis=-1))
             rows = self._read_tables(self._first_row(index), s)
@@ -126,7 +126,7 @@ class LocatorBank:
         reading: what is NaN, has noise that is not positive, or has no positive total is NaN in its own
         element, and `converged` says which iterations were cut off.
         """
-        index = np.asarray(index, dtype=np.intp)
+        index = self._checked_index(index)
         data = np.asarray(currents, dtype=np.float64)
         with np.errstate(all="ignore"):
             weight = np.empty_like(data)
@@ -146,6 +146,15 @@ class LocatorBank:
             return found
 
     # Details ----------------------------------------------------------------------------------------------
+
+    def _checked_index(self, index: ArrayLike) -> IndexArray:
+        """Return pad numbers as an array. Raises ValueError for what is no number of a pad."""
+        found = np.asarray(index)
+        if found.size and (
+            found.dtype.kind not in "iu" or found.min() < 0 or found.max() >= len(self._model)
+        ):
+            raise ValueError(f"index of pads: whole numbers from 0 to {len(self._model) - 1}, not {index!r}")
+        return np.asarray(found, np.intp)
 
     def _first_row(self, index: IndexArray) -> IndexArray:
         return np.asarray(self._model.take(index) * self._grid.cells**2)

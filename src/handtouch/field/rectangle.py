@@ -16,6 +16,7 @@ from handtouch.field._separable import SideRatio, theta_four, theta_two
 from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.model import FloatArray
 
+MAX_ASPECT_RATIO = 1e100
 _HALF_PI = math.pi / 2
 _MAX_UNSCALED_SIDE = 1e100  # sides within this factor of 1 need no scaling against overflow
 _MIN_EDGE_DISTANCE = 1e-300  # of a side: closer points are on the edge
@@ -44,7 +45,8 @@ class Location:
 class Rectangle:
     """A pad 0 <= x <= a, 0 <= y <= b with a grounded electrode along each whole side.
 
-    a, b: lengths of the sides, in any common unit. ValueError unless both are positive and finite.
+    a, b: lengths of the sides, in any common unit. ValueError unless both are positive and finite, and one is
+    at most 1e100 times as long as the other.
 
     All sides are treated alike; accurate for aspect ratios from 1e-3 to 1e3, down to 1e-12 of a side from
     edges and corners. Points that are NaN or off the pad give NaN in their own element.
@@ -59,6 +61,11 @@ class Rectangle:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} = {value!r}: a side of a rectangle is positive and finite")
             object.__setattr__(self, name, value)
+        if max(self.a, self.b) / MAX_ASPECT_RATIO > min(self.a, self.b):
+            raise ValueError(
+                f"sides {self.a!r} and {self.b!r}: one is more than {MAX_ASPECT_RATIO:g} times as long as "
+                "the other"
+            )
 
     # Forward ----------------------------------------------------------------------------------------------
 
