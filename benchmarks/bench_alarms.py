@@ -7,10 +7,11 @@ on from it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
+
+from page import made_by, options, output_folder, table
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
@@ -25,7 +26,6 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
-from section import table
 
 from handtouch import config
 from handtouch.config import shipped
@@ -277,8 +277,7 @@ def used(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="false positives of a hand without faults")
-    parser.add_argument("--quick", action="store_true", help="one hour, nothing written")
+    parser = options(__doc__)
     parser.add_argument("--hours", type=int, default=70, help="of a hand")
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--journal", type=Path, help="file to keep results in")
@@ -293,14 +292,12 @@ def main() -> None:
         "Use of the hand": ("Bouts of 10 to 180 s.", used(results)),
     }
     page = [line for title, (note, rows) in tables.items() for line in table(title, note, rows)]
-    if args.quick:
-        return
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
     head = [
         "# False positives of a hand in ordinary use", "",
-        f"Made by `make bench ONLY=alarms`; {machine}.", "",
+        f"{made_by()}; {machine}.", "",
         f"{len(results)} hours, each on a hand of its own: the shipped one, {len(model().links)} pads, "
         "of seeds that nothing was tuned on, built from tolerances, with sheets that creep, "
         "adapt and scatter (S1 and S2 alternately), zeros that drift by up to 0.05 counts a second, a hand "
@@ -310,7 +307,7 @@ def main() -> None:
         f"{LINGER_S:g} s longer, and at {IDLE_HZ} Hz at rest, as the daemon's own idling does. Wet objects "
         "are in the [episodes](diagnose.md).", "",
     ]  # fmt: skip
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(args.quick)
     (out / "alarms.md").write_text("\n".join([*head, *page]))
     record = {
         "machine": machine,

@@ -8,10 +8,11 @@ have one of their own.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
+
+from page import made_by, options, output_folder, table
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
@@ -26,7 +27,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from diagnose_episodes import FAULT_FREE, FAULTY, LENGTH_S, PADS, deployment, episode, hand_of
-from section import table
 
 from handtouch import config
 from handtouch.config import shipped
@@ -65,7 +65,7 @@ def play(task: tuple[str, int]) -> dict[str, Any]:
         for f in diagnosis.process_block(block):
             if not f.is_fault or f.until_ns is not None:
                 continue
-            if truth == NOTHING or f.link != it.link or t_s < it.begin_delays_s:
+            if truth == NOTHING or f.link != it.link or t_s < it.begin_s:
                 alarms.append(f.kind.value)
                 continue
             mine.append(f.kind.value)
@@ -77,10 +77,10 @@ def play(task: tuple[str, int]) -> dict[str, Any]:
     diagnoses = mine if truth != NOTHING else alarms
     return {
         "name": name, "seed": seed, "truth": truth, "last": diagnoses[-1] if diagnoses else NOTHING,
-        "after_s": None if named_s is None else named_s - it.begin_delays_s, "wrong": wrong + alarms,
+        "after_s": None if named_s is None else named_s - it.begin_s, "wrong": wrong + alarms,
         "alarms": len(alarms), "doubt": FaultKind.UNEXPLAINED in mine,
         "details": it.details if name in FAULTY else {},
-        "pad_s": t_s * len(PADS) - (t_s - it.begin_delays_s if truth != NOTHING else 0.0),
+        "pad_s": t_s * len(PADS) - (t_s - it.begin_s if truth != NOTHING else 0.0),
     }  # fmt: skip
 
 
@@ -233,8 +233,7 @@ def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="how well faults of pads are named")
-    parser.add_argument("--quick", action="store_true", help="four episodes of each, nothing written")
+    parser = options(__doc__)
     parser.add_argument("--episodes", type=int, default=300, help="of each name")
     parser.add_argument("--seed", type=int, default=2000, help="where seeds begin")
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
@@ -242,7 +241,7 @@ def main() -> None:
         "--journal", type=Path, help="file to keep results in; an interrupted run continues from it"
     )
     args = parser.parse_args()
-    results = run(4 if args.quick else args.episodes, args.seed, args.workers, args.journal)
+    results = run(1 if args.quick else args.episodes, args.seed, args.workers, args.journal)
     tables = {
         "By fault": (
             "Named: the right kind was diagnosed on the right pad; right at the end: it is the last "
@@ -261,14 +260,12 @@ def main() -> None:
         "Cost": ("15 pads at 200 Hz, all in use; tables are made in the first round.", cost()),
     }
     page = [line for title, (note, rows) in tables.items() for line in table(title, note, rows)]
-    if args.quick:
-        return
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
     head = [
         "# Diagnosis of faults", "",
-        f"Made by `make bench ONLY=diagnose`; {machine}.", "",
+        f"{made_by()}; {machine}.", "",
         f"{len(results)} episodes of {LENGTH_S:g} s on three pads of the shipped hand at 100 Hz, seeds "
         f"from {args.seed}; one pad has a fault while all are in use. An episode ends {SETTLED_S:g} s "
         "after its fault was named, if there was no wrong diagnosis. Thresholds were tuned on seeds below "
@@ -278,7 +275,7 @@ def main() -> None:
         "hidden from the diagnosis. Left out as not observable: cables of opposite electrodes swapped, "
         "which mirrors the pad, and short circuits between electrodes without series resistors.", "",
     ]  # fmt: skip
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(args.quick)
     draw(out / "diagnose.png", results)
     (out / "diagnose.md").write_text("\n".join([*head, *page, "![confusion](diagnose.png)", ""]))
     misses = [

@@ -19,8 +19,8 @@ import matplotlib
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from page import made_by, options, output_folder, table
 from scipy.special import ndtri
-from section import table
 
 from handtouch.field import (
     ElectrodeNetwork,
@@ -54,6 +54,7 @@ NOISES: dict[str, float | tuple[float, float, float, float]] = {
     "(3, 10, 1, 5)e-4": (3e-4, 1e-3, 1e-4, 5e-4),
 }
 ALARM_TRIALS = 4_000_000
+BATCH = 100_000
 
 
 def noisy(
@@ -72,17 +73,17 @@ def bound(pad: ForwardModel, x: FloatArray, y: FloatArray, sigma: FloatArray) ->
     return np.asarray(covariance[:, 0, 0] + covariance[:, 1, 1])
 
 
-def efficiency() -> list[dict[str, Any]]:
+def efficiency(trials: int) -> list[dict[str, Any]]:
     """Root mean square error in units of the bound, of `estimate` and of a bank."""
     rows = []
     for label, pad in PADS.items():
         bank = LocatorBank([pad])
         for name, level in NOISES.items():
             sigma = np.broadcast_to(np.asarray(level, dtype=np.float64), (4,))
-            x, y, currents = noisy(pad, sigma, TRIALS, 1)
+            x, y, currents = noisy(pad, sigma, trials, 1)
             least = bound(pad, x, y, sigma)
             own = pad.estimate(currents, sigma[:, None])
-            banked = bank.estimate(np.zeros(TRIALS, dtype=np.intp), currents, sigma[:, None])
+            banked = bank.estimate(np.zeros(trials, dtype=np.intp), currents, sigma[:, None])
             ratios = []
             for found in (own, banked):
                 squared = (found.x - x) ** 2 + (found.y - y) ** 2
@@ -102,14 +103,13 @@ def efficiency() -> list[dict[str, Any]]:
     return rows
 
 
-def false_alarms() -> list[dict[str, Any]]:
+def false_alarms(trials: int) -> list[dict[str, Any]]:
     """Rate at which a point fails the test, against the configured rate."""
     pad, rows = Rectangle(1.77, 1.0), []
     for part, noise in enumerate((1e-4, 1e-3, 1e-2)):
-        sigma, scores, trials = np.full(4, noise), [], ALARM_TRIALS
-        batches = trials // 100_000
+        sigma, scores, batches = np.full(4, noise), [], trials // BATCH
         for seed in range(part * batches, (part + 1) * batches):
-            currents = noisy(pad, sigma, 100_000, 100 + seed)[2]
+            currents = noisy(pad, sigma, BATCH, 100 + seed)[2]
             scores.append(np.abs(point_test(pad, currents, noise).score))
         score = np.concatenate(scores)
         row: dict[str, Any] = {"noise": noise, "trials": trials}
@@ -161,11 +161,11 @@ def costs() -> list[dict[str, Any]]:
     return rows
 
 
-def draw_resolution(path: Path) -> None:
+def draw_resolution(path: Path, cells: int) -> None:
     """Resolvable distance of two equal contacts over the pad, for three noises."""
     figure, axes = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
     pad = Rectangle(1.0, 1.0)
-    side = np.linspace(0.06, 0.94, 34)
+    side = np.linspace(0.06, 0.94, cells)
     x, y = np.meshgrid(side, side)
     for row, (angle, words) in enumerate(((0.0, "along x"), (np.pi / 4, "at 45 degrees"))):
         for axis, noise in zip(axes[row], (1e-4, 1e-3, 5e-3), strict=True):
@@ -182,15 +182,17 @@ def draw_resolution(path: Path) -> None:
 
 
 def main() -> None:
+    quick = options(__doc__).parse_args().quick
+    trials, alarm_trials = (500, BATCH) if quick else (TRIALS, ALARM_TRIALS)
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, "
         f"numpy {np.__version__}, scipy {scipy.__version__}"
     )
     tables = {
         "Error against the Cramer-Rao bound": (
-            f"{TRIALS} contacts each, 5 % of a side and farther from the edges. Aim: 1.05 up to 3e-3, 1.15 "
+            f"{trials} contacts each, 5 % of a side and farther from the edges. Aim: 1.05 up to 3e-3, 1.15 "
             "at 1e-2, up to 1.77:1. Below one is possible: estimates stay on the pad, the bound does not.",
-            efficiency(),
+            efficiency(trials),
         ),
         "Cost for a hand of 15 pads": (
             "Six models in one bank; medians of processor time. Aim: 250 us for new contacts, 120 us for "
@@ -199,18 +201,18 @@ def main() -> None:
         ),
         "False alarms of the test for a point": (
             "Counted over configured rate, with the scatter of counting. Pad 1.77:1, 5 % margin.",
-            false_alarms(),
+            false_alarms(alarm_trials),
         ),
     }
-    page = ["# Location from noisy currents", "", f"Made by `make bench ONLY=estimate`; {machine}.", ""]
+    page = ["# Location from noisy currents", "", f"{made_by()}; {machine}.", ""]
     for title, (note, rows) in tables.items():
         page += table(title, note, rows)
     page += ["## Two contacts or one", "", "![resolution](estimate.png)", ""]
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(quick)
     (out / "estimate.md").write_text("\n".join(page))
     record = {"machine": machine, "tables": {title: rows for title, (_, rows) in tables.items()}}
     (out / "estimate.json").write_text(json.dumps(record, indent=1) + "\n")
-    draw_resolution(out / "estimate.png")
+    draw_resolution(out / "estimate.png", 6 if quick else 34)
 
 
 if __name__ == "__main__":

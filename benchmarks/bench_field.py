@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 import skfem
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 from ratio_table import RatioTable
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import least_squares
@@ -89,7 +90,7 @@ def finite_elements(pad: Rectangle) -> Locator:
     columns = np.stack(potentials, axis=1)
 
     def forward(px: float, py: float) -> FloatArray:
-        found: FloatArray = np.asarray(basis.unanswered_probes(np.array([[px], [py]])) @ columns)[0]
+        found: FloatArray = np.asarray(basis.probes(np.array([[px], [py]])) @ columns)[0]
         return found
 
     return _one_by_one(pad, forward)
@@ -202,13 +203,13 @@ def microseconds(call: Callable[[], Any]) -> tuple[float, float]:
     return middle, 100 * float(high - low) / 2 / middle
 
 
-def measure(label: str, pad: Rectangle, name: str, make: Maker) -> Row:
+def measure(label: str, pad: Rectangle, name: str, make: Maker, quick: bool) -> Row:
     locate = make(pad)
-    x, y, currents = contacts(pad, SLOW.get(name, 20_000))
+    x, y, currents = contacts(pad, CALLS[-1] if quick else SLOW.get(name, 20_000))
     found = locate(currents)
     error = np.hypot(found[0] - x, found[1] - y) / min(pad.a, pad.b)
     timed = [microseconds(partial(locate, np.ascontiguousarray(currents[:, :n]))) for n in CALLS]
-    if name in SLOW:
+    if quick or name in SLOW:
         bulk = timed[1][0] / CALLS[1], timed[1][1]
     else:
         bulk = microseconds(partial(locate, contacts(pad, BULK, seed=1)[2]))
@@ -296,6 +297,7 @@ def verdicts(rows: list[Row]) -> list[str]:
 
 
 def main() -> None:
+    quick = options(__doc__).parse_args().quick
     rows: list[Row] = []
     page: list[str] = []
     for label, pad in (
@@ -303,7 +305,7 @@ def main() -> None:
         ("1.77:1", Rectangle(1.77, 1.0)),
         ("3:1", Rectangle(3.0, 1.0)),
     ):
-        here = [measure(label, pad, name, make) for name, make in {**METHODS, **PEERS}.items()]
+        here = [measure(label, pad, name, make, quick) for name, make in {**METHODS, **PEERS}.items()]
         rows += here
         page += [f"## Pad {label}", "", *table(here), ""]
         print("\n".join(page[-len(here) - 5 :]), flush=True)
@@ -317,7 +319,7 @@ def main() -> None:
     head = [
         "# Run time against error of location on an ideal pad",
         "",
-        f"Made by `make bench ONLY=field`; {machine}.",
+        f"{made_by()}; {machine}.",
         "Errors are distances in shorter sides, over random contacts 5 % of a side and farther from the",
         "edges, without noise. Times are medians of processor time; the spread",
         "is half the distance between their quartiles, the largest of the four columns. Formulations of the",
@@ -328,7 +330,7 @@ def main() -> None:
         "![Pareto plot](field.png)",
         "",
     ]
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(quick)
     (out / "field.md").write_text("\n".join(head + page))
     record = {"machine": machine, "rows": [asdict(row) for row in rows]}
     (out / "field.json").write_text(json.dumps(record, indent=1) + "\n")

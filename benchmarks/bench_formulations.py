@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 from ratio_table import RatioTable
 from scipy.special import elliprf
 
@@ -204,22 +205,28 @@ def microseconds(call: Callable[[], Any]) -> float:
     return statistics.median(samples)
 
 
-def measure(label: str, pad: Rectangle, name: str) -> Row | None:
+def measure(label: str, pad: Rectangle, name: str, bulk: int) -> Row | None:
     if name == "separable, cubic table" and max(pad.a, pad.b) > RatioTable.LONGEST_ASPECT * min(pad.a, pad.b):
         return None
     locate = FORMULATIONS[name](pad)
-    x, y = np.random.default_rng(0).uniform(MARGIN, 1 - MARGIN, (2, BULK)) * np.array([[pad.a], [pad.b]])
+    x, y = np.random.default_rng(0).uniform(MARGIN, 1 - MARGIN, (2, bulk)) * np.array([[pad.a], [pad.b]])
     currents = pad.side_fractions(x, y)
     with np.errstate(all="ignore"):
         found = locate(currents)
         error = np.hypot(found[0] - x, found[1] - y) / min(pad.a, pad.b)
         sixteen = np.ascontiguousarray(currents[:, :16])
-        times = microseconds(partial(locate, sixteen)), microseconds(partial(locate, currents)) / BULK
+        times = microseconds(partial(locate, sixteen)), microseconds(partial(locate, currents)) / bulk
     return Row(label, name, float(np.where(np.isnan(error), np.inf, error).max()), *times)
 
 
 def main() -> None:
-    rows = [measure(label, Rectangle(*sides), name) for label, sides in PADS.items() for name in FORMULATIONS]
+    quick = options(__doc__).parse_args().quick
+    bulk = 100 if quick else BULK
+    rows = [
+        measure(label, Rectangle(*sides), name, bulk)
+        for label, sides in PADS.items()
+        for name in FORMULATIONS
+    ]
     lines = ["| pad | formulation | worst error | 16 contacts | each of 1e5 |", "|---|---|---|---|---|"]
     kept = [row for row in rows if row is not None]
     for r in kept:
@@ -233,7 +240,7 @@ def main() -> None:
     head = [
         "# Formulations of the exact location",
         "",
-        f"Made by `make bench ONLY=formulations`; {machine}.",
+        f"{made_by()}; {machine}.",
         "Contacts 0.1 % of a side and farther from the edges; errors in shorter sides against the positions",
         "that produced the currents; medians of processor time. Only the adopted one returns the residual",
         "as well, and only it is designed for aspect ratios from 1e-3 to 1e3 (`make stress`). The separable",
@@ -241,7 +248,7 @@ def main() -> None:
         "than the half plane of theory.md and is faster in bulk, whatever its last step.",
         "",
     ]
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(quick)
     (out / "formulations.md").write_text("\n".join(head + lines) + "\n")
     record = {"machine": machine, "rows": [asdict(row) for row in kept]}
     (out / "formulations.json").write_text(json.dumps(record, indent=1) + "\n")

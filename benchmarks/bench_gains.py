@@ -6,12 +6,11 @@ only these tables, counted from 1, and keeps the others.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import json
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,8 @@ import matplotlib
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from page import OUT, made_by, options, output_folder, table
 from scipy.stats import chi2
-from section import table
 
 from handtouch import config
 from handtouch.calibration.gains import GainEstimator, fisher_covariance, gain_deviation
@@ -68,14 +67,14 @@ def contacts(
     return x, y, (pad.fractions(x - dx, y - dy) + pad.fractions(x + dx, y + dy)) / 2
 
 
-def trials(label: str, noise: float, elongated: float) -> list[dict[str, Any]]:
+def trials(label: str, noise: float, elongated: float, seeds: int) -> list[dict[str, Any]]:
     """Errors against the bound at each of COUNTS."""
     pad = PADS[label]
     errors: dict[int, list[FloatArray]] = {count: [] for count in COUNTS}
     stated: dict[int, list[FloatArray]] = {count: [] for count in COUNTS}
     bounds: dict[int, list[float]] = {count: [] for count in COUNTS}
     distances: dict[int, list[float]] = {count: [] for count in COUNTS}
-    for seed in range(TRIALS_ELONGATED if elongated else TRIALS):
+    for seed in range(seeds):
         generator = np.random.default_rng(
             (seed, round(10 * pad.a), round(1e5 * noise), round(10 * elongated))
         )
@@ -115,24 +114,24 @@ def trials(label: str, noise: float, elongated: float) -> list[dict[str, Any]]:
     return rows
 
 
-def swapped(label: str) -> list[dict[str, Any]]:
+def swapped(label: str, counts: Sequence[int], tested: int) -> list[dict[str, Any]]:
     """Location error on the shipped hand's 15 pads since all nodes were exchanged, by contacts since."""
     deployment = config.load(shipped.path("utah_mit.toml"))
     pads = [(hand, pad) for hand in deployment.hands for pad in hand.pads]
     model = PadModel(deployment)
     networks = [electrode_network(pad, deployment.sheets[pad.sheet]) for _, pad in pads]
-    errors: dict[int, list[FloatArray]] = {count: [] for count in SWAP_COUNTS}
+    errors: dict[int, list[FloatArray]] = {count: [] for count in counts}
     least: list[FloatArray] = []
-    gain_errors: dict[int, list[FloatArray]] = {count: [] for count in SWAP_COUNTS}
-    inside: dict[int, list[FloatArray]] = {count: [] for count in SWAP_COUNTS}
+    gain_errors: dict[int, list[FloatArray]] = {count: [] for count in counts}
+    inside: dict[int, list[FloatArray]] = {count: [] for count in counts}
     for seed in SWAP_SEEDS:
         world = WORLDS[label].draw(seed)
         true = np.array([1 / np.array(world.pad(hand.name, pad).gain_ratio) for hand, pad in pads])
-        learn = _readings(deployment, model, world, max(SWAP_COUNTS), (seed, 1))
-        test = _readings(deployment, model, world, 100, (seed, 2))
+        learn = _readings(deployment, model, world, max(counts), (seed, 1))
+        test = _readings(deployment, model, world, tested, (seed, 2))
         for row, network in enumerate(networks):
             running, done = GainEstimator(network), 0
-            for count in SWAP_COUNTS:
+            for count in counts:
                 running.add_contacts(learn[row].currents[:, done:count], learn[row].noise, count)
                 done, found = count, running.estimate
                 errors[count].append(_located(model, row, test[row], found.gains))
@@ -142,7 +141,7 @@ def swapped(label: str) -> list[dict[str, Any]]:
                 inside[count].append(off**2 < 1.96**2 * np.diag(found.covariance))
             least.append(_located(model, row, test[row], true[row]))
     rows = []
-    for count in SWAP_COUNTS:
+    for count in counts:
         error = np.concatenate(errors[count])
         rows.append(
             {
@@ -254,58 +253,64 @@ def draw(path: Path, fisher: list[dict[str, Any]], swaps: list[dict[str, Any]]) 
     figure.savefig(path, dpi=100)
 
 
-def points() -> tuple[str, list[dict[str, Any]]]:
+def points(quick: bool) -> tuple[str, list[dict[str, Any]]]:
+    seeds = 2 if quick else TRIALS
     note = (
-        f"{TRIALS} trials each; gains {100 * GAIN_STD:g} % off; root mean square over trials and "
+        f"{seeds} trials each; gains {100 * GAIN_STD:g} % off; root mean square over trials and "
         "channels. The ratio's own scatter is 4 % on the square, 6 % at 1.8:1. Aim: 1.2 at most."
     )
-    return note, [row for label in PADS for noise in (1e-4, 1e-3) for row in trials(label, noise, 0.0)]
+    return note, [row for label in PADS for noise in (1e-4, 1e-3) for row in trials(label, noise, 0.0, seeds)]
 
 
-def edges() -> tuple[str, list[dict[str, Any]]]:
+def edges(quick: bool) -> tuple[str, list[dict[str, Any]]]:
+    seeds = 1 if quick else TRIALS_ELONGATED
     note = (
-        f"{TRIALS_ELONGATED} trials each. Some contacts are two points 0.06 to 0.3 of the shorter side "
+        f"{seeds} trials each. Some contacts are two points 0.06 to 0.3 of the shorter side "
         "apart, at any angle. The bound is that of as many points."
     )
     cases = [(label, noise, part) for label in PADS for noise in (1e-4, 1e-3) for part in (0.1, 0.3)]
-    return note, [row for case in cases for row in trials(*case)]
+    return note, [row for case in cases for row in trials(*case, seeds)]
 
 
-def swaps() -> tuple[str, list[dict[str, Any]]]:
+def swaps(quick: bool) -> tuple[str, list[dict[str, Any]]]:
+    counts, tested = (SWAP_COUNTS[:2], 8) if quick else (SWAP_COUNTS, 100)
     note = (
         f"The shipped hand's 15 pads, {len(SWAP_SEEDS)} sets of nodes; finite elements, noise, quantisation "
         f"and sizes of contacts hidden from the estimator; contacts of 0.5 to 5 N, means of {HELD} samples; "
-        "100 other contacts a pad measure the error. The second world also has electrodes that end elsewhere."
+        f"{tested} other contacts a pad measure the error. The second world also has electrodes that "
+        "end elsewhere."
     )
-    return note, [row for label in WORLDS for row in swapped(label)]
+    return note, [row for label in WORLDS for row in swapped(label, counts, tested)]
 
 
-TABLES: dict[str, Callable[[], tuple[str, list[dict[str, Any]]]]] = {
+TABLES: dict[str, Callable[[bool], tuple[str, list[dict[str, Any]]]]] = {
     "Error against the Fisher bound": points,
     "With elongated contacts among them": edges,
     "Position error after a node replacement": swaps,
-    "Shapes": lambda: ("Fisher bound for the least certain gain.", shapes()),
+    "Shapes": lambda _: ("Fisher bound for the least certain gain.", shapes()),
 }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="self-calibration of gains")
+    parser = options(__doc__)
     parser.add_argument("--only", type=int, nargs="+", choices=range(1, 5), default=[1, 2, 3, 4])
-    only = parser.parse_args().only
-    out = ROOT / "docs" / "benchmarks"
-    kept = json.loads((out / "gains.json").read_text())["tables"] if len(only) < len(TABLES) else {}
+    asked = parser.parse_args()
+    out = output_folder(asked.quick)
+    kept = json.loads((OUT / "gains.json").read_text())["tables"] if len(asked.only) < len(TABLES) else {}
     page, rows = [], {}
     for number, (title, measure) in enumerate(TABLES.items(), 1):
-        note, rows[title] = measure() if number in only else (kept[title]["note"], kept[title]["rows"])
-        kept[title] = {"note": note, "rows": rows[title]}
-        page += table(title, note, rows[title])
+        if number in asked.only:
+            note, found = measure(asked.quick)
+            kept[title] = {"note": f"{note}\n{made_by()}.", "rows": found}
+        rows[title] = kept[title]["rows"]
+        page += table(title, kept[title]["note"], rows[title])
     fisher, elongated, since, _ = rows.values()
     draw(out / "gains.png", fisher + elongated, since)
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, "
         f"numpy {np.__version__}, scipy {scipy.__version__}"
     )
-    head = ["# Gains from ordinary contacts", "", f"Made by `make bench ONLY=gains`; {machine}.", ""]
+    head = ["# Gains from ordinary contacts", "", f"{machine}.", ""]
     (out / "gains.md").write_text("\n".join([*head, *page, "![gains](gains.png)", ""]))
     (out / "gains.json").write_text(json.dumps({"machine": machine, "tables": kept}, indent=1) + "\n")
 

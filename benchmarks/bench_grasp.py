@@ -6,7 +6,6 @@ with tolerances. Writes docs/benchmarks/grasp.{md,json,png}. Quick: --seeds 1 --
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -15,6 +14,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from page import made_by, options, output_folder
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -37,7 +38,6 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 FloatArray = NDArray[np.float64]
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 WINDOWS_S = (0.010, 0.020, 0.050, 0.100)
 GAPS_S = (0.010, 0.030, 0.100)
 ONE_PATCH_M = 5.5e-3
@@ -56,10 +56,14 @@ def total(run: Served) -> FloatArray:
     return np.asarray(run.palm_m - run.true_m)
 
 
+def error_part(run: Served, part: str) -> FloatArray:
+    return run.error_m[part]
+
+
 def position_errors(runs: Sequence[Served], wide: bool | None = None) -> dict[str, Any]:
     """Return the number of samples, and median and 95 % of the error [mm] by cause."""
     errors: dict[str, Callable[[Served], FloatArray]] = {"all": total}
-    errors |= {part: lambda run, part=part: run.error_m[part] for part in PARTS}
+    errors |= {part: partial(error_part, part=part) for part in PARTS}
     lengths = {name: length_mm(runs, error, wide) for name, error in errors.items()}
     return {"samples": len(lengths["all"])} | {
         name: np.percentile(length, [50, 95]).tolist() if len(length) else [np.nan, np.nan]
@@ -178,7 +182,7 @@ def pair(values: Sequence[float]) -> str:
     return " / ".join("-" if not np.isfinite(value) else f"{value:.2f}" for value in values)
 
 
-def write(figures: dict[str, Any], seeds: int) -> str:
+def write(figures: dict[str, Any], seeds: int, out: Path) -> str:
     def row(name: str, of: dict[str, Any]) -> str:
         return f"| {name} | {of['samples']} | " + " | ".join(pair(of[key]) for key in ("all", *PARTS)) + " |"
 
@@ -296,15 +300,14 @@ Delays are median / 95 %; F1 within {windows} ms. To suppress flicker, merge con
 pad had a channel at the end of its range: the contact ends there, as `faulted`. {off_pad} % of the force
 on the hand acted beside the pads and is not sensed.
 
-Made by `make bench ONLY=grasp`.
+{made_by()}.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "grasp.md").write_text(text)
-    (OUT / "grasp.json").write_text(json.dumps(figures, indent=1) + "\n")
+    (out / "grasp.md").write_text(text)
+    (out / "grasp.json").write_text(json.dumps(figures, indent=1) + "\n")
     return text
 
 
-def draw(runs: dict[str, list[Served]], figures: dict[str, Any], touch: Touch) -> None:
+def draw(runs: dict[str, list[Served]], figures: dict[str, Any], touch: Touch, path: Path) -> None:
     """Draw error by cause, its distribution, reported over true force, and F1."""
     figure, panels = plt.subplots(2, 2, figsize=(10.5, 7.6), layout="constrained")
     every = [run for of in runs.values() for run in of]
@@ -366,14 +369,17 @@ def draw(runs: dict[str, list[Served]], figures: dict[str, Any], touch: Touch) -
     for panel in panels.flat:
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(alpha=0.2)
-    figure.savefig(OUT / "grasp.png", dpi=130)
+    figure.savefig(path, dpi=130)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--objects", nargs="+", default=list(GRASP_OBJECTS), choices=list(GRASP_OBJECTS))
     args = parser.parse_args()
+    if args.quick:
+        args.seeds, args.objects = 1, args.objects[:1]
+    out = output_folder(args.quick)
     import mujoco
 
     deployment = load(shipped.path("utah_mit.toml"))
@@ -394,8 +400,8 @@ def main() -> None:
             print(f"seed {seed}: {name}, {len(run.step)} contact samples", flush=True)
     figures = {"mujoco": mujoco.__version__} | collect(deployment, runs, assumed, ideal)
     figures["covered"] |= {"seed 1, mounts not stated": covered(unstated, stated=False)}
-    print(write(figures, args.seeds))
-    draw(runs, figures, deployment.touch)
+    print(write(figures, args.seeds, out))
+    draw(runs, figures, deployment.touch, out / "grasp.png")
 
 
 def collect(

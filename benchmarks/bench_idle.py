@@ -7,7 +7,6 @@ from the first event frame on. Writes docs/benchmarks/idle.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -20,8 +19,9 @@ from typing import Any
 
 import can
 import numpy as np
-from bench_latency import OUT, PORT, ProcessorShare, in_own_network, on_loopback, open_bus
+from bench_latency import PORT, ProcessorShare, in_own_network, on_loopback, open_bus
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch.client import request
 from handtouch.config import Deployment, load
@@ -188,7 +188,7 @@ def full_rate_after(stamps: NDArray[np.float64], period_s: float) -> tuple[float
     return float(later[0]), len(later) / (FOLLOWED - float(later[0]))
 
 
-def write(results: dict[str, Any]) -> str:
+def write(results: dict[str, Any], out: Path) -> str:
     rows = "\n".join(
         f"| {r['scene']} | {r['touched']} of 15 | {100 * r['bus_load']:.1f} % | {r['samples_hz']:.0f} "
         f"| {r['ticks_hz']:.0f} | {100 * r['processor_share']:.0f} % |"
@@ -214,26 +214,27 @@ rate: median {wake["median_periods"]:.2f} periods, 95 % {wake["p95_periods"]:.2f
 {100 * wake["within_two_periods"]:.1f} % within two). Afterwards {100 * wake["rate_after"]:.0f} % of the
 full rate.
 
-Made by `make bench ONLY=idle`.
+{made_by()}.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "idle.md").write_text(text)
-    (OUT / "idle.json").write_text(json.dumps(results, indent=1) + "\n")
+    (out / "idle.md").write_text(text)
+    (out / "idle.json").write_text(json.dumps(results, indent=1) + "\n")
     return text
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each case")
     parser.add_argument("--trials", type=int, default=200, help="touches of an idle hand")
     asked = parser.parse_args()
+    if asked.quick:
+        asked.seconds, asked.trials = 1.0, 3
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         results = {"loads": loads(Path(folder), asked.seconds), "wake": wakes(Path(folder), asked.trials)}
     results["machine"] = (
         f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
     )
-    print(write(results))
+    print(write(results, output_folder(asked.quick)))
 
 
 if __name__ == "__main__":

@@ -7,16 +7,15 @@ Writes docs/benchmarks/kinematics.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.config import load, shipped
@@ -30,7 +29,6 @@ from handtouch.hand.joints import JointStateBuffer
 from handtouch.hand.robot_models import RobotModels
 from handtouch.wire.inputs import JointState, decode, encode
 
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PERIOD_NS = 5_000_000
 JOINTS_EVERY_NS = 1_000_000
 STRENGTH = 20.0  # of the threshold's current
@@ -181,17 +179,15 @@ def _each_us(work: Callable[[], object], repeats: int) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="to try it out: few ticks, nothing is written")
-    quick = parser.parse_args().quick
-    ticks = 100 if quick else 1000
+    quick = options(__doc__).parse_args().quick
+    ticks = 20 if quick else 1000
     rows = [row for touched in (0, 1, 5, 15) for row in measure(touched, ticks)]
     single = parts(200 if quick else 5000)
     text = _page(rows, single)
     print(text)
-    if not quick:
-        (OUT / "kinematics.md").write_text(text)
-        (OUT / "kinematics.json").write_text(json.dumps({"rows": rows, "parts_us": single}, indent=1) + "\n")
+    out = output_folder(quick)
+    (out / "kinematics.md").write_text(text)
+    (out / "kinematics.json").write_text(json.dumps({"rows": rows, "parts_us": single}, indent=1) + "\n")
 
 
 def _page(rows: list[dict[str, Any]], single: dict[str, float]) -> str:
@@ -203,6 +199,7 @@ def _page(rows: list[dict[str, Any]], single: dict[str, float]) -> str:
         "From the last sample to encoded contacts and hand frame, 15 pads of the shipped hand, steady",
         "presses; joint states come at 1 kHz. Cases take turns on the same samples; medians of processor",
         f"time. {machine}.",
+        f"{made_by()}.",
         "",
         "| pads touched | case | us a tick | more, us | of the first | bytes a tick |",
         "| --- | --- | --- | --- | --- | --- |",

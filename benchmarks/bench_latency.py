@@ -11,7 +11,6 @@ docs/benchmarks/latency.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -32,6 +31,7 @@ import can
 import numpy as np
 import zmq
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.client import request
@@ -45,7 +45,6 @@ from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS
 
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 CHANNEL, PORT = "239.74.163.9", 43999
 VCAN = Path("/sys/class/net/vcan0")
 TOUCHED = 5
@@ -283,7 +282,7 @@ def losses(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
 
     return {
         "congestion_episodes": grown(lambda status: sum(status["service"]["congestion_episodes"].values())),
-        "samples_missed": grown(lambda status: sum(pad["missed"] for pad in status["pads"])),
+        "samples_missed": grown(lambda status: sum(pad["missed_samples"] for pad in status["pads"])),
         "overruns": grown(lambda status: status["service"]["overruns"]),
     }
 
@@ -453,13 +452,12 @@ def measure(config: Path, turns: int, seconds: float) -> dict[str, Any]:
     }
 
 
-def write(results: dict[str, dict[str, Any]]) -> str:
+def write(results: dict[str, dict[str, Any]], out: Path) -> str:
     """Return the page, of one or both buses."""
     text = "# Latency: last frame of a SYNC to the subscriber\n" + "".join(map(section, results.values()))
-    text += "\nMade by `make bench ONLY=latency`, with SocketCAN under `tests/socketcan/vcan-run`.\n"
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "latency.md").write_text(text)
-    (OUT / "latency.json").write_text(json.dumps(results, indent=1) + "\n")
+    text += "\nSocketCAN is measured under `tests/socketcan/vcan-run`.\n"
+    (out / "latency.md").write_text(text)
+    (out / "latency.json").write_text(json.dumps(results, indent=1) + "\n")
     return text
 
 
@@ -493,7 +491,7 @@ def section(results: dict[str, Any]) -> str:
 {results["pads"]} pads at {results["rate_hz"]:.0f} Hz, {TOUCHED} touched; medians of {count}
 passes of {results["seconds"]:.0f} s each, daemon and floor alternately. Nodes, daemon and subscriber are
 three processes, with ZeroMQ over ipc. {results["machine"]};
-load average when it ended {results["load"]:.1f}.
+load average when it ended {results["load"]:.1f}. {results["made_by"]}.
 
 | contacts | | p50, us | p99, us | worst, us | CPU share |
 | --- | --- | --- | --- | --- | --- |
@@ -515,23 +513,21 @@ Parts of the daemon's latency with sliding contacts, from a traced pass (medians
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--seconds", type=float, default=10.0, help="of a turn")
     parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--trial", action="store_true", help="two turns of 2 s; writes nothing")
     asked = parser.parse_args()
     if not VCAN.exists():
         in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        turns, seconds = (2, 2.0) if asked.trial else (asked.turns, asked.seconds)
+        turns, seconds = (1, 0.5) if asked.quick else (asked.turns, asked.seconds)
         found = measure(on_loopback(Path(folder), PORT), turns, seconds)
-    if asked.trial:
-        print(section(found))
-        return
-    path = OUT / "latency.json"
+    out = output_folder(asked.quick)
+    found["made_by"] = made_by()
+    path = out / "latency.json"
     results = json.loads(path.read_text()) if path.exists() else {}
     results = {bus: results[bus] for bus in ("udp_multicast", "socketcan") if bus in results}
-    print(write({**results, found["bus"]: found}))
+    print(write({**results, found["bus"]: found}, out))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ docs/benchmarks/location.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
@@ -26,8 +26,6 @@ from handtouch.simulate.score import Score, score_contacts
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld
 from handtouch.wire import PadState
-
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 
 _COLUMNS = (
     "hidden from the estimator", "rms error", "rms bound", "ratio (range)", "median", "bias", "scatter",
@@ -49,15 +47,17 @@ class Collector:
             self.contacts.append(message)
 
 
-def play(deployment: Deployment, model: PadModel, scenario: Scenario, world: DrawnWorld) -> Score:
-    """The session through the pipeline, as fast as it goes."""
+def play(
+    deployment: Deployment, model: PadModel, scenario: Scenario, world: DrawnWorld, seconds: float
+) -> Score:
+    """The session, up to a time, through the pipeline, as fast as it goes."""
     hand = VirtualHand(deployment, scenario, world)
     taken = Collector()
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
     pipeline = Pipeline(model, period_ns, deployment.daemon.sample_window_fraction, taken)
     pipeline.node_state[:] = PadState.CLEAR
     truth = []
-    for t_ns in range(period_ns, round(scenario.duration_s * 1e9), period_ns):
+    for t_ns in range(period_ns, round(seconds * 1e9), period_ns):
         pipeline.begin_cycle(t_ns, t_ns)
         for pad, counts in enumerate(hand.sample(t_ns * 1e-9)):
             pipeline.slab.write_pdo(pad, counts.astype("<i2").tobytes(), t_ns + 1)
@@ -74,13 +74,14 @@ def line(name: str, scores: list[Score]) -> str:
     return (
         f"| {name} | {1e6 * mean('rms_error_m'):.0f} | {1e6 * mean('rms_bound_m'):.0f} "
         f"| {np.mean(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f}) | {1e6 * mean('median_error_m'):.1f} "
-        f"| {1e6 * mean('bias_m'):.1f} | {1e6 * mean('scatter_m'):.0f} | {1e3 * mean('force_rms_n'):.1f} "
+        f"| {1e6 * mean('bias_m'):.1f} | {1e6 * mean('scatter_m'):.0f} "
+        f"| {1e3 * mean('rms_force_error_n'):.1f} "
         f"| {sum(r.total.touches for r in scores)} | {sum(r.total.missed for r in scores)} "
         f"| {sum(r.total.false_positives for r in scores)} |"
     )
 
 
-def write(results: dict[str, list[Score]], samples: int) -> str:
+def write(results: dict[str, list[Score]], samples: int, out: Path) -> str:
     rows = "\n".join(line(name, scores) for name, scores in results.items())
     seeds = len(next(iter(results.values())))
     header = f"| {' | '.join(_COLUMNS)} |"
@@ -100,31 +101,33 @@ seed. Lengths in um, force in mN. {machine}.
 * *tolerances*: 2 % gain of each channel, 0.2 mm of each gap, 5 % of each resistor, and the contact's size.
   Their *bias* is the mean error of each touch; what noise does to it is the *scatter*.
 
-Made by `make bench ONLY=location`.
+{made_by()}.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "location.md").write_text(text)
+    (out / "location.md").write_text(text)
     content: dict[str, Any] = {name: [asdict(s.total) for s in scores] for name, scores in results.items()}
-    (OUT / "location.json").write_text(json.dumps(content, indent=1) + "\n")
+    (out / "location.json").write_text(json.dumps(content, indent=1) + "\n")
     return text
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=5)
     asked = parser.parse_args()
     deployment = load(shipped.path("utah_mit.toml"))
     scenario = Scenario.load(shipped.path("utah_mit_session.toml"))
     model = PadModel(deployment)
-    seeds = range(1, asked.seeds + 1)
+    seeds = range(1, 2 if asked.quick else asked.seeds + 1)
+    seconds = 3.0 if asked.quick else scenario.duration_s
     results = {
-        "noise and quantisation": [play(deployment, model, scenario, WORLDS["ideal"].draw(s)) for s in seeds],
+        "noise and quantisation": [
+            play(deployment, model, scenario, WORLDS["ideal"].draw(s), seconds) for s in seeds
+        ],
         "tolerances of parts too": [
-            play(deployment, model, scenario, WORLDS["default"].only("parts", "contacts").draw(s))
+            play(deployment, model, scenario, WORLDS["default"].only("parts", "contacts").draw(s), seconds)
             for s in seeds
         ],
     }
-    print(write(results, next(iter(results.values()))[0].total.samples))
+    print(write(results, next(iter(results.values()))[0].total.samples, output_folder(asked.quick)))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ simulated pad's currents. Writes docs/benchmarks/percept.{md,json,png}; --quick 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -22,6 +21,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 from scipy.optimize import least_squares
 
 from handtouch.config import Deployment, load, shipped
@@ -47,7 +47,6 @@ from matplotlib import pyplot as plt
 
 FloatArray = NDArray[np.float64]
 Rows = list[dict[str, Any]]
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 
 PERIOD_NS, RATE_HZ = 5_000_000, 200.0
 SQUEEZE_S, PAUSE_S, PRESSES = 2.4, 0.6, 4
@@ -640,7 +639,7 @@ def report(found: dict[str, Any]) -> str:
         ],
     )
     cost = table(["call", "us"], [[name, f"{us:.0f}"] for name, us in found["cost_us"].items()])
-    head = HEAD.format(**found["machine"])
+    head = HEAD.format(made_by=made_by(), **found["machine"])
     area = table(
         ["stiffness, N/mm", "radius of the object", "answered", "estimated", "rms error",
          "half of the 95 % interval", "inside it"],
@@ -690,7 +689,7 @@ def report(found: dict[str, Any]) -> str:
 HEAD = """\
 # Stiffness, shape and texture
 
-`make bench ONLY=percept`: seeded simulation; the estimators don't know noise, tolerances, contact radii,
+{made_by}: seeded simulation; the estimators don't know noise, tolerances, contact radii,
 sheets. On {system}, Python {python}, numpy {numpy}.
 
 ![Stiffness, shape and texture](percept.png)"""
@@ -733,12 +732,8 @@ shape's fit two steps at a time (a class takes 6 to 26); none of it without a su
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--quick", action="store_true", help="few of everything; writes to the temporary folder"
-    )
-    quick = parser.parse_args().quick
-    out = Path("/tmp") if quick else OUT
+    quick = options(__doc__).parse_args().quick
+    out = output_folder(quick)
     machine = {"system": platform.platform(), "python": platform.python_version(), "numpy": np.__version__}
     found: dict[str, Any] = {
         "machine": machine | {"cpus": os.cpu_count()},
@@ -758,7 +753,7 @@ def main() -> None:
     (out / "percept.json").write_text(json.dumps(found, indent=1).replace("NaN", "null") + "\n")
     (out / "percept.md").write_text(report(found))
     drawn(found, out / "percept.png")
-    print(f"written to {out}")
+    print(report(found))
 
 
 if __name__ == "__main__":

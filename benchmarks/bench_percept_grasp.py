@@ -7,13 +7,14 @@ docs/benchmarks/percept_grasp.{md,json}. Quick: --seeds 1 --objects ball.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from page import made_by, options, output_folder
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -29,7 +30,6 @@ from handtouch.simulate.grasp.simulation import GraspRecord
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 STATED = {"mount_std_mm": 0.2, "mount_std_deg": 0.5, "joint_std_deg": 0.2}
 _START_NS = 1_000_000_000
 MAX_GRIP_M_S, MIN_SLIP_M_S = 2e-3, 10e-3
@@ -365,7 +365,7 @@ def _stiffness_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     }
 
 
-def write(figures: dict[str, Any], seeds: int) -> str:
+def write(figures: dict[str, Any], seeds: int, out: Path) -> str:
     """Write the page; return its text."""
     slip_rows = "\n".join(
         f"| {name} | {of['slips']} | {of['found']:.0%} | {of['ms']:.0f} / {of['ms_95']:.0f} "
@@ -463,11 +463,10 @@ shape fits only if the object moved by about 2 mm between touches, which increas
 * An object that rotates by more than a few degrees in the hand, as a thin rod does, blurs its shape,
   though older touches have less weight. A fit with a moving object takes twice as long, the first time.
 
-Made by `make bench ONLY=percept_grasp`.
+{made_by()}.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "percept_grasp.md").write_text(text)
-    (OUT / "percept_grasp.json").write_text(json.dumps(figures, indent=1) + "\n")
+    (out / "percept_grasp.md").write_text(text)
+    (out / "percept_grasp.json").write_text(json.dumps(figures, indent=1) + "\n")
     return text
 
 
@@ -477,10 +476,12 @@ def _size(of: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--objects", nargs="+", default=list(GRASP_OBJECTS), choices=list(GRASP_OBJECTS))
     args = parser.parse_args()
+    if args.quick:
+        args.seeds, args.objects = 1, args.objects[:1]
     import mujoco
 
     plain: Deployment = load(shipped.path("utah_mit.toml"))
@@ -492,7 +493,7 @@ def main() -> None:
             runs.append(served(deployment, name, seed, usual(seed), perceive=True))
             print(f"seed {seed}: {name}, {len(runs[-1].percepts)} percepts", flush=True)
     runs.sort(key=lambda run: args.objects.index(run.grasp.grasped_object.name))
-    print(write({"mujoco": mujoco.__version__} | collect(runs), args.seeds))
+    print(write({"mujoco": mujoco.__version__} | collect(runs), args.seeds, output_folder(args.quick)))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ docs/benchmarks/receive_path.{md,json}.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -24,13 +25,13 @@ from pathlib import Path
 from typing import Any
 
 import can
+from page import made_by, options, output_folder
 
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.receivers import grow_receive_buffer
 from handtouch.config import Bus
 from handtouch.core.slab import Slab
 
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PADS, BURST, TURNS = 15, 400, 100
 GROUP = "239.74.163.77"
 VCAN = Path("/sys/class/net/vcan0")
@@ -89,7 +90,7 @@ def drained(port: Port) -> None:
         port.drain()
 
 
-def in_process() -> dict[str, Any]:
+def in_process(turns: int) -> dict[str, Any]:
     """Measure in-process buses: both include queueing the frames, but not the copies that `send` makes."""
     messages = [
         can.Message(arbitration_id=ID0 + n % PADS, data=bytes(8), is_extended_id=False) for n in range(BURST)
@@ -109,7 +110,7 @@ def in_process() -> dict[str, Any]:
             put(inner, messages)
             drained(port)
 
-        for _ in range(TURNS):
+        for _ in range(turns):
             bare.append(cost(through_bare, time.process_time_ns))
             port_us.append(cost(through_port, time.process_time_ns))
         port.close()
@@ -123,7 +124,7 @@ def put(bus: Any, messages: list[can.Message]) -> None:
 
 
 def over_socket(
-    name: str, interface: str, channel: str, bare_loop: Callable[[can.BusABC, Slab], int]
+    name: str, interface: str, channel: str, bare_loop: Callable[[can.BusABC, Slab], int], turns: int
 ) -> dict[str, Any]:
     """Measure a socket interface; both receivers stay open and each receives every frame."""
     slab = Slab(PADS)
@@ -134,7 +135,7 @@ def over_socket(
         grow_receive_buffer(same)
     port = Port.open(Bus(name="port", interface=interface, channel=channel), slab)
     route(port)
-    for _ in range(TURNS):
+    for _ in range(turns):
         fill(sender)
         bare.append(cost(lambda: check(bare_loop(bus, slab))))
         port_us.append(cost(lambda: drained(port)))
@@ -170,16 +171,16 @@ def summary(name: str, bare: list[float], port: list[float]) -> dict[str, Any]:
         "bare_us": round(statistics.median(bare), 3),
         "port_us": round(statistics.median(port), 3),
         "machine": f"{host}, {platform.machine()}, Python {platform.python_version()}",
+        "made_by": made_by(),
         "ratio": round(statistics.median(port) / statistics.median(bare), 3),
     }
     print(f"{name:14} bare {row['bare_us']:6.2f} us  port {row['port_us']:6.2f} us  ratio {row['ratio']:.2f}")
     return row
 
 
-def report(rows: list[dict[str, Any]]) -> None:
+def report(rows: list[dict[str, Any]], out: Path) -> None:
     """Add the rows to those of earlier runs on other interfaces."""
-    OUT.mkdir(parents=True, exist_ok=True)
-    path = OUT / "receive_path.json"
+    path = out / "receive_path.json"
     kept = json.loads(path.read_text())["rows"] if path.exists() else []
     names = {row["interface"] for row in rows}
     rows = [row for row in kept if row["interface"] not in names] + rows
@@ -188,26 +189,42 @@ def report(rows: list[dict[str, Any]]) -> None:
         "# Cost of a received frame",
         "",
         "`Port.drain` against a bare receive-and-store loop on the same interface, in the same run; medians.",
-        "Made by `benchmarks/bench_receive_path.py`; under `tests/socketcan/vcan-run` it measures SocketCAN.",
+        "SocketCAN is measured under `tests/socketcan/vcan-run`.",
         "",
-        "| interface | bare, us | port, us | ratio | machine |",
-        "|---|---|---|---|---|",
+        "| interface | bare, us | port, us | ratio | machine | |",
+        "|---|---|---|---|---|---|",
     ]
-    lines += ["| {interface} | {bare_us} | {port_us} | {ratio} | {machine} |".format(**row) for row in rows]
-    (OUT / "receive_path.md").write_text("\n".join(lines) + "\n")
+    lines += [
+        "| {interface} | {bare_us} | {port_us} | {ratio} | {machine} | {made_by} |".format(**row)
+        for row in rows
+    ]
+    (out / "receive_path.md").write_text("\n".join(lines) + "\n")
 
 
 def main() -> None:
     """Run in a network namespace of its own, except for SocketCAN."""
+    parser = options(__doc__)
+    parser.add_argument("--in-namespace", action="store_true", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    turns, out = 3 if asked.quick else TURNS, output_folder(asked.quick)
     if VCAN.exists():
-        report([over_socket("socketcan", "socketcan", "vcan0", bare_socket)])
+        report([over_socket("socketcan", "socketcan", "vcan0", bare_socket, turns)], out)
         return
-    if "--in-namespace" not in sys.argv:
+    if not asked.in_namespace:
         ready = "ip link set lo up && ip route add 239.0.0.0/8 dev lo"
         rootless = [] if os.geteuid() == 0 else ["--map-root-user"]
-        shell = ["sh", "-c", f'{ready} && exec "$@"', "sh", sys.executable, __file__, "--in-namespace"]
+        shell = [
+            "sh",
+            "-c",
+            f'{ready} && exec "$@"',
+            "sh",
+            sys.executable,
+            __file__,
+            *sys.argv[1:],
+            "--in-namespace",
+        ]
         sys.exit(subprocess.call(["unshare", "--net", *rootless, *shell]))
-    report([in_process(), over_socket("udp_multicast", "udp_multicast", GROUP, bare_recv)])
+    report([in_process(turns), over_socket("udp_multicast", "udp_multicast", GROUP, bare_recv, turns)], out)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ tick, which depend little on other load of the machine. Writes docs/benchmarks/r
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -22,8 +21,9 @@ from typing import Any
 
 import numpy as np
 import zmq
-from bench_latency import OUT, PATHS, machine
+from bench_latency import PATHS, machine
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
@@ -200,7 +200,7 @@ def _median(rows: list[dict[str, Any]], key: str) -> float:
     return float(np.median([row[key] for row in rows]))
 
 
-def write(results: dict[str, Any]) -> str:
+def write(results: dict[str, Any], out: Path) -> str:
     """Write the page and return it."""
     rows = results["rows"]
     baseline = {(row["touched"], row["turn"]): row["loop_us"] for row in rows if row["subscriber"] == "none"}
@@ -242,28 +242,25 @@ A hand of 15 pads at {RATE_HZ} Hz, of which some are touched by sliding contacts
 * Every recording is replayed: contact messages that are *equal* bit for bit, of all; and recorded
   time over the processor time of `handtouch replay`, start and model included (some {_START_S:.0f} s).
 
-`make bench ONLY=record` measures this again.
+{made_by()}.
 """
-    (OUT / "record.md").write_text(text)
-    (OUT / "record.json").write_text(json.dumps(results, indent=1) + "\n")
+    (out / "record.md").write_text(text)
+    (out / "record.json").write_text(json.dumps(results, indent=1) + "\n")
     return text
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--seconds", type=float, default=6.0, help="duration of a case")
     parser.add_argument("--turns", type=int, default=2)
     parser.add_argument("--touched", type=int, nargs="+", default=[1, 5, 15], help="pads that are touched")
-    parser.add_argument(
-        "--trial", action="store_true", help="one turn of 2 s with 5 touched pads; writes no file"
-    )
     args = parser.parse_args()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if args.trial:
-        measure([5], 1, 2.0)
-        return
+    if args.quick:
+        args.touched, args.turns, args.seconds = [5], 1, 2.0
     rows = measure(args.touched, args.turns, args.seconds)
-    print(write({"rows": rows, "seconds": args.seconds, "machine": machine(), "load": os.getloadavg()[0]}))
+    results = {"rows": rows, "seconds": args.seconds, "machine": machine(), "load": os.getloadavg()[0]}
+    print(write(results, output_folder(args.quick)))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ Writes docs/benchmarks/scene.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 from bench_tick import hands
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.config.tables import SceneRequest
@@ -30,7 +30,6 @@ from handtouch.core.scene import ActiveScenes, Demand
 from handtouch.field.paper_methods import log_ratio
 from handtouch.field.rectangle import Rectangle
 
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PERIOD_NS = 5_000_000
 SLIDING_M = 1e-4  # a tick: 20 mm/s at 200 Hz
 CURRENT_RATIO = 20.0  # of the threshold's current
@@ -168,10 +167,11 @@ def locators() -> dict[str, float]:
     linearisations.solve_contacts(pads, currents, place)
     rectangle, columns = Rectangle(*model.locator.sides[0]), np.ascontiguousarray(currents.T)
     unknown = np.zeros((CONTACTS_READ, 2, 2))
+    x, y = place.T
     works: dict[str, Callable[[], object]] = {
         "read": lambda: linearisations.evaluate(pads, currents),
         "log-ratio": lambda: log_ratio(rectangle, columns),
-        "place": lambda: model.placement.to_link_frame(pads, *place.T, unknown),
+        "place": lambda: model.placement.to_link_frame(pads, x, y, unknown),
     }
     costs = {}
     for name, work in works.items():
@@ -184,7 +184,7 @@ def locators() -> dict[str, float]:
     return costs
 
 
-def write(rows: list[dict[str, Any]], costs: dict[str, float], machine: str) -> str:
+def write(rows: list[dict[str, Any]], costs: dict[str, float], machine: str, out: Path) -> str:
     sizes = sorted({row["pads"] for row in rows})
     first = {size: next(row for row in rows if row["pads"] == size) for size in sizes}
 
@@ -216,22 +216,23 @@ locators are no alternative, as none is cheaper: reading {CONTACTS_READ} lineari
 the logarithm of two ratios, takes {costs["log-ratio"]:.1f} us for the position on an ideal pad, and its
 transformation to the link {costs["place"]:.0f} us more. Savings of the bus are in [idle](idle.md).
 
-Made by `make bench ONLY=scene`.
+{made_by()}.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "scene.md").write_text(text)
-    (OUT / "scene.json").write_text(
+    (out / "scene.md").write_text(text)
+    (out / "scene.json").write_text(
         json.dumps({"machine": machine, "rows": rows, "locators_us": costs}, indent=1) + "\n"
     )
     return text
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--ticks", type=int, default=1000)
-    ticks = parser.parse_args().ticks
+    asked = parser.parse_args()
+    ticks = 20 if asked.quick else asked.ticks
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    print(write([row for count in (1, 4) for row in measure(count, ticks)], locators(), machine))
+    rows = [row for count in (1, 4) for row in measure(count, ticks)]
+    print(write(rows, locators(), machine, output_folder(asked.quick)))
 
 
 if __name__ == "__main__":

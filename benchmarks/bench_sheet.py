@@ -19,6 +19,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import numpy.typing as npt
+from page import made_by, options, output_folder
 
 from handtouch.sheet import (
     GRAM_FORCE_N,
@@ -218,7 +219,7 @@ def prony() -> Rows:
 # Cost
 
 
-def costs() -> Rows:
+def costs(batches: int) -> Rows:
     rng = np.random.default_rng(1)
     load = rng.uniform(0.5, 5, PADS) * (rng.random(PADS) < 0.5)
     looped = replace(S1, hysteresis=PrandtlIshlinskii.from_width(LOOP, FULL_N))
@@ -234,20 +235,20 @@ def costs() -> Rows:
         rows.append(
             {
                 "model": name,
-                "forward": timed(partial(step.forward, state, load)),
-                "inverse, exact": timed(partial(exact.compensate, load, DT_S)),
-                "inverse, updated every 0.1 s": timed(partial(held.compensate, load, DT_S)),
-                "std of 60": timed(held.std_n),
-                "std of 8": timed(partial(held.std_n, np.arange(8))),
+                "forward": timed(partial(step.forward, state, load), batches),
+                "inverse, exact": timed(partial(exact.compensate, load, DT_S), batches),
+                "inverse, updated every 0.1 s": timed(partial(held.compensate, load, DT_S), batches),
+                "std of 60": timed(held.std_n, batches),
+                "std of 8": timed(partial(held.std_n, np.arange(8)), batches),
             }
         )
     return rows
 
 
-def timed(call: Callable[[], object]) -> str:
+def timed(call: Callable[[], object], batches: int) -> str:
     """Return median and least processor time over batches, in us."""
     found = []
-    for _ in range(BATCHES):
+    for _ in range(batches):
         start = time.process_time()
         for _ in range(BATCH):
             call()
@@ -348,6 +349,8 @@ def table(title: str, note: str, rows: Rows) -> list[str]:
 
 
 def main() -> None:
+    quick = options(__doc__).parse_args().quick
+    batches = 2 if quick else BATCHES
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
@@ -370,16 +373,16 @@ def main() -> None:
             prony(),
         ),
         "Cost of a step of 60 pads": (
-            f"Half of them touched, {DT_S:g} s; processor time in us, median of {BATCHES} batches (least). "
+            f"Half of them touched, {DT_S:g} s; processor time in us, median of {batches} batches (least). "
             "Aim: 10 us for a tick's part, on an idle machine.",
-            costs(),
+            costs(batches),
         ),
     }
-    page = ["# Sheet behaviour", "", f"Made by `make bench ONLY=sheet`; {machine}.", ""]
+    page = ["# Sheet behaviour", "", f"{made_by()}; {machine}.", ""]
     page += ["![the paper's experiments](sheet.png)", ""]
     for title, (note, rows) in tables.items():
         page += table(title, note, rows)
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(quick)
     (out / "sheet.md").write_text("\n".join(page))
     record = {
         "machine": machine,

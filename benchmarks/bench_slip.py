@@ -1,21 +1,22 @@
 """Measure latency and false positives of slip detection, and of detection by force alone.
 
-Prints its tables and writes docs/benchmarks/slip.md, slip.json and slip.png. `--quick` does a tenth of it.
+Prints its tables and writes docs/benchmarks/slip.md, slip.json and slip.png.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
 import platform
+from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 import numpy.typing as npt
-from slip_runs import DEPLOYMENT, ROOT, Record, pads_of, run
+from page import made_by, options, output_folder
+from slip_runs import DEPLOYMENT, Record, pads_of, run
 
 from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, DrawnWorld
@@ -144,7 +145,7 @@ def curve(made: list[tuple[FloatArray, FloatArray]], held: FloatArray, t_s: Floa
     return rows
 
 
-def measure(quick: bool) -> dict[str, Any]:
+def measure(quick: bool, out: Path) -> dict[str, Any]:
     repeats, seconds = (2, 10.0) if quick else (4, 40.0)
     results: dict[str, Any] = {"latency": [], "false": [], "curves": {}, "cost": []}
     cases = [("ideal", 200.0), ("S1", 200.0), ("S2", 200.0), ("ideal", 500.0), ("S1", 500.0), ("S1", 1000.0)]
@@ -170,8 +171,7 @@ def measure(quick: bool) -> dict[str, Any]:
                 results["curves"][which] = curves([slip for slip in made if slip[2].load == load], firm)
         results["cost"].append(cost(hz, firm))
         print(json.dumps(results["false"][-1]), json.dumps(results["cost"][-1]), flush=True)
-        if not quick:
-            keep(results)
+        keep(results, out)
     return results
 
 
@@ -234,7 +234,7 @@ def cost(hz: float, firm: Record) -> dict[str, Any]:
     }
 
 
-def draw(results: dict[str, Any]) -> None:
+def draw(results: dict[str, Any], path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.2))
     styles = {0.5: ":", 2.0: "-", 5.0: "--"}
     for hz, colour in ((200.0, ACCENT), (500.0, INK)):
@@ -277,7 +277,7 @@ def draw(results: dict[str, Any]) -> None:
     )
     right.legend(frameon=False, fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.13))
     figure.tight_layout()
-    figure.savefig(ROOT / "docs" / "benchmarks" / "slip.png", dpi=130)
+    figure.savefig(path, dpi=130)
 
 
 def at_one_a_minute(rows: Rows) -> dict[str, Any]:
@@ -327,8 +327,8 @@ Simulated Utah/MIT hand, 15 pads at once, through the daemon's own pipeline and 
 1 count, tolerances of all parts, sheets (`ideal`, `S1`, `S2`) unknown to the daemon. A grip has tremor:
 10 % ripple of force and 15 um of sway, both of eight tones from 1 to 10 Hz, and the centroid rolls 0.1 mm a
 newton. In half of the slips the force stays constant, in half it falls to 70 % within 20 ms. The test was
-tuned on hands and grips other than those measured here. Made by
-`benchmarks/bench_slip.py` on {platform.machine()}, Python {platform.python_version()}, {os.cpu_count()}
+tuned on hands and grips other than those measured here. {made_by()}
+on {platform.machine()}, Python {platform.python_version()}, {os.cpu_count()}
 shared cores.
 
 ![latency over speed, and slips found over false alarms](slip.png)
@@ -367,21 +367,17 @@ a subscriber, as a test shows.
 """
 
 
-def keep(results: dict[str, Any]) -> None:
+def keep(results: dict[str, Any], folder: Path) -> None:
     """Write what there is so far: a run takes minutes."""
-    folder = ROOT / "docs" / "benchmarks"
     finite = json.loads(json.dumps(results).replace("Infinity", "null"))
     (folder / "slip.json").write_text(json.dumps(finite, indent=1) + "\n")
     (folder / "slip.md").write_text(report(results))
-    draw(results)
+    draw(results, folder / "slip.png")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a tenth of it, written nowhere")
-    quick = parser.parse_args().quick
-    results = measure(quick)
-    print(report(results))
+    quick = options(__doc__).parse_args().quick
+    print(report(measure(quick, output_folder(quick))))
 
 
 if __name__ == "__main__":

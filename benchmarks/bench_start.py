@@ -8,7 +8,6 @@ docs/benchmarks/start.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -22,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import zmq
-from bench_latency import OUT, PATHS, PORT, film, in_own_network, machine, nodes, on_loopback
+from bench_latency import PATHS, PORT, film, in_own_network, machine, nodes, on_loopback
+from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.config import load
@@ -141,7 +141,7 @@ def measure(config: Path, runs: int) -> dict[str, Any]:
     return {cache: {name: medians(rows[name]) for name in once} for cache, rows in found.items()}
 
 
-def write(results: dict[str, Any]) -> str:
+def write(results: dict[str, Any], out: Path) -> str:
     """Return the page."""
     warm, cold = ({**results[cache]["first"], **results[cache]["help"]} for cache in ("warm", "cold"))
     titles = {
@@ -176,19 +176,19 @@ By part, before the boot of the nodes:
 | --- | --- | --- |
 {parts}
 
-Made by `make bench ONLY=start`.
+{made_by()}.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "start.md").write_text(text)
-    (OUT / "start.json").write_text(json.dumps(results, indent=1) + "\n")
+    (out / "start.md").write_text(text)
+    (out / "start.json").write_text(json.dumps(results, indent=1) + "\n")
     return text
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--runs", type=int, default=10)
-    parser.add_argument("--trial", action="store_true", help="two runs; writes nothing")
     asked = parser.parse_args()
+    if asked.quick:
+        asked.runs = 2
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         config = on_loopback(Path(folder), PORT)
@@ -196,16 +196,14 @@ def main() -> int:
         samples = film(load(config), PATHS["resting"])
         worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
         worker.start()
-        results = measure(config, 2 if asked.trial else asked.runs)
+        results = measure(config, asked.runs)
         stop.set()
         worker.join()
-    if asked.trial:
-        print(json.dumps(results, indent=1))
-        return 0
     results |= {"runs": asked.runs, "machine": machine(), "load": os.getloadavg()[0]}
-    print(write(results))
+    print(write(results, output_folder(asked.quick)))
     return int(
-        any(
+        not asked.quick
+        and any(
             results["warm"][key][name] > AIMS_S[name]
             for key, name in (("first", "first frame"), ("help", "help"))
         )

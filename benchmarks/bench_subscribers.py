@@ -29,7 +29,6 @@ import numpy as np
 import zmq
 from bench_latency import (
     MOST,
-    OUT,
     PATHS,
     PORT,
     ProcessorShare,
@@ -43,6 +42,7 @@ from bench_latency import (
     sync_of,
     wait_for_touch,
 )
+from page import made_by, options, output_folder
 
 from handtouch.client import request
 from handtouch.config import load
@@ -219,40 +219,36 @@ machine, so a hundred readers also compete for its CPUs.
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(lines)}
 
-Made by `make bench ONLY=subscribers`.
+{made_by()}.
 """
 
 
-def asked_of(about: str | None, *, seconds: float, turns: int, trial_s: float) -> argparse.Namespace:
+def asked_of(about: str | None, *, seconds: float, turns: int, quick_s: float) -> argparse.Namespace:
     """Return the options of a benchmark with repeated cases."""
-    parser = argparse.ArgumentParser(description=about)
+    parser = options(about)
     parser.add_argument("--seconds", type=float, default=seconds, help="of a case")
     parser.add_argument("--turns", type=int, default=turns)
-    trial = f"one turn of {trial_s:g} s a case; writes nothing"
-    parser.add_argument("--trial", action="store_true", help=trial)
     asked = parser.parse_args()
-    if asked.trial:
-        asked.turns, asked.seconds = 1, trial_s
+    if asked.quick:
+        asked.turns, asked.seconds = 1, quick_s
     return asked
 
 
-def write(name: str, page_of: Callable[[dict[str, Any]], str], rows: Rows, seconds: float) -> None:
+def write(name: str, page_of: Callable[[dict[str, Any]], str], rows: Rows, asked: argparse.Namespace) -> None:
     """Write the page of a benchmark and its data."""
-    results = {"rows": rows, "seconds": seconds, "machine": machine(), "load": os.getloadavg()[0]}
-    page = page_of(results)
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / f"{name}.md").write_text(page)
-    (OUT / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
+    results = {"rows": rows, "seconds": asked.seconds, "machine": machine(), "load": os.getloadavg()[0]}
+    out, page = output_folder(asked.quick), page_of(results)
+    (out / f"{name}.md").write_text(page)
+    (out / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
     print(page)
 
 
 def main() -> None:
-    asked = asked_of(__doc__, seconds=6.0, turns=5, trial_s=1.5)
+    asked = asked_of(__doc__, seconds=6.0, turns=5, quick_s=1.5)
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         rows = measure(on_loopback(Path(folder), PORT), asked.turns, asked.seconds)
-    if not asked.trial:
-        write("subscribers", page_of, rows, asked.seconds)
+    write("subscribers", page_of, rows, asked)
 
 
 if __name__ == "__main__":

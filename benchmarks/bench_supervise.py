@@ -7,7 +7,6 @@ Writes docs/benchmarks/supervise.{md,json,png}; `--quick` tries it out in a minu
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -24,6 +23,7 @@ import matplotlib
 import numpy as np
 import supervise_day
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch import sheet
 from handtouch.config import Behaviour, load, shipped
@@ -40,7 +40,6 @@ from matplotlib import pyplot as plt
 
 FloatArray = NDArray[np.float64]
 Rows = list[dict[str, Any]]
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PERIOD_NS, TICK_NS = 100_000_000, 5_000_000
 DRIFT = WORLDS["default"].only("electronics").draw(71)
 SPAN_S = 60.0  # of drift that is drawn at once
@@ -348,49 +347,66 @@ def loops() -> Rows:
 # Cost
 
 
-def median_us(call: Callable[[], object], times: int = 2000) -> float:
+def median_us(call: Callable[[], object], prepare: Callable[[], object], times: int) -> float:
     spent = []
     for _ in range(times):
+        prepare()
         begin_ns = time.perf_counter_ns()
         call()
         spent.append(time.perf_counter_ns() - begin_ns)
     return 1e-3 * statistics.median(spent)
 
 
-def costs() -> Rows:
-    rows: Rows = []
-    for count in (1, 4, 16):
-        rig = Rig(hands(count), 73, False)
-        model, tick = rig.model, rig.tick
-        grip = model.begin_threshold_counts * 10 * (np.arange(model.size) % 2)
+class Parts:
+    """Parts of a tick that track baselines and compensate sheets, after presses."""
+
+    def __init__(self, hand_count: int) -> None:
+        rig = Rig(hands(hand_count), 73, False)
+        self.size = rig.model.size
+        grip = rig.model.begin_threshold_counts * 10 * (np.arange(self.size) % 2)
         for _ in range(60):
             rig.step(grip)
-        baseline, free = tick.baseline, np.ones(model.size, np.bool_)
-        strength = SheetForceCompensation([sheet_behaviour_of(Behaviour())] * model.size, TICK_NS)
-        touching, raw = tick.contacts.touching, np.ones(model.size)
-        clock = [rig.t_ns]
+        self._tick, self._t_ns = rig.tick, rig.t_ns
+        self._excess, self._free = np.zeros((self.size, 4)), np.ones(self.size, np.bool_)
+        self._sheets = SheetForceCompensation([sheet_behaviour_of(Behaviour())] * self.size, TICK_NS)
+        self._raw = np.ones(self.size)
 
-        def block(baseline: Any = baseline, touching: Any = touching, clock: list[int] = clock) -> None:
-            clock[0] += 10**8
-            baseline._count[:] = 20.0
-            baseline.update_baseline(clock[0], touching)
+    def add_samples(self) -> None:
+        self._tick.baseline.add_samples(self._excess, self._free)
 
-        def sheets(
-            strength: Any = strength, touching: Any = touching, raw: Any = raw, clock: list[int] = clock
-        ) -> None:
-            clock[0] += TICK_NS
-            strength.step(raw, 0.1 * raw, touching, clock[0])
+    def add_block(self) -> None:
+        self._t_ns += 10**8
+        for _ in range(20):
+            self.add_samples()
 
-        def each(tick: Any = tick, free: Any = free, baseline: Any = baseline) -> None:
-            np.subtract(tick.counts, baseline.expected, out=tick._excess)
-            tick._sampled, tick._trusted, tick._baseline_samples_added = free, free, False
-            tick._gather()
-            baseline.update_baseline(tick._sync_ns, tick.contacts.touching)
+    def update_baseline(self) -> None:
+        self._tick.baseline.update_baseline(self._t_ns, self._tick.contacts.touching)
 
-        parts = median_us(each), median_us(block, 500), median_us(sheets)
+    def each_tick(self) -> None:
+        self.add_samples()
+        self.update_baseline()
+
+    def wait(self) -> None:
+        self._t_ns += TICK_NS
+
+    def compensate(self) -> None:
+        touching = self._tick.contacts.touching
+        self._sheets.compensate_forces(self._raw, 0.1 * self._raw, touching, self._t_ns)
+
+
+def costs(quick: bool) -> Rows:
+    rows: Rows = []
+    times = 20 if quick else 2000
+    for count in (1, 4, 16):
+        made = Parts(count)
+        parts = (
+            median_us(made.each_tick, lambda: None, times),
+            median_us(made.update_baseline, made.add_block, times // 4),
+            median_us(made.compensate, made.wait, times),
+        )
         rows.append(
             {
-                "pads": model.size,
+                "pads": made.size,
                 "baseline, each tick": f"{parts[0]:.1f}",
                 "baseline, each tenth of a second": f"{parts[1]:.0f}",
                 "sheets, if modelled": f"{parts[2]:.1f}",
@@ -482,7 +498,7 @@ def page(parts: dict[str, Rows], hours: float, held_s: float) -> str:
     texts = notes(hours, held_s)
     for title, rows in parts.items():
         lines += [f"## {title}", "", texts[title], "", *table(rows), ""]
-    return "\n".join([*lines, "Made by `make bench ONLY=supervise`.", ""])
+    return "\n".join([*lines, f"{made_by()}.", ""])
 
 
 def days(found: dict[tuple[str, str], list[dict[str, Any]]]) -> tuple[Rows, Rows]:
@@ -503,8 +519,7 @@ def days(found: dict[tuple[str, str], list[dict[str, Any]]]) -> tuple[Rows, Rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="minutes instead of hours; write nothing")
+    parser = options(__doc__)
     parser.add_argument("--hours", type=float, default=24.0, help="length of the day (default: 24)")
     asked = parser.parse_args()
     quick = asked.quick
@@ -529,14 +544,14 @@ def main() -> None:
         found = {key: [future.result() for future in futures] for key, futures in used.items()}
     loop = parts.pop("Loop")
     parts[DAY], parts[PARTS] = days(found)
-    parts |= {"Loop": loop, "Cost": costs()}
+    parts |= {"Loop": loop, "Cost": costs(quick)}
     text = page(parts, hours, held_s)
     print(text)
-    if not quick:
-        curves = {p: np.mean([one["curve"] for one in found[p, ""]], axis=0).tolist() for p in presets}
-        (OUT / "supervise.md").write_text(text)
-        (OUT / "supervise.json").write_text(json.dumps({**parts, "curves": curves}, indent=1) + "\n")
-        draw(curves, parts["Slow presses"], OUT / "supervise.png")
+    out = output_folder(quick)
+    curves = {p: np.mean([one["curve"] for one in found[p, ""]], axis=0).tolist() for p in presets}
+    (out / "supervise.md").write_text(text)
+    (out / "supervise.json").write_text(json.dumps({**parts, "curves": curves}, indent=1) + "\n")
+    draw(curves, parts["Slow presses"], out / "supervise.png")
 
 
 if __name__ == "__main__":

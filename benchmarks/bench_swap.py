@@ -5,7 +5,6 @@ Prints its table and writes docs/benchmarks/swap.md, swap.json and swap.png; wit
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -19,6 +18,7 @@ import msgpack
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch import config
 from handtouch.calibration.store_client import StoreClient
@@ -233,10 +233,8 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer units and contacts; writes nothing")
-    quick = parser.parse_args().quick
-    units, counts = (3, COUNTS[:6]) if quick else (12, COUNTS)
+    quick = options(__doc__).parse_args().quick
+    units, counts = (1, COUNTS[:4]) if quick else (12, COUNTS)
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, "
         f"numpy {np.__version__}, scipy {scipy.__version__}"
@@ -248,12 +246,10 @@ def main() -> None:
     ]
     table = [f"| {' | '.join(line)} |" for line in (list(rows[0]), ["---"] * len(rows[0]), *cells)]
     print("\n".join(table))
-    if quick:
-        return
     lines = [
         "# After a node replacement",
         "",
-        f"Made by `make bench ONLY=swap`; {machine}.",
+        f"{made_by()}; {machine}.",
         "",
         "The supervisor worker receives blocks of ticks as from the daemon, of "
         f"{units} nodes of each shape ({' and '.join(f'{x:g} x {WIDTH_MM:g} mm' for x in SHAPES.values())}), "
@@ -269,7 +265,7 @@ def main() -> None:
         "![swap](swap.png)",
         "",
     ]
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(quick)
     (out / "swap.md").write_text("\n".join(lines))
     (out / "swap.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
     draw(out / "swap.png", rows)

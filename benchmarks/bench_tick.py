@@ -8,7 +8,6 @@ sums, and one comparison. Writes docs/benchmarks/tick.{md,json}.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.cycle import Cycle
@@ -26,7 +26,6 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
 from handtouch.core.tick import TickProcessor
 
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PADS = (15, 60, 240, 960)
 PARTS = (0.1, 1.0)
 PERIOD_NS = 5_000_000
@@ -140,7 +139,7 @@ def whole(row: Row) -> float:
     return float(row["tick"] + row["prepare"])
 
 
-def write(rows: list[Row], machine: str) -> str:
+def write(rows: list[Row], machine: str, out: Path) -> str:
     table = "\n".join(line(rows, row) for row in rows if row["state"] == "hot")
     idle = "\n".join(
         f"* {pads} pads: {whole(none) / whole(pick(rows, 'hot', pads, pads, 'static')):.0%} of all static, "
@@ -170,19 +169,19 @@ Cost of untouched pads as a fraction of that of touched ones:
 Growth from {few} to {many} pads, {many // few} times as many, all touched: {growth["static"]:.1f}
 times static, {growth["sliding"]:.1f} times sliding.
 
-Made by `make bench ONLY=tick`.
+{made_by()}.
 """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "tick.md").write_text(text)
-    (OUT / "tick.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
+    (out / "tick.md").write_text(text)
+    (out / "tick.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
     return text
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--ticks", type=int, default=200)
+    asked = parser.parse_args()
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    print(write(measure(parser.parse_args().ticks), machine))
+    print(write(measure(5 if asked.quick else asked.ticks), machine, output_folder(asked.quick)))
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ from bench_latency import (
     on_loopback,
 )
 from bench_subscribers import Rows, asked_of, bystanders, in_turns, serving, write
+from page import made_by
 
 from handtouch import Robot
 from handtouch.client import request
@@ -277,12 +278,12 @@ A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, with joint s
   and the page then uses at most half of the time.
 * Where ticks/s are below {RATE_HZ}, other processes used the machine: rates are lower limits then.
 
-Made by `make bench ONLY=view`.
+{made_by()}.
 """
 
 
 def main() -> None:
-    asked = asked_of(__doc__, seconds=5.0, turns=3, trial_s=2.0)
+    asked = asked_of(__doc__, seconds=5.0, turns=3, quick_s=2.0)
     if "HANDTOUCH_BENCH_PACKAGES" not in os.environ:
         with tempfile.TemporaryDirectory(prefix="ht.") as folder:
             os.environ["HANDTOUCH_BENCH_PACKAGES"] = str(browser_packages(Path(folder) / "js") or "")
@@ -293,8 +294,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         config = on_loopback(Path(folder), PORT)
         rows = measure(config, asked.turns, asked.seconds, Path(packages) if packages else None)
-    if not asked.trial:
-        write("view", page_of, rows, asked.seconds)
+    write("view", page_of, rows, asked)
 
 
 if __name__ == "__main__":

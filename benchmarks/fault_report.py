@@ -81,7 +81,7 @@ def page(every: dict[str, dict[str, Any]]) -> str:
         "fault: no node without a fault changes its state, no untouched pad reports a contact.\n\n"
         "A busy machine pauses nodes and daemon. Reports while a fault-free node sent nothing\n"
         "are counted separately, as void.\n\n"
-        "Made by `make stress ONLY=faults`; on SocketCAN by `tests/socketcan/vcan-run .venv/bin/python\n"
+        "On SocketCAN by `tests/socketcan/vcan-run .venv/bin/python\n"
         "benchmarks/stress_faults.py --interface socketcan --faults 60 --rate 1 --period-ms 20 "
         "--patience 3`.\n"
     ]
@@ -108,6 +108,7 @@ def section(results: dict[str, Any]) -> str:
 seed {results["seed"]}.
 15 nodes at {1000 / results["period_ms"]:.0f} Hz. Limits: {results["patience"]:g} times those of a robot.
 On {results["machine"]}; load {results["load"]:.1f} at the end.
+{results["made_by"]}.
 
 Seconds: median, 90 %, worst.
 

@@ -60,8 +60,8 @@ class Record:
 
     The information is twice the mean logarithm of the likelihood ratio.
     """
-    per_alarm: float
-    """Threshold on R of an alarm."""
+    samples_per_false_alarm: float
+    """Mean samples between false alarms, the threshold on R of an alarm."""
     load: float = 1.0
     """Force during the slip, relative to that before."""
 

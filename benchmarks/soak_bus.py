@@ -10,7 +10,6 @@ was lost in-process, or if the port is slower than the bare loop.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -27,13 +26,13 @@ from typing import Any
 
 import can
 from bench_receive_path import FRAME, VCAN, store
+from page import made_by, options, output_folder
 
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.receivers import MAX_QUEUE_FRAMES, grow_receive_buffer
 from handtouch.config import Bus
 from handtouch.core.slab import Slab
 
-OUT = Path(__file__).parents[1] / "docs" / "benchmarks"
 PADS, ID0 = 15, 0x281
 FULL_BUS = 8500
 AIM = {1: 0.10, 7: 0.50}
@@ -226,16 +225,17 @@ def machine() -> str:
     return f"{host}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def report(new: dict[str, Any]) -> None:
+def report(new: dict[str, Any], out: Path) -> None:
     """Add the figures to those of earlier runs."""
-    path = OUT / "soak_bus.json"
+    path = out / "soak_bus.json"
     figures: dict[str, Any] = (json.loads(path.read_text()) if path.exists() else {}) | new
     path.write_text(json.dumps(figures, indent=1) + "\n")
     lines = [
         "# Fully loaded buses for a long time",
         "",
         f"In-process buses with {FULL_BUS} frames/s each, all into one slab. CPU loads are those of the",
-        "receiving threads: one reads each bus, one drains all. By `benchmarks/soak_bus.py`.",
+        "receiving threads: one reads each bus, one drains all.",
+        f"{made_by()}.",
         "",
         "| buses | seconds | frames/s | lost | longest queue | limit "
         "| readers | drain | CPU | aim | machine |",
@@ -256,26 +256,26 @@ def report(new: dict[str, Any]) -> None:
             "|---|---|---|---|",
             "| {bare_per_s} | {port_per_s} | {ratio} | {machine} |".format(**figures["socketcan"]),
         ]
-    (OUT / "soak_bus.md").write_text("\n".join(lines) + "\n")
+    (out / "soak_bus.md").write_text("\n".join(lines) + "\n")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__)
     parser.add_argument(
         "--seconds", type=float, default=600.0, help="duration of each in-process run (default: 600)"
     )
     arguments = parser.parse_args()
-    OUT.mkdir(parents=True, exist_ok=True)
+    seconds, out = 2.0 if arguments.quick else arguments.seconds, output_folder(arguments.quick)
     if VCAN.exists():
         figures = without_loss()
-        report({"socketcan": figures})
+        report({"socketcan": figures}, out)
         print(figures)
         return int(figures["ratio"] < 1 / 1.5)
     rows = []
     for buses in AIM:
-        rows.append(in_process(buses, arguments.seconds))
+        rows.append(in_process(buses, seconds))
         print(rows[-1], flush=True)
-    report({"in_process": rows})
+    report({"in_process": rows}, out)
     return int(any(row["lost"] or row["overflow"] for row in rows))
 
 

@@ -6,7 +6,6 @@ ARGS="--minutes 60" sets how long.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -14,6 +13,7 @@ import time
 from pathlib import Path
 
 from bench_latency import PORT, descriptors, in_own_network, on_loopback, resident_mb
+from page import options
 
 from handtouch.client import connect, request
 from handtouch.config import load
@@ -47,7 +47,7 @@ def soak(config: Path, minutes: float) -> int:
             lost = all_of_it.lost_messages
         after = (resident_mb(daemon.pid), descriptors(daemon.pid))
         status = request("status", endpoint=endpoints.control)
-        service, missed = status["service"], sum(pad["missed"] for pad in status["pads"])
+        service, missed = status["service"], sum(pad["missed_samples"] for pad in status["pads"])
         print(
             f"{service['ticks'] - ticks} ticks, {service['overruns']} overruns, {missed} samples missed, "
             f"{lost} messages lost; memory {before[0]:.1f} -> {after[0]:.1f} MB, "
@@ -61,13 +61,12 @@ def soak(config: Path, minutes: float) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--trial", action="store_true", help="half a minute")
     asked = parser.parse_args()
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        return soak(on_loopback(Path(folder), PORT + 1), 0.5 if asked.trial else asked.minutes)
+        return soak(on_loopback(Path(folder), PORT + 1), 0.25 if asked.quick else asked.minutes)
 
 
 if __name__ == "__main__":

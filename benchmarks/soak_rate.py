@@ -28,8 +28,9 @@ from typing import Any
 import can
 import numpy as np
 import zmq
-from bench_latency import OUT, PATHS, descriptors, film, machine, resident_mb
+from bench_latency import PATHS, descriptors, film, machine, resident_mb
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 
 from handtouch.config import (
     Bus,
@@ -341,9 +342,9 @@ def remember(hours: float) -> dict[str, Any]:
     }
 
 
-def write(new: dict[str, Any]) -> str:
+def write(new: dict[str, Any], out: Path) -> str:
     """Return the page, with the stored results of other parts."""
-    path = OUT / "soak_rate.json"
+    path = out / "soak_rate.json"
     results = (json.loads(path.read_text()) if path.exists() else {}) | new
     text = ["# Sustained rates of one core, and memory", ""]
     if long := results.get("long"):
@@ -385,9 +386,8 @@ def write(new: dict[str, Any]) -> str:
             f"{memory['descriptors'][0]} and {memory['descriptors'][1]}.",
             "",
         ]
-    text.append("Made by `make soak ONLY=rate`.")
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "soak_rate.md").write_text("\n".join(text) + "\n")
+    text.append(f"{made_by()}.")
+    (out / "soak_rate.md").write_text("\n".join(text) + "\n")
     path.write_text(json.dumps(results, indent=1) + "\n")
     return "\n".join(text)
 
@@ -408,38 +408,36 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0, help="of 60 pads at 1 kHz; 0: not that")
     parser.add_argument("--hours", type=float, default=1.0, help="of the memory run, compressed; 0: not that")
     parser.add_argument(
         "--limits", action=argparse.BooleanOptionalAction, default=True, help="how far it goes"
     )
-    parser.add_argument("--trial", action="store_true", help="a little of all; writes nothing")
     asked = parser.parse_args()
     sys.setswitchinterval(GIL_SWITCH_S)
-    if asked.trial:
-        print("\n".join(table([served(60, 1000, 5.0), served(60, 500, 3.0)])), remember(0.01))
-        return 0
-    failed = False
+    limits, limit_s, out, failed = [*LIMITS], LIMIT_S, output_folder(asked.quick), False
+    if asked.quick:
+        asked.minutes, asked.hours, limits, limit_s = 0.05, 0.01, [(30, 500)], 3.0
     if asked.minutes:
         long = served(60, 1000, 60 * asked.minutes) | {"machine": machine(), "load": os.getloadavg()[0]}
         print(long, flush=True)
         failed |= long["lost"] > 0
-        write({"long": long})
+        write({"long": long}, out)
     if asked.limits:
         rows = []
-        for pads, rate_hz in LIMITS:
-            rows.append(served(pads, rate_hz, LIMIT_S))
+        for pads, rate_hz in limits:
+            rows.append(served(pads, rate_hz, limit_s))
             print(rows[-1], flush=True)
-        write({"limits": rows})
+        write({"limits": rows}, out)
     if asked.hours:
         memory = remember(asked.hours)
         print(memory)
         failed |= (
             memory["mb_per_hour"] > GROWTH_MB_PER_H or memory["descriptors"][0] < memory["descriptors"][1]
         )
-        write({"memory": memory})
-    print(write({}))
+        write({"memory": memory}, out)
+    print(write({}, out))
     return int(failed)
 
 

@@ -9,7 +9,6 @@ wrongly, did not recover, disturbed a node without a fault, lost a frame, leaked
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -23,13 +22,15 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from bench_latency import OUT, PORT, in_own_network, on_loopback
+import can
+from bench_latency import PORT, in_own_network, on_loopback
 from fault_acts import Fault, Kind
 from fault_bench import PRESSED, Bench, Cable, Resources, S, UnknownDevice, open_bus, sampler
 from fault_kinds import KINDS
 from fault_report import by_kind, page, section, verdict
+from page import made_by, options, output_folder
 
 from handtouch import connect, wire
 from handtouch.client import Subscriber
@@ -45,7 +46,7 @@ ALONE_AT_ONCE = 4
 class Campaign:
     """Causes faults and checks their reports."""
 
-    def __init__(self, bench: Bench, messages: Subscriber[Any], links: dict[str, int], options: Any) -> None:
+    def __init__(self, bench: Bench, messages: Subscriber[Any], links: dict[str, int], asked: Any) -> None:
         self.bench = bench
         self.done: list[Fault] = []
         self.surprises: list[dict[str, Any]] = []
@@ -55,8 +56,8 @@ class Campaign:
         self.service: Any = None
         self._messages = messages
         self._links = links
-        self._chance = random.Random(options.seed)
-        self._options = options
+        self._chance = random.Random(asked.seed)
+        self._asked = asked
         self._coming: deque[Kind] = deque(self._chance.sample(KINDS, len(KINDS)))
         self._alone: list[Kind] = []  # waiting for all other faults to end
         self._draining = False
@@ -125,7 +126,7 @@ class Campaign:
                 return
             self._begin(self._coming.popleft(), self._chance.choice(free), now_ns)
         self._next_ns = max(
-            self._next_ns + int(self._chance.expovariate(self._options.rate) * S), now_ns - S // 2
+            self._next_ns + int(self._chance.expovariate(self._asked.rate) * S), now_ns - S // 2
         )
 
     def _may_begin(self, node_id: int, now_ns: int) -> bool:
@@ -160,9 +161,9 @@ class Campaign:
                     fault.reported_ns.setdefault(0, message.t_ns)
         elif isinstance(message, wire.Contact) and message.event == "begin":
             node_id = self._links[message.link]
-            fault = self._busy.get(node_id)
-            if message.link not in PRESSED and (fault is None or not may_touch(fault.kind)):
-                self.ghosts.append(f"{message.link} {message.force_n} N, {fault.kind.name if fault else ''}")
+            cause = self._busy.get(node_id)
+            if message.link not in PRESSED and (cause is None or not may_touch(cause.kind)):
+                self.ghosts.append(f"{message.link} {message.force_n} N, {cause.kind.name if cause else ''}")
 
     def _take_health(self, health: Any) -> None:
         node_id = health.node_id
@@ -205,7 +206,7 @@ class Campaign:
         return fault.kind.reported is None or node_id in fault.reported_ns
 
     def _follow(self, fault: Fault, now_ns: int) -> None:
-        kind, patience = fault.kind, self._options.patience
+        kind, patience = fault.kind, self._asked.patience
         if not fault.ended_ns:
             if now_ns < fault.end_ns:
                 return
@@ -262,13 +263,13 @@ def _once(fault: Fault, failure: str) -> None:
         fault.failures.append(failure)
 
 
-def measure(folder: Path, options: Any) -> dict[str, Any]:
+def measure(folder: Path, asked: Any) -> dict[str, Any]:
     config = on_loopback(folder, PORT)
     config.write_text(
         re.sub(
             r"sync_period_ms = [\d.]+",
             # a replaced node is a fault here
-            f'sync_period_ms = {options.period_ms}\non_node_replaced = "refuse"',
+            f'sync_period_ms = {asked.period_ms}\non_node_replaced = "refuse"',
             config.read_text(),
         )
     )
@@ -276,14 +277,14 @@ def measure(folder: Path, options: Any) -> dict[str, Any]:
     pads = [pad for hand in deployment.hands for pad in hand.pads]
     raised: list[str] = []
     threading.excepthook = lambda args: raised.append(f"{args.exc_type.__name__}: {args.exc_value}")
-    buses = [open_bus(options.interface), open_bus(options.interface)]
-    cable = Cable(buses[0], round(options.period_ms * 1e6))
-    devices = DeviceBus(cable, sampler(deployment, options.seed))
+    buses = [open_bus(asked.interface), open_bus(asked.interface)]
+    cable = Cable(buses[0], round(asked.period_ms * 1e6))
+    devices = DeviceBus(cast(can.BusABC, cable), sampler(deployment, asked.seed))
     for pad in pads:
         devices.add(pad.node_id, serial=pad.serial)
     unknown_device = UnknownDevice(buses[1])
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
-    if options.interface == "socketcan":
+    if asked.interface == "socketcan":
         command += ["--bus", "can0=socketcan:vcan0"]
     stderr = folder / "daemon.txt"
     sys.setswitchinterval(0.0005)  # reading an EDS for a twin would block the other nodes
@@ -295,16 +296,16 @@ def measure(folder: Path, options: Any) -> dict[str, Any]:
     try:
         with connect(*patterns, endpoint=deployment.daemon.complete, queue=100_000) as messages:
             campaign = Campaign(
-                Bench(devices, unknown_device, round(options.period_ms * 1e6), cable),
+                Bench(devices, unknown_device, round(asked.period_ms * 1e6), cable),
                 messages,
                 {p.link: p.node_id for p in pads},
-                options,
+                asked,
             )
-            campaign.wait_operational(resources, 60 * options.patience)
+            campaign.wait_operational(resources, 60 * asked.patience)
             before, start_s = campaign.service, time.monotonic()
-            campaign.run(resources, options.faults)
+            campaign.run(resources, asked.faults)
             seconds = time.monotonic() - start_s
-            campaign.wait_operational(resources, 20 * options.patience)
+            campaign.wait_operational(resources, 20 * asked.patience)
             devices.stop()
             campaign.take_last_figures()
     finally:
@@ -315,16 +316,17 @@ def measure(folder: Path, options: Any) -> dict[str, Any]:
         for bus in buses:
             bus.shutdown()
     text = stderr.read_text()
-    if options.keep:
-        (options.out / "faults.txt").write_text(text)
+    if asked.keep:
+        (asked.out / "faults.txt").write_text(text)
     bus = next(iter(campaign.service.buses.values()))
     excused = [s for s in campaign.surprises if cable.paused(s["node_id"], s["t_ns"])]
     return {
-        "interface": options.interface,
-        "seed": options.seed,
-        "rate": options.rate,
-        "period_ms": options.period_ms,
-        "patience": options.patience,
+        "interface": asked.interface,
+        "made_by": made_by(),
+        "seed": asked.seed,
+        "rate": asked.rate,
+        "period_ms": asked.period_ms,
+        "patience": asked.patience,
         "machine": machine(),
         "load": os.getloadavg()[0],
         "faults": len([f for f in campaign.done if f.failures != ["paused"]]),
@@ -354,26 +356,29 @@ def machine() -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--faults", type=int, default=1000)
     parser.add_argument("--rate", type=float, default=3.0, help="faults a second")
     parser.add_argument("--seed", type=int, default=4)
     parser.add_argument("--period-ms", type=float, default=10.0)
     parser.add_argument("--interface", choices=("udp_multicast", "socketcan"), default="udp_multicast")
     parser.add_argument("--patience", type=float, default=1.0, help="factor on the time limits of a robot")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for faults.md and faults.json")
+    parser.add_argument("--out", type=Path, help="folder for faults.md and faults.json")
     parser.add_argument("--keep", action="store_true", help="keep the daemon's log, as faults.txt")
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    if options.interface == "udp_multicast":
+    asked = parser.parse_args()
+    if asked.quick:
+        asked.faults = 20
+    asked.out = asked.out or output_folder(asked.quick)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    if asked.interface == "udp_multicast":
         in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        results = measure(Path(folder), options)
-    kept = options.out / "faults.json"
+        results = measure(Path(folder), asked)
+    kept = asked.out / "faults.json"
     every = json.loads(kept.read_text()) if kept.exists() else {}
-    every[options.interface] = results
+    every[asked.interface] = results
     kept.write_text(json.dumps(every, indent=1) + "\n")
-    (options.out / "faults.md").write_text(page(every))
+    (asked.out / "faults.md").write_text(page(every))
     print(section(results))
     return 1 if verdict(results) else 0
 

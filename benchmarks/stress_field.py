@@ -23,6 +23,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from page import made_by, options, output_folder
 from ratio_table import RatioTable
 
 from handtouch.field import (
@@ -369,7 +370,12 @@ def _search_round_trips(examples: int) -> Row:
 
 
 def main() -> int:
-    size = int(sys.argv[1]) if len(sys.argv) > 1 else 40
+    parser = options(__doc__)
+    parser.add_argument(
+        "--size", type=int, default=40, help="cases of a region; 20 times as many of a search"
+    )
+    asked = parser.parse_args()
+    size = 2 if asked.quick else asked.size
     warnings.simplefilter("error")
     with np.errstate(all="raise"):
         rows = [*accuracy(size), *arguments(), *search(20 * size)]
@@ -380,10 +386,10 @@ def main() -> int:
     for r in rows:
         figures = f"{r.cases} | {r.worst:.3g} | {r.limit:g}"
         lines.append(f"| {r.function} | {r.region} | {figures} | {r.where} |")
-    page = ["# Stress of the ideal pad and the estimators", "", "Made by `make stress ONLY=field`.", ""]
+    page = ["# Stress of the ideal pad and the estimators", "", f"{made_by()}.", ""]
     page += (__doc__ or "").split("\n\n", 1)[1].strip().splitlines()
     print("\n".join(lines))
-    (ROOT / "docs" / "benchmarks" / "stress_field.md").write_text("\n".join([*page, "", *lines]) + "\n")
+    (output_folder(asked.quick) / "stress_field.md").write_text("\n".join([*page, "", *lines]) + "\n")
     failed = [r for r in rows if not r.worst <= r.limit]
     print(f"{len(failed)} of {len(rows)} beyond their limit")
     return bool(failed)

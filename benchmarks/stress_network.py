@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from page import made_by, options, output_folder
 
 from handtouch.field import (
     AnisotropicSurface,
@@ -74,7 +75,7 @@ class Worst:
         )
 
 
-def stack() -> Iterator[Row]:
+def stack(share: float) -> Iterator[Row]:
     """Eq. 11 against Bessel functions of 30 digits."""
     rng = np.random.default_rng(1)
     for region, reach, scale in (
@@ -83,7 +84,7 @@ def stack() -> Iterator[Row]:
         ("units of 1e-100 to 1e100", 6, 100),
     ):
         worst = Worst("contact_stack_resistance", region, 20)
-        for _ in range(300):
+        for _ in range(round(share * 300)):
             x2, unit = 10.0 ** rng.uniform(-reach, reach), 10.0 ** rng.uniform(-scale, scale)
             sheet, ratio = 10.0 ** rng.uniform(0, 5), 1 + 10.0 ** rng.uniform(-15, 6)
             radius, outer = unit, unit * ratio
@@ -100,12 +101,12 @@ def stack() -> Iterator[Row]:
         yield worst.row
 
 
-def law() -> Iterator[Row]:
+def law(share: float) -> Iterator[Row]:
     """Force from the current of a force: the inverse's own promise is 1e-8 of the force."""
     rng = np.random.default_rng(2)
     for hertz in (None, 1.0):
         worst = Worst("ContactLaw.force", f"round trip, {'Hertz' if hertz else 'fixed'} radius", 1e8)
-        for _ in range(3000):
+        for _ in range(round(share * 3000)):
             alpha, layer = float(rng.uniform(0.3, 3)), 10.0 ** rng.uniform(-6, 2)
             force, outer = 10.0 ** rng.uniform(-5, 3), 10.0 ** rng.uniform(-2.4, -1)
             curve = ContactLaw(layer, alpha, 2e-3, hertz_n=hertz)
@@ -119,11 +120,11 @@ def law() -> Iterator[Row]:
         yield worst.row
 
 
-def surfaces() -> Iterator[Row]:
+def surfaces(share: float) -> Iterator[Row]:
     """Conformal coordinates of cones and spheres, and the way back."""
     rng = np.random.default_rng(3)
     cone, back = Worst("Cone.to_rectangle", "slopes of 1e-14 to 1", 40), Worst("Cone", "there and back", 60)
-    for _ in range(2000):
+    for _ in range(round(share * 2000)):
         unit, near = 10.0 ** rng.uniform(-100, 100), 1.0
         slope = 10.0 ** rng.uniform(-14, 0) * rng.choice([-1, 1])
         slant = float(rng.uniform(0.1, 0.9 / max(abs(slope), 0.1)))
@@ -140,7 +141,7 @@ def surfaces() -> Iterator[Row]:
     yield back.row
     ball = Worst("Sphere.to_rectangle", "to 1e-6 of the poles", 40)
     back = Worst("Sphere", "there and back", 60)
-    for _ in range(2000):
+    for _ in range(round(share * 2000)):
         low = -math.pi / 2 + 10.0 ** rng.uniform(-6, 0)
         high = low + (math.pi / 2 - 1e-6 - low) * 10.0 ** rng.uniform(-6, 0)
         pad_ = SphereSurface(1.0, low, high, 2.0)
@@ -215,7 +216,7 @@ class HalfPlane:
         return [start[s] + sum(self.coefficients[s][p] * parts[p] for p in range(3)) for s in start]
 
 
-def networks() -> Iterator[Row]:
+def networks(share: float) -> Iterator[Row]:
     """Fractions of gapped pads against Abelian integrals."""
     for region, aspect, gaps, margin in (
         ("square, gaps 0.2 to 20 %, 3 % inside", 1.0, (0.002, 0.01, 0.056, 0.2), 0.03),
@@ -224,7 +225,7 @@ def networks() -> Iterator[Row]:
         ("square, 1e-3 from corners and edges", 1.0, (0.002, 0.05), 1e-3),
     ):
         worst = Worst("ElectrodeNetwork.fractions", region, 20)
-        for gap in gaps:
+        for gap in gaps[: math.ceil(share * len(gaps))]:
             pad = ElectrodeNetwork(aspect, 1.0, gap * min(aspect, 1.0), 1.0)
             exact = HalfPlane(aspect, 1.0, gap * min(aspect, 1.0))
             for s, t in (
@@ -244,7 +245,7 @@ def networks() -> Iterator[Row]:
         yield worst.row
 
 
-def conductance() -> Iterator[Row]:
+def conductance(share: float) -> Iterator[Row]:
     """Against the reference, which has ten decimals; symmetric, and rows that sum to zero, for any gaps."""
     given = Worst("ElectrodeNetwork.conductance", "reference, to its ten decimals", 1e-10 / EPS)
     for case in json.loads((ROOT / "tests" / "field" / "data" / "electrodes.json").read_text()):
@@ -256,7 +257,7 @@ def conductance() -> Iterator[Row]:
     region = "50:1 to 1:50, gaps 1e-6 to 0.49 of the short side"
     mirrored = Worst("ElectrodeNetwork.conductance, asymmetry", region, 40)
     sums = Worst("ElectrodeNetwork.conductance, sums of rows", region, 40)
-    for _ in range(400):
+    for _ in range(round(share * 400)):
         a, gap = 50.0 ** rng.uniform(-1, 1), 10.0 ** rng.uniform(-6, math.log10(0.49))
         found = ElectrodeNetwork(a, 1.0, gap * min(a, 1.0), 1.0).conductance
         largest = float(np.abs(found).max())
@@ -266,12 +267,12 @@ def conductance() -> Iterator[Row]:
     yield sums.row
 
 
-def ideal_limit() -> Iterator[Row]:
+def ideal_limit(share: float) -> Iterator[Row]:
     """Without gaps: against `Rectangle`, which is proven to 50 digits, over aspects, edges and corners."""
     rng = np.random.default_rng(4)
     fractions = Worst("ElectrodeNetwork.fractions", "gap 0, 50:1 to 1:50, 1e-12 from corners", 40)
     radius = Worst("ElectrodeNetwork.spreading_radius", "the same, from 1e-3 off the edges", 2000)
-    for _ in range(400):
+    for _ in range(round(share * 400)):
         a = 50.0 ** rng.uniform(-1, 1)
         pad, ideal = ElectrodeNetwork(a, 1.0, 0.0, 1.0), Rectangle(a, 1.0)
         near = 10.0 ** rng.uniform(-12, -0.31, (2, 40))
@@ -291,12 +292,12 @@ def ideal_limit() -> Iterator[Row]:
     yield radius.row
 
 
-def round_trip() -> Iterator[Row]:
+def round_trip(share: float) -> Iterator[Row]:
     """Location there and back, 3 % and farther from the edges, in shorter sides."""
     rng = np.random.default_rng(5)
     for region, longest, limit in (("to 2:1", 2.0, 1e3), ("to 5:1", 5.0, 1e5)):
         worst = Worst("ElectrodeNetwork.locate", f"{region}, gaps 0.01 to 30 %, resistors to 5 sheets", limit)
-        for _ in range(150):
+        for _ in range(round(share * 150)):
             a = longest ** rng.uniform(-1, 1)
             short = min(a, 1.0)
             series = tuple(map(float, 2400 * 5 * rng.random(4) * rng.integers(0, 2, 4)))
@@ -318,7 +319,7 @@ def _condition(pad: ElectrodeNetwork, x: float, y: float) -> float:
     return float(np.hypot(x, y) + np.hypot(*moves))
 
 
-def arguments() -> Iterator[Row]:
+def arguments(_share: float) -> Iterator[Row]:
     """Every public function on arrays of every kind: each element as if alone, no warning."""
     pad = ElectrodeNetwork(1.3, 1.0, 0.05, 2400.0, (0.0, 336.0, 0.0, 100.0))
     curve, sized = ContactLaw(2e-2, 1.5, 2e-3, 3e-4), ContactLaw(2e-2, 1.5, 2e-3, hertz_n=1.0)
@@ -407,22 +408,23 @@ def _stacked(
     return lambda x, y: np.stack(function(x, y))
 
 
-SEARCH = settings(max_examples=400, deadline=None, derandomize=True, database=None)
 anything = st.floats(width=64) | st.sampled_from([0.0, -0.0, math.inf, -math.inf, math.nan, 5e-324, 1e308])
 part = st.floats(0.03, 0.97)
 
 
-def searches() -> Iterator[Row]:
+def searches(share: float) -> Iterator[Row]:
     """Failures found by hypothesis; any floating-point warning counts as one."""
-    yield from (_search_networks(), _search_points(), _search_surfaces(), _search_law(), _search_sandwich())
+    search = settings(max_examples=round(share * 400), deadline=None, derandomize=True, database=None)
+    for part in (_search_networks, _search_points, _search_surfaces, _search_law, _search_sandwich):
+        yield part(search)
 
 
-def _search_networks() -> Row:
+def _search_networks(search: settings) -> Row:
     worst = Worst(
         "ElectrodeNetwork, fractions, locate, estimate", "any gaps to 45 %, 1:3 to 3:1 (hypothesis)", 1e5
     )
 
-    @SEARCH
+    @search
     @given(st.floats(1 / 3, 3), st.lists(st.floats(1e-3, 0.45), min_size=4, max_size=4), part, part)
     def attempt(aspect: float, gaps: list[float], u: float, v: float) -> None:
         short = min(aspect, 1.0)
@@ -442,14 +444,14 @@ def _search_networks() -> Row:
     return worst.row
 
 
-def _search_points() -> Row:
+def _search_points(search: settings) -> Row:
     worst = Worst(
         "ElectrodeNetwork, spoilt neighbours", "any numbers for places and currents (hypothesis)", 0.5
     )
     pad = ElectrodeNetwork(1.5, 1.0, 0.05, 2400.0, (10.0, 0.0, 336.0, 0.0))
     good = pad.fractions(0.4, 0.6)
 
-    @SEARCH
+    @search
     @given(anything, anything, st.lists(anything, min_size=4, max_size=4))
     def attempt(x: float, y: float, readings: list[float]) -> None:
         shares = pad.fractions(np.array([x, 0.4]), np.array([y, 0.6]))
@@ -461,10 +463,10 @@ def _search_points() -> Row:
     return worst.row
 
 
-def _search_surfaces() -> Row:
+def _search_surfaces(search: settings) -> Row:
     worst = Worst("Cylinder, Cone, Sphere, Anisotropic", "there and back, any shape (hypothesis)", 1e4)
 
-    @SEARCH
+    @search
     @given(st.floats(0.1, 10), st.floats(0.1, 10), st.floats(0.05, 6.2), part, part)
     def attempt(near: float, far: float, arc: float, u: float, v: float) -> None:
         made: list[Surface] = [
@@ -485,11 +487,11 @@ def _search_surfaces() -> Row:
     return worst.row
 
 
-def _search_law() -> Row:
+def _search_law(search: settings) -> Row:
     worst = Worst("ContactLaw, force of current", "any force, layer, exponent, where valid (hypothesis)", 1e8)
     powers = st.floats(-6, 3)
 
-    @SEARCH
+    @search
     @given(powers, powers, st.floats(0.3, 3), st.floats(1.5, 4), st.booleans())
     def attempt(force: float, layer: float, alpha: float, spread: float, hertz: bool) -> None:
         law = ContactLaw(10**layer, alpha, 1e-3, hertz_n=1.0 if hertz else None)
@@ -503,13 +505,13 @@ def _search_law() -> Row:
     return worst.row
 
 
-def _search_sandwich() -> Row:
+def _search_sandwich(search: settings) -> Row:
     worst = Worst(
         "Sandwich, force of its own currents", "any force and radius, where valid (hypothesis)", 1e11
     )
     pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
 
-    @SEARCH
+    @search
     @given(st.floats(-2, 1), st.floats(-3.5, -2.5))
     def attempt(force: float, radius: float) -> None:
         found = pair.force(pair.currents(10**force, 10**radius, 12.0, 0.02), 12.0, 0.02)
@@ -522,6 +524,7 @@ def _search_sandwich() -> Row:
 
 def main() -> int:
     """Run all parts; 1 if one is beyond its limit."""
+    quick = options(__doc__).parse_args().quick
     warnings.simplefilter("error")
     np.seterr(all="raise")
     heads = ("function", "region", "cases", "worst, eps x condition", "limit", "where")
@@ -529,7 +532,7 @@ def main() -> int:
     print("\n".join(lines))
     failed = 0
     for part in (stack, law, surfaces, conductance, ideal_limit, round_trip, networks, arguments, searches):
-        for row in part():
+        for row in part(0.02 if quick else 1.0):
             failed += row.worst > row.limit
             mark = " **!**" if row.worst > row.limit else ""
             cells = (
@@ -543,10 +546,10 @@ def main() -> int:
             lines.append("| " + " | ".join(map(str, cells)) + " |")
             print(lines[-1], flush=True)
     machine = f"{platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
-    made = f"Made by `make stress ONLY=network`; {machine}, mpmath {mp.__version__}."
+    made = f"{made_by()}; {machine}, mpmath {mp.__version__}."
     print(made)
     head = ["# Stress of networks, surfaces and strength", "", made, ""]
-    out = ROOT / "docs" / "benchmarks" / "stress_network.md"
+    out = output_folder(quick) / "stress_network.md"
     out.write_text("\n".join(head + lines) + "\n")
     return 1 if failed else 0
 

@@ -19,11 +19,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from page import made_by, options, output_folder, table
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
-from section import table
 
 from handtouch.calibration.calibration import (
     Calibration,
@@ -136,15 +137,15 @@ def _start(path: Path) -> tuple[int, int]:
     return child, reading
 
 
-def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
-    """KILLS times: kill, open, compare the versions with the reported ones."""
+def kills(folder: Path, count: int) -> tuple[dict[str, Any], list[float]]:
+    """`count` times: kill, open, compare the versions with the reported ones."""
     path, killer = folder / "store.db", Killer()
     reported: dict[int, int] = dict.fromkeys(SERIALS, 0)
     counts = dict.fromkeys(("undone", "unreported", "lost", "wrong", "unopened"), 0)
     openings = []
-    for kill in range(KILLS):
+    for kill in range(count):
         if kill % 50 == 0:
-            print(f"kill {kill} of {KILLS}", file=sys.stderr)
+            print(f"kill {kill} of {count}", file=sys.stderr)
         for serial, number in killer.kill(path):
             reported[serial] = max(reported[serial], number)
         journal = path.with_name("store.db-journal")
@@ -170,7 +171,7 @@ def kills(folder: Path) -> tuple[dict[str, Any], list[float]]:
                     counts["wrong"] += sheet is None or sheet.data != mark(serial, version.number)
                 reported[serial] = len(versions)
     row = {
-        "kills": KILLS,
+        "kills": count,
         **{f"while {phase}": count for phase, count in killer.phases.items()},
         "commits": sum(reported.values()),
         "interrupted writes undone": counts["undone"],
@@ -207,12 +208,12 @@ def modes(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def writes_and_openings(folder: Path) -> list[dict[str, Any]]:
+def writes_and_openings(folder: Path, largest: int) -> list[dict[str, Any]]:
     """`Store.write` of a whole calibration, and opening (which checks everything), by versions."""
     path, rows, took = folder / "long.db", [], []
     estimator = GainEstimator(Rectangle(1.4, 1.0))
     made = calibration(1, 1, estimator)
-    for number in range(1, 3001):
+    for number in range(1, largest + 1):
         if number == 1:
             store = Store(path)
         begin = time.perf_counter()
@@ -255,6 +256,7 @@ def draw(path: Path, openings: list[float]) -> None:
 
 
 def main() -> None:
+    quick = options(__doc__).parse_args().quick
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, {platform.system()} {platform.release()}, "
         f"Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}, "
@@ -262,7 +264,7 @@ def main() -> None:
     )
     with tempfile.TemporaryDirectory(dir=ROOT, prefix=".stress-") as name:  # on a disk: /tmp may be memory
         folder = Path(name)
-        killed, openings = kills(folder)
+        killed, openings = kills(folder, 5 if quick else KILLS)
         tables = {
             "Kill -9 while calibrating and storing": (
                 "A process opens the store, estimates gains by contacts and writes versions of three "
@@ -274,13 +276,13 @@ def main() -> None:
             "Journal modes of SQLite": ("500 transactions each, a row of 2 kB.", modes(folder)),
             "The store": (
                 "A whole calibration a write; opening checks the digest of all rows.",
-                writes_and_openings(folder),
+                writes_and_openings(folder, 100 if quick else 3000),
             ),
         }
-    page = ["# The calibration store", "", f"Made by `make stress ONLY=store`; {machine}.", ""]
+    page = ["# The calibration store", "", f"{made_by()}; {machine}.", ""]
     for title, (note, rows) in tables.items():
         page += table(title, note, rows)
-    out = ROOT / "docs" / "benchmarks"
+    out = output_folder(quick)
     draw(out / "store.png", openings)
     (out / "store.md").write_text("\n".join([*page, "![opening](store.png)", ""]))
     record = {"machine": machine, "tables": {title: rows for title, (_, rows) in tables.items()}}

@@ -49,10 +49,10 @@ class Preisach:
         self._weight = loop * full_n / float((down - up).sum())
         self._base = 1 - float(self._curved(full_n - self._widths).sum()) * self._weight / full_n
 
-    def start(self, pads: int) -> FloatArray:
+    def initial_state(self, pads: int) -> FloatArray:
         return np.zeros((len(self._widths), pads))
 
-    def step(self, state: FloatArray, load_n: FloatArray) -> FloatArray:
+    def apply_to(self, state: FloatArray, load_n: FloatArray) -> FloatArray:
         np.minimum(state, load_n, out=state)
         np.maximum(state, load_n - self._widths, out=state)
         return np.asarray(self._base * load_n + self._weight * self._curved(state).sum(axis=0))
@@ -72,10 +72,10 @@ class TwoTimes:
             replace(one, share=(1 - quick) * share, time_s=middle * ratio**0.5),
         )
 
-    def start(self, pads: int) -> TwoStates:
+    def initial_state(self, pads: int) -> TwoStates:
         return TwoStates(*(part.initial_state(pads) for part in self.parts))
 
-    def at(self, dt_s: float) -> TwoTimesStep:
+    def discretise(self, dt_s: float) -> TwoTimesStep:
         return TwoTimesStep(self.parts, dt_s)
 
 

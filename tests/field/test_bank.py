@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -175,14 +176,14 @@ def test_empty_calls_and_unsupported_models() -> None:
 
 
 @pytest.mark.parametrize("index", [0.5, 1.0, True, -1, 2, np.nan, "0"])
-def test_only_numbers_of_pads_are_taken_as_index(index: object) -> None:
+def test_only_numbers_of_pads_are_taken_as_index(index: Any) -> None:
     bank = LocatorBank([Rectangle(1.0, 1.0), Rectangle(2.0, 1.0)])
     half = np.array([0.5])
     for call in (
-        lambda: bank.fractions([index], half, half),  # type: ignore[list-item]
-        lambda: bank.conformal_radius([index], half, half),  # type: ignore[list-item]
-        lambda: bank.tangent([index], half, half),  # type: ignore[list-item]
-        lambda: bank.estimate([index], np.ones((4, 1)), 0.1),  # type: ignore[list-item]
+        lambda: bank.fractions([index], half, half),
+        lambda: bank.conformal_radius([index], half, half),
+        lambda: bank.tangent([index], half, half),
+        lambda: bank.estimate([index], np.ones((4, 1)), 0.1),
     ):
         with pytest.raises(ValueError, match="index of pads: whole numbers from 0 to 1"):
             call()

@@ -1,0 +1,138 @@
+"""Options and pages of benchmarks, and the stamp of what they measured.
+
+Public names: `options`, `output_folder`, `table`, `made_by`; for readers of a page `source_digest`, `STAMP`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import atexit
+import hashlib
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+OUT = ROOT / "docs" / "benchmarks"
+LAZY = ROOT / "src" / "handtouch" / "__init__.py"
+"""Names in it are imported on use: it depends on all, and nothing that imports a package depends on it."""
+STAMP = re.compile(
+    r"Made\s+by\s+`make\s+(bench|soak|stress)\s+ONLY=(\w+)`\s+at\s+commit\s+`([^`]+)`,\s+source\s+`(\w+)`"
+)
+"""Kind and name of the program, commit and source digest, as `made_by` writes them."""
+
+
+def options(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the option that every benchmark has."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="a little of everything; keeps no page")
+    return parser
+
+
+def output_folder(quick: bool) -> Path:
+    """Return docs/benchmarks or, for a quick pass, a folder that is deleted when the process ends."""
+    if not quick:
+        OUT.mkdir(parents=True, exist_ok=True)
+        return OUT
+    scratch = tempfile.TemporaryDirectory(prefix="handtouch-bench-")
+    atexit.register(scratch.cleanup)
+    return Path(scratch.name)
+
+
+def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
+    """Lines of a section with a table of rows by their keys; printed as well."""
+    heads = list(rows[0])
+    lines = [f"## {title}", "", note, "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for row in rows:
+        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
+        lines.append("| " + " | ".join(cells) + " |")
+    print("\n".join(lines), end="\n\n", flush=True)
+    return [*lines, ""]
+
+
+def made_by() -> str:
+    """Return the stamp of the running program: its name, commit and source digest."""
+    program = Path(str(sys.modules["__main__"].__file__)).resolve()
+    kind, _, name = program.stem.partition("_")
+    return f"Made by `make {kind} ONLY={name}` at commit `{_commit()}`, source `{source_digest(program)}`"
+
+
+def source_digest(program: Path) -> str:
+    """Return a digest of the code that a program imports at any depth, from src and benchmarks, and its own.
+
+    Comments, docstrings and layout don't count.
+    """
+    digest, waiting, seen = hashlib.sha256(), [program], {program}
+    while waiting:
+        for path in _imported(waiting.pop()):
+            if path not in seen:
+                seen.add(path)
+                waiting.append(path)
+    for path in sorted(seen):
+        digest.update(f"{path.relative_to(ROOT)} {_code_digest(path)}\n".encode())
+    return digest.hexdigest()[:12]
+
+
+def _commit() -> str:
+    git = ("git", "-C", str(ROOT))
+    try:
+        commit = subprocess.run(
+            [*git, "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "src", "benchmarks"], check=False)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return commit + (" with changes" if changed.returncode else "")
+
+
+@cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def _imported(path: Path) -> tuple[Path, ...]:
+    """Return the files of this repository that a file imports."""
+    found: list[Path] = []
+    for node in ast.walk(_tree(path)):
+        if isinstance(node, ast.Import):
+            found += [file for alias in node.names for file in _files(alias.name, path)]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found += _files(node.module, path)
+            found += [file for alias in node.names for file in _files(f"{node.module}.{alias.name}", path)]
+    return tuple(found)
+
+
+def _files(module: str, importer: Path) -> Iterator[Path]:
+    """Yield the file of a module, with those of its packages, from src or beside the importing program."""
+    parts = module.split(".")
+    for folder in (ROOT / "src", importer.parent):
+        for depth in range(1, len(parts) + 1):
+            base = folder.joinpath(*parts[:depth])
+            for file in (base.with_suffix(".py"), base / "__init__.py"):
+                if file.is_file() and file != LAZY:
+                    yield file
+
+
+@cache
+def _code_digest(path: Path) -> str:
+    return hashlib.sha256(repr(_code(_tree(path))).encode()).hexdigest()
+
+
+def _code(node: object) -> object:
+    """Return a syntax tree as nested tuples, without docstrings and empty fields, alike for all Pythons."""
+    if isinstance(node, list):
+        is_text = [isinstance(entry, ast.Expr) and isinstance(entry.value, ast.Constant) for entry in node]
+        return tuple(_code(entry) for entry, text in zip(node, is_text, strict=True) if not text)
+    if not isinstance(node, ast.AST):
+        return node
+    fields = ((name, value) for name, value in ast.iter_fields(node) if value is not None and value != [])
+    return (type(node).__name__, *((name, _code(value)) for name, value in fields))
