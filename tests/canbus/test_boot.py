@@ -166,8 +166,8 @@ def test_one_tpdo_with_all_channels_goes_before_several() -> None:
             r"TPDO1 has 0x6401:01 \(16 bit\), 0x6401:02 \(16 bit\), 0x6401:03 \(16 bit\); map",
         ),
         (tpdo(1, (0x64010120, 0x64010220), 0x185), r"TPDO1 carries 0x6401:01 \(16 bit\) with 32 bits"),
-        (tpdo(2, CHANNELS, 0x20000285), "no 11-bit identifier"),
-        (tpdo(2, CHANNELS, 0x80000000), "no 11-bit identifier"),
+        (tpdo(2, CHANNELS, 0x20000285), "no 11-bit COB-ID"),
+        (tpdo(2, CHANNELS, 0x80000000), "no 11-bit COB-ID"),
         ({(0x1A01, 0): (255, 1)}, "TPDO2 has nothing"),
     ],
 )

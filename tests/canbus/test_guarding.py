@@ -154,7 +154,7 @@ def test_two_guarded_nodes_with_one_id_are_reported(rig: Any) -> None:
     twin.plug()
     rig.run(4000)
     assert rig.state(1) is NodeState.FAULTED
-    assert "two nodes have its id" in rig.status(1).reason
+    assert "duplicate node id" in rig.status(1).reason
 
 
 def test_guarded_nodes_survive_a_pause_without_requests(rig: Any) -> None:

@@ -195,7 +195,7 @@ def test_listener_takes_the_mapping_from_the_eds_or_reports_why_not(make_rig: Ma
     ("identifier", "error", "expected"),
     [
         ("0x1C5", ValueError, 'nodes "pad1" and "pad2" both send 0x1C5 by their EDS'),
-        ("0x701", EdsError, "TPDO1 has identifier 0x701, which CANopen reserves for another service"),
+        ("0x701", EdsError, "TPDO1 has COB-ID 0x701, which CANopen reserves for another service"),
     ],
 )
 def test_listener_refuses_invalid_identifiers(
@@ -214,7 +214,7 @@ def test_listener_refuses_a_29_bit_cob_id(make_rig: Make, tmp_path: Path) -> Non
     text = (FOLDER / "noname-4ch.eds").read_text(encoding="latin-1")
     path = tmp_path / "extended.eds"
     path.write_text(text.replace("180h+$NODEID", "0x20000181"), encoding="latin-1")
-    with pytest.raises(EdsError, match=r"TPDO1 has no 11-bit identifier \(0x1800:01 is 0x20000181\)"):
+    with pytest.raises(EdsError, match=r"TPDO1 has no 11-bit COB-ID \(0x1800:01 is 0x20000181\)"):
         make_rig(2, role="listener", eds=str(path))
 
 
@@ -236,8 +236,7 @@ def test_identifier_of_another_service_is_a_fault(make_rig: Make, cob_id: int) -
     rig.run(200)
     assert rig.state(1) is NodeState.FAULTED
     assert (
-        f"TPDO2 has identifier 0x{cob_id:X}, which CANopen reserves for another service"
-        in rig.status(1).reason
+        f"TPDO2 has COB-ID 0x{cob_id:X}, which CANopen reserves for another service" in rig.status(1).reason
     )
 
 

@@ -384,7 +384,7 @@ def test_clash_of_sample_identifiers_is_a_fault_of_the_second(rig: Any) -> None:
     rig.node(2).write_object(0x1801, 1, 0x281)
     rig.run(100)
     assert rig.state(1) is OPERATIONAL
-    expected = "TPDO2 has identifier 0x281, as has pad1; give one of them another identifier and store it"
+    expected = "TPDO2 has COB-ID 0x281, as has pad1; give one of them another COB-ID and store it"
     assert (rig.state(2), rig.status(2).reason) == (FAULTED, expected)
 
 

@@ -26,7 +26,7 @@ def test_two_nodes_with_one_id_are_faulted_until_one_is_unplugged(
     twin.plug()
     rig.run(6000)
     assert [rig.state(n) for n in (1, 2, 3)] == [OPERATIONAL, FAULTED, OPERATIONAL]
-    assert "two nodes have its id" in rig.status(2).reason
+    assert "duplicate node id" in rig.status(2).reason
     expected = [e for e in rig.run(5000) if e.slot == 1]
     assert expected == []  # once
     (rig.node(2) if gone == "the first" else twin).unplug()

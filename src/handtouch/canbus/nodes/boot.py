@@ -320,7 +320,7 @@ def _enable_tpdo(sdo: NodeSdoClient, tpdo: NodeTpdo) -> None:
 
 
 def _identifier_name(tpdo: NodeTpdo) -> str:
-    return f"identifier of TPDO{tpdo.number}"
+    return f"COB-ID of TPDO{tpdo.number}"
 
 
 def _set_up_supervision(sdo: NodeSdoClient, period_ms: int, booted: bool) -> bool:

@@ -50,11 +50,11 @@ _NO_HEARTBEAT_REASON = (
     "its firmware may hang; power-cycle it"
 )
 _DUPLICATE_ID_REASON = (
-    "two nodes have its id: heartbeats come twice as often as configured; unplug one and give it "
+    "duplicate node id: heartbeats come twice as often as configured; unplug one node and give it "
     "another id (`handtouch scan` lists the serial numbers)"
 )
 _BABBLING_REASON = (
-    "babbling: it sends {} samples per SYNC, or another device sends with its identifier; "
+    "babbling: it sends {} samples per SYNC, or another device sends with its COB-ID; "
     "power-cycle or unplug it"
 )
 _TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF)"
@@ -246,7 +246,7 @@ def _on_step_done(life: Lifecycle, event: StepDone, now_ns: int, timing: NodeTim
 def _start_node(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Start a configured node, or stop it in standby; its first samples are discarded.
 
-    A node found running is started, too: it may have been made pre-operational to be configured.
+    A node found operational is started, too: it may have been made pre-operational to be configured.
     """
     if life.standby:
         life = replace(life, last_heartbeat_ns=now_ns, started_ns=now_ns)
@@ -254,7 +254,7 @@ def _start_node(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     running = life.nmt_state == cia301.OPERATIONAL
     ours = timing.role is BusRole.MASTER
     reason = "started" if ours else "configured; another master has to start it"
-    life = enter(life, NodeState.SETTLING, now_ns, "found running" if running else reason)
+    life = enter(life, NodeState.SETTLING, now_ns, "already operational" if running else reason)
     life = replace(
         life,
         last_heartbeat_ns=now_ns,

@@ -465,8 +465,8 @@ class Master:
             owner = router.get_slot(tpdo.cob_id)
             if owner not in (NO_SLOT, slot):
                 return (
-                    f"TPDO{tpdo.number} has identifier 0x{tpdo.cob_id:X}, as has "
-                    f"{self._by_slot[owner].spec.name}; give one of them another identifier and store it"
+                    f"TPDO{tpdo.number} has COB-ID 0x{tpdo.cob_id:X}, as has "
+                    f"{self._by_slot[owner].spec.name}; give one of them another COB-ID and store it"
                 )
         for tpdo in node.mapping.tpdos if node.mapping else ():
             router.route(tpdo.cob_id, NO_SLOT)

@@ -40,7 +40,7 @@ def find_owners(ports: Mapping[str, Port], nodes: Sequence[ManagedNode]) -> dict
             if other != spec.name:
                 raise EdsError(
                     f'nodes "{other}" and "{spec.name}" both send 0x{tpdo.cob_id:X} by their EDS; '
-                    "give each an EDS or DCF with its own identifiers"
+                    "give each an EDS or DCF with its own COB-IDs"
                 )
         for service in (cia301.EMCY, cia301.SDO_RESPONSE, cia301.NMT_ERROR_CONTROL):
             table[service + spec.node_id] = number

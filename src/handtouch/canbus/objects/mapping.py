@@ -192,7 +192,7 @@ def _read_entries(sdo: NodeSdoClient, number: int) -> tuple[int, ...] | None:
 
 def _read_communication(sdo: NodeSdoClient, tpdo: NodeTpdo) -> NodeTpdo:
     index = cia301.TPDO_COMMUNICATION + tpdo.number - 1
-    cob_id = sdo.read(index, 1, f"identifier of TPDO{tpdo.number}")
+    cob_id = sdo.read(index, 1, f"COB-ID of TPDO{tpdo.number}")
     identifier = _check_identifier(tpdo.number, cob_id, cob_id & cia301.IDENTIFIER_MASK)
     transmission = sdo.read(index, 2, f"transmission type of TPDO{tpdo.number}")
     enabled = not cob_id & cia301.INVALID_BIT
@@ -203,10 +203,10 @@ def _check_identifier(number: int, cob_id: int, identifier: int) -> int:
     """Return the identifier of a TPDO. Raises BootStepError if CANopen reserves it."""
     entry = f"(0x{cia301.TPDO_COMMUNICATION + number - 1:04X}:01 is 0x{cob_id:08X})"
     if cob_id & cia301.EXTENDED_BIT or not identifier:
-        raise BootStepError(f"TPDO{number} has no 11-bit identifier {entry}")
+        raise BootStepError(f"TPDO{number} has no 11-bit COB-ID {entry}")
     if identifier not in _PDO_IDENTIFIERS:
         raise BootStepError(
-            f"TPDO{number} has identifier 0x{identifier:X}, which CANopen reserves for another service "
+            f"TPDO{number} has COB-ID 0x{identifier:X}, which CANopen reserves for another service "
             f"{entry}; give it another one and store it"
         )
     return identifier
@@ -244,7 +244,7 @@ def _remap(
 def _map_channels(sdo: NodeSdoClient, node_id: int, number: int, entries: tuple[int, ...]) -> NodeTpdo:
     """Map a TPDO as CiA 301 requires: disable it, then clear, write and count its entries."""
     communication, mapping = cia301.TPDO_COMMUNICATION + number - 1, cia301.TPDO_MAPPING + number - 1
-    mapping_name, identifier_name = f"mapping of TPDO{number}", f"identifier of TPDO{number}"
+    mapping_name, identifier_name = f"mapping of TPDO{number}", f"COB-ID of TPDO{number}"
     cob_id = sdo.read(communication, 1, identifier_name)
     identifier = cob_id & cia301.IDENTIFIER_MASK
     if not identifier and number <= cia301.PREDEFINED_TPDOS:
