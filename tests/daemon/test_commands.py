@@ -117,6 +117,7 @@ def test_any_arguments_get_a_reply_and_ticks_continue(
         ("tare", {"pads": ["nowhere"]}, 'no pad is named "nowhere"'),
         ("tare", {"pads": "plane"}, 'pads = "plane": must be an array'),
         ("tare", {"pads": [1]}, "pads[0] = 1: must be a string"),
+        ("tare", {"pads": b"plane"}, 'pads = "binary": must be an array'),
         ("reload", {"dry_run": "yes"}, 'dry_run = "yes": must be true or false'),
         ("calibrate", {"pad": "plane", "name": "c", "law": 1}, "law = 1: must be an object"),
         ("scene", {"tolerance": 1}, "tolerance"),
@@ -138,7 +139,8 @@ def test_any_arguments_get_a_reply_and_ticks_continue(
         ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 4, "offset_counts": [2e4] * 4}, "half"),
         ("calibrate", {"pad": "plane", "gains": [1] * 4}, "name is missing"),
         ("calibrate", {"pad": "plane", "name": "c", "law": {"alpha": 1.5}}, "contact_ohm_mm2 is missing"),
-        ("log", {"level": "loud"}, "level"),
+        ("log", {"level": "loud"}, 'level = "loud": must be "debug", "info", "warning" or "error"'),
+        ("log", {"level": msgpack.Timestamp(1)}, 'level = "extension type": must be'),
         ("status", {"verbose": True}, "verbose = true: unknown argument"),
     ],
 )

@@ -5,16 +5,14 @@ Public name: `parse_arguments`.
 
 from __future__ import annotations
 
-import json
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from handtouch.config import Table
-from handtouch.daemon.control import RefusedError
+from handtouch.daemon.control import RefusedError, format_value
 
 _MAX_PROBLEMS = 5
-_MAX_VALUE_CHARACTERS = 60
 _TEXTS = {
     "missing": "is missing",
     "extra_forbidden": "unknown argument",
@@ -58,12 +56,7 @@ def parse_arguments(kind: type[_T], arguments: dict[str, Any]) -> _T:
 def _describe(error: dict[str, Any]) -> str:
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
     known = _TEXTS.get(error["type"])
-    text = error["msg"] if known is None else known.format(**error.get("ctx", {}))
+    text = error["msg"] if known is None else known.format(**error.get("ctx", {})).replace("'", '"')
     return (
-        f"{key} {text}" if error["type"] == "missing" else f"{key} = {_format_value(error['input'])}: {text}"
+        f"{key} {text}" if error["type"] == "missing" else f"{key} = {format_value(error['input'])}: {text}"
     )
-
-
-def _format_value(value: object) -> str:
-    text = json.dumps(value, default=repr, ensure_ascii=False)
-    return text if len(text) <= _MAX_VALUE_CHARACTERS else text[: _MAX_VALUE_CHARACTERS - 3] + "..."

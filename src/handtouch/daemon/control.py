@@ -1,10 +1,11 @@
 """Control endpoint: request-reply with one msgpack map each way; no request can block or stop the tick.
 
-Public names: `ControlServer`, `Command`, `Job`, `RefusedError`, `open_control_socket`.
+Public names: `ControlServer`, `Command`, `Job`, `RefusedError`, `format_value`, `open_control_socket`.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -21,6 +22,7 @@ MAX_REQUEST_BYTES = 65_536
 MAX_JOBS = 8
 """Requests in progress at a time"""
 _MAX_REQUESTS_PER_POLL = 2
+_MAX_VALUE_CHARACTERS = 60
 _log = logging.getLogger("handtouch.control")
 
 Reply = dict[str, Any]
@@ -39,6 +41,15 @@ Command = Callable[[dict[str, Any], int], "Reply | Job"]
 
 class RefusedError(Exception):
     """A request that can't be carried out; the text has the reason and a remedy."""
+
+
+def format_value(value: object) -> str:
+    """Return a value of a request as JSON, shortened: "binary" and "extension type" for what JSON lacks."""
+    try:
+        text = json.dumps(value, default=_type_without_json, ensure_ascii=False)
+    except (RecursionError, TypeError):  # nested deeper than Python's stack, or a map with binary keys
+        text = "a map" if isinstance(value, dict) else "a nested list"
+    return text if len(text) <= _MAX_VALUE_CHARACTERS else text[: _MAX_VALUE_CHARACTERS - 3] + "..."
 
 
 class ControlServer:
@@ -94,7 +105,7 @@ class ControlServer:
             command, arguments = _decode_request(request)
             if command not in self.commands:
                 names = ", ".join(sorted(self.commands))
-                raise RefusedError(f"unknown command {command!r:.60}; the commands are {names}")
+                raise RefusedError(f"unknown command {format_value(command)}; the commands are {names}")
             if len(self._jobs) >= MAX_JOBS:
                 raise RefusedError(f"{MAX_JOBS} requests are in progress; retry later")
         except RefusedError as error:
@@ -166,8 +177,12 @@ def _decode_request(request: bytes) -> tuple[str, dict[str, Any]]:
     version, command = arguments.pop("v", None), arguments.pop("command", None)
     if type(version) is not int or version != SCHEMA_VERSION:
         raise RefusedError(
-            f"request of version v = {version!r:.20}; this daemon supports v = {SCHEMA_VERSION}"
+            f"v = {format_value(version)}: this daemon supports v = {SCHEMA_VERSION}, an integer"
         )
     if not isinstance(command, str):
-        raise RefusedError(f"malformed request: command = {command!r:.60} is not a string")
+        raise RefusedError(f"malformed request: command = {format_value(command)} is not a string")
     return command, arguments
+
+
+def _type_without_json(value: object) -> str:
+    return "binary" if isinstance(value, bytes) else "extension type"

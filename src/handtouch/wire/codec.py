@@ -118,7 +118,8 @@ def unpack(parts: Sequence[bytes], topics: Mapping[str, Topic]) -> Received:
         raise WireError(f"{name}: payload isn't a map")
     version = payload.get("v")
     if type(version) is not int or version != SCHEMA_VERSION:
-        raise WireError(f"{name}: schema version v = {version!r:.20}; this reader supports {SCHEMA_VERSION}")
+        shown = version if type(version) is int else _describe(version)
+        raise WireError(f"{name}: schema version v is {shown}; this reader supports {SCHEMA_VERSION}")
     return Received(name, topic, keys, payload)
 
 
