@@ -466,6 +466,17 @@ def test_store_that_cannot_be_created_reports_the_remedy(tmp_path: Path) -> None
         Store(tmp_path / "store.db", create=False)
 
 
+def test_a_full_disk_leaves_no_file_of_a_store_that_could_not_be_created(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        with pytest.raises(StoreError, match="can't be created"):
+            Store(tmp_path / "cal.db")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_default_path_of_the_store(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("STATE_DIRECTORY", "XDG_STATE_HOME"):
         monkeypatch.delenv(name, raising=False)

@@ -57,12 +57,14 @@ def create(path: Path) -> None:
             connection.executescript(f"PRAGMA journal_mode = MEMORY; BEGIN; {_TABLES_SQL} COMMIT;")
         with contextlib.suppress(FileExistsError):
             os.link(new, path)
-        new.unlink()
     except (OSError, sqlite3.Error) as error:
         raise StoreError(
             f"{path}: the calibration store can't be created: {error}; make its folder writable, or name "
             'another with [daemon] store = "FILE"'
         ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            new.unlink(missing_ok=True)
 
 
 def connect(path: Path) -> sqlite3.Connection:
