@@ -578,3 +578,38 @@ port.close(); stranger.shutdown()
 def test_udp_multicast_between_two_buses(network: list[str]) -> None:
     done = subprocess.run([*network, sys.executable, "-c", UDP], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
+
+
+UDP_DOWN = """
+import subprocess, time
+from handtouch.canbus.bus.port import Port
+from handtouch.config import Bus
+from handtouch.core.slab import Slab
+
+UP = "ip link set lo up multicast on && ip route add 239.0.0.0/8 dev lo"
+subprocess.run(UP, shell=True, check=True)
+port = Port.open(Bus(name="palm", interface="udp_multicast", channel="239.74.163.2"), Slab(1))
+
+def wait_for(state):
+    end_s = time.monotonic() + 20
+    while port.bus_state.error_state.value != state:
+        assert time.monotonic() < end_s, port.bus_state.report()
+        port.send(0x80, b"")
+        port.drain()
+        port.update_state(time.monotonic_ns())
+
+wait_for("active")
+subprocess.run("ip link set lo down", shell=True, check=True)
+wait_for("down")
+assert "bring the network interface up" in port.problem, port.problem
+subprocess.run(UP, shell=True, check=True)
+wait_for("active")
+assert port.problem == ""
+port.close()
+"""
+
+
+def test_udp_multicast_without_its_network_interface_is_down(network: list[str]) -> None:
+    own = [*network, "unshare", "--net", sys.executable, "-c", UDP_DOWN]
+    done = subprocess.run(own, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from handtouch.canbus.bus.bus_state import ErrorState
+from handtouch.canbus.bus.bus_state import BusFault, BusState, ErrorState
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
 from handtouch.core.pipeline import Pipeline
@@ -24,7 +24,7 @@ class Rig:
 
     def __init__(self, bench: Any) -> None:
         self.events: list[NodeEvent | SerialChanged] = []
-        self.bus_state = SimpleNamespace(error_state=ErrorState.ACTIVE, problem="")
+        self.bus_state = BusState()
         pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
         master = SimpleNamespace(drain_events=self._drain, states=np.full(3, NodeState.OPERATIONAL))
         port = SimpleNamespace(bus_state=self.bus_state, counters=SimpleNamespace(bits=0, overflow=0))
@@ -50,6 +50,12 @@ class Rig:
     def poll(self) -> None:
         self.now_ns += SECOND_NS
         self.reporter.poll(self.now_ns)
+
+    def update_bus(self, fault: BusFault | None, queue_full: int = 0) -> None:
+        self.bus_state.update(self.now_ns, 0, 0, queue_full, fault)
+
+    def bus_lines(self, caplog: pytest.LogCaptureFixture) -> list[tuple[int, str]]:
+        return [(r.levelno, r.getMessage()) for r in caplog.records if r.name == "handtouch.bus"]
 
     def _drain(self) -> list[NodeEvent | SerialChanged]:
         events, self.events = self.events, []
@@ -92,25 +98,55 @@ def test_replaced_node_is_a_warning(rig: Rig, caplog: pytest.LogCaptureFixture) 
 
 
 @pytest.mark.parametrize(
-    ("state", "level"),
+    ("state", "level", "text"),
     [
-        (ErrorState.WARNING, logging.WARNING),
-        (ErrorState.PASSIVE, logging.WARNING),
-        (ErrorState.BUS_OFF, logging.ERROR),
-        (ErrorState.DOWN, logging.ERROR),
+        (ErrorState.WARNING, logging.WARNING, "error-warning: check wiring"),
+        (ErrorState.PASSIVE, logging.WARNING, "error-passive: check wiring"),
+        (ErrorState.BUS_OFF, logging.ERROR, "bus-off (mostly "),
+        (ErrorState.DOWN, logging.ERROR, "no cable: ip link set can0 up"),
     ],
 )
 def test_bus_states_are_logged_once_by_severity(
-    rig: Rig, caplog: pytest.LogCaptureFixture, state: ErrorState, level: int
+    rig: Rig, caplog: pytest.LogCaptureFixture, state: ErrorState, level: int, text: str
 ) -> None:
     rig.poll()
-    rig.bus_state.error_state, rig.bus_state.problem = state, "check the cable"
+    rig.update_bus(BusFault(state, "no cable"))
     rig.poll()
     rig.poll()
-    rig.bus_state.error_state, rig.bus_state.problem = ErrorState.ACTIVE, ""
+    rig.now_ns += 2 * SECOND_NS
+    rig.update_bus(None)
     rig.poll()
-    lines = [(r.levelno, r.getMessage()) for r in caplog.records if r.name == "handtouch.bus"]
-    assert lines == [
-        (level, f"bus can0: active -> {state.value}: check the cable"),
-        (logging.INFO, f"bus can0: {state.value} -> active"),
+    (level_bad, bad), good = rig.bus_lines(caplog)
+    assert level_bad == level
+    assert bad.startswith(f"bus can0: active -> {state.value}: {text.partition(' (')[0]}")
+    assert good == (logging.INFO, f"bus can0: {state.value} -> active after 4.0 s")
+
+
+def test_every_transition_between_two_polls_is_logged(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    """A controller that restarts itself is bus-off for a millisecond."""
+    rig.poll()
+    for classes, byte in ((0x4, 0x04), (0x4, 0x20), (0x40, 0), (0x100, 0)):
+        rig.now_ns += 1_000_000
+        rig.bus_state.handle_error_frame(classes, bytes((0, byte, 0, 0, 0, 0, 0, 0)), rig.now_ns, 0, 0)
+    rig.reporter.poll(rig.now_ns)
+    assert [line[0] for line in rig.bus_lines(caplog)] == [
+        logging.WARNING,
+        logging.WARNING,
+        logging.ERROR,
+        logging.INFO,
     ]
+    assert rig.bus_lines(caplog)[-1][1] == "bus can0: bus-off -> active after 0.0 s"
+
+
+def test_new_problem_in_the_same_state_is_a_warning(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    rig.poll()
+    for count in (10, 20):
+        rig.update_bus(None, queue_full=count)
+        rig.poll()
+    ((level, text),) = rig.bus_lines(caplog)
+    assert level == logging.WARNING
+    assert text.startswith("bus can0: active: transmit queue full, 10 frames not sent")
+    rig.now_ns += 10 * SECOND_NS
+    rig.update_bus(None, queue_full=20)
+    rig.poll()
+    assert rig.bus_lines(caplog)[1:] == [(logging.INFO, "bus can0: active")]

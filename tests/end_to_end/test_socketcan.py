@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import subprocess
 import time
 from collections import Counter
@@ -90,3 +91,60 @@ def test_sigterm_stops_each_node_by_its_id(vcan_rig: Any) -> None:
     with can.LogReader(log) as reader:
         commands = [tuple(m.data) for m in reader]
     assert sorted(commands) == sorted((2, pad["node_id"]) for pad in status["pads"])
+
+
+def test_bus_states_and_lost_nodes_are_logged_with_the_bus_as_cause(vcan_rig: Any) -> None:
+    rig = vcan_rig
+    rig.simulate()
+    rig.start("run")
+    rig.wait_operational()
+    _wait_for_line(rig, [], "node 0x")
+    for frame, line in (
+        ("20000004#0004000000000000", "WARNING handtouch.bus: bus can0: active -> warning: error-warning"),
+        ("20000004#0020000000000000", "-> passive: error-passive"),
+        ("20000040#0000000000000000", "ERROR handtouch.bus: bus can0: passive -> bus-off: bus-off"),
+    ):
+        _wait_for_line(rig, [["cansend", "vcan0", frame]], line)
+    _wait_for_line(rig, [], "INFO handtouch.bus: bus can0: bus-off -> active after ")  # frames arrive
+    down = [["ip", "link", "set", "vcan0", "down"]]
+    _wait_for_line(rig, down, "ERROR handtouch.bus: bus can0: active -> down: [Errno 100] Network is down")
+    printed = _wait_for_line(rig, [], "lost: no heartbeat for")
+    lost = [line for line in printed.splitlines() if "lost: no heartbeat for" in line]
+    assert all("bus can0: [Errno 100] Network is down: ip link set vcan0 up" in line for line in lost), lost
+    assert "check its power" not in printed
+    up = [["ip", "link", "set", "vcan0", "up"]]
+    _wait_for_line(rig, up, "INFO handtouch.bus: bus can0: down -> active after ")
+    rig.wait_operational()
+
+
+def _wait_for_line(rig: Any, commands: list[list[str]], line: str) -> str:
+    """Run commands, and wait until the daemon has logged a line; what it printed since."""
+    before = len(rig.printed("run")) if commands else 0
+    for command in commands:
+        subprocess.run(command, check=True, timeout=30)
+    end_s = time.monotonic() + LONGEST_S
+    while line not in (printed := str(rig.printed("run")[before:])):
+        assert time.monotonic() < end_s, f"never {line}:\n{rig.all_printed()}"
+        time.sleep(0.05)
+    return printed
+
+
+def test_kernel_sync_that_waited_for_a_stopped_daemon_is_not_another_producers(vcan_rig: Any) -> None:
+    rig = vcan_rig
+    rig.simulate()
+    daemon = rig.start("run")
+    rig.wait_operational()
+    printed = len(rig.printed("run"))
+    for seconds in (0.3, 0.6, 2.0):
+        daemon.send_signal(signal.SIGSTOP)
+        time.sleep(seconds)
+        daemon.send_signal(signal.SIGCONT)
+        time.sleep(1.5)
+    status = rig.status()
+    log = rig.printed("run")[printed:]
+    assert status["service"]["buses"]["can0"]["sync"]["by"] == "kernel", log
+    assert status["service"]["buses"]["can0"]["sync"]["other_syncs"] == 0, log
+    assert "another SYNC producer" not in log
+    assert [pad["reboots"] for pad in status["pads"]] == [0] * 15, log
+    assert " lost: " not in log
+    assert "-> stale" not in log

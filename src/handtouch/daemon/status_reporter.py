@@ -108,7 +108,7 @@ class StatusReporter:
         self._rates_hz: dict[str, float] = {}
         self._tick_durations_ns: list[int] = []
         self._tick_us: dict[str, float] = {}
-        self._logged_bus_state: dict[str, tuple[str, str]] = {}
+        self._logged_problems = dict.fromkeys(ports, "")  # of each bus, without digits
 
     def record_tick(self, from_ns: int, to_ns: int) -> None:
         """Record a tick: last sample read at `from_ns`, messages sent at `to_ns`."""
@@ -123,6 +123,7 @@ class StatusReporter:
 
     def poll(self, now_ns: int) -> None:
         """Copy node states from the master; publish changes at once and every pad once a second."""
+        self._log_bus_transitions()
         events = self._master.drain_events()
         if events:
             for event in events:
@@ -153,7 +154,7 @@ class StatusReporter:
                 about = {"fields": {"part": late[0][0]}}
                 _loop_log.warning("late ticks by longest part: %s", ", ".join(parts), extra=about)
             self._tick_durations_ns.clear()
-            self._log_bus_states()
+            self._log_bus_problems()
             self._service_seq += 1
             self._publish("service", partial(self._make_service, now_ns))
 
@@ -196,18 +197,26 @@ class StatusReporter:
         extra = {"fields": {"hand": hand, "link": link}, "state": state}
         _log.log(level, "node 0x%02X (%s/%s): %s", node_id, hand, link, event, extra=extra)
 
-    def _log_bus_states(self) -> None:
+    def _log_bus_transitions(self) -> None:
         for name, port in self._ports.items():
-            state, problem = port.bus_state.error_state.value, port.bus_state.problem
-            key = state, problem.translate(_WITHOUT_DIGITS)
-            before = self._logged_bus_state.get(name, (ErrorState.ACTIVE.value, ""))
-            if key == before:
-                continue
-            self._logged_bus_state[name] = key
-            level = _BUS_LEVELS.get(port.bus_state.error_state, logging.WARNING if problem else logging.INFO)
-            extra = {"fields": {"bus": name}, "state": state}
-            text = f"{before[0]} -> {state}" + (f": {problem}" if problem else "")
-            _bus_log.log(level, "bus %s: %s", name, text, extra=extra)
+            for change in port.bus_state.drain_transitions():
+                text = f"{change.old.value} -> {change.new.value}"
+                if change.new is ErrorState.ACTIVE:
+                    text += f" after {change.lasted_ns * 1e-9:.1f} s"
+                self._log_bus_state(name, change.new, text, change.problem)
+
+    def _log_bus_problems(self) -> None:
+        """Log problems that have changed while the state hasn't."""
+        for name, port in self._ports.items():
+            state, problem = port.bus_state.error_state, port.bus_state.problem
+            if problem.translate(_WITHOUT_DIGITS) != self._logged_problems[name]:
+                self._log_bus_state(name, state, state.value, problem)
+
+    def _log_bus_state(self, name: str, state: ErrorState, text: str, problem: str) -> None:
+        self._logged_problems[name] = problem.translate(_WITHOUT_DIGITS)
+        level = _BUS_LEVELS.get(state, logging.WARNING if problem else logging.INFO)
+        extra = {"fields": {"bus": name}, "state": f"{state.value} {self._logged_problems[name]}"}
+        _bus_log.log(level, "bus %s: %s", name, f"{text}: {problem}" if problem else text, extra=extra)
 
     def _pads_due(self, now_ns: int) -> range:
         """Return the pads due to be published: each once a period, spread over the period."""

@@ -1,15 +1,15 @@
 """Fault confinement state of a bus from error frames, exceptions and counters, with a problem text and
 remedy.
 
-Public names: `BusState`, `ErrorState`, `BusFault`, `fault_from_exception`, `errno_from_exception`,
-`is_queue_full`.
+Public names: `BusState`, `ErrorState`, `BusTransition`, `BusFault`, `fault_from_exception`,
+`errno_from_exception`, `is_queue_full`.
 """
 
 from __future__ import annotations
 
 import errno
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
@@ -32,6 +32,16 @@ class BusFault:
 
     error_state: ErrorState
     text: str
+
+
+@dataclass(frozen=True, slots=True)
+class BusTransition:
+    """A change of a bus's state, `lasted_ns` after the one before, with the problem of the new state."""
+
+    old: ErrorState
+    new: ErrorState
+    lasted_ns: int
+    problem: str
 
 
 # <linux/can/error.h>: classes in the identifier, details in the data
@@ -72,10 +82,12 @@ _MIN_RECOVERY_FRAMES = 255
 _QUEUE_FULL_HOLD_NS = 2_000_000_000
 """Time for which a full transmit queue stays in `problem`."""
 
+_MAX_TRANSITIONS = 64
 _WIRING_REMEDY = "check wiring, termination (120 ohm at both ends) and the bit rate of all nodes"
 _NO_ACKNOWLEDGE_REMEDY = "no other node acknowledges: is one connected, powered and at this bit rate?"
 _FAULT_CAUSES = ("no acknowledge", "bit error", "form error", "stuff error", "CRC error", "bus error")
 
+_DOWN_ERRNOS = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO, errno.EBADF})
 _BUS_OFF_PATTERN = re.compile(r"bus[ _-]?off", re.IGNORECASE)
 _QUEUE_FULL_PATTERN = re.compile(
     r"(queue|buffer|fifo)[^.]*(full|overflow|overrun)|XMTFULL|TXBUFOFL", re.IGNORECASE
@@ -99,6 +111,7 @@ class BusState:
         self.transmit_errors = self.receive_errors = 0
         self.restart_ms: int | None = None
         self._interface, self._channel = interface, channel
+        self._transitions: deque[BusTransition] = deque(maxlen=_MAX_TRANSITIONS)
         self._recent_causes: Counter[str] = Counter()  # since the bus was error-active last
         self._fault: BusFault | None = None
         self._frames_at_error = self._sent_at_error = 0  # the counters at the last error frame
@@ -150,6 +163,12 @@ class BusState:
             problems.append(self._describe_queue_full())
         return "; ".join(problems)
 
+    def drain_transitions(self) -> list[BusTransition]:
+        """Return the changes of state since the last call, oldest first; at most the latest 64."""
+        transitions = list(self._transitions)
+        self._transitions.clear()
+        return transitions
+
     def report(self) -> dict[str, Any]:
         """Return the state as a map for the service message."""
         return {
@@ -170,7 +189,9 @@ class BusState:
         if error_state is ErrorState.ACTIVE:
             self._recent_causes.clear()
         if error_state is not self.error_state:
+            old, lasted_ns = self.error_state, now_ns - self.since_ns
             self.error_state, self.since_ns = error_state, now_ns
+            self._transitions.append(BusTransition(old, error_state, lasted_ns, self.problem))
 
     def _has_recovered(self, frames: int, sent: int) -> bool:
         transmit = self._recent_causes["transmit passive"] or self._recent_causes["transmit warning"]
@@ -211,6 +232,8 @@ class BusState:
         text = self._fault.text if self._fault is not None else "down"
         if self._interface == "socketcan":
             return f"{text}: ip link set {self._channel} up, or plug the adapter in; reception then resumes"
+        if self._interface == "udp_multicast":
+            return f"{text}: bring the network interface up; reception then resumes"
         return f"{text}: plug the adapter in; it is reopened until it works"
 
     def _describe_queue_full(self) -> str:
@@ -225,7 +248,7 @@ def fault_from_exception(error: BaseException) -> BusFault:
     text = str(error) or type(error).__name__
     if _BUS_OFF_PATTERN.search(text):
         return BusFault(ErrorState.BUS_OFF, text)
-    is_down = errno_from_exception(error) in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
+    is_down = errno_from_exception(error) in _DOWN_ERRNOS
     return BusFault(ErrorState.DOWN if is_down else ErrorState.ACTIVE, text)
 
 
@@ -237,9 +260,11 @@ def is_queue_full(error: BaseException) -> bool:
 
 
 def errno_from_exception(error: BaseException) -> int | None:
-    """Return the errno of an exception of python-can or of the system, None if it has none."""
+    """Return the errno of an exception of python-can or of the system, or of its cause; None without one."""
     code = getattr(error, "errno", None) or getattr(error, "error_code", None)
-    return code if isinstance(code, int) else None
+    if isinstance(code, int):
+        return code
+    return None if error.__cause__ is None else errno_from_exception(error.__cause__)
 
 
 def _causes(classes: int, data: bytes) -> list[str]:
