@@ -1,9 +1,8 @@
 """Automatic calibration of the node of one pad by ordinary contacts.
 
 Public: `AutoCalibrator`, `CalibrationState`, `GainUpdate`. A node that replaced another is in quarantine
-until
-it has a calibration of its own: from the store, from contacts, or from an operator. No clock; time is an
-argument.
+until it has a calibration of its own: from the store, from contacts, or from an operator. No clock; time is
+an argument.
 """
 
 from __future__ import annotations

@@ -189,15 +189,13 @@ class GainEstimator:
             return GainStatus.INVALID, (
                 f"a pad of {self._model.a:.3g} by {self._model.b:.3g} can't be calibrated by contacts: 400 "
                 f"would determine its gains to {self.shape_deviation:.0f} times the noise (limit "
-                f"{MAX_SHAPE_DEVIATION:.0f}); "
-                "measure them with a known current into every channel"
+                f"{MAX_SHAPE_DEVIATION:.0f}); measure them with a known current into every channel"
             )
         if self._mixture.outlier_fraction > 0.5:
             return GainStatus.INVALID, (
                 f"{100 * self._mixture.outlier_fraction:.0f} % of its contacts are no points under any "
-                f"gains near "
-                "these: the pad isn't built as configured, its gains have jumped, or only edges touch it; "
-                "calibrate again, with round contacts"
+                "gains near these: the pad isn't built as configured, its gains have jumped, or only edges "
+                "touch it; calibrate again, with round contacts"
             )
         counts = f"{self._contacts} contacts, worth {self._effective_contacts:.0f} at distinct positions"
         result = f"{counts}; gains known to {100 * std:.2g} %"

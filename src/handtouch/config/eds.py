@@ -1,7 +1,6 @@
 """Electronic data sheets (CiA 306): a node's objects, its default TPDOs and the types of objects.
 
-Public names: `load_eds`, `default_tpdos`, `TpdoDefault`, `ValueType`, `REAL32`, `value_type`,
-`EdsError`.
+Public names: `load_eds`, `default_tpdos`, `TpdoDefault`, `ValueType`, `REAL32`, `value_type`, `EdsError`.
 """
 
 from __future__ import annotations

@@ -52,10 +52,9 @@ class Histogram:
 class StageTimer:
     """Measures the time of each stage in every period, and which stage caused a late tick.
 
-    The loop calls `lap` at the end of each part, `record_wait` after waiting, `begin_period` at each SYNC
-    and `record_tick`
-    once messages are out. Times in ns. A tick is late when its messages leave more than a period after its
-    SYNC, or not before the next one; a period without any tick counts too.
+    The loop calls `lap` at the end of each part, `record_wait` after waiting, `begin_period` at each SYNC and
+    `record_tick` once messages are out. Times in ns. A tick is late when its messages leave more than a
+    period after its SYNC, or not before the next one; a period without any tick counts too.
 
     `histograms`: stage -> time per period, and `latency`: from the last sample read to the last message out;
     `late_ticks`: name of the longest part -> late ticks.
@@ -75,8 +74,7 @@ class StageTimer:
         self._longest_part = WAKE_UP_DELAY, 0
 
     def statistics(self) -> dict[str, Any]:
-        """Return plain values: `latency`, `stages` (name -> histogram), `late_ticks` (part ->
-        ticks)."""
+        """Return plain values: `latency`, `stages` (name -> histogram), `late_ticks` (part -> ticks)."""
         return {
             "latency": self.latency.statistics(),
             "stages": {stage: histogram.statistics() for stage, histogram in self.histograms.items()},

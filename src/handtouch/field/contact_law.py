@@ -75,9 +75,8 @@ class ForceEstimate:
     """Force of contacts; arrays of one shape (...).
 
     force_n: newton; where saturated a lower bound of 2 sigma, 0 where no current flows. std_n: its standard
-    deviation from noise of the current, of the radius and of the place. status: of `ForceEstimateStatus`.
-    radius_m: the
-    contact radius that the law assumed.
+    deviation from noise of the current, of the radius and of the position. status: of `ForceEstimateStatus`.
+    radius_m: the contact radius that the law assumed.
     """
 
     force_n: FloatArray

@@ -311,8 +311,7 @@ def _draw_pads(data: PlotData) -> Figure:
 
 
 def _draw_health(data: PlotData) -> Figure:
-    """Draw the state of every pad over time, and below it the daemon's tick rate, overruns
-    and congestion episodes."""
+    """Draw the state of every pad over time; below it the daemon's tick rate, overruns and congestion."""
     from matplotlib.patches import Patch
 
     pads = list(data.pads)

@@ -1,8 +1,8 @@
 """History of a pad's sheet under load: ratio of apparent to true force over time.
 
-Public name: `SimulatedSheetHistory`. It integrates a `SheetLaw` between knots that are dense
-where the load changes and sparse elsewhere; the laws are exact under constant load, so an idle hour is a
-single step. It is integrated only as far as requested; results don't depend on the order of requests.
+Public name: `SimulatedSheetHistory`. It integrates a `SheetLaw` between knots that are dense where the load
+changes and sparse elsewhere; the laws are exact under constant load, so an idle hour is a single step. It is
+integrated only as far as requested; results don't depend on the order of requests.
 """
 
 from __future__ import annotations

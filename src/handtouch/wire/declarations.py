@@ -1,7 +1,6 @@
 """Declarations of payload fields: type, meaning and values.
 
-Public names: `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`,
-`input_fields`, `is_array`.
+Public names: `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`, `input_fields`, `is_array`.
 
 The declarations are the only source of the tables in docs/wire.md (`handtouch.wire.tables`) and of
 docs/wire.schema.json (`handtouch.wire.schema`). A field's docstring is its meaning. Metadata refine the type

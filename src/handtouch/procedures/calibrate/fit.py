@@ -7,9 +7,9 @@ sigma = k / (F / pi A^2)^alpha, eq. 12. The paper guesses the plane's resistance
 refines it until log(V / I - plane) against log F is straight; here all are estimated together, by maximum
 likelihood: ln k, alpha and ln of the sheet resistance, with the ln A of each indenter as a nuisance that is
 known within its standard deviation. Errors are of two kinds: of the measurement (noise, position), and the
-sheet's
-own scatter from press to press, of one relative size in load, which is unknown and estimated (Mandel and
-Paule: so that squared residuals are as many as degrees of freedom). Intervals are Student's, for that reason.
+sheet's own scatter from press to press, of one relative size in load, which is unknown and estimated (Mandel
+and Paule: so that the sum of squared residuals equals the degrees of freedom). Intervals are Student's, for
+that reason.
 """
 
 from __future__ import annotations

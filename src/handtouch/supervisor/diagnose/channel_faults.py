@@ -1,8 +1,7 @@
 """Detect faults of single channels that show in every sample: stuck, saturated, shorted to the layer.
 
 Public: `ChannelFaultDetector`, `ChannelFault`. A reading of a healthy channel repeats by chance with a
-probability
-that follows from its noise; a run of repeats less likely than e^-ALARM_NATS is a fault.
+probability that follows from its noise; a run of repeats less likely than e^-ALARM_NATS is a fault.
 """
 
 from __future__ import annotations

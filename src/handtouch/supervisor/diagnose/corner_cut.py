@@ -1,8 +1,7 @@
 """Changes of the electrodes' current shares by a cut across a corner: finite differences on the rectangle.
 
-Public: `cut_share_changes`. The intact and the cut sheet are solved on one coarse grid; only their
-difference is
-used, in which most of the grid's error cancels.
+Public: `cut_share_changes`. The intact and the cut sheet are solved on one coarse grid; only their difference
+is used, in which most of the grid's error cancels.
 """
 
 from __future__ import annotations

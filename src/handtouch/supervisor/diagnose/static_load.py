@@ -1,10 +1,9 @@
 """Detect static loads and classify them: held object, gum, offset, moisture, or the tail of a press.
 
 Public: `StaticLoadDetector`, `StaticLoad`. The lowest of a pad's short means in the last seconds is its
-floor.
-While the floor is off zero, the pad has a static load, whatever contacts begin and end above it. Naive Bayes
-classifies it by features of the floor since its begin; their probabilities under each cause are the table
-below. A held object shows the hand's tremor, in position and magnitude; a stuck object doesn't.
+floor. While the floor is off zero, the pad has a static load, whatever contacts begin and end above it. Naive
+Bayes classifies it by features of the floor since its begin; their probabilities under each cause are the
+table below. A held object shows the hand's tremor, in position and magnitude; a stuck object doesn't.
 """
 
 from __future__ import annotations
