@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import pytest
 
 from handtouch.cli import build_parser, main
-from handtouch.cli.daemons import SCENARIO_NAMES
+from handtouch.cli.daemons import SCENARIOS
 from handtouch.config import shipped
 
 COMMANDS = [
@@ -54,7 +54,7 @@ def test_options_of_every_command_are_parameters_of_its_function(name: str) -> N
 
 
 def test_scenario_names_in_help_are_those_shipped() -> None:
-    assert SCENARIO_NAMES.split(", ") == list(shipped.SCENARIO_NAMES)
+    assert tuple(SCENARIOS) == shipped.SCENARIO_NAMES
 
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -50,7 +50,8 @@ def build_parser() -> argparse.ArgumentParser:
         prog="handtouch",
         epilog=EXIT_STATUS_HELP,
         description="Middleware for tactile sensors of a robot hand: reads CANopen sensor nodes and "
-        "publishes contacts (position, force, uncertainty) over ZeroMQ.",
+        "publishes contacts (position, force, uncertainty) over ZeroMQ. First look: demo. On a robot: check, "
+        "doctor, scan, commission, then run; watch shows the contacts.",
     )
     parser.add_argument("--version", action="version", version=f"handtouch {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -23,7 +23,8 @@ def add(commands: Subparsers) -> None:
         action="append",
         default=[],
         metavar="NAME=ENDPOINT",
-        help="complete stream of another daemon, and its name on the network; repeatable",
+        help="another daemon: its name in Zenoh keys and the endpoint of its complete stream (port 5582 by "
+        "default); repeatable",
     )
     for option, text in (("connect", "of a router or peer to connect to"), ("listen", "to listen on")):
         bridge.add_argument(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from handtouch.cli.options import (
+    LIVE_HELP,
     Subparsers,
     add_command,
     add_endpoint,
@@ -30,7 +31,7 @@ def add(commands: Subparsers) -> None:
         commands,
         "snapshot",
         f"{_TEXT}:run_snapshot",
-        "print the present state of all pads and their contacts",
+        "print every pad once: touched or not, and its contact with position and force",
     )
     _add_calibrate(commands)
 
@@ -46,7 +47,10 @@ def add(commands: Subparsers) -> None:
     )
 
     reload = _add_request(
-        commands, "reload", f"{_TEXT}:run_reload", "make the daemon read its deployment file again"
+        commands,
+        "reload",
+        f"{_TEXT}:run_reload",
+        "make the daemon read its deployment file again; pads that don't change are not disturbed",
     )
     reload.add_argument("--dry-run", action="store_true", help="print the changes without applying them")
 
@@ -61,17 +65,21 @@ def _add_calibrate(commands: Subparsers) -> None:
         commands,
         "calibrate",
         "handtouch.cli.calibrate_text:run",
-        "measure a pad's contact law with known weights (--weights), or set its calibration (--name); with "
-        "neither, print the active calibration",
+        "measure a pad's contact law (force against current) with known weights (--weights), or set values "
+        "of its calibration (--gains, --offsets, --law); with neither, print the active calibration",
     )
     calibrate.add_argument("pad", metavar="PAD", help='pad, such as "left/index_distal"')
 
-    guided = calibrate.add_argument_group("guided measurement with known weights")
+    _add_guided(calibrate.add_argument_group("guided measurement with known weights"))
+    _add_direct(calibrate.add_argument_group("direct setting; omitted values are left unchanged"))
+
+
+def _add_guided(guided: argparse._ArgumentGroup) -> None:
     guided.add_argument(
         "--weights",
         default="",
         metavar="LIST",
-        help="weights to place, such as 20,50,100,200,500; 200@4: on a base of radius 4 mm",
+        help="weights to place, such as 20,50,100,200,500 (unit: --unit); 200@4: on a base of radius 4 mm",
     )
     guided.add_argument(
         "--config", type=Path, metavar="CONFIG", help="deployment file that the daemon runs with (required)"
@@ -126,9 +134,12 @@ def _add_calibrate(commands: Subparsers) -> None:
         metavar="S",
         help="time limit for placing a weight or pressing a key (default: 60)",
     )
-    guided.add_argument("--live", default=LIVE_ENDPOINT, help=f"live stream (default: {LIVE_ENDPOINT})")
+    guided.add_argument(
+        "--live", default=LIVE_ENDPOINT, metavar="ENDPOINT", help=f"{LIVE_HELP} (default: {LIVE_ENDPOINT})"
+    )
 
-    direct = calibrate.add_argument_group("direct setting; omitted values are left unchanged")
+
+def _add_direct(direct: argparse._ArgumentGroup) -> None:
     direct.add_argument("--name", help="id of the new calibration, published in contact messages")
     direct.add_argument(
         "--gains", type=float, nargs=4, metavar="G", help="relative gains of the channels x0, xa, y0, yb"
@@ -150,7 +161,8 @@ def _add_scene(commands: Subparsers) -> None:
         commands,
         "scene",
         f"{_TEXT}:run_scene",
-        "show or change the scene: the links, outputs, tolerance and rate that the task uses",
+        "show or change the scene: the links and outputs that a task uses, at what rate and accuracy; the "
+        "rest isn't computed",
     )
     scene.add_argument(
         "--links",
@@ -162,18 +174,20 @@ def _add_scene(commands: Subparsers) -> None:
         "--outputs",
         type=comma_separated,
         metavar="NAMES",
-        help="outputs in use, of position, force, raw, palm, base, motion, stiffness, shape, texture; "
-        '"" for touched or not only',
+        help="outputs in use, of position, force, raw (samples), palm and base (positions in these frames), "
+        'motion (slip), stiffness, shape, texture; "": only whether a pad is touched',
     )
     scene.add_argument(
         "--tolerance-mm",
         type=float,
         metavar="MM",
-        help="tolerable position error; 0: as accurate as possible",
+        help="position error that the task tolerates; 0: as accurate as possible",
     )
     scene.add_argument("--rate-hz", type=float, metavar="HZ", help="rate of contact updates; 0: one per SYNC")
     scene.add_argument(
-        "--name", help="add a temporary scene of this client to the others, instead of changing the default"
+        "--name",
+        help="owner of a temporary scene, which is added to the other scenes; without it, the default scene "
+        "is changed",
     )
     scene.add_argument(
         "--lease-s", type=positive_number, metavar="S", help="lifetime of the temporary scene (default: 10)"

@@ -8,7 +8,13 @@ from pathlib import Path
 from handtouch.cli.options import Subparsers, add_bus, add_command, add_config, positive_number
 from handtouch.host.endpoints import GRIPPER_ENDPOINT
 
-SCENARIO_NAMES = "session, gum, swap, faults"  # those of `config.shipped`, which takes long to import
+SCENARIOS = {
+    "session": "touches, then a grasp",
+    "gum": "chewing gum sticks to a finger",
+    "swap": "a node is replaced",
+    "faults": "several, one after another",
+}
+"""Content of the scenarios of `config.shipped`, which takes long to import."""
 
 
 def add(commands: Subparsers) -> None:
@@ -45,7 +51,7 @@ def _add_demo(commands: Subparsers) -> None:
         help="deployment to simulate (default: the shipped hand)",
     )
     stimulus = demo.add_mutually_exclusive_group()
-    _add_scenario(stimulus, "scenario_path", "faults and replaced nodes are explained in the output")
+    _add_scenario(stimulus, "scenario_path", "(default: session)")
     _add_grasp(stimulus)
     _add_world(demo, "default")
 
@@ -63,7 +69,7 @@ def _add_simulate(commands: Subparsers) -> None:
     _add_scenario(
         stimulus,
         "scenario",
-        "with touches, faults and replaced nodes (default: session if it fits, else a tour)",
+        "(default: session if the deployment has its links, else touches on every pad)",
     )
     _add_grasp(stimulus)
     stimulus.add_argument(
@@ -89,15 +95,19 @@ def _add_scenario(parser: argparse._ActionsContainer, dest: str, text: str) -> N
         dest=dest,
         type=_existing_scenario,
         metavar="NAME",
-        help=f"scenario to play, a file or one of {SCENARIO_NAMES}; {text}",
+        help=f"scenario to play: {_scenario_texts()}, or a file {text}",
     )
+
+
+def _scenario_texts() -> str:
+    return ", ".join(f"{name} ({content})" for name, content in SCENARIOS.items())
 
 
 def _existing_scenario(name: str) -> Path:
     from handtouch.config import shipped
 
     if not (path := shipped.scenario_path(name)).is_file():
-        raise argparse.ArgumentTypeError(f"{name}: is neither a file nor one of {SCENARIO_NAMES}")
+        raise argparse.ArgumentTypeError(f"{name}: is neither a file nor one of {', '.join(SCENARIOS)}")
     return path
 
 
@@ -114,14 +124,15 @@ def _add_world(parser: argparse.ArgumentParser, default_world: str) -> None:
         "--world",
         choices=("ideal", "default", "harsh"),
         default=default_world,
-        help="true properties of the hand, unknown to the daemon: ideal, exactly as in the file, with noise; "
-        "default, the tolerances, sheets and drift that a careful builder gets; harsh, two to three times "
-        f"wider (default: {default_world})",
+        help="true properties of the hand, unknown to the daemon: ideal: exactly as in the file, with noise; "
+        "default: with the tolerances, sheets and drift that a careful builder gets; harsh: two to three "
+        f"times wider (default: {default_world})",
     )
     parser.add_argument(
         "--sheet",
         choices=("S1", "S2"),
-        help="simulate creep and adaptation of this sheet of the paper, instead of the world's sheets",
+        help="simulate the creep and adaptation of S1 or S2, the two sensor sheets measured in the paper, "
+        "instead of the world's sheets",
     )
     parser.add_argument(
         "--drift",

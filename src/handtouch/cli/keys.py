@@ -12,23 +12,26 @@ def add(commands: Subparsers) -> None:
     actions = add_command_group(
         commands,
         "keys",
-        "manage CURVE keys of a daemon that other machines connect to, and of its clients",
-        "Manage CURVE keys: those of a daemon that other machines connect to, and of its clients.",
+        "manage the keys (ZeroMQ CURVE) with which clients on other machines connect to a daemon",
+        "Manage the keys (ZeroMQ CURVE) with which clients on other machines connect to a daemon.",
     )
 
     make = add_command(
         actions, "make", "handtouch.cli.keys_text:run_make", "create a daemon's keys in a new folder"
     )
     make.add_argument(
-        "folder", type=Path, help="folder to create; name it as [daemon] keys in the deployment file"
+        "folder",
+        metavar="FOLDER",
+        type=Path,
+        help="folder to create; name it as [daemon] keys in the deployment file",
     )
     make.add_argument("--name", help="name of the daemon in its clients' key files (default: the host name)")
 
     client = add_command(
         actions, "client", "handtouch.cli.keys_text:run_client", "create a client's key and authorise it"
     )
-    client.add_argument("folder", type=Path, help="folder of the daemon's keys")
-    client.add_argument("name", help="name of the client")
+    client.add_argument("folder", metavar="FOLDER", type=Path, help="folder of the daemon's keys")
+    client.add_argument("name", metavar="NAME", help="name of the client")
     client.add_argument(
         "--rights",
         choices=("read", "control"),
@@ -44,11 +47,11 @@ def add(commands: Subparsers) -> None:
     )
 
     listed = add_command(actions, "list", "handtouch.cli.keys_text:run_list", "list the authorised clients")
-    listed.add_argument("folder", type=Path, help="folder of the daemon's keys")
+    listed.add_argument("folder", metavar="FOLDER", type=Path, help="folder of the daemon's keys")
     add_json(listed)
 
     revoke = add_command(
         actions, "revoke", "handtouch.cli.keys_text:run_revoke", "remove a client's authorisation"
     )
-    revoke.add_argument("folder", type=Path, help="folder of the daemon's keys")
-    revoke.add_argument("name", help="name of the client")
+    revoke.add_argument("folder", metavar="FOLDER", type=Path, help="folder of the daemon's keys")
+    revoke.add_argument("name", metavar="NAME", help="name of the client")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from handtouch.cli.options import (
+    LIVE_HELP,
     Subparsers,
     add_command,
     add_endpoint,
@@ -23,7 +24,7 @@ def add(commands: Subparsers) -> None:
         commands,
         "status",
         "handtouch.cli.status:run",
-        "print the state of a running daemon, its buses and its pads",
+        "print the health of a running daemon: rates, losses, buses, nodes, calibrations, diagnoses",
     )
     add_endpoint(status, CONTROL_ENDPOINT, "control endpoint")
     add_json(status)
@@ -39,7 +40,7 @@ def _add_watch(commands: Subparsers) -> None:
         nargs="*",
         help='topics such as "contact/*/thumb_*", "hand/*", "service" (default: contacts and health)',
     )
-    add_endpoint(watch, LIVE_ENDPOINT, "live stream")
+    add_endpoint(watch, LIVE_ENDPOINT, LIVE_HELP)
     style = watch.add_mutually_exclusive_group()
     style.add_argument(
         "--plain", dest="style", action="store_const", const="plain", help="print lines, also on a terminal"
@@ -55,7 +56,7 @@ def _add_view(commands: Subparsers) -> None:
     view = add_command(
         commands, "view", "handtouch.cli.view:run", "serve a live 3D view of a running daemon's hands"
     )
-    add_endpoint(view, LIVE_ENDPOINT, "live stream")
+    add_endpoint(view, LIVE_ENDPOINT, LIVE_HELP)
     view.add_argument(
         "--host", default="127.0.0.1", help="address that the page is served at (default: 127.0.0.1)"
     )

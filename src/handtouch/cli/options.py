@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-EXIT_STATUS_HELP = (
-    "Exit status: 0 success, 1 failure or a problem found (check: warnings), 2 wrong usage or invalid file."
-)
+EXIT_STATUS_HELP = "Exit status: 0 success; 1 failure, or a problem was found; 2 wrong usage or invalid file."
+
+LIVE_HELP = "endpoint of the daemon's live stream, which drops what a slow subscriber can't take"
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -56,7 +56,8 @@ def add_config(parser: argparse.ArgumentParser, text: str = "deployment file (TO
 
 def add_bus(
     parser: argparse.ArgumentParser,
-    text: str = "another CAN interface for a bus of the deployment, e.g. can0=socketcan:vcan0; repeatable",
+    text: str = "open this CAN interface for bus NAME instead of the one in the deployment file, e.g. "
+    "can0=udp_multicast:239.74.163.2 (no hardware), can0=socketcan:vcan0; repeatable",
 ) -> None:
     """Add `--bus`, which may be given several times, as `buses`."""
     parser.add_argument(

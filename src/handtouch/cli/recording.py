@@ -48,7 +48,8 @@ def _add_record(commands: Subparsers) -> None:
     )
     record.add_argument(
         "--endpoint",
-        help=f"complete stream of the daemon (default: the deployment's, or {COMPLETE_ENDPOINT})",
+        help="endpoint of the daemon's complete stream, which queues messages for slow subscribers "
+        f"(default: the deployment's, or {COMPLETE_ENDPOINT})",
     )
     add_key(record)
     record.add_argument(
@@ -57,7 +58,7 @@ def _add_record(commands: Subparsers) -> None:
     record.add_argument(
         "--hand",
         action="store_true",
-        help="also record hand frames (not needed: replay computes them from the samples)",
+        help="also record hand messages, the state of all pads per tick (not needed: replay recomputes them)",
     )
     add_percepts(record)
     record.add_argument(
@@ -161,10 +162,19 @@ def _add_plot(commands: Subparsers) -> None:
         help="folder to write to (default: plots)",
     )
     plot.add_argument(
-        "--from", dest="from_s", type=float, default=0.0, metavar="S", help="start time (default: 0)"
+        "--from",
+        dest="from_s",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="begin, in seconds since the recording's first message (default: 0)",
     )
     plot.add_argument(
-        "--to", dest="to_s", type=positive_number, metavar="S", help="end time (default: the recording's end)"
+        "--to",
+        dest="to_s",
+        type=positive_number,
+        metavar="S",
+        help="end, in the same seconds (default: the recording's end)",
     )
 
 

@@ -21,7 +21,7 @@ def add(commands: Subparsers) -> None:
         commands,
         "check",
         "handtouch.cli.check_text:run",
-        "check a deployment file: errors, bus load, warnings",
+        "check a deployment file: errors, bus load, warnings (exit status 1)",
     )
     add_config(check, nargs="?")
     add_json(check)
@@ -33,7 +33,8 @@ def add(commands: Subparsers) -> None:
         commands,
         "doctor",
         "handtouch.cli.doctor_text:run",
-        "check that this machine can run the daemon: packages, clock, buffers, CAN interfaces, endpoints",
+        "check that this machine can run the daemon: packages, clock, socket buffers, CAN interfaces, "
+        "endpoints",
     )
     add_config(doctor, "deployment file, to check its buses and endpoints too", nargs="?")
     add_json(doctor)
@@ -59,7 +60,7 @@ def add(commands: Subparsers) -> None:
         commands,
         "design",
         "handtouch.cli.drawing_text:run_design",
-        "draw maps of the expected position error on a pad, as configured",
+        "draw maps of a pad's expected position error from noise, for the design in a deployment file",
     )
     add_config(design)
     design.add_argument("--link", help="pad to draw (default: the first)")
@@ -77,10 +78,14 @@ def _add_scan(commands: Subparsers) -> None:
         commands,
         "scan",
         "handtouch.cli.scan_text:run",
-        "find the nodes on CAN buses, compare them with a deployment, and print the tables that it lacks",
+        "find the nodes on CAN buses, compare them with a deployment file, and print the tables to add to it",
     )
     add_config(scan, "deployment file to compare with", nargs="?")
-    add_bus(scan, "bus to scan, e.g. can0=socketcan:can0, or another interface for a bus of the deployment")
+    add_bus(
+        scan,
+        "bus to scan, e.g. can0=socketcan:can0; with CONFIG, the interface to open for bus NAME instead of "
+        "the one in the file; repeatable",
+    )
     scan.add_argument(
         "--seconds",
         type=positive_number,
@@ -132,7 +137,10 @@ def _add_commission(commands: Subparsers) -> None:
         "--dry-run", action="store_true", help="print the changes of the file instead of writing them"
     )
     commission.add_argument(
-        "--yes", dest="assume_yes", action="store_true", help="accept swapped nodes without confirmation"
+        "--yes",
+        dest="assume_yes",
+        action="store_true",
+        help="accept nodes found on each other's links without confirmation",
     )
     commission.add_argument(
         "--seconds",
