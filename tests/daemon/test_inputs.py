@@ -14,7 +14,7 @@ from handtouch.client import keys
 from handtouch.client.robot import Robot
 from handtouch.core.sheet_force import ForceReference
 from handtouch.daemon.authentication import Authenticator
-from handtouch.daemon.inputs import InputReceiver
+from handtouch.daemon.inputs import DROP_CAUSES, InputReceiver
 from handtouch.hand.joints import JointStateBuffer
 from handtouch.wire.inputs import (
     JointCommand,
@@ -199,3 +199,8 @@ def _try_to_connect(robot: Robot, authenticator: Authenticator, inputs: InputRec
         except PermissionError:
             return False
     raise AssertionError("neither authorised nor refused")
+
+
+def test_the_documentation_lists_every_cause() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
+    assert all(f"`{cause}`" in page for cause in DROP_CAUSES)
