@@ -64,14 +64,17 @@ class Loop:
 
     def __init__(self, deployment: Deployment, samples: NDArray[np.int64], folder: Path) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
-        self.publisher = Publisher.open(self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
+        topics = wire.topics_of(deployment.links_by_hand)
+        self.publisher = Publisher.open(
+            self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics
+        )
         self.pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.6, self.publisher, self.publisher.session)
         self.pipeline.node_state[:] = PadState.CLEAR
         self.publisher.retained_messages.update(self.pipeline.messages.retained_messages())
         self.publisher.retained_messages.update(self.pipeline.journal.retained_messages())
         files = deployment_files(deployment)
         self.pipeline.journal.publish_config(deployment, files, build_info(), time.monotonic_ns())
-        self._hands = {hand.name: [pad.link for pad in hand.pads] for hand in deployment.hands}
+        self._hands = deployment.links_by_hand
         self._service_seq = 0
         self._film = [[row.astype("<i2").tobytes() for row in sample] for sample in samples]
 

@@ -32,6 +32,7 @@ from bench_latency import PATHS, descriptors, film, machine, resident_mb
 from numpy.typing import NDArray
 from page import made_by, options, output_folder
 
+from handtouch import wire
 from handtouch.config import (
     Bus,
     Deployment,
@@ -293,7 +294,8 @@ def remember(hours: float) -> dict[str, Any]:
     script = np.concatenate([moving, untouched.astype(np.int64)]).astype("<i2")
     rows: list[tuple[float, float, int, int, int]] = []
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, zmq.Context() as context:
-        publisher = Publisher.open(context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
+        topics = wire.topics_of(deployment.links_by_hand)
+        publisher = Publisher.open(context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics)
         pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.8, publisher)
         pipeline.node_state[:] = PadState.CLEAR
         reader = context.socket(zmq.SUB)

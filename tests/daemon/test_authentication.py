@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import random
 import re
 import socket
@@ -13,6 +14,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import pytest
 import zmq
 from hypothesis import HealthCheck, given, settings
@@ -20,11 +22,14 @@ from hypothesis import strategies as st
 
 from handtouch import wire
 from handtouch.client import connect, keys, request
+from handtouch.client.connection import Connection
 from handtouch.daemon.authentication import REFUSAL_CAUSES, Authenticator
 from handtouch.daemon.control import ControlServer
+from handtouch.daemon.inputs import InputReceiver
 from handtouch.daemon.publisher import Publisher
 
 _SECOND_NS = 1_000_000_000
+TOPICS = wire.topics_of({"h": ["thumb"]})
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00"
 NULL = GREETING + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
 CURVE = GREETING + b"CURVE".ljust(20, b"\0") + b"\0" + bytes(31)
@@ -48,11 +53,13 @@ GARBAGE = {
 
 def _health(seq: int) -> wire.Health:
     """A message; only its topic and its number matter here."""
-    zero: dict[str, Any] = {"int": 0, "float": 0.0, "str": "", "bool": False, "tuple[str, ...]": ()}
+    zero: dict[str, Any] = {"int": 0, "float": 0.0, "str": "", "bool": False}
     values: dict[str, Any] = {
         field.name: zero.get(str(field.type)) for field in fields(wire.Health) if field.default is MISSING
     }
-    return wire.Health(**{**values, "v": wire.SCHEMA_VERSION, "seq": seq, "hand": "h", "link": "thumb"})
+    status = {"state": "clear", "node_state": "operational", "sampling": "sync", "emergencies": ()}
+    about = {"v": wire.SCHEMA_VERSION, "seq": seq, "hand": "h", "link": "thumb"}
+    return wire.Health(**{**values, **status, **about})
 
 
 class Served:
@@ -62,10 +69,13 @@ class Served:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.authenticator = Authenticator.open(self.context, folder)
         self.publisher = Publisher.open(
-            self.context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", self.authenticator
+            self.context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", TOPICS, self.authenticator
         )
         self.control = ControlServer.open(self.context, "tcp://127.0.0.1:*", self.authenticator)
         self.control.commands["status"] = lambda _, __: {"answer": 42}
+        self.inputs = InputReceiver.open(
+            self.context, "tcp://127.0.0.1:*", self.authenticator, {}, [("h", "thumb")]
+        )
         self.live = self.publisher.endpoints["live"]
         self.skipped_ns = self.sent = 0
         self.now_ns = _SECOND_NS
@@ -81,6 +91,7 @@ class Served:
             self.authenticator.poll(self.now_ns)
             self.publisher.poll_subscriptions(self.now_ns)
             self.control.poll(self.now_ns)
+            self.inputs.poll(self.now_ns)
             self.sent += 1
             self.publisher.send(_health(self.sent))
 
@@ -96,6 +107,7 @@ class Served:
         self._thread.join()
         self.publisher.close()
         self.control.close()
+        self.inputs.close()
         self.authenticator.close()
         self.context.destroy(0)
 
@@ -157,16 +169,23 @@ def test_client_with_control_right_controls(served: Served, tmp_path: Path) -> N
     assert answer["answer"] == 42
 
 
-def test_read_key_is_refused_by_control(
+def test_read_key_may_ask_for_the_status_and_change_nothing(served: Served, tmp_path: Path) -> None:
+    served.control.commands["disable"] = lambda _, __: {}
+    key = tmp_path / "reader.key"
+    assert request("status", endpoint=served.control.endpoint, key=key, timeout_s=30)["answer"] == 42
+    with pytest.raises(RuntimeError, match='this key has the right "read"; the command needs "control"'):
+        request("disable", endpoint=served.control.endpoint, key=key, timeout_s=30)
+    assert request("disable", endpoint=served.control.endpoint, key=tmp_path / "pilot.key", timeout_s=30)
+
+
+def test_read_key_is_refused_by_inputs(
     served: Served, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with pytest.raises(PermissionError, match="rejects the key of reader"):
-        request("status", endpoint=served.control.endpoint, key=tmp_path / "reader.key", timeout_s=30)
-    assert served.authenticator.refused == {"no_right": 1}
-    assert (
-        'connection refused: client has the right "read", but not "control": reader from 127.0.0.1'
-        in caplog.text
-    )
+    connection = Connection.open(zmq.PUB, served.inputs.endpoint, tmp_path / "reader.key", {zmq.LINGER: 0})
+    served.until(lambda: served.authenticator.refused["no_right"] > 0)
+    connection.close()
+    text = 'connection refused: client has the right "read", but not "control": reader from 127.0.0.1'
+    assert text in caplog.text
 
 
 def test_client_without_key_is_refused(served: Served) -> None:
@@ -237,6 +256,50 @@ def test_clients_are_added_and_revoked_without_restart(served: Served, folder: P
     assert _receives(served.live, tmp_path / "reader.key")
 
 
+def test_open_connections_of_a_revoked_client_are_closed(
+    served: Served, folder: Path, tmp_path: Path
+) -> None:
+    key, endpoint = tmp_path / "reader.key", served.control.endpoint
+    asking = Connection.open(zmq.REQ, endpoint, key, {zmq.LINGER: 0})
+    with (
+        connect("health/*/*", endpoint=served.live, key=key) as revoked,
+        connect("health/*/*", endpoint=served.live, key=tmp_path / "pilot.key") as other,
+    ):
+        asking.socket.send(msgpack.packb({"v": 1, "command": "status"}))
+        served.until(lambda: asking.poll(0) and asking.readable)
+        assert revoked.recv(30) is not None
+        assert other.recv(30) is not None
+        keys.revoke(folder, "reader")
+        served.until(lambda: served.authenticator.refused["revoked"] == 2)
+        with pytest.raises(PermissionError, match="rejects the key of reader"):
+            list(itertools.islice(revoked, 10_000))
+        for _ in range(100):
+            assert other.recv(30) is not None
+        assert other.lost_messages == 0
+    asking.close()
+
+
+def test_client_with_other_rights_has_them_at_once(served: Served, folder: Path, tmp_path: Path) -> None:
+    key, endpoint = tmp_path / "pilot.key", served.inputs.endpoint
+    entry = folder / "clients/pilot.pub"
+    message = [
+        b"force/h",
+        msgpack.packb({"v": 1, "t_ns": None, "links": ["x"], "force_n": [1.0], "std_n": [1.0]}),
+    ]
+    connection = Connection.open(zmq.PUB, endpoint, key, {zmq.LINGER: 0})
+
+    def received() -> bool:
+        connection.socket.send_multipart(message)
+        return served.inputs.dropped["unknown_link"] > 0
+
+    served.until(received)
+    entry.write_text(entry.read_text().replace('"control"', '"read"'))
+    served.until(lambda: served.authenticator.refused["no_right"] > 0)
+    served.inputs.dropped.clear()
+    assert not any(received() for _ in range(20))
+    connection.close()
+
+
 def test_all_clients_are_refused_while_the_folder_is_writable_by_others(
     served: Served, folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -291,6 +354,29 @@ def test_garbage_is_refused_and_disturbs_no_client(served: Served, tmp_path: Pat
     assert served.control.refused == 0  # none of it counts as a request
 
 
+def test_bytes_that_are_not_zmtp_3_never_become_messages_without_keys(without_keys: Served) -> None:
+    subscription, request_ = b"\x01contact/", b"\0\x01x"
+    thrown = [
+        *(b"\x01\0" + bytes([len(body) + 1, 0]) + body for body in (subscription, request_)),  # ZMTP 1.0
+        *(random.Random(seed).randbytes(2000) for seed in range(20)),
+    ]
+    endpoints = (
+        *without_keys.publisher.endpoints.values(),
+        without_keys.control.endpoint,
+        without_keys.inputs.endpoint,
+    )
+    with contextlib.ExitStack() as open_still:
+        for data in thrown:
+            for endpoint in endpoints:
+                open_still.enter_context(_throw(endpoint, data))
+        assert request("status", endpoint=without_keys.control.endpoint, key="", timeout_s=30)["answer"] == 42
+        with connect("health/*/*", endpoint=without_keys.live) as messages:
+            assert messages.recv(30) is not None
+        assert without_keys.publisher.subscriptions <= {b"health/", b"service"}
+    assert without_keys.publisher.refused == without_keys.inputs.dropped == {}
+    assert without_keys.control.refused == 0
+
+
 @pytest.mark.parametrize("what", GARBAGE)
 def test_garbage_does_not_disturb_a_daemon_without_keys(without_keys: Served, what: str) -> None:
     with contextlib.ExitStack() as open_still:
@@ -330,7 +416,7 @@ def test_oversized_request_closes_the_connection(without_keys: Served) -> None:
 def test_ipc_needs_no_key(folder: Path, endpoints: dict[str, str]) -> None:
     with zmq.Context() as context:
         authenticator = Authenticator.open(context, folder)
-        publisher = Publisher.open(context, endpoints["live"], endpoints["complete"], authenticator)
+        publisher = Publisher.open(context, endpoints["live"], endpoints["complete"], TOPICS, authenticator)
         control = ControlServer.open(context, endpoints["control"], authenticator)
         control.commands["status"] = lambda _, __: {}
         with context.socket(zmq.REQ) as asker:

@@ -180,12 +180,12 @@ def test_tare_is_refused_with_the_reason(served: Bench, part: float, noise: floa
         part * model.begin_threshold_a[0] / 4 / model.ampere_per_count[0]
     )  # fraction of the begin threshold
     extra = np.random.default_rng(9)
-    job = served.daemon.control.commands["tare"]({"pads": ["plane", "round"]}, served.t_ns)
+    job = served.daemon.control.jobs["tare"]({"pads": ["plane", "round"]}, served.t_ns)
     answer = None
     while answer is None:
         served.counts[0] = counts + noise * extra.normal(size=4)
         served.tick()
-        answer = job.poll(served.t_ns)  # type: ignore[union-attr]
+        answer = job.poll(served.t_ns)
     plane, round_ = answer["pads"]
     assert not plane["tared"]
     assert why in plane["reason"]

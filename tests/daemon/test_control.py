@@ -14,12 +14,15 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from handtouch.daemon.control import (
+    LOOP_FRACTION,
     MAX_JOBS,
+    MAX_JOBS_PER_CLIENT,
     MAX_REQUEST_BYTES,
     ControlServer,
     RefusedError,
 )
 
+MILLISECOND_NS = 1_000_000
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
     lambda inner: (
@@ -46,19 +49,25 @@ class Bench:
 
     def __init__(self) -> None:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.control = ControlServer.open(self.context, "tcp://127.0.0.1:*")
+        self.control = ControlServer.open(self.context, "tcp://127.0.0.1:*", clock=lambda: self.work_ns)
+        self.work_ns = 0
         self.jobs: list[PendingJob] = []
         self.control.commands.update(
             quick=lambda arguments, now_ns: {"arguments": arguments, "now_ns": now_ns},
             refusing=self._refuse,
             failing=lambda _, __: {"x": 1 / 0},
-            long=self._begin,
             unpackable=lambda _, __: {"x": object()},
+            slow=self._work,
         )
+        self.control.jobs["long"] = self._begin
         self.now_ns = 0
 
     def _refuse(self, _: dict[str, Any], __: int) -> dict[str, Any]:
         raise RefusedError("not now")
+
+    def _work(self, _: dict[str, Any], __: int) -> dict[str, Any]:
+        self.work_ns += MILLISECOND_NS
+        return {}
 
     def _begin(self, _: dict[str, Any], __: int) -> PendingJob:
         self.jobs.append(PendingJob())
@@ -71,7 +80,7 @@ class Bench:
         return socket
 
     def poll(self) -> None:
-        self.now_ns += 1
+        self.now_ns += 5 * MILLISECOND_NS
         self.control.poll(self.now_ns)
 
     def answer(self, asker: zmq.Socket[bytes]) -> dict[str, Any]:
@@ -175,7 +184,8 @@ def test_jobs_are_bounded_and_outlive_their_client(bench: Bench) -> None:
         asker.send(msgpack.packb({"v": 1, "command": "long"}))
     while len(bench.jobs) < MAX_JOBS:
         bench.poll()
-    assert "in progress" in bench.ask({"command": "quick"})["error"]
+    assert "long); retry later" in bench.ask({"command": "long"})["error"]
+    assert bench.ask({"command": "quick"})["ok"]
     for asker in askers:
         asker.close()
     for job in bench.jobs:
@@ -183,6 +193,49 @@ def test_jobs_are_bounded_and_outlive_their_client(bench: Bench) -> None:
     bench.poll()
     assert bench.ask({"command": "quick"})["ok"]
     bench.jobs.clear()
+
+
+def test_one_client_does_not_take_the_places_of_all_jobs(bench: Bench) -> None:
+    with bench.asker(zmq.DEALER) as greedy, bench.asker() as other:
+        for _ in range(MAX_JOBS_PER_CLIENT + 1):
+            greedy.send_multipart([b"", msgpack.packb({"v": 1, "command": "long"})])
+        assert "of this client" in bench.answer(greedy)["error"]
+        assert len(bench.jobs) == MAX_JOBS_PER_CLIENT
+        other.send(msgpack.packb({"v": 1, "command": "long"}))
+        while len(bench.jobs) == MAX_JOBS_PER_CLIENT:
+            bench.poll()
+        for job in bench.jobs:
+            job.answer = {}
+        assert bench.answer(other)["ok"]
+    bench.jobs.clear()
+
+
+def test_flood_takes_its_fraction_of_the_loop_and_others_get_their_turn(bench: Bench) -> None:
+    with bench.asker(zmq.DEALER) as flood:
+        for _ in range(500):
+            flood.send_multipart([b"", msgpack.packb({"v": 1, "command": "slow"})])
+        bench.answer(flood)
+        begin_ns, work_ns = bench.now_ns, bench.work_ns
+        for _ in range(5):
+            assert bench.ask({"command": "quick"})["ok"]
+        passed_ns = bench.now_ns - begin_ns
+        assert bench.work_ns - work_ns <= LOOP_FRACTION * passed_ns + 2 * MILLISECOND_NS
+        while flood.poll(1):
+            flood.recv_multipart()
+    bench.now_ns += 10**12
+    bench.poll()
+
+
+def test_message_of_many_parts_is_read_over_many_polls(bench: Bench) -> None:
+    with bench.asker(zmq.DEALER) as stranger:
+        stranger.send_multipart([b"", *[b"x"] * 10_000])
+        polls = itertools.count()
+        while not stranger.poll(1):
+            bench.poll()
+            next(polls)
+        assert "malformed" in msgpack.unpackb(stranger.recv_multipart()[-1])["error"]
+        assert next(polls) >= 10
+    assert bench.ask({"command": "quick"})["ok"]
 
 
 def test_flood_is_answered_a_few_requests_per_poll(bench: Bench) -> None:
@@ -197,18 +250,19 @@ def test_flood_is_answered_a_few_requests_per_poll(bench: Bench) -> None:
             while flood.poll(2):
                 flood.recv_multipart()
                 arrived += 1
-            assert arrived <= 4  # of two polls, if one is slow
+            assert arrived <= 16  # of two polls, if one is slow
             answers += arrived
 
 
 def test_waiting_client_gets_an_error_when_the_daemon_stops() -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     control = ControlServer.open(context, "tcp://127.0.0.1:*")
-    control.commands["long"] = lambda _, __: PendingJob()
+    jobs = [PendingJob()]
+    control.jobs["long"] = lambda _, __: jobs[0]
     with context.socket(zmq.REQ) as asker:
         asker.connect(control.endpoint)
         asker.send(msgpack.packb({"v": 1, "command": "long"}))
-        while not control._jobs:
+        while not jobs[0].polls:
             control.poll(0)
         control.close()
         assert asker.poll(10_000)

@@ -20,12 +20,27 @@ from handtouch.wire import PadState
 
 NOW_NS = 10**9
 PERIOD_NS = 5_000_000
+LINKS = ["plane", "round", "cone", "thumb", "thumb_tip", *(f"link_{number}" for number in range(100))]
+TOPICS = wire.topics_of({"h": LINKS})
+
+
+class Clock:
+    """Time that passes at every poll."""
+
+    now_ns = NOW_NS
+
+    def poll(self, publisher: Publisher) -> None:
+        self.now_ns += 10 * PERIOD_NS
+        publisher.poll_subscriptions(self.now_ns)
+
+
+CLOCK = Clock()
 
 
 @pytest.fixture
 def publisher() -> Iterator[Publisher]:
     with zmq.Context() as context:
-        made = Publisher.open(context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+        made = Publisher.open(context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", TOPICS)
         yield made
         made.close()
 
@@ -39,7 +54,7 @@ def _health(publisher: Publisher, link: str, text: str = "", seq: int = 1) -> wi
 
 def _until(publisher: Publisher, topic: str, subscribed: bool = True) -> None:
     for _ in range(2000):
-        publisher.poll_subscriptions(NOW_NS)
+        CLOCK.poll(publisher)
         if publisher.has_subscriber(topic) == subscribed:
             return
         for socket in publisher._sockets.values():
@@ -72,7 +87,7 @@ def _receive_all(publisher: Publisher, subscriber: Subscriber[Any], least: int) 
     """Return messages until no more arrive, at least `least`."""
     got: list[Any] = []
     for _ in range(1000):
-        publisher.poll_subscriptions(NOW_NS)
+        CLOCK.poll(publisher)
         if (message := subscriber.recv(0.01)) is not None:
             got.append(message)
         elif len(got) >= least:
@@ -120,10 +135,7 @@ def test_late_subscriber_gets_active_contacts_and_the_hand_at_once(
     with connect(*patterns, endpoint=endpoint) as late:
         contact, frame = _receive_all(publisher, late, 2)
         assert (contact.event, contact.id, contact.link, contact.retained) == ("update", 1, "plane", True)
-        assert (contact.session, contact.age_s) == (
-            publisher.session,
-            pytest.approx(-0.02),
-        )  # NOW_NS is before it
+        assert contact.session == publisher.session
         row = columns(frame)
         assert frame.retained
         assert row["state"].tolist() == [1, 0, 0]
@@ -167,7 +179,7 @@ def test_seq_gap_counts_messages_published_while_disconnected(publisher: Publish
         socket.disconnect(endpoint)
         while publisher.has_subscriber("hand/h"):
             assert messages.recv(0.001) is None
-            publisher.poll_subscriptions(NOW_NS)
+            CLOCK.poll(publisher)
         for number in range(1, 8):
             pipeline.tick_without_sync(NOW_NS + number * PERIOD_NS)
         socket.connect(endpoint)
@@ -199,7 +211,7 @@ def test_retained_messages_per_poll_are_bounded(
         max_sent = 0
         while min(map(len, received)) < 100:
             before = encoded
-            publisher.poll_subscriptions(NOW_NS)
+            CLOCK.poll(publisher)
             max_sent = max(max_sent, encoded - before)
             for subscriber, links in zip(subscribers, received, strict=True):
                 while (message := subscriber.recv(0.001)) is not None:
@@ -214,7 +226,7 @@ def test_stalled_subscriber_loses_messages_and_others_do_not(publisher: Publishe
     with connect("health/*/*", endpoint=endpoint, queue=1), connect("health/*/*", endpoint=endpoint) as awake:
         _until(publisher, "health/h/thumb")
         for _ in range(200):  # both have joined when the second subscription has been taken, too
-            publisher.poll_subscriptions(NOW_NS)
+            CLOCK.poll(publisher)
             publisher._sockets["live"].poll(1)
         got = []
         for number in range(count):
@@ -222,6 +234,63 @@ def test_stalled_subscriber_loses_messages_and_others_do_not(publisher: Publishe
             got.append(awake.recv().seq)
         assert got == list(range(1, count + 1))
     assert publisher.congestion_episodes["live"] > 0
+
+
+def test_subscription_flood_is_closed_and_disturbs_no_other_subscriber(publisher: Publisher) -> None:
+    endpoint = publisher.endpoints["live"]
+    with (
+        connect("health/*/*", endpoint=endpoint) as other,
+        zmq.Context() as context,
+        context.socket(zmq.SUB) as flood,
+    ):
+        _until(publisher, "health/h/thumb")
+        flood.setsockopt(zmq.LINGER, 0)
+        flood.setsockopt(zmq.SNDHWM, 0)
+        flood.connect(endpoint)
+        for number in range(5000):
+            flood.subscribe(f"contact/no_such_hand/{number}")
+        sent = 0
+        while publisher.refused["subscription_flood"] < 3:  # it connects again and again
+            flood.poll(0)
+            CLOCK.poll(publisher)
+            sent += 1
+            publisher.send(_health(publisher, "thumb", seq=sent))
+            assert other.recv().seq == sent
+        assert publisher.subscriptions == {b"health/", b"service"}
+        assert other.lost_messages == 0
+        assert publisher.refused["unknown_topic"] < 5000
+
+
+def test_subscriber_that_subscribes_over_and_over_is_closed(publisher: Publisher) -> None:
+    with connect("service", endpoint=publisher.endpoints["live"]) as restless:
+        while not publisher.refused["subscription_flood"]:
+            restless.resubscribe("hand/")
+            restless.recv(0.0001)
+            publisher.poll_subscriptions(CLOCK.now_ns)
+    assert publisher.refused == {"subscription_flood": 1}
+
+
+def test_retained_message_is_sent_once_for_all_who_join_within_its_period(publisher: Publisher) -> None:
+    sent = 0
+
+    def retained(_: int) -> wire.Health:
+        nonlocal sent
+        sent += 1
+        return replace(_health(publisher, "thumb"), retained=True)
+
+    publisher.retained_messages["health/h/thumb"] = retained
+    with ExitStack() as stack:
+        for _ in range(20):
+            joining = stack.enter_context(connect("health/h/thumb", endpoint=publisher.endpoints["live"]))
+            while joining.recv(0.001) is None:
+                CLOCK.now_ns += 10_000_000
+                publisher.poll_subscriptions(CLOCK.now_ns)
+        begin_ns, before = CLOCK.now_ns, sent
+        for _ in range(200):
+            CLOCK.now_ns += 1_000_000
+            joining.resubscribe("health/h/thumb")
+            publisher.poll_subscriptions(CLOCK.now_ns)
+        assert sent - before <= 1 + (CLOCK.now_ns - begin_ns) / 100e6
 
 
 def test_unsubscribing_ends_encoding(publisher: Publisher) -> None:
@@ -233,18 +302,18 @@ def test_unsubscribing_ends_encoding(publisher: Publisher) -> None:
 def test_port_in_use_is_reported_with_a_remedy(publisher: Publisher) -> None:
     taken = publisher.endpoints["live"]
     with zmq.Context() as context, pytest.raises(OSError, match=taken):
-        Publisher.open(context, taken, "tcp://127.0.0.1:*")
+        Publisher.open(context, taken, "tcp://127.0.0.1:*", TOPICS)
 
 
 def test_ipc_endpoint_in_use_is_not_taken_over(endpoints: dict[str, str], tmp_path: Path) -> None:
     with zmq.Context() as others, zmq.Context() as context:
-        first = Publisher.open(others, endpoints["live"], endpoints["complete"])
+        first = Publisher.open(others, endpoints["live"], endpoints["complete"], TOPICS)
         with pytest.raises(OSError, match="another daemon is using it"):
-            Publisher.open(context, endpoints["live"], "tcp://127.0.0.1:*")
+            Publisher.open(context, endpoints["live"], "tcp://127.0.0.1:*", TOPICS)
         first.close()
     with zmq.Context() as context:
         Publisher.open(
-            context, endpoints["live"], endpoints["complete"]
+            context, endpoints["live"], endpoints["complete"], TOPICS
         ).close()  # a stale socket file is no obstacle
         with pytest.raises(OSError, match="create it"):
-            Publisher.open(context, f"ipc://{tmp_path}/absent/live", "tcp://127.0.0.1:*")
+            Publisher.open(context, f"ipc://{tmp_path}/absent/live", "tcp://127.0.0.1:*", TOPICS)

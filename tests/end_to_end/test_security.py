@@ -113,12 +113,11 @@ def test_each_key_grants_its_right(reachable: Reachable, tmp_path: Path) -> None
     assert reachable.ask("pilot")["ok"]
     with connect("service", endpoint=reachable.at("live"), key=reachable.key("reader")) as messages:
         assert messages.recv(START_S) is not None
-    for name, why in (
-        ("reader", "without the right to this endpoint"),
-        ("stranger", "another daemon"),
-    ):
-        with pytest.raises(PermissionError, match=why):
-            reachable.ask(name)
+    assert reachable.ask("reader")["ok"]
+    with pytest.raises(RuntimeError, match='the command needs "control"'):
+        request("disable", endpoint=reachable.at("control"), key=reachable.key("reader"), pads=["*"])
+    with pytest.raises(PermissionError, match="another daemon"):
+        reachable.ask("stranger")
     with pytest.raises(PermissionError, match="requires a key"):
         request("status", endpoint=reachable.at("control"), key="", timeout_s=START_S)
 
@@ -129,8 +128,6 @@ def test_each_key_grants_its_right(reachable: Reachable, tmp_path: Path) -> None
         reachable.ask("late")
     assert reachable.end("run") == 0
     output = reachable.printed("run")
-    refusal = 'client has the right "read", but not "control": reader from 127.0.0.1'
-    assert f"connection refused: {refusal}" in output
     assert "connection refused: client has the key of another daemon" in output
     assert "connection refused: client key is unknown" in output
 
@@ -144,9 +141,11 @@ def test_commands_take_a_key_by_option_and_by_environment(reachable: Reachable) 
     assert '"pads"' in done.stdout, done.stderr
     done = reachable.run_command("status", *control, "--json", HANDTOUCH_KEY=pilot)
     assert '"pads"' in done.stdout, done.stderr
-    done = reachable.run_command("status", *control, HANDTOUCH_KEY=reader)
+    done = reachable.run_command("status", *control, "--json", HANDTOUCH_KEY=reader)
+    assert '"pads"' in done.stdout, done.stderr
+    done = reachable.run_command("tare", *control, HANDTOUCH_KEY=reader)
     assert done.returncode == 1
-    assert "rejects the key of reader" in done.stderr
+    assert 'needs "control"' in done.stderr
     done = reachable.run_command("watch", "service", *live, "--key", reader, "--seconds", "3")
     assert done.returncode == 0, done.stderr
     done = reachable.run_command("watch", "service", *live, "--seconds", "60")
@@ -156,7 +155,6 @@ def test_commands_take_a_key_by_option_and_by_environment(reachable: Reachable) 
 
 def test_garbage_on_raw_sockets_does_not_stop_ticks(reachable: Reachable) -> None:
     reachable.start("run")
-    before = reachable.ask("pilot")["service"]["ticks"]
     with (
         connect("hand/*", endpoint=reachable.at("live"), key=reachable.key("reader"), queue=100_000) as hands,
         ExitStack() as open_still,
@@ -169,7 +167,7 @@ def test_garbage_on_raw_sockets_does_not_stop_ticks(reachable: Reachable) -> Non
                 )
                 with suppress(OSError):  # it may hang up on us
                     thrown.sendall(data)
-        assert reachable.ask("pilot")["service"]["ticks"] > before
+        assert reachable.ask("pilot")["ok"]
         seen = [first.tick, *(hands.recv().tick for _ in range(100))]
         assert seen == list(range(first.tick, first.tick + 101))
         assert hands.lost_messages == 0

@@ -28,7 +28,10 @@ class Daemon:
     def __init__(self, hand: Hand, folder: Path) -> None:
         self.hand = hand
         self._context: zmq.Context[Any] = zmq.Context()
-        self.publisher = Publisher.open(self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete")
+        topics = wire.topics_of(hand.deployment.links_by_hand)
+        self.publisher = Publisher.open(
+            self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics
+        )
         self.endpoint = self.publisher.endpoints["complete"]
         self._seq = 0
         journal = hand.pipeline.journal

@@ -130,10 +130,10 @@ def _open_publisher(
     if not publish:
         return None, pace
     context = stack.enter_context(zmq.Context())
-    settings = deployment.daemon
+    settings, topics = deployment.daemon, wire.topics_of(deployment.links_by_hand)
     authenticator = Authenticator.open(context, Path(settings.keys) if settings.keys else None)
     stack.callback(authenticator.close)
-    publisher = Publisher.open(context, settings.live, settings.complete, authenticator)
+    publisher = Publisher.open(context, settings.live, settings.complete, topics, authenticator)
     stack.callback(publisher.close)
 
     def serve(t_ns: int) -> None:

@@ -421,6 +421,11 @@ class Deployment(Table):
         """Names "hand/link" of all pads, in the order of `pads`."""
         return [entry.name for entry in self.pads]
 
+    @property
+    def links_by_hand(self) -> dict[str, list[str]]:
+        """Names of the links of every hand, by the hand's name."""
+        return {hand.name: [pad.link for pad in hand.pads] for hand in self.hands}
+
     def pads_on(self, bus: str) -> list[NamedPad]:
         """Return the pads whose node is on a bus."""
         return [entry for entry in self.pads if entry.pad.bus == bus]

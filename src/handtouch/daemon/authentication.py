@@ -8,6 +8,7 @@ thread for them would compete with the tick for the interpreter lock.
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 from collections import Counter
@@ -19,6 +20,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from handtouch.client import keys
 from handtouch.daemon.cause_counter import CauseCounter
+from handtouch.daemon.connections import client_key_of, close_connection, connection_of
 from handtouch.daemon.endpoints import is_readable
 
 REFUSAL_CAUSES = {
@@ -27,16 +29,20 @@ REFUSAL_CAUSES = {
     "unknown_key": "client key is unknown",
     "no_right": 'client has the right "read", but not "control"',
     "malformed": "peer doesn't speak ZMTP, or disconnected during the handshake",
+    "revoked": "client is no longer authorised, or has other rights; its connection is closed",
 }
 """Causes of refused connections: name of the counter -> description."""
 
 _ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 _POLL_PERIOD_NS = 10_000_000
+_CLIENT_FILES_PERIOD_NS = 1_000_000_000
+"""Time after which a revoked client is disconnected at the latest"""
 _MAX_HANDSHAKES_PER_POLL = 2
 _MAX_EVENTS_PER_POLL = 100
+_NO_DESCRIPTOR_LEFT = (errno.EMFILE, errno.ENFILE)  # this says nothing about the clients
 _HANDSHAKE_TIMEOUT_MS = 5000
 """A connection that isn't authenticated by then is closed."""
-_MAX_MESSAGE_BYTES = {"read": 4096, "control": 1_000_000, "inputs": 65_536}
+_MAX_MESSAGE_BYTES = {"read": 1024, "control": 200_000, "inputs": 65_536}
 """Largest message that a client may send; on the streams clients send subscriptions only."""
 _HANDSHAKE_FAILURE_EVENTS = (
     zmq.Event.HANDSHAKE_FAILED_NO_DETAIL | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
@@ -51,7 +57,8 @@ class Authenticator:
     """Controls access to the sockets of one context; `poll` it after every tick.
 
     `refused` counts connections by cause (`REFUSAL_CAUSES`). Without keys (`open` without a folder) any
-    client may connect, and only the size limits apply. Client files are read again when they change.
+    client that speaks ZMTP 3 may connect, and only the size limits apply. Client files are read again when
+    they change, and the connections of clients that are no longer authorised closed.
     """
 
     def __init__(
@@ -63,12 +70,13 @@ class Authenticator:
         self._refusals = CauseCounter(_log, "connection refused", REFUSAL_CAUSES)
         self._context, self._folder, self._zap = context, folder, zap
         self._monitors: list[zmq.Socket[bytes]] = []
-        self._last_poll_ns = 0
+        self._last_poll_ns = self._client_files_read_ns = 0
+        self._connections: dict[int, tuple[keys.AuthorisedClient, str]] = {}  # descriptor -> client, endpoint
         self._clients: dict[str, keys.AuthorisedClient] = {}
         self._folder_fingerprint: object = None
         if folder is not None:
             self._key = keys.load_server(folder)
-            self._reload_clients()
+            self._reload_clients(0)
 
     @classmethod
     def open(cls, context: zmq.Context[zmq.Socket[bytes]], folder: Path | None = None) -> Authenticator:
@@ -93,14 +101,17 @@ class Authenticator:
         return self._refusals.counts
 
     def secure_socket(self, socket: zmq.Socket[bytes], endpoint: str, right: str) -> None:
-        """Limit message sizes of a socket before it is bound; over TCP, require keys with the given right."""
+        """Limit message sizes of a socket before it is bound; over TCP, require ZMTP 3 and any keys."""
         socket.setsockopt(zmq.MAXMSGSIZE, _MAX_MESSAGE_BYTES[right])
         socket.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_TIMEOUT_MS)
-        if self._folder is None or not endpoint.startswith("tcp://"):
+        if not endpoint.startswith("tcp://"):
+            return
+        # with a domain, ZeroMQ refuses the protocol before ZMTP 3, as which it would accept any bytes
+        socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
+        if self._folder is None:
             return
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self._key.secret_key.encode())
-        socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
         address = f"inproc://refused-{len(self._monitors)}"
         socket.monitor(address, _HANDSHAKE_FAILURE_EVENTS)
         monitor: zmq.Socket[bytes] = self._context.socket(zmq.PAIR)
@@ -114,6 +125,8 @@ class Authenticator:
         if self._zap is None or now_ns - self._last_poll_ns < _POLL_PERIOD_NS:
             return
         self._last_poll_ns = now_ns
+        if now_ns - self._client_files_read_ns >= _CLIENT_FILES_PERIOD_NS:
+            self._reload_clients(now_ns)
         for _ in range(_MAX_HANDSHAKES_PER_POLL):
             if not is_readable(self._zap):
                 break
@@ -128,6 +141,24 @@ class Authenticator:
                 cause = {_ZMTP_MECHANISM_MISMATCH: "no_key", _ZMTP_CRYPTOGRAPHIC: "wrong_server_key"}
                 self._refusals.add(cause.get(value, "malformed"), "", now_ns)
 
+    def authorise(self, frame: zmq.Frame, right: str, endpoint: str, now_ns: int) -> bool:
+        """Return True if the sender of a frame that was received at an endpoint has a right.
+
+        A client without keys, where none are required, has every right. The connection of a client whose key
+        is no longer authorised is closed.
+        """
+        if self._folder is None or not endpoint.startswith("tcp://"):
+            return True
+        key, connection = client_key_of(frame), connection_of(frame)
+        if key is None:
+            return False
+        client = self._clients.get(key)
+        if client is None:
+            self._close_revoked(connection, f"key {key}", endpoint, now_ns)
+            return False
+        self._connections[connection] = client, endpoint
+        return right == "read" or client.rights == "control"
+
     def close(self) -> None:
         """Close the authentication sockets; call it after the secured sockets are closed."""
         for monitor in self._monitors:
@@ -138,28 +169,37 @@ class Authenticator:
     def _answer_zap_request(self, request: list[bytes], now_ns: int) -> list[bytes]:
         """Return the reply to a request of ZeroMQ's authentication protocol (RFC 27)."""
         version, number, right, address, _, mechanism, *credentials = request
-        self._reload_clients()
+        self._reload_clients(now_ns)
         key = z85.encode(credentials[0]).decode() if mechanism == b"CURVE" else ""
         client = self._clients.get(key)
         user, origin = b"", f"from {address.decode('ascii', 'replace')}"
         if client is None:
             self._refusals.add("unknown_key", f"{key} {origin}", now_ns)
-        elif right in (b"control", b"inputs") and client.rights != "control":
+        elif right == b"inputs" and client.rights != "control":
             self._refusals.add("no_right", f"{client.name} {origin}", now_ns)
         else:
-            user = client.name.encode()
+            user = key.encode()
             _log.debug("client %s: connected %s to %s", client.name, origin, right.decode())
         status = (b"200", b"OK") if user else (b"400", b"NO ACCESS")
         return [version, number, *status, user, b""]
 
-    def _reload_clients(self) -> None:
-        """Read the client files again if any of them changed."""
+    def _close_revoked(self, connection: int, client: str, endpoint: str, now_ns: int) -> None:
+        self._connections.pop(connection, None)
+        if close_connection(connection, endpoint):
+            self._refusals.add("revoked", f"{client} at {endpoint}", now_ns)
+
+    def _reload_clients(self, now_ns: int) -> None:
+        """Read the client files again if any of them changed; disconnect clients that are revoked."""
         assert self._folder is not None
+        self._client_files_read_ns = now_ns
         fingerprint = _fingerprint_folder(self._folder)
-        if fingerprint == self._folder_fingerprint:
+        if fingerprint == self._folder_fingerprint or fingerprint in _NO_DESCRIPTOR_LEFT:
             return
         self._folder_fingerprint = fingerprint
         self._clients, problems = keys.load_clients(self._folder)
+        for connection, (client, endpoint) in list(self._connections.items()):
+            if self._clients.get(client.public_key) != client:  # with other rights it may connect again
+                self._close_revoked(connection, client.name, endpoint, now_ns)
         for problem in problems:
             _log.error("client key rejected: %s", problem)
         if not self._clients:
@@ -180,7 +220,7 @@ def _fingerprint_folder(folder: Path) -> object:
         )
         return (*folders, files)
     except OSError as error:
-        return str(error)
+        return error.errno
 
 
 def _fingerprint_file(status: os.stat_result) -> tuple[int, int, int, int]:

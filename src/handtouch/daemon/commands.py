@@ -1,12 +1,13 @@
 """Commands of the control endpoint; each validates its arguments before it changes anything.
 
-Public name: `ControlCommands`.
+Public names: `ControlCommands`, `STATUS_AGE_NS`.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from handtouch.daemon.arguments import parse_arguments
 from handtouch.daemon.control import (
     Command,
     Job,
+    JobCommand,
     RefusedError,
     Reply,
 )
@@ -34,6 +36,8 @@ from handtouch.daemon.tare import TareJob
 from handtouch.host.build import build_info
 from handtouch.host.logs import set_level
 
+STATUS_AGE_NS = 100_000_000
+"""Age up to which a status is returned again, as making it takes milliseconds"""
 _log = logging.getLogger("handtouch.control")
 
 PadPatterns = Annotated[
@@ -91,9 +95,10 @@ class _LogArguments(Table):
 
 
 class ControlCommands:
-    """The daemon's commands, by name in `by_name`; they run in the hot thread, between two ticks.
+    """The daemon's commands, by name in `by_name`, longer ones in `jobs`.
 
-    `read` reads the deployment file again; None if the deployment has no file.
+    They run in the hot thread, between two ticks. `read` reads the deployment file again; None if the
+    deployment has no file.
     """
 
     def __init__(
@@ -110,21 +115,34 @@ class ControlCommands:
         self._demand, self._sampling = demand, sampling
         self._pad_names = demand.scenes.names
         self._reload_job: ReloadJob | None = None
-        self.by_name: dict[str, Command] = {
-            "status": self._status,
-            "snapshot": self._snapshot,
+        self._status_reply: Reply = {}
+        self._status_ns: int | None = None
+        changing: dict[str, Command] = {
             "scene": self._scene,
-            "tare": self._tare,
             "calibrate": self._calibrate,
             "enable": self._enable,
             "disable": self._disable,
-            "reload": self._reload_file,
             "log": self._set_log_level,
         }
+        self.by_name: dict[str, Command] = {
+            "status": self._status,
+            "snapshot": self._snapshot,
+            **{name: partial(self._run_changing, command) for name, command in changing.items()},
+        }
+        self.jobs: dict[str, JobCommand] = {"tare": self._tare, "reload": self._reload_file}
+
+    def _run_changing(self, command: Command, arguments: dict[str, Any], now_ns: int) -> Reply:
+        """Run a command that may change what `status` returns."""
+        self._status_ns = None
+        return command(arguments, now_ns)
 
     def _status(self, arguments: dict[str, Any], now_ns: int) -> Reply:
+        """Return the status, up to `STATUS_AGE_NS` old unless a command was carried out since."""
         parse_arguments(_NoArguments, arguments)
-        return {**self._reporter.status(now_ns), "scene": self._scene_reply(now_ns)}
+        if self._status_ns is None or now_ns - self._status_ns >= STATUS_AGE_NS:
+            self._status_ns = now_ns
+            self._status_reply = {**self._reporter.status(now_ns), "scene": self._scene_reply(now_ns)}
+        return self._status_reply
 
     def _snapshot(self, arguments: dict[str, Any], now_ns: int) -> Reply:
         """Return all hands and contacts now, computed whether requested or not."""
@@ -178,6 +196,7 @@ class ControlCommands:
         return TareJob(self._pad_names, selected, self._pipeline.tick, self._sampling, now_ns, self._on_tared)
 
     def _on_tared(self, pad: int) -> None:
+        self._status_ns = None
         if self._reporter.supervisor is not None:
             self._reporter.supervisor.register_manual_calibration(pad, {"offset_counts"})
 
@@ -265,6 +284,7 @@ class ControlCommands:
 
     def _apply_reload(self, change: DeploymentChange, now_ns: int) -> None:
         """Apply a reloaded deployment completely, between two ticks."""
+        self._status_ns = None
         if change.model is not None:
             change.model.copy_calibrations(self._pipeline.model)
             self._pipeline.replace_model(

@@ -165,7 +165,9 @@ class HandtouchDaemon:
         for rows in robots.pad_rows:
             self.demand.transformable[rows] = True
         commands = ControlCommands(deployment, read, pipeline, self.reporter, self.demand, self.sampling)
-        self.control = ControlServer(*resources.control_socket, commands.by_name)
+        self.control = ControlServer(
+            *resources.control_socket, self.authenticator, commands.by_name, commands.jobs
+        )
         self._stack.callback(self.control.close)
         for source in (pipeline.messages, pipeline.journal, self.reporter):
             resources.retained_messages.update(source.retained_messages())
@@ -231,7 +233,11 @@ class HandtouchDaemon:
         return supervisor
 
     def _refusals(self) -> dict[str, int]:
-        return {**self.authenticator.refused, "request": self.control.refused}
+        return {
+            **self.authenticator.refused,
+            **self.publisher.refused,
+            "request": self.control.refused,
+        }
 
     def run(self, stop: threading.Event, on_tick: Callable[[int], None] = lambda _: None) -> None:
         """Serve until `stop` is set, then end all contacts and stop the nodes.
@@ -483,7 +489,13 @@ def _open_resources(
     session = secrets.randbits(_SESSION_BITS)
     retained: RetainedMessages = {}
     publisher = Publisher.open(
-        context, settings.live, settings.complete, authenticator, session, retained_messages=retained
+        context,
+        settings.live,
+        settings.complete,
+        wire.topics_of(deployment.links_by_hand),
+        authenticator,
+        session,
+        retained_messages=retained,
     )
     opened.callback(publisher.close)
     control_socket = open_control_socket(context, settings.control, authenticator)

@@ -65,7 +65,9 @@ class InputReceiver:
         joints: Mapping[str, JointStateBuffer],
         pads: Sequence[tuple[str, str]],
         on_force_reference: Callable[[ForceReference], object] = lambda _: None,
+        authenticator: Authenticator | None = None,
     ) -> None:
+        self._authenticator = authenticator
         self.endpoint = endpoint
         self.received: Counter[str] = Counter()
         self._socket = socket
@@ -95,7 +97,7 @@ class InputReceiver:
         socket.subscribe("")  # everything, to count misspelt topics
         socket.subscribe(hands_prefix(hand for hand, _ in pads))
         bound = bind_endpoint(socket, endpoint, "the inputs endpoint", authenticator, "inputs")
-        return cls(socket, bound, joints, pads, on_force_reference)
+        return cls(socket, bound, joints, pads, on_force_reference, authenticator)
 
     @property
     def dropped(self) -> Counter[str]:
@@ -112,7 +114,11 @@ class InputReceiver:
         for _ in range(_MAX_MESSAGES_PER_POLL):
             if not is_readable(self._socket):
                 return
-            self.process_message(self._socket.recv_multipart(zmq.NOBLOCK), now_ns)
+            frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            if self._authenticator is None or self._authenticator.authorise(
+                frames[0], "control", self.endpoint, now_ns
+            ):
+                self.process_message([frame.bytes for frame in frames], now_ns)
         self._drops.add("flood", "", now_ns)
 
     def process_message(self, parts: Sequence[bytes], now_ns: int) -> None:

@@ -5,22 +5,35 @@ Public names: `Publisher`, `RetainedMessages`.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import zmq
 
 from handtouch import wire
 from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.cause_counter import CauseCounter
+from handtouch.daemon.connections import close_connection, connection_of
 from handtouch.daemon.endpoints import bind_endpoint, is_readable
+from handtouch.daemon.subscriptions import SUBSCRIPTION_CAUSES, SubscriptionLimits, SubscriptionTable
 
 LIVE_QUEUE_MESSAGES = 64
 """Messages queued for a slow subscriber of the live stream: a few ticks, as the newest matter most."""
 COMPLETE_QUEUE_MESSAGES = 20_000
 """Messages queued on the complete stream: several seconds."""
 _MAX_SUBSCRIPTIONS_PER_POLL = 100
+_QUEUED_SUBSCRIPTIONS = 4
+"""Subscriptions that ZeroMQ takes from a connection at a time, within a call of the hot thread"""
+_RECEIVE_BUFFER_BYTES = 2048
+"""Kernel's buffer of a connection for subscriptions: what a closed connection leaves to be read"""
 _MAX_RETAINED_PER_POLL = 16
 """Retained messages sent per poll, so that many late subscribers don't delay a tick."""
+_REFRESH_PERIOD_NS = 20_000_000
+"""Least time between two evaluations of changed subscriptions; the first change is evaluated at once."""
+_RETAINED_PERIOD_NS = 100_000_000
+"""Least time between two retained messages of a topic, which every late subscriber in between receives."""
+_log = logging.getLogger("handtouch.publisher")
 
 RetainedMessages = dict[str, Callable[[int], wire.OutgoingMessage | None]]
 """topic -> function that returns its retained message at a time [ns], None if there is none"""
@@ -30,27 +43,33 @@ class Publisher:
     """Two XPUB sockets with the same topics; never blocks, counts how often a queue was found full.
 
     `endpoints` (stream -> endpoint as bound, with its real port), `congestion_episodes` (stream -> times
-    that a message found the queue of a subscriber full), `subscriptions` (subscribed prefixes), `session`
-    (identifies this session of the daemon in every message), `retained_messages` (sent to late subscribers;
-    the owner of the mapping may add topics). Created by `open`.
+    that a message found the queue of a subscriber full), `session` (identifies this session of the daemon in
+    every message), `retained_messages` (sent to late subscribers; the owner of the mapping may add topics).
+    Created by `open`.
     """
 
     def __init__(
         self,
         sockets: Mapping[str, zmq.Socket[bytes]],
         endpoints: Mapping[str, str],
+        topics: Iterable[str],
+        authenticator: Authenticator,
         session: int,
         retained_messages: RetainedMessages | None = None,
     ) -> None:
         self.session = session
         self.retained_messages: RetainedMessages = {} if retained_messages is None else retained_messages
         self.congestion_episodes: Counter[str] = Counter(live=0, complete=0)
-        self.subscriptions: frozenset[bytes] = frozenset()
         self.endpoints = dict(endpoints)
         self._sockets = dict(sockets)
-        self._prefixes: dict[str, set[bytes]] = {stream: set() for stream in sockets}
+        self._authenticator = authenticator
+        self._table = SubscriptionTable(topics, sockets)
+        self._limits = SubscriptionLimits(len(self._table.topics))
+        self._refusals = CauseCounter(_log, "subscription refused", SUBSCRIPTION_CAUSES)
+        self._refreshed_ns: int | None = None
+        self._new_prefixes: dict[tuple[str, bytes], None] = {}  # since the last refresh
         self._pending_retained: dict[tuple[str, str], None] = {}  # (stream, topic), in order of subscription
-        self._is_subscribed: dict[str, bool] = {}
+        self._retained_ns: dict[tuple[str, str], int] = {}
         self._held: list[list[bytes]] | None = None
 
     @classmethod
@@ -59,11 +78,15 @@ class Publisher:
         context: zmq.Context[zmq.Socket[bytes]],
         live: str,
         complete: str,
+        topics: Iterable[str],
         authenticator: Authenticator | None = None,
         session: int = 0,
         retained_messages: RetainedMessages | None = None,
     ) -> Publisher:
-        """Bind both streams. Raises OSError naming the endpoint that can't be bound and a remedy."""
+        """Bind both streams, for all `topics` that will be sent.
+
+        Raises OSError naming the endpoint that can't be bound and a remedy.
+        """
         authenticator = authenticator or Authenticator(context)
         sockets: dict[str, zmq.Socket[bytes]] = {}
         endpoints: dict[str, str] = {}
@@ -73,6 +96,8 @@ class Publisher:
         ):
             socket: zmq.Socket[bytes] = context.socket(zmq.XPUB)
             socket.setsockopt(zmq.SNDHWM, queue)
+            socket.setsockopt(zmq.RCVHWM, _QUEUED_SUBSCRIPTIONS)
+            socket.setsockopt(zmq.RCVBUF, _RECEIVE_BUFFER_BYTES)
             socket.setsockopt(zmq.LINGER, 200)  # the ends of contacts are still sent at shutdown
             socket.setsockopt(zmq.XPUB_NODROP, 1)
             socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # every new subscriber gets the retained messages
@@ -87,36 +112,34 @@ class Publisher:
                     bound.close()
                 raise
             sockets[stream] = socket
-        return cls(sockets, endpoints, session, retained_messages)
+        return cls(sockets, endpoints, topics, authenticator, session, retained_messages)
+
+    @property
+    def subscriptions(self) -> frozenset[bytes]:
+        """Subscribed prefixes of the daemon's topics."""
+        return self._table.prefixes
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Refused subscriptions by cause."""
+        return self._refusals.counts
 
     def poll_subscriptions(self, now_ns: int) -> None:
         """Read subscription changes; send retained messages to new subscribers, from the next poll on."""
         if self._pending_retained:  # by now a tick has computed what nothing was subscribed to before
             self._send_retained(now_ns)
         for stream, socket in self._sockets.items():
-            for _ in range(_MAX_SUBSCRIPTIONS_PER_POLL):  # a flood of requests must not stop the tick
-                if not is_readable(socket):
-                    break
-                request = socket.recv(zmq.NOBLOCK)
-                prefix = request[1:]
-                if request[:1] == b"\x01":
-                    self._prefixes[stream].add(prefix)
-                    topics = (topic for topic in self.retained_messages if topic.encode().startswith(prefix))
-                    self._pending_retained.update({(stream, topic): None for topic in topics})
-                elif request[:1] == b"\x00":
-                    self._prefixes[stream].discard(prefix)
-                else:
-                    continue  # not a subscription: subscribers can send nothing else
-                self.subscriptions = frozenset().union(*self._prefixes.values())
-                self._is_subscribed.clear()
+            if is_readable(socket):
+                self._read_subscriptions(stream, socket, now_ns)
+        if not (self._table.changed or self._new_prefixes):
+            return
+        if self._refreshed_ns is None or now_ns - self._refreshed_ns >= _REFRESH_PERIOD_NS:
+            self._refreshed_ns = now_ns
+            self._refresh()
 
     def has_subscriber(self, topic: str) -> bool:
         """Return True if any client subscribed to a prefix of the topic."""
-        subscribed = self._is_subscribed.get(topic)
-        if subscribed is None:
-            subscribed = any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
-            self._is_subscribed[topic] = subscribed
-        return subscribed
+        return self._table.has_subscriber(topic)
 
     def send(self, message: wire.OutgoingMessage) -> None:
         """Send a message if its topic has a subscriber."""
@@ -145,21 +168,63 @@ class Publisher:
         for socket in self._sockets.values():
             socket.close()
 
+    def _read_subscriptions(self, stream: str, socket: zmq.Socket[bytes], now_ns: int) -> None:
+        for _ in range(_MAX_SUBSCRIPTIONS_PER_POLL):  # a flood of requests must not stop the tick
+            try:
+                frame = socket.recv(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            request = frame.bytes
+            kind, prefix = request[:1], request[1:]
+            if kind == b"\x01":
+                self._subscribe(stream, prefix, frame, now_ns)
+            elif kind == b"\x00":  # by the last subscriber to the prefix
+                self._table.remove(stream, prefix)
+
+    def _subscribe(self, stream: str, prefix: bytes, frame: zmq.Frame, now_ns: int) -> None:
+        endpoint = self.endpoints[stream]
+        if not self._authenticator.authorise(frame, "read", endpoint, now_ns):
+            return
+        known, connection = self._table.is_known(prefix), connection_of(frame)
+        if known:
+            self._table.add(stream, prefix)
+            self._new_prefixes[stream, prefix] = None
+        else:
+            self._refusals.add("unknown_topic", f"{prefix!r:.80}", now_ns)
+        if not self._limits.allow(connection, known, now_ns) and close_connection(connection, endpoint):
+            self._refusals.add("subscription_flood", f"{stream}, last prefix {prefix!r:.80}", now_ns)
+
+    def _refresh(self) -> None:
+        """Evaluate the changes of subscriptions, and note what late subscribers are to receive."""
+        if self._table.changed:
+            self._table.refresh()
+        for stream, prefix in self._new_prefixes:
+            for topic in self._table.topics_under(prefix):
+                if topic in self.retained_messages:
+                    self._pending_retained[stream, topic] = None
+        self._new_prefixes.clear()
+
     def _send_all(self, messages: list[list[bytes]]) -> None:
         for stream, socket in self._sockets.items():
-            prefixes = tuple(self._prefixes[stream])
             for parts in messages:
-                if parts[0].startswith(prefixes):
+                if self._table.has_subscriber_on(stream, parts[0]):
                     self._try_send(stream, socket, parts)
 
     def _send_retained(self, now_ns: int) -> None:
+        due = [key for key in self._pending_retained if self._is_retained_due(key, now_ns)]
         sent = 0
-        while self._pending_retained and sent < _MAX_RETAINED_PER_POLL:
-            stream, topic = next(iter(self._pending_retained))
+        for stream, topic in due:
+            if sent == _MAX_RETAINED_PER_POLL:
+                return
             del self._pending_retained[stream, topic]
             if (message := self.retained_messages[topic](now_ns)) is not None:
+                self._retained_ns[stream, topic] = now_ns
                 self._try_send(stream, self._sockets[stream], wire.encode(message))
                 sent += 1
+
+    def _is_retained_due(self, key: tuple[str, str], now_ns: int) -> bool:
+        sent_ns = self._retained_ns.get(key)
+        return sent_ns is None or now_ns - sent_ns >= _RETAINED_PERIOD_NS
 
     def _try_send(self, stream: str, socket: zmq.Socket[bytes], parts: list[bytes]) -> None:
         try:

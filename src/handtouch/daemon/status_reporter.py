@@ -311,7 +311,7 @@ class StatusReporter:
             pid=os.getpid(),
             uptime_s=(now_ns - self._started_ns) * 1e-9,
             period_s=self._deployment.daemon.sync_period_ms * 1e-3,
-            hands={hand.name: [pad.link for pad in hand.pads] for hand in self._deployment.hands},
+            hands=self._deployment.links_by_hand,
             ticks=self._pipeline.ticks,
             overruns=self._sync.overruns,
             rate_hz=self._rates_hz.get("ticks", 0.0),

@@ -27,6 +27,7 @@ from handtouch.wire.topics import (
     OutgoingMessage,
     Topic,
     topic_of,
+    topics_of,
 )
 
 __all__ = [
@@ -65,4 +66,5 @@ __all__ = [
     "encode",
     "to_map",
     "topic_of",
+    "topics_of",
 ]

@@ -13,6 +13,8 @@ Vector3 = tuple[float, float, float]
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
 
 PERCEPT_KINDS = ("motion", "stiffness", "shape", "texture")
+ACTION_REQUEST = "action_request"
+"""Kind of percept that requests an action of the robot"""
 """Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
 
 

@@ -1,19 +1,19 @@
 """The table of topics: payload, keys and rate of each; everything else about topics is derived from it.
 
-Public names: `Topic`, `TOPICS`, `COLUMNS`, `HEALTH`, `JOINTS`, `SERVICE`, `topic_of`, `EncodedMessage`,
-`Message`, `OutgoingMessage`.
+Public names: `Topic`, `TOPICS`, `COLUMNS`, `HEALTH`, `JOINTS`, `SERVICE`, `topic_of`, `topics_of`,
+`EncodedMessage`, `Message`, `OutgoingMessage`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, cast
 
 from handtouch.wire.columns import Column, columns_of
-from handtouch.wire.contact import Contact, HandFrame, Percept
+from handtouch.wire.contact import ACTION_REQUEST, PERCEPT_KINDS, Contact, HandFrame, Percept
 from handtouch.wire.health import Health, JointPositions
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.service import Service
@@ -106,6 +106,17 @@ COLUMNS: dict[type[Any], dict[str, Column]] = {
 }
 """Payload -> its columns by name."""
 _FORMATTERS = {topic.payload: topic.formatter() for topic in TOPICS}
+
+
+def topics_of(hands: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return all topics of a daemon with these hands (name -> its links)."""
+    values: dict[tuple[str, ...], list[tuple[str, ...]]] = {
+        (): [()],
+        ("hand",): [(hand,) for hand in hands],
+        ("hand", "link"): [(hand, link) for hand, links in hands.items() for link in links],
+        ("hand", "kind"): [(hand, kind) for hand in hands for kind in (*PERCEPT_KINDS, ACTION_REQUEST)],
+    }
+    return ["/".join([topic.prefix, *keys]) for topic in TOPICS for keys in values[topic.keys]]
 
 
 def topic_of(message: OutgoingMessage) -> str:
