@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,3 +32,15 @@ def test_campaign_of_one_fault_of_each_kind_leaves_nothing_behind(tmp_path: Path
     assert all(row["reported"] in (None, row["number"]) for row in results["kinds"])
     assert results["samples_sent"] > 5000
     assert results["samples_lost"] == len(results["exceptions"]) == results["exit_status"] == 0
+
+def test_two_nodes_with_one_id_are_logged_as_errors(rig: Any) -> None:
+    """All 15 ids are used twice; the limit of repeated messages lets the decisive line of each pad pass."""
+    rig.simulate()
+    rig.start("run")
+    rig.wait_operational()
+    rig.processes["first"] = rig.processes.pop("simulate")
+    rig.simulate()
+    rig.wait("all faulted", lambda status: all(pad["node_state"] == "faulted" for pad in status["pads"]))
+    errors = [line for line in rig.printed("run").splitlines() if line.startswith("ERROR")]
+    named = {line.split("(")[1].split(")")[0] for line in errors if "duplicate node id" in line}
+    assert len(named) == 15, rig.printed("run")
