@@ -237,9 +237,9 @@ def test_missing_and_swapped_nodes_are_reported_with_their_location(wire: Virtua
     expected = deployment(wire)
     found = problems(expected, scan_buses(expected.buses, QUICK))
     assert found[0x11] == (
-        "another device: serial number is 1002, configured is 1001; serial 1001 is that of node 18 on can0"
+        "identity mismatch: serial number is 1002, configured is 1001; serial 1001 is that of node 18 on can0"
     )
-    assert found[0x12].startswith("another device: serial number is 1001")
+    assert found[0x12].startswith("identity mismatch: serial number is 1001")
     assert found[0x13] == "missing: no frame received, no SDO response"
 
 
@@ -247,7 +247,7 @@ def test_node_of_another_kind_is_reported(wire: VirtualBus) -> None:
     started(wire, 1)
     expected = deployment(wire, 1, ("drive_v", "product_code = 7\ndrive_v"))
     assert problems(expected, scan_buses(expected.buses, QUICK)) == {
-        0x11: "another device: product code is 1025, configured is 7"
+        0x11: "identity mismatch: product code is 1025, configured is 7"
     }
 
 
@@ -274,7 +274,7 @@ def test_duplicate_node_ids_are_reported(wire: VirtualBus) -> None:
     nodes.add_twin(0x11, serial=1999)
     nodes.start()
     found = problems(None, scan_buses([wire.bus], QUICK))
-    assert found == {0x11: "two nodes with this id: serial numbers 1001 and 1999"}
+    assert found == {0x11: "duplicate node id: serial numbers 1001 and 1999"}
 
 
 def test_several_buses_are_scanned_together() -> None:
@@ -294,7 +294,7 @@ def test_duplicate_cob_ids_are_reported(wire: VirtualBus) -> None:
     for data in ([0x23, 0x01, 0x18, 0x01, 0x91, 0x02, 0, 0x80], [0x23, 0x01, 0x18, 0x01, 0x91, 0x02, 0, 0]):
         wire.listener.send(can.Message(arbitration_id=0x612, data=data, is_extended_id=False))
     (report,) = scan_buses([wire.bus], QUICK)
-    assert report.problems == ["can0: identifier 0x291 is used by TPDO2 of node 17 and TPDO2 of node 18"]
+    assert report.problems == ["can0: COB-ID 0x291 is used by TPDO2 of node 17 and TPDO2 of node 18"]
 
 
 def test_reboots_and_emergencies_are_reported(wire: VirtualBus) -> None:
@@ -311,7 +311,12 @@ def test_reboots_and_emergencies_are_reported(wire: VirtualBus) -> None:
     finally:
         end()
     (node,) = compare_nodes(None, [report])
-    assert re.search(r"booted \d+ times; EMCY 0x3100 mains voltage", node.remark)
+    assert re.fullmatch(r"booted \d+ times", node.remark)
+    assert report.nodes[0].emergency.startswith("0x3100 mains voltage")
+    text = scan_text.to_text([report], [node], None, ok=True)
+    lines = text.splitlines()
+    heading, row = (next(line for line in lines if mark in line) for mark in ("NMT state", "0x3100"))
+    assert heading.index("EMCY") == row.index("0x3100 mains voltage")
 
 
 @pytest.mark.parametrize(
@@ -347,6 +352,39 @@ def test_channels_of_other_vendors_nodes_are_found(
 
 
 # Nodes that misbehave
+
+
+def test_a_refused_identity_is_no_mismatch(wire: VirtualBus) -> None:
+    nodes = started(wire, 1)
+    nodes.devices[0x11].fail_sdo[0x1018, 4] = 0x06090011
+    expected = deployment(wire, 1)
+    reports = scan_buses(expected.buses, QUICK)
+    (problem,) = problems(expected, reports).values()
+    assert problem.startswith("identity unknown: serial number (0x1018:04): Code 0x06090011, ")
+    assert problem.endswith("; configured is 1001")
+
+
+def test_an_invalid_sdo_response_is_not_called_a_missing_one(wire: VirtualBus) -> None:
+    """Neither to the probe, whatever its length, nor to a later request."""
+    expected = deployment(wire, 3)
+    ends = [
+        answering(wire, 0x11, lambda _: bytes.fromhex("4310")),
+        answering(wire, 0x12, lambda request: b"\x43\xff\xff" + request[3:]),
+        answering(wire, 0x13, lambda request: b"\x43\0\x10" + bytes(5) if request[1] == 0 else b"\x21" * 8),
+    ]
+    try:
+        reports = scan_buses(expected.buses, QUICK)
+    finally:
+        for end in ends:
+            end()
+    found = problems(expected, reports)
+    probed = "invalid SDO response to the request for 0x1000:00: "
+    assert found[0x11] == f"{probed}43 10"
+    assert found[0x12] == f"{probed}43 ff ff 00 00 00 00 00"
+    assert re.fullmatch(r"reading vendor_id, 0x1018:01: invalid SDO response: .*0x21.*", found[0x13])
+    text = scan_text.to_text(reports, compare_nodes(expected, reports), expected, ok=False)
+    assert text.count("invalid SDO response ") >= 2
+    assert "no SDO response" not in text
 
 
 def answering(wire: VirtualBus, node_id: int, answer: Callable[[bytes], bytes | None]) -> Callable[[], None]:
@@ -529,7 +567,7 @@ def test_text_lists_nodes_traffic_and_problems(wire: VirtualBus, capsys: pytest.
     started(wire, 1)
     assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.3"]) == 0
     output = capsys.readouterr().out
-    assert re.search(r"17 0x11 .*0x401 .*1001 .*0x6401:1 to 4 in TPDO2 \(every SYNC\)", output)
+    assert re.search(r"17 0x11 .*0x401 .*1001 .*0x6401:1 to 4 in TPDO2 \(transmission type 1\)", output)
     assert "heartbeat of node 17" in output
     assert "no problems" in output
 

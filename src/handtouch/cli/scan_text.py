@@ -140,8 +140,8 @@ def _print_bus(console: Console, report: BusReport, comparisons: dict[int, NodeC
     console.print(Text(", ".join(f"{steps[step]} {seconds:.2f} s" for step, seconds in durations.items())))
     nodes = {node.node_id: node for node in report.nodes}
     if nodes or comparisons:
-        columns = ("id", "state", "vendor", "product", "revision", "serial", "name", "channels", "pad", "")
-        table = _make_table(*columns, right=("id", "vendor", "product", "revision", "serial"))
+        columns = ("id", "NMT state", "vendor", "product", "revision", "serial", "name", "channels", "EMCY")
+        table = _make_table(*columns, "pad", "", right=("id", "vendor", "product", "revision", "serial"))
         for node_id in sorted(nodes.keys() | comparisons.keys()):
             node = nodes.get(node_id, NodeFacts(node_id))
             table.add_row(*_node_cells(node, comparisons.get(node_id), "query" in durations))
@@ -156,14 +156,15 @@ def _print_bus(console: Console, report: BusReport, comparisons: dict[int, NodeC
 
 
 def _node_cells(node: NodeFacts, comparison: NodeComparison | None, queried: bool) -> Iterator[Text]:
-    state = node.state or ("silent" if not node.answers else "no heartbeat")
     yield Text(f"{node.node_id} 0x{node.node_id:02X}")
-    yield Text(state)
+    yield Text(node.state or "unknown")
     for value in (node.vendor_id, node.product_code, node.revision):
         yield Text("" if value is None else f"0x{value:X}")
     yield Text("" if node.serial is None else str(node.serial))
     yield Text(node.name)
-    yield Text(_describe_channels(node) if node.answers else "no SDO response" if queried else "not queried")
+    no_response = "invalid SDO response" if node.error else "no SDO response"
+    yield Text(_describe_channels(node) if node.answers else no_response if queried else "not queried")
+    yield Text(node.emergency)
     if comparison is None:
         yield from (Text(), Text())
         return
@@ -184,17 +185,8 @@ def _describe_channels(node: NodeFacts) -> str:
 
 
 def _describe_tpdo(tpdo: TpdoFacts) -> str:
-    kind = tpdo.transmission
-    when = (
-        f"every {kind if kind and kind > 1 else ''} SYNC".replace("  ", " ")
-        if kind is not None and 1 <= kind <= 240
-        else "on change, at SYNC"
-        if kind == 0
-        else "on request"
-        if kind in (252, 253)
-        else "event-driven"
-    )
-    return f"TPDO{tpdo.number} ({when}{'' if tpdo.enabled else ', off'})"
+    kind = "unknown" if tpdo.transmission is None else tpdo.transmission
+    return f"TPDO{tpdo.number} (transmission type {kind}{'' if tpdo.enabled else ', disabled'})"
 
 
 def _traffic_table(report: BusReport) -> Table:

@@ -12,9 +12,11 @@ import select
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from canopen.sdo import SdoAbortedError
 
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import Port
@@ -55,6 +57,7 @@ class NodeFacts:
 
     `state` : NMT state in its heartbeat, empty without a heartbeat
     `answers` : it responds to SDO requests
+    `refused` : identity fields that it refuses to return, with the SDO abort
     `inputs` : number of analogue inputs (0x6401 sub 0)
     `boots` : number of boot-up messages
     `emergency` : text of its latest EMCY message
@@ -70,6 +73,7 @@ class NodeFacts:
     product_code: int | None = None
     revision: int | None = None
     serial: int | None = None
+    refused: Mapping[str, str] = field(default_factory=dict)
     name: str = ""
     hardware: str = ""
     software: str = ""
@@ -91,6 +95,8 @@ class BusSurvey:
         self._clock = clock
         self._identity_values: dict[int, dict[tuple[int, int], set[bytes]]] = {}
         self._responding_ids: set[int] = set()
+        self._probed_ids: set[int] = set()
+        self._invalid_responses: dict[int, bytes] = {}  # of probed nodes
         self._readers: dict[int, SdoTransport] = {}
         self._lss_responses: deque[bytes] = deque()
 
@@ -114,6 +120,7 @@ class BusSurvey:
         """
         ids = list(ids)
         self._responding_ids -= set(ids)
+        self._probed_ids |= set(ids)
         detected = self.traffic.detected_nodes()
         for probed in (ids, [node_id for node_id in ids if node_id in detected]):
             silent = [node_id for node_id in probed if node_id not in self._responding_ids]
@@ -164,10 +171,14 @@ class BusSurvey:
         self.traffic.handle_frame(can_id, data, arrival_ns)
         if can_id == cia301.LSS_RESPONSE:
             self._lss_responses.append(data)
-        elif cia301.SDO_RESPONSE < can_id < cia301.SDO_REQUEST and len(data) == 8:
+        elif cia301.SDO_RESPONSE < can_id < cia301.SDO_REQUEST:
             self._handle_sdo_response(can_id - cia301.SDO_RESPONSE, data)
 
     def _handle_sdo_response(self, node_id: int, data: bytes) -> None:
+        if node_id in self._probed_ids:
+            self._invalid_responses[node_id] = data  # unless a valid one comes
+        if len(data) != _SDO_FRAME.size:
+            return
         command, index, sub, value = _SDO_FRAME.unpack(data)
         if command & 0xE0 in (0x40, 0x80) and (index, sub) == (cia301.DEVICE_TYPE, 0):
             self._responding_ids.add(node_id)
@@ -190,6 +201,9 @@ class BusSurvey:
         assert isinstance(node_id, int)
         state = self.traffic.nmt_states.get(node_id)
         name = "" if state is None else _state_name(state)
+        if node_id in self._invalid_responses and node_id not in self._responding_ids:
+            received = self._invalid_responses[node_id].hex(" ")
+            facts["error"] = f"invalid SDO response to the request for 0x1000:00: {received or 'no data'}"
         return NodeFacts(
             **facts,  # type: ignore[arg-type]
             state=name,
@@ -204,7 +218,7 @@ class BusSurvey:
         for (_, sub), values in sorted(self._identity_values.get(node_id, {}).items(), reverse=True):
             if len(values) > 1:
                 numbers = sorted(int.from_bytes(value, "little") for value in values)
-                return f"two nodes with this id: {names[sub]} {' and '.join(map(str, numbers))}"
+                return f"duplicate node id: {names[sub]} {' and '.join(map(str, numbers))}"
         return ""
 
 
@@ -235,7 +249,7 @@ def _group_entries(pairs: list[tuple[int, int]], by_object: bool) -> Iterator[li
 
 
 def _is_channel_entry(entry: int) -> bool:
-    """Return True if a mapping entry may be a channel: an integer's width, and no dummy entry."""
+    """Return True if a mapping entry may be a channel: a number's width, and no dummy entry."""
     return entry & 0xFF in (8, 16, 24, 32) and entry >> 16 >= 0x2000
 
 
@@ -248,8 +262,7 @@ def _read_node(node_id: int, sdo: NodeSdoClient) -> dict[str, object]:
     facts: dict[str, object] = {"node_id": node_id, "answers": True}
     try:
         facts["device_type"] = _read_integer(sdo, cia301.DEVICE_TYPE, 0)
-        for sub, name in enumerate(("vendor_id", "product_code", "revision", "serial"), 1):
-            facts[name] = _read_integer(sdo, cia301.IDENTITY, sub)
+        _read_identity(sdo, facts)
         facts["heartbeat_ms"] = _read_integer(sdo, cia301.HEARTBEAT_TIME, 0)
         tpdos = facts["tpdos"] = tuple(_read_tpdos(sdo))
         if find_four_channels(tpdos) is None:
@@ -263,6 +276,18 @@ def _read_node(node_id: int, sdo: NodeSdoClient) -> dict[str, object]:
     except BootStepError as error:
         facts["error"] = str(error)
     return facts
+
+
+def _read_identity(sdo: NodeSdoClient, facts: dict[str, object]) -> None:
+    """Read 0x1018 into `facts`; fields that the node refuses are in `refused`."""
+    facts["refused"] = refused = dict[str, str]()
+    for sub, name in enumerate(("vendor_id", "product_code", "revision", "serial"), 1):
+        try:
+            facts[name] = sdo.read(cia301.IDENTITY, sub, name) & 0xFFFFFFFF
+        except BootStepError as error:
+            if not isinstance(error.__cause__, SdoAbortedError):
+                raise
+            refused[name] = str(error.__cause__)
 
 
 def _read_tpdos(sdo: NodeSdoClient) -> Iterator[TpdoFacts]:
@@ -296,11 +321,11 @@ def _read_integer(sdo: NodeSdoClient, index: int, sub: int) -> int | None:
 
 
 def _read_object(sdo: NodeSdoClient, index: int, sub: int) -> int | None:
-    """Read an object of any length; None if the node refuses. Raises BootStepError after a timeout."""
+    """Read an object of any length; None if the node refuses. Raises BootStepError for no valid response."""
     try:
         return sdo.read(index, sub, "an object")
     except BootStepError as error:
-        if error.timed_out:
+        if not isinstance(error.__cause__, SdoAbortedError):
             raise
         return None
 

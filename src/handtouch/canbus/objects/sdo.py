@@ -7,6 +7,7 @@ responses on from the receiving thread.
 
 from __future__ import annotations
 
+import queue
 import time
 from collections.abc import Callable
 
@@ -135,7 +136,13 @@ class SdoTransport:
                 raise BootStepError(f"{description}: refused by the node ({error})") from error
             except SdoCommunicationError as error:
                 if self._responded:
-                    raise BootStepError(f"{description}: {error}") from error
+                    silent = isinstance(error.__context__, queue.Empty)
+                    cause = (
+                        f"no answer within {self._timeout_s * 1e3:.0f} ms after the first segments"
+                        if silent
+                        else f"invalid SDO response: {error}"
+                    )
+                    raise BootStepError(f"{description}: {cause}") from error
                 timeout = error
             finally:
                 self.awaiting_response = False

@@ -129,7 +129,7 @@ def _cob_id_conflicts(report: BusReport) -> Iterator[str]:
                 users.setdefault(tpdo.cob_id, []).append(f"TPDO{tpdo.number} of node {node.node_id}")
     for cob_id, names in users.items():
         if len(names) > 1:
-            yield f"{report.bus.name}: identifier 0x{cob_id:X} is used by {' and '.join(names)}"
+            yield f"{report.bus.name}: COB-ID 0x{cob_id:X} is used by {' and '.join(names)}"
 
 
 def _listen(survey: BusSurvey, seconds: float, report: BusReport) -> None:

@@ -87,9 +87,8 @@ def _compare_bus(
 
 
 def _describe_events(node: NodeFacts) -> str:
-    """Describe a node's boot-ups and emergency message during the scan."""
-    booted = f"booted {node.boots} times" if node.boots > 1 else ""
-    return "; ".join(filter(None, (booted, node.emergency and f"EMCY {node.emergency}")))
+    """Describe a node's boot-ups during the scan."""
+    return f"booted {node.boots} times" if node.boots > 1 else ""
 
 
 def _names_by_serial(deployment: config.Deployment | None) -> dict[int, str]:
@@ -100,13 +99,20 @@ def _names_by_serial(deployment: config.Deployment | None) -> dict[int, str]:
 
 def _describe_mismatch(node: NodeFacts, pad: config.Pad, kind: config.Node) -> str:
     """Describe in what a node differs from its configuration; empty if it doesn't."""
-    for quantity, found, configured in (
-        ("vendor id", node.vendor_id, kind.vendor_id),
-        ("product code", node.product_code, kind.product_code),
-        ("serial number", node.serial, pad.serial),
+    for sub, quantity, key, found, configured in (
+        (1, "vendor id", "vendor_id", node.vendor_id, kind.vendor_id),
+        (2, "product code", "product_code", node.product_code, kind.product_code),
+        (3, "revision", "revision", node.revision, kind.revision),
+        (4, "serial number", "serial", node.serial, pad.serial),
     ):
-        if configured is not None and found != configured:
-            return f"another device: {quantity} is {found}, configured is {configured}"
+        if configured is None or found == configured:
+            continue
+        if found is None:
+            return (
+                f"identity unknown: {quantity} (0x1018:{sub:02}): {node.refused.get(key, 'not read')}; "
+                f"configured is {configured}"
+            )
+        return f"identity mismatch: {quantity} is {found}, configured is {configured}"
     carried = {(entry >> 16, entry >> 8 & 0xFF) for tpdo in node.tpdos for entry in tpdo.mapping}
     missing = [text for text in kind.channels if channels.parse_object(text)[:2] not in carried]
     if missing and not kind.allow_pdo_remapping:
