@@ -33,6 +33,7 @@ from handtouch.simulate.sheet_solver import (
 )
 from handtouch.simulate.stimulus import PadStimulus
 from handtouch.simulate.torn_sheet import cut_sheet_maps, is_beyond_cut
+from handtouch.simulate.uneven_sheet import Unevenness
 
 FloatArray = NDArray[np.float64]
 _MIN_FORCE_N = 1e-6  # avoids a division by 0
@@ -77,6 +78,7 @@ class PadCircuit:
     shape: SimulatedSurface
     gaps: ElectrodeGaps
     maps: SheetMaps
+    unevenness: Unevenness
     sheet: config.Sheet
     series_ohm: FloatArray
     drive_v: float
@@ -160,7 +162,6 @@ class PadCircuit:
         rows: NDArray[np.intp],
     ) -> FloatArray:
         """Return the currents (n, 4) that contacts cause in the amplifiers at the times `rows`."""
-        sheet_ohm = self.sheet.ohm_per_square
         shares, own = [], []
         for contact in contacts:
             at = rows[:1] if contact.is_static else rows
@@ -168,13 +169,14 @@ class PadCircuit:
             values, _ = look_up_patches(bank, sheet, contact.position[:, at], contact.focus[:, at])
             shares.append(np.broadcast_to(values[:4].T, (len(rows), 4)))
             spreading = np.maximum(values[4] - np.log(contact.radius_m[rows]), 0.0)
-            own.append(contact.contact_ohm[rows] + sheet_ohm / (2 * math.pi) * spreading)
+            local_ohm = self._local_ohm(contact.position[:, rows])
+            own.append(contact.contact_ohm[rows] + local_ohm / (2 * math.pi) * spreading)
         phi = np.stack(shares, axis=1)  # (n, k, 4)
         ohm = phi @ circuit.impedance_ohm @ phi.transpose(0, 2, 1)
         number = np.arange(len(contacts))
         ohm[:, number, number] += np.stack(own, axis=1)
         if len(contacts) > 1:
-            ohm += sheet_ohm * self._mutual_ohm(contacts, rows)
+            ohm += self.sheet.ohm_per_square * self._mutual_ohm(contacts, rows)
         volt = self.drive_v - phi @ circuit.idle_v
         current = volt / ohm[:, 0] if len(contacts) == 1 else np.linalg.solve(ohm, volt[:, :, None])[:, :, 0]
         return np.asarray(np.einsum("nk,nki->ni", current, phi) @ circuit.share_to_channel.T)
@@ -251,12 +253,17 @@ class PadCircuit:
         own[on] = contact_layer_ohm(
             force_n[on],
             radius_m[on],
-            sheet.ohm_per_square,
+            self._local_ohm(position[:, on]),
             1e-6 * sheet.contact_ohm_mm2,
             1e3 * sheet.reference_kpa,
             sheet.alpha,
         )
         return _ContactSeries(position, equivalent_m, focus, own, is_static)
+
+    def _local_ohm(self, position: FloatArray) -> FloatArray | float:
+        """Return the sheet resistance at positions (2, n): (n,), or () on an even sheet."""
+        nominal = self.sheet.ohm_per_square
+        return nominal if self.unevenness.is_even else nominal * self.unevenness.ohm_ratio(position)
 
     def patch_on_sheet(self, position: FloatArray, patch: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return equivalent radii (n,) [m], and foci (2, n) as fractions, of patches (3, n) [m]."""

@@ -144,7 +144,7 @@ class VirtualHand:
         equivalent_m, focus = self._patches_on_sheets(pads, position, patch)
         values, slopes = look_up_patches(self._bank, rows, position, focus)
         shares, log_ratio = values[:4].T, values[4] - np.log(equivalent_m)
-        collected, total = self._circuits.solve_contacts(rows, shares, log_ratio, force, patch[0])
+        collected, total = self._circuits.solve_contacts(rows, position, shares, log_ratio, force, patch[0])
         by_position = self._circuits.share_to_channel[rows] @ slopes[:4].transpose(2, 0, 1)
         jacobian = np.concatenate([total[:, None, None] * by_position, collected[:, :, None]], axis=2)
         return total[:, None] * collected, jacobian
@@ -209,10 +209,13 @@ class _HealthyCircuits:
         self._impedance_ohm = np.array([circuit.impedance_ohm for circuit in circuits])
         self.share_to_channel = np.array([circuit.share_to_channel for circuit in circuits])
         """(rows, 4, 4): from the shares of grounded electrodes to those of the channels."""
+        self._unevenness = [row.circuit.unevenness for row in rows]
+        self._is_even = all(unevenness.is_even for unevenness in self._unevenness)
 
     def solve_contacts(
         self,
         rows: NDArray[np.intp],
+        position: FloatArray,
         shares: FloatArray,
         log_ratio: FloatArray,
         force_n: FloatArray,
@@ -225,7 +228,7 @@ class _HealthyCircuits:
         """
         column = shares[:, :, None]
         collected = (self.share_to_channel[rows] @ column)[:, :, 0]
-        sheet_ohm = self._sheet_ohm[rows]
+        sheet_ohm = self._sheet_ohm[rows] * self._ohm_ratio(rows, position)
         ohm = contact_layer_ohm(
             force_n,
             radius_m,
@@ -237,6 +240,13 @@ class _HealthyCircuits:
         ohm += sheet_ohm / (2 * math.pi) * np.maximum(log_ratio, 0.0)
         ohm += (column.transpose(0, 2, 1) @ self._impedance_ohm[rows] @ column)[:, 0, 0]
         return collected, self._drive_v[rows] / ohm
+
+    def _ohm_ratio(self, rows: NDArray[np.intp], position: FloatArray) -> FloatArray:
+        """Return the local over the nominal sheet resistance (k,) at positions (2, k)."""
+        if self._is_even:
+            return np.ones(len(rows))
+        pairs = zip(rows.tolist(), position.T, strict=True)
+        return np.array([float(self._unevenness[row].ohm_ratio(at)) for row, at in pairs])
 
 
 def _vector(values: FloatArray) -> Vector:

@@ -21,9 +21,10 @@ from handtouch.simulate.pad_circuit import PadCircuit
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.sheet_physics import SheetLaw
-from handtouch.simulate.sheet_solver import ElectrodeGaps, solve_sheet
+from handtouch.simulate.sheet_solver import ElectrodeGaps
 from handtouch.simulate.stimulus import PadStimulus, Stimulus
-from handtouch.simulate.worlds import DrawnWorld, HiddenPad
+from handtouch.simulate.uneven_sheet import Unevenness, uneven_sheet_maps
+from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, HiddenPad
 
 FloatArray = NDArray[np.float64]
 CountArray = NDArray[np.int64]
@@ -77,10 +78,12 @@ class VirtualPad:
         per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(hidden.gain_ratio)
         shape = world.surface(hand, pad)
         gaps = _true_gaps(shape, hidden)
+        unevenness = Unevenness(UNEVEN_MODES, hidden.unevenness)
         circuit = PadCircuit(
             shape,
             gaps,
-            solve_sheet(shape, gaps),
+            uneven_sheet_maps(shape, gaps, unevenness),
+            unevenness,
             sheet,
             np.array(hidden.series_ohm),
             node.drive_v,
