@@ -33,6 +33,7 @@ def test_campaign_of_one_fault_of_each_kind_leaves_nothing_behind(tmp_path: Path
     assert results["samples_sent"] > 5000
     assert results["samples_lost"] == len(results["exceptions"]) == results["exit_status"] == 0
 
+
 def test_two_nodes_with_one_id_are_logged_as_errors(rig: Any) -> None:
     """All 15 ids are used twice; the limit of repeated messages lets the decisive line of each pad pass."""
     rig.simulate()

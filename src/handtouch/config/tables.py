@@ -173,7 +173,10 @@ class Node(Table):
         description="producer heartbeat time, written to 0x1017; guard time of a node without heartbeat",
     )
     heartbeat_timeout_ms: int = Field(
-        350, ge=20, le=300_000, description="a node without heartbeat for this long is lost"
+        350,
+        ge=20,
+        le=300_000,
+        description="heartbeat consumer time: a node without heartbeat for this long is lost",
     )
 
 
