@@ -39,10 +39,11 @@ def lap(name):
 import numpy; lap("numpy")
 import can, canopen; lap("python-can and canopen")
 import pydantic; lap("pydantic")
-import handtouch.daemon.daemon as d; lap("other imports of the daemon")
+from handtouch.core.pad_model import PadModel
+import handtouch.daemon.serve as d; lap("other imports of the daemon")
 deployment = d.load(Path(sys.argv[1])); lap("reading the deployment")
-model = d.PadModel(deployment); lap("model of the pads: tables of their surfaces")
-daemon = d.Daemon(deployment, model); lap("opening endpoints and buses")
+model = PadModel(deployment); lap("model of the pads: tables of their surfaces")
+daemon = d.HandtouchDaemon.open(deployment, model); lap("opening endpoints and buses")
 for name, took in times: print(f"{took} {name}")
 """
 

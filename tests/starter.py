@@ -23,7 +23,7 @@ from typing import IO, Any
 
 LOADED = (
     "handtouch.bridge.runner",
-    "handtouch.daemon.daemon",
+    "handtouch.daemon.serve",
     "handtouch.simulate.simulated_hand",
     "handtouch.simulate.worlds",
     "handtouch.cli.status",

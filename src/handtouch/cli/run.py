@@ -6,14 +6,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from handtouch.daemon import daemon
+from handtouch.daemon import serve
 
 
 def run_command(config_path: Path, buses: Sequence[str]) -> int:
     """Run the daemon; exit status 1 if buses or endpoints can't be opened, 2 for wrong configuration."""
     try:
-        daemon.run(config_path, tuple(buses))
-    except daemon.StartError as error:
+        serve.run(config_path, tuple(buses))
+    except serve.StartError as error:
         print(error, file=sys.stderr)
         return 2 if error.permanent else 1
     return 0

@@ -1,6 +1,6 @@
 """The daemon: opens buses and endpoints, reads the clock, and runs the pipeline in one loop.
 
-Public names: `HandtouchDaemon`, `run`, `StartError`.
+Public name: `HandtouchDaemon`. `handtouch.daemon.serve` runs it as a service.
 """
 
 from __future__ import annotations
@@ -10,13 +10,11 @@ import logging
 import os
 import secrets
 import select
-import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +25,11 @@ from handtouch import wire
 from handtouch.calibration.store import store_path
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.loop_pause import LoopPause
-from handtouch.canbus.bus.port import BusError, Port
+from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.master import Master
-from handtouch.canbus.nodes.spec import NodeSpec, check_nodes, node_specs
-from handtouch.client.keys import KeyFileError
-from handtouch.config import ConfigError, Deployment, load, with_bus
-from handtouch.config.eds import EdsError
+from handtouch.canbus.nodes.spec import NodeSpec, node_specs
+from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
 from handtouch.core.cache_warming import CacheWarmer
 from handtouch.core.cycle import BusyPoll
@@ -53,20 +49,15 @@ from handtouch.daemon.control import ControlServer, open_control_socket
 from handtouch.daemon.endpoints import remove_socket_file
 from handtouch.daemon.inputs import InputReceiver
 from handtouch.daemon.joint_messages import JointPublisher
-from handtouch.daemon.metrics import MetricsExporter
-from handtouch.daemon.metrics_page import METRICS_PATH
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.daemon.publisher import Publisher, RetainedMessages
 from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.status_reporter import StatusReporter
 from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.hand.joints import JointStateBuffer
-from handtouch.hand.robot_models import RobotModels, drop_invalid_urdfs
-from handtouch.host import logs, realtime
+from handtouch.hand.robot_models import RobotModels
 from handtouch.host.build import build_info
 from handtouch.host.process import process_statistics
-from handtouch.host.signals import stop_on_signals
-from handtouch.host.systemd import ServiceWatchdog, SystemdNotifier
 
 _log = logging.getLogger("handtouch.daemon")
 
@@ -80,16 +71,7 @@ _BACKGROUND_PERIOD_NS = 4_000_000
 _LOGGED_PAUSE_NS = 100_000_000
 _MESSAGE_PATH_THREADS = 3
 """Threads that a message passes, each waking the next: ZeroMQ's on both sides, and the subscriber's"""
-_GIL_SWITCH_INTERVAL_S = 0.0005  # limits how long a thread that boots a node or builds a model holds the GIL
 _SESSION_BITS = 53  # exact where numbers are doubles
-
-
-class StartError(Exception):
-    """The daemon can't start; `permanent` if a restart can't help, as with a wrong configuration."""
-
-    def __init__(self, error: Exception, *, permanent: bool) -> None:
-        super().__init__(str(error))
-        self.permanent = permanent
 
 
 @dataclass(frozen=True)
@@ -433,49 +415,6 @@ def pad_names(deployment: Deployment) -> list[tuple[str, str]]:
     return [(entry.hand, entry.pad.link) for entry in deployment.pads]
 
 
-def run(config_path: Path, buses: tuple[str, ...] = ()) -> None:
-    """Serve a deployment until SIGINT or SIGTERM. Raises StartError."""
-    try:
-        deployment = _read_deployment(config_path, buses)
-    except ConfigError as error:
-        raise StartError(error, permanent=True) from error
-    stop = stop_on_signals()
-    log_handler = logs.start_logging(deployment.daemon.log_level)
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master logs these events itself
-    try:
-        _serve(deployment, stop, partial(_read_deployment, config_path, buses), config_path.parent)
-    finally:
-        log_handler.close()
-
-
-def _serve(
-    deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment], folder: Path
-) -> None:
-    settings = deployment.daemon
-    sys.setswitchinterval(_GIL_SWITCH_INTERVAL_S)
-    with ExitStack() as stack:
-        notifier = stack.enter_context(closing(SystemdNotifier.open()))
-        try:
-            exporter = None
-            if settings.metrics is not None:
-                exporter = stack.enter_context(closing(MetricsExporter.open(settings.metrics)))
-            on_message = exporter.send if exporter is not None else None
-            daemon = HandtouchDaemon.open(deployment, read=read, folder=folder, on_message=on_message)
-            stack.enter_context(daemon)
-        except (KeyFileError, EdsError) as error:
-            raise StartError(error, permanent=True) from error
-        except (BusError, OSError) as error:
-            raise StartError(error, permanent=False) from error
-        _log_endpoints(daemon)
-        if exporter is not None:
-            _log.info("metrics: http://%s%s", exporter.address, METRICS_PATH)
-        for refused in realtime.apply_realtime_settings(settings):
-            _log.warning("%s", refused)
-        watchdog_ns = int(os.environ.get("WATCHDOG_USEC", "0")) * 1000
-        daemon.run(stop, ServiceWatchdog(notifier, watchdog_ns, daemon.reporter.summary).notify_tick)
-        notifier.send("STOPPING=1")
-
-
 def _open_resources(
     stack: ExitStack, deployment: Deployment, model: PadModel, robots: RobotModels
 ) -> _Resources:
@@ -517,23 +456,3 @@ def _open_resources(
         ports[bus.name] = port = Port.open(bus, pipeline.slab)
         opened.callback(port.close)
     return _Resources(opened, authenticator, publisher, retained, control_socket, inputs, pipeline, ports)
-
-
-def _read_deployment(config_path: Path, buses: tuple[str, ...]) -> Deployment:
-    """Read a deployment, with other buses if given; drop URDFs that don't fit. Raises ConfigError."""
-    deployment = load(config_path)
-    for bus in buses:
-        deployment = with_bus(deployment, bus)
-    deployment = check_nodes(deployment, str(config_path))  # report mistakes before a bus is opened
-    deployment, problems = drop_invalid_urdfs(deployment, str(config_path))
-    for problem in problems:
-        _log.error("%s: %s; palm and base frame of that hand are unavailable", config_path, problem)
-    return deployment
-
-
-def _log_endpoints(daemon: HandtouchDaemon) -> None:
-    endpoints = {**daemon.publisher.endpoints, "control": daemon.control.endpoint}
-    hands = ", ".join(f"{hand.name} ({len(hand.pads)} pads)" for hand in daemon.deployment.hands)
-    buses = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in daemon.deployment.buses)
-    _log.info("hands: %s; buses: %s", hands, buses)
-    _log.info("endpoints: %s", ", ".join(f"{name} {endpoint}" for name, endpoint in endpoints.items()))

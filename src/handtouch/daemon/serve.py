@@ -1,0 +1,103 @@
+"""Start of `handtouch run`: deployment file, logging, metrics, real-time settings, systemd.
+
+Public names: `run`, `StartError`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+
+from handtouch.canbus.bus.port import BusError
+from handtouch.canbus.nodes.spec import check_nodes
+from handtouch.client.keys import KeyFileError
+from handtouch.config import ConfigError, Deployment, load, with_bus
+from handtouch.config.eds import EdsError
+from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.daemon.metrics import MetricsExporter
+from handtouch.daemon.metrics_page import METRICS_PATH
+from handtouch.hand.robot_models import drop_invalid_urdfs
+from handtouch.host import logs, realtime
+from handtouch.host.signals import stop_on_signals
+from handtouch.host.systemd import ServiceWatchdog, SystemdNotifier
+
+_log = logging.getLogger("handtouch.daemon")
+
+_GIL_SWITCH_INTERVAL_S = 0.0005  # limits how long a thread that boots a node or builds a model holds the GIL
+
+
+class StartError(Exception):
+    """The daemon can't start; `permanent` if a restart can't help, as with a wrong configuration."""
+
+    def __init__(self, error: Exception, *, permanent: bool) -> None:
+        super().__init__(str(error))
+        self.permanent = permanent
+
+
+def run(config_path: Path, buses: tuple[str, ...] = ()) -> None:
+    """Serve a deployment until SIGINT or SIGTERM. Raises StartError."""
+    try:
+        deployment = _read_deployment(config_path, buses)
+    except ConfigError as error:
+        raise StartError(error, permanent=True) from error
+    stop = stop_on_signals()
+    log_handler = logs.start_logging(deployment.daemon.log_level)
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master logs these events itself
+    try:
+        _serve(deployment, stop, partial(_read_deployment, config_path, buses), config_path.parent)
+    finally:
+        log_handler.close()
+
+
+def _serve(
+    deployment: Deployment, stop: threading.Event, read: Callable[[], Deployment], folder: Path
+) -> None:
+    settings = deployment.daemon
+    sys.setswitchinterval(_GIL_SWITCH_INTERVAL_S)
+    with ExitStack() as stack:
+        notifier = stack.enter_context(closing(SystemdNotifier.open()))
+        try:
+            exporter = None
+            if settings.metrics is not None:
+                exporter = stack.enter_context(closing(MetricsExporter.open(settings.metrics)))
+            on_message = exporter.send if exporter is not None else None
+            daemon = HandtouchDaemon.open(deployment, read=read, folder=folder, on_message=on_message)
+            stack.enter_context(daemon)
+        except (KeyFileError, EdsError) as error:
+            raise StartError(error, permanent=True) from error
+        except (BusError, OSError) as error:
+            raise StartError(error, permanent=False) from error
+        _log_endpoints(daemon)
+        if exporter is not None:
+            _log.info("metrics: http://%s%s", exporter.address, METRICS_PATH)
+        for refused in realtime.apply_realtime_settings(settings):
+            _log.warning("%s", refused)
+        watchdog_ns = int(os.environ.get("WATCHDOG_USEC", "0")) * 1000
+        daemon.run(stop, ServiceWatchdog(notifier, watchdog_ns, daemon.reporter.summary).notify_tick)
+        notifier.send("STOPPING=1")
+
+
+def _read_deployment(config_path: Path, buses: tuple[str, ...]) -> Deployment:
+    """Read a deployment, with other buses if given; drop URDFs that don't fit. Raises ConfigError."""
+    deployment = load(config_path)
+    for bus in buses:
+        deployment = with_bus(deployment, bus)
+    deployment = check_nodes(deployment, str(config_path))  # report mistakes before a bus is opened
+    deployment, problems = drop_invalid_urdfs(deployment, str(config_path))
+    for problem in problems:
+        _log.error("%s: %s; palm and base frame of that hand are unavailable", config_path, problem)
+    return deployment
+
+
+def _log_endpoints(daemon: HandtouchDaemon) -> None:
+    endpoints = {**daemon.publisher.endpoints, "control": daemon.control.endpoint}
+    hands = ", ".join(f"{hand.name} ({len(hand.pads)} pads)" for hand in daemon.deployment.hands)
+    buses = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in daemon.deployment.buses)
+    _log.info("hands: %s; buses: %s", hands, buses)
+    _log.info("endpoints: %s", ", ".join(f"{name} {endpoint}" for name, endpoint in endpoints.items()))
