@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
+import zmq
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -69,13 +69,13 @@ class Bench:
 
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         """Run ticks until the reply is there, and return it."""
-        request = msgpack.packb({"v": 1, "command": command, **arguments})
-        _, answer = self.control.start_request(request, self.t_ns)
-        while not isinstance(answer, dict):
-            self.tick()
-            time.sleep(0 if command == "tare" else 0.001)  # a reload's thread needs its share
-            answer = self.control._call_command(command, partial(answer.poll, self.t_ns)) or answer
-        return dict(msgpack.unpackb(msgpack.packb(answer)))
+        with zmq.Context() as context, context.socket(zmq.REQ) as client:
+            client.connect(self.control.endpoint)
+            client.send(msgpack.packb({"v": 1, "command": command, **arguments}))
+            while not client.poll(1):  # a reload's thread needs its share
+                self.tick()
+                self.control.poll(self.t_ns)
+            return dict(msgpack.unpackb(client.recv()))
 
     def pads(self, answer: dict[str, Any]) -> dict[str, Any]:
         assert answer["ok"], answer

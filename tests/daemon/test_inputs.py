@@ -38,11 +38,19 @@ def test_gravity_is_normalised_and_the_newest_value_holds(inputs: InputReceiver)
 
 
 @pytest.fixture
-def inputs() -> Any:
+def references() -> list[ForceReference]:
+    """Force references that the receiver forwarded."""
+    return []
+
+
+@pytest.fixture
+def inputs(references: list[ForceReference]) -> Any:
     with zmq.Context() as context:
         limits = np.array([[-0.5, 1.5], [-np.inf, np.inf]])
         states = {"right": JointStateBuffer(("a", "b"), limits=limits)}
-        made = InputReceiver.open(context, "tcp://127.0.0.1:*", Authenticator.open(context), states, PADS)
+        made = InputReceiver.open(
+            context, "tcp://127.0.0.1:*", Authenticator.open(context), states, PADS, references.append
+        )
         yield made
         made.close()
 
@@ -111,9 +119,7 @@ def test_commands_are_separate_from_joint_states_and_persist(inputs: Any) -> Non
     assert inputs.dropped == {"no_urdf": 1}
 
 
-def test_forces_are_forwarded_by_pad(inputs: Any) -> None:
-    references: list[ForceReference] = []
-    inputs._on_force_reference = references.append
+def test_forces_are_forwarded_by_pad(inputs: Any, references: list[ForceReference]) -> None:
     message = LinkForces("right", NOW, ("toe", "palm"), np.array([1.0, 2.0]), np.array([0.3, 0.1]))
     inputs.process_message(encode(message), NOW)
     (reference,) = references
