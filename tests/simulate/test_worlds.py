@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -223,3 +225,27 @@ def test_a_builder_describes_the_nominal_kind_of_his_sheets(deployment: config.D
     assert kind is not None
     assert drawn.describe(deployment).sheets["s"].behaviour == kind.behaviour
     assert WORLDS["ideal"].draw(3).describe(deployment) == deployment
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "worlds.md").read_text()
+
+
+def test_docs_state_every_distribution() -> None:
+    stated = {
+        name: cells
+        for name, *cells in re.findall(
+            r"^\| `(\w+\.\w+)` \| [^|]+ \| [^|]+ \| ([^|]+) \| ([^|]+) \| ([^|]+) \| [^|]+ \|$", PAGE, re.M
+        )
+    }
+    columns = [distributions(world) for world in WORLDS.values()]
+    assert stated == {name: [str(column[name]) for column in columns] for name in columns[0]}
+
+
+def test_docs_state_the_world_and_family_of_every_kind_of_sheet() -> None:
+    stated = set(re.findall(r"^\| `(\w+)` \| (\w+), (\w+) \|", PAGE, re.M))
+    assert stated == {
+        (kind.name, world.name, family.name.lower())
+        for world in WORLDS.values()
+        for family in Family
+        for kind in world.sheets.kinds(family)
+    }

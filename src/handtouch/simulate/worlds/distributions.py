@@ -69,7 +69,7 @@ class Uniform:
         return rng.uniform(self.low, self.high, count)
 
     def __str__(self) -> str:
-        return f"uniform, {self.low:g} to {self.high:g}"
+        return f"U({self.low:g}, {self.high:g})"
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Normal:
         return rng.normal(self.mean, self.std, count)
 
     def __str__(self) -> str:
-        return f"normal, {self.mean:g} with standard deviation {self.std:g}"
+        return f"N({self.mean:g}, {self.std:g})"
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class LogNormal:
         return np.asarray(self.median * np.exp(self.log_std * rng.standard_normal(count)))
 
     def __str__(self) -> str:
-        return f"log-normal, median {self.median:g}, log deviation {self.log_std:g}"
+        return f"LN({self.median:g}, {self.log_std:g})"
 
 
 @dataclass(frozen=True)
@@ -131,4 +131,4 @@ class LogUniform:
         return np.asarray(np.exp(rng.uniform(math.log(self.low), math.log(self.high), count)))
 
     def __str__(self) -> str:
-        return f"log-uniform, {self.low:g} to {self.high:g}"
+        return f"LU({self.low:g}, {self.high:g})"
