@@ -16,7 +16,9 @@ from fault_bench import TPDO
 from handtouch.device import Device, LineFaults
 
 SYNC_ID, NMT, SDO_ANSWER, HEARTBEAT = 0x080, 0x000, 0x580, 0x700
-BOOT_REQUESTS = 14  # SDO requests of the boot of a shipped node; an abort of each is reported
+BOOT_REQUESTS = (*range(1, 5), *range(7, 17))
+"""SDO requests of the boot of a shipped node; an abort of each is reported. The fifth and the sixth read the
+error register and history, which a node may refuse."""
 ABORT = 0x08000000
 OBJECTS = ((0x1018, 1), (0x1018, 4), (0x1A01, 0), (0x1A01, 2), (0x1801, 1), (0x1801, 2), (0x1017, 0))
 
@@ -86,6 +88,8 @@ class Kind:
     """periods by which its samples are late; shortens the pause that makes it stale"""
     within_s: float = 1.0
     well_s: float = 2.0
+    rest_s: float = 0.0
+    """time until the node may have the next fault: an unstable one is stable after 5 s"""
     weight: float = 1.0
 
 
@@ -191,7 +195,7 @@ def fail_at_step(code: int | None) -> Callable[[Fault, Any], None]:
     def begin(fault: Fault, bench: Any) -> None:
         with bench.devices.lock:
             server = fault.node.sdo
-            server.fail_nth = {server.requests + fault.chance.randint(1, BOOT_REQUESTS): code}
+            server.fail_nth = {server.requests + fault.chance.choice(BOOT_REQUESTS): code}
             fault.node.reboot()
 
     return begin
@@ -231,9 +235,55 @@ def heal_sdo(fault: Fault, bench: Any) -> None:
 
 
 def emergency(fault: Fault, _: Any) -> None:
-    code = 0xFF00 + fault.number % 256
-    fault.kept = f"0x{code:04X}"
-    fault.node.send_emergency(code, 0x81, b"hand")
+    fault.kept = 0xFF00 + fault.number % 256
+    fault.node.send_emergency(fault.kept, 0x81, b"hand")
+
+
+def no_emergency(fault: Fault, _: Any) -> None:
+    fault.node.send_emergency(0)
+
+
+def latch(code: int, reboot: bool) -> Callable[[Fault, Any], None]:
+    """Give the node an error that keeps it from being operational."""
+
+    def begin(fault: Fault, bench: Any) -> None:
+        with bench.devices.lock:
+            if reboot:
+                fault.node.unplug()
+            fault.node.latch_error(code, 1)
+            fault.node.plug()
+
+    return begin
+
+
+def unlatch(fault: Fault, _: Any) -> None:
+    fault.node.clear_error()
+
+
+def boot_loop(fault: Fault, _: Any) -> None:
+    fault.node.start_boot_loop(fault.chance.randrange(80, 250) * 1_000_000)
+
+
+def no_boot_loop(fault: Fault, _: Any) -> None:
+    fault.node.stop_boot_loop()
+
+
+def illegal_state(fault: Fault, _: Any) -> None:
+    fault.kept = fault.chance.choice((1, 2, 3, 6, 99, 126))
+    fault.node.heartbeat_state = fault.kept
+
+
+def legal_state(fault: Fault, _: Any) -> None:
+    fault.node.heartbeat_state = None
+
+
+def disable_tpdo(fault: Fault, _: Any) -> None:
+    fault.node.write_object(0x1801, 1, 0x80000000 | TPDO + fault.node.node_id)
+
+
+def change(index: int, sub: int, value: int) -> Callable[[Fault, Any], None]:
+    """Change a setting, as another client would."""
+    return lambda fault, _: fault.node.write_object(index, sub, value)
 
 
 def nmt(command: int) -> Callable[[Fault, Any], None]:

@@ -21,11 +21,14 @@ from fault_acts import (
     answers,
     attribute,
     babble,
+    boot_loop,
     brown_out,
     brown_outs,
     bus_off,
+    change,
     chatter,
     dead,
+    disable_tpdo,
     emergency,
     fail_at_step,
     fail_object,
@@ -34,11 +37,16 @@ from fault_acts import (
     garble,
     heal_sdo,
     hush,
+    illegal_state,
+    latch,
     late,
+    legal_state,
     line,
     malformed,
     nmt,
     no_beat_time,
+    no_boot_loop,
+    no_emergency,
     no_line,
     no_twin,
     nothing,
@@ -54,6 +62,7 @@ from fault_acts import (
     swap_back,
     sync,
     twin,
+    unlatch,
     unplug,
 )
 
@@ -87,7 +96,21 @@ def beats_missed(fault: Fault, health: Any) -> bool:
 
 
 def emergency_reported(fault: Fault, health: Any) -> bool:
-    return any(fault.kept in text for text in health.emergencies)
+    found = [error for error in health.emergencies if error["code"] == fault.kept]
+    return bool(found) and found[-1]["cleared_ns"] is None and health.reason == ""
+
+
+def emergency_cleared(fault: Fault, health: Any) -> bool:
+    found = [error for error in health.emergencies if error["code"] == fault.kept]
+    return bool(found) and found[-1]["cleared_ns"] is not None and health.reason == ""
+
+
+def illegal_reported(fault: Fault, health: Any) -> bool:
+    return f"heartbeat with illegal NMT state {fault.kept};" in health.reason
+
+
+def reset_reported(fault: Fault, health: Any) -> bool:
+    return rebooted(fault, health) and "reset by an NMT command of another master" in health.reason
 
 
 def grew(counter: str, by: int = 1) -> Callable[[Fault], bool]:
@@ -116,8 +139,10 @@ KINDS = (
     Kind("duplicate samples", "nothing", line(duplicate=0.5), no_line, quiet=True),
     Kind("heartbeats lost, two at most", "`heartbeats_missed`", **attribute("send_heartbeat", False, True),
          lasts_s=(0.15, 0.2), reported=beats_missed, quiet=True, within_s=1.6),
-    Kind("EMCY", "its text in `emergencies`", emergency, nothing,
-         reported=emergency_reported, quiet=True, within_s=1.6),
+    Kind("EMCY", "in `emergencies`, not cleared", emergency, no_emergency, lasts_s=(0.3, 0.8),
+         reported=emergency_reported, quiet=True, within_s=0.3),
+    Kind("EMCY, cleared", "in `emergencies`, cleared", emergency, no_emergency, lasts_s=(0.1, 0.8),
+         reported=emergency_cleared, quiet=True, within_s=1.0),
     Kind("SDO server frozen, node runs", "nothing", freeze(reboot=False), heal_sdo, quiet=True),
     Kind("babbles with unknown identifiers", "`unknown_frames`", chatter, hush,
          reported_by_bus=grew("unknown_frames", 100), quiet=True, within_s=1.6),
@@ -153,6 +178,20 @@ KINDS = (
     Kind("bus-off, long", "lost: no heartbeat", bus_off, nothing, lasts_s=(0.7, 1.5), reported=_LOST),
     Kind("bus-off, then boots", "`reboots`, or lost", bus_off, nothing,
          lasts_s=(0.1, 1.0), reported=rebooted_or_away, within_s=1.8),
+    Kind("reboot, refuses OPERATIONAL", "faulted: error register and EMCY", latch(0x5000, True), unlatch,
+         lasts_s=(0.8, 3.0), well_s=7.0, rest_s=5.5,
+         reported=matches(r"refuses OPERATIONAL, error register 0x01 .*EMCY 0x5000")),
+    Kind("leaves OPERATIONAL upon an error", "error register and EMCY", latch(0x2310, False), unlatch,
+         lasts_s=(0.8, 3.0), well_s=7.0, rest_s=5.5,
+         reported=matches(r"left OPERATIONAL by itself.*error register 0x01 .*EMCY 0x2310")),
+    Kind("boot loop", "faulted: boot loop", boot_loop, no_boot_loop,
+         lasts_s=(1.5, 3.0), well_s=7.0, rest_s=5.5, reported=matches(r"boot loop: \d+ boot-up messages")),
+    Kind("illegal heartbeat state", "faulted: the state", illegal_state, legal_state,
+         lasts_s=(0.5, 3.0), well_s=7.0, rest_s=5.5, reported=illegal_reported),
+    Kind("transmission type changed", "the object, both values", change(0x1801, 2, 240), nothing,
+         lasts_s=(0.5, 0.5), reported=matches("0x1801:02, transmission type of TPDO2, is 240 instead of 1")),
+    Kind("TPDO disabled by another client", "the object, both values", disable_tpdo, nothing,
+         lasts_s=(0.5, 0.5), reported=matches("0x1801:01, COB-ID of TPDO2, is 0x800002")),
     Kind("node replaced", "faulted: identity mismatch, both numbers", swap, swap_back,
          lasts_s=(0.3, 2.0), weight=2.0,
          reported=matches(r"identity mismatch: serial number is (\d+) .* configured is (\d+)")),
@@ -172,10 +211,11 @@ KINDS = (
     Kind("reboot, SDO server frozen", "faulted: no answer", freeze(reboot=True), heal_sdo,
          lasts_s=(0.8, 2.0), reported=_NO_ANSWER, within_s=1.5, well_s=7.0),
     Kind("stopped by another master", "NMT state", nmt(2), nothing, lasts_s=(0.3, 0.3),
-         reported=matches("node is stopped, although it was started|no sample|samples don't")),
+         reported=matches("made stopped by an NMT command of another master")),
     Kind("made pre-operational by another master", "NMT state", nmt(128), nothing, lasts_s=(0.3, 0.3),
-         reported=matches("node is pre-operational, although it was started|no sample|samples don't")),
-    Kind("reset by another master", "`reboots`", nmt(129), nothing, lasts_s=(0.0, 0.0), reported=rebooted),
+         reported=matches("made pre-operational by an NMT command of another master")),
+    Kind("reset by another master", "`reboots`, NMT command", nmt(129), nothing, lasts_s=(0.0, 0.0),
+         reported=reset_reported),
     Kind("babbles as itself", "faulted: too many samples", babble, hush,
          lasts_s=(1.5, 2.5), reported=matches("samples per SYNC"), within_s=2.0, well_s=4.0),
     # the bus; no pad may be disturbed by what others send

@@ -235,7 +235,7 @@ class Campaign:
         self.done.append(fault)
         for node_id in fault.nodes:
             del self._busy[node_id]
-            self._free_ns[node_id] = now_ns
+            self._free_ns[node_id] = now_ns + int(fault.kind.rest_s * S)
         for t_ns in fault.disturbed_ns:
             paused = self.bench.cable.paused(fault.nodes[0], t_ns, fault.kind.lag)
             _once(fault, "paused" if paused else "disturbed")

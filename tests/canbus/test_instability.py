@@ -225,6 +225,19 @@ def test_boot_loop_is_faulted_without_traffic_until_it_ends(rig: Any) -> None:
     assert [rig.state(n) for n in (2, 3)] == [OPERATIONAL] * 2
 
 
+def test_refusal_after_a_boot_loop_is_named_as_such(make_rig: Make) -> None:
+    rig = make_rig(1, device=EDS)
+    rig.boot()
+    rig.run(500)
+    rig.node(1).start_boot_loop(100 * MS)
+    rig.run(450)
+    rig.node(1).stop_boot_loop()
+    rig.node(1).latch_error(0x5000)
+    rig.run(1500)
+    assert rig.state(1) is FAULTED
+    assert rig.status(1).reason.startswith("refuses OPERATIONAL, error register 0x01")
+
+
 def test_single_reboots_of_a_stable_node_are_never_a_boot_loop(rig: Any) -> None:
     rig.boot()
     for _ in range(6):
@@ -300,12 +313,16 @@ def test_events_without_a_reason_or_a_new_state_read_well(rig: Any) -> None:
 
 CHANGES = [
     ((0x1801, 2), 240, "0x1801:02, transmission type of TPDO2, is 240 instead of 1"),
-    ((0x1801, 1), 0x80000281, "0x1801:01, COB-ID of TPDO2, is 0x80000281 instead of 0x00000281"),
+    ((0x1801, 1), 0x80000281, "0x1801:01, COB-ID of TPDO2, is 0x80000281 instead of 0x281"),
+    ((0x1801, 1), 0x2A1, "0x1801:01, COB-ID of TPDO2, is 0x2A1 instead of 0x281"),
+    ((0x1801, 1), 0x282, "0x1801:01, COB-ID of TPDO2, is 0x282 instead of 0x281"),  # that of node 2
     ((0x1A01, 0), 0, "0x1A01:00, number of objects mapped in TPDO2, is 0 instead of 4"),
 ]
 
 
-@pytest.mark.parametrize(("where", "value", "expected"), CHANGES, ids=[c[2][:9] for c in CHANGES])
+@pytest.mark.parametrize(
+    ("where", "value", "expected"), CHANGES, ids=[f"{c[2][:9]}={c[1]:X}" for c in CHANGES]
+)
 def test_setting_changed_by_another_device_is_repaired_and_named(
     make_rig: Make, where: tuple[int, int], value: int, expected: str
 ) -> None:
@@ -315,6 +332,7 @@ def test_setting_changed_by_another_device_is_repaired_and_named(
     events = rig.run(1500)
     reasons = [e.reason for e in events if e.new_state is NodeState.BOOTING]
     assert reasons == [f"changed by another device: {expected}; repaired"]
+    assert rig.status(1).cob_ids == (0x281,)
     assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2, rig.status(1).reason
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,9 +12,10 @@ import pytest
 
 from handtouch.canbus.bus.bus_state import BusFault, BusState, ErrorState
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
+from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent, SerialChanged
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.status_reporter import StatusReporter
+from handtouch.wire.emergency import Emergency
 
 PERIOD_NS = 5_000_000
 SECOND_NS = 1_000_000_000
@@ -23,7 +25,7 @@ class Rig:
     """A reporter with a master and a bus whose states the test sets."""
 
     def __init__(self, bench: Any) -> None:
-        self.events: list[NodeEvent | SerialChanged] = []
+        self.events: list[MasterEvent] = []
         self.bus_state = BusState()
         pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
         master = SimpleNamespace(drain_events=self._drain, states=np.full(3, NodeState.OPERATIONAL))
@@ -57,7 +59,7 @@ class Rig:
     def bus_lines(self, caplog: pytest.LogCaptureFixture) -> list[tuple[int, str]]:
         return [(r.levelno, r.getMessage()) for r in caplog.records if r.name == "handtouch.bus"]
 
-    def _drain(self) -> list[NodeEvent | SerialChanged]:
+    def _drain(self) -> list[MasterEvent]:
         events, self.events = self.events, []
         return events
 
@@ -74,6 +76,8 @@ def rig(bench: Any, caplog: pytest.LogCaptureFixture) -> Rig:
         (NodeState.OPERATIONAL, NodeState.FAULTED, logging.ERROR),
         (NodeState.OPERATIONAL, NodeState.ABSENT, logging.WARNING),
         (NodeState.OPERATIONAL, NodeState.STALE, logging.WARNING),
+        (NodeState.OPERATIONAL, NodeState.BOOTING, logging.WARNING),
+        (NodeState.STALE, NodeState.BOOTING, logging.WARNING),
         (NodeState.SETTLING, NodeState.OPERATIONAL, logging.INFO),
         (NodeState.ABSENT, NodeState.BOOTING, logging.INFO),
         (NodeState.ABSENT, NodeState.ABSENT, logging.INFO),
@@ -89,6 +93,22 @@ def test_node_events_are_logged_by_severity(
     assert "(h/plane): " in record.getMessage()
     assert record.getMessage().startswith("node 0x")
     assert "no heartbeat for 352 ms" in record.getMessage()
+
+
+def test_emcy_is_a_warning_and_its_clearing_information(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "handtouch.health")
+    error = Emergency(0x5000, 1, "2f74000000", "0x5000 device hardware (register: generic)", SECOND_NS)
+    rig.events = [ErrorChanged(1, rig.now_ns, error)]
+    rig.events += [ErrorChanged(1, rig.now_ns, replace(error, cleared_ns=3 * SECOND_NS))]
+    rig.poll()
+    logged = [(r.levelno, r.getMessage().partition(": ")[2]) for r in caplog.records]
+    assert logged == [
+        (
+            logging.WARNING,
+            "EMCY 0x5000 device hardware (register: generic), manufacturer-specific 2f74000000",
+        ),
+        (logging.INFO, "EMCY 0x5000 device hardware (register: generic): cleared after 2.0 s"),
+    ]
 
 
 def test_replaced_node_is_a_warning(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:

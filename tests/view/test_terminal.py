@@ -12,6 +12,7 @@ from handtouch.cli import status
 from handtouch.view.displays import LineDisplay
 from handtouch.view.message_lines import diagnosis_text, message_line, position_std_m
 from handtouch.view.terminal import HandView
+from handtouch.wire.emergency import Emergency
 
 CONTACT = wire.Contact(
     v=1,
@@ -269,7 +270,12 @@ def test_status_shows_diagnoses_the_supervisor_and_the_store(capsys: pytest.Capt
         "loop": {"stages": {"tick": {"sum_s": 0.004, "counts": [3, 1]}}, "late": {"report": 2}},
         "process": {"memory_bytes": 10**8, "cpu_s": 3.5, "loop_cpu_s": 3.0},
     }  # fmt: skip
-    pads = [asdict(replace(HEALTH, diagnoses=(GUM,))), asdict(replace(HEALTH, sampling="event"))]
+    errors = (
+        Emergency(0x2310, 3, "0000000000", "0x2310 current", 1, cleared_ns=2),
+        Emergency(0x5000, 1, "0000000000", "0x5000 device hardware", 3),
+    )
+    failing = replace(HEALTH, sampling="event", emergencies=tuple(error.to_map() for error in errors))
+    pads = [asdict(replace(HEALTH, diagnoses=(GUM,))), asdict(failing)]
     answer = {"service": service, "scene": {"scenes": [], "pads": []}, "pads": pads}
     status.print_status(answer, Console(width=200))
     printed = capsys.readouterr().out
@@ -286,4 +292,6 @@ def test_status_shows_diagnoses_the_supervisor_and_the_store(capsys: pytest.Capt
         "error frames: ack 2 no acknowledge" in printed
     )
     assert "operational (event)" in printed
+    assert "EMCY 0x5000 device hardware" in printed
+    assert "0x2310" not in printed  # cleared
     assert not status.is_ok({"state": "clear", "calibration_state": "quarantined"})

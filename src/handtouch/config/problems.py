@@ -67,7 +67,11 @@ def problems_of(
     return tuple(dict.fromkeys(problem for problem in problems if problem))
 
 
-_KIND_TABLES = (["surface"], ["fault"])  # tables that follow one of several models, by their key `kind`
+_KIND_TABLES = (
+    ["surface"],
+    ["fault"],
+    ["node_fault"],
+)  # tables that follow one of several models, by their key `kind`
 _SCALAR_TYPES = ("str", "int", "float", "bool")  # pydantic's marks for the alternatives of a scalar union
 _MESSAGE_REPLACEMENTS = (
     ("Input should be ", "must be "),

@@ -347,11 +347,13 @@ class StatusReporter:
 
 
 def _event_level(event: NodeEvent) -> int:
-    """Return the log level of a node event: faults are errors, lost nodes and missing samples warnings."""
+    """Return the log level of a node event: errors for faults, warnings for a node that ceases to run."""
     if event.new_state == NodeState.FAULTED:
         return logging.ERROR
     lost = event.new_state == NodeState.ABSENT and event.old_state != NodeState.ABSENT
-    return logging.WARNING if lost or event.new_state == NodeState.STALE else logging.INFO
+    was_running = event.old_state in (NodeState.OPERATIONAL, NodeState.STALE)
+    restarted = was_running and event.new_state == NodeState.BOOTING
+    return logging.WARNING if lost or restarted or event.new_state == NodeState.STALE else logging.INFO
 
 
 def _bus_counter_names(names: Iterable[str]) -> list[str]:

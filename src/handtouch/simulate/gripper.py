@@ -147,6 +147,7 @@ class GripperStimulus:
     """Contacts of a gripper world on the pads of a deployment; only present contacts are known."""
 
     faults = ()
+    node_faults = ()
     node_replacements = ()
     repeat = False
     duration_s = math.inf

@@ -19,11 +19,12 @@ from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import FAULTS, INFLUENCES, AnyFault, Fault
 from handtouch.simulate.joints import JointMotion, ScenarioJoints
+from handtouch.simulate.node_faults import NODE_FAULTS, AnyNodeFault, NodeFault
 from handtouch.simulate.stimulus import AppliedContact, NodeReplacement
 from handtouch.simulate.touch import ScenarioTouch, ScheduledTouches
 
 _TOUR_TOUCH_S, _TOUR_STEP_S = 1.6, 1.0
-_FAULT_TABLES = {**FAULTS, **INFLUENCES}
+_FAULT_TABLES = {**FAULTS, **INFLUENCES, **NODE_FAULTS}
 
 
 class Scenario(Table):
@@ -35,6 +36,9 @@ class Scenario(Table):
     )
     node_replacements: Annotated[tuple[NodeReplacement, ...], Field(strict=False)] = Field(
         (), alias="swap", description="nodes that are replaced, and when"
+    )
+    node_faults: Annotated[tuple[AnyNodeFault, ...], Field(strict=False)] = Field(
+        (), alias="node_fault", description="faults of nodes, and when they are active"
     )
     motions: Annotated[tuple[JointMotion, ...], Field(strict=False)] = Field(
         (), alias="joint", description="joint motion; without any the joints don't move"
@@ -125,9 +129,10 @@ class Scenario(Table):
     def check_links(self, links: Iterable[str], file: str = "scenario") -> None:
         """Raise ConfigError if a touch, fault or replacement names a link that carries no pad."""
         known = sorted(set(links))
-        tables: tuple[tuple[str, Sequence[ScenarioTouch | Fault | NodeReplacement]], ...] = (
+        tables: tuple[tuple[str, Sequence[ScenarioTouch | Fault | NodeFault | NodeReplacement]], ...] = (
             ("touch", self.touches),
             ("fault", self.faults),
+            ("node_fault", self.node_faults),
             ("swap", self.node_replacements),
         )
         problems = [

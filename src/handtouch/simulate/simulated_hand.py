@@ -9,7 +9,8 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Self
 
 import can
@@ -23,7 +24,7 @@ from handtouch.device import Device, DeviceBus
 from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.gripper_service import GripperService
 from handtouch.simulate.joint_feed import JointFeed
-from handtouch.simulate.stimulus import NodeReplacement, Stimulus
+from handtouch.simulate.stimulus import Stimulus
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import DrawnWorld
@@ -86,9 +87,7 @@ class SimulatedHand:
                 port = open_bus(bus)
                 resources.callback(port.shutdown)
                 simulated.append(
-                    _SimulatedBus(
-                        deployment, bus.name, port, virtual_hand, clock, record, stimulus.node_replacements
-                    )
+                    _SimulatedBus(deployment, bus.name, port, virtual_hand, clock, record, stimulus)
                 )
             return cls(simulated, clock, resources.pop_all())
 
@@ -164,7 +163,7 @@ class _SimulatedBus:
         virtual_hand: VirtualHand,
         clock: ScenarioClock,
         record: bool,
-        replacements: Sequence[NodeReplacement],
+        stimulus: Stimulus,
     ) -> None:
         self.name = name
         self.sync_times_ns: deque[int] = deque()
@@ -187,12 +186,20 @@ class _SimulatedBus:
             device.wiring = tuple(map(ELECTRODES.index, pad.electrodes))
             self.devices[f"{hand}/{pad.link}"] = device
         self._excited = [True] * len(virtual_hand.pads)
-        self._replacements = [
-            (replacement.at_s, replacement.serial, self.devices[f"{hand}/{pad.link}"])
-            for replacement in sorted(replacements, key=lambda replacement: replacement.at_s)
-            for hand, pad in virtual_hand.pads
-            if pad.link == replacement.link
-        ]
+        self._events = sorted(self._node_events(stimulus), key=lambda event: event[0])
+
+    def _node_events(self, stimulus: Stimulus) -> Iterator[tuple[float, Callable[[], None]]]:
+        """Yield the times of replacements and faults of nodes, and what causes them."""
+        for hand, pad in self._virtual_hand.pads:
+            device = self.devices[f"{hand}/{pad.link}"]
+            for replacement in stimulus.node_replacements:
+                if replacement.link == pad.link:
+                    yield replacement.at_s, partial(device.replace_device, replacement.serial)
+            for fault in stimulus.node_faults:
+                if fault.link == pad.link:
+                    yield fault.from_s, partial(fault.begin, device)
+                    if fault.until_s is not None:
+                        yield fault.until_s, partial(fault.end, device)
 
     def truth_at(self, times_ns: Sequence[int]) -> list[GroundTruth]:
         return [
@@ -212,10 +219,10 @@ class _SimulatedBus:
         return self._virtual_hand.sample(elapsed_s)
 
     def _apply_node_events(self, elapsed_s: float) -> None:
-        """Replace nodes whose time has come, and pass switched excitation on to the sheets."""
-        while self._replacements and elapsed_s >= self._replacements[0][0]:
-            _, serial, device = self._replacements.pop(0)
-            device.replace_device(serial)
+        """Cause the events of nodes whose time has come, and pass switched excitation on to the sheets."""
+        while self._events and elapsed_s >= self._events[0][0]:
+            _, cause = self._events.pop(0)
+            cause()
         for row, device in enumerate(self.devices.values()):
             if device.is_excited != self._excited[row]:
                 self._excited[row] = device.is_excited

@@ -19,6 +19,7 @@ from handtouch.config.tables import Name, PositivePerChannel, Unsigned32
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import Fault
+from handtouch.simulate.node_faults import NodeFault
 
 FloatArray = NDArray[np.float64]
 
@@ -76,6 +77,8 @@ class Stimulus(Protocol):
 
     @property
     def faults(self) -> Sequence[Fault]: ...
+    @property
+    def node_faults(self) -> Sequence[NodeFault]: ...
     @property
     def node_replacements(self) -> Sequence[NodeReplacement]: ...
     @property

@@ -33,6 +33,12 @@ class FaultKind(StrEnum):
     GAIN_STEP = "gain_step", "channel gain that has changed"
     # played by the simulator only: no fault, but it acts like one
     HEAT = "heat", "pad warmed or cooled by what is held"
+    # played by the simulator only: faults of a node, which the CANopen master reports
+    EMCY = "emcy", "error reported by EMCY"
+    REFUSES_OPERATIONAL = "refuses_operational", "error that keeps the node from being operational"
+    BOOT_LOOP = "boot_loop", "node that restarts again and again"
+    ILLEGAL_NMT_STATE = "illegal_nmt_state", "heartbeats with an NMT state that CiA 301 doesn't define"
+    CHANGED_SETTING = "changed_setting", "object changed by another master or a configuration tool"
     # diagnosed from a pad's samples only
     HELD_OBJECT = "held_object", "object held by the hand; no fault"
     HYSTERESIS_TAIL = "hysteresis_tail", "slowly fading remainder of a press"

@@ -165,21 +165,42 @@ def check_settings(
         index, number = cia301.TPDO_MAPPING + tpdo.number - 1, tpdo.number
         _check_value(sdo, index, 0, len(tpdo.entries), f"number of objects mapped in TPDO{number}")
         for sub, entry in enumerate(tpdo.entries, 1):
-            _check_value(sdo, index, sub, entry, f"mapping of TPDO{number}")
+            _check_value(sdo, index, sub, entry, f"mapping of TPDO{number}", form="0x{:08X}")
+        _check_cob_id(sdo, tpdo)
         index = cia301.TPDO_COMMUNICATION + number - 1
-        _check_value(sdo, index, 1, tpdo.enabled_entry, f"COB-ID of TPDO{number}")
         allowed = cia301.EVENT_DRIVEN_TYPES if event_driven else (cia301.SYNCHRONOUS,)
         _check_value(sdo, index, 2, allowed[-1], f"transmission type of TPDO{number}", allowed)
     if heartbeat_ms is not None:
         _check_value(sdo, cia301.HEARTBEAT_TIME, 0, heartbeat_ms, "heartbeat time")
 
 
+def _check_cob_id(sdo: NodeSdoClient, tpdo: NodeTpdo) -> None:
+    """Check a COB-ID; another identifier is replaced by the former one before the error is raised.
+
+    CiA 301 allows that only while the PDO is disabled, which it stays until the node is configured.
+    """
+    index, name = cia301.TPDO_COMMUNICATION + tpdo.number - 1, f"COB-ID of TPDO{tpdo.number}"
+    try:
+        _check_value(sdo, index, 1, tpdo.enabled_entry, name, form="0x{:X}")
+    except BootStepError as error:
+        entry = sdo.read(index, 1, name)
+        if not error.timed_out and entry & cia301.IDENTIFIER_MASK != tpdo.cob_id:
+            sdo.write_if_different(index, 1, entry | cia301.INVALID_BIT, 4, name)
+            sdo.write_verified(index, 1, tpdo.disabled_entry, 4, name)
+        raise
+
+
 def _check_value(
-    sdo: NodeSdoClient, index: int, sub: int, expected: int, name: str, allowed: tuple[int, ...] = ()
+    sdo: NodeSdoClient,
+    index: int,
+    sub: int,
+    expected: int,
+    name: str,
+    allowed: tuple[int, ...] = (),
+    form: str = "{}",
 ) -> None:
     value = sdo.read(index, sub, name)
     if value != expected and value not in allowed:
-        form = "0x{:08X}" if max(value, expected) > 0xFFFF else "{}"
         raise BootStepError(
             f"0x{index:04X}:{sub:02X}, {name}, is {form.format(value)} instead of {form.format(expected)}"
         )

@@ -13,8 +13,8 @@ from handtouch.canbus import cia301
 from handtouch.canbus.nodes.lifecycle_types import (
     BusRole,
     Lifecycle,
+    NmtFault,
     NodeAction,
-    NodeFault,
     NodeState,
     NodeTiming,
 )
@@ -53,14 +53,14 @@ def on_departure(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition
         errors = f", {life.errors}" if life.errors else ""
         return begin_boot(life, now_ns, f"left OPERATIONAL by itself, is {name}{errors}", timing)
     delay_ns = timing.retry_delay_ns(life.restarts - MAX_QUICK_RESTARTS)
-    life = replace(life, fault=NodeFault.LEAVES_OPERATIONAL, due_ns=now_ns + delay_ns)
+    life = replace(life, fault=NmtFault.LEAVES_OPERATIONAL, due_ns=now_ns + delay_ns)
     return _explain(life, now_ns)
 
 
 def _refuse(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Enter FAULTED, or stay there, after a start without effect."""
     delay_ns = timing.retry_delay_ns(life.restarts)
-    life = replace(life, fault=NodeFault.REFUSES_OPERATIONAL, start_pending=False, due_ns=now_ns + delay_ns)
+    life = replace(life, fault=NmtFault.REFUSES_OPERATIONAL, start_pending=False, due_ns=now_ns + delay_ns)
     return _explain(life, now_ns)
 
 
@@ -87,7 +87,7 @@ def on_errors(life: Lifecycle, errors: str, now_ns: int) -> Transition:
 
 def on_faulted_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming, settled: bool) -> Transition:
     """Handle a heartbeat of a FAULTED node that refused to become operational."""
-    if life.fault is not NodeFault.REFUSES_OPERATIONAL or life.standby:
+    if life.fault is not NmtFault.REFUSES_OPERATIONAL or life.standby:
         return life, ()
     if life.nmt_state == cia301.OPERATIONAL:
         life = enter(life, NodeState.SETTLING, now_ns, "became operational after refusals")
@@ -107,7 +107,7 @@ def on_faulted_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming, settl
 
 def on_fault_due(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Retry a FAULTED node. It stays FAULTED, with its reason, until that succeeds."""
-    refuses = life.fault is NodeFault.REFUSES_OPERATIONAL and not life.standby
+    refuses = life.fault is NmtFault.REFUSES_OPERATIONAL and not life.standby
     quiet_ns = now_ns - (life.last_frame_ns or 0)
     illegal = has_illegal_state(life) and quiet_ns <= timing.heartbeat_timeout_ns
     may_reset = (

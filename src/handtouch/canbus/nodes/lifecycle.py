@@ -261,6 +261,7 @@ def _start_node(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
         started_ns=now_ns,
         samples_to_discard=timing.settle_samples,
         foreign_nmt=None,
+        confirmed=False,
         due_ns=now_ns + timing.settle_timeout_ns if running or ours else NEVER_NS,
     )
     return life, (NodeAction.START,) if ours else ()

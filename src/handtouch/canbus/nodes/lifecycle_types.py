@@ -1,6 +1,6 @@
 """Types of a CANopen node's lifecycle: states, events, actions, timing.
 
-Public names: `Lifecycle` with its `NodeState` and `NodeFault`; `LifecycleEvent`, a union of the event
+Public names: `Lifecycle` with its `NodeState` and `NmtFault`; `LifecycleEvent`, a union of the event
 classes; `NodeAction`; `BusRole` and `NodeTiming`, the parameters of `lifecycle.advance`. Times are in ns.
 """
 
@@ -41,7 +41,7 @@ class NodeAction(Enum):
     SET_TRANSMISSION = auto()  # event-driven or synchronous; started by the master itself
 
 
-class NodeFault(Enum):
+class NmtFault(Enum):
     """Fault in a node's NMT behaviour; its reason ends with the errors that the node reports."""
 
     REFUSES_OPERATIONAL = "refuses OPERATIONAL"
@@ -100,7 +100,7 @@ class Lifecycle:
     duplicate_id: bool = False  # two nodes have its id
     babbling: bool = False  # sends many samples per SYNC
     identified: bool = False  # as the configured node, since its last boot-up
-    fault: NodeFault | None = None
+    fault: NmtFault | None = None
     errors: str = ""  # errors that the node reports, as text
     confirmed: bool = False  # it was operational after its start
     operational_ns: int = 0  # when it became operational after its start, 0 before

@@ -19,6 +19,7 @@ from handtouch.simulate.faults import Fault
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches
 from handtouch.simulate.grasp.simulation import GraspRecord
+from handtouch.simulate.node_faults import NodeFault
 from handtouch.simulate.stimulus import AppliedContact, JointTrajectory, NodeReplacement
 from handtouch.simulate.worlds import DrawnWorld, HiddenJoints
 
@@ -72,6 +73,7 @@ class GraspStimulus:
     """(n, m), joint positions reported by the robot."""
     repeat: bool = False
     faults: Sequence[Fault] = ()
+    node_faults: Sequence[NodeFault] = ()
     node_replacements: Sequence[NodeReplacement] = ()
 
     @classmethod
