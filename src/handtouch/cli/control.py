@@ -140,7 +140,7 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
 
 
 def _add_direct(direct: argparse._ArgumentGroup) -> None:
-    direct.add_argument("--name", help="id of the new calibration, published in contact messages")
+    direct.add_argument("--name", help="id of the new calibration, published in contact messages (required)")
     direct.add_argument(
         "--gains", type=float, nargs=4, metavar="G", help="relative gains of the channels x0, xa, y0, yb"
     )

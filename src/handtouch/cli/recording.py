@@ -58,7 +58,7 @@ def _add_record(commands: Subparsers) -> None:
     record.add_argument(
         "--hand",
         action="store_true",
-        help="also record hand messages, the state of all pads per tick (not needed: replay recomputes them)",
+        help="also record hand frames, all pads in one message per tick (not needed: replay recomputes them)",
     )
     add_percepts(record)
     record.add_argument(
