@@ -1,7 +1,6 @@
 """Calibration store: every calibration of every node, in one SQLite file; nothing is overwritten.
 
-Public: `Store` (open, write, read, roll back) and `store_path`; `damaged_files` and the errors of
-`store_file`. Readers and one writer at a time may be different processes.
+Public: `Store`, `store_path`; `damaged_files` and errors of `store_file`. Several processes may have it open.
 """
 
 from __future__ import annotations
