@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,27 @@ def test_robot_client_refuses_an_unknown_hand(inputs: Any) -> None:
         with pytest.raises(ValueError, match="unknown"):
             robot.send_forces("rihgt", {"tip": 1.0}, 0.1)
         robot.send_joints("right", {"a": 0.1})
+
+
+def test_robot_client_knows_the_hands_of_a_daemon_that_restarts(endpoints: dict[str, str]) -> None:
+    def accepts_right_hand() -> bool:
+        try:
+            robot.send_joints("right", {"a": 0.1})
+        except ValueError:
+            return False
+        return True
+
+    with Robot(endpoints["inputs"], key="") as robot:
+        for hand in ("left", "right", "left"):
+            with zmq.Context() as context:
+                made = InputReceiver.open(
+                    context, endpoints["inputs"], Authenticator(context), {}, [(hand, "tip")]
+                )
+                end_s = time.monotonic() + 60
+                while not robot.wait_connected(0.05) or accepts_right_hand() is not (hand == "right"):
+                    made.poll(NOW)
+                    assert time.monotonic() < end_s
+                made.close()
 
 
 def test_robot_client_refuses_nan_and_missing_values(inputs: Any) -> None:

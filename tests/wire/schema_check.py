@@ -16,7 +16,7 @@ SCHEMA = Path(__file__).parents[2] / "docs" / "wire.schema.json"
 
 
 class SchemaCheck:
-    """Validates messages of `direction` "published" or "inputs"; undocumented keys are errors too."""
+    """Validates messages of `direction` "published" or "inputs"; undocumented keys and values are errors."""
 
     def __init__(self, direction: str) -> None:
         jsonschema = pytest.importorskip("jsonschema", reason="run `make dev`")
@@ -25,6 +25,9 @@ class SchemaCheck:
         for definition in schema["$defs"].values():
             if "properties" in definition:
                 definition["additionalProperties"] = False
+                for key in definition["properties"].values():
+                    if "examples" in key:
+                        key["enum"] = key["examples"]
         self._validators = {
             row["properties"]["topic"]["pattern"]: jsonschema.Draft202012Validator(
                 {**row["properties"]["payload"], "$defs": schema["$defs"]}

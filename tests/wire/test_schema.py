@@ -20,7 +20,7 @@ from handtouch.wire.tables import with_tables
 from tests.wire.schema_check import SchemaCheck
 
 DOCS = Path(__file__).parents[2] / "docs"
-UPDATE = "the declarations have changed: run `make tables`"
+UPDATE = "the declarations have changed: run `python -m handtouch.wire.tables docs`"
 ENVELOPE = {"v", "session", "seq", "t_ns", "retained"}
 
 

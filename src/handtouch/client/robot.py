@@ -46,6 +46,7 @@ class Robot:
         self.endpoint = endpoint
         self._hands: frozenset[str] = frozenset()  # of the connected daemon
         options = {zmq.SNDHWM: _QUEUE_MESSAGES, zmq.LINGER: _LINGER_MS, **RECONNECT_OPTIONS}
+        options[zmq.XPUB_VERBOSE] = 1  # report also what a daemon before a restart had subscribed to
         self._connection = Connection.open(zmq.XPUB, endpoint, key, options)
 
     def send_joints(
@@ -136,8 +137,11 @@ class Robot:
                 request = self._connection.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            if hands := hands_in_prefix(request[1:].decode("utf-8", "replace")):
-                self._hands = hands if request[:1] == b"\x01" else frozenset()
+            hands = hands_in_prefix(request[1:].decode("utf-8", "replace"))
+            if hands and request[:1] == b"\x01":
+                self._hands = hands
+            elif hands == self._hands:  # the daemon disconnected
+                self._hands = frozenset()
 
 
 def _to_array(values: Mapping[str, float], names: tuple[str, ...]) -> NDArray[np.float64]:
