@@ -265,6 +265,26 @@ def test_a_node_that_does_not_stay_selected_is_found_once() -> None:
     assert master.problems == []
 
 
+class Eager(LssSlave):
+    """Enters the configuration state at its serial number, though the master remains at that part."""
+
+    def handle_request(self, data: bytes) -> bytes | None:
+        answer = super().handle_request(data)
+        if answer is not None and data[0] == 0x51 and data[5:7] == bytes((0, 3)):
+            self.configuring = True
+        return answer
+
+
+@pytest.mark.parametrize("compares", [True, False])
+def test_nodes_that_are_selected_by_their_serial_number_alone_are_found(compares: bool) -> None:
+    slaves = [Eager(slave.address, compares=compares) for slave in pads(4)]
+    bus = Bus(slaves)
+    master = bus.master()
+    assert master.scan() == sorted(slave.address for slave in slaves)
+    assert master.problems == []
+    assert bus.seconds < 6.0
+
+
 class Deaf(LssSlave):
     """Misses some requests to return to the waiting state: its last response is still being sent."""
 

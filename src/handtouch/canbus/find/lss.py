@@ -187,7 +187,7 @@ class LssMaster:
         self._enter(path)
         tried = known[part] if part < len(known) else ()
         values = [value for value in tried if self._has_match(_scan_request(value, 0, part, part))]
-        for value in values or self._find_values(part):
+        for value in values or self._find_values(path):
             if part < _SERIAL_PART:
                 self._search_below((*path, value), known, found)
             else:
@@ -207,16 +207,21 @@ class LssMaster:
         ):
             self._record_mismatch()
 
-    def _find_values(self, part: int, prefix: int = 0, bit: int = 31) -> list[int]:
-        """Return the values of a part, among the nodes entered, that begin with these bits, in order.
+    def _find_values(self, path: tuple[int, ...], prefix: int = 0, bit: int = 31) -> list[int]:
+        """Return the values of the part after `path` that begin with these bits, in order.
 
         Raises _ScanMismatch.
         """
+        part = len(path)
         for _ in range(2):
             values: list[int] = []
             for value in (prefix, prefix | 1 << bit):
-                if self._has_match(_scan_request(value, bit, part, part)):
-                    values += self._find_values(part, value, bit - 1) if bit else [value]
+                if not self._has_match(_scan_request(value, bit, part, part)):
+                    continue
+                values += self._find_values(path, value, bit - 1) if bit else [value]
+                if not bit and part == _SERIAL_PART and self._answers_contradiction():
+                    self._confirm_waiting()  # some nodes are selected by their serial number already
+                    self._enter(path)
             if len(values) > _MAX_VALUES:
                 raise _ScanMismatch
             if values:
