@@ -323,7 +323,7 @@ CHANGES = [
 @pytest.mark.parametrize(
     ("where", "value", "expected"), CHANGES, ids=[f"{c[2][:9]}={c[1]:X}" for c in CHANGES]
 )
-def test_setting_changed_by_another_device_is_repaired_and_named(
+def test_changed_setting_is_repaired_and_named(
     make_rig: Make, where: tuple[int, int], value: int, expected: str
 ) -> None:
     rig = make_rig(2, device={"eds": REMAPPABLE})
@@ -331,7 +331,7 @@ def test_setting_changed_by_another_device_is_repaired_and_named(
     rig.node(1).write_object(*where, value)
     events = rig.run(1500)
     reasons = [e.reason for e in events if e.new_state is NodeState.BOOTING]
-    assert reasons == [f"changed by another device: {expected}; repaired"]
+    assert reasons == [f"settings changed since its boot: {expected}; repaired"]
     assert rig.status(1).cob_ids == (0x281,)
     assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2, rig.status(1).reason
 

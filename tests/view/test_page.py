@@ -234,6 +234,17 @@ def test_health_sets_the_status_of_a_pad_and_appends_messages() -> None:
     ]
 
 
+def test_errors_that_a_node_reports_are_shown_until_they_are_cleared() -> None:
+    model, error = PageModel(), {"code": 0x5000, "text": "0x5000 device hardware", "cleared_ns": None}
+    shown = []
+    for cleared_ns in (None, 7):
+        model.add_message(health(emergencies=({**error, "cleared_ns": cleared_ns},)))
+        model.add_message(frame({}))
+        model.update_values(True)
+        shown.append(model.values.changes_since(0)["pad/right/index_distal"]["reason"])
+    assert shown == ["EMCY 0x5000 device hardware", ""]
+
+
 def test_the_same_fault_of_several_pads_is_one_message() -> None:
     model = PageModel()
     for link in LINKS[:3]:

@@ -15,7 +15,7 @@ from typing import Any, Protocol, Self
 
 from handtouch import wire
 from handtouch.client import Subscriber
-from handtouch.view.message_lines import DISCONNECTED_TEXT, message_line
+from handtouch.view.message_lines import DISCONNECTED_TEXT, active_errors, message_line
 
 _FRAMES_PER_S = 15
 _MAX_UPDATE_LINES_PER_S = 1
@@ -84,7 +84,7 @@ class LineDisplay:
                 message.reason,
                 message.calibration_state,
                 *kinds,
-                *(str(error.get("text")) for error in message.emergencies if error.get("cleared_ns") is None),
+                *active_errors(message),
             )
             pad = (message.hand, message.link)
             known, self._health[pad] = self._health.get(pad), state

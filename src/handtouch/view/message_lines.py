@@ -58,6 +58,11 @@ def position_std_m(contact: wire.Contact) -> float:
     return math.sqrt(max(0.0, xx + yy + zz))
 
 
+def active_errors(health: wire.Health) -> list[str]:
+    """Return the errors that the pad's node has reported by EMCY and not cleared."""
+    return [f"EMCY {e.get('text')}" for e in health.emergencies if e.get("cleared_ns") is None]
+
+
 def health_line(health: wire.Health) -> str:
     """Format a pad and its node."""
     serial = "" if health.serial is None else f" serial {health.serial}"
@@ -66,8 +71,7 @@ def health_line(health: wire.Health) -> str:
     if health.calibration_state in UNCALIBRATED_STATES:
         mode += f" {health.calibration_state}"
     why += "".join(f"; {diagnosis_text(diagnosis)}" for diagnosis in health.diagnoses)
-    active = [error for error in health.emergencies if error.get("cleared_ns") is None]
-    why += "".join(f"; EMCY {error.get('text')}" for error in active)
+    why += "".join(f"; {text}" for text in active_errors(health))
     return (
         f"{health.t_ns * 1e-9:14.4f}  health  {health.hand}/{health.link:<16}  {health.state:8} "
         f"node {health.node_id} on {health.bus} {health.node_state}{mode}{serial}, {health.rate_hz:.0f} Hz, "

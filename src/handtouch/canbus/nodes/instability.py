@@ -25,7 +25,8 @@ MAX_QUICK_RESTARTS = 3
 _RESETS_BEGIN = 2
 """Refusals after which one NMT reset communication is sent."""
 _RESET_TIMEOUT_NS = 1_000_000_000
-_REFUSAL_REMEDY = "it is started again when its error is cleared; the node's manual explains its errors"
+_ERROR_REMEDY = "clear the error in the node, whose manual explains it"
+_NO_ERROR_REMEDY = "look for the cause in the node's firmware"
 _BOOT_LOOP_REMEDY = "check its supply voltage, watchdog and firmware"
 _ILLEGAL_STATE_REMEDY = "check its firmware, and that no other device sends with its COB-ID"
 
@@ -74,7 +75,9 @@ def _explain(life: Lifecycle, now_ns: int) -> Transition:
 
 def _fault_reason(life: Lifecycle) -> str:
     assert life.fault is not None
-    return f"{life.fault.value}, {life.errors or 'reports no error'}; {_REFUSAL_REMEDY}"
+    if life.errors:
+        return f"{life.fault.value}, {life.errors}; {_ERROR_REMEDY}"
+    return f"{life.fault.value}, reports no error; {_NO_ERROR_REMEDY}"
 
 
 def on_errors(life: Lifecycle, errors: str, now_ns: int) -> Transition:

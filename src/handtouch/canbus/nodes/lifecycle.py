@@ -64,7 +64,7 @@ _STANDBY_REASON = "outside the scene: in standby until needed"
 MAX_CHECKS = 3
 """Times that the settings of a stale node are read back."""
 MAX_REPAIRS = 3
-"""Times that settings changed by another device are repaired, before that is only reported."""
+"""Times that changed settings are repaired, before that is only reported."""
 _BOOT_STEPS = frozenset({NodeAction.IDENTIFY, NodeAction.READ_MAPPING, NodeAction.CONFIGURE})
 _IN_BOOT = frozenset({NodeState.BOOTING, NodeState.IDENTIFIED, NodeState.CONFIGURING})
 
@@ -296,7 +296,7 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
 
 
 def _repair_settings(life: Lifecycle, difference: str, now_ns: int, timing: NodeTiming) -> Transition:
-    """Configure a stale node again whose settings another device has changed, a few times."""
+    """Configure a stale node again whose settings have changed, a few times."""
     life = forget_if_stable(life, now_ns, timing)
     if life.repairs >= MAX_REPAIRS:
         reason = (
@@ -305,7 +305,7 @@ def _repair_settings(life: Lifecycle, difference: str, now_ns: int, timing: Node
         )
         return replace(enter(life, NodeState.STALE, now_ns, reason), due_ns=NEVER_NS), ()
     life = replace(life, repairs=life.repairs + 1)
-    return begin_boot(life, now_ns, f"changed by another device: {difference}; repaired", timing)
+    return begin_boot(life, now_ns, f"settings changed since its boot: {difference}; repaired", timing)
 
 
 def _on_sample(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:

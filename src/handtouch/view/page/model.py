@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from handtouch import wire
 from handtouch.client import columns
 from handtouch.config import Deployment
-from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
+from handtouch.view.message_lines import UNCALIBRATED_STATES, active_errors, diagnosis_text
 from handtouch.view.page.percepts import PerceptSummaries
 from handtouch.view.page.scene_graph import scene_of
 
@@ -182,7 +182,7 @@ class PageModel:
             value |= {
                 "node_state": health.node_state,
                 "rate_hz": round(health.rate_hz),
-                "reason": health.reason,
+                "reason": "; ".join(filter(None, [health.reason, *active_errors(health)])),
                 "diagnoses": [diagnosis_text(diagnosis) for diagnosis in health.diagnoses],
                 "calibration_state": health.calibration_state,
                 "calibration_progress": health.calibration_progress,
