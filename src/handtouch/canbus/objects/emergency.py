@@ -65,7 +65,8 @@ class ErrorLog:
         """
         is_reset = message.code >> 8 == 0
         latest = self._emergencies[-1] if self._emergencies else None
-        if latest is not None and not is_reset and _is_repetition(message, latest):
+        is_same = latest is not None and _is_repetition(message, latest) and message.register == self.register
+        if latest is not None and is_same and not is_reset:
             self._emergencies[-1] = replace(latest, count=latest.count + 1)
             return ()
         cleared = self._update_register(message.register, message.arrival_ns)
