@@ -298,6 +298,26 @@ def test_responses_for_other_objects_are_ignored() -> None:
     assert node.sdo.read(0x1017, 0, "heartbeat time") == 100
 
 
+@pytest.mark.parametrize(
+    ("response", "received"),
+    [("4310", "43 10"), ("", "no data"), ("43001000 91010f00", "43 00 10 00 91 01 0f 00")],
+)
+def test_timeout_after_invalid_responses_names_the_last_one(response: str, received: str) -> None:
+    node = Node({(0x1017, 0): (100, 2)})
+
+    def invalid(_id: int, _data: bytes) -> bool:
+        node.transport.deliver_response(bytes.fromhex(response))
+        return True
+
+    node.intercept(invalid)
+    with pytest.raises(BootStepError) as error:
+        node.sdo.read(0x1017, 0, "heartbeat time")
+    assert str(error.value).endswith(f"no valid SDO response within 5 ms in 2 attempts; received: {received}")
+    node.intercept(lambda _id, _data: True)
+    with pytest.raises(BootStepError, match="no answer within 5 ms in 2 attempts"):
+        node.sdo.read(0x1017, 0, "heartbeat time")
+
+
 def test_garbled_response_is_an_error_not_a_value() -> None:
     node = Node({})
 

@@ -68,7 +68,7 @@ EVENT_DRIVEN = 255
 EVENT_DRIVEN_TYPES = (254, EVENT_DRIVEN)
 DUMMY_ENTRIES = range(1, 0x20)
 """Indices of data types: mapping entries that only fill a PDO."""
-PDO_BYTES = 8
+PDO_BYTES = SDO_BYTES = 8
 
 
 def tpdo_identifier(number: int) -> int:

@@ -177,16 +177,16 @@ class BusSurvey:
     def _handle_sdo_response(self, node_id: int, data: bytes) -> None:
         if node_id in self._probed_ids:
             self._invalid_responses[node_id] = data  # unless a valid one comes
-        if len(data) != _SDO_FRAME.size:
+        reader = self._readers.get(node_id)
+        if reader is not None and reader.awaiting_response:
+            reader.deliver_response(data)
+        if len(data) != cia301.SDO_BYTES:
             return
         command, index, sub, value = _SDO_FRAME.unpack(data)
         if command & 0xE0 in (0x40, 0x80) and (index, sub) == (cia301.DEVICE_TYPE, 0):
             self._responding_ids.add(node_id)
         if command & 0xE0 == 0x40 and (index, sub) in _IDENTITY_OBJECTS:
             self._identity_values.setdefault(node_id, {}).setdefault((index, sub), set()).add(value)
-        reader = self._readers.get(node_id)
-        if reader is not None and reader.awaiting_response:
-            reader.deliver_response(data)
 
     def _send(self, can_id: int, data: bytes) -> bool:
         for _ in range(_MAX_SEND_ATTEMPTS):

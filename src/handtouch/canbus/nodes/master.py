@@ -258,6 +258,8 @@ class Master:
         size = {cia301.NMT_ERROR_CONTROL: 1}.get(service, 8)
         if len(data) != size:
             node.port.counters.wrong_length += 1
+            if service == cia301.SDO_RESPONSE and node.sdo.awaiting_response:
+                node.sdo.deliver_response(data)  # for the reason of the timeout
         elif service == cia301.NMT_ERROR_CONTROL:
             self._handle_heartbeat(node, data[0] & 0x7F, now_ns)
         elif service == cia301.EMCY:

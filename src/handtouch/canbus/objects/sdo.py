@@ -99,14 +99,20 @@ class SdoTransport:
         self._client.RESPONSE_TIMEOUT = self._timeout_s = SDO_TIMEOUT_S if timeout_s is None else timeout_s
         self.awaiting_response = False
         self._responded = False
+        self._dropped: bytes | None = None
         self._object = bytes(3)
 
     def deliver_response(self, data: bytes) -> None:
-        """Pass on a response of 8 bytes, from the receiving thread, while `awaiting_response`.
+        """Pass on a response, from the receiving thread, while `awaiting_response`.
 
-        A response for another object is dropped: it is late, or answers a probe or another master.
+        A response for another object is dropped: it is late, or answers a probe or another master; so is one
+        of another length than 8 bytes. The latest one dropped is in the reason of a timeout.
         """
-        if data[0] & 0xE0 in _COMMANDS_WITH_OBJECT and data[1:4] not in (self._object, bytes(3)):
+        is_invalid = len(data) != cia301.SDO_BYTES
+        if is_invalid or (
+            data[0] & 0xE0 in _COMMANDS_WITH_OBJECT and data[1:4] not in (self._object, bytes(3))
+        ):
+            self._dropped = data
             return
         self._responded = True
         self._client.on_response(0, data, 0.0)
@@ -125,6 +131,7 @@ class SdoTransport:
         """
         self._object = index.to_bytes(2, "little") + bytes((sub,))
         timeout: SdoCommunicationError | None = None
+        self._dropped = None
         for _ in range(MAX_SDO_ATTEMPTS):
             if is_cancelled():
                 raise BootStepCancelled
@@ -146,11 +153,13 @@ class SdoTransport:
                 timeout = error
             finally:
                 self.awaiting_response = False
-        raise BootStepError(
-            f"{description}: no answer within {self._timeout_s * 1e3:.0f} ms in {MAX_SDO_ATTEMPTS} attempts; "
-            "is its SDO server running, the bus overloaded?",
-            timed_out=True,
-        ) from timeout
+        limit = f"within {self._timeout_s * 1e3:.0f} ms in {MAX_SDO_ATTEMPTS} attempts"
+        cause = (
+            f"no answer {limit}; is its SDO server running, the bus overloaded?"
+            if self._dropped is None
+            else f"no valid SDO response {limit}; received: {self._dropped.hex(' ') or 'no data'}"
+        )
+        raise BootStepError(f"{description}: {cause}", timed_out=True) from timeout
 
 
 def _never_cancelled() -> bool:
