@@ -374,3 +374,27 @@ def test_listener_reads_no_settings_of_a_stale_node(make_rig: Make) -> None:
     rig.node(1).write_object(0x1801, 2, 240)
     rig.run(5000)
     assert rig.wire.sent == [] == rig.wire.asked
+
+
+def test_missing_sync_stays_the_reason_after_the_settings_were_checked(rig: Any) -> None:
+    rig.boot()
+    rig.syncs = False
+    rig.run(10_000)
+    reasons = {rig.status(n).reason.partition(", ")[2] for n in (1, 2, 3)}
+    assert len(reasons) == 1
+    assert reasons.pop().endswith("; check its SYNC producer and cable")
+
+
+def test_settings_are_checked_too_if_a_pause_hid_the_change(make_rig: Make) -> None:
+    """Its samples stayed away together with those of others, but not for their cause."""
+    rig = make_rig(2, device=EDS)
+    rig.boot()
+    rig.syncs = False
+    rig.node(1).write_object(0x1801, 2, 240)
+    rig.run(100)
+    assert rig.state(1) is STALE
+    assert "no SYNC on bus can" in rig.status(1).reason
+    rig.syncs = True
+    events = rig.run(2000)
+    assert any("0x1801:02, transmission type of TPDO2, is 240 instead of 1" in e.reason for e in events)
+    assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2

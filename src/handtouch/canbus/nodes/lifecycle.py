@@ -63,6 +63,8 @@ _STANDBY_REASON = "outside the scene: in standby until needed"
 
 MAX_CHECKS = 3
 """Times that the settings of a stale node are read back."""
+_BUS_CAUSE_DELAY_NS = 1_000_000_000
+"""Time until the settings of a node are checked whose samples stayed away with those of others."""
 MAX_REPAIRS = 3
 """Times that changed settings are repaired, before that is only reported."""
 _BOOT_STEPS = frozenset({NodeAction.IDENTIFY, NodeAction.READ_MAPPING, NodeAction.CONFIGURE})
@@ -237,8 +239,8 @@ def _on_step_done(life: Lifecycle, event: StepDone, now_ns: int, timing: NodeTim
             return _start_node(life, now_ns, timing)
         case NodeAction.ENTER_STANDBY if life.state is NodeState.STOPPED:
             return enter(life, NodeState.STOPPED, now_ns, _STANDBY_REASON), ()
-        case NodeAction.CHECK_SETTINGS if life.state is NodeState.STALE and life.checks == 1:
-            reason = f"{life.reason.partition(';')[0]}; {_SETTINGS_UNCHANGED}"
+        case NodeAction.CHECK_SETTINGS if life.state is NodeState.STALE:
+            reason = life.reason.replace(_TPDO_REMEDY, _SETTINGS_UNCHANGED)
             return enter(life, NodeState.STALE, now_ns, reason), ()
     return life, ()
 
@@ -344,15 +346,14 @@ def _on_samples_missing(
 
 
 def _enter_stale(life: Lifecycle, now_ns: int, reason: str, bus_cause: str, timing: NodeTiming) -> Lifecycle:
-    """Enter STALE; the settings are checked soon unless the cause is in the host or the bus.
+    """Enter STALE; the settings are checked soon, or later if the cause seems to be in the host or the bus.
 
     The first check isn't postponed by single samples.
     """
     life = enter(life, NodeState.STALE, now_ns, reason)
-    if bus_cause:
-        return replace(life, due_ns=NEVER_NS)
     if now_ns - life.first_check_ns > timing.max_retry_ns:
-        life = replace(life, first_check_ns=now_ns + timing.retry_delay_ns(1), checks=0)
+        delay_ns = _BUS_CAUSE_DELAY_NS if bus_cause else timing.retry_delay_ns(1)
+        life = replace(life, first_check_ns=now_ns + delay_ns, checks=0)
     return replace(life, due_ns=max(life.first_check_ns, now_ns))
 
 
