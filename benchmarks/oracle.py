@@ -1,0 +1,187 @@
+"""Least uncertainty that an estimator of contacts can honestly state in a simulated world.
+
+Public names: `PadOracle`, `OracleCovariances`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scores import laplace_covariance
+
+from handtouch import config
+from handtouch.field import ContactLaw, Electrode, ElectrodeNetwork, Surface
+from handtouch.hand import pad_surface
+from handtouch.simulate.worlds import DrawnWorld, HiddenPad
+
+FloatArray = NDArray[np.float64]
+_STEP = 1e-4
+"""Of differences: of a side, or in the parameter's own unit."""
+
+
+@dataclass(frozen=True)
+class OracleCovariances:
+    """Of n touches: covariance of position (n, 2, 2) [m^2] and of force (n, 1, 1) [N^2] by the oracle, and
+    the least standard deviation of force from noise alone (n,) [N]."""
+
+    position_m2: FloatArray
+    force_n2: FloatArray
+    force_bound_n: FloatArray
+
+
+@dataclass(frozen=True)
+class _Hidden:
+    """Hidden parameters of one touch: differences from their true values; logarithms of ratios."""
+
+    log_gain: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    gap_m: tuple[float, ...] = (0.0,) * 8
+    log_aspect: float = 0.0
+    log_sheet: float = 0.0
+    radius_m: float = 0.0
+    log_layer: float = 0.0
+    alpha: float = 0.0
+
+
+class PadOracle:
+    """Readings of a pad as a function of contact and hidden parameters, about the true ones."""
+
+    def __init__(
+        self,
+        pad: config.Pad,
+        sheet: config.Sheet,
+        hidden: HiddenPad,
+        drive_v: float,
+        noise_a: FloatArray,
+        prior_std: dict[str, float],
+    ) -> None:
+        self.surface: Surface = pad_surface(pad)
+        self.surface_name = type(pad.surface).__name__.lower()
+        length_m, width_m = self._size_m()
+        self.aspect = max(length_m, width_m) / min(length_m, width_m)
+        self._pad, self._sheet, self._hidden = pad, sheet, hidden
+        self._drive_v, self._noise_a, self._prior_std = drive_v, noise_a, prior_std
+
+    @classmethod
+    def build(
+        cls,
+        drawn: DrawnWorld,
+        deployment: config.Deployment,
+        hand: str,
+        pad: config.Pad,
+        noise_a: FloatArray,
+        *,
+        gains_known: bool,
+    ) -> PadOracle:
+        """Return the oracle of a pad in a drawn world, with that world's distributions for prior."""
+        world, sheet = drawn.world, deployment.sheets[pad.sheet]
+        parts, surface = world.parts, pad_surface(pad)
+        length_mm = 1e3 * surface.extent_m[0]
+        width_mm = length_mm * surface.b / surface.a
+        prior_std = {
+            "log_gain": 0.0 if gains_known else parts.gain_ratio.std,
+            "gap_m": 1e-3 * parts.gap_offset_mm.std,
+            "log_aspect": float(
+                np.hypot(
+                    np.hypot(parts.length_offset_mm.std / length_mm, parts.width_offset_mm.std / width_mm),
+                    parts.anisotropy_ratio.std / 2,
+                )
+            ),
+            "log_sheet": parts.sheet_ohm_ratio.std,
+            "radius_m": 1e-3 * world.contacts.radius_sigma.std * sheet.contact_radius_std_mm,
+            "log_layer": world.sheets.contact_ohm_ratio.std,
+            "alpha": world.sheets.alpha_offset.std,
+        }
+        drive_v = deployment.nodes[pad.node].drive_v
+        return cls(pad, drawn.sheet(hand, pad, sheet), drawn.pad(hand, pad), drive_v, noise_a, prior_std)
+
+    def edge_distance(self, u_m: FloatArray, v_m: FloatArray) -> FloatArray:
+        """Return the distance (n,) from the nearest edge as a fraction of that side's own direction."""
+        x, y = self.surface.to_rectangle(u_m, v_m)
+        s, t = x / self.surface.a, y / self.surface.b
+        return np.asarray(np.min([s, 1 - s, t, 1 - t], axis=0))
+
+    def covariances(self, u_m: FloatArray, v_m: FloatArray, force_n: FloatArray) -> OracleCovariances:
+        """Return covariances at true contacts: arc lengths (n,) [m] and forces (n,) [N]."""
+        x, y = self.surface.to_rectangle(u_m, v_m)
+        side = _STEP * min(self.surface.a, self.surface.b)
+        contact = np.stack([x, y, np.log(force_n)])
+        columns = []
+        for step in np.diag([side, side, _STEP]):
+            more, less = contact + step[:, None], contact - step[:, None]
+            change = self._readings(more, _Hidden()) - self._readings(less, _Hidden())
+            columns.append(change / (2 * step.max()))
+        prior = [np.inf] * 3
+        for std, above, below, width in self._shifts():
+            columns.append((self._readings(contact, above) - self._readings(contact, below)) / width)
+            prior.append(std)
+        design = np.moveaxis(np.array(columns), 0, -1).swapaxes(0, 1)  # (n, 4, parameters)
+        full = laplace_covariance(design, self._noise_a, prior)
+        noise_only = laplace_covariance(design[:, :, :3], self._noise_a, prior[:3])
+        metres = self.surface.scales(x, y).T
+        position = full[:, :2, :2] * metres[:, :, None] * metres[:, None, :]
+        force = full[:, 2:3, 2:3] * (force_n**2)[:, None, None]
+        return OracleCovariances(position, force, np.sqrt(noise_only[:, 2, 2]) * force_n)
+
+    def _size_m(self) -> tuple[float, float]:
+        middle = self.surface.a / 2, self.surface.b / 2
+        return self.surface.extent_m[0], float(self.surface.b * self.surface.scale(*middle))
+
+    def _shifts(self) -> Iterator[tuple[float, _Hidden, _Hidden, float]]:
+        """Yield prior deviation, two shifted values and their distance of every hidden parameter."""
+        for name, std in self._prior_std.items():
+            if std == 0:
+                continue
+            zero = getattr(_Hidden(), name)
+            step = min(std, 1e-5 if name.endswith("_m") else 1e-3)
+            for index in range(len(zero) if isinstance(zero, tuple) else 1):
+                pair = []
+                for sign in (step, -step):
+                    moved = (
+                        sign
+                        if not isinstance(zero, tuple)
+                        else tuple(sign * (k == index) for k in range(len(zero)))
+                    )
+                    pair.append(_Hidden(**{name: moved}))  # type: ignore[arg-type]
+                yield std, pair[0], pair[1], 2 * step
+
+    def _readings(self, contact: FloatArray, hidden: _Hidden) -> FloatArray:
+        """Return the currents (4, n) that the channels report of contacts: x, y, ln of force (3, n)."""
+        x, y, log_force = contact
+        stretch = np.exp(hidden.log_aspect)
+        sheet_ohm = self._sheet.ohm_per_square * np.exp(hidden.log_sheet)
+        network = self._network(stretch, sheet_ohm, hidden.gap_m)
+        at = stretch * x, y
+        fractions = network.fractions(*at)
+        law = ContactLaw(
+            self._sheet.contact_ohm_mm2 * 1e-6 * np.exp(hidden.log_layer),
+            self._sheet.alpha + hidden.alpha,
+            self._sheet.contact_radius_mm * 1e-3 + hidden.radius_m,
+            reference_pa=self._sheet.reference_kpa * 1e3,
+        )
+        spreading_m = network.spreading_radius(*at) * self.surface.scale(x, y)
+        series_ohm = np.einsum("in,ij,jn->n", fractions, network.series_quadratic_form, fractions)
+        total = law.current(np.exp(log_force), self._drive_v, sheet_ohm, spreading_m, series_ohm)
+        gains = np.array(self._hidden.gain_ratio) * np.exp(hidden.log_gain)
+        return np.asarray(gains[:, None] * total * fractions)
+
+    def _network(self, stretch: float, sheet_ohm: float, gap_m: tuple[float, ...]) -> ElectrodeNetwork:
+        """Return the pad's network with its true gaps and these differences, before and after by side."""
+        surface = self.surface
+        shifts = np.reshape(gap_m, (2, 4))
+        true_m = 1e-3 * np.array([self._hidden.gap_before_mm, self._hidden.gap_after_mm])
+        before, after = np.maximum(true_m + shifts, 0.0)
+        length_m = surface.extent_m[0]
+        electrodes = []
+        for number, side in enumerate(("x0", "xa")):
+            u = 0.0 if side == "x0" else length_m
+            _, ends = surface.to_rectangle([u, u], [before[number], after[number]])
+            electrodes.append(Electrode(side, float(ends[0]), float(surface.b - ends[1])))  # type: ignore[arg-type]
+        for number, side in enumerate(("y0", "yb"), 2):
+            ends, _ = surface.to_rectangle([before[number], length_m - after[number]], [0.0, 0.0])
+            electrodes.append(Electrode(side, float(stretch * ends[0]), float(stretch * ends[1])))  # type: ignore[arg-type]
+        return ElectrodeNetwork.from_electrodes(
+            stretch * surface.a, surface.b, electrodes, sheet_ohm, self._hidden.series_ohm
+        )
