@@ -33,7 +33,7 @@ from handtouch.simulate.faults import INFLUENCES, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import SHEET_KINDS, WORLDS
+from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, Family
 from handtouch.supervisor.diagnose import DiagnosisModel, HandDiagnostics, HandSamples
 
 ROOT = Path(__file__).parent.parent
@@ -83,7 +83,9 @@ class Hour:
             self.busy.append((at, at + lasts + LINGER_S))
             at += lasts + LINGER_S + float(self._rng.exponential(lasts * (1 / IN_USE - 1)))
         self._world = (
-            WORLDS["default"].with_sheets(SHEET_KINDS[("S1", "S2")[seed % 2]]).draw(FIRST_SEED + seed)
+            WORLDS["default"]
+            .with_sheets(SHEET_KINDS[("S1", "S2")[seed % 2]])
+            .draw(Family.REPORTING.seed(FIRST_SEED + seed))
         )
 
     def blocks(self) -> Iterator[HandSamples]:

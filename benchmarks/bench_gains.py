@@ -31,7 +31,7 @@ from handtouch.hand import electrode_network
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import DrawnWorld, PartSpread, Uniform, World
+from handtouch.simulate.worlds import DrawnWorld, Family, PartSpread, Uniform, World
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -125,7 +125,7 @@ def swapped(label: str, counts: Sequence[int], tested: int) -> list[dict[str, An
     gain_errors: dict[int, list[FloatArray]] = {count: [] for count in counts}
     inside: dict[int, list[FloatArray]] = {count: [] for count in counts}
     for seed in SWAP_SEEDS:
-        world = WORLDS[label].draw(seed)
+        world = WORLDS[label].draw(Family.REPORTING.seed(seed))
         true = np.array([1 / np.array(world.pad(hand.name, pad).gain_ratio) for hand, pad in pads])
         learn = _readings(deployment, model, world, max(counts), (seed, 1))
         test = _readings(deployment, model, world, tested, (seed, 2))

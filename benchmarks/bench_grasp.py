@@ -32,7 +32,7 @@ from handtouch.config import (
 )
 from handtouch.simulate.grasp.event_score import EventScore
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
-from handtouch.simulate.worlds import WORLDS
+from handtouch.simulate.worlds import WORLDS, Family
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -395,7 +395,9 @@ def main() -> None:
             runs[name].append(run)
             assumed.append(served(stated, name, seed, setting, assumed_radius=True, done=run.grasp))
             if seed == 1:
-                ideal.append(served(deployment, name, seed, WORLDS["ideal"].draw(seed)))
+                ideal.append(
+                    served(deployment, name, seed, WORLDS["ideal"].draw(Family.REPORTING.seed(seed)))
+                )
                 unstated.append(served(deployment, name, seed, setting, done=run.grasp))
             print(f"seed {seed}: {name}, {len(run.step)} contact samples", flush=True)
     figures = {"mujoco": mujoco.__version__} | collect(deployment, runs, assumed, ideal)

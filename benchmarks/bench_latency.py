@@ -43,7 +43,7 @@ from handtouch.device import DeviceBus
 from handtouch.host import realtime
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS
+from handtouch.simulate.worlds import WORLDS, Family
 
 CHANNEL, PORT = "239.74.163.9", 43999
 VCAN = Path("/sys/class/net/vcan0")
@@ -90,7 +90,7 @@ def film(deployment: Deployment, path: str, touched: Sequence[int] = range(TOUCH
         f"radius_mm = 2.5\npath = {path}"
         for link in (links[n] for n in touched)
     )
-    hand = VirtualHand(deployment, Scenario.parse(touches), WORLDS["ideal"].draw(1))
+    hand = VirtualHand(deployment, Scenario.parse(touches), WORLDS["ideal"].draw(Family.REPORTING.seed(1)))
     times_s = np.arange(0.5, 0.5 + ROUND_S, deployment.daemon.sync_period_ms * 1e-3)
     there = np.stack([hand.sample(t_s) for t_s in times_s])
     return np.concatenate([there, there[::-1]])

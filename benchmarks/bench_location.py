@@ -24,7 +24,7 @@ from handtouch.core.pipeline import Pipeline
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import Score, score_contacts
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, DrawnWorld
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
 from handtouch.wire import PadState
 
 _COLUMNS = (
@@ -120,10 +120,17 @@ def main() -> None:
     seconds = 3.0 if asked.quick else scenario.duration_s
     results = {
         "noise and quantisation": [
-            play(deployment, model, scenario, WORLDS["ideal"].draw(s), seconds) for s in seeds
+            play(deployment, model, scenario, WORLDS["ideal"].draw(Family.REPORTING.seed(s)), seconds)
+            for s in seeds
         ],
         "tolerances of parts too": [
-            play(deployment, model, scenario, WORLDS["default"].only("parts", "contacts").draw(s), seconds)
+            play(
+                deployment,
+                model,
+                scenario,
+                WORLDS["default"].only("parts", "contacts").draw(Family.REPORTING.seed(s)),
+                seconds,
+            )
             for s in seeds
         ],
     }

@@ -39,7 +39,7 @@ from handtouch.percept.stiffness import estimate_stiffness, estimate_stiffness_f
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, DrawnWorld, World, world_with
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family, World, world_with
 from handtouch.wire import PERCEPT_KINDS
 
 matplotlib.use("Agg")
@@ -134,7 +134,9 @@ def stiffnesses(seeds: int) -> Rows:
                 behaviour = Behaviour(preset="S2" if name == "S2" else "S1")
                 sheets = {k: s.model_copy(update={"behaviour": behaviour}) for k, s in plain.sheets.items()}
                 deployment = plain.model_copy(update={"sheets": sheets})
-            runs = [play(deployment, world.draw(seed)) for seed in range(101, 101 + seeds)]
+            runs = [
+                play(deployment, world.draw(Family.REPORTING.seed(seed))) for seed in range(101, 101 + seeds)
+            ]
             for k in STIFFNESSES:
                 rows.append(
                     {"sheet": name, "compensated": compensated, "k": float(k), **assess(runs, float(k))}
@@ -436,7 +438,9 @@ def slid(
                 ramp_s=ramp,
             )
         )
-    hand = VirtualHand(deployment, Scenario(touch=tuple(touches)), world.draw(seed + 1))
+    hand = VirtualHand(
+        deployment, Scenario(touch=tuple(touches)), world.draw(Family.REPORTING.seed(seed + 1))
+    )
     row = model.links.index(link)
     found = []
     for begin, period in zip(begins, periods, strict=True):

@@ -34,7 +34,7 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.host.build import build_info
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS
+from handtouch.simulate.worlds import WORLDS, Family
 from handtouch.wire import PadState
 
 RATE_HZ = 500
@@ -54,7 +54,7 @@ def film(deployment: Deployment, touched: int) -> NDArray[np.int64]:
         f"radius_mm = 2.5\npath = {PATHS['sliding']}"
         for link in links[:touched]
     )
-    hand = VirtualHand(deployment, Scenario.parse(touches), WORLDS["ideal"].draw(1))
+    hand = VirtualHand(deployment, Scenario.parse(touches), WORLDS["ideal"].draw(Family.REPORTING.seed(1)))
     there = np.stack([hand.sample(t_s) for t_s in np.arange(0.5, 0.5 + FILM_S, 5e-3)])
     return np.concatenate([there, there[::-1]])
 

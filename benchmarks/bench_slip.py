@@ -19,7 +19,7 @@ from page import made_by, options, output_folder
 from slip_runs import DEPLOYMENT, Record, pads_of, run
 
 from handtouch.simulate.grip_touch import GripTouch
-from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, DrawnWorld
+from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, DrawnWorld, Family
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -28,7 +28,10 @@ FloatArray = npt.NDArray[np.float64]
 PADS = pads_of(DEPLOYMENT)
 SPEEDS, FORCES = (1.0, 3.0, 10.0, 30.0, 100.0), (0.5, 2.0, 5.0)
 SHEETS = {
-    name: WORLDS["default"].only("parts", "contacts", "sheets").with_sheets(*kinds).draw(21)
+    name: WORLDS["default"]
+    .only("parts", "contacts", "sheets")
+    .with_sheets(*kinds)
+    .draw(Family.REPORTING.seed(21))
     for name, kinds in (("ideal", ()), ("S1", (SHEET_KINDS["S1"],)), ("S2", (SHEET_KINDS["S2"],)))
 }
 LOADS = {0: 1.0, 1: 0.7}

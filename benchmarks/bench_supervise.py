@@ -33,7 +33,7 @@ from handtouch.core.sheet_force import SheetForceCompensation, sheet_behaviour_o
 from handtouch.core.slab import Slab
 from handtouch.core.tick import TickProcessor
 from handtouch.simulate.electronics_drift import ElectronicsDrift
-from handtouch.simulate.worlds import WORLDS
+from handtouch.simulate.worlds import WORLDS, Family
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -41,7 +41,7 @@ from matplotlib import pyplot as plt
 FloatArray = NDArray[np.float64]
 Rows = list[dict[str, Any]]
 PERIOD_NS, TICK_NS = 100_000_000, 5_000_000
-DRIFT = WORLDS["default"].only("electronics").draw(71)
+DRIFT = WORLDS["default"].only("electronics").draw(Family.REPORTING.seed(71))
 SPAN_S = 60.0  # of drift that is drawn at once
 HELD = 5  # pads
 FULL_N = 5.0
@@ -69,7 +69,9 @@ class Rig:
         self.cycle = Cycle(PERIOD_NS, 0.6)
         self._rng = np.random.default_rng(seed)
         names = list(zip(model.hands, model.links, strict=True))
-        self._climate = ElectronicsDrift(DRIFT if drifts else WORLDS["ideal"].draw(1), names)
+        self._climate = ElectronicsDrift(
+            DRIFT if drifts else WORLDS["ideal"].draw(Family.REPORTING.seed(1)), names
+        )
         self._zeros = np.zeros((0, model.size, 4))
         self._at = 0
         pads = np.arange(model.size)

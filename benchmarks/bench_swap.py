@@ -26,7 +26,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import DrawnWorld, PartSpread, Uniform, World
+from handtouch.simulate.worlds import DrawnWorld, Family, PartSpread, Uniform, World
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
@@ -148,7 +148,7 @@ def run(units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
         PartSpread(
             gain_ratio=Uniform(1 - GAIN_TOLERANCE, 1 + GAIN_TOLERANCE), gap_offset_mm=Uniform(-0.1, 0.1)
         ),
-    ).draw(5)
+    ).draw(Family.REPORTING.seed(5))
     hand = VirtualHand(deployment, touches(model, max(counts), 3), world)
     readings, places = test_set(deployment, model, world)
     start = WorkerConfig(

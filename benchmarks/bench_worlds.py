@@ -68,13 +68,13 @@ SINGLE = {
 }
 """Worlds in which only some quantities are hidden, as those of earlier claims; contact patches as stated."""
 FORCES_N = (0.2, 12.0)
-REST_S, STEP_S, TOUCH_S, SAMPLE_S = 2.0, 0.8, 0.5, 0.35
+REST_S, STEP_S, TOUCH_S, SAMPLE_S = 2.0, 0.65, 0.5, 0.32
 """Time before the first touch, from touch to touch of a pad, of a touch, and from its begin to its sample."""
 WARM_UP = 12
 """Touches before those that are compared: as many as compensation of sheets needs for evidence."""
 LEARNT_SAMPLES = 12
 STATES = ("as configured", "calibrated")
-SLICES = ("state", "edge distance", "force", "sheet", "surface", "aspect")
+SLICES = ("edge distance", "force", "sheet", "sheet kind", "surface", "aspect")
 _FIRST_NS = 1_000_000_000
 
 
@@ -179,7 +179,7 @@ def play(task: tuple[str, int, int, int]) -> dict[str, Estimates]:
         (k, truth.link): truth for tick, k in sampled.items() for truth in hand.truth(float(times_s[tick]))
     }
     parts: dict[str, list[Estimates]] = {"position": [], "force": []}
-    for state in STATES:
+    for state in STATES if name in NAMED else STATES[:1]:
         if state == "calibrated":
             learnt_gains(hand, deployment, model, range(WARM_UP + touches, WARM_UP + touches + learnt))
         contacts = serve(model, deployment, counts, sampled)
@@ -188,7 +188,16 @@ def play(task: tuple[str, int, int, int]) -> dict[str, Estimates]:
                 drawn, deployment, hand_name, pad, model.noise_a[row], gains_known=state == "calibrated"
             )
             found = [(contacts.get(key), truth) for key, truth in truths.items() if key[1] == pad.link]
-            position, force = compare(found, oracle, {"world": name, "state": state, "sheet": pad.sheet})
+            position, force = compare(
+                found,
+                oracle,
+                {
+                    "world": name,
+                    "state": state,
+                    "sheet": pad.sheet,
+                    "sheet kind": kind.name if (kind := drawn.sheet_kind(pad.sheet)) else "ideal",
+                },
+            )
             parts["position"].append(position)
             parts["force"].append(force)
     return {quantity: concatenate(some) for quantity, some in parts.items()}
@@ -267,13 +276,10 @@ def sections(found: Mapping[str, Mapping[str, Estimates]]) -> list[str]:
     for quantity, (unit, _) in UNITS.items():
         every = {name: found[name][quantity] for name in found}
         parts = {
-            f"{name}, {state}": part
-            for name, both in every.items()
-            for state, part in slices(both, "state")
-            if name in NAMED or state == STATES[0]
+            f"{name}, {state}": part for name, both in every.items() for state, part in slices(both, "state")
         }
         page += table(quantity.capitalize(), f"Errors and deviations in {unit}.", rows_of(parts, quantity))
-        for by in SLICES[1:]:
+        for by in SLICES:
             cut = {
                 f"{name}, {value}": part
                 for name in NAMED
@@ -308,7 +314,7 @@ def draw(found: Mapping[str, Mapping[str, Estimates]], path: Path) -> None:
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument(
-        "--hands", type=int, default=6, help="of each named world; half as many of the others"
+        "--hands", type=int, default=8, help="of each named world; half as many of the others"
     )
     parser.add_argument("--touches", type=int, default=20, help="of each pad")
     parser.add_argument("--learnt", type=int, default=160, help="touches of each pad for its calibration")
@@ -354,7 +360,7 @@ HEAD = """\
 {hands} hands of each of the [worlds](../worlds.md) `ideal`, `default` and `harsh`, and half as many of worlds
 with few hidden quantities; 15 pads each, of four surfaces; seeds of the reporting family. {touches} touches
 of each pad, {low:g} to {high:g} N (log-uniform), anywhere from 2 % of a side inside the edges; one sample of
-each, 0.35 s after it began. 12 touches come first, as evidence for the compensation of sheets. Deployment
+each, 0.32 s after it began. 12 touches come first, as evidence for the compensation of sheets. Deployment
 files describe sheets as their builder would. Pads are mounted as stated; for mounts and joints see
 [grasp](grasp.md). *Calibrated*: with the gains of automatic calibration after {learnt} other touches of each
 pad, where it reached that state.

@@ -15,7 +15,7 @@ from handtouch.simulate.faults import FAULTS, INFLUENCES, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS
+from handtouch.simulate.worlds import WORLDS, Family
 from handtouch.supervisor.diagnose import HandSamples
 from handtouch.wire.faults import FaultKind
 
@@ -115,7 +115,7 @@ def episode(name: str, seed: int) -> Episode:
     hand = VirtualHand(
         deployment(),
         Scenario(touch=touches),
-        WORLDS["default"].only("parts", "contacts").draw(hand_of(seed)),
+        WORLDS["default"].only("parts", "contacts").draw(Family.REPORTING.seed(hand_of(seed))),
         faults=tuple(faults),
     )
     return Episode(name, seed, link, begin_s, details, hand)

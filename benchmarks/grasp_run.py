@@ -39,7 +39,7 @@ from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches, contact_patches
 from handtouch.simulate.grasp.simulation import DURATION_S, GraspRecord, simulate_grasp
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, DrawnWorld
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
 from handtouch.wire import PERCEPT_KINDS, PadState
 from handtouch.wire.inputs import JointState, encode
 
@@ -52,7 +52,7 @@ _PER_TICK = 5  # steps of MuJoCo
 
 def usual(seed: int) -> DrawnWorld:
     """Return a world of tolerances of parts, misaligned pads and encoders, and delayed joint states."""
-    return WORLDS["default"].only("parts", "mounts", "contacts").draw(seed)
+    return WORLDS["default"].only("parts", "mounts", "contacts").draw(Family.REPORTING.seed(seed))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Options and pages of benchmarks, and the stamp of what they measured.
 
-Public names: `options`, `output_folder`, `table`, `made_by`; for readers of a page `source_digest`, `STAMP`.
+Public names: `options`, `output_folder`, `table`, `made_by`; for readers of a page `outdated`.
 """
 
 from __future__ import annotations
@@ -63,6 +63,26 @@ def made_by() -> str:
     program = Path(str(sys.modules["__main__"].__file__)).resolve()
     kind, _, name = program.stem.partition("_")
     return f"Made by `make {kind} ONLY={name}` at commit `{_commit()}`, source `{source_digest(program)}`"
+
+
+def outdated(text: str) -> str:
+    """Return why a page is older than the code that it measures; empty if it isn't."""
+    stamps = STAMP.findall(text)
+    if not stamps:
+        return "The page doesn't state a commit; the code that it measures has changed since."
+    for kind, name, commit, source in stamps:
+        program = ROOT / "benchmarks" / f"{kind}_{name}.py"
+        if not program.exists():
+            return f"The program that made the page at commit {commit} was removed."
+        if source_digest(program) != source:
+            return f"The code that the page measures has changed since commit {commit}."
+    return ""
+
+
+def forget_files() -> None:
+    """Read all files again from now on."""
+    for cached in (_tree, _imported, _code_digest):
+        cached.cache_clear()
 
 
 def source_digest(program: Path) -> str:

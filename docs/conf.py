@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import itertools
 import re
+import sys
+from pathlib import Path
 from typing import Any
 
 from handtouch import __version__
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from page import outdated
 
 project = "handtouch"
 author = "the handtouch authors"
@@ -46,6 +51,14 @@ def _in_list(line: str) -> str:
     return f"  {line.strip()}" if line.startswith(" ") else f"* {line}"
 
 
+def mark_outdated(app: Any, page: str, source: list[str]) -> None:  # noqa: ARG001
+    """Add a note below the title of a page of measurements that is older than the code it measures."""
+    if page.startswith("benchmarks/") and page != "benchmarks/README" and (reason := outdated(source[0])):
+        title, rest = source[0].split("\n", 1)
+        source[0] = f"{title}\n\n:::{{note}}\nOlder than the code: {reason}\n:::\n{rest}"
+
+
 def setup(app: Any) -> None:
     """Sphinx calls it."""
+    app.connect("source-read", mark_outdated)
     app.connect("autodoc-process-docstring", as_text)

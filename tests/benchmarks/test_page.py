@@ -1,0 +1,69 @@
+"""Pages of benchmarks: families of seeds, and the stamp of what was measured."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import page
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "benchmarks").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_benchmarks_draw_worlds_of_the_reporting_family_only(path: Path) -> None:
+    text = path.read_text()
+    assert "TUNING" not in text
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "draw":
+            assert re.match(r"Family\.REPORTING\.seed\(", ast.unparse(node.args[0])), ast.unparse(node)
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A benchmark that measures one module, in a tree of its own."""
+    monkeypatch.setattr(page, "ROOT", tmp_path)
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "src" / "handtouch").mkdir(parents=True)
+    (tmp_path / "src" / "handtouch" / "measured.py").write_text('"""Text."""\nSIZE = 3\n')
+    (tmp_path / "src" / "handtouch" / "other.py").write_text("SIZE = 3\n")
+    made = tmp_path / "benchmarks" / "bench_it.py"
+    made.write_text("from handtouch.measured import SIZE\n")
+    yield made
+    page.forget_files()
+
+
+def stamped(program: Path) -> str:
+    return (
+        f"# It\n\nMade by `make bench ONLY=it` at commit `1234567`,\nsource `{page.source_digest(program)}`."
+    )
+
+
+def rewrite(path: Path, text: str) -> None:
+    path.write_text(text)
+    page.forget_files()
+
+
+def test_a_page_is_outdated_when_code_changes_that_its_program_imports(program: Path) -> None:
+    text, measured = stamped(program), program.parents[1] / "src" / "handtouch" / "measured.py"
+    assert page.outdated(text) == ""
+    rewrite(measured, '"""Text."""\nSIZE = 4\n')
+    assert "changed since commit 1234567" in page.outdated(text)
+
+
+def test_comments_docstrings_and_other_modules_outdate_no_page(program: Path) -> None:
+    text, folder = stamped(program), program.parents[1] / "src" / "handtouch"
+    rewrite(folder / "measured.py", '"""Another text."""\n\nSIZE = (3)  # as before\n')
+    rewrite(folder / "other.py", "SIZE = 5\n")
+    assert page.outdated(text) == ""
+
+
+def test_a_page_without_a_stamp_or_a_program_is_outdated(program: Path) -> None:
+    text = stamped(program)
+    assert "doesn't state a commit" in page.outdated("# It\n\nMade by `make bench ONLY=it`; x86_64.")
+    program.unlink()
+    assert "was removed" in page.outdated(text)
