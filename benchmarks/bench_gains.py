@@ -23,7 +23,8 @@ from page import OUT, made_by, options, output_folder, table
 from scipy.stats import chi2
 
 from handtouch import config
-from handtouch.calibration.gains import GainEstimator, fisher_covariance, gain_deviation
+from handtouch.calibration.auto_calibration import new_gain_estimator
+from handtouch.calibration.gains import fisher_covariance, gain_deviation
 from handtouch.config import shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.field import Rectangle
@@ -82,7 +83,7 @@ def trials(label: str, noise: float, elongated: float, seeds: int) -> list[dict[
         truth = generator.normal(0, GAIN_STD, 4)
         truth -= truth.mean()
         currents = (fractions + noise * generator.normal(size=fractions.shape)) * np.exp(-truth)[:, None]
-        running = GainEstimator(pad, tolerance=0.2, drift_per_day=0, model_error=0)
+        running = new_gain_estimator(pad)
         done = 0
         for count in COUNTS:
             running.add_contacts(currents[:, done:count], noise, 0)
@@ -130,7 +131,7 @@ def swapped(label: str, counts: Sequence[int], tested: int) -> list[dict[str, An
         learn = _readings(deployment, model, world, max(counts), (seed, 1))
         test = _readings(deployment, model, world, tested, (seed, 2))
         for row, network in enumerate(networks):
-            running, done = GainEstimator(network), 0
+            running, done = new_gain_estimator(network), 0
             for count in counts:
                 running.add_contacts(learn[row].currents[:, done:count], learn[row].noise, count)
                 done, found = count, running.estimate
@@ -208,7 +209,7 @@ def shapes() -> list[dict[str, Any]]:
     rows = []
     for aspect in (1.0, 1.2, 1.5, 1.8, 2.0, 2.2, 2.5, 3.0):
         deviation = gain_deviation(Rectangle(aspect, 1.0))
-        refused = "refused" if GainEstimator(Rectangle(aspect, 1.0)).estimate.status == "invalid" else ""
+        refused = "refused" if new_gain_estimator(Rectangle(aspect, 1.0)).estimate.status == "invalid" else ""
         rows.append({"pad": f"{aspect:g}:1", "std / noise, 400 contacts": deviation, "": refused})
     return rows
 

@@ -15,17 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from daemon_settings import pipeline_of
 from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pipeline import Pipeline
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import Score, score_contacts
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
-from handtouch.wire import PadState
 
 _COLUMNS = (
     "hidden from the estimator", "rms error", "rms bound", "ratio (range)", "median", "bias", "scatter",
@@ -54,8 +53,7 @@ def play(
     hand = VirtualHand(deployment, scenario, world)
     taken = Collector()
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
-    pipeline = Pipeline(model, period_ns, deployment.daemon.sample_window_fraction, taken)
-    pipeline.node_state[:] = PadState.CLEAR
+    pipeline = pipeline_of(deployment, taken, model=model)
     truth = []
     for t_ns in range(period_ns, round(seconds * 1e9), period_ns):
         pipeline.begin_cycle(t_ns, t_ns)

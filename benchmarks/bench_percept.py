@@ -20,6 +20,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from daemon_settings import pipeline_of
 from numpy.typing import NDArray
 from page import made_by, options, output_folder
 from scipy.optimize import least_squares
@@ -27,7 +28,6 @@ from scipy.optimize import least_squares
 from handtouch.config import Deployment, load, shipped
 from handtouch.config.tables import Behaviour
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pipeline import Pipeline
 from handtouch.field import Sandwich
 from handtouch.percept.classify import classify_shape
 from handtouch.percept.primitives import SHAPE_CLASSES, fit_primitive
@@ -103,8 +103,7 @@ def play(deployment: Deployment, world: DrawnWorld) -> tuple[FloatArray, FloatAr
     hand = VirtualHand(deployment, scenario, world)
     times = np.arange(0, 0.5 + PRESSES * (SQUEEZE_S + PAUSE_S), 1 / RATE_HZ)
     counts = np.stack([hand.counts(row, times) for row in range(model.size)], axis=1).astype("<i2")
-    pipeline = Pipeline(model, PERIOD_NS, 0.6, Silent())
-    pipeline.node_state[:] = 0
+    pipeline = pipeline_of(deployment, Silent(), model=model, period_ns=PERIOD_NS)
     estimates = np.full((2, len(times), model.size), np.nan)
     for number in range(len(times)):
         t_ns = 10**9 + number * PERIOD_NS

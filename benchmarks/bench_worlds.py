@@ -21,6 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
+from daemon_settings import pipeline_of
 from numpy.typing import NDArray
 from oracle import PadOracle
 from page import made_by, options, output_folder, table
@@ -31,7 +32,6 @@ from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel, networks_of
-from handtouch.core.pipeline import Pipeline
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
@@ -47,7 +47,6 @@ from handtouch.simulate.worlds import (
     Uniform,
     World,
 )
-from handtouch.wire import PadState
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -148,8 +147,7 @@ def serve(
     """Return the contacts in the `sampled` ticks by touch number and link; counts (ticks, pads, 4)."""
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
     collector = Collector()
-    pipeline = Pipeline(model, period_ns, deployment.daemon.sample_window_fraction, collector)
-    pipeline.node_state[:] = PadState.CLEAR
+    pipeline = pipeline_of(deployment, collector, model=model)
     for tick, rows in enumerate(counts.astype("<i2")):
         t_ns = _FIRST_NS + tick * period_ns
         collector.sampled = sampled.get(tick)

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import zmq
+from daemon_settings import pipeline_of
 from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment, Touch
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import RequestedOutputs
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.inputs import InputReceiver
@@ -40,7 +40,7 @@ from handtouch.simulate.grasp.patches import ContactPatches, contact_patches
 from handtouch.simulate.grasp.simulation import DURATION_S, GraspRecord, simulate_grasp
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
-from handtouch.wire import PERCEPT_KINDS, PadState
+from handtouch.wire import PERCEPT_KINDS
 from handtouch.wire.inputs import JointState, encode
 
 FloatArray = NDArray[np.float64]
@@ -145,10 +145,7 @@ class _Run:
         self.inputs = InputReceiver.open(
             context, "tcp://127.0.0.1:*", Authenticator.open(context), {hand: states}, pads
         )
-        self.pipeline = Pipeline(
-            model, _PERIOD_NS, deployment.daemon.sample_window_fraction, self, robots=robots
-        )
-        self.pipeline.node_state[:] = PadState.CLEAR
+        self.pipeline = pipeline_of(deployment, self, model=model, robots=robots, period_ns=_PERIOD_NS)
         self.pipeline.transforms.joints_at = self.inputs.joints_at
         all_pads = np.ones(model.size, np.bool_)
         requested = RequestedOutputs(

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from daemon_settings import pipeline_of
 
 from handtouch import wire
 from handtouch.config import Deployment, load
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import RequestedOutputs
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.percept.motion import MotionEstimator
@@ -21,7 +21,7 @@ from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import DrawnWorld
-from handtouch.wire import PERCEPT_KINDS, PadState
+from handtouch.wire import PERCEPT_KINDS
 
 FloatArray = npt.NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
@@ -97,8 +97,7 @@ def run(
     times = from_s + np.arange(1, round(seconds * hz) + 1) / hz
     counts = np.stack([hand.counts(row, times) for row in range(len(hand.pads))], axis=1)
     collector, model = PerceptCollector(), PadModel(deployment)
-    pipeline = Pipeline(model, period_ns, 0.6, collector)
-    pipeline.node_state[:] = PadState.CLEAR
+    pipeline = pipeline_of(deployment, collector, model=model, period_ns=period_ns)
     perceiving = PerceptPublisher(pipeline, collector)
     all_pads = np.ones(model.size, dtype=np.bool_)
     percepts = np.zeros((len(PERCEPT_KINDS), model.size), dtype=np.bool_)

@@ -1,8 +1,8 @@
 """Automatic calibration of the node of one pad by ordinary contacts.
 
-Public: `AutoCalibrator`, `CalibrationState`, `GainUpdate`. A node that replaced another is in quarantine
-until it has a calibration of its own: from the store, from contacts, or from an operator. No clock; time is
-an argument.
+Public: `AutoCalibrator`, `CalibrationState`, `GainUpdate`, `new_gain_estimator`. A node that replaced another
+is in quarantine until it has a calibration of its own: from the store, from contacts, or from an operator. No
+clock; time is an argument.
 """
 
 from __future__ import annotations
@@ -66,6 +66,20 @@ class GainUpdate:
     store: bool = False
 
 
+def new_gain_estimator(model: ForwardModel, attempt: int = 0, own: Gains | None = None) -> GainEstimator:
+    """Return the estimator of a pad's gains, about gains of its `own` or the deployment's.
+
+    `attempt`: 0, then 1, with a wider prior, where no gains near these explain the contacts.
+    """
+    return GainEstimator(
+        model,
+        tolerance=_INITIAL_LOG_GAIN_STDS[attempt],
+        required_std=_MAX_CALIBRATED_LOG_GAIN_STD,
+        start=own.factors if own else None,
+        covariance=own.covariance if own else None,
+    )
+
+
 class AutoCalibrator:
     """Calibration state and gain estimate of the node at one pad; `model` is the pad's."""
 
@@ -81,7 +95,7 @@ class AutoCalibrator:
         self.since_ns, self._attempt, self._store_at_contacts = 0, 0, 0
         self._has_own_gains = False  # the estimate started from gains of its own
         self._mean_gain = 1.0  # geometric mean, not observable by contacts
-        self._estimator = GainEstimator(model)
+        self._estimator = new_gain_estimator(model)
         self.estimate = self._estimator.estimate
 
     def assign_node(
@@ -244,14 +258,7 @@ class AutoCalibrator:
 
     def _restart_estimator(self, attempt: int, own: Gains | None = None) -> None:
         self._attempt, self._pending, self._has_own_gains = attempt, [], own is not None
-        start, covariance = (own.factors, own.covariance) if own else (None, None)
         self._mean_gain = math.exp(np.log(own.factors).mean()) if own else 1.0
-        self._estimator = GainEstimator(
-            self._model,
-            tolerance=_INITIAL_LOG_GAIN_STDS[attempt],
-            required_std=_MAX_CALIBRATED_LOG_GAIN_STD,
-            start=start,
-            covariance=covariance,
-        )
+        self._estimator = new_gain_estimator(self._model, attempt, own)
         self.estimate = self._estimator.estimate
         self._store_at_contacts = _MIN_CONTACTS_TO_STORE_AGAIN
