@@ -51,7 +51,11 @@ class PrismSurface(Surface):
 
     def grid_lines(self, cells: int) -> tuple[FloatArray, FloatArray]:
         x, y = super().grid_lines(cells)
-        return x, np.union1d(y, np.cumsum(self._faces[0])[:-1])
+        return x, np.union1d(y, self.folds)
+
+    @property
+    def folds(self) -> FloatArray:
+        return np.asarray(np.cumsum(self._faces[0])[:-1])
 
     def describe_side(self, side: str) -> str:  # noqa: ARG002
         return "the edge"

@@ -362,6 +362,10 @@ class AnisotropicSurface(Surface):
         x, y = self.surface.grid_lines(cells)
         return x * self._stretch, y
 
+    @property
+    def folds(self) -> FloatArray:
+        return self.surface.folds
+
     def describe_side(self, side: str) -> str:
         return self.surface.describe_side(side)
 

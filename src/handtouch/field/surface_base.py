@@ -116,6 +116,11 @@ class Surface(ABC):
         """Yield (key, remedy) for values that exclude each other; the constructor raises for the rest."""
         return iter(())
 
+    @property
+    def folds(self) -> FloatArray:
+        """Coordinates y, increasing, of folds along x, at which the normal jumps; empty where it is smooth."""
+        return np.zeros(0)
+
     def describe_side(self, side: str) -> str:
         """Return what an operator sees at side x0, xa, y0 or yb: an edge, an end, a tip."""
         return "the end" if side in ("x0", "xa") else "the side"

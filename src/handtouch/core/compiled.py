@@ -1,0 +1,81 @@
+"""Compiled stages: which files hold them, and whether they are used.
+
+Public names: `STAGES`, `source_hash`, `compiled_file`, `CompiledFinder`, `Compilation`.
+
+The modules of `handtouch.core.stages` are plain Python that Cython compiles as it stands. A compiled module
+carries the hash of all their sources in its file's name; one of other sources isn't loaded, and Python runs
+the source instead, with the same results to the last bit and some fifty times slower.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sysconfig
+from collections.abc import Sequence
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ExtensionFileLoader, ModuleSpec
+from importlib.util import spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+STAGES = ("tables", "locate", "force", "place", "solve")
+"""Modules of `handtouch.core.stages`, lowest first."""
+DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"
+"""Environment variable that makes Python run the sources, for debugging."""
+_PACKAGE = "handtouch.core.stages"
+_FOLDER = Path(__file__).parent / "stages"
+
+
+class Compilation(NamedTuple):
+    """Whether the stages that this process runs are compiled; if not, why, with the remedy."""
+
+    compiled: bool
+    reason: str
+
+    @classmethod
+    def current(cls) -> Compilation:
+        """Return that of this process."""
+        if os.environ.get(DISABLE_VARIABLE):
+            return cls(False, f"{DISABLE_VARIABLE} is set; unset it")
+        missing = [name for name in STAGES if not compiled_file(name).exists()]
+        if not missing:
+            return cls(True, "")
+        if any((_FOLDER / "_compiled").glob("*.so")):
+            return cls(False, "the compiled modules are of other sources; run `make dev`")
+        return cls(False, "they were never compiled on this machine; run `make dev`")
+
+
+def source_hash() -> str:
+    """Return the hash of the sources of all stages, and of how they are compiled."""
+    digest = hashlib.sha256((_FOLDER.parent / "build.py").read_bytes())
+    for name in STAGES:
+        for ending in (".py", ".pxd"):
+            digest.update((_FOLDER / f"{name}{ending}").read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def compiled_file(stage: str) -> Path:
+    """Return the file that holds a stage compiled from the present sources, whether it exists or not."""
+    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    return _FOLDER / "_compiled" / f"{stage}-{source_hash()}-{platform}.abi3.so"
+
+
+class CompiledFinder(MetaPathFinder):
+    """Finds the compiled modules of the stages where all are there; else leaves it to the sources."""
+
+    def __init__(self) -> None:
+        self._files = {f"{_PACKAGE}.{name}": str(compiled_file(name)) for name in STAGES}
+
+    def find_spec(
+        self,
+        fullname: str,
+        path: Sequence[str] | None = None,  # noqa: ARG002
+        target: ModuleType | None = None,  # noqa: ARG002
+    ) -> ModuleSpec | None:
+        """Return the spec of a compiled stage; None for any other module."""
+        file = self._files.get(fullname)
+        if file is None:
+            return None
+        return spec_from_file_location(fullname, file, loader=ExtensionFileLoader(fullname, file))

@@ -1,0 +1,240 @@
+"""Tables of forward models and surfaces for the stages, built once for each distinct pad.
+
+Public names: `ForwardTable`, `SurfaceTable`, `stack_table`, `hermite_table`.
+
+A forward model is tabulated over cells that shrink towards the edges and the ends of the electrodes, as the
+distances do over which its fractions vary.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.core.stages.force import StackTable
+from handtouch.core.stages.locate import PadTable
+from handtouch.core.stages.place import PadSurface
+from handtouch.field.contact_law import log_stack_inverse
+from handtouch.field.model import ForwardModel
+from handtouch.field.surface import Surface
+
+FloatArray = NDArray[np.float64]
+
+_STENCIL = 7  # nodes that a slope is computed from
+_FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB
+_EDGE_CELL, _ELECTRODE_END_CELL = 0.003, 0.008
+"""Distances from an edge and from an electrode's end below which cells shrink no further, in sides."""
+SEARCH_POINTS = 9
+_BISECTIONS = 60
+_MIN_EDGE_DISTANCE = 1e-6  # of a side
+_MIN_RADIUS_DISTANCE = 1e-3  # of a side: the spreading radius vanishes at an edge
+_SURFACE_CELLS = (8, 16, 32, 64)
+_MAX_SURFACE_ERROR = 1e-7
+"""Of a pad's size, between the nodes."""
+_STACK_INTERVALS = 2048
+_MIN_LOG_FACTOR, _MAX_LOG_FACTOR = -16.0, 32.0
+
+
+def view_floats(array: FloatArray) -> memoryview[float]:
+    """Return the memory of a contiguous float64 array, flat, as the stages take it."""
+    return cast("memoryview[float]", array.reshape(-1).data)
+
+
+def view_bytes(array: NDArray[np.uint8] | NDArray[np.bool_]) -> memoryview[int]:
+    """Return the memory of a contiguous array of bytes or truth values, flat, as the stages take it."""
+    return array.reshape(-1).view(np.uint8).data
+
+
+def hermite_table(values: FloatArray) -> FloatArray:
+    """Return nodes for `read_table`, (y, x, 4, columns), of the values (y, x, columns) on a square grid."""
+    slope = _slope_operator(len(values) - 1)
+    by_x = np.einsum("ij,kjc->kic", slope, values)
+    by_y, by_both = np.einsum("ij,jkc->ikc", slope, values), np.einsum("ij,jkc->ikc", slope, by_x)
+    return np.ascontiguousarray(np.stack([values, by_x, by_y, by_both], axis=2))
+
+
+@cache
+def _slope_operator(cells: int) -> FloatArray:
+    """Return the matrix (nodes, nodes) from values at the nodes to slopes there, per cell.
+
+    Each from the seven nearest nodes only: a singular edge spoils no slope farther inside.
+    """
+    slopes = np.zeros((cells + 1, cells + 1))
+    for node in range(cells + 1):
+        first = min(max(node - _STENCIL // 2, 0), cells + 1 - _STENCIL)
+        powers = np.vander(np.arange(first, first + _STENCIL) - float(node), increasing=True).T
+        slopes[node, first : first + _STENCIL] = np.linalg.solve(powers, np.eye(_STENCIL)[1])
+    return slopes
+
+
+@dataclass(frozen=True)
+class ForwardTable:
+    """Forward model of a pad: fractions of its n electrodes and ln of its spreading radius.
+
+    nodes: (cells + 1, cells + 1, 4, n + 1), see `hermite_table`. nodes_x, nodes_y: (cells + 1, 2) coordinates
+    of the nodes and their derivatives by cell. search_fractions: (81, n), search_cells: (2, 9), see
+    `PadTable`.
+    """
+
+    nodes: FloatArray
+    nodes_x: FloatArray
+    nodes_y: FloatArray
+    search_fractions: FloatArray
+    search_cells: FloatArray
+
+    @classmethod
+    def from_model(cls, model: ForwardModel, gap: float = 0.0) -> ForwardTable:
+        """Tabulate a model whose electrodes end at a distance `gap` from the corners."""
+        axes = [_Axis(side, gap) for side in (model.a, model.b)]
+        nodes_x, nodes_y = (axis.nodes() for axis in axes)
+        x, y = np.meshgrid(*(_inside(at[:, 0]) for at in (nodes_x, nodes_y)))
+        radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
+        fractions = model.fractions(x, y)
+        edge = _MIN_RADIUS_DISTANCE
+        x, y = np.clip(x, edge * model.a, (1 - edge) * model.a), np.clip(y, edge * model.b, (1 - edge) * model.b)
+        values = np.stack([*fractions, np.log(radius(x, y))], axis=-1)
+        search = (np.arange(SEARCH_POINTS) + 0.5) / SEARCH_POINTS
+        x, y = (at.ravel() for at in np.meshgrid(model.a * search, model.b * search))
+        return cls(
+            hermite_table(values),
+            nodes_x,
+            nodes_y,
+            np.ascontiguousarray(model.fractions(x, y).T),
+            np.stack([axis.cells(search * axis.side) for axis in axes]),
+        )
+
+    @property
+    def electrodes(self) -> int:
+        """Number of electrodes."""
+        return int(self.search_fractions.shape[1])
+
+    def pad_table(self) -> PadTable:
+        """Return it as the stages take it."""
+        return PadTable(
+            view_floats(self.nodes), len(self.nodes) - 1, self.electrodes,
+            *map(view_floats, (self.nodes_x, self.nodes_y, self.search_fractions, self.search_cells)),
+            SEARCH_POINTS,
+        )  # fmt: skip
+
+
+class _Axis:
+    """Coordinate of a side, and the cells that it is tabulated in."""
+
+    def __init__(self, side: float, gap: float) -> None:
+        self.side = side
+        self._ends = (gap, side - gap) if gap else ()
+        self._low, high = (self._stretched(np.array([at]))[0] for at in (0.0, side))
+        self._per_unit = _FORWARD_CELLS / (high - self._low)
+
+    def cells(self, x: FloatArray) -> FloatArray:
+        """Return coordinates in cells."""
+        return np.asarray((self._stretched(x) - self._low) * self._per_unit)
+
+    def nodes(self) -> FloatArray:
+        """Return the coordinates of the nodes and their derivatives by cell, (cells + 1, 2)."""
+        targets = np.arange(_FORWARD_CELLS + 1.0)
+        low, high = np.zeros_like(targets), np.full_like(targets, self.side)
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            below = self.cells(middle) < targets
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        x = (low + high) / 2
+        x[0], x[-1] = 0.0, self.side
+        return np.stack([x, 1 / (self._density(x) * self._per_unit)], axis=1)
+
+    def _stretched(self, x: FloatArray) -> FloatArray:
+        edge = _EDGE_CELL * self.side
+        stretched = np.log((x + edge) / (self.side - x + edge))
+        for end in self._ends:
+            stretched = stretched + np.arcsinh((x - end) / (_ELECTRODE_END_CELL * self.side))
+        return np.asarray(stretched)
+
+    def _density(self, x: FloatArray) -> FloatArray:
+        """Return the derivative of `_stretched`."""
+        edge = _EDGE_CELL * self.side
+        density = 1 / (x + edge) + 1 / (self.side - x + edge)
+        for end in self._ends:
+            density = density + 1 / np.hypot(x - end, _ELECTRODE_END_CELL * self.side)
+        return np.asarray(density)
+
+
+def _inside(x: FloatArray) -> FloatArray:
+    """Return node coordinates with the outermost off the edges, where a model may have no value."""
+    return np.clip(x, _MIN_EDGE_DISTANCE * x[-1], (1 - _MIN_EDGE_DISTANCE) * x[-1])
+
+
+@dataclass(frozen=True)
+class SurfaceTable:
+    """Surface of a pad in its link's frame, in patches between folds; see `PadSurface`.
+
+    nodes: (patches, cells + 1, cells + 1, 4, 5). ends: (patches,) of y.
+    """
+
+    nodes: FloatArray
+    ends: FloatArray
+    side_x: float
+
+    @classmethod
+    def from_surface(cls, surface: Surface, rotation: FloatArray, translation: FloatArray) -> SurfaceTable:
+        """Tabulate a surface whose pad frame `rotation` (3, 3) and `translation` (3,) carry to the link's."""
+        ends = np.append(surface.folds, surface.b)
+        begins = np.append(0.0, surface.folds)
+
+        def evaluate(cells: int, inside: FloatArray) -> FloatArray:
+            """Return values (patches, y, x, 5) at nodes or, `inside` of cells, between them."""
+            s = inside / cells
+            patches = []
+            for begin, end in zip(begins, ends, strict=True):
+                # a hair inside: on a fold, the surface is that of the next patch
+                y_inside = begin + (end - begin) * np.clip(s, 1e-12, 1 - 1e-12)
+                x, y = np.meshgrid(surface.a * s, y_inside)
+                position = np.tensordot(rotation, surface.point(x, y), axes=1) + translation[:, None, None]
+                patches.append(np.stack([*position, *surface.from_rectangle(x, y)], axis=-1))
+            return np.stack(patches)
+
+        size = max(surface.extent_m)
+        for cells in _SURFACE_CELLS:
+            nodes = np.stack([hermite_table(patch) for patch in evaluate(cells, np.arange(cells + 1.0))])
+            between = evaluate(cells, np.arange(cells) + 0.5)
+            if np.abs(_mid_cell_values(nodes) - between).max() < _MAX_SURFACE_ERROR * size:
+                break
+        return cls(np.ascontiguousarray(nodes), ends, surface.a)
+
+    def pad_surface(self) -> PadSurface:
+        """Return it as the stages take it."""
+        cells = self.nodes.shape[1] - 1
+        return PadSurface(
+            view_floats(self.nodes), 0, cells, self.nodes[0].size, view_floats(self.ends), self.side_x
+        )
+
+
+def _mid_cell_values(nodes: FloatArray) -> FloatArray:
+    """Return the bicubics (..., y, x, columns) in the middle of the cells."""
+
+    def middle(value: FloatArray, slope: FloatArray, axis: int) -> FloatArray:
+        low, high = [slice(None)] * value.ndim, [slice(None)] * value.ndim
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        of_slopes = (slope[tuple(low)] - slope[tuple(high)]) / 8
+        return np.asarray((value[tuple(low)] + value[tuple(high)]) / 2 + of_slopes)
+
+    value, by_x, by_y, by_both = np.moveaxis(nodes, -2, 0)
+    x_axis = value.ndim - 2
+    return middle(middle(value, by_x, x_axis), middle(by_y, by_both, x_axis), x_axis - 1)
+
+
+@cache
+def stack_table() -> StackTable:
+    """Return the inverse of the contact stack's factor: cubics of its logarithm."""
+    knots = np.linspace(_MIN_LOG_FACTOR, _MAX_LOG_FACTOR, _STACK_INTERVALS + 1)
+    width = float(knots[1] - knots[0])
+    level, by_factor = log_stack_inverse(np.exp(knots))
+    slope = by_factor * np.exp(knots) * width
+    chord, left, right = np.diff(level), slope[:-1], slope[1:]
+    pieces = np.stack([left + right - 2 * chord, 3 * chord - 2 * left - right, left, level[:-1]], axis=1)
+    return StackTable(
+        view_floats(np.ascontiguousarray(pieces)), _STACK_INTERVALS, _MIN_LOG_FACTOR, width
+    )

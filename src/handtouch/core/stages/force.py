@@ -1,0 +1,209 @@
+"""Force: from a contact's total current through the contact law, with its standard deviation.
+
+The same law as `handtouch.field.contact_law`, which is the reference. The standard deviation is by quadrature
+over the contact radius, not by a slope: on soft sheets the slope passes through zero.
+"""
+
+from __future__ import annotations
+
+import math
+
+_VALID, _LOWER_BOUND, _NOT_ESTIMATED = 0, 1, 2  # of a result's status
+_BOUND_SIGMA = 2.0
+_MAX_CURRENT_FRACTION = 0.98  # of the greatest current that the sheet can carry
+_MIN_LOG_SPREADING_RATIO = math.log(2.0)  # of spreading over contact radius, for contacts at an edge
+_MIN_CURRENT_A = 1e-200
+_TWO_PI, _LOG_PI, _INFINITY, _NAN = 2.0 * math.pi, math.log(math.pi), math.inf, float("nan")
+# Gauss-Hermite quadrature of five nodes; the middle one is the reported force itself
+_NEAR_NODE, _FAR_NODE = 1.3556261799742657, 2.8569700138728056
+_NEAR_WEIGHT, _FAR_WEIGHT = 0.22207592200561263, 0.011257411327720693
+
+
+class StackTable:
+    """Inverse of the stack factor I0(x) / (x I1(x)): ln x^2 as cubic polynomials of the factor's logarithm.
+
+    coefficients: (4 intervals,), highest power first, intervals of `width` from `first` on.
+    """
+
+    def __init__(self, coefficients: memoryview[float], intervals: int, first: float, width: float) -> None:
+        self.coefficients = coefficients
+        self.intervals = intervals
+        self.first = first
+        self.width = width
+
+
+class PadLaw:
+    """Contact law of one pad, in logarithms, and what it is applied to.
+
+    log_layer: ln of specific resistance times reference pressure^alpha. radius_std: of ln radius. axes: (9,),
+    one standard deviation of the calibrated (ln layer, alpha, ln sheet) along each of three axes;
+    has_covariance: any isn't 0. series: (n n,) quadratic form of the series resistors [ohm].
+    """
+
+    def __init__(
+        self,
+        log_layer: float,
+        alpha: float,
+        log_radius_m: float,
+        radius_std: float,
+        log_sheet: float,
+        drive_v: float,
+        axes: memoryview[float],
+        has_covariance: bool,
+        series: memoryview[float],
+        has_series: bool,
+    ) -> None:
+        self.log_layer = log_layer
+        self.alpha = alpha
+        self.log_radius_m = log_radius_m
+        self.radius_std = radius_std
+        self.log_sheet = log_sheet
+        self.drive_v = drive_v
+        self.axes = axes
+        self.has_covariance = has_covariance
+        self.series = series
+        self.has_series = has_series
+
+
+class ForceResult:
+    """Force of one contact [N]; `std_n` is infinite where `status` is LOWER_BOUND."""
+
+    def __init__(self) -> None:
+        self.force_n = self.std_n = _NAN
+        self.status = _NOT_ESTIMATED
+
+
+def estimate_force(
+    stack: StackTable,
+    law: PadLaw,
+    result: ForceResult,
+    total_a: float,
+    total_std_a: float,
+    offset_std_a: float,
+    log_spreading_m: float,
+    position_variance: float,
+    series_ohm: float,
+) -> None:
+    """Estimate the force for a total current.
+
+    total_std_a: noise; offset_std_a: of the baseline. log_spreading_m: ln of the spreading radius;
+    position_variance: what the position's uncertainty, with that of the total, makes of the stack factor's
+    variance beyond noise of the total.
+    """
+    result.force_n = result.std_n = _NAN
+    result.status = _NOT_ESTIMATED
+    if not total_a > _BOUND_SIGMA * total_std_a:
+        return
+    per_sheet = _TWO_PI * math.exp(-law.log_sheet)
+    resistors = per_sheet * series_ohm
+    spread = max(log_spreading_m - law.log_radius_m, _MIN_LOG_SPREADING_RATIO)
+    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
+    whole = per_sheet * law.drive_v / max(total_a, _MIN_CURRENT_A)
+    factor = whole - resistors - spread
+    noise = whole * total_std_a / total_a
+    variance = noise * noise + position_variance
+    margin = _BOUND_SIGMA * math.sqrt(variance + law.radius_std * law.radius_std)
+    if factor - margin <= least:
+        margin /= max(1.0 - _BOUND_SIGMA * total_std_a / total_a, 0.1)  # the factor is inverse to the current
+        result.force_n = _force_at(
+            stack, law.log_layer, law.alpha, law.log_radius_m, law.log_sheet, max(factor + margin, least)
+        )
+        result.std_n = _INFINITY
+        result.status = _LOWER_BOUND
+        return
+    force = _force_at(stack, law.log_layer, law.alpha, law.log_radius_m, law.log_sheet, factor)
+    offset = whole * offset_std_a / total_a
+    slope = force / law.alpha * _log_x2_slope(stack, factor)
+    square = slope * slope * (variance + offset * offset)
+    if law.radius_std > 0.0:
+        near = _NEAR_NODE * law.radius_std
+        far = _FAR_NODE * law.radius_std
+        square += _NEAR_WEIGHT * (
+            _squared_change(stack, law, force, near, log_spreading_m, whole, resistors)
+            + _squared_change(stack, law, force, -near, log_spreading_m, whole, resistors)
+        )
+        square += _FAR_WEIGHT * (
+            _squared_change(stack, law, force, far, log_spreading_m, whole, resistors)
+            + _squared_change(stack, law, force, -far, log_spreading_m, whole, resistors)
+        )
+    if law.has_covariance:
+        for k in range(3):
+            scale = math.exp(-law.axes[3 * k + 2])  # a larger sheet resistance makes the factor smaller
+            alpha = max(law.alpha + law.axes[3 * k + 1], 0.1)
+            changed = max((whole - resistors) * scale - spread, least)
+            log_sheet = law.log_sheet + law.axes[3 * k + 2]
+            log_layer = law.log_layer + law.axes[3 * k]
+            change = _force_at(stack, log_layer, alpha, law.log_radius_m, log_sheet, changed) - force
+            square += change * change
+    result.force_n, result.std_n, result.status = force, math.sqrt(square), _VALID
+
+
+def series_resistance(law: PadLaw, currents: memoryview[float], first: int, electrodes: int) -> float:
+    """Return the resistance from contact to ground that the series resistors add [ohm], for its currents."""
+    if not law.has_series:
+        return 0.0
+    total = form = 0.0
+    for i in range(electrodes):
+        total += currents[first + i]
+        row = 0.0
+        for j in range(electrodes):
+            row += law.series[i * electrodes + j] * currents[first + j]
+        form += currents[first + i] * row
+    return form / (total * total) if total > 0.0 else 0.0
+
+
+def _squared_change(
+    stack: StackTable,
+    law: PadLaw,
+    force: float,
+    log_ratio: float,
+    log_spreading_m: float,
+    whole: float,
+    resistors: float,
+) -> float:
+    """Return the squared change of the force with a radius larger by the factor exp(log_ratio)."""
+    log_radius_m = law.log_radius_m + log_ratio
+    spread = max(log_spreading_m - log_radius_m, _MIN_LOG_SPREADING_RATIO)
+    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
+    factor = max(whole - resistors - spread, least)
+    change = _force_at(stack, law.log_layer, law.alpha, log_radius_m, law.log_sheet, factor) - force
+    return change * change
+
+
+def _force_at(
+    stack: StackTable, log_layer: float, alpha: float, log_radius_m: float, log_sheet: float, factor: float
+) -> float:
+    """Return the force [N] at a stack factor: pressure from the layer's resistance, times the area."""
+    log_resistance = _log_x2(stack, factor) - log_sheet - 2.0 * log_radius_m  # minus ln of ohm m^2
+    return math.exp(min(700.0, _LOG_PI + 2.0 * log_radius_m + (log_resistance + log_layer) / alpha))
+
+
+def _log_x2(stack: StackTable, factor: float) -> float:
+    """Return ln x^2 where I0(x) / (x I1(x)) is `factor`."""
+    place = (math.log(factor) - stack.first) / stack.width
+    k = _interval(stack, place)
+    t = place - k
+    c = stack.coefficients
+    if t < 0.0 or t > 1.0:  # straight beyond the table
+        edge = 0.0 if t < 0.0 else 1.0
+        level = ((c[4 * k] * edge + c[4 * k + 1]) * edge + c[4 * k + 2]) * edge + c[4 * k + 3]
+        rate = (3.0 * c[4 * k] * edge + 2.0 * c[4 * k + 1]) * edge + c[4 * k + 2]
+        return level + rate * (t - edge)
+    return ((c[4 * k] * t + c[4 * k + 1]) * t + c[4 * k + 2]) * t + c[4 * k + 3]
+
+
+def _log_x2_slope(stack: StackTable, factor: float) -> float:
+    """Return the derivative of ln x^2 by the factor."""
+    place = (math.log(factor) - stack.first) / stack.width
+    k = _interval(stack, place)
+    t = max(0.0, min(1.0, place - k))
+    c = stack.coefficients
+    return ((3.0 * c[4 * k] * t + 2.0 * c[4 * k + 1]) * t + c[4 * k + 2]) / (stack.width * factor)
+
+
+def _interval(stack: StackTable, place: float) -> int:
+    if place <= 0.0:
+        return 0
+    if place >= stack.intervals:
+        return stack.intervals - 1
+    return int(place)

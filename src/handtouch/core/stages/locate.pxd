@@ -1,0 +1,49 @@
+cimport cython
+from libc cimport math
+from handtouch.core.stages cimport tables
+
+cdef Py_ssize_t _MAX_STEPS, _CORNER_STEPS, _BISECTIONS
+cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
+cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
+cdef double _MIN_INFORMATION, _INFINITY, _HALF_PI
+
+cdef class PadTable:
+    cdef double[::1] values, nodes_x, nodes_y, search_fractions, search_cells
+    cdef Py_ssize_t cells, electrodes, points
+    cdef double side_x, side_y
+
+cdef class Fit:
+    cdef double[::1] data, weight, fractions, slope_x, slope_y, raw, gain
+    cdef public double s, t, total, cost, norm, mixing_x, mixing_y, gradient_x, gradient_y, xx, xy, yy
+    cdef public double step_s, step_t, decrement, x, y, scale_x, scale_y
+    cdef public double var_x, var_y, cov_xy, cov_x_total, cov_y_total, var_total
+    cdef public bint found
+
+@cython.locals(tracked=bint, settled=bint, variance=double)
+cdef void locate(PadTable table, Fit fit, double s, double t) noexcept
+cdef double _clamp(PadTable table, double s) noexcept
+@cython.locals(i=Py_ssize_t)
+cdef double _coordinate(double[::1] nodes, Py_ssize_t cells, double s) noexcept
+@cython.locals(i=Py_ssize_t)
+cdef double _cell_length(double[::1] nodes, Py_ssize_t cells, double s) noexcept
+@cython.locals(_=Py_ssize_t)
+cdef double _cell_at(double[::1] nodes, Py_ssize_t cells, double x) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t)
+cdef void _linearise(PadTable table, Fit fit) noexcept
+cdef void _compute_step(PadTable table, Fit fit) noexcept
+@cython.locals(_=Py_ssize_t)
+cdef bint _maximise(PadTable table, Fit fit, bint tracked) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, points=Py_ssize_t, first=Py_ssize_t, second=Py_ssize_t,
+               peak=Py_ssize_t)
+cdef void _search(PadTable table, Fit fit, bint located) noexcept
+@cython.locals(k=Py_ssize_t, row=Py_ssize_t, column=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, best=Py_ssize_t,
+               is_peak=bint)
+cdef Py_ssize_t _highest_peak(Fit fit, Py_ssize_t points, Py_ssize_t excluded) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t)
+cdef void _compute_covariance(PadTable table, Fit fit) noexcept
+cdef void _compute_position(PadTable table, Fit fit) noexcept
+@cython.locals(i=Py_ssize_t, known_x=bint, known_y=bint)
+cdef void _invert_information(PadTable table, Fit fit) noexcept
+@cython.locals(i=Py_ssize_t, _=Py_ssize_t, far_x=bint, far_y=bint)
+cdef void _move_out_of_corner(PadTable table, Fit fit) noexcept
+cdef void _linearise_on_arc(PadTable table, Fit fit, bint far_x, bint far_y, double radius, double angle) noexcept

@@ -1,0 +1,419 @@
+"""Location: the most likely point contact for the currents of one pad, and its covariance.
+
+Gauss-Newton on the position with the total current eliminated (variable projection), steps halved until the
+likelihood rises. Positions are in cells of the pad's table, which shrink towards edges and electrode ends as
+the distances do over which currents vary. The same likelihood, limits and covariance as
+`handtouch.field.estimate`, which is the reference.
+"""
+
+from __future__ import annotations
+
+import math
+
+from handtouch.core.stages import tables
+
+_MAX_STEPS = 30
+_MAX_STEP_CELLS = 7.0
+_MAX_SETTLED_DECREMENT = 1e-3  # squared Newton decrement, in variances: the last step leaves far less
+_MIN_DAMPING = 1e-4
+_BISECTIONS = 50
+_MAX_TRACKED_COST = 25.0  # sum of squares beyond which, and
+_MAX_TRACKED_VARIANCE = 2.5e-3  # variance of a coordinate, in sides, beyond which other starts are tried
+_MAX_START_COST = 40.0  # cost above the best start's at which another one is still tried
+_MAX_STD_SIDES = 1e3  # a coordinate with a larger deviation is unknown
+_CORNER_RADIUS_FACTOR = 0.7  # of the root of the relative noise, in shorter sides: no information on the radius
+_MAX_CORNER_RADIUS = 0.25  # in shorter sides
+_CORNER_STEPS = 6
+_MIN_CORNER_ANGLE_RAD = 0.02
+_MIN_INFORMATION = 1e-300
+_INFINITY, _HALF_PI = math.inf, 0.5 * math.pi
+
+
+class PadTable:
+    """Table of one pad's forward model, as `read_table` needs it.
+
+    values: columns are the fractions of the n electrodes and ln of the spreading radius. nodes_x, nodes_y:
+    (2 (cells + 1),) coordinate of each node, and its derivative by cell. search_fractions: (points^2, n) on a
+    square grid, x fastest; search_cells: (2 points,) its coordinates along x, then y, in cells.
+    """
+
+    def __init__(
+        self,
+        values: memoryview[float],
+        cells: int,
+        electrodes: int,
+        nodes_x: memoryview[float],
+        nodes_y: memoryview[float],
+        search_fractions: memoryview[float],
+        search_cells: memoryview[float],
+        points: int,
+    ) -> None:
+        self.values = values
+        self.cells = cells
+        self.electrodes = electrodes
+        self.nodes_x, self.nodes_y = nodes_x, nodes_y
+        self.side_x, self.side_y = nodes_x[2 * cells], nodes_y[2 * cells]
+        self.search_fractions = search_fractions
+        self.search_cells = search_cells
+        self.points = points
+
+
+class Fit:
+    """Working memory of the fit of one contact, and its result.
+
+    `data`, `weight`, `fractions`, `slope_x`, `slope_y` (n,): currents and what the model gives for them per
+    total, all divided by the noise; slopes by cell, less the part that the total absorbs. `raw` (3 columns,):
+    what was read from the table. `gain` (points,): reduction of the cost by a contact at each search point.
+    """
+
+    def __init__(
+        self,
+        data: memoryview[float],
+        weight: memoryview[float],
+        fractions: memoryview[float],
+        slope_x: memoryview[float],
+        slope_y: memoryview[float],
+        raw: memoryview[float],
+        gain: memoryview[float],
+    ) -> None:
+        self.data, self.weight = data, weight
+        self.fractions, self.slope_x, self.slope_y = fractions, slope_x, slope_y
+        self.raw, self.gain = raw, gain
+        self.s = self.t = 0.0  # position, in cells
+        self.total = self.cost = 0.0
+        self.norm = self.mixing_x = self.mixing_y = 0.0  # of fractions; slopes' part that the total absorbs
+        self.gradient_x = self.gradient_y = 0.0
+        self.xx = self.xy = self.yy = 0.0
+        self.step_s = self.step_t = self.decrement = 0.0
+        # the result: position in sides of the pad and lengths of a cell there; covariance of (x, y, total)
+        self.x = self.y = self.scale_x = self.scale_y = 0.0
+        self.var_x = self.var_y = self.cov_xy = 0.0
+        self.cov_x_total = self.cov_y_total = self.var_total = 0.0
+        self.found = False
+
+
+def locate(table: PadTable, fit: Fit, s: float, t: float) -> None:
+    """Find the most likely contact for the currents in `fit`; (s, t): last position in cells, NaN if new.
+
+    `fit.found` is False where no contact explains the currents better than none.
+    """
+    tracked, settled = s == s and t == t, False
+    if tracked:
+        fit.s, fit.t = s, t
+        settled = _maximise(table, fit, True)
+    if settled:
+        _compute_covariance(table, fit)
+        variance = max(
+            fit.var_x / (table.side_x * table.side_x), fit.var_y / (table.side_y * table.side_y)
+        )
+        settled = fit.cost <= _MAX_TRACKED_COST and variance <= _MAX_TRACKED_VARIANCE
+    if not settled:
+        _search(table, fit, tracked)
+        _compute_covariance(table, fit)
+    fit.found = fit.total > 0.0
+    if fit.found:
+        _move_out_of_corner(table, fit)
+
+
+def _clamp(table: PadTable, s: float) -> float:
+    """Return a coordinate inside the table, in cells."""
+    return max(0.0, min(1.0 * table.cells, s))
+
+
+def _coordinate(nodes: memoryview[float], cells: int, s: float) -> float:
+    """Return the coordinate on the pad at s cells, a cubic between the nodes."""
+    i = min(int(s), cells - 1)
+    p = s - i
+    near, far, near_slope, far_slope = nodes[2 * i], nodes[2 * i + 2], nodes[2 * i + 1], nodes[2 * i + 3]
+    rise = p * p * (3.0 - 2.0 * p)
+    return near + rise * (far - near) + p * (1.0 - p) * ((1.0 - p) * near_slope - p * far_slope)
+
+
+def _cell_length(nodes: memoryview[float], cells: int, s: float) -> float:
+    """Return the derivative of `_coordinate`."""
+    i = min(int(s), cells - 1)
+    p = s - i
+    near_slope, far_slope = nodes[2 * i + 1], nodes[2 * i + 3]
+    rise = 6.0 * p * (1.0 - p) * (nodes[2 * i + 2] - nodes[2 * i])
+    return rise + (1.0 - p) * (1.0 - 3.0 * p) * near_slope + p * (3.0 * p - 2.0) * far_slope
+
+
+def _cell_at(nodes: memoryview[float], cells: int, x: float) -> float:
+    """Return the cells of a coordinate on the pad, the inverse of `_coordinate`."""
+    low, high = 0.0, 1.0 * cells
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        if _coordinate(nodes, cells, middle) < x:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+def _linearise(table: PadTable, fit: Fit) -> None:
+    """Evaluate the model at (s, t), with the total eliminated."""
+    n = table.electrodes
+    tables.read_table(table.values, 0, table.cells, n + 1, fit.s, fit.t, fit.raw)
+    norm = along = mixing_x = mixing_y = 0.0
+    for i in range(n):
+        weight = fit.weight[i]
+        f = fit.raw[i] * weight
+        fx = fit.raw[n + 1 + i] * weight
+        fy = fit.raw[2 * n + 2 + i] * weight
+        fit.fractions[i], fit.slope_x[i], fit.slope_y[i] = f, fx, fy
+        norm += f * f
+        along += f * fit.data[i]
+        mixing_x += f * fx
+        mixing_y += f * fy
+    total = along / norm
+    mixing_x /= norm
+    mixing_y /= norm
+    cost = xx = xy = yy = gradient_x = gradient_y = 0.0
+    for i in range(n):
+        f = fit.fractions[i]
+        sx, sy = fit.slope_x[i] - mixing_x * f, fit.slope_y[i] - mixing_y * f
+        fit.slope_x[i], fit.slope_y[i] = sx, sy
+        misfit = fit.data[i] - total * f
+        cost += misfit * misfit
+        xx += sx * sx
+        xy += sx * sy
+        yy += sy * sy
+        gradient_x += sx * misfit
+        gradient_y += sy * misfit
+    fit.total, fit.cost, fit.norm = total, cost, norm
+    fit.mixing_x, fit.mixing_y = mixing_x, mixing_y
+    fit.xx, fit.xy, fit.yy = xx, xy, yy
+    fit.gradient_x, fit.gradient_y = gradient_x, gradient_y
+
+
+def _compute_step(table: PadTable, fit: Fit) -> None:
+    """Compute the Gauss-Newton step and its squared decrement; a coordinate at the table's end is held."""
+    xx, xy, yy = fit.xx, fit.xy, fit.yy
+    gradient_x, gradient_y = fit.gradient_x, fit.gradient_y
+    if (fit.s <= 0.0 and gradient_x < 0.0) or (fit.s >= table.cells and gradient_x > 0.0):
+        gradient_x = xy = 0.0
+    if (fit.t <= 0.0 and gradient_y < 0.0) or (fit.t >= table.cells and gradient_y > 0.0):
+        gradient_y = xy = 0.0
+    along_x = along_y = 0.0
+    determinant = xx * yy - xy * xy
+    if determinant > 1e-14 * xx * yy:
+        along_x = (yy * gradient_x - xy * gradient_y) / determinant
+        along_y = (xx * gradient_y - xy * gradient_x) / determinant
+    elif xx >= yy and xx > 0.0:
+        along_x = gradient_x / xx
+    elif yy > 0.0:
+        along_y = gradient_y / yy
+    fit.decrement = along_x * gradient_x + along_y * gradient_y
+    if fit.total != 0.0:
+        along_x /= fit.total
+        along_y /= fit.total
+    longest = max(abs(along_x), abs(along_y))
+    scale = _MAX_STEP_CELLS / longest if longest > _MAX_STEP_CELLS else 1.0
+    fit.step_s, fit.step_t = scale * along_x, scale * along_y
+
+
+def _maximise(table: PadTable, fit: Fit, tracked: bool) -> bool:
+    """Iterate from (s, t); return True where the maximum was reached.
+
+    tracked: give up where the first step is too long for the contact to have been followed.
+    """
+    _linearise(table, fit)
+    _compute_step(table, fit)
+    longest = 0.999 * _MAX_STEP_CELLS
+    if tracked and (fit.total <= 0.0 or abs(fit.step_s) > longest or abs(fit.step_t) > longest):
+        return False
+    damping = 1.0
+    for _ in range(_MAX_STEPS):
+        s, t, cost, total = fit.s, fit.t, fit.cost, fit.total
+        step_s, step_t = fit.step_s, fit.step_t
+        if total > 0.0 and fit.decrement <= _MAX_SETTLED_DECREMENT:
+            fit.s, fit.t = _clamp(table, s + step_s), _clamp(table, t + step_t)
+            fit.step_s, fit.step_t = fit.s - s, fit.t - t
+            return True
+        while True:
+            fit.s, fit.t = _clamp(table, s + damping * step_s), _clamp(table, t + damping * step_t)
+            _linearise(table, fit)
+            if total <= 0.0 or (fit.total > 0.0 and fit.cost <= cost):
+                damping = min(1.0, 4.0 * damping)
+                break
+            damping *= 0.25
+            if damping < _MIN_DAMPING:
+                fit.s, fit.t = s, t
+                _linearise(table, fit)
+                fit.step_s = fit.step_t = fit.decrement = 0.0
+                return total > 0.0
+        _compute_step(table, fit)
+    fit.step_s = fit.step_t = 0.0
+    return False
+
+
+def _search(table: PadTable, fit: Fit, located: bool) -> None:
+    """Fit from the most likely points of the search grid; keep the most likely result.
+
+    located: the present position is a result too. Weak contacts on long pads have two maxima.
+    """
+    n, points = table.electrodes, table.points
+    power = 0.0
+    for i in range(n):
+        power += fit.data[i] * fit.data[i]
+    for k in range(points * points):
+        along = norm = 0.0
+        for i in range(n):
+            f = table.search_fractions[k * n + i] * fit.weight[i]
+            along += f * fit.data[i]
+            norm += f * f
+        fit.gain[k] = along * along / norm if along > 0.0 else 0.0
+    best_s, best_t, best_cost = fit.s, fit.t, _INFINITY
+    if located and fit.total > 0.0:
+        best_cost = fit.cost
+    first, second = _highest_peak(fit, points, -1), -1
+    if first >= 0:
+        second = _highest_peak(fit, points, first)
+    for peak in range(2):
+        k = second if peak else first
+        if k < 0 or power - fit.gain[k] > best_cost + _MAX_START_COST:
+            continue
+        fit.s, fit.t = table.search_cells[k % points], table.search_cells[points + k // points]
+        _maximise(table, fit, False)
+        if fit.total > 0.0 and fit.cost < best_cost:
+            best_s, best_t, best_cost = fit.s, fit.t, fit.cost
+    fit.s, fit.t = best_s, best_t
+    _linearise(table, fit)
+    fit.step_s = fit.step_t = fit.decrement = 0.0
+
+
+def _highest_peak(fit: Fit, points: int, excluded: int) -> int:
+    """Return the local maximum of the gain other than `excluded`, -1 if there is none."""
+    best, highest = -1, 0.0
+    for k in range(points * points):
+        gain = fit.gain[k]
+        if gain <= highest or k == excluded:
+            continue
+        row, column = k // points, k % points
+        is_peak = True
+        for j in range(-1, 2):
+            for i in range(-1, 2):
+                if 0 <= row + j < points and 0 <= column + i < points and (i != 0 or j != 0):
+                    is_peak = is_peak and gain > fit.gain[(row + j) * points + column + i]
+        if is_peak:
+            best, highest = k, gain
+    return best
+
+
+def _compute_covariance(table: PadTable, fit: Fit) -> None:
+    """Apply the last step; compute position and inverse Fisher information of (x, y, total)."""
+    ds, dt, n = fit.step_s, fit.step_t, table.electrodes
+    if ds != 0.0 or dt != 0.0:  # what was read moves along its tangent
+        for i in range(n + 1):
+            fit.raw[i] += ds * fit.raw[n + 1 + i] + dt * fit.raw[2 * n + 2 + i]
+        fit.total *= 1.0 - fit.mixing_x * ds - fit.mixing_y * dt
+        fit.cost = max(0.0, fit.cost - fit.decrement)
+        fit.step_s = fit.step_t = fit.decrement = 0.0
+    _compute_position(table, fit)
+    _invert_information(table, fit)
+
+
+def _compute_position(table: PadTable, fit: Fit) -> None:
+    fit.x, fit.y = _coordinate(table.nodes_x, table.cells, fit.s), _coordinate(table.nodes_y, table.cells, fit.t)
+    fit.scale_x = _cell_length(table.nodes_x, table.cells, fit.s)
+    fit.scale_y = _cell_length(table.nodes_y, table.cells, fit.t)
+
+
+def _invert_information(table: PadTable, fit: Fit) -> None:
+    total2 = fit.total * fit.total
+    xx, xy, yy = fit.xx, fit.xy, fit.yy
+    by_y = xy / yy if yy > 0.0 else 0.0
+    by_x = xy / xx if xx > 0.0 else 0.0
+    # each variance from the part that the other coordinate can't explain: no difference of products
+    free_x = free_y = 0.0
+    for i in range(table.electrodes):
+        rest_x = fit.slope_x[i] - by_y * fit.slope_y[i]
+        rest_y = fit.slope_y[i] - by_x * fit.slope_x[i]
+        free_x += rest_x * rest_x
+        free_y += rest_y * rest_y
+    var_x = 1.0 / (free_x * total2) if free_x * total2 > _MIN_INFORMATION else _INFINITY
+    var_y = 1.0 / (free_y * total2) if free_y * total2 > _MIN_INFORMATION else _INFINITY
+    limit_x, limit_y = _MAX_STD_SIDES * table.side_x, _MAX_STD_SIDES * table.side_y
+    known_x = var_x * fit.scale_x * fit.scale_x <= limit_x * limit_x
+    known_y = var_y * fit.scale_y * fit.scale_y <= limit_y * limit_y
+    cov_xy = 0.0
+    if known_x and known_y:
+        cov_xy = -by_x * var_y
+    elif known_x and xx > 0.0:
+        var_x = 1.0 / (xx * total2)
+    elif known_y and yy > 0.0:
+        var_y = 1.0 / (yy * total2)
+    cov_x_total = cov_y_total = 0.0
+    fit.var_total = 1.0 / fit.norm
+    fit.var_x = fit.var_y = _INFINITY
+    if known_x:
+        cov_x_total -= fit.total * fit.mixing_x * var_x
+        cov_y_total -= fit.total * fit.mixing_x * cov_xy
+        fit.var_x = var_x * fit.scale_x * fit.scale_x
+    if known_y:
+        cov_y_total -= fit.total * fit.mixing_y * var_y
+        cov_x_total -= fit.total * fit.mixing_y * cov_xy
+        fit.var_y = var_y * fit.scale_y * fit.scale_y
+    if known_x:
+        fit.var_total -= fit.total * fit.mixing_x * cov_x_total
+    if known_y:
+        fit.var_total -= fit.total * fit.mixing_y * cov_y_total
+    fit.cov_xy = cov_xy * fit.scale_x * fit.scale_y
+    fit.cov_x_total, fit.cov_y_total = cov_x_total * fit.scale_x, cov_y_total * fit.scale_y
+
+
+def _move_out_of_corner(table: PadTable, fit: Fit) -> None:
+    """Move a position out of a corner to where the currents carry information.
+
+    Near a corner the two far currents vanish with the square of the distance from it, so that all distances
+    up to the root of the relative noise are equally likely, and only the direction is known.
+    """
+    far_x, far_y = fit.x > 0.5 * table.side_x, fit.y > 0.5 * table.side_y
+    near_x = table.side_x - fit.x if far_x else fit.x
+    near_y = table.side_y - fit.y if far_y else fit.y
+    shortest = min(table.side_x, table.side_y)
+    distance2 = near_x * near_x + near_y * near_y
+    if distance2 >= _MAX_CORNER_RADIUS * _MAX_CORNER_RADIUS * shortest * shortest:
+        return
+    weight2 = 0.0
+    for i in range(table.electrodes):
+        weight2 += fit.weight[i] * fit.weight[i]
+    noise = math.sqrt(table.electrodes / weight2)
+    relative = min(_CORNER_RADIUS_FACTOR * math.sqrt(noise / fit.total), _MAX_CORNER_RADIUS)
+    radius = relative * shortest
+    if distance2 >= radius * radius:
+        return
+    angle = math.atan2(near_y, near_x)
+    highest = _HALF_PI - _MIN_CORNER_ANGLE_RAD
+    for _ in range(_CORNER_STEPS):
+        angle = max(_MIN_CORNER_ANGLE_RAD, min(highest, angle))
+        _linearise_on_arc(table, fit, far_x, far_y, radius, angle)
+        # derivatives of the whitened currents by the angle; slopes are by cell
+        by_x = -radius * math.sin(angle) / fit.scale_x
+        by_y = radius * math.cos(angle) / fit.scale_y
+        if far_x:
+            by_x = -by_x
+        if far_y:
+            by_y = -by_y
+        along = norm = 0.0
+        for i in range(table.electrodes):
+            tangent = fit.total * (fit.slope_x[i] * by_x + fit.slope_y[i] * by_y)
+            along += tangent * (fit.data[i] - fit.total * fit.fractions[i])
+            norm += tangent * tangent
+        if norm > 0.0:
+            angle += max(-0.3, min(0.3, along / norm))
+    angle = max(_MIN_CORNER_ANGLE_RAD, min(highest, angle))
+    _linearise_on_arc(table, fit, far_x, far_y, radius, angle)
+    fit.found = fit.total > 0.0
+    _invert_information(table, fit)
+
+
+def _linearise_on_arc(
+    table: PadTable, fit: Fit, far_x: bool, far_y: bool, radius: float, angle: float
+) -> None:
+    x, y = radius * math.cos(angle), radius * math.sin(angle)
+    fit.s = _cell_at(table.nodes_x, table.cells, table.side_x - x if far_x else x)
+    fit.t = _cell_at(table.nodes_y, table.cells, table.side_y - y if far_y else y)
+    _linearise(table, fit)
+    fit.step_s = fit.step_t = fit.decrement = 0.0
+    _compute_position(table, fit)

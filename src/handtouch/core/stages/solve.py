@@ -1,0 +1,235 @@
+"""Contacts of a tick: locate, estimate the force, place; one row of `values` a pad.
+
+Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from handtouch.core.stages import force, locate, place
+
+_X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD = 0, 2, 4, 5, 8, 11, 12, 13
+_COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _COUNT = 14, 23, 26, 27, 29
+VALUE_COUNT = _COUNT
+VALUE_SLICES = {
+    "xy": slice(_X, _X + 2),  # on the pad's rectangle
+    "pad_m": slice(_U, _U + 2),
+    "residual": slice(_RESIDUAL, _RESIDUAL + 1),
+    "position_m": slice(_POSITION, _POSITION + 3),
+    "normal": slice(_NORMAL, _NORMAL + 3),
+    "force_n": slice(_FORCE, _FORCE + 1),
+    "force_std_n": slice(_FORCE_STD, _FORCE_STD + 1),
+    "residual_std": slice(_RESIDUAL_STD, _RESIDUAL_STD + 1),  # from channel noise
+    "covariance_m2": slice(_COVARIANCE, _COVARIANCE + 9),
+    "pad_noise_m2": slice(_PAD_NOISE, _PAD_NOISE + 3),  # of pad_m from channel noise: uu, uv, vv
+    "force_status": slice(_FORCE_STATUS, _FORCE_STATUS + 1),  # ForceEstimateStatus
+    "cells": slice(_CELLS, _CELLS + 2),  # position in the pad's table, where the next tick starts from
+}
+"""Layout of a row of values."""
+_NAN, _TWO_PI = float("nan"), 2.0 * math.pi
+_MAX_SQUARED_MISFIT = 9.0
+"""Squared misfit of a point contact, of one degree of freedom, that noise explains. Beyond it the covariance
+is inflated by the excess (Birge, Phys. Rev. 40, 1932): where a contact is no point, or gains are off, the
+errors of currents along the directions that move the position are as large as along the observable one."""
+
+
+class ContactSolver:
+    """Solves contacts of the pads of a model; arrays are flat, with a row a pad.
+
+    currents, weight: (pads n,) currents [A] and 1 / noise [1/A]. gain_covariance: (pads n n,) of log gains;
+    gain_uncertain: (pads,), 1 where it isn't 0. offset_std: (pads,) of the sum of the currents, from the
+    baseline [A]. force_requested: (pads,), 0 where no force is to be estimated. values: (pads VALUE_COUNT,),
+    the result; NaN for a new contact, else the search begins at the position in it.
+    """
+
+    def __init__(
+        self,
+        tables: list[locate.PadTable],
+        laws: list[force.PadLaw],
+        surfaces: list[place.PadSurface],
+        stack: force.StackTable,
+        fit: locate.Fit,
+        placement: place.Placement,
+        electrodes: int,
+        work: memoryview[float],
+        currents: memoryview[float],
+        weight: memoryview[float],
+        gain_covariance: memoryview[float],
+        gain_uncertain: memoryview[int],
+        offset_std: memoryview[float],
+        force_requested: memoryview[int],
+        values: memoryview[float],
+    ) -> None:
+        self.tables, self.laws, self.surfaces = tables, laws, surfaces
+        self.stack, self.fit, self.placement = stack, fit, placement
+        self.result = force.ForceResult()
+        self.electrodes = electrodes
+        self.by_x, self.by_y, self.by_total = (
+            work[:electrodes], work[electrodes : 2 * electrodes], work[2 * electrodes : 3 * electrodes],
+        )  # fmt: skip
+        self.by_residual = work[3 * electrodes : 4 * electrodes]
+        self.currents, self.weight = currents, weight
+        self.gain_covariance, self.gain_uncertain = gain_covariance, gain_uncertain
+        self.offset_std, self.force_requested = offset_std, force_requested
+        self.values = values
+
+    def solve_contacts(self, pads: memoryview[int]) -> None:
+        """Solve the contacts of these pads; a row is NaN where no contact explains the currents."""
+        for k in range(len(pads)):
+            solve_contact(self, pads[k])
+
+
+def solve_contact(solver: ContactSolver, pad: int) -> None:
+    """Locate a pad's contact, estimate its force, and place it in the link's frame."""
+    n, row = solver.electrodes, pad * _COUNT
+    fit, table, values = solver.fit, solver.tables[pad], solver.values
+    for i in range(n):
+        weight = solver.weight[pad * n + i]
+        fit.weight[i] = weight
+        fit.data[i] = solver.currents[pad * n + i] * weight
+    locate.locate(table, fit, values[row + _CELLS], values[row + _CELLS + 1])
+    for i in range(_COUNT):
+        values[row + i] = _NAN
+    if not fit.found:
+        return
+    values[row + _CELLS], values[row + _CELLS + 1] = fit.s, fit.t
+    place.place_contact(solver.surfaces[pad], solver.placement, fit.x, fit.y)
+    _propagate(solver, pad)
+    if solver.force_requested[pad]:
+        _estimate_force(solver, pad)
+    _write_position(solver, row)
+
+
+def _propagate(solver: ContactSolver, pad: int) -> None:
+    """Compute residual and derivatives by the currents; add the gains' covariance, inflate for misfit."""
+    n, row, fit, values = solver.electrodes, pad * _COUNT, solver.fit, solver.values
+    total, pair, modelled, noise = fit.total, 0.0, 0.0, 0.0
+    # derivatives of (x, y, total) by each current, from slopes by cell
+    per_x, per_y = total / fit.scale_x, total / fit.scale_y
+    var_x = fit.var_x if fit.var_x < 1e300 else 0.0
+    var_y = fit.var_y if fit.var_y < 1e300 else 0.0
+    for i in range(n):
+        weight = fit.weight[i]
+        sx, sy = fit.slope_x[i] * per_x * weight, fit.slope_y[i] * per_y * weight
+        solver.by_x[i] = var_x * sx + fit.cov_xy * sy
+        solver.by_y[i] = fit.cov_xy * sx + var_y * sy
+        solver.by_total[i] = (
+            fit.fractions[i] * weight / fit.norm
+            - fit.mixing_x * per_x * solver.by_x[i]
+            - fit.mixing_y * per_y * solver.by_y[i]
+        )
+    for i in range(2):
+        pair += fit.data[i] / fit.weight[i]
+        modelled += fit.raw[i]
+    slope_x = (fit.raw[n + 1] + fit.raw[n + 2]) / fit.scale_x
+    slope_y = (fit.raw[2 * n + 2] + fit.raw[2 * n + 3]) / fit.scale_y
+    residual = pair / total - modelled
+    for i in range(n):
+        by = -pair / (total * total) * solver.by_total[i] - slope_x * solver.by_x[i] - slope_y * solver.by_y[i]
+        if i < 2:
+            by += 1.0 / total
+        solver.by_residual[i] = by
+        noise += (by / fit.weight[i]) * (by / fit.weight[i])
+    values[row + _RESIDUAL], values[row + _RESIDUAL_STD] = residual, math.sqrt(noise)
+    _write_pad_noise(solver, row)
+    if solver.gain_uncertain[pad]:
+        noise += _add_gain_covariance(solver, pad)
+    excess = residual * residual / noise - _MAX_SQUARED_MISFIT if noise > 0.0 else 0.0
+    if excess > 0.0:
+        fit.var_x *= 1.0 + excess
+        fit.var_y *= 1.0 + excess
+        fit.cov_xy *= 1.0 + excess
+
+
+def _write_pad_noise(solver: ContactSolver, row: int) -> None:
+    """Write the covariance of the arc lengths from channel noise."""
+    fit, values = solver.fit, solver.values
+    raw = solver.placement
+    along = math.sqrt(raw.tx * raw.tx + raw.ty * raw.ty + raw.tz * raw.tz)
+    around = math.sqrt(raw.wx * raw.wx + raw.wy * raw.wy + raw.wz * raw.wz)
+    values[row + _PAD_NOISE] = fit.var_x * along * along
+    values[row + _PAD_NOISE + 1] = fit.cov_xy * along * around
+    values[row + _PAD_NOISE + 2] = fit.var_y * around * around
+
+
+def _add_gain_covariance(solver: ContactSolver, pad: int) -> float:
+    """Add the covariance of log gains to that of (x, y, total); return what it adds to the residual's."""
+    n, fit = solver.electrodes, solver.fit
+    xx = xy = yy = xt = yt = tt = rr = 0.0
+    for i in range(n):
+        current = solver.currents[pad * n + i]
+        ax, ay, at = solver.by_x[i] * current, solver.by_y[i] * current, solver.by_total[i] * current
+        ar = solver.by_residual[i] * current
+        bx = by = bt = br = 0.0
+        for j in range(n):
+            covariance = solver.gain_covariance[(pad * n + i) * n + j] * solver.currents[pad * n + j]
+            bx += covariance * solver.by_x[j]
+            by += covariance * solver.by_y[j]
+            bt += covariance * solver.by_total[j]
+            br += covariance * solver.by_residual[j]
+        xx += ax * bx
+        xy += ax * by
+        yy += ay * by
+        xt += ax * bt
+        yt += ay * bt
+        tt += at * bt
+        rr += ar * br
+    fit.var_x += xx
+    fit.var_y += yy
+    fit.cov_xy += xy
+    fit.cov_x_total += xt
+    fit.cov_y_total += yt
+    fit.var_total += tt
+    return rr
+
+
+def _estimate_force(solver: ContactSolver, pad: int) -> None:
+    n, row, fit, values = solver.electrodes, pad * _COUNT, solver.fit, solver.values
+    law = solver.laws[pad]
+    log_spreading_m = fit.raw[n] + math.log(solver.placement.scale_m)
+    # the stack factor is whole / total - ln R(x, y): its variance beyond that of the total alone
+    slope_x, slope_y = fit.raw[2 * n + 1] / fit.scale_x, fit.raw[3 * n + 2] / fit.scale_y
+    variance = 0.0
+    if fit.var_x < 1e300 and fit.var_y < 1e300:
+        whole = _TWO_PI * math.exp(-law.log_sheet) * law.drive_v / (fit.total * fit.total)
+        variance = slope_x * slope_x * fit.var_x + slope_y * slope_y * fit.var_y
+        variance += 2.0 * slope_x * slope_y * fit.cov_xy
+        variance += 2.0 * whole * (slope_x * fit.cov_x_total + slope_y * fit.cov_y_total)
+    force.estimate_force(
+        solver.stack,
+        law,
+        solver.result,
+        fit.total,
+        math.sqrt(fit.var_total),
+        solver.offset_std[pad],
+        log_spreading_m,
+        variance,
+        force.series_resistance(law, solver.currents, pad * n, n),
+    )
+    values[row + _FORCE], values[row + _FORCE_STD] = solver.result.force_n, solver.result.std_n
+    values[row + _FORCE_STATUS] = 1.0 * solver.result.status
+
+
+def _write_position(solver: ContactSolver, row: int) -> None:
+    """Write position, normal and covariance; NaN what the currents don't determine."""
+    fit, at, values = solver.fit, solver.placement, solver.values
+    if not fit.var_x < 1e300 or not fit.var_y < 1e300:
+        return
+    values[row + _X], values[row + _X + 1] = fit.x, fit.y
+    values[row + _U], values[row + _U + 1] = at.u_m, at.v_m
+    values[row + _POSITION], values[row + _POSITION + 1], values[row + _POSITION + 2] = at.px, at.py, at.pz
+    values[row + _NORMAL], values[row + _NORMAL + 1], values[row + _NORMAL + 2] = at.nx, at.ny, at.nz
+    _write_row(values, row + _COVARIANCE, fit, at, at.tx, at.wx)
+    _write_row(values, row + _COVARIANCE + 3, fit, at, at.ty, at.wy)
+    _write_row(values, row + _COVARIANCE + 6, fit, at, at.tz, at.wz)
+
+
+def _write_row(
+    values: memoryview[float], first: int, fit: locate.Fit, at: place.Placement, t: float, w: float
+) -> None:
+    """Write a row of the covariance in the link's frame, from components of the tangents."""
+    by_t, by_w = fit.var_x * t + fit.cov_xy * w, fit.cov_xy * t + fit.var_y * w
+    values[first] = by_t * at.tx + by_w * at.wx
+    values[first + 1] = by_t * at.ty + by_w * at.wy
+    values[first + 2] = by_t * at.tz + by_w * at.wz

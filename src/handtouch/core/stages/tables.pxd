@@ -1,0 +1,6 @@
+cimport cython
+
+@cython.locals(i=Py_ssize_t, j=Py_ssize_t, c=Py_ssize_t, node=Py_ssize_t, near=Py_ssize_t, far=Py_ssize_t,
+               a=Py_ssize_t, b=Py_ssize_t)
+cdef void read_table(double[::1] table, Py_ssize_t first, Py_ssize_t cells, Py_ssize_t columns,
+                     double s, double t, double[::1] out) noexcept
