@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from handtouch import wire
 from handtouch.config.tables import SceneRequest
-from handtouch.core.linearisation import POSITION_COLUMNS, ContactLinearisations
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import (
     CONTROL_OWNER,
@@ -31,7 +30,6 @@ scene_requests = st.builds(
     SceneRequest,
     links=st.lists(st.sampled_from(["*", "thumb_*", "left/palm", "right/*"]), max_size=3).map(tuple),
     outputs=st.lists(st.sampled_from(["position", "force", "raw"]), max_size=3).map(tuple),
-    tolerance_mm=st.floats(0, 10),
     rate_hz=st.none() | st.floats(1, 1000),
 )
 
@@ -49,10 +47,8 @@ def test_an_additional_scene_removes_nothing(present: list[SceneRequest], more: 
     before, after = merge_scenes(present, NAMES), merge_scenes([*present, more], NAMES)
     for name in ("pads", "position", "force", "raw"):
         assert (getattr(after, name) >= getattr(before, name)).all()
-    assert (after.tolerance_m[before.pads] <= before.tolerance_m[before.pads]).all()
     assert (after.rate_hz >= before.rate_hz).all()
     mine = select_pads(more.links, NAMES)
-    assert (after.tolerance_m[mine] <= more.tolerance_mm * 1e-3).all()
     assert (after.rate_hz[mine] >= (more.rate_hz or np.inf)).all()
     assert merge_scenes([more, *present], NAMES).pads.tolist() == after.pads.tolist()
 
@@ -111,16 +107,16 @@ class TouchedPads:
         self.messages: list[Any] = []
         self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
         self.pipeline.node_state[:] = PadState.CLEAR
-        self.solved: list[int] = []
-        solve = self.pipeline.tick.linearisations.evaluate
-        self.pipeline.tick.linearisations.evaluate = lambda pads, currents: (  # type: ignore[method-assign]
-            self.solved.extend(pads.tolist()) or solve(pads, currents)  # type: ignore[func-returns-value]
-        )
         self.touched = [bench.counts(pad, 0.4, 0.6, 1e-3).tobytes() for pad in range(3)]
         names = list(zip(bench.model.hands, bench.model.links, strict=True))
         self.demand = Demand(ActiveScenes(scene, names), self, 200.0, self._apply)
         self.t_ns = SECOND
         self.demand.update(self.t_ns)
+
+    @property
+    def solved(self) -> set[int]:
+        """Pads whose contact has a computed position."""
+        return set(np.flatnonzero(np.isfinite(self.pipeline.tick.columns.xy[:, 0])).tolist())
 
     def _apply(self, requested: Any, needed: Any, enabled: Any, now_ns: int) -> None:
         del needed, enabled, now_ns
@@ -152,18 +148,17 @@ class TouchedPads:
 def test_nothing_is_solved_or_encoded_without_a_subscriber(bench: Any) -> None:
     rig = TouchedPads(bench, SceneRequest())
     assert rig.run(6) == []
-    assert rig.solved == []
+    assert not rig.solved
     assert rig.pipeline.tick.contacts.touching.all()  # contacts are detected
     rig.subscriptions = frozenset([b"contact/h/round"])
     rig.run(6)
-    assert set(rig.solved) == {1}
+    assert rig.solved == {1}
     assert {(m.link, m.position_status) for m in rig.messages[1:]} == {("round", "valid")}
     assert rig.rows()["plane"]["not_computed"]["position"] == "no subscriber"
     assert rig.rows()["round"]["subscriptions"] == ["contact/h/round"]
     rig.subscriptions = frozenset([b"hand/"])
-    rig.solved.clear()
     rig.run(3)
-    assert set(rig.solved) == {0, 1, 2}
+    assert rig.solved == {0, 1, 2}
 
 
 def test_outputs_in_no_scene_are_not_computed_and_reported(bench: Any) -> None:
@@ -179,7 +174,7 @@ def test_outputs_in_no_scene_are_not_computed_and_reported(bench: Any) -> None:
     assert last["resisted"].total_current_a > 0
     assert rig.rows()["plane"]["not_computed"]["force"] == "in no scene's outputs"
     assert rig.rows()["resisted"]["not_computed"]["contact"] == "in no scene"
-    assert set(rig.solved) == {0, 1}
+    assert rig.solved == {0, 1}
 
 
 def test_a_position_is_the_same_with_and_without_force(bench: Any) -> None:
@@ -225,61 +220,11 @@ def test_a_lower_rate_reduces_updates_and_frames_but_delays_no_begin_or_end(benc
     assert [m.seq for m in contacts] == list(range(1, len(contacts) + 1))  # no gaps
 
 
-@pytest.mark.parametrize("tolerance_mm", [0.05, 0.2, 1.0])
-def test_sliding_contacts_stay_within_the_tolerance(bench: Any, tolerance_mm: float) -> None:
-    exact = TouchedPads(bench, SceneRequest(), "contact/")
-    tolerant = TouchedPads(bench, SceneRequest(tolerance_mm=tolerance_mm), "contact/")
-    errors, calls = [], {id(exact): 0, id(tolerant): 0}
-    for rig in (exact, tolerant):
-        linearise = rig.pipeline.tick.linearisations.linearise
-
-        def counted(*arguments: Any, me: int = id(rig), linearise: Any = linearise, **more: Any) -> Any:
-            calls[me] += len(arguments[0])
-            return linearise(*arguments, **more)
-
-        rig.pipeline.tick.linearisations.linearise = counted  # type: ignore[method-assign]
-    for step in range(300):
-        x, y = 0.5 + 0.35 * np.sin(step / 60), 0.5 + 0.35 * np.cos(step / 40)
-        for rig in (exact, tolerant):
-            rig.touched = [bench.counts(pad, x, y, 1e-3).tobytes() for pad in range(3)]
-            rig.run(1)
-        if step > 3:
-            positions = [s.pipeline.tick.columns.position_m.copy() for s in (exact, tolerant)]
-            errors.append(np.linalg.norm(positions[0] - positions[1], axis=1).max())
-    assert max(errors) * 1e3 <= tolerance_mm
-    assert calls[id(tolerant)] < 0.8 * calls[id(exact)]
-
-
-@pytest.mark.parametrize("tolerance_mm", [0.05, 0.2, 1.0, 10.0])
-def test_a_linearisation_is_used_within_the_tolerance_only(bench: Any, tolerance_mm: float) -> None:
-    model, chance = bench.model, np.random.default_rng(8)
-    pads, sides = np.arange(3), bench.model.locator.sides
-
-    def currents(at: Any) -> Any:
-        return (model.locator.fractions(pads, *at.T) * (20 * model.begin_threshold_a)).T
-
-    linearisations, error_m, valid = ContactLinearisations(model), 0.0, 0
-    linearisations.tolerance_m[:] = tolerance_mm * 1e-3
-    for _ in range(100):
-        centre = chance.uniform(0.1, 0.9, (3, 2)) * sides
-        linearisations.linearise(pads, currents(centre), centre, solved=True)
-        for _ in range(20):
-            offset = chance.normal(size=(3, 2)) * 1e-3 * np.sqrt(tolerance_mm)
-            at = np.clip(centre + offset, 0.02 * sides, 0.98 * sides)
-            values, off = linearisations.evaluate(pads, currents(at))
-            inside = off.max(axis=1) <= 1
-            true = model.placement.to_link_frame(pads, *at.T, np.zeros((3, 2, 2))).position_m
-            apart = np.linalg.norm(values[:, POSITION_COLUMNS] - true, axis=1)[inside]
-            error_m, valid = max(error_m, *apart, 0.0), valid + len(apart)
-    assert valid > 500
-    assert error_m * 1e3 <= tolerance_mm
-
-
 def test_a_disabled_pad_is_not_computed_with_any_subscription(bench: Any) -> None:
     rig = TouchedPads(bench, SceneRequest(), "contact/")
     rig.demand.disable([1], "operator")
     rig.run(6)
-    assert set(rig.solved) == {0, 2}
+    assert rig.solved == {0, 2}
     assert rig.rows()["round"]["not_computed"]["position"] == "disabled by operator"
     rig.demand.enable([1])
     rig.run(2)

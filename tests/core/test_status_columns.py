@@ -35,8 +35,14 @@ class _Driver:
         self.sent = _Recorder()
         self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self.sent)
         self.pipeline.node_state[:] = PadState.CLEAR
-        self.touched = [bench.counts(pad, 0.4, 0.6, 1e-3).tobytes() for pad in range(3)]
+        self._bench = bench
+        self.touched = [self.counts(pad, 1e-3) for pad in range(3)]
         self.sync_ns = 10**9
+
+    def counts(self, pad: int, current_a: float) -> bytes:
+        """Return the sample of a contact with a total current."""
+        data: bytes = self._bench.counts(pad, 0.4, 0.6, current_a).tobytes()
+        return data
 
     def run_cycle(self, *pads: int) -> tuple[wire.HandFrame, dict[str, wire.Contact]]:
         """Run a cycle with contacts on these pads; return the hand frame, and the contacts by link."""
@@ -52,24 +58,26 @@ class _Driver:
         return frame, contacts
 
 
-def _nothing(pipeline: Pipeline) -> None:
-    del pipeline
+def _nothing(driver: _Driver) -> None:
+    del driver
 
 
-def _unreliable_position(pipeline: Pipeline) -> None:
-    pipeline.model.position_unreliable[ROUND] = True
+def _unreliable_position(driver: _Driver) -> None:
+    driver.pipeline.model.position_unreliable[ROUND] = True
 
 
-def _saturated(pipeline: Pipeline) -> None:
-    pipeline.tick.columns.force_saturated[RESISTED] = True
+def _saturated(driver: _Driver) -> None:
+    driver.touched[RESISTED] = driver.counts(RESISTED, 9.4e-3)
 
 
-def _unknown_baseline(pipeline: Pipeline) -> None:
-    pipeline.tick.baseline.touching[PLANE], pipeline.tick.baseline.known[PLANE] = True, False
+def _unknown_baseline(driver: _Driver) -> None:
+    baseline = driver.pipeline.tick.baseline
+    baseline.touching[PLANE], baseline.known[PLANE] = True, False
 
 
-def _position_only(pipeline: Pipeline) -> None:
-    pipeline.tick.linearisations.force_requested[ROUND] = False
+def _position_only(driver: _Driver) -> None:
+    every = np.ones(3, np.bool_)
+    driver.pipeline.tick.set_requested(every, np.arange(3) != ROUND, np.ones(3, np.int64))
 
 
 @pytest.mark.parametrize(
@@ -94,7 +102,7 @@ def test_codes_in_the_hand_frame_are_the_statuses_of_the_contacts(
     for _ in range(4):
         driver.run_cycle(PLANE, ROUND, RESISTED)
     monkeypatch.setattr(bench.model, "position_unreliable", bench.model.position_unreliable.copy())
-    change(driver.pipeline)
+    change(driver)
     frame, contacts = driver.run_cycle(PLANE, ROUND, RESISTED)
     values = columns(frame)
     row = frame.links.index(link)

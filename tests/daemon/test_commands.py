@@ -29,7 +29,7 @@ from handtouch.wire import PadState
 PERIOD_NS = 5_000_000
 COMMANDS = ("status", "snapshot", "scene", "tare", "calibrate", "enable", "disable", "reload", "log")
 KEYS = (
-    *("pads", "pad", "name", "links", "outputs", "tolerance_mm", "rate_hz", "lease_s", "reset", "gains"),
+    *("pads", "pad", "name", "links", "outputs", "rate_hz", "lease_s", "reset", "gains"),
     *("offset_counts", "law", "dry_run", "level", "anything"),
 )
 VALUES = st.recursive(
@@ -122,8 +122,8 @@ def test_any_arguments_get_a_reply_and_ticks_continue(
         ("calibrate", {"pad": "plane", "name": "c", "law": 1}, "law = 1: must be an object"),
         ("scene", {"tolerance": 1}, "tolerance"),
         ("scene", {"outputs": ["smell"]}, "position"),
-        ("scene", {"tolerance_mm": -1.0}, "tolerance_mm = -1.0: must be at least 0"),
-        ("scene", {"tolerance_mm": float("nan")}, "tolerance_mm"),
+        ("scene", {"rate_hz": -1.0}, "rate_hz = -1.0: must be at least 0"),
+        ("scene", {"rate_hz": float("nan")}, "rate_hz"),
         ("scene", {"links": ["thumb*"]}, "no pad is named"),
         ("scene", {"reset": True, "rate_hz": 5.0}, "send two requests"),
         ("scene", {"name": "a\nb"}, "name"),

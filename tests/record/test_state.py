@@ -41,7 +41,7 @@ def _do(hand: Any, action: tuple[Any, ...]) -> None:
     elif action[0] == "request":
         _, position, force, every = action
         requested = np.array([position, True]), np.array([force, True])
-        tick.set_requested(*requested, np.zeros(2), np.array([every, 1]))
+        tick.set_requested(*requested, np.array([every, 1]))
     elif action[0] == "discard":
         tick.discard_solutions(np.array([action[1]]))
     else:
@@ -90,8 +90,8 @@ def test_an_attribute_of_unknown_type_is_named(make_hand: Callable[..., Any]) ->
 
 def test_every_array_and_number_of_the_tick_is_saved(make_hand: Callable[..., Any]) -> None:
     saved = state.save(make_hand().pipeline)
-    for path in ("tick.contacts._contradicting_samples", "tick.linearisations._maps",
-                 "tick._smoothed_currents", "tick._last_solved", "ticks", "messages._seq",
+    for path in ("tick.contacts._contradicting_samples", "tick.columns.values",
+                 "tick.baseline.offset", "ticks", "messages._seq",
                  "cycle.sync_ns", "model.gains", "tick.columns.sample_ns"):  # fmt: skip
         assert path in saved
 

@@ -161,8 +161,8 @@ def _add_scene(commands: Subparsers) -> None:
         commands,
         "scene",
         f"{_TEXT}:run_scene",
-        "show or change the scene: the links and outputs that a task uses, at what rate and accuracy; the "
-        "rest isn't computed",
+        "show or change the scene: the links and outputs that a task uses, and at what rate; the rest isn't "
+        "computed",
     )
     scene.add_argument(
         "--links",
@@ -176,12 +176,6 @@ def _add_scene(commands: Subparsers) -> None:
         metavar="NAMES",
         help="outputs in use, of position, force, raw (samples), palm and base (positions in these frames), "
         'motion (slip), stiffness, shape, texture; "": only whether a pad is touched',
-    )
-    scene.add_argument(
-        "--tolerance-mm",
-        type=float,
-        metavar="MM",
-        help="position error that the task tolerates; 0: as accurate as possible",
     )
     scene.add_argument("--rate-hz", type=float, metavar="HZ", help="rate of contact updates; 0: one per SYNC")
     scene.add_argument(

@@ -15,11 +15,10 @@ def scene_lines(answer: Mapping[str, Any]) -> Iterator[str]:
     """Format the daemon's answer to `scene`: active scenes, then pads grouped by their outputs."""
     for scene in answer["scenes"]:
         rate = "every SYNC" if scene["rate_hz"] is None else f"{scene['rate_hz']:g} Hz"
-        within = f", within {scene['tolerance_mm']:g} mm" if scene["tolerance_mm"] else ""
         lease = "" if scene["lease_s"] is None else f"; expires in {scene['lease_s']:.0f} s"
         yield (
             f"scene of {scene['owner']}: links {', '.join(scene['links']) or 'none'}; "
-            f"{', '.join(scene['outputs']) or 'touched only'}{within}; {rate}{lease}"
+            f"{', '.join(scene['outputs']) or 'touched only'}; {rate}{lease}"
         )
     alike: dict[tuple[str, ...], list[str]] = {}
     for pad in answer["pads"]:

@@ -351,7 +351,7 @@ class Hand(Table):
 
 
 class SceneRequest(Table):
-    """Links, outputs, tolerance and rate that a task uses."""
+    """Links, outputs and rate that a task uses."""
 
     links: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         ("*",), description='patterns of the links in use: "thumb_*", "left/index_distal"'
@@ -361,9 +361,6 @@ class SceneRequest(Table):
         description="outputs of a contact that are computed; raw: pads are sampled with every SYNC even "
         "while untouched; palm, base: positions in these frames, which need [[hand]] urdf and joint states; "
         "motion, stiffness, shape, texture: computed even without a subscriber",
-    )
-    tolerance_mm: NonNegative = Field(
-        0.0, le=10, description="tolerable error of a contact position; 0: as accurate as possible"
     )
     rate_hz: Positive | None = Field(
         None,

@@ -1,43 +1,54 @@
-"""The compiled solver of a pad model: position, force and covariance of contacts, in one call a tick."""
+"""The stages on the arrays of a pad model: position, force and covariance of contacts, in one call a tick.
+
+Public names: `make_solver`, `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import SEARCH_POINTS, stack_table, view_bytes, view_floats
-from handtouch.core.stages.force import PadLaw
-from handtouch.core.stages.locate import Fit, PadTable
-from handtouch.core.stages.place import PadSurface, Placement
+from handtouch.core.stages.locate import Fit
+from handtouch.core.stages.place import Placement
 from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES, ContactSolver
 
 FloatArray = NDArray[np.float64]
 
 
 def make_solver(
-    tables: list[PadTable],
-    laws: list[PadLaw],
-    surfaces: list[PadSurface],
-    electrodes: int,
+    model: PadModel,
     currents: FloatArray,
-    weight: FloatArray,
-    gain_covariance: FloatArray,
-    gain_uncertain: NDArray[np.bool_],
     offset_std_a: FloatArray,
     force_requested: NDArray[np.bool_],
     values: FloatArray,
 ) -> ContactSolver:
-    """Return a solver on these arrays, which it reads and writes in place.
+    """Return a solver of contacts that reads and writes these arrays in place.
 
-    currents, weight: (pads, n). gain_covariance: (pads, n, n). gain_uncertain, offset_std_a,
-    force_requested: (pads,). values: (pads, VALUE_COUNT).
+    currents: (pads, n) [A]. offset_std_a: (pads,) of the sum of the currents, from the baseline.
+    force_requested: (pads,). values: (pads, VALUE_COUNT), laid out as VALUE_SLICES; NaN for new contacts.
     """
-    fit = Fit(*(_work(electrodes) for _ in range(5)), _work(3 * (electrodes + 1)), _work(SEARCH_POINTS**2))
+    n = currents.shape[1]
+    raw, gain = _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
+    fit = Fit(_work(n), _work(n), _work(n), _work(n), _work(n), raw, gain)
     return ContactSolver(
-        tables, laws, surfaces, stack_table(), fit, Placement(_work(15)), electrodes, _work(4 * electrodes),
-        *map(view_floats, (currents, weight, gain_covariance)), view_bytes(gain_uncertain),
-        view_floats(offset_std_a), view_bytes(force_requested), view_floats(values),
-    )  # fmt: skip
+        [table.pad_table() for table in model.forward_tables],
+        model.stage_laws(),
+        [surface.pad_surface() for surface in model.surface_tables],
+        stack_table(),
+        fit,
+        Placement(_work(15)),
+        n,
+        _work(4 * n),
+        view_floats(currents),
+        view_floats(model.weight),
+        view_floats(model.gain_covariance),
+        view_bytes(model.gain_uncertain),
+        view_floats(offset_std_a),
+        view_bytes(force_requested),
+        view_floats(values),
+    )
 
 
 def _work(size: int) -> memoryview[float]:

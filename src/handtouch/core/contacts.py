@@ -82,11 +82,6 @@ class ContactDetector:
         self._threshold = np.where(self.touching, self._end_threshold, begin)
         self._required_samples = np.stack([begin_samples, end_samples])
 
-    def copy_state(self, other: ContactDetector) -> None:
-        """Copy contacts and thresholds of another detector of the same pads; debounces start at 0."""
-        self.touching[:], self._threshold[:] = other.touching, other._threshold
-        self._contradicting_samples[:] = 0
-
     @property
     def begun_count(self) -> int:
         """Number of contacts begun so far."""

@@ -56,10 +56,6 @@ class BusyPoll:
         if last_ns > sync_ns:
             self._usual_latency_ns += (last_ns - sync_ns - self._usual_latency_ns) // _SMOOTHING_CYCLES
 
-    def expected_arrival_ns(self, sync_ns: int) -> int:
-        """Return the time at which the last sample of this SYNC is expected."""
-        return sync_ns + self._usual_latency_ns
-
     def max_sleep_ns(self, sync_ns: int, now_ns: int) -> int:
         """Return the longest permitted sleep while samples of this SYNC are missing."""
         left_ns = sync_ns + self._usual_latency_ns - now_ns

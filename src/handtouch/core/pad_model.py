@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +20,9 @@ from handtouch.config.channels import (
     order_by_electrode,
     resolve_channels,
 )
+from handtouch.core.pad_tables import ForwardTable, SurfaceTable, view_floats
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
+from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
 from handtouch.field.network import ElectrodeNetwork
@@ -31,7 +34,6 @@ from handtouch.hand import (
 )
 
 FloatArray = NDArray[np.float64]
-_MIN_ALPHA = 0.1
 
 
 class PadModel:
@@ -49,8 +51,10 @@ class PadModel:
     A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
     `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_samples`,
     `end_samples`: debounce. `max_rise_time_s`: a slower rise to `end_threshold_n` is drift. `behaviours`
-    (n,): sheet behaviour, None where it isn't modelled. `locator` locates contacts, `placement` transforms
-    them to link frames, `estimate_force` applies the contact law.
+    (n,): sheet behaviour, None where it isn't modelled.
+
+    `forward_tables`, `surface_tables` and `law_parameters` are what the stages read; `weight` (n, 4) is
+    1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that they tabulate.
     """
 
     def __init__(self, deployment: Deployment) -> None:
@@ -73,6 +77,8 @@ class PadModel:
         counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
         self.noise_counts = np.array(counts)
         self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
+        self.weight = 1 / self.noise_a
+        self.mean_ampere_per_count = self.ampere_per_count.mean(axis=1)
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = np.ones((self.size, 4))
@@ -80,7 +86,7 @@ class PadModel:
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
         self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
         self.diagnoses: list[tuple[str, ...]] = [()] * self.size
-        self.any_gain_uncertain = False
+        self.gain_uncertain = np.zeros(self.size, dtype=np.bool_)
         self.begin_threshold_n = np.array([touch.begin_threshold_n for touch in touches])
         self.end_threshold_n = np.array([touch.end_threshold_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
@@ -89,9 +95,12 @@ class PadModel:
         kinds_of_sheet = {name: _behaviour_of_sheet(sheet) for name, sheet in deployment.sheets.items()}
         self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]
         networks = networks_of(deployment)
-        full_scale_a = np.array([node.full_scale_ma * 1e-3 for node in nodes])
-        finest = float((self.noise_a.min(axis=1) / full_scale_a).min())  # noise of the strongest contact
-        self.locator = LocatorBank(networks, tolerance=finest / 10)
+        self.networks = networks
+        tables = {id(network): ForwardTable.from_network(network) for network in networks}
+        self.forward_tables = [tables[id(network)] for network in networks]
+        self.surface_tables = [
+            SurfaceTable.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
+        ]
         self.placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
         self.laws: list[LawParameters | None] = [None] * self.size
@@ -106,13 +115,19 @@ class PadModel:
             np.array([sheet.contact_radius_std_mm * 1e-3 for sheet in sheets]),
             np.array([sheet.reference_kpa * 1e3 for sheet in sheets]),
         )
-        self._law_axes = np.zeros((3, 3, self.size))
-        """parameters of `LawParameters.covariance` by its axes by pads: one standard deviation per axis"""
-        self._laws_on_axes: tuple[ContactLaw, FloatArray] | None = None
+        self.law_parameters = np.zeros((self.size, LAW_PARAMETERS))
+        """(n, LAW_PARAMETERS), see `PadLaw`"""
+        for pad in range(self.size):
+            self._update_law_parameters(pad)
         self._centre_spreading = self._spreading_at_centre(networks)
         self.begin_threshold_a, self.end_threshold_a = (
             self._threshold_current(force) for force in (self.begin_threshold_n, self.end_threshold_n)
         )
+
+    @cached_property
+    def locator(self) -> LocatorBank:
+        """Tables of the same forward models for offline use, built on first use; large, no part of a tick."""
+        return LocatorBank(self.networks)
 
     def apply_calibration(self, pad: int, calibration: Calibration, name: str) -> None:
         """Apply gains and contact law of a pad's calibration; its offsets are applied to the baseline.
@@ -135,6 +150,8 @@ class PadModel:
         self.gains[pad] = gains
         self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
         self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
+        self.weight[pad] = 1 / self.noise_a[pad]
+        self.mean_ampere_per_count[pad] = self.ampere_per_count[pad].mean()
         self.calibration_ids[pad] = calibration_id
 
     @property
@@ -164,7 +181,7 @@ class PadModel:
         self.gain_covariance[pad] = log_gain_covariance
         self.quarantined[pad], self.position_unreliable[pad] = quarantined, position_unreliable
         self.diagnoses[pad] = diagnoses
-        self.any_gain_uncertain = bool(self.gain_covariance.any() or self.quarantined.any())
+        self.gain_uncertain[pad] = self.gain_covariance[pad].any()
 
     def copy_calibrations(self, other: PadModel) -> None:
         """Take over all calibrations of the model that this one replaces."""
@@ -205,30 +222,6 @@ class PadModel:
             current_std_a=total_std_a,
         )
 
-    def law_force_std(
-        self,
-        index: NDArray[np.intp],
-        currents: FloatArray,
-        total_a: FloatArray,
-        radius_m: FloatArray,
-        force_n: FloatArray,
-    ) -> FloatArray:
-        """Return the standard deviation [N] of forces (n,) from the covariance of calibrated laws; arguments
-        as of `estimate_force`. Delta method along the axes of the covariance; 0 for the deployment's law,
-        which has none."""
-        if self._laws_on_axes is None:
-            return np.zeros(len(index))
-        law, sheet_ohm = self._laws_on_axes
-        rows = (index + self.size * np.arange(3)[:, None]).ravel()
-        along = law.select(rows).force(
-            np.tile(total_a, 3),
-            np.tile(self._drive_v[index], 3),
-            sheet_ohm[rows],
-            np.tile(radius_m, 3),
-            np.tile(self._series_resistance(index, currents), 3) if self._has_series.any() else 0.0,
-        )
-        return np.asarray(np.sqrt(np.square(along.force_n.reshape(3, -1) - force_n).sum(axis=0)))
-
     def _series_resistance(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray | float:
         """Return the equivalent series resistance from contact to ground [ohm] (n,), sum of phi_i V_i / I."""
         if not self._has_series[index].any():
@@ -245,24 +238,37 @@ class PadModel:
         contact[pad], alpha[pad] = applied.contact_ohm_mm2 * 1e-6, applied.alpha
         self._sheet_ohm[pad] = applied.ohm_per_square
         self._law = replace(old, contact_ohm_m2=contact, alpha=alpha)
-        variances, axes = np.linalg.eigh(np.array(applied.covariance))
-        self._law_axes[:, :, pad] = axes * np.sqrt(np.maximum(variances, 0.0))
-        self._laws_on_axes = self._perturbed_laws() if self._law_axes.any() else None
+        self._update_law_parameters(pad)
         self.begin_threshold_a[pad] = self._threshold_current(self.begin_threshold_n)[pad]
         self.end_threshold_a[pad] = self._threshold_current(self.end_threshold_n)[pad]
 
-    def _perturbed_laws(self) -> tuple[ContactLaw, FloatArray]:
-        """Return the laws one standard deviation along each axis, and their sheet resistances: (3 n,), axis
-        by axis."""
-        law, (log_layer, alpha, log_sheet) = self._law, self._law_axes
-        along = ContactLaw(
-            (np.asarray(law.contact_ohm_m2) * np.exp(log_layer)).ravel(),
-            np.maximum(np.asarray(law.alpha) + alpha, _MIN_ALPHA).ravel(),
-            np.tile(np.asarray(law.radius_m), 3),
-            np.tile(np.asarray(law.radius_std_m), 3),
-            np.tile(np.asarray(law.reference_pa), 3),
+    def _update_law_parameters(self, pad: int) -> None:
+        """Write the law of a pad as the stages take it."""
+        law = self._law.select(np.array([pad]))
+        layer, alpha, radius, radius_std, reference = (
+            float(np.ravel(column)[0])
+            for column in (law.contact_ohm_m2, law.alpha, law.radius_m, law.radius_std_m, law.reference_pa)
         )
-        return along, (self._sheet_ohm * np.exp(log_sheet)).ravel()
+        variances, axes = np.linalg.eigh(np.array(self.law(pad).covariance))
+        self.law_parameters[pad, :7] = (
+            math.log(layer) + alpha * math.log(reference),
+            alpha,
+            math.log(radius),
+            radius_std / radius,
+            math.log(self._sheet_ohm[pad]),
+            self._drive_v[pad],
+            math.log(reference),
+        )
+        self.law_parameters[pad, 7:] = (axes * np.sqrt(np.maximum(variances, 0.0))).T.ravel()
+
+    def stage_laws(self) -> list[PadLaw]:
+        """Return the contact laws as the stages take them; they follow later changes."""
+        return [
+            PadLaw(view_floats(parameters), view_floats(form), bool(has_series))
+            for parameters, form, has_series in zip(
+                self.law_parameters, self._series_form, self._has_series, strict=True
+            )
+        ]
 
     def _spreading_at_centre(
         self, networks: Sequence[ElectrodeNetwork]
@@ -271,8 +277,9 @@ class PadModel:
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
         pads = np.arange(self.size)
         scale = self.placement.to_link_frame(pads, x, y, np.zeros((self.size, 2, 2))).scale_m_per_unit
-        radius_m = self.locator.conformal_radius(pads, x, y) * scale
-        return radius_m, self._series_resistance(pads, self.locator.fractions(pads, x, y))
+        radius = np.array([net.spreading_radius(*at) for net, *at in zip(networks, x, y, strict=True)])
+        fractions = np.stack([net.fractions(*at) for net, *at in zip(networks, x, y, strict=True)], axis=1)
+        return radius * scale, self._series_resistance(pads, fractions)
 
     def _threshold_current(self, force_n: FloatArray) -> FloatArray:
         """Return the total current of a contact of that force at the centre of each pad."""

@@ -8,6 +8,7 @@ distances do over which its fractions vary.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import cast
@@ -20,6 +21,7 @@ from handtouch.core.stages.locate import PadTable
 from handtouch.core.stages.place import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.model import ForwardModel
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 
 FloatArray = NDArray[np.float64]
@@ -87,15 +89,20 @@ class ForwardTable:
     search_cells: FloatArray
 
     @classmethod
-    def from_model(cls, model: ForwardModel, gap: float = 0.0) -> ForwardTable:
-        """Tabulate a model whose electrodes end at a distance `gap` from the corners."""
-        axes = [_Axis(side, gap) for side in (model.a, model.b)]
+    def from_model(
+        cls, model: ForwardModel, ends_x: Sequence[float] = (), ends_y: Sequence[float] = ()
+    ) -> ForwardTable:
+        """Tabulate a model with ends of electrodes at x = `ends_x` and at y = `ends_y`, corners aside."""
+        axes = _Axis(model.a, ends_x), _Axis(model.b, ends_y)
         nodes_x, nodes_y = (axis.nodes() for axis in axes)
         x, y = np.meshgrid(*(_inside(at[:, 0]) for at in (nodes_x, nodes_y)))
         radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
         fractions = model.fractions(x, y)
         edge = _MIN_RADIUS_DISTANCE
-        x, y = np.clip(x, edge * model.a, (1 - edge) * model.a), np.clip(y, edge * model.b, (1 - edge) * model.b)
+        x, y = (
+            np.clip(x, edge * model.a, (1 - edge) * model.a),
+            np.clip(y, edge * model.b, (1 - edge) * model.b),
+        )
         values = np.stack([*fractions, np.log(radius(x, y))], axis=-1)
         search = (np.arange(SEARCH_POINTS) + 0.5) / SEARCH_POINTS
         x, y = (at.ravel() for at in np.meshgrid(model.a * search, model.b * search))
@@ -107,6 +114,16 @@ class ForwardTable:
             np.stack([axis.cells(search * axis.side) for axis in axes]),
         )
 
+    @classmethod
+    def from_network(cls, network: ElectrodeNetwork) -> ForwardTable:
+        """Tabulate a pad's electrode network."""
+        ends_x: set[float] = set()
+        ends_y: set[float] = set()
+        for electrode in network.electrodes:
+            ends = ends_x if electrode.side in ("y0", "yb") else ends_y
+            ends.update((electrode.start, electrode.stop))
+        return cls.from_model(network, sorted(ends_x - {0.0, network.a}), sorted(ends_y - {0.0, network.b}))
+
     @property
     def electrodes(self) -> int:
         """Number of electrodes."""
@@ -115,18 +132,23 @@ class ForwardTable:
     def pad_table(self) -> PadTable:
         """Return it as the stages take it."""
         return PadTable(
-            view_floats(self.nodes), len(self.nodes) - 1, self.electrodes,
-            *map(view_floats, (self.nodes_x, self.nodes_y, self.search_fractions, self.search_cells)),
+            view_floats(self.nodes),
+            len(self.nodes) - 1,
+            self.electrodes,
+            view_floats(self.nodes_x),
+            view_floats(self.nodes_y),
+            view_floats(self.search_fractions),
+            view_floats(self.search_cells),
             SEARCH_POINTS,
-        )  # fmt: skip
+        )
 
 
 class _Axis:
     """Coordinate of a side, and the cells that it is tabulated in."""
 
-    def __init__(self, side: float, gap: float) -> None:
+    def __init__(self, side: float, ends: Sequence[float]) -> None:
         self.side = side
-        self._ends = (gap, side - gap) if gap else ()
+        self._ends = ends
         self._low, high = (self._stretched(np.array([at]))[0] for at in (0.0, side))
         self._per_unit = _FORWARD_CELLS / (high - self._low)
 
@@ -199,7 +221,7 @@ class SurfaceTable:
         size = max(surface.extent_m)
         for cells in _SURFACE_CELLS:
             nodes = np.stack([hermite_table(patch) for patch in evaluate(cells, np.arange(cells + 1.0))])
-            between = evaluate(cells, np.arange(cells) + 0.5)
+            between = evaluate(cells, np.arange(0.5, cells))
             if np.abs(_mid_cell_values(nodes) - between).max() < _MAX_SURFACE_ERROR * size:
                 break
         return cls(np.ascontiguousarray(nodes), ends, surface.a)
@@ -235,6 +257,4 @@ def stack_table() -> StackTable:
     slope = by_factor * np.exp(knots) * width
     chord, left, right = np.diff(level), slope[:-1], slope[1:]
     pieces = np.stack([left + right - 2 * chord, 3 * chord - 2 * left - right, left, level[:-1]], axis=1)
-    return StackTable(
-        view_floats(np.ascontiguousarray(pieces)), _STACK_INTERVALS, _MIN_LOG_FACTOR, width
-    )
+    return StackTable(view_floats(np.ascontiguousarray(pieces)), _STACK_INTERVALS, _MIN_LOG_FACTOR, width)

@@ -68,9 +68,7 @@ class Pipeline:
 
     def apply_demand(self, requested: RequestedOutputs) -> None:
         """Compute the requested outputs only."""
-        self.tick.set_requested(
-            requested.position, requested.force, requested.tolerance_m, requested.interval_ticks
-        )
+        self.tick.set_requested(requested.position, requested.force, requested.interval_ticks)
         self.transforms.set_requested(requested.palm, requested.base)
 
     def begin_cycle(self, sync_ns: int, now_ns: int) -> None:

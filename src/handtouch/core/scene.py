@@ -26,7 +26,7 @@ PadName = tuple[str, str]
 
 
 class SceneRequirements(NamedTuple):
-    """Union of scenes over n pads; tolerance [m] and rate [Hz] are the strictest requested."""
+    """Union of scenes over n pads; the rate [Hz] is the highest requested."""
 
     pads: BoolArray
     position: BoolArray
@@ -34,7 +34,6 @@ class SceneRequirements(NamedTuple):
     raw: BoolArray
     palm: BoolArray
     base: BoolArray
-    tolerance_m: NDArray[np.float64]
     rate_hz: NDArray[np.float64]
     """inf: at every SYNC"""
     percepts: BoolArray
@@ -62,9 +61,7 @@ def merge_scenes(scenes: Sequence[SceneRequest], names: Sequence[PadName]) -> Sc
     n = len(names)
     shape = (6 + len(PERCEPT_KINDS), n)
     pads, position, force, raw, palm, base, *percepts = np.zeros(shape, dtype=np.bool_)
-    merged = SceneRequirements(
-        pads, position, force, raw, palm, base, np.full(n, np.inf), np.zeros(n), np.array(percepts)
-    )
+    merged = SceneRequirements(pads, position, force, raw, palm, base, np.zeros(n), np.array(percepts))
     outputs = {"position": position, "force": force, "raw": raw, "palm": palm, "base": base}
     for scene in scenes:
         chosen = select_pads(scene.links, names)
@@ -73,9 +70,7 @@ def merge_scenes(scenes: Sequence[SceneRequest], names: Sequence[PadName]) -> Sc
             requested[chosen] |= output in scene.outputs
         merged.percepts[np.outer([kind in scene.outputs for kind in PERCEPT_KINDS], chosen)] = True
         position[chosen] |= bool({"palm", "base"} & set(scene.outputs))  # they need the position on the link
-        np.minimum(merged.tolerance_m, scene.tolerance_mm * 1e-3, out=merged.tolerance_m, where=chosen)
         np.maximum(merged.rate_hz, scene.rate_hz or np.inf, out=merged.rate_hz, where=chosen)
-    merged.tolerance_m[~pads] = 0.0
     return merged
 
 
@@ -149,7 +144,6 @@ class ActiveScenes:
                 "owner": owner,
                 "links": list(scene.links),
                 "outputs": list(scene.outputs),
-                "tolerance_mm": scene.tolerance_mm,
                 "rate_hz": scene.rate_hz,
                 "lease_s": (ends[owner] - now_ns) * 1e-9 if owner in ends else None,
             }
@@ -175,7 +169,6 @@ class RequestedOutputs(NamedTuple):
 
     position: BoolArray
     force: BoolArray
-    tolerance_m: NDArray[np.float64]
     interval_ticks: NDArray[np.int64]
     """ticks from one update to the next"""
     palm: BoolArray
@@ -210,7 +203,7 @@ class Demand:
         self.ticks_per_hand_frame = 1
         """ticks per hand frame, as the most frequently updated pad requires"""
         none = np.zeros(n, dtype=np.bool_)
-        self.requested = RequestedOutputs(none, none, np.zeros(n), np.ones(n, dtype=np.int64), none, none)
+        self.requested = RequestedOutputs(none, none, np.ones(n, dtype=np.int64), none, none)
 
     def update(self, now_ns: int) -> None:
         """Merge scenes and subscriptions again if any of them changed."""
@@ -253,7 +246,6 @@ class Demand:
                     "not_computed": skipped,
                     "scenes": owners,
                     "subscriptions": subscribed,
-                    "tolerance_mm": float(self.requested.tolerance_m[pad]) * 1e3,
                     "rate_hz": self._tick_hz / int(self.requested.interval_ticks[pad]),
                 }
             )
@@ -311,7 +303,6 @@ class Demand:
         self.requested = RequestedOutputs(
             position=subscribed & located | perceived,
             force=subscribed & needed.force | perceived,
-            tolerance_m=np.where(located & ~perceived, needed.tolerance_m, 0.0),
             interval_ticks=every.astype(np.int64),
             palm=subscribed & needed.palm | perceived & self.transformable,
             base=subscribed & needed.base,

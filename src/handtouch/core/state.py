@@ -18,6 +18,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from handtouch.core.contact_solver import ContactSolver
 from handtouch.core.slab import Slab
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw
@@ -35,15 +36,20 @@ _IMMUTABLE_TYPES = (
     BuiltinFunctionType,
     partial,
 )
-_DERIVED_TYPES = (LocatorBank, PadGeometry, ContactLaw, RobotModels)
+_DERIVED_TYPES = (
+    *(LocatorBank, ContactSolver),
+    *(PadGeometry, ContactLaw, RobotModels),
+)
 """Follow from the deployment."""
 _INPUT_TYPES = (Slab,)
 """Filled in every tick."""
 _EXCLUDED_ATTRIBUTES = {
     ("Pipeline", "_sink"), ("Pipeline", "journal"), ("Pipeline", "external_inputs"),
     ("ContactTransforms", "_robots"), ("TickMessages", "_encoders"),
+    ("PadModel", "networks"), ("PadModel", "forward_tables"), ("PadModel", "surface_tables"),
 }  # fmt: skip
-"""Message output and its encoding, inputs not applied yet, and robots, which are optional: no state."""
+"""Message output and its encoding, inputs not applied yet, robots, which are optional, and what follows from
+the deployment: no state."""
 _SCALAR_TYPES = (bool, int, float, str, type(None))
 _NOT_STATE_TYPES = _IMMUTABLE_TYPES + _DERIVED_TYPES + _INPUT_TYPES
 _LEAF_TYPES = {*_SCALAR_TYPES, np.ndarray}

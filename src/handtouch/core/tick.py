@@ -16,21 +16,11 @@ from handtouch import wire
 from handtouch.core.baseline import Baseline
 from handtouch.core.contacts import BoolArray, ContactDetector, IntArray
 from handtouch.core.cycle import Cycle
-from handtouch.core.linearisation import (
-    FORCE_COLUMN,
-    MAX_GAUSS_NEWTON_DISTANCE,
-    NORMAL_COLUMNS,
-    PAD_COLUMNS,
-    POSITION_COLUMNS,
-    RESIDUAL_COLUMN,
-    VALUE_COUNT,
-    XY_COLUMNS,
-    ContactLinearisations,
-    ContactSolution,
-)
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import ForceReference, ForceReliability, SheetForceCompensation
 from handtouch.core.slab import Slab
+from handtouch.field.contact_law import ForceEstimateStatus
 from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
@@ -44,8 +34,7 @@ _CLEAR, _TOUCHED, _STALE, _FAULTED = map(
 _UNRELIABLE, _INVALID = int(ForceReliability.UNRELIABLE), int(ForceReliability.INVALID)
 _NO_LIMIT_NS = np.iinfo(np.int64).max
 _CONTACT_COLUMNS = (
-    *("pad_m", "residual", "position_m", "normal", "force_n"),  # evaluated in every tick, in this order
-    *("force_std_n", "residual_std", "covariance_m2"),
+    *("pad_m", "residual", "position_m", "normal", "force_n", "force_std_n", "residual_std", "covariance_m2"),
 )
 CONTACT_DTYPE = np.dtype(
     [
@@ -55,16 +44,13 @@ CONTACT_DTYPE = np.dtype(
     ]
 )
 """Columns of the hand frame that are written per contact."""
-_EVALUATED_VALUES = VALUE_COUNT - PAD_COLUMNS.start
-"""Leading float32 values of CONTACT_DTYPE that are evaluated in every tick."""
+_PUBLISHED_VALUES = slice(VALUE_SLICES["pad_m"].start, VALUE_SLICES["covariance_m2"].stop)
+"""Values of a contact that CONTACT_DTYPE repeats, in its order."""
+_FORCE, _FORCE_STD, _FORCE_STATUS = (
+    VALUE_SLICES[name].start for name in ("force_n", "force_std_n", "force_status")
+)
+_LOWER_BOUND = float(ForceEstimateStatus.LOWER_BOUND)
 _ALL_CHANNELS = np.ones(4)
-_RELINEARISE_DISTANCE = 0.7
-"""Fraction of a linearisation's range beyond which it is renewed, before the contact leaves it."""
-_RELINEARISE_ALONG_DISTANCE = 0.3
-"""Beyond this fraction it is renewed together with one that must be: each further one costs a tenth."""
-_SMOOTHING_TICKS = 4
-"""Time constant of exponential smoothing; it lags one tick less behind a steady change."""
-_NONE_SOLVED = np.zeros(0, dtype=np.intp), np.zeros((0, 4))
 
 
 @dataclass(frozen=True)
@@ -78,7 +64,7 @@ class PadColumns:
     total_current_a: FloatArray
     """sum of the four channels"""
     values: FloatArray
-    """(n, VALUE_COUNT) contact values from the currents of each tick; the six below are views of it"""
+    """(n, VALUE_COUNT) contact values of each pad's last sample of a contact; most below are views of it"""
     xy: FloatArray
     """(n, 2) position on the pad's rectangle"""
     position_m: FloatArray
@@ -87,17 +73,20 @@ class PadColumns:
     """(n, 3)"""
     pad_m: FloatArray
     """(n, 2) arc lengths from the electrodes x0 and y0"""
+    pad_noise_m2: FloatArray
+    """(n, 3) covariance of pad_m that is independent in each sample: uu, uv, vv"""
     residual: FloatArray
-    force_n: FloatArray
-    """NaN without a valid force; a lower bound where `force_saturated`"""
-    uncompensated_force_n: FloatArray
-    """force of the contact law, before the sheet behaviour is compensated"""
-    force_std_n: FloatArray
-    covariance_m2: FloatArray
-    """(n, 3, 3); this and the following belong to the contact's last solution"""
-    force_saturated: NDArray[np.bool_]
     residual_std: FloatArray
     """of a point contact, from channel noise"""
+    covariance_m2: FloatArray
+    """(n, 3, 3) of position_m"""
+    force_n: FloatArray
+    """NaN without a valid force; a lower bound where `force_saturated`"""
+    force_std_n: FloatArray
+    """infinite for a lower bound"""
+    uncompensated_force_n: FloatArray
+    """force of the contact law, before the sheet behaviour is compensated"""
+    force_saturated: NDArray[np.bool_]
     contact_columns: NDArray[np.void]
     """published contact columns, as CONTACT_DTYPE; all NaN without contact"""
 
@@ -109,22 +98,26 @@ class PadColumns:
             return np.full((n, *shape), np.nan)
 
         values = unknown(VALUE_COUNT)
+        views = {name: values[:, columns] for name, columns in VALUE_SLICES.items()}
         return cls(
             state=np.full(n, PadState.STARTING, dtype=np.uint8),
             sample_ns=np.zeros(n, dtype=np.int64),
             total_current_a=np.zeros(n),
             values=values,
-            xy=values[:, XY_COLUMNS],
-            position_m=values[:, POSITION_COLUMNS],
-            normal=values[:, NORMAL_COLUMNS],
-            pad_m=values[:, PAD_COLUMNS],
-            residual=values[:, RESIDUAL_COLUMN],
-            force_n=values[:, FORCE_COLUMN],
+            xy=views["xy"],
+            position_m=views["position_m"],
+            normal=views["normal"],
+            pad_m=views["pad_m"],
+            pad_noise_m2=views["pad_noise_m2"],
+            residual=views["residual"][:, 0],
+            residual_std=views["residual_std"][:, 0],
+            covariance_m2=np.lib.stride_tricks.as_strided(
+                views["covariance_m2"], (n, 3, 3), (values.strides[0], 24, 8)
+            ),
+            force_n=views["force_n"][:, 0],
+            force_std_n=views["force_std_n"][:, 0],
             uncompensated_force_n=unknown(),
-            force_std_n=unknown(),
-            covariance_m2=unknown(3, 3),
             force_saturated=np.zeros(n, dtype=np.bool_),
-            residual_std=unknown(),
             contact_columns=np.full((n, CONTACT_DTYPE.itemsize // 4), np.nan, dtype="<f4").view(
                 CONTACT_DTYPE
             )[:, 0],
@@ -165,6 +158,8 @@ class TickProcessor:
         """pads sampled by SYNC; the others are event-driven and not waited for"""
         self.position_requested = np.ones(model.size, dtype=np.bool_)
         """pads whose contact position is computed; see `set_requested`"""
+        self.force_requested = np.ones(model.size, dtype=np.bool_)
+        """pads whose force is computed"""
         self.state_changed = False
         """something other than a tick changed the state; read and reset by `TickJournal`"""
         self.baseline = Baseline(
@@ -177,9 +172,6 @@ class TickProcessor:
         """counts of untouched pads"""
         self.sheet_force = SheetForceCompensation(model.behaviours, period_ns)
         """compensation of creep, adaptation and hysteresis"""
-        self.linearisations = ContactLinearisations(model)
-        self._last_solved = _NONE_SOLVED  # pads and currents of the contacts of the last tick
-        self._smoothed_currents = np.full((model.size, 4), np.nan)  # lagging behind the present ones
         self._contact_rows = self.columns.contact_columns.view("<f4").reshape(model.size, -1)
         self._no_pads = np.zeros(model.size, dtype=np.bool_)
         self._sampled, self._trusted = self._no_pads.copy(), self._no_pads.copy()  # of the last tick
@@ -190,31 +182,25 @@ class TickProcessor:
         self._min_counts = -_MAX_NEGATIVE_SIGMA * model.noise_counts[:, None]
         self._excess = np.zeros((model.size, 4))  # counts above the baseline
         self._currents = np.zeros((model.size, 4))
-        self._law_std_n = np.full(model.size, np.nan)  # of forces, from noise and contact radius
-        self._uncompensated_std_n = np.full(model.size, np.nan)  # including the baseline
+        self._uncompensated_std_n = np.full(model.size, np.nan)
         self._sync_ns = 0
         self._used_arrival_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the newest used samples
+        self._offset_std_a = np.zeros(model.size)  # of the baseline
+        self._estimate_force = self.force_requested.copy()  # and the pad isn't in quarantine
+        self._solver = self._make_solver(model)
 
     def expected_pads(self) -> NDArray[np.bool_]:
         """Return the pads whose sample a tick waits for: those alive and sampled by SYNC."""
         return np.asarray((self.columns.state <= _TOUCHED) & self.synchronous)
 
-    def set_requested(
-        self,
-        position: BoolArray,
-        force: BoolArray,
-        tolerance_m: FloatArray,
-        interval_ticks: NDArray[np.int64],
-    ) -> None:
+    def set_requested(self, position: BoolArray, force: BoolArray, interval_ticks: NDArray[np.int64]) -> None:
         """Restrict positions, forces and updates to the requested pads; all (n,), copied."""
         if self.sheet_force.any_modelled:  # the sheet's history needs every contact
             position, force = position | self.sheet_force.modelled, force | self.sheet_force.modelled
-        changed = np.flatnonzero(
-            (position != self.position_requested) | (force != self.linearisations.force_requested)
-        )
-        self.discard_solutions(changed)
-        self.linearisations.force_requested[:], self.linearisations.tolerance_m[:] = force, tolerance_m
+        changed = np.flatnonzero((position != self.position_requested) | (force != self.force_requested))
         self.position_requested[:], self._update_interval_ticks[:] = position, interval_ticks
+        self.force_requested[:] = force
+        self.discard_solutions(changed)
         self._some_skipped = not (position.all() and (interval_ticks == 1).all())
 
     def is_force_unreliable(self, pads: slice | int) -> BoolArray:
@@ -225,7 +211,7 @@ class TickProcessor:
 
     def position_noise_covariance(self, pads: IntArray) -> FloatArray:
         """Return the covariance (k, 2, 2) of arc lengths on pads (k,) that is independent in each sample."""
-        return self.linearisations.position_noise_covariance(pads, self._currents.take(pads, axis=0))
+        return self.columns.pad_noise_m2[pads][:, [[0, 1], [1, 2]]]
 
     def excuse_pause(self, excused_ns: int) -> None:
         """Make pads stale later, since the loop or the whole host paused for so long."""
@@ -235,9 +221,7 @@ class TickProcessor:
     def solve_all(self) -> None:
         """Compute position and force of every touched pad, requested or not; valid until `set_requested`."""
         everything = ~self._no_pads
-        self.set_requested(
-            everything, everything, self.linearisations.tolerance_m, self._update_interval_ticks
-        )
+        self.set_requested(everything, everything, self._update_interval_ticks)
         touching = np.flatnonzero(self.contacts.touching)
         if len(touching):
             self._solve_contacts(touching)
@@ -273,9 +257,7 @@ class TickProcessor:
         )
         for pad in changed.tolist():
             self.sheet_force.reset_evidence(pad)
-        before, self.model = self.linearisations, model
-        self.linearisations = ContactLinearisations(model)
-        self.linearisations.share_state(before)
+        self.model, self._solver = model, self._make_solver(model)
         self._min_counts = -_MAX_NEGATIVE_SIGMA * model.noise_counts[:, None]
         self.discard_solutions(changed)
         self.contacts.set_thresholds(
@@ -283,12 +265,11 @@ class TickProcessor:
         )
 
     def discard_solutions(self, pads: IntArray) -> None:
-        """Discard the values and linearisations of these pads."""
-        columns = self.columns
+        """Discard the contact values of these pads, because what they are computed from changed."""
         self.state_changed = True
-        self.linearisations.discard(pads)
-        columns.values[pads] = columns.force_std_n[pads] = self._contact_rows[pads] = np.nan
-        columns.uncompensated_force_n[pads] = np.nan
+        np.greater(self.force_requested, self.model.quarantined, out=self._estimate_force)
+        self.columns.values[pads] = self._contact_rows[pads] = np.nan
+        self.columns.uncompensated_force_n[pads] = np.nan
 
     def run_tick(
         self,
@@ -321,8 +302,6 @@ class TickProcessor:
         self._resolve_states(node_state, operational, implausible, stale)
         if len(began):
             columns.values[began] = np.nan  # not a starting point: it is of the contact before
-            self.linearisations.discard(began)
-            self._smoothed_currents[began] = np.nan
             self.baseline.begin_contacts(began)
             self.sheet_force.begin_contacts(began)
         self._sampled, self._trusted, self._baseline_samples_added = sampled, trusted, False
@@ -414,15 +393,21 @@ class TickProcessor:
 
     def _solve_contacts(self, touched: IntArray) -> None:
         """Compute position and force of the contacts on the pads `touched`."""
-        currents = self._currents.take(touched, axis=0)
-        values, off = self.linearisations.evaluate(touched, currents)
-        if np.count_nonzero(off <= 1) < off.size:  # or NaN
-            self._solve_outside_range(touched, currents, values, off)
-        self._last_solved = touched, currents
-        self.columns.values[touched] = values
-        self._contact_rows[touched, :_EVALUATED_VALUES] = values[:, PAD_COLUMNS.start :]
+        columns = self.columns
+        np.multiply(self.baseline.std, self.model.mean_ampere_per_count, out=self._offset_std_a)
+        self._solver.solve_contacts(touched.data)
+        values = columns.values[touched]
+        published = values[:, _PUBLISHED_VALUES]
+        self._contact_rows[touched] = np.where(np.isfinite(published), published, np.nan)
+        columns.force_saturated[touched] = values[:, _FORCE_STATUS] == _LOWER_BOUND
         if self.sheet_force.any_modelled:
-            self.columns.uncompensated_force_n[touched] = values[:, FORCE_COLUMN]
+            columns.uncompensated_force_n[touched] = values[:, _FORCE]
+            self._uncompensated_std_n[touched] = values[:, _FORCE_STD]
+
+    def _make_solver(self, model: PadModel) -> ContactSolver:
+        return make_solver(
+            model, self._currents, self._offset_std_a, self._estimate_force, self.columns.values
+        )
 
     def _add_baseline_samples(self) -> None:
         """Count samples, and pass those of untouched pads to the baseline, unless a contact may be beginning.
@@ -445,73 +430,8 @@ class TickProcessor:
         columns.contact_columns["force_n"][pads] = force
         self.columns.contact_columns["force_std_n"][pads] = np.where(np.isfinite(std), std, np.nan)
 
-    def _update_force_std(self, pads: IntArray) -> None:
-        """Update standard deviations of forces from contact law and baseline."""
-        columns = self.columns
-        with np.errstate(divide="ignore", invalid="ignore"):
-            off = self.baseline.std[pads] * self.model.ampere_per_count[pads].mean(axis=1)
-            by_baseline = (
-                self.linearisations.force_slopes(pads) * off / (self._currents[pads] @ _ALL_CHANNELS)
-            )
-        std = np.hypot(self._law_std_n[pads], by_baseline)
-        self._uncompensated_std_n[pads] = std
-        if self.sheet_force.any_modelled:
-            plain = ~self.sheet_force.modelled[pads]
-            pads, std = pads[plain], std[plain]
-        columns.force_std_n[pads] = std
-        self.columns.contact_columns["force_std_n"][pads] = np.where(np.isfinite(std), std, np.nan)
-
-    def _solve_outside_range(
-        self, pads: IntArray, currents: FloatArray, values: FloatArray, off: FloatArray
-    ) -> None:
-        """Solve contacts outside the range of their linearisation; update their `values` and `off`."""
-        far = off.max(axis=1)
-        near = np.flatnonzero((far > 1) & (far <= MAX_GAUSS_NEWTON_DISTANCE))
-        if len(near):
-            self._linearise(pads[near], currents[near], values[near, XY_COLUMNS])
-            values[near], off[near] = self.linearisations.evaluate(pads[near], currents[near])
-        lost = np.flatnonzero(~(off.max(axis=1) <= 1))
-        if len(lost):
-            some = pads[lost]
-            self._store_solution(
-                some, self.linearisations.solve_contacts(some, currents[lost], self.columns.xy[some])
-            )
-            values[lost], off[lost] = self.linearisations.evaluate(some, currents[lost])
-
     def prepare_next_tick(self) -> None:
-        """Update the baseline; renew linearisations that contacts are about to leave, ahead of the contact.
-
-        Call between two ticks, off the critical path: it makes the next tick cheap and changes no contact.
-        """
+        """Update the baseline. Call between two ticks, off the critical path: it changes no contact."""
         self._add_baseline_samples()
-        if self._sync_ns and self.baseline.update_baseline(self._sync_ns, self.contacts.touching):
-            touching = np.flatnonzero(self.contacts.touching)
-            if len(touching):
-                self._update_force_std(touching)
-        pads, currents = self._last_solved
-        self._last_solved = _NONE_SOLVED
-        if not len(pads):
-            return
-        smoothed = self._smoothed_currents.take(pads, axis=0)
-        smoothed = np.where(np.isnan(smoothed), currents, smoothed + (currents - smoothed) / _SMOOTHING_TICKS)
-        self._smoothed_currents[pads] = smoothed
-        ahead = currents + (currents - smoothed) / (_SMOOTHING_TICKS - 1)
-        values, off = self.linearisations.evaluate(pads, ahead)
-        if np.count_nonzero(off > _RELINEARISE_DISTANCE) and np.count_nonzero(
-            (far := off.max(axis=1)) > _RELINEARISE_DISTANCE
-        ):
-            leaving = np.flatnonzero(far > _RELINEARISE_ALONG_DISTANCE)
-            self._linearise(pads[leaving], ahead[leaving], values[leaving, XY_COLUMNS])
-
-    def _linearise(self, pads: IntArray, currents: FloatArray, xy: FloatArray) -> None:
-        self._store_solution(pads, self.linearisations.linearise(pads, currents, xy))
-
-    def _store_solution(self, pads: IntArray, solved: ContactSolution) -> None:
-        columns = self.columns
-        columns.covariance_m2[pads] = solved.covariance_m2
-        self._law_std_n[pads] = solved.force_std_n
-        columns.force_saturated[pads] = solved.force_saturated
-        columns.residual_std[pads] = solved.residual_std
-        self._update_force_std(pads)
-        columns.contact_columns["residual_std"][pads] = solved.residual_std
-        columns.contact_columns["covariance_m2"][pads] = solved.covariance_m2.reshape(-1, 9)
+        if self._sync_ns:
+            self.baseline.update_baseline(self._sync_ns, self.contacts.touching)

@@ -102,12 +102,6 @@ class TickMessages:
             if sink.has_subscriber(raw):
                 sink.send(self._raw_message(hand, slab))
 
-    def warm_caches(self, sink: MessageSink) -> None:
-        """Encode the frames of hands with a subscriber, without sending them."""
-        for hand, topic, _ in self._hand_topics:
-            if sink.has_subscriber(topic):
-                wire.encode(self._hand_frame(hand))
-
     def retained_messages(self) -> dict[str, Callable[[int], wire.OutgoingMessage | None]]:
         """Return topic -> function of the time [ns] that makes its retained message: contacts and hands."""
         return {
@@ -142,7 +136,7 @@ class TickMessages:
         position[touching & tick.position_requested[rows]] = PositionStatus.INVALID
         position[located] = PositionStatus.VALID
         position[located & self._model.position_unreliable[rows]] = PositionStatus.UNRELIABLE
-        requested = touching & tick.linearisations.force_requested[rows]
+        requested = touching & tick.force_requested[rows]
         force[requested] = ForceStatus.VALID
         force[requested & tick.is_force_unreliable(rows)] = ForceStatus.UNRELIABLE
         force[requested & columns.force_saturated[rows]] = ForceStatus.LOWER_BOUND
@@ -237,7 +231,7 @@ class TickMessages:
         return PositionStatus.INVALID if requested else PositionStatus.NOT_COMPUTED
 
     def _force_status_of(self, pad: int, force_n: float | None) -> ForceStatus:
-        if not self._tick.linearisations.force_requested[pad]:
+        if not self._tick.force_requested[pad]:
             return ForceStatus.NOT_COMPUTED
         if force_n is None:
             return ForceStatus.INVALID

@@ -99,15 +99,6 @@ class ContactTransforms:
             self.palm_status[rows] = self.base_status[rows] = _NOT_COMPUTED
             self._values[rows] = np.nan
 
-    def warm_caches(self) -> None:
-        """Run the code of the next tick, to have it in the caches; changes nothing."""
-        if self.used_joints and self._robots:
-            hand, t_ns, position, *_ = self.used_joints[-1]
-            self.joints_at(hand, t_ns)
-            kinematics = self._robots.kinematics[self._robots.hands.index(hand)]
-            kinematics.set_joint_positions(position)
-            kinematics.pose_in_palm(0)
-
     def in_palm(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return position, normal and covariance (k, 15) of contacts in the palm, rotations (k, 3, 3) of
         their links in it, and ages (k,) of joints; NaN where not valid. Also the variance (k,) [m^2] of the

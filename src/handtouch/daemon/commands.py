@@ -65,7 +65,6 @@ class _SwitchArguments(_PadArguments):
 class _SceneArguments(Table):
     links: Annotated[tuple[str, ...], Field(strict=False, max_length=1000)] | None = None
     outputs: Annotated[tuple[Output, ...], Field(strict=False, max_length=10)] | None = None
-    tolerance_mm: Annotated[float, Field(ge=0, le=10)] | None = None
     rate_hz: Annotated[float, Field(ge=0)] | None = None  # 0: every SYNC
     name: ClientName | None = None
     lease_s: Annotated[float, Field(ge=0.1, le=3600)] = 10.0
@@ -161,7 +160,7 @@ class ControlCommands:
 
     def _scene(self, arguments: dict[str, Any], now_ns: int) -> Reply:
         request = parse_arguments(_SceneArguments, arguments)
-        keys = ("links", "outputs", "tolerance_mm", "rate_hz")
+        keys = ("links", "outputs", "rate_hz")
         given = {key: value for key in keys if (value := getattr(request, key)) is not None}
         if given.get("rate_hz") == 0:
             given["rate_hz"] = None

@@ -31,7 +31,6 @@ from handtouch.canbus.nodes.master import Master
 from handtouch.canbus.nodes.spec import NodeSpec, node_specs
 from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
-from handtouch.core.cache_warming import CacheWarmer
 from handtouch.core.cycle import BusyPoll
 from handtouch.core.gravity import GravityTracker
 from handtouch.core.pad_model import PadModel
@@ -61,11 +60,6 @@ from handtouch.host.process import process_statistics
 
 _log = logging.getLogger("handtouch.daemon")
 
-_CACHE_COLD_AFTER_NS = 1_000_000
-"""After this idle time other processes have replaced the caches, and a tick takes several times as long"""
-_REHEARSE_BEFORE_SYNC_NS, _REHEARSE_BEFORE_TICK_NS = 400_000, 250_000
-"""When to warm all caches before SYNC, and those of the tick once more before the samples arrive"""
-_NEVER_NS = 1 << 62
 _BACKGROUND_PERIOD_NS = 4_000_000
 """Least period of polling nodes, buses, health and requests, which is longer than a tick's at high rates"""
 _LOGGED_PAUSE_NS = 100_000_000
@@ -109,8 +103,6 @@ class HandtouchDaemon:
         self.authenticator, self.publisher = resources.authenticator, resources.publisher
         self.inputs, self.ports, self.pipeline = resources.inputs, resources.ports, resources.pipeline
         self._stack = resources.stack
-        self._next_rehearsal_ns = _NEVER_NS
-        self._rehearsed = False  # since the last tick
         self._next_background_ns = 0
         settings, pipeline, inputs, publisher = deployment.daemon, self.pipeline, self.inputs, self.publisher
         period_ns, session = pipeline.cycle.period_ns, publisher.session
@@ -118,7 +110,6 @@ class HandtouchDaemon:
         pipeline.transforms.joints_at = inputs.joints_at
         self.joint_publisher = JointPublisher(robots, inputs.joints_at, publisher, session)
         self.gravity = GravityTracker(robots, pipeline.model.size, inputs.joints_at, inputs.gravity_direction)
-        self.rehearsal = CacheWarmer(pipeline, publisher)
         self.percepts = PerceptPublisher(pipeline, publisher, session, inputs.commanded_joints_at)
         self.master = Master(self.ports, self._node_specs(), period_ns)
         self.sync = Sync(list(self.ports.values()), period_ns)
@@ -262,7 +253,7 @@ class HandtouchDaemon:
             if not cycle.ticked:
                 sleep_ns = busy_poll.max_sleep_ns(cycle.sync_ns, now_ns)
                 wake_ns = min(wake_ns, cycle.sync_ns + cycle.window_ns, now_ns + sleep_ns)
-            wait_s = max(0, min(wake_ns, self._next_rehearsal_ns) - now_ns) * 1e-9
+            wait_s = max(0, wake_ns - now_ns) * 1e-9
             pause.begin_wait(now_ns)
             readable = select.select(descriptors, (), (), wait_s)[0]
             woke_ns = time.monotonic_ns()
@@ -296,8 +287,6 @@ class HandtouchDaemon:
                 self._after_tick(on_tick)
             elif now_ns >= master.wake_ns:
                 master.poll(self._received_until_ns)
-            elif now_ns >= self._next_rehearsal_ns:
-                self._rehearse()
 
     def _on_tick_computed(self) -> None:
         self.reporter.stage_timer.lap(stage_timer.TICK, time.monotonic_ns())
@@ -317,20 +306,7 @@ class HandtouchDaemon:
             self.pipeline.external_inputs.set_gravity(gravity)
         self.pipeline.begin_cycle(sync_ns, now_ns)
         self.publisher.release()
-        tick_ns = self._busy_poll.expected_arrival_ns(sync_ns)
-        if self._rehearsed and tick_ns - sync_ns > _CACHE_COLD_AFTER_NS:
-            self._next_rehearsal_ns = tick_ns - _REHEARSE_BEFORE_TICK_NS
         self.reporter.stage_timer.lap(stage_timer.SYNC, time.monotonic_ns())
-
-    def _rehearse(self) -> None:
-        """Warm the caches before the next SYNC, or before the last samples of a cycle."""
-        self._next_rehearsal_ns = _NEVER_NS
-        if self.pipeline.cycle.ticked:
-            self.rehearsal.warm_all()
-            self._rehearsed = True
-        else:
-            self.rehearsal.warm_tick()
-        self.reporter.stage_timer.lap(stage_timer.REHEARSE, time.monotonic_ns())
 
     def _receive_frames(self, ports: list[Port]) -> None:
         for port in ports:
@@ -376,8 +352,6 @@ class HandtouchDaemon:
 
     def _after_tick(self, on_tick: Callable[[int], None]) -> None:
         """Do what can wait until the contacts are sent."""
-        self._rehearsed = False
-        before_sync_ns = self.pipeline.cycle.sync_ns + self.sync.period_ns - _REHEARSE_BEFORE_SYNC_NS
         lap = self.reporter.stage_timer.lap
         self.pipeline.prepare_next_tick()
         now_ns = time.monotonic_ns()
@@ -390,10 +364,7 @@ class HandtouchDaemon:
             self._next_background_ns = now_ns + _BACKGROUND_PERIOD_NS
             self._run_background_tasks(now_ns)
         on_tick(now_ns)
-        now_ns = time.monotonic_ns()
-        lap(stage_timer.REQUESTS, now_ns)
-        warming_pays = self.publisher.subscriptions and before_sync_ns - now_ns > _CACHE_COLD_AFTER_NS
-        self._next_rehearsal_ns = before_sync_ns if warming_pays else _NEVER_NS
+        lap(stage_timer.REQUESTS, time.monotonic_ns())
 
     def _run_background_tasks(self, now_ns: int) -> None:
         lap = self.reporter.stage_timer.lap

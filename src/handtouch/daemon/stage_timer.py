@@ -16,14 +16,12 @@ _BUCKET_COUNT = 64  # enough for any int64 of nanoseconds, so that adding needs 
 
 STAGES = (
     *("sync", "wait", "receive", "tick", "send", "percepts", "settle", "supervise"),
-    *("nodes", "report", "requests", "warm_caches"),
+    *("nodes", "report", "requests"),
 )
 """Stages of a period, in order: send SYNC; wait for the bus; receive frames; compute contacts; send messages;
 compute percepts; prepare the next tick; exchange data with the supervisor process; poll nodes and buses;
-publish health and service; handle requests, subscriptions and handshakes; warm caches for the next tick."""
-(SYNC, WAIT, RECEIVE, TICK, SEND, PERCEIVE, SETTLE, SUPERVISE, NODES, REPORT, REQUESTS, REHEARSE) = range(
-    len(STAGES)
-)
+publish health and service; handle requests, subscriptions and handshakes."""
+(SYNC, WAIT, RECEIVE, TICK, SEND, PERCEIVE, SETTLE, SUPERVISE, NODES, REPORT, REQUESTS) = range(len(STAGES))
 WAKE_UP_DELAY = "wake_up_delay"
 """Name for time spent in no stage: the operating system woke the loop later than requested."""
 _PARTS = (*STAGES, WAKE_UP_DELAY)

@@ -118,7 +118,7 @@ class Surface(ABC):
 
     @property
     def folds(self) -> FloatArray:
-        """Coordinates y, increasing, of folds along x, at which the normal jumps; empty where it is smooth."""
+        """Coordinates y, increasing, of folds along x, at which the normal jumps; empty if there are none."""
         return np.zeros(0)
 
     def describe_side(self, side: str) -> str:

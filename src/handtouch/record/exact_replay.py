@@ -264,9 +264,7 @@ class DeploymentReplay(ExactReplay):
         needed = ActiveScenes(self._new_deployment.scene, names[1]).requirements
         every = np.ones(model.size, dtype=np.int64)
         force = needed.pads & needed.force
-        pipeline.apply_demand(
-            RequestedOutputs(needed.pads, force, needed.tolerance_m, every, needed.palm, needed.base)
-        )
+        pipeline.apply_demand(RequestedOutputs(needed.pads, force, every, needed.palm, needed.base))
         return pipeline
 
     def _compare(self) -> None:

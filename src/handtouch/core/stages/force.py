@@ -9,11 +9,24 @@ from __future__ import annotations
 import math
 
 _VALID, _LOWER_BOUND, _NOT_ESTIMATED = 0, 1, 2  # of a result's status
+_LOG_LAYER, _ALPHA, _LOG_RADIUS, _RADIUS_STD, _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _AXES = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+)
+LAW_PARAMETERS = 16
+_MIN_ALPHA = 0.1
 _BOUND_SIGMA = 2.0
 _MAX_CURRENT_FRACTION = 0.98  # of the greatest current that the sheet can carry
 _MIN_LOG_SPREADING_RATIO = math.log(2.0)  # of spreading over contact radius, for contacts at an edge
 _MIN_CURRENT_A = 1e-200
-_TWO_PI, _LOG_PI, _INFINITY, _NAN = 2.0 * math.pi, math.log(math.pi), math.inf, float("nan")
+_TWO_PI, _LOG_PI, _INFINITY = 2.0 * math.pi, math.log(math.pi), math.inf
+_NAN = float("nan")
 # Gauss-Hermite quadrature of five nodes; the middle one is the reported force itself
 _NEAR_NODE, _FAR_NODE = 1.3556261799742657, 2.8569700138728056
 _NEAR_WEIGHT, _FAR_WEIGHT = 0.22207592200561263, 0.011257411327720693
@@ -35,32 +48,14 @@ class StackTable:
 class PadLaw:
     """Contact law of one pad, in logarithms, and what it is applied to.
 
-    log_layer: ln of specific resistance times reference pressure^alpha. radius_std: of ln radius. axes: (9,),
-    one standard deviation of the calibrated (ln layer, alpha, ln sheet) along each of three axes;
-    has_covariance: any isn't 0. series: (n n,) quadratic form of the series resistors [ohm].
+    parameters: (LAW_PARAMETERS,) ln of specific resistance times reference pressure^alpha; alpha; ln of the
+    contact radius [m] and its standard deviation; ln of the sheet resistance; drive voltage; ln of the
+    reference pressure; and three axes of the calibrated law's covariance, one standard deviation each of (ln
+    specific resistance, alpha, ln sheet resistance). series: (n n,) quadratic form of the series resistors [ohm]; has_series: any isn't 0.
     """
 
-    def __init__(
-        self,
-        log_layer: float,
-        alpha: float,
-        log_radius_m: float,
-        radius_std: float,
-        log_sheet: float,
-        drive_v: float,
-        axes: memoryview[float],
-        has_covariance: bool,
-        series: memoryview[float],
-        has_series: bool,
-    ) -> None:
-        self.log_layer = log_layer
-        self.alpha = alpha
-        self.log_radius_m = log_radius_m
-        self.radius_std = radius_std
-        self.log_sheet = log_sheet
-        self.drive_v = drive_v
-        self.axes = axes
-        self.has_covariance = has_covariance
+    def __init__(self, parameters: memoryview[float], series: memoryview[float], has_series: bool) -> None:
+        self.parameters = parameters
         self.series = series
         self.has_series = has_series
 
@@ -94,30 +89,31 @@ def estimate_force(
     result.status = _NOT_ESTIMATED
     if not total_a > _BOUND_SIGMA * total_std_a:
         return
-    per_sheet = _TWO_PI * math.exp(-law.log_sheet)
+    p = law.parameters
+    alpha, radius_std = p[_ALPHA], p[_RADIUS_STD]
+    per_sheet = _TWO_PI * math.exp(-p[_LOG_SHEET])
     resistors = per_sheet * series_ohm
-    spread = max(log_spreading_m - law.log_radius_m, _MIN_LOG_SPREADING_RATIO)
+    spread = max(log_spreading_m - p[_LOG_RADIUS], _MIN_LOG_SPREADING_RATIO)
     least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
-    whole = per_sheet * law.drive_v / max(total_a, _MIN_CURRENT_A)
+    whole = whole_factor(law, total_a)
     factor = whole - resistors - spread
     noise = whole * total_std_a / total_a
     variance = noise * noise + position_variance
-    margin = _BOUND_SIGMA * math.sqrt(variance + law.radius_std * law.radius_std)
+    margin = _BOUND_SIGMA * math.sqrt(variance + radius_std * radius_std)
     if factor - margin <= least:
         margin /= max(1.0 - _BOUND_SIGMA * total_std_a / total_a, 0.1)  # the factor is inverse to the current
         result.force_n = _force_at(
-            stack, law.log_layer, law.alpha, law.log_radius_m, law.log_sheet, max(factor + margin, least)
+            stack, p[_LOG_LAYER], alpha, p[_LOG_RADIUS], p[_LOG_SHEET], max(factor + margin, least)
         )
         result.std_n = _INFINITY
         result.status = _LOWER_BOUND
         return
-    force = _force_at(stack, law.log_layer, law.alpha, law.log_radius_m, law.log_sheet, factor)
+    force = _force_at(stack, p[_LOG_LAYER], alpha, p[_LOG_RADIUS], p[_LOG_SHEET], factor)
     offset = whole * offset_std_a / total_a
-    slope = force / law.alpha * _log_x2_slope(stack, factor)
+    slope = force / alpha * _log_x2_slope(stack, factor)
     square = slope * slope * (variance + offset * offset)
-    if law.radius_std > 0.0:
-        near = _NEAR_NODE * law.radius_std
-        far = _FAR_NODE * law.radius_std
+    if radius_std > 0.0:
+        near, far = _NEAR_NODE * radius_std, _FAR_NODE * radius_std
         square += _NEAR_WEIGHT * (
             _squared_change(stack, law, force, near, log_spreading_m, whole, resistors)
             + _squared_change(stack, law, force, -near, log_spreading_m, whole, resistors)
@@ -126,16 +122,22 @@ def estimate_force(
             _squared_change(stack, law, force, far, log_spreading_m, whole, resistors)
             + _squared_change(stack, law, force, -far, log_spreading_m, whole, resistors)
         )
-    if law.has_covariance:
-        for k in range(3):
-            scale = math.exp(-law.axes[3 * k + 2])  # a larger sheet resistance makes the factor smaller
-            alpha = max(law.alpha + law.axes[3 * k + 1], 0.1)
-            changed = max((whole - resistors) * scale - spread, least)
-            log_sheet = law.log_sheet + law.axes[3 * k + 2]
-            log_layer = law.log_layer + law.axes[3 * k]
-            change = _force_at(stack, log_layer, alpha, law.log_radius_m, log_sheet, changed) - force
+    for k in range(_AXES, _AXES + 9, 3):
+        if p[k] != 0.0 or p[k + 1] != 0.0 or p[k + 2] != 0.0:
+            # a larger sheet resistance makes the factor smaller
+            changed = max((whole - resistors) * math.exp(-p[k + 2]) - spread, least)
+            changed_alpha = max(alpha + p[k + 1], _MIN_ALPHA)
+            log_layer = p[_LOG_LAYER] + p[k] + (changed_alpha - alpha) * p[_LOG_REFERENCE]
+            log_sheet = p[_LOG_SHEET] + p[k + 2]
+            change = _force_at(stack, log_layer, changed_alpha, p[_LOG_RADIUS], log_sheet, changed) - force
             square += change * change
     result.force_n, result.std_n, result.status = force, math.sqrt(square), _VALID
+
+
+def whole_factor(law: PadLaw, total_a: float) -> float:
+    """Return the stack factor that would leave the drive's whole voltage to the contact."""
+    p = law.parameters
+    return _TWO_PI * math.exp(-p[_LOG_SHEET]) * p[_DRIVE] / max(total_a, _MIN_CURRENT_A)
 
 
 def series_resistance(law: PadLaw, currents: memoryview[float], first: int, electrodes: int) -> float:
@@ -162,11 +164,12 @@ def _squared_change(
     resistors: float,
 ) -> float:
     """Return the squared change of the force with a radius larger by the factor exp(log_ratio)."""
-    log_radius_m = law.log_radius_m + log_ratio
+    p = law.parameters
+    log_radius_m = p[_LOG_RADIUS] + log_ratio
     spread = max(log_spreading_m - log_radius_m, _MIN_LOG_SPREADING_RATIO)
     least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
     factor = max(whole - resistors - spread, least)
-    change = _force_at(stack, law.log_layer, law.alpha, log_radius_m, law.log_sheet, factor) - force
+    change = _force_at(stack, p[_LOG_LAYER], p[_ALPHA], log_radius_m, p[_LOG_SHEET], factor) - force
     return change * change
 
 

@@ -3,7 +3,7 @@ from libc cimport math
 from handtouch.core.stages cimport tables
 
 cdef Py_ssize_t _MAX_STEPS, _CORNER_STEPS, _BISECTIONS
-cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
+cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
 cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
 cdef double _MIN_INFORMATION, _INFINITY, _HALF_PI
 
@@ -30,7 +30,7 @@ cdef double _cell_length(double[::1] nodes, Py_ssize_t cells, double s) noexcept
 cdef double _cell_at(double[::1] nodes, Py_ssize_t cells, double x) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)
 cdef void _linearise(PadTable table, Fit fit) noexcept
-cdef void _compute_step(PadTable table, Fit fit) noexcept
+cdef void _compute_step(PadTable table, Fit fit, double damping) noexcept
 @cython.locals(_=Py_ssize_t)
 cdef bint _maximise(PadTable table, Fit fit, bint tracked) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, points=Py_ssize_t, first=Py_ssize_t, second=Py_ssize_t,

@@ -15,13 +15,15 @@ from handtouch.core.stages import tables
 _MAX_STEPS = 30
 _MAX_STEP_CELLS = 7.0
 _MAX_SETTLED_DECREMENT = 1e-3  # squared Newton decrement, in variances: the last step leaves far less
-_MIN_DAMPING = 1e-4
+_FIRST_DAMPING, _MIN_DAMPING = 1e-2, 1e-3
 _BISECTIONS = 50
 _MAX_TRACKED_COST = 25.0  # sum of squares beyond which, and
 _MAX_TRACKED_VARIANCE = 2.5e-3  # variance of a coordinate, in sides, beyond which other starts are tried
 _MAX_START_COST = 40.0  # cost above the best start's at which another one is still tried
 _MAX_STD_SIDES = 1e3  # a coordinate with a larger deviation is unknown
-_CORNER_RADIUS_FACTOR = 0.7  # of the root of the relative noise, in shorter sides: no information on the radius
+_CORNER_RADIUS_FACTOR = (
+    0.7  # of the root of the relative noise, in shorter sides: no information on the radius
+)
 _MAX_CORNER_RADIUS = 0.25  # in shorter sides
 _CORNER_STEPS = 6
 _MIN_CORNER_ANGLE_RAD = 0.02
@@ -103,9 +105,7 @@ def locate(table: PadTable, fit: Fit, s: float, t: float) -> None:
         settled = _maximise(table, fit, True)
     if settled:
         _compute_covariance(table, fit)
-        variance = max(
-            fit.var_x / (table.side_x * table.side_x), fit.var_y / (table.side_y * table.side_y)
-        )
+        variance = max(fit.var_x / (table.side_x * table.side_x), fit.var_y / (table.side_y * table.side_y))
         settled = fit.cost <= _MAX_TRACKED_COST and variance <= _MAX_TRACKED_VARIANCE
     if not settled:
         _search(table, fit, tracked)
@@ -186,9 +186,12 @@ def _linearise(table: PadTable, fit: Fit) -> None:
     fit.gradient_x, fit.gradient_y = gradient_x, gradient_y
 
 
-def _compute_step(table: PadTable, fit: Fit) -> None:
-    """Compute the Gauss-Newton step and its squared decrement; a coordinate at the table's end is held."""
-    xx, xy, yy = fit.xx, fit.xy, fit.yy
+def _compute_step(table: PadTable, fit: Fit, damping: float) -> None:
+    """Compute the step and its squared decrement; a coordinate at the table's end is held.
+
+    damping: 0 for Gauss-Newton's step; more makes it shorter and turns it downhill (Levenberg-Marquardt).
+    """
+    xx, xy, yy = fit.xx * (1.0 + damping), fit.xy, fit.yy * (1.0 + damping)
     gradient_x, gradient_y = fit.gradient_x, fit.gradient_y
     if (fit.s <= 0.0 and gradient_x < 0.0) or (fit.s >= table.cells and gradient_x > 0.0):
         gradient_x = xy = 0.0
@@ -218,32 +221,31 @@ def _maximise(table: PadTable, fit: Fit, tracked: bool) -> bool:
     tracked: give up where the first step is too long for the contact to have been followed.
     """
     _linearise(table, fit)
-    _compute_step(table, fit)
+    _compute_step(table, fit, 0.0)
     longest = 0.999 * _MAX_STEP_CELLS
     if tracked and (fit.total <= 0.0 or abs(fit.step_s) > longest or abs(fit.step_t) > longest):
         return False
-    damping = 1.0
+    damping = 0.0
     for _ in range(_MAX_STEPS):
         s, t, cost, total = fit.s, fit.t, fit.cost, fit.total
-        step_s, step_t = fit.step_s, fit.step_t
         if total > 0.0 and fit.decrement <= _MAX_SETTLED_DECREMENT:
-            fit.s, fit.t = _clamp(table, s + step_s), _clamp(table, t + step_t)
+            fit.s, fit.t = _clamp(table, s + fit.step_s), _clamp(table, t + fit.step_t)
             fit.step_s, fit.step_t = fit.s - s, fit.t - t
             return True
-        while True:
-            fit.s, fit.t = _clamp(table, s + damping * step_s), _clamp(table, t + damping * step_t)
-            _linearise(table, fit)
-            if total <= 0.0 or (fit.total > 0.0 and fit.cost <= cost):
-                damping = min(1.0, 4.0 * damping)
-                break
-            damping *= 0.25
+        if damping > 0.0:
+            _compute_step(table, fit, damping)
+        fit.s, fit.t = _clamp(table, s + fit.step_s), _clamp(table, t + fit.step_t)
+        _linearise(table, fit)
+        if total <= 0.0 or (fit.total > 0.0 and fit.cost <= cost):
+            damping *= 0.1
             if damping < _MIN_DAMPING:
-                fit.s, fit.t = s, t
-                _linearise(table, fit)
-                fit.step_s = fit.step_t = fit.decrement = 0.0
-                return total > 0.0
-        _compute_step(table, fit)
-    fit.step_s = fit.step_t = 0.0
+                damping = 0.0
+        else:
+            fit.s, fit.t = s, t
+            _linearise(table, fit)
+            damping = max(_FIRST_DAMPING, 10.0 * damping)
+        _compute_step(table, fit, 0.0)
+    fit.step_s = fit.step_t = fit.decrement = 0.0
     return False
 
 
@@ -314,7 +316,10 @@ def _compute_covariance(table: PadTable, fit: Fit) -> None:
 
 
 def _compute_position(table: PadTable, fit: Fit) -> None:
-    fit.x, fit.y = _coordinate(table.nodes_x, table.cells, fit.s), _coordinate(table.nodes_y, table.cells, fit.t)
+    fit.x, fit.y = (
+        _coordinate(table.nodes_x, table.cells, fit.s),
+        _coordinate(table.nodes_y, table.cells, fit.t),
+    )
     fit.scale_x = _cell_length(table.nodes_x, table.cells, fit.s)
     fit.scale_y = _cell_length(table.nodes_y, table.cells, fit.t)
 

@@ -4,7 +4,7 @@ from handtouch.core.stages cimport force, locate, place
 
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
 cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _COUNT
-cdef double _NAN, _TWO_PI, _MAX_SQUARED_MISFIT
+cdef double _NAN, _MAX_SQUARED_MISFIT
 
 cdef class ContactSolver:
     cdef list tables, laws, surfaces

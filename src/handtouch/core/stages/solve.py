@@ -27,7 +27,7 @@ VALUE_SLICES = {
     "cells": slice(_CELLS, _CELLS + 2),  # position in the pad's table, where the next tick starts from
 }
 """Layout of a row of values."""
-_NAN, _TWO_PI = float("nan"), 2.0 * math.pi
+_NAN = float("nan")
 _MAX_SQUARED_MISFIT = 9.0
 """Squared misfit of a point contact, of one degree of freedom, that noise explains. Beyond it the covariance
 is inflated by the excess (Birge, Phys. Rev. 40, 1932): where a contact is no point, or gains are off, the
@@ -126,7 +126,9 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
     slope_y = (fit.raw[2 * n + 2] + fit.raw[2 * n + 3]) / fit.scale_y
     residual = pair / total - modelled
     for i in range(n):
-        by = -pair / (total * total) * solver.by_total[i] - slope_x * solver.by_x[i] - slope_y * solver.by_y[i]
+        by = (
+            -pair / (total * total) * solver.by_total[i] - slope_x * solver.by_x[i] - slope_y * solver.by_y[i]
+        )
         if i < 2:
             by += 1.0 / total
         solver.by_residual[i] = by
@@ -192,7 +194,7 @@ def _estimate_force(solver: ContactSolver, pad: int) -> None:
     slope_x, slope_y = fit.raw[2 * n + 1] / fit.scale_x, fit.raw[3 * n + 2] / fit.scale_y
     variance = 0.0
     if fit.var_x < 1e300 and fit.var_y < 1e300:
-        whole = _TWO_PI * math.exp(-law.log_sheet) * law.drive_v / (fit.total * fit.total)
+        whole = force.whole_factor(law, fit.total) / fit.total
         variance = slope_x * slope_x * fit.var_x + slope_y * slope_y * fit.var_y
         variance += 2.0 * slope_x * slope_y * fit.cov_xy
         variance += 2.0 * whole * (slope_x * fit.cov_x_total + slope_y * fit.cov_y_total)

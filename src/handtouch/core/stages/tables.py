@@ -21,7 +21,7 @@ def read_table(
     if j > cells - 1:
         j = cells - 1
     p, q = s - i, t - j
-    # cubic Hermite functions of both nodes, of their values (v) and slopes (d), and their derivatives (_s, _t)
+    # cubic Hermite functions of both nodes' values (v, w) and slopes (d, e), and their derivatives
     v1 = p * p * (3.0 - 2.0 * p)
     v0 = 1.0 - v1
     d0, d1 = p * (1.0 - p) * (1.0 - p), p * p * (p - 1.0)

@@ -1,0 +1,244 @@
+"""Contacts solved by the stages agree with the exact theory, for any currents."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.pad_model import PadModel
+from handtouch.field import estimate
+from handtouch.field.contact_law import ForceEstimateStatus
+
+FloatArray = NDArray[np.float64]
+PADS = np.arange(3)
+
+
+class Contacts:
+    """Contacts on the three pads of a model, solved one after the other."""
+
+    def __init__(self, model: PadModel, force_requested: bool = True) -> None:
+        self._currents, self._values = np.zeros((3, 4)), np.full((3, VALUE_COUNT), np.nan)
+        requested = np.full(3, force_requested)
+        self._solver = make_solver(model, self._currents, np.zeros(3), requested, self._values)
+
+    def solve(self, currents: FloatArray) -> None:
+        """Solve contacts with these currents (3, 4) [A]."""
+        self._currents[:] = currents
+        self._solver.solve_contacts(PADS.data)
+
+    def __getattr__(self, name: str) -> FloatArray:
+        """Return a value of all pads by its name."""
+        values = self._values[:, VALUE_SLICES[name]].copy()
+        if name == "covariance_m2":
+            return values.reshape(3, 3, 3)
+        return values[:, 0] if values.shape[1] == 1 else values
+
+
+class Reference(NamedTuple):
+    """Contacts on all pads, each solved separately."""
+
+    xy: FloatArray
+    xy_std: FloatArray
+    position_m: FloatArray
+    normal: FloatArray
+    pad_m: FloatArray
+    covariance_m2: FloatArray
+    force_n: FloatArray
+    force_std_n: FloatArray
+    residual: FloatArray
+    residual_std: FloatArray
+
+    @classmethod
+    def solve(cls, model: PadModel, currents: FloatArray) -> Reference:
+        found = model.locator.estimate(PADS, currents.T, model.noise_a.T)
+        placed = model.placement.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
+        radius_m = model.locator.conformal_radius(PADS, found.x, found.y) * placed.scale_m_per_unit
+        std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        force = model.estimate_force(PADS, currents.T, found.total, std[:, 2], radius_m)
+        assert (force.status == ForceEstimateStatus.VALID).all()
+        return cls(
+            np.stack([found.x, found.y], axis=1),
+            std[:, :2],
+            placed.position_m,
+            placed.normal,
+            placed.pad_m,
+            placed.covariance_m2 * (1 + np.fmax(found.chi_squared - 9, 0))[:, None, None],
+            force.force_n,
+            force.std_n,
+            found.residual,
+            np.abs(found.residual) / np.sqrt(np.maximum(found.chi_squared, 1e-300)),
+        )
+
+
+def reading(model: PadModel, xy: FloatArray, total_a: float, rng: np.random.Generator | None) -> FloatArray:
+    """Return currents (3, 4) of contacts at xy (3, 2), fractions of the sides."""
+    fractions = model.locator.fractions(PADS, *(xy * model.locator.sides).T).T
+    noise = model.noise_a * rng.normal(size=(3, 4)) if rng else 0.0
+    return np.asarray(total_a * fractions + noise)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(3e-4, 3e-3))
+def test_a_contact_equals_its_reference(bench: Any, seed: int, total_a: float) -> None:
+    rng = np.random.default_rng(seed)
+    currents = reading(bench.model, rng.uniform(0.15, 0.85, (3, 2)), total_a, rng)
+    contacts, expected = Contacts(bench.model), Reference.solve(bench.model, currents)
+    contacts.solve(currents)
+    assert (np.abs(contacts.xy - expected.xy) < 0.02 * expected.xy_std + 1e-9).all()
+    np.testing.assert_allclose(contacts.position_m, expected.position_m, atol=1e-7)
+    np.testing.assert_allclose(contacts.normal, expected.normal, atol=2e-5)
+    np.testing.assert_allclose(contacts.pad_m, expected.pad_m, atol=1e-7)
+    np.testing.assert_allclose(contacts.force_n, expected.force_n, rtol=1e-4)
+    np.testing.assert_allclose(contacts.residual, expected.residual, atol=1e-5)
+    np.testing.assert_allclose(contacts.residual_std, expected.residual_std, rtol=0.02)
+    scale = np.abs(expected.covariance_m2).max(axis=(1, 2))[:, None, None]
+    np.testing.assert_allclose(contacts.covariance_m2 / scale, expected.covariance_m2 / scale, atol=0.03)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(3e-4, 3e-3))
+def test_normals_are_unit_and_covariances_singular_along_them(bench: Any, seed: int, total_a: float) -> None:
+    rng = np.random.default_rng(seed)
+    contacts = Contacts(bench.model)
+    contacts.solve(reading(bench.model, rng.uniform(0.02, 0.98, (3, 2)), total_a, rng))
+    np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1, atol=1e-12)
+    along = np.einsum("kij,kj->ki", contacts.covariance_m2, contacts.normal)
+    trace = np.trace(contacts.covariance_m2, axis1=1, axis2=2)
+    assert (np.linalg.norm(along, axis=1) < 1e-9 * trace).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_contact_that_jumps_or_changes_is_found_as_a_new_one_is(bench: Any, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tracked = Contacts(bench.model)
+    for total_a in 10 ** rng.uniform(-4.5, -2.5, 4):
+        currents = reading(bench.model, rng.uniform(0.02, 0.98, (3, 2)), total_a, rng)
+        tracked.solve(currents)
+        new = Contacts(bench.model)
+        new.solve(currents)
+        for pad in range(3):
+            if np.isfinite(new.xy[pad] + tracked.xy[pad]).all():
+                likely = [misfit(bench.model, pad, currents, at.xy[pad]) for at in (tracked, new)]
+                assert abs(likely[0] - likely[1]) < 1
+
+
+@pytest.mark.parametrize("position", [(0.0, 0.5), (0.5, 1.0), (0.0, 0.0), (1.0, 1.0)])
+def test_a_contact_on_an_edge_or_corner_is_within_four_deviations_of_the_most_likely_one(
+    bench: Any, position: tuple[float, float]
+) -> None:
+    rng, model = np.random.default_rng(5), bench.model
+    contacts = Contacts(model)
+    at = np.clip(np.full((3, 2), position), 0.02, 0.98)
+    for _ in range(20):
+        currents = reading(model, at, 3e-4, rng)
+        contacts.solve(currents)
+        for pad, network in enumerate(model.networks):
+            own = estimate(network, currents[pad], model.noise_a[pad])
+            assert (
+                misfit(model, pad, currents, contacts.xy[pad]) < own.chi_squared + 16
+            )  # four standard deviations
+        assert ((contacts.xy >= 0) & (contacts.xy <= model.locator.sides)).all()
+
+
+def misfit(model: PadModel, pad: int, currents: FloatArray, xy: FloatArray) -> float:
+    """Return the sum of squared residuals, in noise, of the best contact at a position."""
+    data = currents[pad] * model.weight[pad]
+    fractions = model.networks[pad].fractions(*xy) * model.weight[pad]
+    return float(np.sum((data - fractions * max(fractions @ data / (fractions @ fractions), 0)) ** 2))
+
+
+def test_covariance_includes_the_uncertainty_of_gains(bench: Any) -> None:
+    """Positions of a thousand nodes with random gains scatter as the covariance states."""
+    rng = np.random.default_rng(11)
+    deviation, model = 0.02, copy.deepcopy(bench.model)
+    model.set_uncertainty(0, deviation**2 * (np.eye(4) - 0.25), quarantined=False)
+    contacts = Contacts(model)
+    true = np.array([[0.4, 0.65]])
+    straight = reading(model, np.repeat(true, 3, axis=0), 2e-3, None)
+    contacts.solve(straight)
+    stated = contacts.covariance_m2[0]
+    logs = rng.normal(0, deviation, (1000, 4))
+    logs -= logs.mean(axis=1, keepdims=True)
+    found = model.locator.estimate(
+        np.zeros(1000, int), (straight[:1] * np.exp(logs)).T, model.noise_a[[0] * 1000].T
+    )
+    placed = model.placement.to_link_frame(np.zeros(1000, int), found.x, found.y, np.zeros((1000, 2, 2)))
+    scatter = np.cov(placed.position_m.T)
+    assert np.sqrt(np.diag(stated))[:2] == pytest.approx(np.sqrt(np.diag(scatter))[:2], rel=0.1)
+
+
+def test_a_force_that_is_not_requested_is_not_computed(bench: Any) -> None:
+    contacts = Contacts(bench.model, force_requested=False)
+    contacts.solve(reading(bench.model, np.full((3, 2), 0.5), 2e-3, None))
+    assert np.isfinite(contacts.xy).all()
+    assert np.isnan(contacts.force_n).all()
+    assert np.isnan(contacts.force_std_n).all()
+
+
+def test_a_force_at_the_end_of_the_range_is_a_value_or_a_lower_bound(bench: Any) -> None:
+    """Contacts slide to and fro across the limit of the sheet's current."""
+    rng, contacts, model = np.random.default_rng(8), Contacts(bench.model), bench.model
+    statuses = set()
+    for number in range(600):
+        position = 0.5 + 0.3 * np.sin(0.07 * number + np.arange(6).reshape(3, 2))
+        currents = reading(model, position, 8.5e-3 * (1 + 0.15 * np.sin(0.023 * number)), rng)
+        contacts.solve(currents)
+        found = model.locator.estimate(PADS, currents.T, model.noise_a.T)
+        placed = model.placement.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
+        radius_m = model.locator.conformal_radius(PADS, found.x, found.y) * placed.scale_m_per_unit
+        std = np.sqrt(found.covariance[:, 2, 2])
+        own = model.estimate_force(PADS, currents.T, found.total, std, radius_m)
+        statuses |= set(own.status.tolist())
+        same = (contacts.force_status == ForceEstimateStatus.LOWER_BOUND) == (
+            own.status == ForceEstimateStatus.LOWER_BOUND
+        )
+        assert (np.abs(contacts.force_n / own.force_n - 1) < 0.02)[same].all()
+    assert statuses == {ForceEstimateStatus.VALID, ForceEstimateStatus.LOWER_BOUND}
+
+
+def test_the_covariance_of_an_extended_contact_covers_its_centre_of_force(bench: Any) -> None:
+    rng = np.random.default_rng(6)
+    inside: list[bool] = []
+    as_a_point: list[bool] = []
+    model = bench.model
+    for _ in range(60):
+        middle, apart = rng.uniform(0.3, 0.7, (3, 2)), rng.uniform(0.05, 0.2, (3, 1))
+        angle = rng.uniform(0, np.pi, (3, 1))
+        offset = apart * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        currents = reading(model, middle - offset, 1e-3, rng) + reading(model, middle + offset, 1e-3, rng)
+        contacts = Contacts(model)
+        contacts.solve(currents)
+        zero = np.zeros((3, 2, 2))
+        true = model.placement.to_link_frame(PADS, *(middle * model.locator.sides).T, zero).position_m
+        point = model.locator.estimate(PADS, currents.T, model.noise_a.T).covariance[:, :2, :2]
+        narrow = model.placement.to_link_frame(PADS, *contacts.xy.T, point).covariance_m2
+        for covariances, found in ((contacts.covariance_m2, inside), (narrow, as_a_point)):
+            values, axes = np.linalg.eigh(covariances)
+            along = np.einsum("kji,kj->ki", axes, contacts.position_m - true)[:, 1:]
+            found.extend((along**2 / values[:, 1:]).sum(axis=1) < 5.991)  # 95 % of chi squared of two
+    assert np.mean(inside) > 0.8
+    assert np.mean(as_a_point) < 0.1
+
+
+def test_a_point_contact_has_the_covariance_of_its_noise(bench: Any) -> None:
+    rng, equal = np.random.default_rng(7), []
+    for _ in range(100):
+        contacts = Contacts(bench.model)
+        currents = reading(bench.model, rng.uniform(0.2, 0.8, (3, 2)), 1e-3, rng)
+        contacts.solve(currents)
+        found = bench.model.locator.estimate(PADS, currents.T, bench.model.noise_a.T)
+        placed = bench.model.placement.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
+        sizes = [
+            np.trace(covariance, axis1=1, axis2=2)
+            for covariance in (contacts.covariance_m2, placed.covariance_m2)
+        ]
+        equal.extend(sizes[0] < 1.05 * sizes[1])
+    assert 0.98 < np.mean(equal) <= 1.0
