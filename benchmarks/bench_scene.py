@@ -1,8 +1,8 @@
-"""Savings of a tick by scenes: outputs, links, tolerance, rate, and missing subscriptions.
+"""Savings of a tick by scenes: outputs, links, rate, and missing subscriptions.
 
 The pipeline of the daemon, from the last sample to encoded messages, with 15 and 60 pads that all are touched
 by sliding contacts; every case has the same samples. Cases are interleaved, so that a slower machine affects
-all. Also the cost of the cheapest locator for comparison with a contact's linearisation.
+all.
 Writes docs/benchmarks/scene.{md,json}.
 """
 
@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +22,13 @@ from page import made_by, options, output_folder
 
 from handtouch import wire
 from handtouch.config.tables import SceneRequest
-from handtouch.core.linearisation import ContactLinearisations
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import ActiveScenes, Demand
-from handtouch.field.paper_methods import log_ratio
-from handtouch.field.rectangle import Rectangle
 
 PERIOD_NS = 5_000_000
 SLIDING_M = 1e-4  # a tick: 20 mm/s at 200 Hz
 CURRENT_RATIO = 20.0  # of the threshold's current
-CONTACTS_READ = 15
 CONTACTS, EVERYTHING = ("contact/",), ("contact/", "hand/")
 CASES: dict[str, tuple[tuple[str, ...], SceneRequest]] = {
     "all outputs, contacts and hand frames subscribed": (EVERYTHING, SceneRequest()),
@@ -44,14 +39,11 @@ CASES: dict[str, tuple[tuple[str, ...], SceneRequest]] = {
     "position only": (EVERYTHING, SceneRequest(outputs=("position",))),
     "a fifth of the links": (EVERYTHING, SceneRequest(links=("thumb_*",))),
     "a fifth of the contacts subscribed": (("contact/hand0/thumb_",), SceneRequest()),
-    "within 0.05 mm": (EVERYTHING, SceneRequest(tolerance_mm=0.05)),
-    "within 0.2 mm": (EVERYTHING, SceneRequest(tolerance_mm=0.2)),
-    "within 1 mm": (EVERYTHING, SceneRequest(tolerance_mm=1.0)),
     "half the rate": (EVERYTHING, SceneRequest(rate_hz=100.0)),
     "a tenth of the rate": (EVERYTHING, SceneRequest(rate_hz=20.0)),
-    "position only within 0.2 mm at a tenth of the rate": (
+    "position only at a tenth of the rate": (
         EVERYTHING,
-        SceneRequest(outputs=("position",), tolerance_mm=0.2, rate_hz=20.0),
+        SceneRequest(outputs=("position",), rate_hz=20.0),
     ),
 }
 Counts = NDArray[np.int16]
@@ -123,19 +115,12 @@ def measure(hand_count: int, ticks: int) -> list[dict[str, Any]]:
     """Return a row per case: mean microseconds of a tick, bytes sent, largest error of a position."""
     model = hands(15 * hand_count)
     cases = {name: Case(model, *case) for name, case in CASES.items()}
-    slides, off = Slides(model), {name: [0.0] for name in cases}
+    slides = Slides(model)
     for number in range(ticks + 20):
         t_ns, counts = 10**9 + number * PERIOD_NS, slides.counts()
         order = list(cases.items())
         for _, case in order[number % len(order) :] + order[: number % len(order)]:
             case.tick(t_ns, counts)
-        for name, case in order:
-            if (
-                "within" in name
-                and number > 20
-                and case.pipeline.ticks % case.demand.ticks_per_hand_frame == 0
-            ):
-                off[name].append(_apart(case, order[0][1]))
     rows = []
     for name, case in cases.items():
         spent = np.sort(case.spent[20:])[: -max(1, ticks // 100)]  # without the slowest, of other load
@@ -145,46 +130,13 @@ def measure(hand_count: int, ticks: int) -> list[dict[str, Any]]:
                 "case": name,
                 "tick_us": float(spent.mean()) * 1e-3,
                 "bytes_per_tick": case.sent_bytes / case.pipeline.ticks,
-                "off_mm": max(off[name]) * 1e3 if "within" in name else None,
             }
         )
         print(rows[-1], flush=True)
     return rows
 
 
-def _apart(case: Case, reference: Case) -> float:
-    """Return the largest distance [m] of positions of two cases."""
-    a, b = (c.pipeline.tick.columns.position_m for c in (case, reference))
-    return float(np.nanmax(np.linalg.norm(a - b, axis=1)))
-
-
-def locators() -> dict[str, float]:
-    """Return median microseconds of linearisations, of the cheapest locator, and of the transformation."""
-    model, pads = hands(CONTACTS_READ), np.arange(CONTACTS_READ)
-    place = 0.4 * model.locator.sides
-    currents = (model.locator.fractions(pads, *place.T) * model.begin_threshold_a * CURRENT_RATIO).T
-    linearisations = ContactLinearisations(model)
-    linearisations.solve_contacts(pads, currents, place)
-    rectangle, columns = Rectangle(*model.locator.sides[0]), np.ascontiguousarray(currents.T)
-    unknown = np.zeros((CONTACTS_READ, 2, 2))
-    x, y = place.T
-    works: dict[str, Callable[[], object]] = {
-        "read": lambda: linearisations.evaluate(pads, currents),
-        "log-ratio": lambda: log_ratio(rectangle, columns),
-        "place": lambda: model.placement.to_link_frame(pads, x, y, unknown),
-    }
-    costs = {}
-    for name, work in works.items():
-        spent = []
-        for _ in range(2000):
-            begin_ns = time.perf_counter_ns()
-            work()
-            spent.append(time.perf_counter_ns() - begin_ns)
-        costs[name] = float(np.median(spent)) * 1e-3
-    return costs
-
-
-def write(rows: list[dict[str, Any]], costs: dict[str, float], machine: str, out: Path) -> str:
+def write(rows: list[dict[str, Any]], machine: str, out: Path) -> str:
     sizes = sorted({row["pads"] for row in rows})
     first = {size: next(row for row in rows if row["pads"] == size) for size in sizes}
 
@@ -194,34 +146,26 @@ def write(rows: list[dict[str, Any]], costs: dict[str, float], machine: str, out
             row = next(r for r in rows if (r["pads"], r["case"]) == (size, name))
             part = row["tick_us"] / first[size]["tick_us"]
             cells.append(f"{row['tick_us']:.0f} | {part:.0%} | {row['bytes_per_tick']:.0f}")
-        off = [r["off_mm"] for r in rows if r["case"] == name and r["off_mm"] is not None]
-        return f"| {name} | {' | '.join(cells)} | {f'{max(off):.3f}' if off else ''} |"
+        return f"| {name} | {' | '.join(cells)} |"
 
     heads = " | ".join(f"{size} pads: us a tick | of the first | bytes" for size in sizes)
     text = f"""# Savings by scenes
 
 From the last sample to encoded messages, including preparation of the next tick; mean. All pads are
 touched; contacts slide {SLIDING_M * 1e3:.1f} mm a tick and have {CURRENT_RATIO:.0f} times
-the threshold's current. Bytes are those encoded per tick. The last column is the largest distance of a
-position from that of the first case.
+the threshold's current. Bytes are those encoded per tick.
 {machine}.
 
-| case | {heads} | largest error, mm |
-| --- | {"--- | " * (3 * len(sizes))}--- |
+| case | {heads} |
+| --- | {"--- | " * (3 * len(sizes))}
 {chr(10).join(map(line, CASES))}
 
-With a larger tolerance the linearisation of a contact is used for longer (`core/linearisation.py`). Other
-locators are no alternative, as none is cheaper: reading {CONTACTS_READ} linearisations takes
-{costs["read"]:.1f} us and gives position, normal, arc lengths and force on the link; the cheapest locator,
-the logarithm of two ratios, takes {costs["log-ratio"]:.1f} us for the position on an ideal pad, and its
-transformation to the link {costs["place"]:.0f} us more. Savings of the bus are in [idle](idle.md).
+Savings of the bus are in [idle](idle.md).
 
 {made_by()}.
 """
     (out / "scene.md").write_text(text)
-    (out / "scene.json").write_text(
-        json.dumps({"machine": machine, "rows": rows, "locators_us": costs}, indent=1) + "\n"
-    )
+    (out / "scene.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
     return text
 
 
@@ -232,7 +176,7 @@ def main() -> None:
     ticks = 20 if asked.quick else asked.ticks
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
     rows = [row for count in (1, 4) for row in measure(count, ticks)]
-    print(write(rows, locators(), machine, output_folder(asked.quick)))
+    print(write(rows, machine, output_folder(asked.quick)))
 
 
 if __name__ == "__main__":

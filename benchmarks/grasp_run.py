@@ -148,9 +148,7 @@ class _Run:
         self.pipeline = pipeline_of(deployment, self, model=model, robots=robots, period_ns=_PERIOD_NS)
         self.pipeline.transforms.joints_at = self.inputs.joints_at
         all_pads = np.ones(model.size, np.bool_)
-        requested = RequestedOutputs(
-            all_pads, all_pads, np.zeros(model.size), np.ones(model.size, np.int64), all_pads, ~all_pads
-        )
+        requested = RequestedOutputs(all_pads, all_pads, np.ones(model.size, np.int64), all_pads, ~all_pads)
         self.pipeline.apply_demand(requested)
         self._perceiving = PerceptPublisher(self.pipeline, self)
         if perceive:

@@ -102,9 +102,7 @@ def run(
     all_pads = np.ones(model.size, dtype=np.bool_)
     percepts = np.zeros((len(PERCEPT_KINDS), model.size), dtype=np.bool_)
     percepts[PERCEPT_KINDS.index("motion")] = True
-    requested = RequestedOutputs(
-        all_pads, all_pads, np.zeros(model.size), np.ones(model.size, np.int64), ~all_pads, ~all_pads
-    )
+    requested = RequestedOutputs(all_pads, all_pads, np.ones(model.size, np.int64), ~all_pads, ~all_pads)
     pipeline.apply_demand(requested)
     perceiving.set_requested(requested._replace(percepts=percepts))
     motion = next(part for part in perceiving._perceiver.estimators if isinstance(part, MotionEstimator))  # type: ignore[union-attr]

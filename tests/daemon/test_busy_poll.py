@@ -24,9 +24,9 @@ def test_sleep_ends_shortly_before_the_usual_arrival() -> None:
 
 def test_sync_without_samples_is_not_learned() -> None:
     poll = learned(100_000)
-    before_ns = poll.expected_arrival_ns(0)
+    before_ns = poll.max_sleep_ns(0, 0)
     poll.update_usual_latency(1_000_000_000, 999_000_000)
-    assert poll.expected_arrival_ns(0) == before_ns
+    assert poll.max_sleep_ns(0, 0) == before_ns
 
 
 @pytest.mark.parametrize("now_ns", [0, 799_000, 800_000, 801_000])

@@ -1,7 +1,7 @@
 """Compile the stages of the core: `python -m handtouch.core.build`.
 
-Public names: `build_stages`, `BuildError`. Needs Cython, a C compiler and Python's headers; depends on nothing
-else of handtouch, so that a build of the package can use it before that is installed.
+Public names: `build_stages`, `BuildError`. Needs Cython, a C compiler and Python's headers, and nothing else
+of handtouch, so that a build of the package can use it before that is installed.
 """
 
 from __future__ import annotations

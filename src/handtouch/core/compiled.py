@@ -29,7 +29,7 @@ _FOLDER = Path(__file__).parent / "stages"
 
 
 class Compilation(NamedTuple):
-    """Whether the stages that this process runs are compiled; if not, why, with the remedy."""
+    """State of the stages in this process: compiled, or the reason why not, with the remedy."""
 
     compiled: bool
     reason: str

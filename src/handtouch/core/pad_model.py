@@ -20,7 +20,7 @@ from handtouch.config.channels import (
     order_by_electrode,
     resolve_channels,
 )
-from handtouch.core.pad_tables import ForwardTable, SurfaceTable, view_floats
+from handtouch.core.pad_tables import ForwardTable, SurfacePatches, view_floats
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.field import LocatorBank
@@ -99,7 +99,7 @@ class PadModel:
         tables = {id(network): ForwardTable.from_network(network) for network in networks}
         self.forward_tables = [tables[id(network)] for network in networks]
         self.surface_tables = [
-            SurfaceTable.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
+            SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
         ]
         self.placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])

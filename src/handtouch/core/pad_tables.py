@@ -1,6 +1,6 @@
 """Tables of forward models and surfaces for the stages, built once for each distinct pad.
 
-Public names: `ForwardTable`, `SurfaceTable`, `stack_table`, `hermite_table`.
+Public names: `ForwardTable`, `SurfacePatches`, `stack_table`, `hermite_table`.
 
 A forward model is tabulated over cells that shrink towards the edges and the ends of the electrodes, as the
 distances do over which its fractions vary.
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.stages.force import StackTable
-from handtouch.core.stages.locate import PadTable
+from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.place import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.model import ForwardModel
@@ -79,7 +79,7 @@ class ForwardTable:
 
     nodes: (cells + 1, cells + 1, 4, n + 1), see `hermite_table`. nodes_x, nodes_y: (cells + 1, 2) coordinates
     of the nodes and their derivatives by cell. search_fractions: (81, n), search_cells: (2, 9), see
-    `PadTable`.
+    `ModelTable`.
     """
 
     nodes: FloatArray
@@ -129,9 +129,9 @@ class ForwardTable:
         """Number of electrodes."""
         return int(self.search_fractions.shape[1])
 
-    def pad_table(self) -> PadTable:
+    def pad_table(self) -> ModelTable:
         """Return it as the stages take it."""
-        return PadTable(
+        return ModelTable(
             view_floats(self.nodes),
             len(self.nodes) - 1,
             self.electrodes,
@@ -190,7 +190,7 @@ def _inside(x: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class SurfaceTable:
+class SurfacePatches:
     """Surface of a pad in its link's frame, in patches between folds; see `PadSurface`.
 
     nodes: (patches, cells + 1, cells + 1, 4, 5). ends: (patches,) of y.
@@ -201,7 +201,7 @@ class SurfaceTable:
     side_x: float
 
     @classmethod
-    def from_surface(cls, surface: Surface, rotation: FloatArray, translation: FloatArray) -> SurfaceTable:
+    def from_surface(cls, surface: Surface, rotation: FloatArray, translation: FloatArray) -> SurfacePatches:
         """Tabulate a surface whose pad frame `rotation` (3, 3) and `translation` (3,) carry to the link's."""
         ends = np.append(surface.folds, surface.b)
         begins = np.append(0.0, surface.folds)

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch import wire
 from handtouch.core.baseline import Baseline
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, IntArray
 from handtouch.core.cycle import Cycle
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import ForceReference, ForceReliability, SheetForceCompensation
 from handtouch.core.slab import Slab

@@ -51,7 +51,8 @@ class PadLaw:
     parameters: (LAW_PARAMETERS,) ln of specific resistance times reference pressure^alpha; alpha; ln of the
     contact radius [m] and its standard deviation; ln of the sheet resistance; drive voltage; ln of the
     reference pressure; and three axes of the calibrated law's covariance, one standard deviation each of (ln
-    specific resistance, alpha, ln sheet resistance). series: (n n,) quadratic form of the series resistors [ohm]; has_series: any isn't 0.
+    specific resistance, alpha, ln sheet resistance). series: (n n,) quadratic form of the series resistors
+    [ohm]; has_series: any isn't 0.
     """
 
     def __init__(self, parameters: memoryview[float], series: memoryview[float], has_series: bool) -> None:

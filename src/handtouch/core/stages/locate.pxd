@@ -7,7 +7,7 @@ cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPIN
 cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
 cdef double _MIN_INFORMATION, _INFINITY, _HALF_PI
 
-cdef class PadTable:
+cdef class ModelTable:
     cdef double[::1] values, nodes_x, nodes_y, search_fractions, search_cells
     cdef Py_ssize_t cells, electrodes, points
     cdef double side_x, side_y
@@ -20,8 +20,8 @@ cdef class Fit:
     cdef public bint found
 
 @cython.locals(tracked=bint, settled=bint, variance=double)
-cdef void locate(PadTable table, Fit fit, double s, double t) noexcept
-cdef double _clamp(PadTable table, double s) noexcept
+cdef void locate(ModelTable table, Fit fit, double s, double t) noexcept
+cdef double _clamp(ModelTable table, double s) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef double _coordinate(double[::1] nodes, Py_ssize_t cells, double s) noexcept
 @cython.locals(i=Py_ssize_t)
@@ -29,21 +29,21 @@ cdef double _cell_length(double[::1] nodes, Py_ssize_t cells, double s) noexcept
 @cython.locals(_=Py_ssize_t)
 cdef double _cell_at(double[::1] nodes, Py_ssize_t cells, double x) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)
-cdef void _linearise(PadTable table, Fit fit) noexcept
-cdef void _compute_step(PadTable table, Fit fit, double damping) noexcept
+cdef void _linearise(ModelTable table, Fit fit) noexcept
+cdef void _compute_step(ModelTable table, Fit fit, double damping) noexcept
 @cython.locals(_=Py_ssize_t)
-cdef bint _maximise(PadTable table, Fit fit, bint tracked) noexcept
+cdef bint _maximise(ModelTable table, Fit fit, bint tracked) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, points=Py_ssize_t, first=Py_ssize_t, second=Py_ssize_t,
                peak=Py_ssize_t)
-cdef void _search(PadTable table, Fit fit, bint located) noexcept
+cdef void _search(ModelTable table, Fit fit, bint located) noexcept
 @cython.locals(k=Py_ssize_t, row=Py_ssize_t, column=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, best=Py_ssize_t,
                is_peak=bint)
 cdef Py_ssize_t _highest_peak(Fit fit, Py_ssize_t points, Py_ssize_t excluded) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)
-cdef void _compute_covariance(PadTable table, Fit fit) noexcept
-cdef void _compute_position(PadTable table, Fit fit) noexcept
+cdef void _compute_covariance(ModelTable table, Fit fit) noexcept
+cdef void _compute_position(ModelTable table, Fit fit) noexcept
 @cython.locals(i=Py_ssize_t, known_x=bint, known_y=bint)
-cdef void _invert_information(PadTable table, Fit fit) noexcept
+cdef void _invert_information(ModelTable table, Fit fit) noexcept
 @cython.locals(i=Py_ssize_t, _=Py_ssize_t, far_x=bint, far_y=bint)
-cdef void _move_out_of_corner(PadTable table, Fit fit) noexcept
-cdef void _linearise_on_arc(PadTable table, Fit fit, bint far_x, bint far_y, double radius, double angle) noexcept
+cdef void _move_out_of_corner(ModelTable table, Fit fit) noexcept
+cdef void _linearise_on_arc(ModelTable table, Fit fit, bint far_x, bint far_y, double radius, double angle) noexcept

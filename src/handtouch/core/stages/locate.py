@@ -19,7 +19,7 @@ _FIRST_DAMPING, _MIN_DAMPING = 1e-2, 1e-3
 _BISECTIONS = 50
 _MAX_TRACKED_COST = 25.0  # sum of squares beyond which, and
 _MAX_TRACKED_VARIANCE = 2.5e-3  # variance of a coordinate, in sides, beyond which other starts are tried
-_MAX_START_COST = 40.0  # cost above the best start's at which another one is still tried
+_MAX_START_COST = 40.0  # cost beyond twice the best start's at which another one is still tried
 _MAX_STD_SIDES = 1e3  # a coordinate with a larger deviation is unknown
 _CORNER_RADIUS_FACTOR = (
     0.7  # of the root of the relative noise, in shorter sides: no information on the radius
@@ -31,7 +31,7 @@ _MIN_INFORMATION = 1e-300
 _INFINITY, _HALF_PI = math.inf, 0.5 * math.pi
 
 
-class PadTable:
+class ModelTable:
     """Table of one pad's forward model, as `read_table` needs it.
 
     values: columns are the fractions of the n electrodes and ln of the spreading radius. nodes_x, nodes_y:
@@ -94,7 +94,7 @@ class Fit:
         self.found = False
 
 
-def locate(table: PadTable, fit: Fit, s: float, t: float) -> None:
+def locate(table: ModelTable, fit: Fit, s: float, t: float) -> None:
     """Find the most likely contact for the currents in `fit`; (s, t): last position in cells, NaN if new.
 
     `fit.found` is False where no contact explains the currents better than none.
@@ -115,7 +115,7 @@ def locate(table: PadTable, fit: Fit, s: float, t: float) -> None:
         _move_out_of_corner(table, fit)
 
 
-def _clamp(table: PadTable, s: float) -> float:
+def _clamp(table: ModelTable, s: float) -> float:
     """Return a coordinate inside the table, in cells."""
     return max(0.0, min(1.0 * table.cells, s))
 
@@ -150,7 +150,7 @@ def _cell_at(nodes: memoryview[float], cells: int, x: float) -> float:
     return 0.5 * (low + high)
 
 
-def _linearise(table: PadTable, fit: Fit) -> None:
+def _linearise(table: ModelTable, fit: Fit) -> None:
     """Evaluate the model at (s, t), with the total eliminated."""
     n = table.electrodes
     tables.read_table(table.values, 0, table.cells, n + 1, fit.s, fit.t, fit.raw)
@@ -186,7 +186,7 @@ def _linearise(table: PadTable, fit: Fit) -> None:
     fit.gradient_x, fit.gradient_y = gradient_x, gradient_y
 
 
-def _compute_step(table: PadTable, fit: Fit, damping: float) -> None:
+def _compute_step(table: ModelTable, fit: Fit, damping: float) -> None:
     """Compute the step and its squared decrement; a coordinate at the table's end is held.
 
     damping: 0 for Gauss-Newton's step; more makes it shorter and turns it downhill (Levenberg-Marquardt).
@@ -215,7 +215,7 @@ def _compute_step(table: PadTable, fit: Fit, damping: float) -> None:
     fit.step_s, fit.step_t = scale * along_x, scale * along_y
 
 
-def _maximise(table: PadTable, fit: Fit, tracked: bool) -> bool:
+def _maximise(table: ModelTable, fit: Fit, tracked: bool) -> bool:
     """Iterate from (s, t); return True where the maximum was reached.
 
     tracked: give up where the first step is too long for the contact to have been followed.
@@ -249,7 +249,7 @@ def _maximise(table: PadTable, fit: Fit, tracked: bool) -> bool:
     return False
 
 
-def _search(table: PadTable, fit: Fit, located: bool) -> None:
+def _search(table: ModelTable, fit: Fit, located: bool) -> None:
     """Fit from the most likely points of the search grid; keep the most likely result.
 
     located: the present position is a result too. Weak contacts on long pads have two maxima.
@@ -273,7 +273,7 @@ def _search(table: PadTable, fit: Fit, located: bool) -> None:
         second = _highest_peak(fit, points, first)
     for peak in range(2):
         k = second if peak else first
-        if k < 0 or power - fit.gain[k] > best_cost + _MAX_START_COST:
+        if k < 0 or (peak and power - fit.gain[k] > 2.0 * (power - fit.gain[first]) + _MAX_START_COST):
             continue
         fit.s, fit.t = table.search_cells[k % points], table.search_cells[points + k // points]
         _maximise(table, fit, False)
@@ -302,7 +302,7 @@ def _highest_peak(fit: Fit, points: int, excluded: int) -> int:
     return best
 
 
-def _compute_covariance(table: PadTable, fit: Fit) -> None:
+def _compute_covariance(table: ModelTable, fit: Fit) -> None:
     """Apply the last step; compute position and inverse Fisher information of (x, y, total)."""
     ds, dt, n = fit.step_s, fit.step_t, table.electrodes
     if ds != 0.0 or dt != 0.0:  # what was read moves along its tangent
@@ -315,7 +315,7 @@ def _compute_covariance(table: PadTable, fit: Fit) -> None:
     _invert_information(table, fit)
 
 
-def _compute_position(table: PadTable, fit: Fit) -> None:
+def _compute_position(table: ModelTable, fit: Fit) -> None:
     fit.x, fit.y = (
         _coordinate(table.nodes_x, table.cells, fit.s),
         _coordinate(table.nodes_y, table.cells, fit.t),
@@ -324,7 +324,7 @@ def _compute_position(table: PadTable, fit: Fit) -> None:
     fit.scale_y = _cell_length(table.nodes_y, table.cells, fit.t)
 
 
-def _invert_information(table: PadTable, fit: Fit) -> None:
+def _invert_information(table: ModelTable, fit: Fit) -> None:
     total2 = fit.total * fit.total
     xx, xy, yy = fit.xx, fit.xy, fit.yy
     by_y = xy / yy if yy > 0.0 else 0.0
@@ -367,7 +367,7 @@ def _invert_information(table: PadTable, fit: Fit) -> None:
     fit.cov_x_total, fit.cov_y_total = cov_x_total * fit.scale_x, cov_y_total * fit.scale_y
 
 
-def _move_out_of_corner(table: PadTable, fit: Fit) -> None:
+def _move_out_of_corner(table: ModelTable, fit: Fit) -> None:
     """Move a position out of a corner to where the currents carry information.
 
     Near a corner the two far currents vanish with the square of the distance from it, so that all distances
@@ -414,7 +414,7 @@ def _move_out_of_corner(table: PadTable, fit: Fit) -> None:
 
 
 def _linearise_on_arc(
-    table: PadTable, fit: Fit, far_x: bool, far_y: bool, radius: float, angle: float
+    table: ModelTable, fit: Fit, far_x: bool, far_y: bool, radius: float, angle: float
 ) -> None:
     x, y = radius * math.cos(angle), radius * math.sin(angle)
     fit.s = _cell_at(table.nodes_x, table.cells, table.side_x - x if far_x else x)

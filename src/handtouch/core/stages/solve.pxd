@@ -19,7 +19,7 @@ cdef class ContactSolver:
     @cython.locals(k=Py_ssize_t)
     cpdef solve_contacts(self, Py_ssize_t[::1] pads)
 
-@cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, table=locate.PadTable,
+@cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, table=locate.ModelTable,
                values='double[::1]')
 cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, values='double[::1]')

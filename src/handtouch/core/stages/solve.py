@@ -45,7 +45,7 @@ class ContactSolver:
 
     def __init__(
         self,
-        tables: list[locate.PadTable],
+        tables: list[locate.ModelTable],
         laws: list[force.PadLaw],
         surfaces: list[place.PadSurface],
         stack: force.StackTable,
