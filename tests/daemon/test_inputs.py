@@ -148,7 +148,7 @@ def test_misspelt_topic_is_counted_by_the_endpoint(inputs: Any) -> None:
         while not inputs.dropped:
             robot.send_multipart([b"joint/right", b""])
             inputs.poll(NOW)
-    assert inputs.dropped.keys() == {"unknown_topic"}
+    assert "unknown_topic" in inputs.dropped
 
 
 def test_robot_client_refuses_an_unknown_hand(inputs: Any) -> None:
