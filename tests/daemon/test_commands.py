@@ -152,7 +152,7 @@ def test_invalid_arguments_are_refused_in_json_terms_and_change_nothing(
     assert not answer["ok"]
     assert why in answer["error"]
     assert served.daemon.demand.scenes.version == before
-    assert not served.pipeline.tick.baseline.expected_counts.any()
+    assert np.abs(served.pipeline.tick.baseline.expected_counts).max() < 1  # noise of a count
 
 
 def test_tare_sets_the_offsets_of_an_unloaded_pad(served: Bench) -> None:
