@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import typing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from handtouch import wire
 from handtouch.config.tables import Output
 from handtouch.wire import inputs
 from handtouch.wire.declarations import FieldDeclaration, declared_fields
+from handtouch.wire.emergency import Emergency
 from handtouch.wire.schema import json_schema
 from handtouch.wire.tables import with_tables
 from tests.wire.schema_check import SchemaCheck
@@ -82,6 +84,21 @@ FORCES = inputs.LinkForces("right", 7, ("tip",), np.array([1.0]), np.array([0.1]
 @pytest.mark.parametrize("message", [JOINTS, FORCES])
 def test_inputs_conform_to_the_schema(message: inputs.InputMessage) -> None:
     assert SchemaCheck("inputs").errors(inputs.encode(message)) == []
+
+
+def test_emergencies_conform_to_the_schema() -> None:
+    lasting = Emergency(0x5000, 1, "2f74000000", "0x5000 device hardware (register: generic)", 10**9)
+    errors = tuple(error.to_map() for error in (replace(lasting, cleared_ns=2 * 10**9, count=3), lasting))
+    health = wire.Health(
+        wire.SCHEMA_VERSION, 1, 1, 1, "h", "x", "can0", 1, "clear", "operational", 0, "sync", "", None, 0.0,
+        0, 0, None, 0, 0, errors, False, error_register=1, error_history=(0x5000,),
+    )  # fmt: skip
+    check = SchemaCheck("published")
+    assert check.errors(wire.encode(health)) == []
+    nameless = {name: value for name, value in errors[0].items() if name != "text"}
+    for wrong in ("0x5000 device hardware", nameless, {**errors[0], "more": 1}):
+        parts = wire.encode(replace(health, emergencies=(wrong,)))  # type: ignore[arg-type]
+        assert check.errors(parts)
 
 
 def test_violations_are_found() -> None:

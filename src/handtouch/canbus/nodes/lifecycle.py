@@ -182,7 +182,7 @@ def _on_boot_up(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     if instability.was_commanded(life, (cia301.RESET_NODE, cia301.RESET_COMMUNICATION), now_ns, timing):
         report = "reset by an NMT command of another master"
     elif life.reset_pending:
-        report = "NMT reset communication sent, as it refused to run"
+        report = "reset by handtouch (NMT reset communication)"
     elif known:
         by_itself, report = True, "rebooted by itself"
         life = count_restart(life, now_ns, timing)
