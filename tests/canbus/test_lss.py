@@ -152,6 +152,16 @@ def test_responses_with_jitter_cost_time_but_no_node(seed: int, compares: bool) 
 
 
 @pytest.mark.parametrize("compares", [True, False])
+@pytest.mark.parametrize("seed", [3, 14, 29, 41, 58])
+def test_nodes_missed_after_late_responses_are_a_problem(seed: int, compares: bool) -> None:
+    bus = Bus(pads(6, compares=compares), (0.002, 0.004), jitter=8.0)
+    bus.random.seed(seed)
+    master = bus.master()
+    found = master.scan()
+    assert master.problems or found == sorted(slave.address for slave in bus.slaves)
+
+
+@pytest.mark.parametrize("compares", [True, False])
 @pytest.mark.parametrize("seed", range(5))
 def test_very_bad_bus_yields_a_problem_and_no_false_node(seed: int, compares: bool) -> None:
     bus = Bus(pads(6, compares=compares), lost=0.2)

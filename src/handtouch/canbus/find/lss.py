@@ -75,7 +75,7 @@ class LssMaster:
         self._exchange = exchange
         self._clock = clock
         self._response_timer = _ResponseTimer(min_wait_s)
-        self._mismatches = 0
+        self._mismatches, self._is_incomplete = 0, False  # of the present search
 
     @property
     def wait_s(self) -> float:
@@ -93,14 +93,16 @@ class LssMaster:
         Values given are tried as a whole before single bits. `problems` are the reasons why some nodes may be
         missing, and addresses that several nodes share.
         """
-        known = [list(dict.fromkeys(values)) for values in (vendor_ids, product_codes, revisions)]
+        known: list[list[int]] | None = [
+            list(dict.fromkeys(values)) for values in (vendor_ids, product_codes, revisions)
+        ]
         compares: dict[LssAddress, bool] = {}  # confirmed nodes; True: silent in the configuration state
         self.problems = []
         problem = ""
         try:
             for _ in range(_MAX_PASSES):
                 responding, problem = self._search(known, [each for each in compares if compares[each]])
-                known = []  # a second pass finds what other values have hidden
+                known = None
                 if not problem and responding <= compares.keys():
                     break
                 for address in sorted(responding - compares.keys()):
@@ -158,9 +160,13 @@ class LssMaster:
         return _STORE_ERRORS.get(answer[1], f"error {answer[1]}") if answer[1] else ""
 
     def _search(
-        self, known: Sequence[Collection[int]], excluded: Collection[LssAddress]
+        self, known: Sequence[Collection[int]] | None, excluded: Collection[LssAddress]
     ) -> tuple[set[LssAddress], str]:
-        """Return the unconfigured nodes but excluded ones, and the reason if the search was broken off."""
+        """Return the unconfigured nodes but excluded ones, and the reason why some may be missing.
+
+        `known` : vendor ids, product codes, revisions to search, or if none of them is present the smallest;
+        None: search all
+        """
         found: set[LssAddress] = set()
         self._deselect_all()
         if not self._start_search():
@@ -170,24 +176,30 @@ class LssMaster:
             self._request_selection(address)
         if excluded and self._answers_contradiction():
             self._confirm_waiting()
-        self._mismatches = 0
+        self._mismatches, self._is_incomplete = 0, False
         self._response_timer.reset_backoff()
         try:
             if self._start_search():
                 self._search_below((), known, found)
         except _ScanMismatch:
-            return found, _UNDETERMINED
-        return found, ""
+            self._is_incomplete = True
+        return found, _UNDETERMINED if self._is_incomplete else ""
 
     def _search_below(
-        self, path: tuple[int, ...], known: Sequence[Collection[int]], found: set[LssAddress]
+        self, path: tuple[int, ...], known: Sequence[Collection[int]] | None, found: set[LssAddress]
     ) -> None:
         """Find the nodes whose addresses begin with these parts. Raises _ScanMismatch."""
         part = len(path)
         self._enter(path)
-        tried = known[part] if part < len(known) else ()
-        values = [value for value in tried if self._has_match(_scan_request(value, 0, part, part))]
-        for value in values or self._find_values(path):
+        values: list[int] = []
+        first_only = known is not None and part < _SERIAL_PART
+        if known is not None and first_only:
+            values = [value for value in known[part] if self._has_match(_scan_request(value, 0, part, part))]
+        values = values or self._find_values(path, first_only)
+        if not values:
+            self._is_incomplete = True
+            self._record_mismatch()
+        for value in values:
             if part < _SERIAL_PART:
                 self._search_below((*path, value), known, found)
             else:
@@ -207,8 +219,10 @@ class LssMaster:
         ):
             self._record_mismatch()
 
-    def _find_values(self, path: tuple[int, ...], prefix: int = 0, bit: int = 31) -> list[int]:
-        """Return the values of the part after `path` that begin with these bits, in order.
+    def _find_values(
+        self, path: tuple[int, ...], first_only: bool, prefix: int = 0, bit: int = 31
+    ) -> list[int]:
+        """Return the values of the part after `path` that begin with these bits, or the smallest one.
 
         Raises _ScanMismatch.
         """
@@ -218,7 +232,9 @@ class LssMaster:
             for value in (prefix, prefix | 1 << bit):
                 if not self._has_match(_scan_request(value, bit, part, part)):
                     continue
-                values += self._find_values(path, value, bit - 1) if bit else [value]
+                values += self._find_values(path, first_only, value, bit - 1) if bit else [value]
+                if first_only and values:
+                    break
                 if not bit and part == _SERIAL_PART and self._answers_contradiction():
                     self._confirm_waiting()  # some nodes are selected by their serial number already
                     self._enter(path)
