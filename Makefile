@@ -31,6 +31,11 @@ $(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python
 	@$(PIP) install --no-compile -c requirements.lock -e '.[dev]'
 	@touch $(VENV)/.run $(VENV)/.view $@
 
+# sources that Cython compiles; a run without a compiler is slower, and says so
+CORE := $(wildcard src/handtouch/core/stages/*.py src/handtouch/core/stages/*.pxd) src/handtouch/core/build.py
+$(VENV)/.core: $(CORE) | $(VENV)/.dev
+	@$(BIN)/python -m handtouch.core.build && touch $@ || test "$(CI)" != true
+
 $(VENV)/.view: pyproject.toml requirements.lock | $(VENV)/.run
 	@echo "installing packages for joints and meshes in the view ..."
 	@$(PIP) install --no-compile -c requirements.lock -e '.[view]'
@@ -38,7 +43,7 @@ $(VENV)/.view: pyproject.toml requirements.lock | $(VENV)/.run
 
 .PHONY: install dev
 install: $(VENV)/.run ## install the packages for a robot into .venv
-dev: $(VENV)/.dev ## install the packages for development into .venv
+dev: $(VENV)/.dev $(VENV)/.core ## install the packages for development into .venv
 
 # --- use
 
@@ -70,13 +75,13 @@ docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are error
 tables: $(VENV)/.dev ## write the tables of docs/wire.md and docs/wire.schema.json from the code
 	$(BIN)/python -m handtouch.wire.tables docs
 
-unit: $(VENV)/.dev ## run all tests that need no SocketCAN
+unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
 	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 coverage: $(VENV)/.dev ## run them with a report of lines not covered; slower
 	@$(MAKE) --no-print-directory unit ARGS="--cov --cov-report=term:skip-covered $(ARGS)"
 
-socketcan: $(VENV)/.dev ## run the tests on SocketCAN; skipped without it, which fails CI
+socketcan: $(VENV)/.dev $(VENV)/.core ## run the tests on SocketCAN; skipped without it, which fails CI
 	@marked=$$(grep -rl --include='*.py' 'mark\.socketcan' tests); \
 	tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $$marked $(ARGS); status=$$?; \
 	if [ $$status -eq 77 ] && [ "$(CI)" != true ]; then echo "SocketCAN tests SKIPPED, see the reason above"; exit 0; \
@@ -88,7 +93,7 @@ socketcan: $(VENV)/.dev ## run the tests on SocketCAN; skipped without it, which
 bench: ## run the benchmarks: errors, latency, load
 soak: ## run the endurance tests
 stress: ## run sweeps that are too slow for the tests
-bench soak stress: $(VENV)/.dev
+bench soak stress: $(VENV)/.dev $(VENV)/.core
 	@set -e; for program in benchmarks/$@_$(ONLY).py; do \
 		test -e "$$program" || { echo "there is no $$program"; exit 1; }; \
 		echo "== $$program"; PYTHONPATH=. $(BIN)/python "$$program" $(ARGS); done
@@ -110,7 +115,7 @@ schema: $(VENV)/.run ## write config/handtouch.schema.json from the models of th
 
 dist: $(VENV)/.dev ## build the wheel and the source archive
 	rm -rf dist
-	$(BIN)/python -m build --no-isolation
+	HANDTOUCH_REQUIRE_COMPILED=1 $(BIN)/python -m build --no-isolation
 
 clean: ## remove build results and .venv
 	rm -rf $(VENV) dist build .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -118,6 +118,7 @@ class Loop:
             ticks=self.pipeline.ticks,
             overruns=0,
             rate_hz=RATE_HZ,
+            core_compiled=True,
             tick_us={},
             loop={},
             contacts=self.pipeline.tick.contacts.begun_count,

@@ -73,9 +73,7 @@ def test_a_benchmarks_pipeline_computes_what_the_daemons_does(tmp_path: Path) ->
         cycles = [(p.cycle.period_ns, p.cycle.window_ns) for p in (own, theirs)]
         own.node_state[:] = PadState.CLEAR
         every = np.ones(own.model.size, np.bool_)
-        outputs = RequestedOutputs(
-            every, every, np.zeros(every.size), np.ones(every.size, np.int64), ~every, ~every
-        )
+        outputs = RequestedOutputs(every, every, np.ones(every.size, np.int64), ~every, ~every)
         own.apply_demand(outputs)
         results = press(own), press(theirs)
     finally:

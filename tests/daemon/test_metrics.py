@@ -36,7 +36,8 @@ def service(**changes: object) -> wire.Service:
     values = {
         "v": 1, "session": 1, "seq": 1, "t_ns": 1, "wall_offset_ns": 0, "version": "1.2", "pid": 7,
         "uptime_s": 60.5, "period_s": 0.005, "hands": {"left": ["thumb_tip"]}, "ticks": 12_000, "overruns": 2,
-        "rate_hz": 199.5, "tick_us": {}, "loop": StageTimer(0).statistics(), "contacts": 17,
+        "rate_hz": 199.5, "core_compiled": True, "tick_us": {}, "loop": StageTimer(0).statistics(),
+        "contacts": 17,
         "rejected": {"no_key": 3, "request": 1}, "buses": {"can0": BUS}, "congestion_episodes": {"live": 9},
         "process": {
             "memory_bytes": 10**8, "cpu_s": 3.5, "loop_cpu_s": 3.0, "collections": [100, 10, 1],

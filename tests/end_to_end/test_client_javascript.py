@@ -149,7 +149,14 @@ def _service(seq: int, session: int = 1, retained: bool = False) -> wire.Service
         for name in ("hands", "tick_us", "loop", "rejected", "process", "buses", "congestion_episodes")
     }
     values |= {"v": 1, "session": session, "seq": seq, "t_ns": 2**62 + seq, "wall_offset_ns": -(2**60)}
-    values |= {"version": "x", "uptime_s": 1.0, "period_s": 0.1, "rate_hz": 0.0, "subscriptions": ()}
+    values |= {
+        "version": "x",
+        "uptime_s": 1.0,
+        "period_s": 0.1,
+        "rate_hz": 0.0,
+        "core_compiled": True,
+        "subscriptions": (),
+    }
     values |= {"inputs": {}, "supervisor": None}
     return wire.Service(**{**values, "retained": retained})
 

@@ -117,7 +117,7 @@ def service(seq: int, t_ns: int, session: int = SESSION) -> list[bytes]:
     message = wire.Service(
         v=wire.SCHEMA_VERSION, session=session, seq=seq, t_ns=t_ns, wall_offset_ns=WALL_NS, version="0",
         pid=1, uptime_s=1.0, period_s=5e-3, hands={"h": ["plane", "round"]}, ticks=1, overruns=0,
-        rate_hz=200.0, tick_us={}, loop={}, contacts=0, rejected={}, process={}, buses={},
+        rate_hz=200.0, core_compiled=True, tick_us={}, loop={}, contacts=0, rejected={}, process={}, buses={},
         congestion_episodes={"complete": 0},
         subscriptions=(), retained=False,
     )  # fmt: skip

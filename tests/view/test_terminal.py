@@ -84,6 +84,7 @@ SERVICE = wire.Service(
     ticks=600,
     overruns=0,
     rate_hz=200.0,
+    core_compiled=True,
     tick_us={"p50": 250.0, "p99": 400.0, "max": 500.0},
     buses={"can0": {"load": 0.43}},
     congestion_episodes={},

@@ -73,6 +73,10 @@ def _print_daemon(service: dict[str, Any], console: Console) -> None:
         f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
         + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
     )
+    if not service["core_compiled"]:
+        console.print(
+            "core: uncompiled, some fifty times slower per contact; `handtouch doctor` names the remedy"
+        )
     episodes = _counts_text(service["congestion_episodes"])
     console.print(
         f"congestion episodes: {episodes}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"

@@ -31,6 +31,7 @@ from handtouch.canbus.nodes.master import Master
 from handtouch.canbus.nodes.spec import NodeSpec, node_specs
 from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
+from handtouch.core.compiled import Compilation
 from handtouch.core.cycle import BusyPoll
 from handtouch.core.gravity import GravityTracker
 from handtouch.core.pad_model import PadModel
@@ -220,6 +221,9 @@ class HandtouchDaemon:
         if self.supervisor is not None:
             self.supervisor.start(time.monotonic_ns())
         self.master.start(time.monotonic_ns())
+        compilation = Compilation.current()
+        if not compilation.compiled:
+            _log.warning("core: uncompiled, some fifty times slower per contact: %s", compilation.reason)
         gc.collect()
         gc.freeze()
         try:

@@ -23,6 +23,7 @@ from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master
 from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent
 from handtouch.config import Deployment
+from handtouch.core.compiled import Compilation
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.pad_explanation import explain_pad_state
 from handtouch.daemon.publisher import Publisher
@@ -102,6 +103,7 @@ class StatusReporter:
         self._sample_rate_window = _RateWindow(self._started_ns, np.zeros(n, dtype=np.int64))
         self._published_this_period = 0  # pads are published in turn, as all at once would delay a tick
         self._seq: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
+        self._core_compiled = Compilation.current().compiled
         self._service_seq = 0
         self._service_window = _RateWindow(self._started_ns, self._totals())
         self._sample_rate_hz = np.zeros(n)
@@ -315,6 +317,7 @@ class StatusReporter:
             ticks=self._pipeline.ticks,
             overruns=self._sync.overruns,
             rate_hz=self._rates_hz.get("ticks", 0.0),
+            core_compiled=self._core_compiled,
             tick_us=self._tick_us,
             loop=self.stage_timer.statistics(),
             contacts=self._pipeline.tick.contacts.begun_count,

@@ -23,6 +23,7 @@ import zmq
 from handtouch import config
 from handtouch.canbus.bus.receivers import RECEIVE_BUFFER_BYTES
 from handtouch.client import keys
+from handtouch.core.compiled import Compilation
 from handtouch.host import realtime
 from handtouch.host.machine import Machine
 
@@ -47,6 +48,7 @@ def check_host(deployment: config.Deployment | None, machine: Machine | None = N
     """Yield the results of all checks."""
     machine = machine or Machine()
     yield from check_python()
+    yield check_core()
     yield from check_clock(machine)
     yield from check_receive_buffer(machine)
     for bus in deployment.buses if deployment else ():
@@ -107,6 +109,15 @@ def check_python() -> Iterator[HostCheck]:
         )
     else:
         yield HostCheck("packages", "ok", ", ".join(found))
+
+
+def check_core() -> HostCheck:
+    """Check that the stages of the core are compiled."""
+    state = Compilation.current()
+    if state.compiled:
+        return HostCheck("core", "ok", "compiled")
+    why, _, remedy = state.reason.partition("; ")
+    return HostCheck("core", "warn", f"uncompiled, some fifty times slower per contact: {why}", remedy)
 
 
 def check_clock(machine: Machine) -> Iterator[HostCheck]:

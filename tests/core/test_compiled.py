@@ -1,0 +1,67 @@
+"""The stages give the same bits compiled and interpreted, and compiled ones belong to their sources."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from handtouch.core.compiled import DISABLE_VARIABLE, Compilation
+
+ROOT = Path(__file__).parents[2]
+STATE = "from handtouch.core.compiled import Compilation; from handtouch.core.stages import solve; \
+print(Compilation.current().compiled, solve.__file__.endswith('.so'), Compilation.current().reason)"
+
+needs_compiled = pytest.mark.skipif(
+    not Compilation.current().compiled and os.environ.get("CI") != "true",
+    reason=f"the stages are not compiled: {Compilation.current().reason}",
+)
+
+
+def run(*arguments: str, source: Path = ROOT / "src", **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run Python on a source tree."""
+    variables = {key: value for key, value in os.environ.items() if key != DISABLE_VARIABLE}
+    variables |= {"PYTHONPATH": f"{source}{os.pathsep}{ROOT}", **environment}
+    return subprocess.run(
+        [sys.executable, *arguments], env=variables, capture_output=True, text=True, check=False, timeout=200
+    )
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """A copy of the sources, with the compiled stages."""
+    shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path / "src"
+
+
+@needs_compiled
+def test_compiled_and_interpreted_stages_give_the_same_bits() -> None:
+    program = str(Path(__file__).with_name("solve_many.py"))
+    compiled, interpreted = run(program, "1000"), run(program, "1000", HANDTOUCH_UNCOMPILED="1")
+    kinds, digests = zip(*(out.stdout.split() for out in (compiled, interpreted)), strict=True)
+    assert kinds == ("compiled", "interpreted")
+    assert digests[0] == digests[1]
+
+
+@needs_compiled
+def test_stages_compiled_from_other_sources_are_refused(copied: Path) -> None:
+    assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
+    with (copied / "handtouch/core/stages/locate.py").open("a") as file:
+        file.write("# edited\n")
+    compiled, used, *reason = run("-c", STATE, source=copied).stdout.split()
+    assert (compiled, used) == ("False", "False")
+    assert "of other sources" in " ".join(reason)
+
+
+def test_a_build_without_a_compiler_names_the_package_to_install(copied: Path) -> None:
+    shutil.rmtree(copied / "handtouch/core/stages/_compiled", ignore_errors=True)
+    failed = run("-m", "handtouch.core.build", source=copied, PATH="/nowhere", CC="")
+    assert failed.returncode == 1
+    assert "apt-get install build-essential" in failed.stderr
+    compiled, used, *reason = run("-c", STATE, source=copied).stdout.split()
+    assert (compiled, used) == ("False", "False")
+    assert "never compiled" in " ".join(reason)
