@@ -76,7 +76,7 @@ def page(every: dict[str, dict[str, Any]]) -> str:
         "several at once on different nodes;\neach lasts a random time and is removed. The daemon runs in "
         "its own process; a client checks\n`health` and `service`. Times are "
         "those of the messages, after the fault began and after it was removed;\ncounters that "
-        "are published once a second (`missed_samples`, `emergencies`) or twice (`service`) are reported no "
+        "are published once a second (`missed_samples`) or twice (`service`) are reported no "
         "sooner. A node has\nrecovered when it is operational and its samples are valid.\n\nDuring every "
         "fault: no node without a fault changes its state, no untouched pad reports a contact.\n\n"
         "A busy machine pauses nodes and daemon. Reports while a fault-free node sent nothing\n"
