@@ -23,6 +23,9 @@ WAVE_PERIODS_S: Final = (30.0, 120.0, 480.0, 1920.0, 7680.0, 30720.0)
 """Periods of the waves of a random walk, spaced like its spectrum."""
 
 _MAX_SLOPE = 3.0  # slope of a wave of amplitude 1 and period 1: a smoothstep from -1 to 1
+_MAX_TIMES_AT_ONCE = 4096
+_PERIODS_S = np.array(WAVE_PERIODS_S)
+_AMPLITUDES = np.sqrt(_PERIODS_S) / (_MAX_SLOPE * (_PERIODS_S**-0.5).sum())
 
 
 def stream_key(seed: int, *names: str) -> np.uint64:
@@ -41,15 +44,20 @@ def random_walk(keys: KeyArray, times_s: ArrayLike) -> FloatArray:
     They are sums of waves of `WAVE_PERIODS_S` with amplitudes proportional to the root of the period.
     """
     t = np.atleast_1d(np.asarray(times_s, np.float64))
-    scale = 1 / (_MAX_SLOPE * sum(period**-0.5 for period in WAVE_PERIODS_S))
-    walk = np.zeros((len(keys), len(t)))
-    for number, period in enumerate(WAVE_PERIODS_S):
-        phase = t / period
-        before = np.floor(phase)
-        part = smoothstep_array(phase - before)
-        first = (before.astype(np.int64) << 4) + number
-        low, high = (2 * _uniform(keys[:, None], counter) - 1 for counter in (first, first + (1 << 4)))
-        walk += scale * math.sqrt(period) * (low + part * (high - low))
+    chunks = np.array_split(t, max(math.ceil(len(t) / _MAX_TIMES_AT_ONCE), 1))
+    return np.concatenate([_sum_waves(keys, chunk) for chunk in chunks], axis=1)
+
+
+def _sum_waves(keys: KeyArray, times_s: FloatArray) -> FloatArray:
+    phase = times_s / _PERIODS_S[:, None]
+    before = np.floor(phase)
+    first = (before.astype(np.int64) << 4) + np.arange(len(_PERIODS_S))[:, None]
+    ends = 2 * _uniform(keys[:, None, None, None], np.stack([first, first + (1 << 4)])) - 1
+    low, high = ends[:, 0], ends[:, 1]
+    waves = low + smoothstep_array(phase - before) * (high - low)
+    walk = np.zeros((len(keys), len(times_s)))
+    for number, amplitude in enumerate(_AMPLITUDES.tolist()):  # in this order for any number of times
+        walk += amplitude * waves[:, number]
     return walk
 
 
