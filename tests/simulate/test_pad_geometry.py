@@ -49,3 +49,29 @@ def test_point_above_a_surface_projects_to_its_foot(table: SurfaceTable) -> None
         np.testing.assert_allclose(foot.fraction[0], (x, y), atol=1e-7)
         np.testing.assert_allclose(foot.height_m, 1e-3, atol=1e-8)
         np.testing.assert_allclose(foot.normal[0], shape.normal(s, phi), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", SURFACE_TABLES)
+def test_resized_pads_are_longer_and_wider_about_their_middle(kind: str) -> None:
+    shape = simulated_surface(SURFACE_TABLES[kind])
+    resized = shape.resized(0.4e-3, -0.3e-3)
+    assert resized.length_m - shape.length_m == pytest.approx(0.4e-3, rel=1e-6)
+    middles = [it.length_m / 2 for it in (shape, resized)]
+    widths = [it.arc * float(it.radius(middle)) for it, middle in zip((shape, resized), middles, strict=True)]
+    assert widths[1] - widths[0] == pytest.approx(-0.3e-3, rel=1e-6)
+    for it, middle in zip((shape, resized), middles, strict=True):
+        np.testing.assert_allclose(it.point(middle, it.arc / 2), 0, atol=1e-12)
+        np.testing.assert_allclose(it.normal(middle, it.arc / 2), [0.0, 0.0, 1.0], atol=1e-9)
+    for x in (0.1, 0.4, 0.8):  # points of equal distance from the middle stay where they are
+        s = x * shape.length_m
+        moved = resized.point(s + 0.2e-3, resized.arc / 2)
+        tolerance = 1e-9 if kind != "revolution" else 3e-4  # similar to the old one, not the same
+        np.testing.assert_allclose(moved, shape.point(s, shape.arc / 2), atol=tolerance)
+    assert shape.resized(0.0, 0.0) == shape
+
+
+def test_resized_profiles_keep_their_length_as_curves() -> None:
+    resized = simulated_surface(SURFACE_TABLES["revolution"]).resized(0.5e-3, 0.0)
+    s = np.linspace(0.0, resized.length_m, 4001)
+    points = np.array([resized.point(at, resized.arc / 2) for at in s.tolist()])
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(resized.length_m, rel=1e-6)

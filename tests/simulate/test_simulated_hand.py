@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -14,14 +15,14 @@ import pytest
 
 from handtouch import config
 from handtouch.canbus.bus.port import BusError
-from handtouch.cli.simulate import run
+from handtouch.cli.simulate import run, run_command
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import simulated_hand
 from handtouch.simulate import truth as truth_file
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS
+from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, Fixed, world_with
 
 IDEAL = WORLDS["ideal"].draw(2)
 SESSION = """
@@ -261,6 +262,30 @@ def test_simulate_exit_status_for_each_mistake(
     paths = {key: files / value if isinstance(value, str) else value for key, value in arguments.items()}
     assert run(**paths, stop=threading.Event(), seconds=0.05) == status  # type: ignore[arg-type]
     assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("world", ["ideal", "default", "harsh"])
+def test_simulate_runs_in_every_world(files: Path, world: str) -> None:
+    config_path, scenario = files / "hand.toml", files / "session.toml"
+    options = {"sheet": None, "drift": False, "seconds": 0.05, "stop": threading.Event()}
+    assert run_command(config_path, scenario=scenario, world=world, seed=3, **options) == 0  # type: ignore[arg-type]
+
+
+def test_gripper_has_no_sheet_behaviour(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = {"seed": 1, "drift": False, "world": "default", "gripper": "tcp://127.0.0.1:*"}
+    assert run_command(files / "hand.toml", sheet="S1", **options) == 2  # type: ignore[arg-type]
+    assert "--gripper excludes --sheet" in capsys.readouterr().err
+
+
+def test_sheet_and_drift_act_on_an_ideal_world_as_in_the_default_one() -> None:
+    ideal, default = WORLDS["ideal"], WORLDS["default"]
+    assert world_with(ideal) == ideal
+    world = world_with(ideal, sheet="S2", drift=True)
+    assert world.parts == ideal.parts
+    assert world.sheets.tuning_kinds == world.sheets.reporting_kinds == (SHEET_KINDS["S2"],)
+    assert world.sheets.parameter_ratio == default.sheets.parameter_ratio
+    assert world.electronics == replace(default.electronics, noise_ratio=Fixed(1.0))
+    assert world_with(default, drift=True) == default
 
 
 def test_replaced_node_has_new_serial_number_and_boots_once(deployment: config.Deployment) -> None:

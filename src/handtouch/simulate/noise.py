@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -44,21 +45,39 @@ def random_walk(keys: KeyArray, times_s: ArrayLike) -> FloatArray:
     They are sums of waves of `WAVE_PERIODS_S` with amplitudes proportional to the root of the period.
     """
     t = np.atleast_1d(np.asarray(times_s, np.float64))
-    chunks = np.array_split(t, max(math.ceil(len(t) / _MAX_TIMES_AT_ONCE), 1))
+    if len(t) <= _MAX_TIMES_AT_ONCE:
+        return _sum_waves(keys, t)
+    chunks = np.array_split(t, math.ceil(len(t) / _MAX_TIMES_AT_ONCE))
     return np.concatenate([_sum_waves(keys, chunk) for chunk in chunks], axis=1)
 
 
 def _sum_waves(keys: KeyArray, times_s: FloatArray) -> FloatArray:
     phase = times_s / _PERIODS_S[:, None]
     before = np.floor(phase)
-    first = (before.astype(np.int64) << 4) + np.arange(len(_PERIODS_S))[:, None]
-    ends = 2 * _uniform(keys[:, None, None, None], np.stack([first, first + (1 << 4)])) - 1
+    numbers = before.astype(np.int64)
+    ends = (
+        _wave_ends_at(keys.tobytes(), tuple(numbers[:, 0].tolist()))
+        if len(times_s) == 1
+        else _wave_ends(keys, numbers)
+    )
     low, high = ends[:, 0], ends[:, 1]
     waves = low + smoothstep_array(phase - before) * (high - low)
     walk = np.zeros((len(keys), len(times_s)))
     for number, amplitude in enumerate(_AMPLITUDES.tolist()):  # in this order for any number of times
         walk += amplitude * waves[:, number]
     return walk
+
+
+def _wave_ends(keys: KeyArray, numbers: NDArray[np.int64]) -> FloatArray:
+    """Return the values (keys, 2, periods, times) of waves at both ends of a period, by its number."""
+    first = (numbers << 4) + np.arange(len(_PERIODS_S))[:, None]
+    return 2 * _uniform(keys[:, None, None, None], np.stack([first, first + (1 << 4)])) - 1
+
+
+@lru_cache(maxsize=4096)
+def _wave_ends_at(keys: bytes, numbers: tuple[int, ...]) -> FloatArray:
+    """Return `_wave_ends` at one time: a live hand needs the same ones for half a minute."""
+    return _wave_ends(np.frombuffer(keys, np.uint64), np.array(numbers)[:, None])
 
 
 def _uniform(keys: ArrayLike, counters: ArrayLike) -> FloatArray:
