@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -259,6 +261,73 @@ def test_subscription_flood_is_closed_and_disturbs_no_other_subscriber(publisher
         assert publisher.subscriptions == {b"health/", b"service"}
         assert other.lost_messages == 0
         assert publisher.refused["unknown_topic"] < 5000
+
+
+FLOOD_WITH_HEARTBEATS = """
+import contextlib, socket, sys, threading, time
+import zmq
+from handtouch import wire
+from handtouch.daemon.publisher import Publisher
+
+greeting = b"\\xff" + bytes(8) + b"\\x7f\\x03\\x01" + b"NULL".ljust(20, b"\\0") + b"\\0" + bytes(31)
+ready = b"\\x04\\x19\\x05READY\\x0bSocket-Type\\0\\0\\0\\x03SUB"
+ping = b"\\x04\\x07\\x04PING\\0\\0"
+flood = (b"\\0\\x05\\x01none" + ping) * 5000
+
+def attack(port):
+    while True:
+        with socket.create_connection(("127.0.0.1", port)) as connection, contextlib.suppress(OSError):
+            connection.sendall(greeting + ready)
+            connection.recv(92, socket.MSG_WAITALL)  # the daemon's greeting and READY
+            connection.sendall(flood)
+            while connection.recv(1000):
+                pass
+
+with zmq.Context() as context:
+    topics = wire.topics_of({"h": ["x"]})
+    publisher = Publisher.open(context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", topics)
+    port = int(publisher.endpoints["live"].rpartition(":")[2])
+    threading.Thread(target=attack, args=(port,), daemon=True).start()
+    end_s = time.monotonic() + 30
+    while publisher.refused["subscription_flood"] < 20 and time.monotonic() < end_s:
+        publisher.poll_subscriptions(time.monotonic_ns())
+        time.sleep(0.001)
+    print(publisher.refused["subscription_flood"])
+    publisher.close()
+    sys.stdout.flush()
+    import os; os._exit(0)
+"""
+
+
+def test_closing_a_flooding_connection_with_heartbeats_does_not_abort_the_daemon() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FLOOD_WITH_HEARTBEATS], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stdout) == (0, "20\n"), done.stderr
+
+
+STALLED_READER = """
+import sys, time
+from handtouch.client import connect
+
+with connect("health/*/*", endpoint=sys.argv[1], queue=1) as reader:
+    assert reader.recv(60) is not None
+    time.sleep(4)
+    for _ in range(20):
+        assert reader.recv(60) is not None
+"""
+
+
+def test_reader_survives_a_pause_with_a_full_queue(publisher: Publisher) -> None:
+    command = [sys.executable, "-c", STALLED_READER, publisher.endpoints["live"]]
+    with subprocess.Popen(command) as reader:
+        seq = 0
+        while reader.poll() is None:
+            CLOCK.poll(publisher)
+            seq += 1
+            publisher.send(_health(publisher, "thumb", "x" * 50_000, seq))
+            time.sleep(0.001)
+    assert reader.returncode == 0
 
 
 def test_subscriber_that_subscribes_over_and_over_is_closed(publisher: Publisher) -> None:

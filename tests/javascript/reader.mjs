@@ -122,7 +122,8 @@ function print(value) {
 
 const [endpoint, ...topics] = process.argv.slice(2);
 const subscribed = (topic) => topics.some((t) => (t.endsWith("/") ? topic.startsWith(t) : topic === t));
-const socket = new Subscriber({ receiveHighWaterMark: 100_000, linger: 0, heartbeatInterval: 500 });
+const keepalive = { tcpKeepalive: 1, tcpKeepaliveIdle: 1, tcpKeepaliveInterval: 1, tcpKeepaliveCount: 2 };
+const socket = new Subscriber({ receiveHighWaterMark: 100_000, linger: 0, ...keepalive });
 socket.connect(endpoint);
 socket.subscribe(...topics, "service");
 

@@ -19,6 +19,7 @@ from zmq.utils import z85
 from zmq.utils.monitor import recv_monitor_message
 
 from handtouch.client import keys
+from handtouch.client.connection import KEEPALIVE_OPTIONS
 from handtouch.daemon.cause_counter import CauseCounter
 from handtouch.daemon.connections import client_key_of, close_connection, connection_of
 from handtouch.daemon.endpoints import is_readable
@@ -40,6 +41,8 @@ _CLIENT_FILES_PERIOD_NS = 1_000_000_000
 _MAX_HANDSHAKES_PER_POLL = 2
 _MAX_EVENTS_PER_POLL = 100
 _NO_DESCRIPTOR_LEFT = (errno.EMFILE, errno.ENFILE)  # this says nothing about the clients
+_MAX_UNACKNOWLEDGED_MS = 10_000
+"""Time after which a connection is closed whose peer takes no data"""
 _HANDSHAKE_TIMEOUT_MS = 5000
 """A connection that isn't authenticated by then is closed."""
 _MAX_MESSAGE_BYTES = {"read": 1024, "control": 200_000, "inputs": 65_536}
@@ -106,6 +109,8 @@ class Authenticator:
         socket.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_TIMEOUT_MS)
         if not endpoint.startswith("tcp://"):
             return
+        for option, value in {**KEEPALIVE_OPTIONS, zmq.TCP_MAXRT: _MAX_UNACKNOWLEDGED_MS}.items():
+            socket.setsockopt(option, value)
         # with a domain, ZeroMQ refuses the protocol before ZMTP 3, as which it would accept any bytes
         socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
         if self._folder is None:

@@ -6,10 +6,15 @@ Public names: `connection_of`, `client_key_of`, `close_connection`.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import socket
+import struct
 
 import zmq
+
+_SO_ATTACH_FILTER = 26  # not in Python's module
+_ACCEPT_NOTHING = struct.pack("HBBI", 0x06, 0, 0, 0)  # socket filter: return 0 bytes of every packet
 
 
 def connection_of(frame: zmq.Frame) -> int:
@@ -31,18 +36,35 @@ def client_key_of(frame: zmq.Frame) -> str | None:
 def close_connection(descriptor: int, endpoint: str) -> bool:
     """Close a connection to an endpoint as if its client had left; return False if it is closed already.
 
-    ZeroMQ can't disconnect a peer, so the connection is shut down below it: ZeroMQ then ends it as any other
-    that breaks. Meanwhile the descriptor may be another's: what isn't a connection to this endpoint is left
-    alone, and another client of this endpoint reconnects within milliseconds.
+    ZeroMQ can't disconnect a peer, so the receiving side is shut down below it: ZeroMQ reads what is there,
+    and then the end. Meanwhile the descriptor may be another's: what isn't a connection to this endpoint is
+    left alone, and another client of this endpoint reconnects within milliseconds.
     """
     with (
         contextlib.suppress(OSError),
         socket.fromfd(descriptor, socket.AF_INET, socket.SOCK_STREAM) as connection,
     ):
-        if _is_of_endpoint(connection.getsockname(), endpoint):
-            connection.shutdown(socket.SHUT_RDWR)
+        address = connection.getsockname()
+        if _is_of_endpoint(address, endpoint):
+            if isinstance(address, tuple):
+                _drop_packets(connection)
+            connection.shutdown(socket.SHUT_RD)
             return True
     return False
+
+
+def _drop_packets(connection: socket.socket) -> None:
+    """Make the kernel drop whatever a TCP connection receives from now on.
+
+    Linux would go on receiving after a shutdown. A shutdown of both sides, or a reset, must not be seen by
+    ZeroMQ while it waits for the hot thread to take subscriptions: a heartbeat among them would abort it
+    (zeromq/libzmq issue 4364).
+    """
+    instructions = ctypes.create_string_buffer(_ACCEPT_NOTHING)
+    program = struct.pack("@HP", 1, ctypes.addressof(instructions))
+    connection.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
+    # the peer's answer to an orderly end would be dropped, too: reset the connection when ZeroMQ closes it
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 def _is_of_endpoint(address: object, endpoint: str) -> bool:

@@ -85,7 +85,7 @@ class ControlServer:
     requests. Jobs have places of their own, so quick commands never wait for them.
 
     `commands` and `jobs` (name -> command), `refused` (number of requests that were malformed, unknown or
-    refused). `clock` returns the time [ns] by which the work on requests is measured.
+    refused). `clock` returns the CPU time [ns] of this thread, by which the work on requests is measured.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class ControlServer:
         authenticator: Authenticator,
         commands: Mapping[str, Command] | None = None,
         jobs: Mapping[str, JobCommand] | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
+        clock: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self.endpoint = endpoint
         self.commands: dict[str, Command] = dict(commands or {})
@@ -113,7 +113,7 @@ class ControlServer:
         context: zmq.Context[zmq.Socket[bytes]],
         endpoint: str,
         authenticator: Authenticator | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
+        clock: Callable[[], int] = time.thread_time_ns,
     ) -> ControlServer:
         """Bind the endpoint. Raises OSError naming it and a remedy."""
         authenticator = authenticator or Authenticator(context)

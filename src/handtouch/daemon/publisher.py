@@ -101,8 +101,6 @@ class Publisher:
             socket.setsockopt(zmq.LINGER, 200)  # the ends of contacts are still sent at shutdown
             socket.setsockopt(zmq.XPUB_NODROP, 1)
             socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # every new subscriber gets the retained messages
-            socket.setsockopt(zmq.HEARTBEAT_IVL, 500)
-            socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1500)
             try:
                 endpoints[stream] = bind_endpoint(
                     socket, endpoint, f"the {stream} stream", authenticator, "read"
