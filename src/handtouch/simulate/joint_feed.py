@@ -23,14 +23,14 @@ _logger = logging.getLogger(__name__)
 class JointFeed:
     """Sends the joint states of every hand with a URDF, from `start` until `close`.
 
-    `trajectory` returns the motion of a hand's joints, or None; `scenario_time_s` is the time in the
+    `trajectory` returns the reported motion of a hand's joints, or None; `scenario_time_s` is the time in the
     scenario. If the daemon rejects the connection, that is logged once and the thread ends.
     """
 
     def __init__(
         self,
         deployment: Deployment,
-        trajectory: Callable[[urdf.RobotDescription], JointTrajectory | None],
+        trajectory: Callable[[str, urdf.RobotDescription], JointTrajectory | None],
         scenario_time_s: Callable[[], float],
         endpoint: str,
         key: Path | str | None = None,
@@ -39,7 +39,7 @@ class JointFeed:
         self._hands = [
             (hand, joints)
             for hand in deployment.hands
-            if hand.urdf and (joints := trajectory(urdf.read_urdf(Path(hand.urdf))))
+            if hand.urdf and (joints := trajectory(hand.name, urdf.read_urdf(Path(hand.urdf))))
         ]
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="simulated-joints", daemon=True)

@@ -1,6 +1,6 @@
 """Joint motion of a scenario: smooth trajectories of the joints of a URDF.
 
-Public names: `JointMotion` (`[[joint]]`), `ScenarioJoints` (a `JointTrajectory`).
+Public names: `JointMotion` (`[[joint]]`), `ScenarioJoints` and `ReportedJoints` (each a `JointTrajectory`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,12 @@ from pydantic import Field
 from handtouch.config.base import Table
 from handtouch.config.tables import Positive
 from handtouch.hand import urdf
+from handtouch.simulate import noise
 from handtouch.simulate.smoothstep import smoothstep
+from handtouch.simulate.stimulus import JointTrajectory
+from handtouch.simulate.worlds import DrawnWorld
+
+_ROTARY_TYPES = tuple(kind for kind in urdf.MOVABLE_JOINT_TYPES if kind != "prismatic")
 
 
 class JointMotion(Table):
@@ -56,4 +61,28 @@ class ScenarioJoints:
             begun = [motion for motion in motions if motion.from_s <= t_s] or motions[:1]
             position = begun[-1].position_at(t_s) if begun else 0.0
             positions[joint.name] = position * 1e-3 if joint.kind == "prismatic" else math.radians(position)
+        return positions
+
+
+class ReportedJoints:
+    """Joint positions as the encoders of a hand report them; prismatic joints are reported exactly."""
+
+    def __init__(
+        self, true: JointTrajectory, robot: urdf.RobotDescription, world: DrawnWorld, hand: str
+    ) -> None:
+        self._true = true
+        self._names = sorted(name for name, joint in robot.joints.items() if joint.kind in _ROTARY_TYPES)
+        self._errors = world.joints(hand, len(self._names))
+        self._keys = [noise.stream_key(world.seed, "encoder", hand, name) for name in self._names]
+
+    def positions_at(self, t_s: float) -> dict[str, float]:
+        """Return the reported positions at `t_s` [rad or m]."""
+        errors = self._errors
+        positions = dict(self._true.positions_at(max(t_s - errors.delay_s, 0.0)))
+        readings = errors.noise_deg * noise.standard_normal(self._keys, round(t_s * 1e9))
+        for name, offset_deg, noise_deg in zip(
+            self._names, errors.offset_deg, readings.tolist(), strict=True
+        ):
+            if name in positions:
+                positions[name] += math.radians(offset_deg + noise_deg)
         return positions

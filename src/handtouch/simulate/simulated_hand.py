@@ -21,10 +21,12 @@ from handtouch import config
 from handtouch.canbus.bus.port import open_bus
 from handtouch.config.channels import ELECTRODES, parse_object, resolve_channels
 from handtouch.device import Device, DeviceBus
+from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.gripper_service import GripperService
 from handtouch.simulate.joint_feed import JointFeed
-from handtouch.simulate.stimulus import Stimulus
+from handtouch.simulate.joints import ReportedJoints
+from handtouch.simulate.stimulus import JointTrajectory, Stimulus
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import DrawnWorld
@@ -57,9 +59,13 @@ class SimulatedHand:
     """
 
     def __init__(
-        self, buses: Sequence[_SimulatedBus], clock: ScenarioClock, resources: contextlib.ExitStack
+        self,
+        buses: Sequence[_SimulatedBus],
+        world: DrawnWorld,
+        clock: ScenarioClock,
+        resources: contextlib.ExitStack,
     ) -> None:
-        self._buses, self._clock, self._resources = buses, clock, resources
+        self._buses, self._world, self._clock, self._resources = buses, world, clock, resources
         self.devices: dict[str, Device] = {
             name: device for bus in buses for name, device in bus.devices.items()
         }
@@ -89,7 +95,7 @@ class SimulatedHand:
                 simulated.append(
                     _SimulatedBus(deployment, bus.name, port, virtual_hand, clock, record, stimulus)
                 )
-            return cls(simulated, clock, resources.pop_all())
+            return cls(simulated, world, clock, resources.pop_all())
 
     def start(self) -> None:
         """Switch on every node."""
@@ -105,7 +111,11 @@ class SimulatedHand:
             t_s = self._clock.elapsed_s(time.monotonic_ns())
             return t_s % stimulus.duration_s if stimulus.repeat else t_s
 
-        feed = JointFeed(deployment, stimulus.joint_trajectory, scenario_time_s, endpoint)
+        def reported(hand: str, robot: RobotDescription) -> JointTrajectory | None:
+            true = stimulus.joint_trajectory(robot)
+            return ReportedJoints(true, robot, self._world, hand) if true else None
+
+        feed = JointFeed(deployment, reported, scenario_time_s, endpoint)
         feed.start()
         self._resources.callback(feed.close)
 

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 from handtouch import config
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
-from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
+from handtouch.simulate.grasp.grasp_stimulus import GraspStimulus
 from handtouch.simulate.grasp.patches import contact_patches
 from handtouch.simulate.grasp.simulation import GraspRecord, simulate_grasp
 from handtouch.simulate.worlds import DrawnWorld
@@ -37,5 +37,4 @@ def grasp_stimulus(
     if object_name not in GRASP_OBJECTS:
         raise ValueError(f"--grasp {object_name}: unknown object; known: {', '.join(GRASP_OBJECTS)}")
     grasp = simulate_grasp(deployment.hands[0], object_name, world.seed, world)
-    encoders = EncoderErrors.of_world(world, grasp)
-    return GraspStimulus.from_grasp(grasp, contact_patches(grasp), encoders, repeat=repeat)
+    return GraspStimulus.from_grasp(grasp, contact_patches(grasp), repeat=repeat)
