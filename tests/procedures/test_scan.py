@@ -483,6 +483,14 @@ def test_nodes_that_do_not_compare_lss_requests_all_get_ids_in_one_scan(
     assert {address.serial for address in report.unconfigured} == set(serials)
 
 
+def test_unconfigured_nodes_with_one_identity_get_no_id_and_are_reported_once(wire: VirtualBus) -> None:
+    _, made = unconfigured(wire, [8, 9, 8])
+    (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=1, listen_s=0.05))
+    assert [each.lss.node_id for each in made] == [None, 1, None]
+    (problem,) = report.problems
+    assert "serial 8: several nodes respond" in problem
+
+
 def test_an_unconfigured_node_with_the_identity_of_another_gets_no_id(wire: VirtualBus) -> None:
     nodes, made = unconfigured(wire, [77, 78])
     (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=1, listen_s=0.05))

@@ -182,7 +182,7 @@ def _find_unconfigured(
             lambda: all(survey.traffic.boot_up_counts.get(i, 0) > boots.get(i, 0) for i in new),
         )
         report.nodes += survey.read_nodes(sorted(survey.probe_ids(sorted(new))))
-    report.problems += [f"{name}: LSS: {problem}" for problem in problems]
+    report.problems += [f"{name}: LSS: {problem}" for problem in dict.fromkeys(problems)]
 
 
 class _Assignment:
