@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -326,3 +330,22 @@ def test_storing_gains_keeps_parts_stored_before(tmp_path: Path) -> None:
     assert stored is not None
     assert (stored.calibration.gains, stored.calibration.law) == (later, law)
     client.close()
+
+
+@pytest.mark.skipif(os.geteuid() == 0 and not shutil.which("setpriv"), reason="root may write everywhere")
+def test_store_that_can_only_be_read_is_reported_when_it_is_opened(tmp_path: Path) -> None:
+    script = f"""
+import datetime
+from pathlib import Path
+from handtouch.calibration.store_client import StoreClient
+client = StoreClient(Path({str(tmp_path / "c.db")!r}))
+client.changed(datetime.datetime.now(datetime.UTC))
+print(client.error)
+"""
+    Store(tmp_path / "c.db").close()
+    (tmp_path / "c.db").chmod(0o444)
+    for folder in (tmp_path, *tmp_path.parents[:2]):
+        folder.chmod(0o755)
+    user = ["setpriv", "--reuid=65534", "--clear-groups"] if os.geteuid() == 0 else []
+    done = subprocess.run([*user, sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert "calibrations are read, but new ones are not kept" in done.stdout, done.stderr

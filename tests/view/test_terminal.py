@@ -296,3 +296,5 @@ def test_status_shows_diagnoses_the_supervisor_and_the_store(capsys: pytest.Capt
     assert "EMCY 0x5000 device hardware" in printed
     assert "0x2310" not in printed  # cleared
     assert not status.is_ok({"state": "clear", "calibration_state": "quarantined"})
+    assert not status.is_all_ok(answer | {"pads": []})
+    assert status.is_all_ok({"service": {"supervisor": figures | {"store_error": ""}}, "pads": []})

@@ -6,6 +6,7 @@ Public: `StoreClient`, `MountingPoint`. Without a store, nodes are calibrated al
 from __future__ import annotations
 
 import logging
+import os
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -121,8 +122,21 @@ class StoreClient:
             return default
 
     def _open(self) -> tuple[Store, str]:
+        """Return the store, and a problem that leaves it usable."""
         try:
-            return Store(self._path), ""
+            return Store(self._path), self._write_problem()
         except DamagedStoreError as damage:
             _log.error("%s", damage)
             return Store(self._path), str(damage)  # a new one; the damaged file was moved aside
+
+    def _write_problem(self) -> str:
+        """Return why the store or its folder, for the journal, can't be written; empty if they can."""
+        for path in (self._path, self._path.absolute().parent):
+            if not os.access(path, os.W_OK):
+                problem = (
+                    f"{path} can't be written by user {os.geteuid()}: calibrations are read, but new ones "
+                    "are not kept; change its owner or mode, or the file system's"
+                )
+                _log.error("calibration store: %s", problem)
+                return problem
+        return ""

@@ -32,7 +32,7 @@ _COLUMNS: tuple[tuple[str, bool, Callable[[dict[str, Any]], str]], ...] = (
 
 
 def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bool = False) -> int:
-    """Print the status; exit status 0 (all pads ok), 1 (not all, or no daemon), 2 (usage)."""
+    """Print the status; exit status 0 (pads and store ok), 1 (not all, or no daemon), 2 (usage)."""
     try:
         answer = request("status", endpoint=endpoint, key=key)
     except (OSError, RuntimeError) as error:
@@ -45,7 +45,13 @@ def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bo
         print(json.dumps(answer, indent=2))
     else:
         print_status(answer, Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH_COLUMNS))
-    return 0 if all(map(is_ok, answer["pads"])) else 1
+    return 0 if is_all_ok(answer) else 1
+
+
+def is_all_ok(answer: dict[str, Any]) -> bool:
+    """Return True if all pads are ok, and calibrations can be stored."""
+    supervisor = answer["service"].get("supervisor") or {}
+    return all(map(is_ok, answer["pads"])) and not supervisor.get("store_error")
 
 
 def is_ok(pad: dict[str, Any]) -> bool:
