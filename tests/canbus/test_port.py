@@ -532,13 +532,13 @@ from handtouch.core.slab import Slab
 from handtouch.config import Bus
 receivers.RECEIVE_BUFFER_BYTES = 1  # the kernel's least: a few frames
 port = Port.open(Bus(name="palm", interface="udp_multicast", channel="239.74.163.3"), Slab(1))
-stranger = can.Bus(interface="udp_multicast", channel="239.74.163.3")
+other = can.Bus(interface="udp_multicast", channel="239.74.163.3")
 for number in range(200):
-    stranger.send(can.Message(arbitration_id=0x701, data=bytes(8), is_extended_id=False))
+    other.send(can.Message(arbitration_id=0x701, data=bytes(8), is_extended_id=False))
 port.drain()
 c = port.counters
 assert 0 < c.frames < 200 and c.overflow == 200 - c.frames, c
-port.close(); stranger.shutdown()
+port.close(); other.shutdown()
 """
 
 
@@ -557,10 +557,10 @@ from handtouch.config import Bus
 bus = Bus(name="palm", interface="udp_multicast", channel="239.74.163.2")
 port = Port.open(bus, Slab(1))
 port.route(0x281, 0)
-stranger = can.Bus(interface="udp_multicast", channel="239.74.163.2")
-stranger.send(can.Message(arbitration_id=0x281, data=b"\\x01\\x00" * 4, is_extended_id=False))
-stranger._multicast.send(b"no such thing as a frame")
-stranger.send(can.Message(arbitration_id=0x281, data=b"\\x02\\x00" * 4, is_extended_id=False))
+other = can.Bus(interface="udp_multicast", channel="239.74.163.2")
+other.send(can.Message(arbitration_id=0x281, data=b"\\x01\\x00" * 4, is_extended_id=False))
+other._multicast.send(b"no such thing as a frame")
+other.send(can.Message(arbitration_id=0x281, data=b"\\x02\\x00" * 4, is_extended_id=False))
 port.send(0x80, b"")
 others = []
 deadline = time.monotonic() + 5
@@ -571,7 +571,7 @@ assert port.slab.unpack_counts()[0].tolist() == [2] * 4, port.slab.unpack_counts
 assert 0 <= time.monotonic_ns() - port.slab.arrival_ns[0] < 10**9
 c = port.counters
 assert (c.samples, c.receive_failures, c.sent, c.bits) == (2, 1, 1, 135 + 135 + 55), c
-port.close(); stranger.shutdown()
+port.close(); other.shutdown()
 """
 
 

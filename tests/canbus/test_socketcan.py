@@ -146,9 +146,9 @@ def test_error_frames_are_reported_as_text(port: Port) -> None:
 
 
 def test_remote_frame_is_sent_as_one(port: Port) -> None:
-    with can.Bus(interface="socketcan", channel="vcan0") as stranger:
+    with can.Bus(interface="socketcan", channel="vcan0") as other:
         assert port.send(0x701, bytes(1), remote=True)
-        got = stranger.recv(2.0)
+        got = other.recv(2.0)
     assert got is not None
     assert (got.arbitration_id, got.is_remote_frame, got.dlc, got.data) == (0x701, True, 1, bytearray())
 
@@ -167,31 +167,31 @@ def produce(sync: Sync, port: Port, seconds: float) -> int:
     return cycles
 
 
-def syncs_of(stranger: can.BusABC) -> int:
+def syncs_of(other: can.BusABC) -> int:
     count = 0
-    while (message := stranger.recv(0)) is not None:
+    while (message := other.recv(0)) is not None:
         count += message.arbitration_id == 0x80
     return count
 
 
 def test_kernel_sends_sync_at_changing_periods_and_stops(port: Port) -> None:
     sync = Sync([port], 20_000_000)
-    with can.Bus(interface="socketcan", channel="vcan0") as stranger:
+    with can.Bus(interface="socketcan", channel="vcan0") as other:
         sync.start(time.monotonic_ns())
         for period_ns, seconds in ((20_000_000, 1.0), (100_000_000, 2.0), (20_000_000, 1.0)):
             sync.set_period(period_ns, time.monotonic_ns())
             cycles = produce(sync, port, seconds)
             expected = seconds * 1e9 / period_ns
             assert expected / 2 < cycles < expected + 3
-            assert expected / 2 < syncs_of(stranger) < expected + 3
+            assert expected / 2 < syncs_of(other) < expected + 3
         assert sync.report("palm", time.monotonic_ns())["by"] == "kernel"
         assert port.counters.sent == 0  # by the loop
         assert sync.report("palm", time.monotonic_ns())["other_syncs"] == 0
         assert sync.report("palm", time.monotonic_ns())["jitter_us"]["p50"] < 20_000
         sync.stop()
-        syncs_of(stranger)
+        syncs_of(other)
         time.sleep(0.1)  # long enough for five more
-        assert syncs_of(stranger) == 0
+        assert syncs_of(other) == 0
 
 
 def test_loop_takes_over_while_the_interface_is_missing_and_one_sender_is_left(port: Port) -> None:
@@ -207,9 +207,9 @@ def test_loop_takes_over_while_the_interface_is_missing_and_one_sender_is_left(p
     finally:
         run("ip link add vcan0 type vcan && ip link set vcan0 up")
     produce(sync, port, 6.5)
-    with can.Bus(interface="socketcan", channel="vcan0") as stranger:
+    with can.Bus(interface="socketcan", channel="vcan0") as other:
         produce(sync, port, 1.0)
-        assert 25 < syncs_of(stranger) < 54
+        assert 25 < syncs_of(other) < 54
     assert sync.report("palm", time.monotonic_ns())["by"] == "kernel"
     assert sync.report("palm", time.monotonic_ns())["other_syncs"] == 0
     sync.stop()

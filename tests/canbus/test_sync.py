@@ -88,7 +88,7 @@ class Rig:
         self.sync.start(T0)
 
     def run(self, seconds: float, step_ns: int = 100_000, foreign_ns: int = 0) -> None:
-        """Let time pass; a stranger may send SYNC on the first bus with a period of its own."""
+        """Let time pass; another producer may send SYNC on the first bus with a period of its own."""
         end_ns = self.now_ns + round(seconds * 1e9)
         next_foreign_ns = self.now_ns + foreign_ns // 3
         while self.now_ns < end_ns:

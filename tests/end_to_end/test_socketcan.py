@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.socketcan, pytest.mark.timeout(240)]
 
 
 def _record(rig: Any, seconds: float) -> list[can.Message]:
-    """What candump, as a stranger, sees on the bus."""
+    """Return what candump sees on the bus."""
     log = Path(rig.folder) / "session.log"
     with log.open("w") as file:
         candump = subprocess.Popen([shutil.which("candump") or "candump", "-L", "vcan0"], stdout=file)

@@ -331,8 +331,8 @@ class HandtouchDaemon:
         self.master.excuse_pause(paused_ns, now_ns)
         self.pipeline.tick.excuse_pause(paused_ns)
         if paused_ns > _LOGGED_PAUSE_NS:
-            text = "the loop was late by %.0f ms; timeouts of nodes and pads are extended by that time"
-            _log.warning(text, paused_ns * 1e-6)
+            late_ms = (paused_ns + self.sync.period_ns) * 1e-6
+            _log.warning("the loop was late by %.0f ms; timeouts of nodes and pads are extended", late_ms)
 
     def _apply_demand(
         self, requested: RequestedOutputs, needs: SceneRequirements, enabled: NDArray[np.bool_], now_ns: int

@@ -102,7 +102,7 @@ class Router:
         self.bus_state.handle_error_frame(can_id, data, arrival_ns, counters.frames, counters.sent)
 
     def handle_remote_frame(self, can_id: int) -> None:
-        """Count a remote frame: a node-guarding request (our own echo on some buses) or a foreign frame."""
+        """Count a remote frame: a node-guarding request (our own echo on some buses), or an unknown frame."""
         counters = self.counters
         if can_id in _GUARDING_IDS:
             counters.frames += 1

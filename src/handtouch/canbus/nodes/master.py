@@ -155,7 +155,7 @@ class Master:
         self.poll(now_ns)
 
     def handle_frame(self, bus_name: str, can_id: int, data: bytes, now_ns: int) -> None:
-        """Handle a frame that isn't a sample; one that no configured node sends is counted as foreign.
+        """Handle a frame that isn't a sample; one that no configured node sends counts as unknown.
 
         Before `start` and after `stop` frames are only counted.
         """
@@ -173,7 +173,7 @@ class Master:
         """Extend all timeouts by a pause of the loop or the whole host; before its frames are handled."""
         reference_ns = np.maximum(self._slab.arrival_ns, self.transmission_since_ns)
         np.add(reference_ns, excused_ns, out=self.transmission_since_ns)
-        self._bus_causes.record_pause(excused_ns, now_ns)
+        self._bus_causes.record_pause(excused_ns + self._sync_period_ns, now_ns)
         for node in self._nodes:
             self._advance(node, LoopPaused(excused_ns), now_ns)
         self._next_due_ns = now_ns

@@ -1,0 +1,482 @@
+"""A hand beside a second master, floods, pauses and an interface that goes down: no healthy node is lost.
+
+On the host: 15 simulated nodes, master and SYNC on an injected bus with the program's own clock, --hours of
+it. Under `tests/socketcan/vcan-run`: daemon and nodes as processes on vcan0, --minutes of real time. One act
+follows another, each with a time to recover. A node may leave OPERATIONAL only where another master commanded
+it, and be lost only while the interface is down, with the bus as the reason; after each act all nodes must be
+operational again. Writes docs/benchmarks/soak_peers.{md,json}; exit status 1 if a promise is broken.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import json
+import os
+import platform
+import random
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, ClassVar
+
+import can
+import numpy as np
+from bench_receive_path import VCAN
+from numpy.typing import NDArray
+from page import made_by, options, output_folder
+
+from handtouch.canbus import cia301
+from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
+from handtouch.canbus.bus.loop_pause import LoopPause
+from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.router import CanFrame, Router
+from handtouch.canbus.bus.sync import Sync
+from handtouch.canbus.nodes import master as master_module
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import NodeEvent, NodeSpec
+from handtouch.canbus.objects import sdo
+from handtouch.client import connect, request
+from handtouch.config import Bus, shipped
+from handtouch.core.slab import Slab
+from handtouch.device import DeviceBus
+
+MS, SECOND = 1_000_000, 1_000_000_000
+NODES = range(1, 16)
+PERIOD_NS, STEP_NS = 10 * MS, 5 * MS
+RECOVERY_S = 10.0
+WORKER_POLL_S = 0.0001
+ACTS = ("nmt", "sync", "sdo", "flood", "emcy", "short", "pause", "down", "nothing")
+COMMANDS = (cia301.STOP_NODE, cia301.ENTER_PREOPERATIONAL, cia301.RESET_COMMUNICATION, cia301.RESET_NODE)
+GUEST_PERIOD_MS, GUEST_HEARTBEAT_TIMEOUT_MS = 50, 1000
+ACCUSED = ("absent", "faulted")
+NO_PROCESSOR = re.compile("as from every pad of bus|no sample for three SYNC|no answer within|no SYNC on bus")
+"""Reasons that the guest's one processor causes: simulated nodes that don't get it are late all together."""
+
+
+class Verdicts:
+    """Counts acts and node events, and keeps what must not happen."""
+
+    def __init__(self, one_processor: bool) -> None:
+        self.one_processor = one_processor
+        self.starved: Counter[str] = Counter()  # events of nodes without processor time, by act
+        self.acts: Counter[str] = Counter()
+        self.left: Counter[str] = Counter()  # nodes that left OPERATIONAL, by act
+        self.broken: list[str] = []
+
+    def judge(self, act: str, node: str, old: str, new: str, reason: str) -> None:
+        """Judge a node's event during an act or its recovery."""
+        if old == "operational" != new:
+            self.left[act] += 1
+        if self.one_processor and NO_PROCESSOR.search(reason):
+            self.starved[act] += 1
+            return
+        blamed = act == "down" and (new == "absent" or old == "absent") and "bus can" in reason
+        if (new in ACCUSED and not blamed) or (act not in ("nmt", "down") and new != "operational"):
+            self.broken.append(f"{act}: {node}: {old} -> {new}: {reason}")
+
+    def figures(self, length: str, seconds: float) -> dict[str, Any]:
+        """Return the figures of a run."""
+        return {
+            "length": length,
+            "seconds": round(seconds),
+            "acts": dict(self.acts),
+            "left_operational": dict(self.left),
+            "starved": dict(self.starved),
+            "broken": self.broken[:20],
+            "machine": f"{os.environ.get('VCAN_RUN', 'host')}, {platform.machine()}, {os.cpu_count()} cores",
+        }
+
+
+class InjectedBus:
+    """A bus in this thread: python-can's to `DeviceBus`, a receiver to `Port`."""
+
+    def __init__(self, clock: Callable[[], int]) -> None:
+        self.fault: BusFault | None = None
+        self.backlog_ns: int | None = None
+        self.is_down = False
+        self.devices: DeviceBus | None = None
+        self._clock = clock
+        self._waiting: deque[tuple[can.Message, int]] = deque()
+
+    def recv(self, timeout: float | None = None) -> None:
+        """Return nothing: frames are passed to the devices when they are sent."""
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def send_cyclically(self, *_: object) -> None:
+        """No cyclic sender."""
+
+    def drain(self, router: Router) -> list[CanFrame]:
+        frames = [router.accept_message(*self._waiting.popleft()) for _ in range(len(self._waiting))]
+        if self.is_down:
+            self.fault = fault_from_exception(OSError(errno.ENETDOWN, "Network is down"))
+        return [frame for frame in frames if frame is not None]
+
+    def send(self, *frame: Any) -> None:
+        """Send a message of a device, or identifier, data and remote flag of the port."""
+        if len(frame) == 1:
+            message = frame[0]
+            if not self.is_down:
+                copy = can.Message(
+                    arbitration_id=message.arbitration_id, data=bytes(message.data), is_extended_id=False
+                )
+                self._waiting.append((copy, self._clock()))
+            return
+        if self.is_down:
+            raise OSError(errno.ENETDOWN, "Network is down")
+        can_id, data, remote = frame
+        self.inject_to_devices(can_id, data, remote)
+
+    def inject_to_devices(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Pass a frame to the devices only."""
+        assert self.devices is not None
+        self.devices.handle_frame(
+            can.Message(arbitration_id=can_id, data=data, is_remote_frame=remote, is_extended_id=False),
+            self._clock(),
+        )
+
+    def inject(self, can_id: int, data: bytes) -> None:
+        """Send a frame of another device to all."""
+        if not self.is_down:
+            self.inject_to_devices(can_id, data)
+            self._waiting.append(
+                (can.Message(arbitration_id=can_id, data=data, is_extended_id=False), self._clock())
+            )
+
+
+class CountedWorkers(ThreadPoolExecutor):
+    """The master's worker threads; the injected clock stands still while they are busy."""
+
+    steps: ClassVar[set[Future[Any]]] = set()
+
+    def submit(self, *call: Any, **options: Any) -> Future[Any]:
+        """Submit a step and remember it until it has ended."""
+        step = super().submit(*call, **options)
+        self.steps.add(step)
+        step.add_done_callback(self.steps.discard)
+        return step
+
+
+class InjectedHand:
+    """15 nodes, master and SYNC on an injected bus and clock, and the daemon's order of work."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1000 * SECOND
+        self.bus = InjectedBus(lambda: self.now_ns)
+        counts = np.tile(np.array([10, 20, 30, 40], dtype=np.int64), (len(NODES), 1))
+        self.bus.devices = self.devices = DeviceBus(self.bus, _sampler(counts), clock=lambda: self.now_ns)  # type: ignore[arg-type]
+        for number in NODES:
+            self.devices.add(number, serial=100 + number)
+        slab = Slab(len(NODES))
+        port = Port(Bus(name="can", interface="virtual", channel="soak"), self.bus, slab)
+        specs = [NodeSpec(slot=n - 1, bus="can", node_id=n, name=f"pad{n}") for n in NODES]
+        self.port, self.slab = port, slab
+        self.sync = Sync([port], PERIOD_NS)
+        self.master = Master({"can": port}, specs, PERIOD_NS)
+        self._pause = LoopPause(PERIOD_NS)
+        for device in self.devices.devices.values():
+            device.plug()
+        self.sync.start(self.now_ns)
+        self.master.start(self.now_ns)
+
+    @property
+    def is_operational(self) -> bool:
+        """True if all nodes are."""
+        return bool((self.master.states == NodeState.OPERATIONAL).all())
+
+    def run(self, seconds: float, during: Callable[[], None] = lambda: None) -> Iterator[NodeEvent]:
+        """Run for a time, with something in every step; yield the nodes' events."""
+        for _ in range(round(seconds * SECOND / STEP_NS)):
+            during()
+            self._pause.begin_wait(self.now_ns)
+            self._pass_time(STEP_NS)
+            yield from self._work(self.now_ns)
+
+    def pause(self, seconds: float) -> Iterator[NodeEvent]:
+        """Stop the loop while the nodes go on."""
+        self._pause.begin_wait(self.now_ns)
+        wake_ns = self.now_ns + STEP_NS
+        for _ in range(round(seconds * SECOND / STEP_NS)):
+            self._pass_time(STEP_NS)
+        yield from self._work(wake_ns)
+
+    def _pass_time(self, step_ns: int) -> None:
+        self.now_ns += step_ns
+        self.devices.advance(self.now_ns)
+
+    def _work(self, wake_ns: int) -> Iterator[NodeEvent]:
+        if paused_ns := self._pause.end_wait(wake_ns, self.now_ns):
+            self.sync.excuse_pause(paused_ns)
+            self.master.excuse_pause(paused_ns, self.now_ns)
+        self._receive()
+        self._pause.end_receive(self.now_ns)
+        for sync_ns in self.sync.poll(self.now_ns, self.now_ns):
+            self.slab.begin_cycle(sync_ns)
+        self.port.update_state(self.now_ns)
+        self.master.poll(self.now_ns)
+        while CountedWorkers.steps:
+            time.sleep(WORKER_POLL_S)
+            self._receive()
+        self.master.poll(self.now_ns)
+        yield from (e for e in self.master.drain_events() if isinstance(e, NodeEvent))
+
+    def _receive(self) -> None:
+        for can_id, data, arrival_ns in self.port.drain():
+            if can_id == cia301.SYNC:
+                self.sync.handle_sync("can", arrival_ns)
+            else:
+                self.master.handle_frame("can", can_id, data, arrival_ns)
+
+
+def _sampler(counts: NDArray[np.int64]) -> Callable[[int], NDArray[np.int64]]:
+    return lambda _: counts
+
+
+def injected(hours: float) -> dict[str, Any]:
+    """Run the acts for so many hours of the injected clock."""
+    master_module.ThreadPoolExecutor = CountedWorkers  # type: ignore[attr-defined]
+    sdo.SDO_TIMEOUT_S = 0.05  # of real time, while the injected clock stands still
+    hand, verdicts, generator = InjectedHand(), Verdicts(one_processor=False), random.Random(1)
+    list(hand.run(2.0))
+    assert hand.is_operational, hand.master.status()
+    began_s, end_ns = time.monotonic(), hand.now_ns + round(hours * 3600 * SECOND)
+    for act in itertools.cycle(ACTS):
+        if hand.now_ns >= end_ns:
+            break
+        verdicts.acts[act] += 1
+        events = itertools.chain(_act_injected(hand, act, generator), hand.run(RECOVERY_S))
+        for event in events:
+            old, new = event.old_state.name.lower(), event.new_state.name.lower()
+            if old != new:
+                verdicts.judge(act, f"node {event.slot + 1}", old, new, event.reason)
+        if not hand.is_operational:
+            verdicts.broken.append(f"{act}: not operational after {RECOVERY_S} s")
+    hand.master.stop(hand.now_ns)
+    return verdicts.figures(f"{hours:g} h, injected clock", time.monotonic() - began_s)
+
+
+def _act_injected(hand: InjectedHand, act: str, generator: random.Random) -> Iterator[NodeEvent]:
+    bus, choose = hand.bus, generator.choice
+    if act == "nmt":
+        bus.inject(cia301.NMT, bytes((choose(COMMANDS), choose((0, *NODES)))))
+        return iter(())
+    if act == "pause":
+        return hand.pause(choose((0.3, 0.6, 2.0)))
+    if act == "down":
+        return _down(hand, generator.uniform(0.1, 5.0))
+
+    def send() -> None:
+        match act:
+            case "sync":
+                bus.inject(cia301.SYNC, b"")
+            case "sdo":
+                bus.inject_to_devices(cia301.SDO_REQUEST + choose(NODES), b"\x40\x18\x10\x01" + bytes(4))
+            case "flood":
+                for _ in range(40):
+                    bus.inject(generator.choice(FOREIGN_IDS), generator.randbytes(generator.randrange(9)))
+            case "emcy":
+                bus.inject(cia301.EMCY + choose(NODES), b"\x00\x10\x00" + bytes(5))
+            case "short":
+                bus.inject(choose((0x80, 0x280, 0x580, 0x700)) + choose(NODES), generator.randbytes(2))
+
+    return hand.run(5.0, send)
+
+
+FOREIGN_IDS = [
+    can_id
+    for can_id in range(1, 0x780)
+    if can_id not in (cia301.SYNC, cia301.TIME) and can_id & 0x7F not in NODES
+]
+"""Identifiers that no node of the hand and no command has."""
+
+
+def _down(hand: InjectedHand, seconds: float) -> Iterator[NodeEvent]:
+    hand.bus.is_down = True
+    yield from hand.run(seconds)
+    hand.bus.is_down = False
+
+
+def socketcan(minutes: float) -> dict[str, Any]:
+    """Run the acts on vcan0 for so many minutes, against the daemon's own process."""
+    verdicts, generator = Verdicts(one_processor=True), random.Random(1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        config = _guest_deployment(folder)
+        with (folder / "run.txt").open("w") as output:
+            words = [str(config), "--bus", "can0=socketcan:vcan0"]
+            nodes = subprocess.Popen([sys.executable, "-m", "handtouch", "simulate", *words], stdout=output)
+            daemon = subprocess.Popen([sys.executable, "-m", "handtouch", "run", *words], stderr=output)
+            try:
+                return _run_guest(folder, daemon, verdicts, generator, minutes)
+            finally:
+                for process in (daemon, nodes):
+                    process.terminate()
+                    process.wait()
+                log = (folder / "run.txt").read_text()
+                print("\n".join(re.findall(r"^(?:WARNING|ERROR) (?!handtouch.loop).*", log, re.M)[-40:]))
+
+
+def _guest_deployment(folder: Path) -> Path:
+    endpoints = "\n".join(
+        f'{stream} = "ipc://{folder}/{stream}"' for stream in ("live", "complete", "control", "inputs")
+    )
+    text = shipped.path("utah_mit.toml").read_text()
+    text = text.replace("[daemon]\n", f"[daemon]\n{endpoints}\nsupervise = false\n")
+    text = re.sub(r"sync_period_ms = [\d.]+", f"sync_period_ms = {GUEST_PERIOD_MS}", text)
+    timeout = f"heartbeat_timeout_ms = {GUEST_HEARTBEAT_TIMEOUT_MS}"
+    (folder / "hand.toml").write_text(re.sub(r"heartbeat_timeout_ms = \d+", timeout, text))
+    return folder / "hand.toml"
+
+
+def _run_guest(
+    folder: Path,
+    daemon: subprocess.Popen[bytes],
+    verdicts: Verdicts,
+    generator: random.Random,
+    minutes: float,
+) -> dict[str, Any]:
+    endpoint = f"ipc://{folder}/control"
+    pads = _wait_operational(endpoint, 120.0)
+    ids = [pad["node_id"] for pad in pads]
+    states = {pad["link"]: pad["node_state"] for pad in pads}
+    began_s = time.monotonic()
+    with (
+        connect("health/*/*", endpoint=f"ipc://{folder}/live", queue=100_000) as health,
+        can.Bus(interface="socketcan", channel="vcan0") as other,
+    ):
+        for act in itertools.cycle(ACTS):
+            if time.monotonic() - began_s > 60 * minutes:
+                break
+            verdicts.acts[act] += 1
+            _act_guest(act, daemon, other, ids, generator)
+            end_s = time.monotonic() + 3.0
+            while time.monotonic() < end_s or not all(s == "operational" for s in states.values()):
+                if time.monotonic() > end_s + 60:
+                    verdicts.broken.append(f"{act}: not operational after a minute: {states}")
+                    break
+                if (message := health.recv(0.2)) is None:
+                    continue
+                old, states[message.link] = states[message.link], message.node_state
+                if old != message.node_state:
+                    verdicts.judge(act, message.link, old, message.node_state, message.reason)
+    return verdicts.figures(f"{minutes:g} min, vcan0", time.monotonic() - began_s)
+
+
+def _act_guest(
+    act: str,
+    daemon: subprocess.Popen[bytes],
+    other: can.BusABC,
+    ids: list[int],
+    generator: random.Random,
+) -> None:
+    def cangen(*words: str) -> None:
+        subprocess.run(["cangen", "vcan0", *words], check=True, timeout=60)
+
+    def send(can_id: int, data: bytes) -> None:
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        try:
+            other.send(message, timeout=5)
+        except can.CanOperationError:  # the socket's error of an interface that was down is reported once
+            other.send(message, timeout=5)
+
+    match act:
+        case "nmt":
+            send(cia301.NMT, bytes((generator.choice(COMMANDS), generator.choice((0, *ids)))))
+        case "sync":
+            cangen("-g", "70", "-n", "50", "-I", "80", "-L", "0")
+        case "sdo":
+            for node_id in ids * 3:
+                send(cia301.SDO_REQUEST + node_id, b"\x40\x18\x10\x01" + bytes(4))
+        case "flood":
+            cangen("-g", "1", "-n", "3000", "-I", "37F", "-L", "8")
+        case "emcy":
+            for _ in range(300):
+                send(cia301.EMCY + generator.choice(ids), b"\x00\x10\x00" + bytes(5))
+        case "short":
+            for _ in range(300):
+                base = generator.choice((0x80, 0x280, 0x580, 0x700))
+                send(base + generator.choice(ids), generator.randbytes(2))
+        case "pause":
+            daemon.send_signal(signal.SIGSTOP)
+            time.sleep(generator.choice((0.3, 0.6, 2.0)))
+            daemon.send_signal(signal.SIGCONT)
+        case "down":
+            subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+            time.sleep(generator.uniform(0.1, 5.0))
+            subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+
+
+def _wait_operational(endpoint: str, seconds: float) -> list[dict[str, Any]]:
+    end_s = time.monotonic() + seconds
+    while True:
+        pads: list[dict[str, Any]] = []
+        with contextlib.suppress(TimeoutError):
+            pads = request("status", endpoint=endpoint, timeout_s=10)["pads"]
+        if pads and all(pad["node_state"] == "operational" for pad in pads):
+            return pads
+        if time.monotonic() > end_s:
+            raise TimeoutError(f"not operational: {[pad['reason'] for pad in pads]}")
+        time.sleep(0.2)
+
+
+def report(name: str, figures: dict[str, Any], out: Path) -> None:
+    """Add the figures to those of earlier runs."""
+    path = out / "soak_peers.json"
+    runs: dict[str, Any] = (json.loads(path.read_text()) if path.exists() else {}) | {name: figures}
+    path.write_text(json.dumps(runs, indent=1) + "\n")
+    lines = [
+        "# A hand beside other masters, floods and failing interfaces",
+        "",
+        "Acts follow one another, each with a time to recover: NMT commands of another master (`nmt`), another",
+        "SYNC producer (`sync`), SDO client (`sdo`), unknown identifiers (`flood`), EMCY messages and frames of",
+        "wrong length of the hand's nodes (`emcy`, `short`), a pause of the host of 0.3, 0.6 or 2 s (`pause`),",
+        "an interface that is down for up to 5 s (`down`). Nodes may leave OPERATIONAL only by `nmt` and",
+        "`down`; a promise is broken by a node that is lost or faulted, that leaves it for another reason, or",
+        "that doesn't return. In the guest all processes share one processor: events of simulated nodes that",
+        "are late for want of it, known by a reason that names host or bus, are counted apart.",
+        f"{made_by()}.",
+        "",
+        "| length | duration, s | acts | left OPERATIONAL | no processor | broken promises | machine |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for run in runs.values():
+        left = ", ".join(f"{act} {count}" for act, count in run["left_operational"].items()) or "none"
+        lines.append(
+            f"| {run['length']} | {run['seconds']} | {sum(run['acts'].values())} | {left} "
+            f"| {sum(run['starved'].values())} "
+            f"| {len(run['broken'])} | {run['machine']} |"
+        )
+    (out / "soak_peers.md").write_text("\n".join(lines) + "\n")
+
+
+def main() -> int:
+    parser = options(__doc__)
+    parser.add_argument("--hours", type=float, default=2.0, help="of the injected clock (default: 2)")
+    parser.add_argument("--minutes", type=float, default=20.0, help="on vcan0 (default: 20)")
+    arguments = parser.parse_args()
+    out = output_folder(arguments.quick)
+    if VCAN.exists():
+        name, figures = "socketcan", socketcan(1.0 if arguments.quick else arguments.minutes)
+    else:
+        name, figures = "injected", injected(0.02 if arguments.quick else arguments.hours)
+    print(json.dumps(figures, indent=1))
+    report(name, figures, out)
+    return int(bool(figures["broken"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
