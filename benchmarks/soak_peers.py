@@ -363,13 +363,12 @@ def _run_guest(
                 break
             verdicts.acts[act] += 1
             _act_guest(act, daemon, other, ids, generator)
-            end_s = time.monotonic() + 3.0
-            while time.monotonic() < end_s or not all(s == "operational" for s in states.values()):
-                if time.monotonic() > end_s + 60:
-                    verdicts.broken.append(f"{act}: not operational after a minute: {states}")
-                    break
-                if (message := health.recv(0.2)) is None:
-                    continue
+            time.sleep(3.0)
+            try:
+                _wait_operational(endpoint, 60.0)
+            except TimeoutError as error:
+                verdicts.broken.append(f"{act}: {error}")
+            while (message := health.recv(0.1)) is not None:
                 old, states[message.link] = states[message.link], message.node_state
                 if old != message.node_state:
                     verdicts.judge(act, message.link, old, message.node_state, message.reason)
@@ -441,13 +440,14 @@ def report(name: str, figures: dict[str, Any], out: Path) -> None:
     lines = [
         "# A hand beside other masters, floods and failing interfaces",
         "",
-        "Acts follow one another, each with a time to recover: NMT commands of another master (`nmt`), another",
-        "SYNC producer (`sync`), SDO client (`sdo`), unknown identifiers (`flood`), EMCY messages and frames of",
-        "wrong length of the hand's nodes (`emcy`, `short`), a pause of the host of 0.3, 0.6 or 2 s (`pause`),",
-        "an interface that is down for up to 5 s (`down`). Nodes may leave OPERATIONAL only by `nmt` and",
-        "`down`; a promise is broken by a node that is lost or faulted, that leaves it for another reason, or",
-        "that doesn't return. In the guest all processes share one processor: events of simulated nodes that",
-        "are late for want of it, known by a reason that names host or bus, are counted apart.",
+        "Acts follow one another, each with a time to recover: NMT commands of another master (`nmt`),",
+        "another SYNC producer (`sync`), SDO client (`sdo`), unknown identifiers (`flood`), EMCY messages",
+        "and frames of wrong length of the hand's nodes (`emcy`, `short`), a pause of the host of 0.3,",
+        "0.6 or 2 s (`pause`), an interface that is down for up to 5 s (`down`). Nodes may leave",
+        "OPERATIONAL only by `nmt` and `down`; a promise is broken by a node that is lost or faulted,",
+        "that leaves it for another reason, or that doesn't return. In the guest all processes share one",
+        "processor: events of simulated nodes that are late for want of it, known by a reason that names",
+        "host or bus, are counted apart.",
         f"{made_by()}.",
         "",
         "| length | duration, s | acts | left OPERATIONAL | no processor | broken promises | machine |",
