@@ -207,3 +207,27 @@ def test_a_closed_subscriber_leaves_no_reader_in_the_event_loop(
 def test_the_public_names_are_listed_before_their_first_use() -> None:
     fresh = "import handtouch; assert set(handtouch.__all__) < set(dir(handtouch))"
     subprocess.run([sys.executable, "-c", fresh], check=True, timeout=60)
+
+
+SLOW = """
+import sys, time
+import handtouch
+with handtouch.connect("hand/*", endpoint=sys.argv[1], queue=10):
+    sys.stdin.readline()
+    time.sleep(1.2)
+"""
+
+
+def test_slow_subscriber_survives_the_end_of_its_daemon(publisher: Any, endpoints: dict[str, str]) -> None:
+    """Its queue is full then; with ZeroMQ's heartbeats libzmq would abort it."""
+    command = [sys.executable, "-c", SLOW, endpoints["live"]]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as slow:
+        for _ in range(2):  # its topic and `service`
+            assert publisher.poll(20_000)
+            publisher.recv()
+        for _ in range(20_000):
+            publisher.send_multipart([b"hand/h", bytes(1000)])
+        time.sleep(0.2)
+        publisher.close()
+        _, printed = slow.communicate("\n", timeout=60)
+    assert slow.returncode == 0, printed
