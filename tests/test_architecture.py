@@ -121,6 +121,17 @@ def test_a_package_imports_no_library_of_another_concern(package: str) -> None:
     assert not wrong
 
 
+def test_the_simulator_uses_none_of_the_estimators(graph: Graph) -> None:
+    """An error in either must show, and what is tuned must not change what it is tuned on."""
+    estimators = {"field", "sheet", "calibration", "core", "supervisor", "percept"}
+    wrong = [
+        f"{module}:{line} imports {other}"
+        for module, other, line in _across(graph)
+        if _package(module) == "simulate" and _package(other) in estimators
+    ]
+    assert not wrong
+
+
 def test_class_names_are_unique() -> None:
     places: dict[str, list[str]] = defaultdict(list)
     for module, path in FILES.items():

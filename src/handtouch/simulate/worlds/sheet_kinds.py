@@ -1,6 +1,8 @@
 """Kinds of sheets: nominal behaviour of a material.
 
 Public names: `SheetKind`, `SHEET_KINDS` by name. docs/worlds.md states the source of each number.
+The presets of `handtouch.sheet` repeat those of S1 and S2, so that a change of what is compensated doesn't
+change what is simulated.
 """
 
 from __future__ import annotations
@@ -9,10 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import numpy as np
-
 from handtouch.config.tables import Behaviour
-from handtouch.sheet import S1, S2, SheetModel
 from handtouch.simulate.preisach import HomogeneousLoops, PlayLoops
 from handtouch.simulate.sheet_physics import BackForces, ElementCreep, PowerCreep, SheetLaw
 
@@ -63,33 +62,19 @@ class SheetKind:
         )
 
 
-def _law_of_model(model: SheetModel) -> SheetLaw:
-    """Return the law with the parameters of a preset of one back force and elements of creep."""
-    back, creep, fluctuation = model.adaptation, model.creep, model.fluctuation
-    share, time_s, recovery_s, threshold_n, fatigue_s, wipe = (
-        float(np.asarray(value))
-        for value in (
-            back.share,
-            back.time_s,
-            back.recovery_s,
-            back.threshold_n,
-            back.fatigue_s,
-            back.wipe_fraction,
-        )
-    )
-    return SheetLaw(
-        BackForces((share,), (time_s,), recovery_s, threshold_n, fatigue_s, wipe),
-        ElementCreep(creep.instant, creep.weights, creep.times_s),
-        None,
-        model.temperature.gain_per_k,
-        model.temperature.preload_n_per_k,
-        fluctuation.press_std,
-        fluctuation.noise_std,
-        fluctuation.noise_time_s,
-    )
-
-
-_S1, _S2 = _law_of_model(S1), _law_of_model(S2)
+_HOUR_S, _GRAM_FORCE_N = 3600.0, 1 / 102
+_S1 = SheetLaw(
+    BackForces((1.0,), (3000.0,), 1.5 * _HOUR_S, 2 * _GRAM_FORCE_N, fatigue_s=10_000.0),
+    ElementCreep(0.4, (0.6,), (0.25,)),
+    gain_per_k=0.01,
+    press_std=0.072,
+    noise_std=0.01,
+)
+_S2 = replace(
+    _S1,
+    adaptation=BackForces((0.851,), (3000.0,), 1.5 * _HOUR_S, 5 * _GRAM_FORCE_N),
+    press_std=0.171,
+)
 _FSR = SheetLaw(
     BackForces(threshold_n=0.02),
     PowerCreep(0.021),
