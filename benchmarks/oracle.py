@@ -46,7 +46,11 @@ class _Hidden:
 
 
 class PadOracle:
-    """Readings of a pad as a function of contact and hidden parameters, about the true ones."""
+    """Readings of a pad as a function of contact and hidden parameters, about the true ones.
+
+    Nearer an edge than twice a contact's radius the currents are those of `ContactLaw`, whose spreading
+    resistance has a lower limit there; the simulator's are up to a quarter larger.
+    """
 
     def __init__(
         self,

@@ -1,0 +1,120 @@
+"""The oracle of benchmarks: against the simulator's own bound, and growing with what is hidden."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from oracle import OracleCovariances, PadOracle
+
+from handtouch import config
+from handtouch.config import load, shipped
+from handtouch.core.pad_model import PadModel
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.truth import GroundTruth
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.worlds import (
+    ContactSpread,
+    DrawnWorld,
+    Family,
+    Normal,
+    PartSpread,
+    Uniform,
+    World,
+)
+
+PLACES = ((0.5, 0.5), (0.2, 0.7), (0.65, 0.35))
+FORCE_N = 2.0
+
+
+@pytest.fixture(scope="module")
+def deployment() -> config.Deployment:
+    """One curved pad of the shipped hand."""
+    whole = load(shipped.path("utah_mit.toml"))
+    (hand,) = whole.hands
+    pads = tuple(pad for pad in hand.pads if pad.link == "index_distal")
+    return whole.model_copy(update={"hands": (hand.model_copy(update={"pads": pads}),)})
+
+
+def world(parts: PartSpread, contacts: ContactSpread | None = None) -> DrawnWorld:
+    made = World("of a test", parts, contacts=contacts or ContactSpread())
+    return made.draw(Family.TUNING.seed(3))
+
+
+def truths(deployment: config.Deployment, drawn: DrawnWorld) -> list[GroundTruth]:
+    touches = tuple(
+        ScenarioTouch(link="index_distal", from_s=k * 1.0, duration_s=0.9, path=(place,), force_n=(FORCE_N,))
+        for k, place in enumerate(PLACES)
+    )
+    hand = VirtualHand(deployment, Scenario(touch=touches), drawn)
+    return [truth for k in range(len(PLACES)) for truth in hand.truth(k + 0.45)]
+
+
+def covariances(
+    deployment: config.Deployment, drawn: DrawnWorld, found: list[GroundTruth], *, gains_known: bool = False
+) -> OracleCovariances:
+    ((hand, pad),) = deployment.pads
+    noise_a = PadModel(deployment).noise_a[0]
+    oracle = PadOracle.build(drawn, deployment, hand, pad, noise_a, gains_known=gains_known)
+    u, v = np.array([(truth.u_m, truth.v_m) for truth in found]).T
+    return oracle.covariances(u, v, np.full(len(found), FORCE_N))
+
+
+def test_without_hidden_quantities_it_is_the_simulators_own_bound(deployment: config.Deployment) -> None:
+    """Electrodes and sheet as configured; the bound is of finite elements, the oracle of the theory."""
+    drawn = world(PartSpread())
+    found = truths(deployment, drawn)
+    stated = covariances(deployment, drawn, found)
+    rms_m = np.sqrt(np.trace(stated.position_m2, axis1=1, axis2=2))
+    assert rms_m == pytest.approx([truth.bound_m for truth in found], rel=0.02)
+    assert np.sqrt(stated.force_n2[:, 0, 0]) == pytest.approx(stated.force_bound_n)
+
+
+def test_it_evaluates_at_the_true_parts(deployment: config.Deployment) -> None:
+    """Wider gaps on one side than the file says change the bound as in the simulator."""
+    drawn = world(PartSpread(gap_offset_mm=Uniform(0.0, 1.5)))
+    found = truths(deployment, drawn)
+    ((hand, pad),) = deployment.pads
+    known = replace(drawn, world=World("known"))
+    oracle = PadOracle(
+        pad, deployment.sheets[pad.sheet], drawn.pad(hand, pad), deployment.nodes[pad.node].drive_v,
+        PadModel(deployment).noise_a[0], {},
+    )  # fmt: skip
+    u, v = np.array([(truth.u_m, truth.v_m) for truth in found]).T
+    stated = oracle.covariances(u, v, np.full(len(found), FORCE_N))
+    rms_m = np.sqrt(np.trace(stated.position_m2, axis1=1, axis2=2))
+    assert rms_m == pytest.approx([truth.bound_m for truth in found], rel=0.02)
+    nominal = covariances(deployment, known, found)
+    assert np.abs(np.trace(nominal.position_m2, axis1=1, axis2=2) / rms_m**2 - 1).max() > 0.02
+
+
+def test_hidden_gains_widen_positions_until_they_are_known(deployment: config.Deployment) -> None:
+    drawn = world(PartSpread(gain_ratio=Uniform(0.98, 1.02)))
+    found = truths(deployment, world(PartSpread()))
+    hidden, known = (
+        np.trace(covariances(deployment, drawn, found, gains_known=known).position_m2, axis1=1, axis2=2)
+        for known in (False, True)
+    )
+    assert (hidden > 100 * known).all()
+
+
+def test_a_hidden_radius_widens_forces_up_to_what_the_contact_layer_alone_would(
+    deployment: config.Deployment,
+) -> None:
+    """Force goes with the radius to the power 2 - 2 / alpha where the layer dominates, else with less."""
+    ((_, pad),) = deployment.pads
+    sheet = deployment.sheets[pad.sheet]
+    found = truths(deployment, world(PartSpread()))
+    narrow, wide = (
+        covariances(
+            deployment, world(PartSpread(), ContactSpread(radius_sigma=Normal(0.0, std))), found
+        ).force_n2[:, 0, 0]
+        ** 0.5
+        for std in (0.1, 0.2)
+    )
+    layer_alone = (2 - 2 / sheet.alpha) * 0.1 * sheet.contact_radius_std_mm / sheet.contact_radius_mm
+    assert (narrow < 1.01 * layer_alone * FORCE_N).all()
+    assert (narrow > 0.1 * layer_alone * FORCE_N).all()
+    assert wide == pytest.approx(2 * narrow, rel=0.01)
