@@ -320,11 +320,11 @@ def main() -> None:
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.touches, asked.learnt = 1, 2, 40
-    names = (*NAMED, *SINGLE)
+    names, few = (*NAMED, *SINGLE), (asked.hands + 1) // 2
     tasks = [
         (name, number, asked.touches, asked.learnt)
         for name in names
-        for number in range(asked.hands if name in NAMED else (asked.hands + 1) // 2)
+        for number in range(asked.hands if name in NAMED else few)
     ]
     made: dict[str, list[dict[str, Estimates]]] = {name: [] for name in names}
     with ProcessPoolExecutor(asked.workers) as pool:
@@ -340,7 +340,8 @@ def main() -> None:
         "# Position and force by world", "",
         f"{made_by()}; {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}.", "",
         HEAD.format(
-            hands=asked.hands, touches=asked.touches, learnt=asked.learnt, low=FORCES_N[0], high=FORCES_N[1]
+            hands=asked.hands, few=few, touches=asked.touches, learnt=asked.learnt,
+            low=FORCES_N[0], high=FORCES_N[1],
         ), "", "![stated and observed probability](worlds.png)", "",
     ]  # fmt: skip
     (out / "worlds.md").write_text("\n".join([*head, *sections(found)]))
@@ -355,7 +356,7 @@ def main() -> None:
 
 
 HEAD = """\
-{hands} hands of each of the [worlds](../worlds.md) `ideal`, `default` and `harsh`, and half as many of worlds
+{hands} hands of each of the [worlds](../worlds.md) `ideal`, `default` and `harsh`, and {few} of each world
 with few hidden quantities; 15 pads each, of four surfaces; seeds of the reporting family. {touches} touches
 of each pad, {low:g} to {high:g} N (log-uniform), anywhere from 2 % of a side inside the edges; one sample of
 each, 0.32 s after it began. 12 touches come first, as evidence for the compensation of sheets. Deployment
