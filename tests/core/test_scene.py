@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import wire
+from handtouch.client import columns
 from handtouch.config.tables import SceneRequest
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import (
@@ -159,6 +160,28 @@ def test_nothing_is_solved_or_encoded_without_a_subscriber(bench: Any) -> None:
     rig.subscriptions = frozenset([b"hand/"])
     rig.run(3)
     assert rig.solved == {0, 1, 2}
+
+
+@pytest.mark.parametrize("released", [False, True])
+def test_a_contact_that_was_not_requested_before_is_not_computed_instead_of_invalid(
+    bench: Any, released: bool
+) -> None:
+    rig = TouchedPads(bench, SceneRequest())
+    rig.run(6)
+    rig.subscriptions = frozenset([b"contact/h/round", b"hand/"])
+    rig.demand.update(rig.t_ns)
+    retained = rig.pipeline.messages.retained_messages()
+    contact, frame = (retained[topic](rig.t_ns) for topic in ("contact/h/round", "hand/h"))
+    assert isinstance(contact, wire.Contact)
+    assert frame is not None
+    rows = columns(wire.decode(wire.encode(frame)))
+    if released:
+        rig.touched = [bytes(8)] * 3
+        contact = next(m for m in rig.run(8) if isinstance(m, wire.Contact) and m.event == "end")
+    assert (contact.position_status, contact.force_status) == ("not_computed", "not_computed")
+    assert set(rows["position_status"].tolist()) == set(rows["force_status"].tolist()) == {0}
+    if not released:
+        assert {m.position_status for m in rig.run(2) if isinstance(m, wire.Contact)} == {"valid"}
 
 
 def test_outputs_in_no_scene_are_not_computed_and_reported(bench: Any) -> None:

@@ -156,6 +156,8 @@ class TickProcessor:
         pauses"""
         self.synchronous = np.ones(model.size, dtype=np.bool_)
         """pads sampled by SYNC; the others are event-driven and not waited for"""
+        self.solved = np.zeros(model.size, dtype=np.bool_)
+        """contacts that were solved since they began and their outputs were requested"""
         self.position_requested = np.ones(model.size, dtype=np.bool_)
         """pads whose contact position is computed; see `set_requested`"""
         self.force_requested = np.ones(model.size, dtype=np.bool_)
@@ -266,6 +268,7 @@ class TickProcessor:
 
     def discard_solutions(self, pads: IntArray) -> None:
         """Discard the contact values of these pads, because what they are computed from changed."""
+        self.solved[pads] = False
         self.state_changed = True
         np.greater(self.force_requested, self.model.quarantined, out=self._estimate_force)
         self.columns.values[pads] = self._contact_rows[pads] = np.nan
@@ -301,6 +304,7 @@ class TickProcessor:
         )
         self._resolve_states(node_state, operational, implausible, stale)
         if len(began):
+            self.solved[began] = False
             columns.values[began] = np.nan  # not a starting point: it is of the contact before
             self.baseline.begin_contacts(began)
             self.sheet_force.begin_contacts(began)
@@ -396,6 +400,7 @@ class TickProcessor:
         columns = self.columns
         np.multiply(self.baseline.std, self.model.mean_ampere_per_count, out=self._offset_std_a)
         self._solver.solve_contacts(touched.data)
+        self.solved[touched] = True
         values = columns.values[touched]
         published = values[:, _PUBLISHED_VALUES]
         self._contact_rows[touched] = np.where(np.isfinite(published), published, np.nan)

@@ -133,10 +133,11 @@ class TickMessages:
         if not np.count_nonzero(touching):
             return
         located = touching & np.isfinite(columns.contact_columns["position_m"][rows, 0])
-        position[touching & tick.position_requested[rows]] = PositionStatus.INVALID
+        solved = touching & tick.solved[rows]
+        position[solved & tick.position_requested[rows]] = PositionStatus.INVALID
         position[located] = PositionStatus.VALID
         position[located & self._model.position_unreliable[rows]] = PositionStatus.UNRELIABLE
-        requested = touching & tick.force_requested[rows]
+        requested = solved & tick.force_requested[rows]
         force[requested] = ForceStatus.VALID
         force[requested & tick.is_force_unreliable(rows)] = ForceStatus.UNRELIABLE
         force[requested & columns.force_saturated[rows]] = ForceStatus.LOWER_BOUND
@@ -227,11 +228,11 @@ class TickMessages:
         if located:
             unreliable = self._model.position_unreliable[pad]
             return PositionStatus.UNRELIABLE if unreliable else PositionStatus.VALID
-        requested = self._tick.position_requested[pad]
-        return PositionStatus.INVALID if requested else PositionStatus.NOT_COMPUTED
+        failed = self._tick.position_requested[pad] and self._tick.solved[pad]
+        return PositionStatus.INVALID if failed else PositionStatus.NOT_COMPUTED
 
     def _force_status_of(self, pad: int, force_n: float | None) -> ForceStatus:
-        if not self._tick.force_requested[pad]:
+        if not (self._tick.force_requested[pad] and self._tick.solved[pad]):
             return ForceStatus.NOT_COMPUTED
         if force_n is None:
             return ForceStatus.INVALID
