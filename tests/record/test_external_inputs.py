@@ -75,3 +75,27 @@ def test_external_inputs_are_replayed_from_ticks_without_additional_states(sessi
         assert replay.result.equal == replay.result.compared == len(contacts) > 100
         assert replay.pipeline is not None
         np.testing.assert_array_equal(replay.pipeline.tick.sheet_force.log_gain, gains)
+
+
+def test_a_replay_is_exact_after_excitation_was_switched_off(tmp_path: Path) -> None:
+    deployment = parse(DEPLOYMENT.replace("[touch]", "[sheet.s.behaviour]\ngain_std = 0.2\n\n[touch]"))
+    model = PadModel(deployment)
+
+    def make(take: Callable[[list[bytes]], None]) -> Hand:
+        sink = CollectingSink(take)
+        return Hand(deployment, Pipeline(model, PERIOD_NS, 0.6, sink, SESSION), sink)
+
+    made = RecordingSession(make, tmp_path)
+    hand, press = made.hand, {0: made.hand.counts(0, 0.4, 0.3, 1e-3)}
+    for tick in range(600):
+        if tick in (250, 400):
+            hand.pipeline.tick.set_excitation(np.full(2, tick == 400))
+        hand.step(press if tick < 240 or tick > 420 else {})
+    hand.pipeline.end_session(hand.t_ns + PERIOD_NS)
+    made.recorder.finish()
+    contacts: list[wire.Contact] = []
+    replay = ExactReplay(contacts.append)
+    for entry in Recording(Path(made.paths[0])):
+        replay.process_message(entry)
+    assert replay.result.first_difference is None
+    assert replay.result.equal == replay.result.compared > 300

@@ -143,6 +143,11 @@ class SheetForceCompensation:
                 group, row = self.groups.find(pad)
                 group.compensator.reset_pads(np.array([row]))
 
+    def set_excitation(self, on: BoolArray) -> None:
+        """Set the pads (n,) whose sheet has its potential."""
+        for group in self.groups.all:
+            group.compensator.set_powered(on[group.pads])
+
     @property
     def back_force(self) -> tuple[FloatArray, FloatArray]:
         """Back force of each sheet and its standard deviation (n,) [N]; NaN where not modelled."""

@@ -234,6 +234,11 @@ class TickProcessor:
         self.baseline.set_offset(pad, offset_counts, std_counts)
         self.state_changed = True
 
+    def set_excitation(self, on: BoolArray) -> None:
+        """Set the pads (n,) whose sheet has its potential; the back force of the others decays."""
+        self.sheet_force.set_excitation(on)
+        self.state_changed = True
+
     def reset_pad(self, pad: int) -> None:
         """Forget what was learned of a pad: its node and sheet were replaced."""
         self.baseline.reset_pad(pad)

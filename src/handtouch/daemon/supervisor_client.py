@@ -225,8 +225,7 @@ class SupervisorClient:
             self._pipeline.model.begin_threshold_n,
         ):
             return
-        for group in sheet_force.groups.all:
-            group.compensator.set_powered(~schedule.off[group.pads])
+        self._pipeline.tick.set_excitation(~schedule.off)
         for pad in np.flatnonzero(schedule.off != before).tolist():
             self._log_pad(pad, _EXCITATION_OFF_TEXT if schedule.off[pad] else "excitation on again")
             self.changed_pads.add(pad)
