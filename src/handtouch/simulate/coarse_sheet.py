@@ -51,7 +51,12 @@ class CoarseGrid:
         weight, radius = conductivity * self._weights, self._radius[:, None]
         stiffness = _stiffness_matrix(self._s.slopes, self._phi.values, weight * radius)
         stiffness = stiffness + _stiffness_matrix(self._s.values, self._phi.slopes, weight / radius)
-        factors = splu(stiffness[self._free][:, self._free].tocsc())
+        factors = splu(
+            stiffness[self._free][:, self._free].tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},  # it is positive definite
+        )
         potential = self.on_electrode.copy()
         potential[self._free] = factors.solve(-(stiffness @ self.on_electrode)[self._free])
         conductance = self.on_electrode.T @ (stiffness @ potential)
