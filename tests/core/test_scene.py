@@ -174,7 +174,9 @@ def test_a_contact_that_was_not_requested_before_is_not_computed_instead_of_inva
     contact, frame = (retained[topic](rig.t_ns) for topic in ("contact/h/round", "hand/h"))
     assert isinstance(contact, wire.Contact)
     assert frame is not None
-    rows = columns(wire.decode(wire.encode(frame)))
+    decoded = wire.decode(wire.encode(frame))
+    assert isinstance(decoded, wire.HandFrame)
+    rows = columns(decoded)
     if released:
         rig.touched = [bytes(8)] * 3
         contact = next(m for m in rig.run(8) if isinstance(m, wire.Contact) and m.event == "end")
