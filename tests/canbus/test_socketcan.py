@@ -233,3 +233,18 @@ def test_a_flood_of_foreign_frames_costs_no_sample(port: Port) -> None:
         port.drain()
     assert (port.counters.frames, port.counters.samples, port.counters.overflow) == (4812, 12, 0)
     assert port.slab.unpack_counts()[0, 0] == 11
+
+
+def test_frames_that_waited_when_the_interface_went_down_do_not_make_it_look_up(port: Port) -> None:
+    """The kernel reports the error before the frames that are still in the queue."""
+    run("cansend vcan0 281#0100020003000400; cansend vcan0 281#0200020003000400; ip link set vcan0 down")
+    states = []
+    for _ in range(20):
+        port.drain()
+        states.append(look(port).error_state)
+        time.sleep(0.01)
+    run("ip link set vcan0 up")
+    assert port.counters.samples == 2
+    assert set(states[1:]) == {ErrorState.DOWN}
+    run("cansend vcan0 281#0300020003000400")
+    assert eventually(port, lambda: look(port).error_state is ErrorState.ACTIVE)

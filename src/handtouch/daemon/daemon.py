@@ -372,9 +372,9 @@ class HandtouchDaemon:
 
     def _run_background_tasks(self, now_ns: int) -> None:
         lap = self.reporter.stage_timer.lap
-        self.master.poll(self._received_until_ns)
-        for port in self.ports.values():
+        for port in self.ports.values():  # first: the master names a bus's problem as the cause of a node's
             port.update_state(now_ns)
+        self.master.poll(self._received_until_ns)
         lap(stage_timer.NODES, time.monotonic_ns())
         self.reporter.poll(now_ns)
         lap(stage_timer.REPORT, time.monotonic_ns())

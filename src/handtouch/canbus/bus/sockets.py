@@ -52,6 +52,7 @@ class _SocketReceiver:
         self._epoll: select.epoll | None = None
         self._backoff = ReopenBackoff()
         self._consecutive_errors = 0
+        self._newest_ns = self._failure_ns = 0  # arrival of the newest frame, and the last failure
         self._bus: can.BusABC | None = None
         self._dropped = 0
         self._emptied_ns = 0  # begin of the last `drain` that emptied the queue
@@ -87,11 +88,13 @@ class _SocketReceiver:
             failure = None
         except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; it is counted here
             failure = error
-        if router.counters.frames > before:
+        # frames that were waiting at a failure don't show that the bus works again
+        if router.counters.frames > before and self._newest_ns > self._failure_ns:
             self.fault = None
             self._consecutive_errors = 0
             self._backoff.reset()
         if failure is not None:
+            self._failure_ns = time.monotonic_ns()
             self._record_failure(router, failure)
         return others
 
@@ -180,7 +183,7 @@ class SocketcanReceiver(_SocketReceiver):
             try:
                 frame, ancillary, _, _ = recvmsg(16, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
-                self._emptied_ns = now_ns
+                self._emptied_ns, self._newest_ns = now_ns, arrival_ns
                 return
             for _, kind, value in ancillary:
                 if kind == _SO_TIMESTAMPNS:
@@ -201,7 +204,7 @@ class SocketcanReceiver(_SocketReceiver):
                 data = data[:size]
             if not accept(can_id, data, arrival_ns):
                 others.append((can_id, data, arrival_ns))
-        self.backlog_ns = arrival_ns
+        self.backlog_ns = self._newest_ns = arrival_ns
 
     def _send(self, bus: can.BusABC, can_id: int, data: bytes, remote: bool) -> None:  # noqa: ARG002
         frame = _FRAME.pack(can_id | _REMOTE_FLAG if remote else can_id, len(data), data)
@@ -244,7 +247,7 @@ class DatagramReceiver(_SocketReceiver):
             try:
                 packet, ancillary, _, _ = recvmsg(_MAX_DATAGRAM_BYTES, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
-                self._emptied_ns = now_ns
+                self._emptied_ns, self._newest_ns = now_ns, arrival_ns
                 return
             for _, kind, value in ancillary:
                 if kind == _SO_TIMESTAMPNS:
@@ -261,7 +264,7 @@ class DatagramReceiver(_SocketReceiver):
             frame = router.accept_message(unpack_message(packet, check=True), arrival_ns)
             if frame is not None:
                 others.append(frame)
-        self.backlog_ns = arrival_ns
+        self.backlog_ns = self._newest_ns = arrival_ns
 
 
 def _is_data_frame(fields: Any) -> bool:
