@@ -242,7 +242,7 @@ def serve_and_receive(
 ) -> Turn:
     """Measure one pass with this server between nodes and a subscriber."""
     stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
-    worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
+    worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop), daemon=True)
     worker.start()
     process = server(stop)
     control, figures = load(config).daemon.control, {}
@@ -254,12 +254,12 @@ def serve_and_receive(
         socket.connect(endpoint)
         wait_for_touch(socket)
         is_daemon = isinstance(process, subprocess.Popen)
-        before = request("status", endpoint=control) if is_daemon else {}
+        before = request("status", endpoint=control, timeout_s=30) if is_daemon else {}
         cpu.start(process.pid or 0)
         received = receive(socket, seconds)
         share = cpu.stop()
         if is_daemon:
-            figures = losses(before, request("status", endpoint=control))
+            figures = losses(before, request("status", endpoint=control, timeout_s=30))
     if isinstance(process, subprocess.Popen):
         process.terminate()
         process.wait()
@@ -303,7 +303,7 @@ def floor_turn(
 
     def server(stop: Event) -> BaseProcess:
         args = endpoint, samples.shape[1], size, period_s, priority, stop
-        process = multiprocessing.Process(target=bare_loop, args=args)
+        process = multiprocessing.Process(target=bare_loop, args=args, daemon=True)
         process.start()
         return process
 
@@ -315,7 +315,7 @@ def where_it_goes(config: Path, samples: NDArray[np.int64], seconds: float) -> d
     out = config.parent / "trace.npy"
 
     def server(stop: Event) -> BaseProcess:
-        process = multiprocessing.Process(target=traced, args=(config, out, stop))
+        process = multiprocessing.Process(target=traced, args=(config, out, stop), daemon=True)
         process.start()
         return process
 

@@ -195,7 +195,7 @@ def main() -> int:
         config = on_loopback(Path(folder), PORT)
         stamps, stop = multiprocessing.Array("q", 1 + 1000, lock=False), multiprocessing.Event()
         samples = film(load(config), PATHS["resting"])
-        worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
+        worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop), daemon=True)
         worker.start()
         results = measure(config, asked.runs)
         stop.set()

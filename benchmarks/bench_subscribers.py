@@ -83,8 +83,10 @@ def bystanders(endpoint: str, count: int, stop: Event) -> None:
 def company(endpoint: str, count: int, fate: signal.Signals | None) -> Iterator[None]:
     """Run other subscribers; stop or kill one more during the measurement."""
     stop = multiprocessing.Event()
-    others = multiprocessing.Process(target=bystanders, args=(endpoint, count, stop))
-    victim = multiprocessing.Process(target=bystanders, args=(endpoint, 1, multiprocessing.Event()))
+    others = multiprocessing.Process(target=bystanders, args=(endpoint, count, stop), daemon=True)
+    victim = multiprocessing.Process(
+        target=bystanders, args=(endpoint, 1, multiprocessing.Event()), daemon=True
+    )
     if count:
         others.start()
     if fate is not None:
@@ -153,7 +155,7 @@ def serving(config: Path) -> Iterator[tuple[int, Any]]:
     deployment = load(config)
     stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
     samples = film(deployment, PATHS["sliding"])
-    worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop))
+    worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop), daemon=True)
     worker.start()
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
     daemon = subprocess.Popen(command, stderr=subprocess.DEVNULL)

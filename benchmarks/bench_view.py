@@ -116,7 +116,7 @@ def case(config: Path, pid: int, seconds: float, name: str, packages: Path | Non
     daemon = load(config).daemon
     row: dict[str, Any] = {"case": name}
     stop = multiprocessing.Event()
-    reader = multiprocessing.Process(target=bystanders, args=(daemon.live, 1, stop))
+    reader = multiprocessing.Process(target=bystanders, args=(daemon.live, 1, stop), daemon=True)
     if name == READER:
         reader.start()
     if name in (NO_SUBSCRIBER, READER):
