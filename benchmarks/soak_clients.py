@@ -35,7 +35,7 @@ JOINING_S, LEAVING_S = 5.0, 10.0
 SAMPLES_OF_MEMORY = 50
 MAX_RATIO = 1.1
 MAX_GROWTH_MB = 5.0
-"""Growth after a third of the time: until then the queues of stalled subscribers to the complete stream fill"""
+"""Growth after a third of the time; until then the queues of stalled subscribers fill"""
 HEAD = """| beside | ticks/s | overruns | p50, ms | p99, ms | messages | lost | status | MB | third | last |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"""
 
