@@ -86,7 +86,7 @@ def test_contacts_have_the_position_and_force_of_touches(rig: Any) -> None:
     rig.start("run")
     rig.wait_operational()
     contacts = _contacts(
-        rig, lambda got: _ends(3)(got) and sum(len(_steady(times)) for times in _times(got).values()) > 60
+        rig, lambda got: _ends(5)(got) and sum(len(_steady(times)) for times in _times(got).values()) > 120
     )
     rig.end("run")
     assert rig.end("simulate") == 0
@@ -109,9 +109,13 @@ def test_contacts_have_the_position_and_force_of_touches(rig: Any) -> None:
         truth.setdefault(row.link, []).append(row)
     sampled = {link: _steady([row.t_ns for row in rows]) for link, rows in truth.items()}
     steady = {number: _steady(times) for number, times in _times(contacts).items()}
+    # a pad whose first reading is of a light touch takes that for its baseline until it is released
+    first = {contact.link: contact.id for contact in reversed(contacts)}.values()
     errors = []
     for contact in contacts:
         if contact.event == "end" or contact.position_m is None or contact.force_n is None:
+            continue
+        if contact.id in first:
             continue
         nearest = min(truth[contact.link], key=lambda row: abs(row.t_ns - contact.t_ns))
         if contact.t_ns not in steady[contact.id] or nearest.t_ns not in sampled[contact.link]:

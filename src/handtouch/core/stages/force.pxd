@@ -22,7 +22,7 @@ cdef class ForceResult:
 
 @cython.locals(k=Py_ssize_t, p='double[::1]')
 cdef void estimate_force(
-    StackTable stack, PadLaw law, ForceResult result, double total_a, double total_std_a, double offset_std_a,
+    StackTable stack, PadLaw law, ForceResult result, double total_a, double total_std_a,
     double log_spreading_m, double position_variance, double series_ohm) noexcept
 @cython.locals(p='double[::1]')
 cdef double whole_factor(PadLaw law, double total_a) noexcept

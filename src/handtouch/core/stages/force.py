@@ -75,14 +75,13 @@ def estimate_force(
     result: ForceResult,
     total_a: float,
     total_std_a: float,
-    offset_std_a: float,
     log_spreading_m: float,
     position_variance: float,
     series_ohm: float,
 ) -> None:
     """Estimate the force for a total current.
 
-    total_std_a: noise; offset_std_a: of the baseline. log_spreading_m: ln of the spreading radius;
+    total_std_a: of noise and baseline. log_spreading_m: ln of the spreading radius;
     position_variance: what the position's uncertainty, with that of the total, makes of the stack factor's
     variance beyond noise of the total.
     """
@@ -110,9 +109,8 @@ def estimate_force(
         result.status = _LOWER_BOUND
         return
     force = _force_at(stack, p[_LOG_LAYER], alpha, p[_LOG_RADIUS], p[_LOG_SHEET], factor)
-    offset = whole * offset_std_a / total_a
     slope = force / alpha * _log_x2_slope(stack, factor)
-    square = slope * slope * (variance + offset * offset)
+    square = slope * slope * variance
     if radius_std > 0.0:
         near, far = _NEAR_NODE * radius_std, _FAR_NODE * radius_std
         square += _NEAR_WEIGHT * (

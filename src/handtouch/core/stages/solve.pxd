@@ -24,8 +24,8 @@ cdef class ContactSolver:
 cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(fit=locate.Fit, values='double[::1]', raw=place.Placement)
-cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t row) noexcept
+@cython.locals(row=Py_ssize_t, fit=locate.Fit, values='double[::1]', raw=place.Placement)
+cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, fit=locate.Fit)
 cdef double _add_gain_covariance(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, values='double[::1]', law=force.PadLaw)

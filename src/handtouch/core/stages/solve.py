@@ -20,7 +20,7 @@ VALUE_SLICES = {
     "normal": slice(_NORMAL, _NORMAL + 3),
     "force_n": slice(_FORCE, _FORCE + 1),
     "force_std_n": slice(_FORCE_STD, _FORCE_STD + 1),
-    "residual_std": slice(_RESIDUAL_STD, _RESIDUAL_STD + 1),  # from channel noise
+    "residual_std": slice(_RESIDUAL_STD, _RESIDUAL_STD + 1),  # from channel noise and baseline
     "covariance_m2": slice(_COVARIANCE, _COVARIANCE + 9),
     "pad_noise_m2": slice(_PAD_NOISE, _PAD_NOISE + 3),  # of pad_m from channel noise: uu, uv, vv
     "force_status": slice(_FORCE_STATUS, _FORCE_STATUS + 1),  # ForceEstimateStatus
@@ -39,8 +39,9 @@ class ContactSolver:
 
     currents, weight: (pads n,) currents [A] and 1 / noise [1/A]. gain_covariance: (pads n n,) of log gains;
     gain_uncertain: (pads,), 1 where it isn't 0. offset_std: (pads,) of the sum of the currents, from the
-    baseline [A]. force_requested: (pads,), 0 where no force is to be estimated. values: (pads VALUE_COUNT,),
-    the result; NaN for a new contact, else the search begins at the position in it.
+    baseline [A]; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
+    force is to be estimated. values: (pads VALUE_COUNT,), the result; NaN for a new contact, else the search
+    begins at the position in it.
     """
 
     def __init__(
@@ -84,8 +85,10 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     """Locate a pad's contact, estimate its force, and place it in the link's frame."""
     n, row = solver.electrodes, pad * _COUNT
     fit, table, values = solver.fit, solver.tables[pad], solver.values
+    offset2 = solver.offset_std[pad] * solver.offset_std[pad] / n
     for i in range(n):
         weight = solver.weight[pad * n + i]
+        weight /= math.sqrt(1.0 + offset2 * weight * weight)
         fit.weight[i] = weight
         fit.data[i] = solver.currents[pad * n + i] * weight
     locate.locate(table, fit, values[row + _CELLS], values[row + _CELLS + 1])
@@ -134,7 +137,7 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
         solver.by_residual[i] = by
         noise += (by / fit.weight[i]) * (by / fit.weight[i])
     values[row + _RESIDUAL], values[row + _RESIDUAL_STD] = residual, math.sqrt(noise)
-    _write_pad_noise(solver, row)
+    _write_pad_noise(solver, pad)
     if solver.gain_uncertain[pad]:
         noise += _add_gain_covariance(solver, pad)
     excess = residual * residual / noise - _MAX_SQUARED_MISFIT if noise > 0.0 else 0.0
@@ -144,12 +147,13 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
         fit.cov_xy *= 1.0 + excess
 
 
-def _write_pad_noise(solver: ContactSolver, row: int) -> None:
-    """Write the covariance of the arc lengths from channel noise."""
-    fit, values = solver.fit, solver.values
+def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
+    """Write the covariance of the arc lengths from channel noise, without the baseline's."""
+    fit, values, row = solver.fit, solver.values, pad * _COUNT
     raw = solver.placement
-    along = math.sqrt(raw.tx * raw.tx + raw.ty * raw.ty + raw.tz * raw.tz)
-    around = math.sqrt(raw.wx * raw.wx + raw.wy * raw.wy + raw.wz * raw.wz)
+    noise = fit.weight[0] / solver.weight[pad * solver.electrodes]  # over noise and offset
+    along = noise * math.sqrt(raw.tx * raw.tx + raw.ty * raw.ty + raw.tz * raw.tz)
+    around = noise * math.sqrt(raw.wx * raw.wx + raw.wy * raw.wy + raw.wz * raw.wz)
     values[row + _PAD_NOISE] = fit.var_x * along * along
     values[row + _PAD_NOISE + 1] = fit.cov_xy * along * around
     values[row + _PAD_NOISE + 2] = fit.var_y * around * around
@@ -204,7 +208,6 @@ def _estimate_force(solver: ContactSolver, pad: int) -> None:
         solver.result,
         fit.total,
         math.sqrt(fit.var_total),
-        solver.offset_std[pad],
         log_spreading_m,
         variance,
         force.series_resistance(law, solver.currents, pad * n, n),
