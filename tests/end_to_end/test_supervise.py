@@ -190,8 +190,8 @@ def test_replaced_node_is_quarantined_and_calibrated_by_contacts(bench: Bench) -
     since = [c for c in contacts if c.t_ns > calibrated.t_ns + 200_000_000]
     before_mm, after_mm = _errors_mm(unknown, truth), _errors_mm(since, truth)
     assert np.median(after_mm) < 0.5 * np.median(before_mm)
-    # until it is applied: on a busy machine the calibration applies before `health` reports it
-    assert all(c.force_status == "invalid" and c.force_n is None for c in unknown)
+    # not_computed: the end of a contact that quarantine found, before another sample of it
+    assert all(c.force_status in ("invalid", "not_computed") and c.force_n is None for c in unknown)
     assert any(c.force_status == "valid" for c in since if c.link == "swapped")
     # the published covariance covered the error
     wide = [float(np.sqrt(np.trace(np.reshape(c.covariance_m2, (3, 3))))) for c in unknown if c.covariance_m2]
