@@ -1,4 +1,4 @@
-"""Programs in benchmarks/ start, explain themselves, and run; figures are nobody's promise here."""
+"""Programs in benchmarks/ start, print their help, and run; their figures aren't checked here."""
 
 from __future__ import annotations
 

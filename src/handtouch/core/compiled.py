@@ -13,6 +13,7 @@ import hashlib
 import os
 import sysconfig
 from collections.abc import Sequence
+from functools import cache
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ExtensionFileLoader, ModuleSpec
 from importlib.util import spec_from_file_location
@@ -47,6 +48,7 @@ class Compilation(NamedTuple):
         return cls(False, "they were never compiled on this machine; run `make dev`")
 
 
+@cache
 def source_hash() -> str:
     """Return the hash of the sources of all stages, and of how they are compiled."""
     digest = hashlib.sha256((_FOLDER.parent / "build.py").read_bytes())

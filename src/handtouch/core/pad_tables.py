@@ -20,7 +20,7 @@ from handtouch.core.stages.force import StackTable
 from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.place import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
-from handtouch.field.model import ForwardModel
+from handtouch.field.model import ForwardModel, spreading_radius
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 
@@ -96,14 +96,13 @@ class ForwardTable:
         axes = _Axis(model.a, ends_x), _Axis(model.b, ends_y)
         nodes_x, nodes_y = (axis.nodes() for axis in axes)
         x, y = np.meshgrid(*(_inside(at[:, 0]) for at in (nodes_x, nodes_y)))
-        radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
         fractions = model.fractions(x, y)
         edge = _MIN_RADIUS_DISTANCE
         x, y = (
             np.clip(x, edge * model.a, (1 - edge) * model.a),
             np.clip(y, edge * model.b, (1 - edge) * model.b),
         )
-        values = np.stack([*fractions, np.log(radius(x, y))], axis=-1)
+        values = np.stack([*fractions, np.log(spreading_radius(model, x, y))], axis=-1)
         search = (np.arange(SEARCH_POINTS) + 0.5) / SEARCH_POINTS
         x, y = (at.ravel() for at in np.meshgrid(model.a * search, model.b * search))
         return cls(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from handtouch.field.model import FloatArray, ForwardModel
+from handtouch.field.model import FloatArray, ForwardModel, spreading_radius
 from handtouch.field.spline import spline_operator
 
 POLYNOMIAL_TERMS = 6  # coefficients of a quintic
@@ -108,7 +108,7 @@ class PadTable:
     def from_model(cls, model: ForwardModel, grid: Grid) -> PadTable:
         """Evaluate `model` on the grid and measure the error of interpolation."""
         x, y = grid.points(model, np.arange(grid.cells + 1.0))
-        values = np.stack([*model.fractions(x, y), np.log(_spreading_radius(model, x, y))], axis=-1)
+        values = np.stack([*model.fractions(x, y), np.log(spreading_radius(model, x, y))], axis=-1)
         between = np.arange(0.5, grid.cells)
         middle = np.tensordot(
             spline_operator(grid.cells, POLYNOMIAL_TERMS - 1), 0.5 ** np.arange(POLYNOMIAL_TERMS), axes=(1, 0)
@@ -119,11 +119,3 @@ class PadTable:
         return cls(
             values, start_table(model, grid), float(error[np.ix_(inside, inside)].max()), float(error.max())
         )
-
-
-def _spreading_radius(model: ForwardModel, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the radius in the sheet resistance ln(radius / A) / (2 pi): the conformal radius, enlarged by
-    gaps.
-    """
-    radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
-    return np.asarray(radius(x, y), dtype=np.float64)

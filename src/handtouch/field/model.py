@@ -42,6 +42,14 @@ class ForwardModel(Protocol):
         ...
 
 
+def spreading_radius(model: ForwardModel, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the radius in the sheet resistance ln(radius / A) / (2 pi): the conformal radius, enlarged by
+    gaps.
+    """
+    radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
+    return np.asarray(radius(x, y), dtype=np.float64)
+
+
 def channel_noise(noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Return standard deviations for currents of shape (channels, ...), broadcast to it.
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+from handtouch.field import contact_law
+
 _VALID, _LOWER_BOUND, _NOT_ESTIMATED = 0, 1, 2  # of a result's status
 _LOG_LAYER, _ALPHA, _LOG_RADIUS, _RADIUS_STD, _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _AXES = (
     0,
@@ -21,9 +23,8 @@ _LOG_LAYER, _ALPHA, _LOG_RADIUS, _RADIUS_STD, _LOG_SHEET, _DRIVE, _LOG_REFERENCE
 )
 LAW_PARAMETERS = 16
 _MIN_ALPHA = 0.1
-_BOUND_SIGMA = 2.0
-_MAX_CURRENT_FRACTION = 0.98  # of the greatest current that the sheet can carry
-_MIN_LOG_SPREADING_RATIO = math.log(2.0)  # of spreading over contact radius, for contacts at an edge
+_BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_CURRENT_FRACTION
+_MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
 _MIN_CURRENT_A = 1e-200
 _TWO_PI, _LOG_PI, _INFINITY = 2.0 * math.pi, math.log(math.pi), math.inf
 _NAN = float("nan")

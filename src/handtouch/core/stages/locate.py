@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 from handtouch.core.stages import tables
+from handtouch.field.estimate import CORNER_RADIUS_FACTOR, MAX_STD_SIDES
 
 _MAX_STEPS = 30
 _MAX_STEP_CELLS = 7.0
@@ -20,10 +21,7 @@ _BISECTIONS = 50
 _MAX_TRACKED_COST = 25.0  # sum of squares beyond which, and
 _MAX_TRACKED_VARIANCE = 2.5e-3  # variance of a coordinate, in sides, beyond which other starts are tried
 _MAX_START_COST = 40.0  # cost beyond twice the best start's at which another one is still tried
-_MAX_STD_SIDES = 1e3  # a coordinate with a larger deviation is unknown
-_CORNER_RADIUS_FACTOR = (
-    0.7  # of the root of the relative noise, in shorter sides: no information on the radius
-)
+_MAX_STD_SIDES, _CORNER_RADIUS_FACTOR = MAX_STD_SIDES, CORNER_RADIUS_FACTOR
 _MAX_CORNER_RADIUS = 0.25  # in shorter sides
 _CORNER_STEPS = 6
 _MIN_CORNER_ANGLE_RAD = 0.02

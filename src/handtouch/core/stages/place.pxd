@@ -11,7 +11,7 @@ cdef class PadSurface:
 
 cdef class Placement:
     cdef double[::1] raw
-    cdef double u_m, v_m, px, py, pz, nx, ny, nz, tx, ty, tz, wx, wy, wz, scale_m
+    cdef double u_m, v_m, px, py, pz, nx, ny, nz, tx, ty, tz, wx, wy, wz, along_m, around_m, scale_m
 
 @cython.locals(cells=Py_ssize_t, patch=Py_ssize_t, raw='double[::1]')
 cdef void place_contact(PadSurface surface, Placement placement, double x, double y) noexcept

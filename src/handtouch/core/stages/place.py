@@ -45,6 +45,7 @@ class Placement:
         self.nx = self.ny = self.nz = 0.0
         self.tx = self.ty = self.tz = 0.0  # tangents along x and y, metres per unit of the rectangle
         self.wx = self.wy = self.wz = 0.0
+        self.along_m = self.around_m = 1.0  # their lengths
         self.scale_m = 1.0  # a contact's radius on the surface over that on the rectangle
 
 
@@ -69,6 +70,7 @@ def place_contact(surface: PadSurface, placement: Placement, x: float, y: float)
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     placement.nx, placement.ny, placement.nz = nx / length, ny / length, nz / length
     along, around = math.sqrt(tx * tx + ty * ty + tz * tz), math.sqrt(wx * wx + wy * wy + wz * wz)
+    placement.along_m, placement.around_m = along, around
     placement.scale_m = 2.0 * along * around / (along + around)
     placement.tx, placement.ty, placement.tz = tx, ty, tz
     placement.wx, placement.wy, placement.wz = wx, wy, wz

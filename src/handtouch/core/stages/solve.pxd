@@ -24,7 +24,7 @@ cdef class ContactSolver:
 cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(row=Py_ssize_t, fit=locate.Fit, values='double[::1]', raw=place.Placement)
+@cython.locals(row=Py_ssize_t, fit=locate.Fit, values='double[::1]')
 cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, fit=locate.Fit)
 cdef double _add_gain_covariance(ContactSolver solver, Py_ssize_t pad) noexcept

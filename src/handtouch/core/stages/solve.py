@@ -150,10 +150,8 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
 def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
     """Write the covariance of the arc lengths from channel noise, without the baseline's."""
     fit, values, row = solver.fit, solver.values, pad * _COUNT
-    raw = solver.placement
     noise = fit.weight[0] / solver.weight[pad * solver.electrodes]  # over noise and offset
-    along = noise * math.sqrt(raw.tx * raw.tx + raw.ty * raw.ty + raw.tz * raw.tz)
-    around = noise * math.sqrt(raw.wx * raw.wx + raw.wy * raw.wy + raw.wz * raw.wz)
+    along, around = noise * solver.placement.along_m, noise * solver.placement.around_m
     values[row + _PAD_NOISE] = fit.var_x * along * along
     values[row + _PAD_NOISE + 1] = fit.cov_xy * along * around
     values[row + _PAD_NOISE + 2] = fit.var_y * around * around
