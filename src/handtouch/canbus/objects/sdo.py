@@ -147,7 +147,7 @@ class SdoTransport:
                     cause = (
                         f"no answer within {self._timeout_s * 1e3:.0f} ms after the first segments"
                         if silent
-                        else f"invalid SDO response: {error}"
+                        else f"invalid SDO response: {error}; a firmware fault, or two nodes with this id"
                     )
                     raise BootStepError(f"{description}: {cause}") from error
                 timeout = error
