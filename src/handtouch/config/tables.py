@@ -299,7 +299,7 @@ class Pad(Table):
     touch: Touch | None = Field(None, description="thresholds of this pad; default: those of [touch]")
 
 
-class Hand(Table):
+class HandTable(Table):
     """`[[hand]]`: a hand and its pads."""
 
     name: Name = Field(description="name of the hand in topics")
@@ -409,7 +409,7 @@ class Deployment(Table):
     nodes: dict[Name, Node] = Field(alias="node")
     sheets: dict[Name, Sheet] = Field(alias="sheet")
     touch: Touch = Touch()
-    hands: Annotated[tuple[Hand, ...], Field(strict=False, min_length=1)] = Field(alias="hand")
+    hands: Annotated[tuple[HandTable, ...], Field(strict=False, min_length=1)] = Field(alias="hand")
 
     @property
     def pads(self) -> list[NamedPad]:
@@ -446,7 +446,7 @@ TABLES: dict[str, type[Table]] = {
     "sheet.*": Sheet,
     "sheet.*.behaviour": Behaviour,
     "touch": Touch,
-    "hand": Hand,
+    "hand": HandTable,
     "hand.pad": Pad,
     "hand.pad.mount": Mount,
     "hand.pad.touch": Touch,

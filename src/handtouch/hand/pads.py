@@ -30,7 +30,7 @@ def mount_transform(pad: config.Pad) -> tuple[NDArray[np.float64], NDArray[np.fl
 class MountUncertainty:
     """Uncertainty of the mounts of a hand's pads on their links."""
 
-    def __init__(self, hand: config.Hand) -> None:
+    def __init__(self, hand: config.HandTable) -> None:
         self._origin_m = np.array([pad.mount.position_mm for pad in hand.pads]) * _M_PER_MM
         self._position_variance_m2 = (hand.mount_std_mm * _M_PER_MM) ** 2
         self._rotation_variance_rad2 = math.radians(hand.mount_std_deg) ** 2

@@ -17,7 +17,7 @@ from handtouch import config
 from handtouch.config import (
     ConfigError,
     Deployment,
-    Hand,
+    HandTable,
     Problem,
 )
 from handtouch.hand import kinematics, urdf
@@ -81,7 +81,7 @@ class RobotModels:
             first += len(hand.pads)
 
 
-def _message_joint_name(hand: Hand, joint: str) -> str:
+def _message_joint_name(hand: HandTable, joint: str) -> str:
     return hand.joint_names.get(joint, hand.joint_prefix + joint)
 
 
@@ -140,7 +140,7 @@ def unchecked_items(deployment: Deployment) -> Iterator[str]:
                 yield f"{hand.name}/{pad.link}: position on the link's body not checked: {why}"
 
 
-def _hand_problems(number: int, hand: Hand) -> Iterator[Problem]:
+def _hand_problems(number: int, hand: HandTable) -> Iterator[Problem]:
     location = f'[[hand]] {number} "{hand.name}": '
     if not any(hand.gravity):
         yield Problem(

@@ -104,7 +104,7 @@ def _bus_warnings(deployment: config.Deployment, bus: config.Bus) -> Iterator[st
         )
 
 
-def _serial_warnings(hand: config.Hand) -> Iterator[str]:
+def _serial_warnings(hand: config.HandTable) -> Iterator[str]:
     without = [pad.link for pad in hand.pads if pad.serial is None]
     if without:
         yield f"{hand.name}: no serial for {', '.join(without)}: replaced sensors are not detected"

@@ -49,7 +49,7 @@ class MujocoScene:
     `joints` and `pads` are in the order of URDF and deployment. Raises ValueError for an unfit hand.
     """
 
-    def __init__(self, hand: config.Hand, world: DrawnWorld, grasp_object: GraspObject) -> None:
+    def __init__(self, hand: config.HandTable, world: DrawnWorld, grasp_object: GraspObject) -> None:
         import mujoco
 
         if not hand.urdf:

@@ -67,7 +67,7 @@ class GraspRecord:
 
 
 def simulate_grasp(
-    hand: config.Hand,
+    hand: config.HandTable,
     name: str,
     seed: int = 1,
     world: DrawnWorld | None = None,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config import Deployment, Hand, Pad
+from handtouch.config import Deployment, HandTable, Pad
 from handtouch.hand import urdf
 from handtouch.hand.pads import mount_transform, pad_surface
 from handtouch.hand.urdf import RobotDescription
@@ -67,7 +67,7 @@ class _SceneGraph:
         self.points.append(mesh.corners_m @ rotation.T + translation)
         self.bodies.append({"node": node, **to_base64(mesh)})
 
-    def add_pad(self, hand: Hand, pad: Pad, node: int) -> int:
+    def add_pad(self, hand: HandTable, pad: Pad, node: int) -> int:
         surface, (turn, at) = pad_surface(pad), mount_transform(pad)
         mesh = pad_mesh(surface, turn, at)
         rotation, translation = self.poses[node]
@@ -110,7 +110,7 @@ def scene_of(deployment: Deployment, files: dict[str, bytes]) -> dict[str, Any]:
     }
 
 
-def _parse_robot(hand: Hand, files: dict[str, bytes], problems: list[str]) -> RobotDescription | None:
+def _parse_robot(hand: HandTable, files: dict[str, bytes], problems: list[str]) -> RobotDescription | None:
     if not hand.urdf or hand.urdf not in files:
         return None
     try:
@@ -120,7 +120,7 @@ def _parse_robot(hand: Hand, files: dict[str, bytes], problems: list[str]) -> Ro
         return None
 
 
-def _add_robot(scene: _SceneGraph, hand: Hand, robot: RobotDescription, offset_m: float) -> list[list[int]]:
+def _add_robot(scene: _SceneGraph, hand: HandTable, robot: RobotDescription, offset_m: float) -> list[list[int]]:
     numbers = {robot.root: scene.add_node(-1, (np.eye(3), np.array([0.0, offset_m, 0.0])))}
     waiting = list(robot.joints.values())
     while waiting:  # a parent may come later in the file than its child
@@ -143,7 +143,7 @@ def _add_robot(scene: _SceneGraph, hand: Hand, robot: RobotDescription, offset_m
     )
 
 
-def _add_joint(scene: _SceneGraph, hand: Hand, joint: urdf.UrdfJoint, numbers: dict[str, int]) -> bool:
+def _add_joint(scene: _SceneGraph, hand: HandTable, joint: urdf.UrdfJoint, numbers: dict[str, int]) -> bool:
     if joint.parent not in numbers:
         return False
     moved: dict[str, Any] = {}
@@ -161,7 +161,7 @@ def _add_joint(scene: _SceneGraph, hand: Hand, joint: urdf.UrdfJoint, numbers: d
     return True
 
 
-def _add_row(scene: _SceneGraph, hand: Hand, offset_m: float) -> list[list[int]]:
+def _add_row(scene: _SceneGraph, hand: HandTable, offset_m: float) -> list[list[int]]:
     """Place the pads of a hand without a URDF side by side, those of one digit above one another."""
     sizes = [np.ptp(outline_m(pad_surface(pad)), axis=0) for pad in hand.pads]
     columns, x = _group_by_digit(hand, range(len(hand.pads))), 0.0
@@ -180,7 +180,7 @@ def _add_row(scene: _SceneGraph, hand: Hand, offset_m: float) -> list[list[int]]
     return [[first + order.index(k) for k in column] for column in columns]
 
 
-def _group_by_digit(hand: Hand, numbers: Any) -> list[list[int]]:
+def _group_by_digit(hand: HandTable, numbers: Any) -> list[list[int]]:
     """Group numbers of pads by digit, the first part of the link name."""
     digits: dict[str, list[int]] = {}
     for pad, number in zip(hand.pads, numbers, strict=True):
