@@ -24,7 +24,7 @@ class DiscardingSink:
 
 
 @pytest.mark.parametrize("event", ["begin", "update", "end"])
-def test_a_contact_of_non_finite_numbers_is_readable(bench: Any, event: str) -> None:
+def test_a_contact_of_non_finite_numbers_is_readable(bench: Any, event: wire.ContactEvent) -> None:
     pipeline = Pipeline(bench.model, 5_000_000, 0.6, DiscardingSink())
     rng, columns = np.random.default_rng(1), pipeline.tick.columns
     for _ in range(300):

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -135,7 +135,7 @@ def health(seq: int, t_ns: int, state: str = "clear", reason: str = "") -> list[
         link="plane",
         bus="can0",
         node_id=1,
-        state=state,
+        state=cast(wire.PadStateName, state),
         node_state="operational",
         node_state_since_ns=1,
         sampling="sync",

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import columns, wire
+from handtouch.wire import status
 
 names = st.from_regex(r"[a-z][a-z0-9_]{0,12}", fullmatch=True)
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -22,6 +23,8 @@ integers = st.integers(-(2**62), 2**62)
 
 def _values(hint: Any) -> st.SearchStrategy[Any]:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if typing.get_origin(hint) is typing.Literal:
+        return st.sampled_from(typing.get_args(hint))
     if hint in (int, float, str, bool, bytes):
         return {int: integers, float: finite, str: names, bool: st.booleans(), bytes: st.binary(max_size=40)}[
             hint
@@ -230,3 +233,24 @@ HEALTH = wire.Health(
     wire.SCHEMA_VERSION, 1, 1, 1, "h", "x", "can0", 1, "clear", "operational",
     0, "sync", "", None, 0.0, 0, 0, None, 0, 0, (), False,
 )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("codes", "names"),
+    [
+        (status.PadState, status.PadStateName),
+        (status.PositionStatus, status.PositionStatusName),
+        (status.ForceStatus, status.ForceStatusName),
+        (status.FrameStatus, status.FrameStatusName),
+    ],
+)
+def test_the_type_of_a_status_lists_the_names_of_its_codes(codes: Any, names: Any) -> None:
+    assert tuple(code.text for code in codes) == typing.get_args(names)
+
+
+@given(contact=_messages(wire.Contact))
+def test_a_value_of_a_later_version_is_accepted(contact: wire.Contact) -> None:
+    later = {**wire.to_map(contact), "end_reason": "a later reason"}
+    read = wire.decode([wire.topic_of(contact).encode(), msgpack.packb(later)])
+    assert isinstance(read, wire.Contact)
+    assert str(read.end_reason) == "a later reason"

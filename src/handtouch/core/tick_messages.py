@@ -16,9 +16,9 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
 from handtouch.core.tick import CONTACT_DTYPE, TickProcessor, TickResult
 from handtouch.core.transforms import ContactTransforms
-from handtouch.wire import ForceStatus, PadState, PositionStatus
+from handtouch.wire import ContactEvent, EndReason, ForceStatus, PadState, PositionStatus
 
-END_REASONS = {
+END_REASONS: dict[PadState, EndReason] = {
     PadState.STALE: "stale",
     PadState.LOST: "lost",
     PadState.FAULTED: "faulted",
@@ -26,7 +26,7 @@ END_REASONS = {
     PadState.OFF: "off",
 }
 """End reason of a contact by the state of its pad; "released" for any other."""
-_STOPPED = "stopped"
+_STOPPED: EndReason = "stopped"
 _WITH_STD = (ForceStatus.VALID, ForceStatus.UNRELIABLE)
 
 
@@ -60,7 +60,7 @@ class TickMessages:
         self._seq: NDArray[np.int64] = np.zeros(model.size, dtype=np.int64)
         self._frame_seq = 0
         self._frame_tick = 0, 0  # number and SYNC time of the last frames' tick
-        self._end_reason = ""  # of all contacts, when the daemon stops
+        self._end_reason: EndReason = ""  # of all contacts, when the daemon stops
         self._position_status = np.zeros(model.size, dtype=np.uint8)
         self._force_status = np.zeros(model.size, dtype=np.uint8)
         self._encoders = {hand: self._make_encoder(hand, rows) for hand, rows in model.rows_of_hand.items()}
@@ -69,7 +69,12 @@ class TickMessages:
 
     def send_contacts(self, result: TickResult, now_ns: int, sink: MessageSink) -> None:
         """Send begin, update and end of contacts, and clear those that ended."""
-        for event, rows in (("begin", result.began), ("update", result.updated), ("end", result.ended)):
+        events: dict[ContactEvent, NDArray[np.intp]] = {
+            "begin": result.began,
+            "update": result.updated,
+            "end": result.ended,
+        }
+        for event, rows in events.items():
             if len(rows):
                 self._seq[rows] += 1
             for pad in rows.tolist():
@@ -173,7 +178,7 @@ class TickMessages:
         )
 
     def _contact_message(
-        self, pad: int, event: str, sync_ns: int, now_ns: int, retained: bool = False
+        self, pad: int, event: ContactEvent, sync_ns: int, now_ns: int, retained: bool = False
     ) -> wire.Contact:
         model, columns, contacts = self._model, self._tick.columns, self._tick.contacts
         sample_ns = int(columns.sample_ns[pad])

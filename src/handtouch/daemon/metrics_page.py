@@ -166,10 +166,10 @@ def _add_pad_metrics(page: _MetricsPage, pads: list[wire.Health]) -> None:
         ("node_heartbeats_missed_total", "counter", "heartbeats_missed", "heartbeats that timed out"),
     ):
         page.add_values(metric, kind, text, rows(field))
-    states = [(name, pad.state) for name, pad in zip(names, pads, strict=True)]
-    page.add_states("pad_state", "state of the pad", "state", _PAD_STATES, states)
-    states = [(name, pad.node_state) for name, pad in zip(names, pads, strict=True)]
-    page.add_states("node_state", "state of the pad's node", "state", _NODE_STATES, states)
+    pad_states = [(name, pad.state) for name, pad in zip(names, pads, strict=True)]
+    page.add_states("pad_state", "state of the pad", "state", _PAD_STATES, pad_states)
+    node_states = [(name, pad.node_state) for name, pad in zip(names, pads, strict=True)]
+    page.add_states("node_state", "state of the pad's node", "state", _NODE_STATES, node_states)
     _add_diagnosis_metrics(page, pads, names)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -212,7 +212,7 @@ class PerceptPublisher:
                     seq=self._seq[topic],
                     t_ns=t_ns,
                     hand=hand,
-                    kind=kind,
+                    kind=cast(wire.PerceptKind, kind),
                     retained=False,
                     **fields,  # type: ignore[arg-type]
                 )

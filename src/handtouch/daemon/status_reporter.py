@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from handtouch.daemon.pad_explanation import explain_pad_state
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.stage_timer import StageTimer
 from handtouch.daemon.supervisor_client import SupervisorClient
-from handtouch.wire import PadState
+from handtouch.wire import NodeStateName, PadState
 
 _SECOND_NS = 1_000_000_000
 _HEALTH_PERIOD_NS = round(wire.HEALTH.period_s * _SECOND_NS)
@@ -277,8 +277,8 @@ class StatusReporter:
             link=settings.link,
             bus=settings.bus,
             node_id=settings.node_id,
-            state=state.name.lower(),
-            node_state=status.state.name.lower(),
+            state=state.text,
+            node_state=cast(NodeStateName, status.state.name.lower()),
             node_state_since_ns=status.since_ns,
             sampling="off" if state == PadState.OFF else "event" if status.idle else "sync",
             reason=self._disabled_reason(pad)

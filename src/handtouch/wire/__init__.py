@@ -10,12 +10,22 @@ clock; an unknown number is nil, never NaN. Optional fields are left out where t
 
 from handtouch.wire.codec import SCHEMA_VERSION, UnknownTopicError, WireError, decode, encode, to_map
 from handtouch.wire.columns import Column
-from handtouch.wire.contact import PERCEPT_KINDS, Contact, HandFrame, Matrix3, Percept, Vector3
-from handtouch.wire.health import Health, JointPositions
+from handtouch.wire.contact import (
+    PERCEPT_KINDS,
+    Contact,
+    ContactEvent,
+    EndReason,
+    HandFrame,
+    Matrix3,
+    Percept,
+    PerceptKind,
+    Vector3,
+)
+from handtouch.wire.health import Health, JointPositions, NodeStateName
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.sequence import SequenceTracker
 from handtouch.wire.service import Service
-from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus
+from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PadStateName, PositionStatus
 from handtouch.wire.topics import (
     COLUMNS,
     HEALTH,
@@ -41,7 +51,9 @@ __all__ = [
     "Column",
     "Config",
     "Contact",
+    "ContactEvent",
     "EncodedMessage",
+    "EndReason",
     "ForceStatus",
     "FrameStatus",
     "HandFrame",
@@ -49,9 +61,12 @@ __all__ = [
     "JointPositions",
     "Matrix3",
     "Message",
+    "NodeStateName",
     "OutgoingMessage",
     "PadState",
+    "PadStateName",
     "Percept",
+    "PerceptKind",
     "PositionStatus",
     "Raw",
     "SequenceTracker",

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from functools import cache
 from operator import attrgetter
-from typing import Any, NamedTuple, Union
+from typing import Any, Literal, NamedTuple, Union
 
 import msgpack
 
@@ -177,6 +177,8 @@ _TYPE_NAMES = {
 def _expected(hint: Any) -> str:
     """Describe an annotated type by the types of JSON and msgpack."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:  # a later version may add values
+        return _TYPE_NAMES[str]
     if origin in (Union, types.UnionType):
         inner = next(argument for argument in arguments if argument is not type(None))
         return f"{_expected(inner)} or nil"
@@ -207,6 +209,8 @@ def _is_array(origin: Any) -> bool:
 def _checker(hint: Any) -> Callable[[Any], Any]:
     """Return a function that returns a value of the annotated type, or raises TypeError or ValueError."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        return _checker(str)
     if origin in (Union, types.UnionType):
         inner = next(_checker(argument) for argument in arguments if argument is not type(None))
         return lambda value: None if value is None else inner(value)

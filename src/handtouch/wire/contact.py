@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from handtouch.wire.columns import Column
-from handtouch.wire.declarations import Values
-from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus
+from handtouch.wire.declarations import CLOSED
+from handtouch.wire.status import (
+    ForceStatus,
+    ForceStatusName,
+    FrameStatus,
+    FrameStatusName,
+    PadState,
+    PositionStatus,
+    PositionStatusName,
+)
 
 Vector3 = tuple[float, float, float]
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
+EndReason = Literal["released", "stale", "lost", "faulted", "off", "restarted", "stopped", ""]
+ContactEvent = Literal["begin", "update", "end"]
 
+PerceptKind = Literal["motion", "stiffness", "shape", "texture", "action_request"]
 PERCEPT_KINDS = ("motion", "stiffness", "shape", "texture")
 ACTION_REQUEST = "action_request"
 """Kind of percept that requests an action of the robot"""
@@ -27,7 +38,7 @@ class Contact:
     seq: int
     t_ns: int
     """the sample; in `end` the SYNC of the tick in which the contact ended"""
-    event: Annotated[str, Values("begin", "update", "end", closed=True)]
+    event: Annotated[ContactEvent, CLOSED]
     """`begin`, `update` or `end`"""
     id: int
     """constant from begin to end; unique in the `session`"""
@@ -53,7 +64,7 @@ class Contact:
     `residual` indicates that the contact is no point, or that gains are wrong"""
     pad_m: tuple[float, float] | None
     """arc lengths on the pad, from the electrodes x0 and y0"""
-    position_status: Annotated[str, PositionStatus]
+    position_status: Annotated[PositionStatusName, PositionStatus]
     """status of the position"""
     force_n: float | None
     """normal force, for a single contact patch of the radius configured in the deployment; a lower bound
@@ -62,7 +73,7 @@ class Contact:
     """standard deviation of `force_n`; nil unless `force_status` is `valid` or `unreliable`"""
     peak_force_n: float | None
     """maximum force since the contact began"""
-    force_status: Annotated[str, ForceStatus]
+    force_status: Annotated[ForceStatusName, ForceStatus]
     """status of the force"""
     total_current_a: float
     """total current of the pad"""
@@ -77,16 +88,14 @@ class Contact:
     """force below which it ends"""
     calibration_id: str
     """the calibration by which currents were converted to newtons"""
-    end_reason: Annotated[
-        str, Values("released", "stale", "lost", "faulted", "off", "restarted", "stopped", "")
-    ]
+    end_reason: EndReason
     """`released`; `stale`, `lost`, `faulted` or `off` as its pad; `restarted` (the node), `stopped` (the
     daemon); empty before the end"""
     retained: bool
     group: int = 0
     """the same for contacts on one hand that are so close that one object may bridge them; the id of one of
     its contacts, constant while any of them lasts"""
-    palm_status: Annotated[str, FrameStatus] = FrameStatus.NOT_COMPUTED.text
+    palm_status: Annotated[FrameStatusName, FrameStatus] = FrameStatus.NOT_COMPUTED.text
     """status of the three that follow"""
     palm_position_m: Vector3 | None = None
     """in the palm's frame, with the joint positions at the sample; nil unless `palm_status` is `valid`"""
@@ -94,7 +103,7 @@ class Contact:
     """outward unit normal, in the palm's frame"""
     palm_covariance_m2: Matrix3 | None = None
     """covariance of `palm_position_m`, row by row; includes the stated uncertainty of mounts and joints"""
-    base_status: Annotated[str, FrameStatus] = FrameStatus.NOT_COMPUTED.text
+    base_status: Annotated[FrameStatusName, FrameStatus] = FrameStatus.NOT_COMPUTED.text
     """status of the three that follow"""
     base_position_m: Vector3 | None = None
     """in the base's frame"""
@@ -192,13 +201,13 @@ class Percept:
     """publication"""
     hand: str
     """name of the hand"""
-    kind: Annotated[str, Values(*PERCEPT_KINDS, "action_request")]
+    kind: PerceptKind
     """as in the topic"""
     link: str
     """link that carries the pad; empty: the whole hand"""
     contact_id: int
     """id of the contact, 0 for none"""
-    state: Annotated[str, Values("undetermined", "estimated", "invalid", "open")]
+    state: Literal["undetermined", "estimated", "invalid", "open"]
     """`undetermined`: too little data yet, `reason` states what is missing; `estimated`; `invalid`; of an
     action request `open`"""
     label: str

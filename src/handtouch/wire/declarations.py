@@ -1,15 +1,16 @@
 """Declarations of payload fields: type, meaning and values.
 
-Public names: `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`, `input_fields`, `is_array`.
+Public names: `CLOSED`, `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`, `input_fields`,
+`is_array`.
 
 The declarations are the only source of the tables in docs/wire.md (`handtouch.wire.tables`) and of
 docs/wire.schema.json (`handtouch.wire.schema`). A field's docstring is its meaning. Metadata refine the type
 that the code sees:
 
-    state: Annotated[str, PadState]                           # texts of a status
-    event: Annotated[str, Values("begin", "update", "end")]   # names
-    force_n: Annotated[bytes, Column("<f4")]                  # a column
-    buses: Annotated[dict[str, Any], dict[str, BusStatistics]]    # maps inside of a map
+    state: Annotated[PadStateName, PadState]                   # texts of a status
+    event: Annotated[Literal["begin", "end"], CLOSED]          # names
+    force_n: Annotated[bytes, Column("<f4")]                   # a column
+    buses: Annotated[dict[str, Any], dict[str, BusStatistics]]     # maps inside of a map
 """
 
 from __future__ import annotations
@@ -21,16 +22,20 @@ import types
 import typing
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
-from typing import Annotated, Any, NamedTuple, Union
+from typing import Annotated, Any, Literal, NamedTuple, Union
 
 from handtouch.wire.columns import Column
 
 
-class Values:
+class Values(NamedTuple):
     """Values of a text field; a later version may add some unless they are `closed`."""
 
-    def __init__(self, *names: str, closed: bool = False) -> None:
-        self.names, self.closed = names, closed
+    names: tuple[str, ...]
+    closed: bool
+
+
+CLOSED = object()
+"""Metadata of a text field: a later version adds no values."""
 
 
 class FieldDeclaration(NamedTuple):
@@ -82,19 +87,24 @@ def _declaration(name: str, hint: Any, is_optional: bool, meanings: dict[str, st
     column: Column | None = None
     values: Values | None = None
     codes: type[Enum] | None = None
+    is_closed = False
     is_nilable, hint = _without_none(hint)
     if typing.get_origin(hint) is Annotated:
         hint, *metadata = typing.get_args(hint)
         for extra in metadata:
             if isinstance(extra, Column):
                 column, codes = extra, extra.codes
-            elif isinstance(extra, Values):
-                values = extra
+            elif extra is CLOSED:
+                is_closed = True
             elif isinstance(extra, type) and issubclass(extra, Enum):
                 codes = extra
             else:
                 hint = extra
     also_nilable, hint = _without_none(hint)
+    if typing.get_origin(hint) is Literal:
+        if codes is None:
+            values = Values(typing.get_args(hint), is_closed)
+        hint = str
     meaning = meanings.get(name, "")
     return FieldDeclaration(
         name, hint, is_nilable or also_nilable, is_optional, meaning, column, values, codes

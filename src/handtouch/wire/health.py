@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from handtouch.wire.declarations import Values
 from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.emergency import Emergency
-from handtouch.wire.status import PadState
+from handtouch.wire.status import PadState, PadStateName
+
+NodeStateName = Literal[
+    "absent", "booting", "identified", "configuring", "settling", "operational", "stale", "faulted", "stopped"
+]
+CalibrationStateName = Literal["default", "calibrated", "quarantined", "manual_required", ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,20 +32,14 @@ class Health:
     """bus of its node, as named in the deployment"""
     node_id: int
     """CANopen node id"""
-    state: Annotated[str, PadState]
+    state: Annotated[PadStateName, PadState]
     """state of the pad"""
-    node_state: Annotated[
-        str,
-        Values(
-            *("absent", "booting", "identified", "configuring", "settling"),
-            *("operational", "stale", "faulted", "stopped"),
-        ),
-    ]
+    node_state: NodeStateName
     """`absent`, `booting`, `identified`, `configuring`, `settling`, `operational`, `stale`, `faulted` or
     `stopped`"""
     node_state_since_ns: int
     """when the node entered that state"""
-    sampling: Annotated[str, Values("sync", "event", "off")]
+    sampling: Literal["sync", "event", "off"]
     """`sync`: with every SYNC; `event`: on change and ten times a second, while untouched; `off`: switched
     off"""
     reason: str
@@ -69,7 +67,7 @@ class Health:
     error_history: tuple[int, ...] = ()
     """pre-defined error field (0x1003) as read at boot and after a failure, the latest error first: error
     code in bits 0 to 15, manufacturer's information in bits 16 to 31"""
-    calibration_state: Annotated[str, Values("default", "calibrated", "quarantined", "manual_required")] = ""
+    calibration_state: CalibrationStateName = ""
     """`default`: the deployment's values; `calibrated`; `quarantined`: not relied on after its node was
     replaced; `manual_required`: automatic calibration failed. This and the following are absent where
     `[daemon] supervise` is false"""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, TypedDict
-
-from handtouch.wire.declarations import Values
+from typing import Annotated, Any, Literal, TypedDict
 
 
 class DurationPercentiles(TypedDict, total=False):
@@ -62,7 +60,7 @@ class ProcessStatistics(TypedDict):
 class SyncStatistics(TypedDict):
     """`sync` of a bus."""
 
-    by: Annotated[str, Values("kernel", "loop", "other_producer")]
+    by: Literal["kernel", "loop", "other_producer"]
     """producer of SYNC: `kernel`, `loop` or `other_producer`"""
     jitter_us: DurationPercentiles
     """deviation of SYNC intervals from the period, over the last second; empty: fewer than two SYNCs"""
@@ -79,7 +77,7 @@ class BusStatistics(TypedDict):
     """fraction of the bit rate, over the last half second, for worst-case bit stuffing"""
     lost_hz: float
     """frames lost per second on this host, over the last half second: the rate of `overflow`"""
-    state: Annotated[str, Values("active", "warning", "passive", "bus-off", "down")]
+    state: Literal["active", "warning", "passive", "bus-off", "down"]
     """`active`, `warning` (an error counter at 96 or more), `passive` (128), `bus-off`, `down`"""
     since_ns: int
     """since when, on the clock of `t_ns`; 0: from the start"""

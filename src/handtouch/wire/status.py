@@ -1,21 +1,21 @@
 """Status codes: numbers in columns, lower-case names in other messages (`status.text`).
 
-Public names: `PadState`, `PositionStatus`, `ForceStatus`, `FrameStatus`.
+Public names: `PadState`, `PositionStatus`, `ForceStatus`, `FrameStatus`, and the type of the names of each,
+`PadStateName` and so on. A later version may add codes.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Literal, cast
+
+PadStateName = Literal["clear", "touched", "stale", "lost", "faulted", "starting", "off"]
+PositionStatusName = Literal["not_computed", "valid", "unreliable", "invalid"]
+ForceStatusName = Literal["not_computed", "valid", "lower_bound", "unreliable", "invalid"]
+FrameStatusName = Literal["not_computed", "valid", "stale", "invalid"]
 
 
-class _StatusCode(IntEnum):
-    @property
-    def text(self) -> str:
-        """Name of the code in messages without columns."""
-        return self.name.lower()
-
-
-class PadState(_StatusCode):
+class PadState(IntEnum):
     """State of a pad: "no contact" is CLEAR only, not STALE, LOST or FAULTED."""
 
     CLEAR = 0
@@ -33,8 +33,13 @@ class PadState(_StatusCode):
     OFF = 6
     """switched off: in no scene, or disabled"""
 
+    @property
+    def text(self) -> PadStateName:
+        """Name of the code in messages without columns."""
+        return cast(PadStateName, self.name.lower())
 
-class PositionStatus(_StatusCode):
+
+class PositionStatus(IntEnum):
     """Status of a contact's position."""
 
     NOT_COMPUTED = 0
@@ -45,8 +50,13 @@ class PositionStatus(_StatusCode):
     INVALID = 3
     """no position agrees with the currents"""
 
+    @property
+    def text(self) -> PositionStatusName:
+        """Name of the code in messages without columns."""
+        return cast(PositionStatusName, self.name.lower())
 
-class ForceStatus(_StatusCode):
+
+class ForceStatus(IntEnum):
     """Status of a contact's force."""
 
     NOT_COMPUTED = 0
@@ -58,8 +68,13 @@ class ForceStatus(_StatusCode):
     """the pad's baseline, or the state of its sheet, is not known well enough yet"""
     INVALID = 4
 
+    @property
+    def text(self) -> ForceStatusName:
+        """Name of the code in messages without columns."""
+        return cast(ForceStatusName, self.name.lower())
 
-class FrameStatus(_StatusCode):
+
+class FrameStatus(IntEnum):
     """Status of a contact's position in the frame of the palm or the base."""
 
     NOT_COMPUTED = 0
@@ -69,3 +84,8 @@ class FrameStatus(_StatusCode):
     """the joint states that it depends on are too old"""
     INVALID = 3
     """no position on the link, or joints without any joint state"""
+
+    @property
+    def text(self) -> FrameStatusName:
+        """Name of the code in messages without columns."""
+        return cast(FrameStatusName, self.name.lower())

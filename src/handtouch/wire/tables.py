@@ -78,8 +78,9 @@ def _topic_rows() -> Iterator[Sequence[str]]:
 
 
 def _status_rows() -> Iterator[Sequence[str]]:
-    for number, row in enumerate(zip_longest(*_STATUS_HEADS.values())):
-        yield str(number), *("" if code is None else f"`{code.text}`" for code in row)
+    names = [[code.text for code in codes] for codes in _STATUS_HEADS.values()]
+    for number, row in enumerate(zip_longest(*names)):
+        yield str(number), *("" if name is None else f"`{name}`" for name in row)
 
 
 def _meaning(field: FieldDeclaration) -> str:

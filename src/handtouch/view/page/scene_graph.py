@@ -120,7 +120,9 @@ def _parse_robot(hand: HandTable, files: dict[str, bytes], problems: list[str]) 
         return None
 
 
-def _add_robot(scene: _SceneGraph, hand: HandTable, robot: RobotDescription, offset_m: float) -> list[list[int]]:
+def _add_robot(
+    scene: _SceneGraph, hand: HandTable, robot: RobotDescription, offset_m: float
+) -> list[list[int]]:
     numbers = {robot.root: scene.add_node(-1, (np.eye(3), np.array([0.0, offset_m, 0.0])))}
     waiting = list(robot.joints.values())
     while waiting:  # a parent may come later in the file than its child
