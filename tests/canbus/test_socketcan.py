@@ -73,6 +73,16 @@ def test_every_kind_of_frame_is_distinguished(port: Port) -> None:
     assert not select.select([port.fileno()], [], [], 0)[0]
 
 
+def test_bursts_longer_than_a_batch_are_read_whole_with_rising_stamps(port: Port) -> None:
+    run("cangen vcan0 -g 0 -n 600 -I 281 -L 8 -D i; cangen vcan0 -g 0 -n 3 -I 701 -L 1 -D i")
+    run("cangen vcan0 -g 0 -n 600 -I 281 -L 8 -D i")
+    others = port.drain()
+    assert [can_id for can_id, _, _ in others] == [0x701] * 3
+    assert (port.counters.samples, port.counters.frames, port.counters.overflow) == (1200, 1203, 0)
+    assert others[0][2] <= others[1][2] <= others[2][2] < port.slab.arrival_ns[0] <= time.monotonic_ns()
+    assert int.from_bytes(port.slab.unpack_counts()[0].astype("<i2").tobytes(), "little") == 599
+
+
 def test_own_frames_do_not_come_back(port: Port) -> None:
     assert port.send(0x80, b"")
     assert port.drain() == []

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.config.channels import integer_limits
+from handtouch.core.stages import receive
 
 MAX_PDOS = 4
 """Most PDOs that the four channels of a pad may be spread over."""
@@ -78,7 +79,7 @@ class Slab:
         ]
         self._has_standard_layout = np.ones(size, dtype=np.bool_)
         self._all_standard = True
-        self._required_pdos = [1] * size  # bit set of the PDOs of a sample
+        self._single = bytearray(size)  # 1 where a sample is one PDO
         self._partial_samples: dict[int, _PartialSample] = {}  # of pads with several PDOs
         self._word_indices = np.zeros((size, 4), dtype=np.intp)
         self._left_shifts = np.zeros((size, 4), dtype=np.int64)
@@ -89,6 +90,13 @@ class Slab:
         self._low_limits = np.zeros((size, 4), dtype=np.int64)
         self._high_limits = np.zeros((size, 4), dtype=np.int64)
         self._counts = np.zeros((size, 4), dtype=np.int64)
+        self._memory = receive.SampleMemory(
+            self._words.data,
+            self._arrival_ns,
+            self._repeat_counts,
+            memoryview(self._fresh),
+            memoryview(self._single),
+        )
         for slot in range(size):
             self.set_layout(slot, STANDARD_LAYOUT)
 
@@ -103,15 +111,13 @@ class Slab:
             # an amplifier at its limit gives either of the two lowest counts; a current of zero is no limit
             self._low_limits[slot, channel] = low + 1 if field.signed else -1
             self._high_limits[slot, channel] = high
-        required = 0
-        for field in layout:
-            required |= 1 << field.pdo
-        self._required_pdos[slot] = required
+        pdos = frozenset(field.pdo for field in layout)
+        self._single[slot] = pdos == {0}
         self._has_standard_layout[slot] = layout == STANDARD_LAYOUT
         self._all_standard = bool(self._has_standard_layout.all())
         self._partial_samples.pop(slot, None)
-        if required != 1:
-            self._partial_samples[slot] = _PartialSample(frozenset(field.pdo for field in layout))
+        if not self._single[slot]:
+            self._partial_samples[slot] = _PartialSample(pdos)
         self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = bytes(_SAMPLE_BYTES)
         is_real = self._counts_per_unit > 0
         self._is_real = is_real if is_real.any() else None
@@ -124,7 +130,7 @@ class Slab:
         A sample counts when all its PDOs have arrived; a second one within a cycle replaces the first. One of
         several PDOs is dropped if the previous SYNC brought fewer than all: the missing ones may arrive now.
         """
-        if self._required_pdos[slot] == 1:
+        if self._single[slot]:
             start = slot * _SAMPLE_BYTES
             self._bytes[start : start + len(data)] = data
         elif self._partial_samples[slot].add_pdo(pdo, data, arrival_ns):
@@ -137,6 +143,17 @@ class Slab:
         else:
             self._fresh[slot] = 1
             self.fresh_count += 1
+
+    def store_samples(
+        self, batch: receive.FrameBatch, routes: memoryview[int], first: int, count: int
+    ) -> tuple[int, int]:
+        """Store the samples of a batch of `count` frames from frame `first` to the next that is no sample.
+
+        Return that frame's number, and the bytes stored; see `handtouch.core.stages.receive`.
+        """
+        end = receive.store_samples(self._memory, batch, routes, first, count)
+        self.fresh_count += self._memory.new_fresh
+        return end, self._memory.stored_bytes
 
     def unpack_counts(self) -> NDArray[np.int64]:
         """Return counts (size, 4) of the electrodes x0, xa, y0, yb; the array is reused by the next call."""

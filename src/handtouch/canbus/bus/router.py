@@ -9,11 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import can
+import numpy as np
 
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.bus_state import BusState
 from handtouch.canbus.bus.load import frame_bits
 from handtouch.core.slab import MAX_PDOS, PDO_BYTES, Slab
+from handtouch.core.stages.receive import ROUTE_WORDS, FrameBatch
 
 IDENTIFIER_COUNT = 2048
 """Number of 11-bit identifiers."""
@@ -24,6 +26,7 @@ CanFrame = tuple[int, bytes, int]
 """Identifier, data, arrival in ns of the host's monotonic clock."""
 
 _FRAME_BITS = tuple(frame_bits(size) for size in range(9))
+_BITS_PER_BYTE = _FRAME_BITS[1] - _FRAME_BITS[0]
 
 
 @dataclass(slots=True)
@@ -52,6 +55,8 @@ class Router:
         self.bus_state = BusState() if bus_state is None else bus_state
         self._routes: list[tuple[int, int, int] | None] = [None] * IDENTIFIER_COUNT  # slot, PDO, size
         self._write = slab.write_pdo
+        routes = np.full((IDENTIFIER_COUNT, ROUTE_WORDS), NO_SLOT, dtype=np.int64)
+        self._route_words = routes.reshape(-1).data  # the same routes for batches
 
     def route(self, can_id: int, slot: int, pdo: int = 0, size: int = PDO_BYTES) -> None:
         """Write frames with this identifier and `size` bytes to the slab as PDO number `pdo` of a slot.
@@ -68,6 +73,8 @@ class Router:
                 f"PDO {pdo} of {size} bytes is outside 0 to {MAX_PDOS - 1} of 1 to {PDO_BYTES} bytes"
             )
         self._routes[can_id] = None if slot == NO_SLOT else (slot, pdo, size)
+        self._route_words[ROUTE_WORDS * can_id] = slot
+        self._route_words[ROUTE_WORDS * can_id + 1] = size
 
     def get_slot(self, can_id: int) -> int:
         """Return the slot that frames with this identifier are written to, NO_SLOT without a route."""
@@ -94,6 +101,18 @@ class Router:
         else:
             counters.wrong_length += 1
         return True
+
+    def accept_samples(self, batch: FrameBatch, first: int, count: int) -> int:
+        """Accept the samples of a batch of `count` frames from frame `first` to the next that is no sample.
+
+        Return that frame's number, `count` without one. `accept_frame` takes it, and samples of several PDOs.
+        """
+        end, stored_bytes = self.slab.store_samples(batch, self._route_words, first, count)
+        counters = self.counters
+        counters.frames += end - first
+        counters.samples += end - first
+        counters.bits += (end - first) * _FRAME_BITS[0] + _BITS_PER_BYTE * stored_bytes
+        return end
 
     def handle_error_frame(self, can_id: int, data: bytes | bytearray, arrival_ns: int) -> None:
         """Count an error frame, whose error classes are in the identifier, and update the bus state."""

@@ -18,6 +18,7 @@ import msgpack
 from can.interfaces.udp_multicast.utils import unpack_message
 
 from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
+from handtouch.canbus.bus.frame_reader import BATCH_FRAMES, FrameReader, RawFrame, enable_stamps
 from handtouch.canbus.bus.receivers import (
     MAX_DRAIN_FRAMES,
     CyclicSender,
@@ -31,6 +32,7 @@ from handtouch.canbus.bus.receivers import (
     must_reopen,
 )
 from handtouch.canbus.bus.router import IDENTIFIER_COUNT, CanFrame, Router
+from handtouch.core.stages.receive import frame_arrival_ns
 
 _SO_TIMESTAMPNS, _SO_MEMINFO = 35, 55
 _MEMINFO_DROPS_INDEX = 8  # of 32-bit words
@@ -162,10 +164,11 @@ class _SocketReceiver:
 
 
 class SocketcanReceiver(_SocketReceiver):
-    """Receiver for SocketCAN: kernel receive stamps, at a third of the cost of python-can's `recv`."""
+    """Receiver for SocketCAN: batches of frames with kernel receive stamps, samples straight to the slab."""
 
     def __init__(self, opener: Opener, channel: str) -> None:
         self._channel = channel
+        self._reader = FrameReader()
         super().__init__(opener)
 
     def _reopen(self, router: Router) -> can.BusABC | None:
@@ -175,36 +178,28 @@ class SocketcanReceiver(_SocketReceiver):
         return super()._reopen(router)
 
     def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:  # noqa: ARG002
-        recvmsg, unpack, accept = self._socket.recvmsg, _FRAME.unpack_from, router.accept_frame
-        stamp = _TIMESPEC.unpack_from
-        offset_ns, emptied_ns, now_ns = clock_offset_ns(), self._emptied_ns, time.monotonic_ns()
-        arrival_ns = now_ns
-        for _ in range(MAX_DRAIN_FRAMES):
-            try:
-                frame, ancillary, _, _ = recvmsg(16, _ANCILLARY, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                self._emptied_ns, self._newest_ns = now_ns, arrival_ns
+        reader, accept_samples, descriptor = self._reader, router.accept_samples, self._socket.fileno()
+        offset_ns, read = clock_offset_ns(), 0
+        while True:
+            before_ns = time.monotonic_ns()
+            count = reader.receive(descriptor, offset_ns, self._emptied_ns)
+            first = accept_samples(reader.batch, 0, count)
+            while first < count:
+                _accept_other(router, reader.frame(first), others)
+                first = accept_samples(reader.batch, first + 1, count)
+            if count:
+                self._newest_ns = frame_arrival_ns(reader.batch, count - 1)
+            if count < BATCH_FRAMES:
+                self._emptied_ns = before_ns
                 return
-            for _, kind, value in ancillary:
-                if kind == _SO_TIMESTAMPNS:
-                    seconds, nanoseconds = stamp(value)
-                    arrival_ns = seconds * 1_000_000_000 + nanoseconds + offset_ns
-            if not emptied_ns <= arrival_ns <= now_ns:
-                arrival_ns = bounded_arrival_ns(arrival_ns, emptied_ns)
-            can_id, size, data = unpack(frame)
-            if can_id >= 0x800:
-                if can_id & _ERROR_FLAG:
-                    router.handle_error_frame(can_id & _IDENTIFIER_MASK, data, arrival_ns)
-                elif can_id & ~_REMOTE_FLAG < 0x800:
-                    router.handle_remote_frame(can_id & ~_REMOTE_FLAG)
-                else:
-                    router.counters.unknown_frames += 1  # extended
-                continue
-            if size != 8:
-                data = data[:size]
-            if not accept(can_id, data, arrival_ns):
-                others.append((can_id, data, arrival_ns))
-        self.backlog_ns = self._newest_ns = arrival_ns
+            read += count
+            if read >= MAX_DRAIN_FRAMES:
+                self.backlog_ns = self._newest_ns
+                return
+
+    def _attach_bus(self, bus: can.BusABC) -> None:
+        super()._attach_bus(bus)
+        enable_stamps(self._socket)
 
     def _send(self, bus: can.BusABC, can_id: int, data: bytes, remote: bool) -> None:  # noqa: ARG002
         frame = _FRAME.pack(can_id | _REMOTE_FLAG if remote else can_id, len(data), data)
@@ -215,6 +210,23 @@ class SocketcanReceiver(_SocketReceiver):
             raise OSError(errno.ENODEV, self.fault.text if self.fault else "closed")
         # Not stored: with the task of a removed device python-can's shutdown would fail and close nothing.
         return _KernelSender(self._bus.send_periodic(make_message(can_id, data), period_s, store_task=False))
+
+
+def _accept_other(router: Router, frame: RawFrame, others: list[CanFrame]) -> None:
+    """Count a frame that is no plain sample; append it to `others` if it is a data frame without a route."""
+    can_id = frame.can_id
+    if frame.datagram_bytes != _FRAME.size or frame.size > 8:
+        router.counters.unknown_frames += 1  # CAN FD
+    elif can_id & _ERROR_FLAG:
+        router.handle_error_frame(can_id & _IDENTIFIER_MASK, frame.data, frame.arrival_ns)
+    elif can_id & ~_REMOTE_FLAG >= IDENTIFIER_COUNT:
+        router.counters.unknown_frames += 1  # extended
+    elif can_id & _REMOTE_FLAG:
+        router.handle_remote_frame(can_id & ~_REMOTE_FLAG)
+    else:
+        data = frame.data[: frame.size]
+        if not router.accept_frame(can_id, data, frame.arrival_ns):
+            others.append((can_id, data, frame.arrival_ns))
 
 
 class _KernelSender:

@@ -1,0 +1,21 @@
+cimport cython
+
+cdef long long _STAMP_KIND, _LOW_HALF
+cdef Py_ssize_t _HEADER, _FRAME, _CONTROL, _ROUTE
+cdef Py_ssize_t _CONTROL_SIZE, _MESSAGE_SIZE, _STAMP_BYTES, _FRAME_BYTES, _IDENTIFIERS, _WORDS_OF_SLOT
+
+cdef class SampleMemory:
+    cdef long long[::1] words, arrival_ns, repeat_counts
+    cdef unsigned char[::1] fresh, single
+    cdef readonly Py_ssize_t new_fresh, stored_bytes
+
+cdef class FrameBatch:
+    cdef long long[::1] headers, frames, control
+    cdef public long long offset_ns, earliest_ns, latest_ns
+
+@cython.locals(i=Py_ssize_t, head='long long', can_id='long long', slot='long long', size='long long',
+               message_size='long long')
+cpdef Py_ssize_t store_samples(
+    SampleMemory memory, FrameBatch batch, long long[::1] routes, Py_ssize_t first, Py_ssize_t count)
+@cython.locals(header=Py_ssize_t, control=Py_ssize_t, arrival_ns='long long')
+cpdef long long frame_arrival_ns(FrameBatch batch, Py_ssize_t i)

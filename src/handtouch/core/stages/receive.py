@@ -1,0 +1,97 @@
+"""Samples of a batch of CAN frames, stored in the slab's memory.
+
+Public names: `SampleMemory`, `FrameBatch`, `store_samples`, `frame_arrival_ns`, `HEADER_WORDS`,
+`FRAME_WORDS`, `CONTROL_WORDS`, `ROUTE_WORDS`. Memory is read in words of 64 bits; the layouts are those of
+Linux on 64-bit little-endian processors.
+"""
+
+from __future__ import annotations
+
+_HEADER, _FRAME, _CONTROL, _ROUTE = 8, 9, 4, 2
+HEADER_WORDS, FRAME_WORDS, CONTROL_WORDS, ROUTE_WORDS = _HEADER, _FRAME, _CONTROL, _ROUTE
+"""Words of a `struct mmsghdr`, of the longest frame (`struct canfd_frame`), of a control message with a
+`struct timespec`, and of a route."""
+_CONTROL_SIZE, _MESSAGE_SIZE = 5, 7  # words of a `struct mmsghdr`
+_STAMP_BYTES = 32
+_STAMP_KIND = 35 << 32 | 1  # SCM_TIMESTAMPNS of SOL_SOCKET
+_FRAME_BYTES = 16
+_IDENTIFIERS = 0x800
+_WORDS_OF_SLOT = 4
+_LOW_HALF = 0xFFFFFFFF
+
+
+class SampleMemory:
+    """Memory of a slab; a row a slot.
+
+    words: (slots 4,) PDOs. arrival_ns, repeat_counts: (slots,). fresh: (slots,). single: (slots,), 1 where a
+    sample is one PDO. `new_fresh` and `stored_bytes` are those of the last call of `store_samples`.
+    """
+
+    def __init__(
+        self,
+        words: memoryview[int],
+        arrival_ns: memoryview[int],
+        repeat_counts: memoryview[int],
+        fresh: memoryview[int],
+        single: memoryview[int],
+    ) -> None:
+        self.words, self.arrival_ns, self.repeat_counts = words, arrival_ns, repeat_counts
+        self.fresh, self.single = fresh, single
+        self.new_fresh = self.stored_bytes = 0
+
+
+class FrameBatch:
+    """Memory that `recvmmsg` writes frames to: headers, frames and control messages, each a row a frame.
+
+    Their stamps are of the wall clock: monotonic minus wall clock is `offset_ns`. An arrival isn't before
+    `earliest_ns`, when the queue was last empty, nor after `latest_ns`, when the batch had been read; a step
+    of the wall clock would falsify it.
+    """
+
+    def __init__(self, headers: memoryview[int], frames: memoryview[int], control: memoryview[int]) -> None:
+        self.headers, self.frames, self.control = headers, frames, control
+        self.offset_ns = self.earliest_ns = self.latest_ns = 0
+
+
+def store_samples(
+    memory: SampleMemory, batch: FrameBatch, routes: memoryview[int], first: int, count: int
+) -> int:
+    """Store the samples of a batch of `count` frames, from frame `first` up to the next that is no sample.
+
+    routes: (2048 ROUTE_WORDS,) by identifier, slot (-1: none) and bytes of data. Return the number of the
+    frame that is no sample, `count` if all were; a frame of another size than its route's is no sample, nor
+    is one of several PDOs of a sample.
+    """
+    memory.new_fresh = memory.stored_bytes = 0
+    for i in range(first, count):
+        head = batch.frames[_FRAME * i]
+        can_id = head & _LOW_HALF
+        message_size = batch.headers[_HEADER * i + _MESSAGE_SIZE] & _LOW_HALF
+        if can_id >= _IDENTIFIERS or message_size != _FRAME_BYTES:
+            return i
+        slot, size = routes[_ROUTE * can_id], routes[_ROUTE * can_id + 1]
+        if slot < 0 or head >> 32 & 0xFF != size or not memory.single[slot]:
+            return i
+        memory.words[_WORDS_OF_SLOT * slot] = batch.frames[_FRAME * i + 1]
+        memory.arrival_ns[slot] = frame_arrival_ns(batch, i)
+        if memory.fresh[slot]:
+            memory.repeat_counts[slot] += 1
+        else:
+            memory.fresh[slot] = 1
+            memory.new_fresh += 1
+        memory.stored_bytes += size
+    return count
+
+
+def frame_arrival_ns(batch: FrameBatch, i: int) -> int:
+    """Return the arrival of a frame on the monotonic clock; prepare its header for the next batch."""
+    header, control = _HEADER * i, _CONTROL * i
+    if batch.headers[header + _CONTROL_SIZE] != _STAMP_BYTES:  # it has no stamp
+        batch.headers[header + _CONTROL_SIZE] = _STAMP_BYTES
+        batch.control[control + 1] = 0
+    arrival_ns = batch.latest_ns
+    if batch.control[control + 1] == _STAMP_KIND:
+        arrival_ns = batch.control[control + 2] * 1_000_000_000 + batch.control[control + 3] + batch.offset_ns
+    if arrival_ns < batch.earliest_ns:
+        return batch.earliest_ns
+    return arrival_ns if arrival_ns < batch.latest_ns else batch.latest_ns
