@@ -125,6 +125,21 @@ def test_nodes_of_a_bus_that_is_down_name_its_problem(rig: Any) -> None:
     assert all("bus can: Network is down" in event.reason for event in events)
 
 
+@pytest.mark.parametrize("outage_ms", range(20, 600, 20))
+def test_no_node_is_lost_by_its_own_fault_after_an_outage_of_its_bus(rig: Any, outage_ms: int) -> None:
+    """Its heartbeat may be due in the moment in which the bus recovers."""
+    rig.boot()
+    rig.wire.cut = {1, 2, 3}
+    rig.wire.fault = BusFault(ErrorState.DOWN, "Network is down")
+    rig.port.update_state(rig.t_ns)
+    events = rig.run(outage_ms)
+    rig.wire.cut, rig.wire.fault = set(), None
+    rig.port.update_state(rig.t_ns)
+    events += rig.run(600)
+    assert all("bus can: Network is down" in e.reason for e in events if e.new_state is NodeState.ABSENT)
+    assert all(rig.state(number) is NodeState.OPERATIONAL for number in (1, 2, 3))
+
+
 def test_loop_pause_is_what_exceeds_wait_and_allowance() -> None:
     pause = LoopPause(PERIOD_NS)
     pause.begin_wait(0)

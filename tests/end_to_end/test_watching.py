@@ -30,7 +30,7 @@ def is_up_with(operational: int, found: dict[str, list[Any]]) -> bool:
     states = [
         sample.value for sample in found.get("node_state", []) if sample.labels["state"] == "operational"
     ]
-    return sum(states) == operational and found["up"][0].value == 1
+    return sum(states) == operational and bool(found["up"][0].value == 1)
 
 
 def test_metrics_of_pads_ticks_and_stages(rig: Any, free_port: int) -> None:

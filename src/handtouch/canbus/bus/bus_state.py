@@ -94,11 +94,15 @@ _QUEUE_FULL_PATTERN = re.compile(
 )
 
 
+_WITHOUT_FRAMES = (ErrorState.DOWN, ErrorState.BUS_OFF)
+
+
 class BusState:
     """State of one bus: call `handle_error_frame` for each error frame and `update` regularly.
 
     `error_state` : current state, since `since_ns` on the clock of the calls
     `problem` : cause and remedy, empty if there is no problem
+    `recovered_ns` : end of the last time in which the bus was down or bus-off, 0 if there was none
     `causes` : number of error frames by cause
     `transmit_errors`, `receive_errors` : the controller's error counters
     `restart_ms` : the kernel's automatic restart after bus-off, 0 for none, None while unknown
@@ -106,7 +110,7 @@ class BusState:
 
     def __init__(self, interface: str = "socketcan", channel: str = "can0") -> None:
         self.error_state = ErrorState.ACTIVE
-        self.since_ns = 0
+        self.since_ns = self.recovered_ns = 0
         self.causes: Counter[str] = Counter()
         self.transmit_errors = self.receive_errors = 0
         self.restart_ms: int | None = None
@@ -190,6 +194,8 @@ class BusState:
             self._recent_causes.clear()
         if error_state is not self.error_state:
             old, lasted_ns = self.error_state, now_ns - self.since_ns
+            if old in _WITHOUT_FRAMES and error_state not in _WITHOUT_FRAMES:
+                self.recovered_ns = now_ns
             self.error_state, self.since_ns = error_state, now_ns
             self._transitions.append(BusTransition(old, error_state, lasted_ns, self.problem))
 

@@ -14,6 +14,7 @@ from handtouch.canbus.nodes import instability
 from handtouch.canbus.nodes.lifecycle_types import (
     CONNECTION_REMEDY,
     BootUpReceived,
+    BusRecovered,
     BusRole,
     ErrorsReported,
     ForeignNmtCommand,
@@ -104,6 +105,8 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
             return _on_timer_expired(life, bus_cause, now_ns, timing)
         case LoopPaused(excused_ns):
             return _extend_timeouts(life, excused_ns), ()
+        case BusRecovered():
+            return _restart_timeouts(life, now_ns, timing), ()
         case StopRequested():
             # a node that wasn't identified, or is another device, is left alone
             stop = timing.role is BusRole.MASTER and life.identified
@@ -331,6 +334,14 @@ def _extend_timeouts(life: Lifecycle, excused_ns: int) -> Lifecycle:
         life = replace(life, last_heartbeat_ns=life.last_heartbeat_ns + excused_ns)
     if life.state is NodeState.SETTLING and life.due_ns != NEVER_NS:
         life = replace(life, due_ns=life.due_ns + excused_ns)
+    return life
+
+
+def _restart_timeouts(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifecycle:
+    if life.last_heartbeat_ns is not None:
+        life = replace(life, last_heartbeat_ns=now_ns)
+    if life.state is NodeState.SETTLING and life.due_ns != NEVER_NS:
+        life = replace(life, due_ns=now_ns + timing.settle_timeout_ns)
     return life
 
 

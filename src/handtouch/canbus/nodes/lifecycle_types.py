@@ -214,6 +214,11 @@ class LoopPaused:
 
 
 @dataclass(frozen=True, slots=True)
+class BusRecovered:
+    """The bus carries frames again after it was down or bus-off: timeouts start again."""
+
+
+@dataclass(frozen=True, slots=True)
 class StandbyRequested:
     """The scene doesn't need the node (`standby`), or needs it again."""
 
@@ -240,5 +245,6 @@ LifecycleEvent = (
     | StandbyRequested
     | TimerExpired
     | LoopPaused
+    | BusRecovered
     | StopRequested
 )

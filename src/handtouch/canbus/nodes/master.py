@@ -22,6 +22,7 @@ from handtouch.canbus.nodes.bus_cause import BusCauses
 from handtouch.canbus.nodes.lifecycle import advance, due_ns, is_supervised
 from handtouch.canbus.nodes.lifecycle_types import (
     BootUpReceived,
+    BusRecovered,
     BusRole,
     ErrorsReported,
     ForeignNmtCommand,
@@ -137,6 +138,7 @@ class Master:
         self._awaited_samples: dict[int, int] = {}  # slot -> arrival of its last sample
         self._next_due_ns = 0
         self._sample_rates = SampleRates(self._slab, ports, self._nodes, sync_period_ns or 0)
+        self._recovered_ns = {name: port.bus_state.recovered_ns for name, port in ports.items()}
         self._events: deque[MasterEvent] = deque(maxlen=_MAX_EVENTS)
         # from the workers
         self._results: deque[tuple[ManagedNode, StepOutcome | None, StepResult | None]] = deque()
@@ -187,6 +189,7 @@ class Master:
             return
         if self._results:
             self._collect_results(now_ns)
+        self._check_recoveries(now_ns)
         self._check_samples(now_ns)
         for slot, samples_per_sync in self._sample_rates.check(now_ns).items():
             self._advance(self._by_slot[slot], SampleRate(samples_per_sync), now_ns)
@@ -332,6 +335,15 @@ class Master:
                     node = self._by_slot[slot]
                     cause = self._bus_causes.of_missing_samples(node, states, ages_ns, now_ns)
                     self._advance(node, SamplesMissing(int(ages_ns[slot]), cause), now_ns)
+
+    def _check_recoveries(self, now_ns: int) -> None:
+        """Restart the timeouts of a bus that was down: its nodes could not be heard."""
+        for name, port in self._ports.items():
+            if self._recovered_ns[name] != port.bus_state.recovered_ns:
+                self._recovered_ns[name] = port.bus_state.recovered_ns
+                for node in self._nodes:
+                    if node.port is port:
+                        self._advance(node, BusRecovered(), now_ns)
 
     def _run_timers(self, now_ns: int) -> None:
         self._next_due_ns = _NEVER_NS
