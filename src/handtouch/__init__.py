@@ -1,36 +1,49 @@
 """handtouch: middleware that gives a robot hand a sense of touch.
 
-`connect` subscribes to a running daemon, `columns` reads its hand frames as arrays, `request` asks it
-something; they load on first use, so that `import handtouch.field` stays light.
+`Hand` is the newest state of a hand, for control loops. `connect` receives every message of a daemon,
+`columns` reads its hand frames as arrays. `DaemonControl` has the daemon's commands as methods, `request`
+sends any of them; `Robot` sends joint states. All load on first use, so that `import handtouch.field` stays
+light.
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from handtouch.client import (
-        Subscriber,
-        columns,
-        connect,
-        request,
-    )
+    from handtouch.client import Subscriber, columns, connect, request
+    from handtouch.client.control import DaemonControl
+    from handtouch.client.hand import Hand
     from handtouch.client.robot import Robot
 
 __version__ = "0.1.0"
-__all__ = ["Robot", "Subscriber", "__version__", "columns", "connect", "request"]
+_MODULES = {
+    "DaemonControl": "handtouch.client.control",
+    "Hand": "handtouch.client.hand",
+    "Robot": "handtouch.client.robot",
+    "Subscriber": "handtouch.client",
+    "columns": "handtouch.client",
+    "connect": "handtouch.client",
+    "request": "handtouch.client",
+}
+__all__ = [
+    "DaemonControl",
+    "Hand",
+    "Robot",
+    "Subscriber",
+    "__version__",
+    "columns",
+    "connect",
+    "request",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("Subscriber", "columns", "connect", "request"):
-        from handtouch import client
-
-        return getattr(client, name)
-    if name == "Robot":
-        from handtouch.client.robot import Robot
-
-        return Robot
-    raise AttributeError(f"module 'handtouch' has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'handtouch' has no attribute {name!r}")
+    found = globals()[name] = getattr(importlib.import_module(_MODULES[name]), name)
+    return found
 
 
 def __dir__() -> list[str]:

@@ -170,6 +170,44 @@ def test_timeouts_and_cancellation_lose_no_message(publisher: Any, subscriber: S
     assert subscriber.lost_messages == 0
 
 
+def test_each_message_goes_to_one_of_the_tasks(publisher: Any, subscriber: Subscriber[Any]) -> None:
+    async def main() -> list[list[int]]:
+        got: list[list[int]] = [[], [], []]
+
+        async def read(seqs: list[int]) -> None:
+            while True:
+                seqs.append((await subscriber.arecv()).seq)
+
+        tasks = [asyncio.create_task(read(seqs)) for seqs in got]
+        for seq in range(1, 201):
+            for _ in range(seq % 5):
+                await asyncio.sleep(0)
+            publisher.send_multipart(_parts(seq))
+        async with asyncio.timeout(60):
+            while sum(map(len, got)) < 200:
+                await asyncio.sleep(0.01)
+        for task in tasks:
+            task.cancel()
+        return got
+
+    got = asyncio.run(main())
+    assert sorted(seq for seqs in got for seq in seqs) == list(range(1, 201))
+
+
+def test_a_task_that_waits_is_not_affected_by_the_timeout_of_another(
+    publisher: Any, subscriber: Subscriber[Any]
+) -> None:
+    async def main() -> tuple[Any, Any]:
+        waits = asyncio.create_task(subscriber.arecv(60.0))
+        gives_up = await subscriber.arecv(0.01)
+        publisher.send_multipart(_parts(1))
+        return gives_up, await waits
+
+    gives_up, message = asyncio.run(main())
+    assert gives_up is None
+    assert message.seq == 1
+
+
 def test_a_stream_without_a_pause_lets_other_tasks_run(publisher: Any, subscriber: Subscriber[Any]) -> None:
     async def main() -> int:
         iterations = 0

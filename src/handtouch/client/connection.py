@@ -59,6 +59,7 @@ class Connection:
         self._monitor = monitor
         self._key = key
         self._failures = 0
+        self._waiting: set[asyncio.Future[None]] = set()
         self._poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
         self._poller.register(monitor, zmq.POLLIN)
@@ -110,19 +111,41 @@ class Connection:
         return bool(int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
 
     async def wait(self) -> None:
-        """Return once a message may be received. Raises PermissionError when the daemon rejects us."""
-        loop, woken = asyncio.get_running_loop(), asyncio.Event()
-        descriptors = [int(socket.getsockopt(zmq.FD)) for socket in (self.socket, self._monitor)]
-        for descriptor in descriptors:
-            loop.add_reader(descriptor, woken.set)
+        """Return when a message may have arrived, or another task has received one: receive again then.
+
+        Several tasks may wait at once. Raises PermissionError, in all of them, when the daemon rejects us.
+        """
         try:
-            while not self.readable:
-                if not self.poll(0):  # the descriptors are edge-triggered: poll before waiting on them
-                    await woken.wait()
-                    woken.clear()
+            if self.readable or self.poll(0):
+                return  # the descriptors are edge-triggered: poll before waiting on them
+        except PermissionError as error:
+            self.wake_waiting(error)
+            raise
+        loop = asyncio.get_running_loop()
+        woken: asyncio.Future[None] = loop.create_future()
+        if not self._waiting:
+            for descriptor in self._descriptors():
+                loop.add_reader(descriptor, self.wake_waiting)
+        self._waiting.add(woken)
+        try:
+            await woken
         finally:
-            for descriptor in descriptors:
-                loop.remove_reader(descriptor)
+            self._waiting.discard(woken)
+            if not self._waiting:
+                for descriptor in self._descriptors():
+                    loop.remove_reader(descriptor)
+
+    def wake_waiting(self, error: PermissionError | None = None) -> None:
+        """Make every `wait` return, or raise the error. Call it after receiving: that may hide messages."""
+        for woken in self._waiting:
+            if not woken.done():
+                if error is None:
+                    woken.set_result(None)
+                else:
+                    woken.set_exception(PermissionError(*error.args))
+
+    def _descriptors(self) -> list[int]:
+        return [int(socket.getsockopt(zmq.FD)) for socket in (self.socket, self._monitor)]
 
     def close(self) -> None:
         """Close the socket and its monitor; the daemon notices within milliseconds."""

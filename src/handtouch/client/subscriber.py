@@ -43,37 +43,50 @@ class _ConnectOptions(TypedDict, total=False):
 def connect(**options: Unpack[_ConnectOptions]) -> Subscriber[wire.Contact]: ...
 @overload
 def connect(
-    pattern: Literal["contact/*/*"], /, **options: Unpack[_ConnectOptions]
+    pattern: Literal["contact/*/*", "contact/left/*", "contact/right/*"],
+    /,
+    **options: Unpack[_ConnectOptions],
 ) -> Subscriber[wire.Contact]: ...
 @overload
 def connect(
-    pattern: Literal["hand/*"], /, **options: Unpack[_ConnectOptions]
+    pattern: Literal["hand/*", "hand/left", "hand/right"], /, **options: Unpack[_ConnectOptions]
 ) -> Subscriber[wire.HandFrame]: ...
 @overload
 def connect(
-    pattern: Literal["health/*/*"], /, **options: Unpack[_ConnectOptions]
+    pattern: Literal["health/*/*", "health/left/*", "health/right/*"], /, **options: Unpack[_ConnectOptions]
 ) -> Subscriber[wire.Health]: ...
 @overload
 def connect(
-    pattern: Literal["percept/*/*"], /, **options: Unpack[_ConnectOptions]
+    pattern: Literal["percept/*/*", "percept/left/*", "percept/right/*"],
+    /,
+    **options: Unpack[_ConnectOptions],
 ) -> Subscriber[wire.Percept]: ...
 @overload
-def connect(pattern: Literal["raw/*"], /, **options: Unpack[_ConnectOptions]) -> Subscriber[wire.Raw]: ...
+def connect(
+    pattern: Literal["raw/*", "raw/left", "raw/right"], /, **options: Unpack[_ConnectOptions]
+) -> Subscriber[wire.Raw]: ...
 @overload
 def connect(
     pattern: Literal["service"], /, **options: Unpack[_ConnectOptions]
 ) -> Subscriber[wire.Service]: ...
 @overload
+def connect(*patterns: str, kind: type[M], **options: Unpack[_ConnectOptions]) -> Subscriber[M]: ...
+@overload
 def connect(*patterns: str, **options: Unpack[_ConnectOptions]) -> Subscriber[Any]: ...
 def connect(
-    *patterns: str, endpoint: str = LIVE_ENDPOINT, key: Path | str | None = None, queue: int = 1000
+    *patterns: str,
+    kind: type[Any] | None = None,
+    endpoint: str = LIVE_ENDPOINT,
+    key: Path | str | None = None,
+    queue: int = 1000,
 ) -> Subscriber[Any]:
     """Subscribe to the topics that match any of the patterns.
 
     A pattern is a topic whose parts may contain the wildcards * and ?: "contact/*/*" (the default),
     "contact/left/thumb_tip", "hand/*", "health/*/index_*", "percept/left/motion", "service". Messages are
-    `wire.Contact`, `HandFrame`, `Health`, `PerceptEstimate`, `Raw` or `Service`; a type checker knows which
-    for the patterns of a whole topic.
+    `wire.Contact`, `HandFrame`, `Health`, `Percept`, `Raw` or `Service`; a type checker knows which for the
+    patterns of a whole topic, of the hands `left` and `right`, and where `kind` names it:
+    `connect("hand/gripper", kind=wire.HandFrame)`.
 
     On joining, the current state is received first, with `retained` set: active contacts as an update, the
     latest hand frame, health and service. `queue` bounds the messages that wait in this process; when it is
@@ -83,9 +96,12 @@ def connect(
     `key` is this client's key file, for a daemon that requires one (`handtouch keys`). Default: the file
     named by the environment variable HANDTOUCH_KEY; "" for none.
 
-    Raises ValueError for a pattern that matches no topic, an invalid endpoint or an unusable key file.
-    Receiving raises PermissionError when the daemon rejects this client.
+    Raises ValueError for a pattern that matches no topic, or one of another `kind`, an invalid endpoint or an
+    unusable key file. Receiving raises PermissionError when the daemon rejects this client.
     """
+    for pattern in patterns:
+        if kind is not None and _check_pattern(pattern) != [kind]:
+            raise ValueError(f"messages of {pattern!r} are no {kind.__name__}")
     return Subscriber.open(patterns or ("contact/*/*",), endpoint, queue, key)
 
 
@@ -96,8 +112,8 @@ class Subscriber(Generic[M]):
             async for frame in frames:
                 force_n = handtouch.columns(frame)["force_n"]
 
-    Not thread-safe: use it in one thread, or one task, at a time. After a restart of the daemon it continues
-    with the new `session`; messages of the previous one don't count as lost.
+    Not thread-safe: use it in one thread; there, several asyncio tasks may receive. After a restart of the
+    daemon it continues with the new `session`; messages of the previous one don't count as lost.
     """
 
     def __init__(self, patterns: tuple[str, ...], connection: Connection) -> None:
@@ -179,7 +195,10 @@ class Subscriber(Generic[M]):
     @overload
     async def arecv(self, timeout_s: float | None) -> M | None: ...
     async def arecv(self, timeout_s: float | None = None) -> M | None:
-        """Do as `recv`, for asyncio. Cancelling it loses no message."""
+        """Do as `recv`, for asyncio. Cancelling it loses no message.
+
+        Several tasks may receive at once; each message goes to one of them.
+        """
         await asyncio.sleep(0)  # let other tasks run even while the stream never pauses
         try:
             async with asyncio.timeout(timeout_s):
@@ -187,6 +206,7 @@ class Subscriber(Generic[M]):
                     await self.connection.wait()
         except TimeoutError:
             return None
+        self.connection.wake_waiting()
         return received[0]
 
     def resubscribe(self, prefix: str) -> None:
@@ -294,11 +314,16 @@ def request(
     return answer
 
 
-def _check_pattern(pattern: str) -> None:
+def _check_pattern(pattern: str) -> list[type[Any]]:
+    """Return the types of messages that a pattern matches. Raises ValueError if there is none."""
     parts = pattern.split("/")
-    if not any(len(parts) == len(t.keys) + 1 and fnmatchcase(t.prefix, parts[0]) for t in wire.TOPICS):
+    kinds = [
+        t.payload for t in wire.TOPICS if len(parts) == len(t.keys) + 1 and fnmatchcase(t.prefix, parts[0])
+    ]
+    if not kinds:
         rows = ", ".join(topic.pattern for topic in wire.TOPICS)
         raise ValueError(f"no topic matches the pattern {pattern!r}; the topics are {rows}")
+    return kinds
 
 
 def _literal_prefix(pattern: str) -> str:

@@ -8,7 +8,15 @@ docs/wire.md describes every field for readers in other languages. SI units; `t_
 clock; an unknown number is nil, never NaN. Optional fields are left out where they have their default.
 """
 
-from handtouch.wire.codec import SCHEMA_VERSION, UnknownTopicError, WireError, decode, encode, to_map
+from handtouch.wire.codec import (
+    SCHEMA_VERSION,
+    UnknownTopicError,
+    WireError,
+    check_fields,
+    decode,
+    encode,
+    to_map,
+)
 from handtouch.wire.columns import Column
 from handtouch.wire.contact import (
     PERCEPT_KINDS,
@@ -77,6 +85,7 @@ __all__ = [
     "UnknownTopicError",
     "Vector3",
     "WireError",
+    "check_fields",
     "decode",
     "encode",
     "to_map",

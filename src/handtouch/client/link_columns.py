@@ -1,0 +1,242 @@
+"""Arrays of a hand frame by link, and the wrenches of its contacts.
+
+Public names: `LinkColumn`, `HandView`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Mapping
+from fnmatch import fnmatchcase
+from functools import cached_property
+from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import wire
+from handtouch.client.wrench import GraspMatrix, Wrench, contact_wrenches, grasp_matrix, sum_wrenches
+
+T = TypeVar("T")
+FrameName = Literal["link", "palm", "base"]
+"""Frame of positions, normals and wrenches: of each link, or of the links that the deployment names."""
+FloatArray = NDArray[np.float64]
+_COLUMNS = wire.COLUMNS[wire.HandFrame]
+
+
+class LinkColumn(Mapping[str, T], Generic[T]):
+    """One quantity of every pad: a read-only mapping from link to value, and an array in `array`.
+
+        hand.force_n["index_distal"]     # a number, or a row such as (3,) of position_m
+        hand.force_n.array               # (n,) or (n, elements), in the order of hand.links
+
+    numpy accepts it as an array. An unknown link raises KeyError naming the closest one.
+    """
+
+    __slots__ = ("_rows", "array")
+
+    def __init__(self, array: NDArray[Any], rows: Mapping[str, int]) -> None:
+        self.array = array
+        self._rows = rows
+
+    def __getitem__(self, link: str) -> T:
+        try:
+            value = self.array[self._rows[link]]
+        except KeyError:
+            close = difflib.get_close_matches(link, self._rows, 1)
+            hint = f"did you mean {close[0]!r}?" if close else f"the links are {', '.join(self._rows)}"
+            raise KeyError(f"no link {link!r}; {hint}") from None
+        return cast(T, value.item() if self.array.ndim == 1 else value)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.array, dtype=dtype, copy=copy)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
+
+class _FrameColumn(Generic[T]):
+    """Attribute that returns a column of the newest frame; its name is the column's."""
+
+    def __init__(self, meaning: str) -> None:
+        self.__doc__ = meaning
+
+    def __set_name__(self, _: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, owner: None, _: type) -> Self: ...
+    @overload
+    def __get__(self, owner: LinkColumns, _: type) -> LinkColumn[T]: ...
+    def __get__(self, owner: LinkColumns | None, _: type) -> Self | LinkColumn[T]:
+        return self if owner is None else owner.column(self._name)
+
+
+class LinkColumns:
+    """The columns of `wire.HandFrame` by link, as attributes; a row per pad.
+
+    Unknown values are NaN. Those of the palm and the base raise LookupError while no scene requests them.
+    """
+
+    state = _FrameColumn[int]("State of the pad, a `wire.PadState`; only CLEAR means no contact.")
+    touched = _FrameColumn[bool]("True where the pad has a contact.")
+    sampled = _FrameColumn[bool]("True where the pad is sampled, so that no contact means none.")
+    contact_id = _FrameColumn[int]("Id of the contact, 0 for none.")
+    sample_ns = _FrameColumn[int]("Time of the sample on the daemon's monotonic clock, 0 before the first.")
+    total_current_a = _FrameColumn[float]("Total current of the newest sample.")
+    position_m = _FrameColumn[FloatArray]("(3,) contact position in the link's frame.")
+    normal = _FrameColumn[FloatArray]("(3,) outward unit normal of the pad at the position.")
+    covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position, row by row.")
+    pad_m = _FrameColumn[FloatArray]("(2,) arc lengths on the pad, from the electrodes x0 and y0.")
+    position_status = _FrameColumn[int]("Status of the position, a `wire.PositionStatus`.")
+    force_n = _FrameColumn[float]("Normal force.")
+    force_std_n = _FrameColumn[float]("Its standard deviation; NaN where the force is a lower bound.")
+    force_status = _FrameColumn[int]("Status of the force, a `wire.ForceStatus`.")
+    residual = _FrameColumn[float]("Deviation from a point contact, as in `wire.Contact`.")
+    residual_std = _FrameColumn[float]("Its standard deviation for a point contact.")
+    group = _FrameColumn[int]("The same for contacts that one object may bridge, 0 without contact.")
+    palm_status = _FrameColumn[int]("Status in the palm's frame, a `wire.FrameStatus`.")
+    palm_position_m = _FrameColumn[FloatArray]("(3,) contact position in the palm's frame.")
+    palm_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the palm's frame.")
+    palm_covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position in the palm's frame.")
+    base_status = _FrameColumn[int]("Status in the base's frame, a `wire.FrameStatus`.")
+    base_position_m = _FrameColumn[FloatArray]("(3,) contact position in the base's frame.")
+    base_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the base's frame.")
+    base_covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position in the base's frame.")
+    joints_age_s = _FrameColumn[float]("Time from the sample to the nearest joint state.")
+
+    def column(self, name: str) -> LinkColumn[Any]:
+        """Return a column by its name. Raises LookupError while it isn't published."""
+        raise NotImplementedError
+
+
+class HandView(LinkColumns):
+    """All pads of a hand at one tick, as arrays by link; immutable."""
+
+    def __init__(self, frame: wire.HandFrame, rows: Mapping[str, int] | None = None) -> None:
+        self.frame = frame
+        """the message it was made of"""
+        self._rows = rows if rows is not None else {link: row for row, link in enumerate(frame.links)}
+        self._cache: dict[str, LinkColumn[Any]] = {}
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Links in the order of the rows."""
+        return self.frame.links
+
+    @property
+    def t_ns(self) -> int:
+        """SYNC of the tick, on the daemon's monotonic clock."""
+        return self.frame.t_ns
+
+    def column(self, name: str) -> LinkColumn[Any]:
+        """Return a column by its name. Raises LookupError while no scene requests it."""
+        found = self._cache.get(name)
+        if found is None:
+            found = self._cache[name] = LinkColumn(self._make_array(name), self._rows)
+        return found
+
+    def age_at(self, now_ns: int) -> LinkColumn[float]:
+        """Return the age [s] of each pad's sample at a time on the daemon's clock; infinite without one."""
+        sample_ns = self.sample_ns.array
+        age_s = np.where(sample_ns > 0, (now_ns - sample_ns) * 1e-9, np.inf)
+        return LinkColumn(age_s, self._rows)
+
+    def wrenches(self, frame: FrameName = "palm", links: str = "*") -> dict[str, Wrench]:
+        """Return the wrench of each contact on links that match a pattern, about the origin of the frame.
+
+        Contacts without a valid force, or a valid position in that frame, are left out. Raises LookupError
+        while no scene requests the frame.
+        """
+        rows = self._rows_of(links) & self._usable(frame)
+        made = contact_wrenches(*self._geometry(frame, rows), *self._forces(rows))
+        return dict(zip(self._names(rows), made, strict=True))
+
+    def wrench(self, links: str = "*", frame: FrameName = "palm") -> Wrench:
+        """Return the total wrench of the contacts on links that match a pattern, such as a finger's.
+
+        `missing` names the contacts that it lacks because their force or position isn't valid. In the frame
+        "link" the pattern must match one link. Raises LookupError for a pattern without a link and while no
+        scene requests the frame, ValueError for several links in the frame "link".
+        """
+        rows = self._rows_of(links)
+        if frame == "link" and rows.sum() > 1:
+            raise ValueError(f"{links!r} matches {rows.sum()} links, and each has a frame of its own")
+        missing = self._names(rows & self.touched.array & ~self._usable(frame))
+        return sum_wrenches(list(self.wrenches(frame, links).values()), missing)
+
+    def total_force_n(self, links: str = "*") -> tuple[float, float]:
+        """Return the sum of the normal forces on links that match a pattern, and its standard deviation.
+
+        It is NaN if one of the contacts has no valid force. Raises LookupError for a pattern without a link.
+        """
+        rows = self._rows_of(links) & self.touched.array
+        if (self.force_status.array[rows] != wire.ForceStatus.VALID).any():
+            return float("nan"), float("nan")
+        force_n, std_n = self._forces(rows)
+        return float(force_n.sum()), float(np.sqrt((std_n**2).sum()))
+
+    def grasp_matrix(self, frame: FrameName = "palm", links: str = "*") -> GraspMatrix:
+        """Return the map from contact forces to the wrench on the object, for valid positions.
+
+        Raises LookupError as `wrench`.
+        """
+        rows = self._rows_of(links) & self._is_located(frame)
+        position_m, normal, _ = self._geometry(frame, rows)
+        return GraspMatrix(grasp_matrix(position_m, normal), self._names(rows))
+
+    @cached_property
+    def _valid_force(self) -> NDArray[np.bool_]:
+        return np.asarray(self.touched.array & (self.force_status.array == wire.ForceStatus.VALID))
+
+    def _is_located(self, frame: FrameName) -> NDArray[np.bool_]:
+        if frame == "link":
+            return np.asarray(self.position_status.array == wire.PositionStatus.VALID)
+        return np.asarray(self.column(f"{frame}_status").array == wire.FrameStatus.VALID)
+
+    def _usable(self, frame: FrameName) -> NDArray[np.bool_]:
+        return np.asarray(self._valid_force & self._is_located(frame))
+
+    def _geometry(
+        self, frame: FrameName, rows: NDArray[np.bool_]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        prefix = "" if frame == "link" else f"{frame}_"
+        names = ("position_m", "normal", "covariance_m2")
+        position_m, normal, covariance_m2 = (
+            self.column(prefix + name).array[rows].astype(np.float64) for name in names
+        )
+        return position_m, normal, covariance_m2.reshape(-1, 3, 3)
+
+    def _forces(self, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        force_n, std_n = (c.array[rows].astype(np.float64) for c in (self.force_n, self.force_std_n))
+        return force_n, std_n
+
+    def _rows_of(self, pattern: str) -> NDArray[np.bool_]:
+        rows = np.array([fnmatchcase(link, pattern) for link in self.links], np.bool_)
+        if not rows.any():
+            raise LookupError(f"no link matches {pattern!r}; the links are {', '.join(self.links)}")
+        return rows
+
+    def _names(self, rows: NDArray[np.bool_]) -> tuple[str, ...]:
+        return tuple(link for link, chosen in zip(self.links, rows, strict=True) if chosen)
+
+    def _make_array(self, name: str) -> NDArray[Any]:
+        if derive := _DERIVED.get(name):
+            return derive(_COLUMNS["state"].to_array(self.frame.state))
+        data = getattr(self.frame, name)
+        if not data and self.links:
+            output = name.split("_")[0] if name != "group" else "palm"
+            raise LookupError(f'no scene requests {name}; add "{output}" to the outputs of the scene')
+        return _COLUMNS[name].to_array(data)
+
+
+_DERIVED: Mapping[str, Callable[[NDArray[np.uint8]], NDArray[np.bool_]]] = {
+    "touched": lambda state: np.asarray(state == wire.PadState.TOUCHED),
+    "sampled": lambda state: np.isin(state, (wire.PadState.CLEAR, wire.PadState.TOUCHED)),
+}

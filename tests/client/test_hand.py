@@ -1,0 +1,414 @@
+"""The newest state of a hand: never an old frame, contacts that end, wrenches, callbacks, asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, assert_type
+
+import numpy as np
+import pytest
+import zmq
+from hypothesis import given
+from hypothesis import strategies as st
+
+import handtouch
+from handtouch import wire
+from handtouch.client.hand_state import HandState
+from handtouch.client.link_columns import HandView
+from handtouch.client.wrench import contact_wrenches, grasp_matrix
+from tests.client.hand_messages import LINKS, make_contact, make_frame
+
+LONGEST_S = 60.0
+CLEAR, TOUCHED, STALE = wire.PadState.CLEAR, wire.PadState.TOUCHED, wire.PadState.STALE
+
+
+def _state_after(*messages: wire.Message) -> HandState:
+    state = HandState()
+    for order, message in enumerate(messages):
+        state.feed(message, order)
+    return state
+
+
+def _view(state: HandState) -> HandView:
+    assert state.view is not None
+    return state.view
+
+
+# --- arrays by link
+
+
+def test_columns_are_read_by_link_and_as_arrays() -> None:
+    position_m = np.arange(9.0).reshape(3, 3)
+    state = (CLEAR, TOUCHED, STALE)
+    view = HandView(make_frame(force_n=(0.5, 1.5, 2.5), position_m=position_m, state=state))
+    assert view.force_n["index_tip"] == 1.5
+    assert dict(view.force_n) == {"thumb_tip": 0.5, "index_tip": 1.5, "index_base": 2.5}
+    assert np.asarray(view.position_m) == pytest.approx(position_m)
+    assert view.position_m["index_base"] == pytest.approx(position_m[2])
+    assert list(view.touched.values()) == [False, True, False]
+    assert list(view.sampled.values()) == [True, True, False]
+    with pytest.raises(ValueError, match="read-only"):
+        view.force_n.array[0] = 9.0
+
+
+def test_an_unknown_link_is_reported_with_the_closest_one() -> None:
+    view = HandView(make_frame())
+    with pytest.raises(KeyError, match="did you mean 'index_tip'"):
+        view.force_n["indx_tip"]
+    with pytest.raises(KeyError, match="the links are thumb_tip, index_tip, index_base"):
+        view.force_n["q"]
+
+
+def test_an_output_that_no_scene_requests_is_an_error_that_names_the_output() -> None:
+    with pytest.raises(LookupError, match='add "palm" to the outputs of the scene'):
+        _ = HandView(make_frame()).palm_position_m
+
+
+def test_ages_are_those_of_samples_at_the_given_time() -> None:
+    view = HandView(make_frame(sample_ns=(10**9, 2 * 10**9, 0)))
+    assert list(view.age_at(3 * 10**9).values()) == [2.0, 1.0, np.inf]
+
+
+# --- state from messages
+
+
+def test_an_older_or_repeated_frame_never_replaces_a_newer_one() -> None:
+    state = _state_after(make_frame(7))
+    newest = _view(state)
+    for order, seq in enumerate((6, 7, 1), 1):
+        state.feed(make_frame(seq, retained=True), order)
+        assert state.view is newest
+    state.feed(make_frame(8), 9)
+    assert _view(state).frame.seq == 8
+
+
+def test_another_session_voids_the_state() -> None:
+    state = _state_after(make_frame(7), make_contact("index_tip", "begin", 4))
+    state.feed(make_contact("thumb_tip", "begin", 1, session=2), 2)
+    assert state.view is None
+    assert list(state.contacts) == ["thumb_tip"]
+    state.feed(make_contact("index_tip", "update", 4, seq=2), 1)  # decoded later, received earlier
+    assert list(state.contacts) == ["thumb_tip"]
+
+
+def test_contacts_begin_and_end() -> None:
+    state = _state_after(make_contact("index_tip", "begin", 4))
+    assert state.contacts["index_tip"].id == 4
+    state.feed(make_contact("index_tip", "end", 4, seq=2), 1)
+    assert not state.contacts
+
+
+def test_a_contact_whose_end_was_lost_ends_with_the_next_frame() -> None:
+    begin = make_contact("index_tip", "begin", 4)
+    assert list(_state_after(begin, make_frame(contact_id=(0, 4, 0))).contacts) == ["index_tip"]
+    assert not _state_after(begin, make_frame(contact_id=(0, 5, 0))).contacts
+    # the frame is older than the contact, or is a retained one, which may be older
+    assert list(_state_after(make_frame(), begin).contacts) == ["index_tip"]
+    assert list(_state_after(begin, make_frame(retained=True)).contacts) == ["index_tip"]
+
+
+@given(
+    events=st.lists(st.tuples(st.sampled_from(LINKS), st.booleans()), max_size=8),
+    shuffled=st.randoms(use_true_random=False),
+)
+def test_contacts_do_not_depend_on_when_messages_are_decoded(
+    events: list[tuple[str, bool]], shuffled: Any
+) -> None:
+    """Only the newest of each topic is decoded, in any order."""
+    messages: list[wire.Message] = []
+    ids: dict[str, int] = {}
+    for number, (link, touches) in enumerate(events, 1):
+        if touches:
+            messages.append(make_contact(link, "begin", number, seq=number))
+            ids[link] = number
+        elif link in ids:
+            messages.append(make_contact(link, "end", ids.pop(link), seq=number))
+        messages.append(make_frame(number, contact_id=[ids.get(name, 0) for name in LINKS]))
+    newest = {wire.topic_of(message): (order, message) for order, message in enumerate(messages)}
+    waiting = list(newest.values())
+    shuffled.shuffle(waiting)
+    state = HandState()
+    for order, message in waiting:
+        state.feed(message, order)
+    assert {link: contact.id for link, contact in state.contacts.items()} == ids
+
+
+# --- wrenches
+
+
+def _touched_view(status: int = wire.ForceStatus.VALID) -> HandView:
+    rng = np.random.default_rng(3)
+    normal = rng.normal(size=(3, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    position_m = rng.normal(scale=0.03, size=(3, 3))
+    places: dict[str, Any] = {
+        prefix + name: value
+        for prefix in ("", "palm_")
+        for name, value in (
+            ("position_m", position_m),
+            ("normal", normal),
+            ("covariance_m2", np.tile(1e-7 * np.eye(3).ravel(), (3, 1))),
+        )
+    }
+    return HandView(
+        make_frame(
+            state=(TOUCHED,) * 3,
+            force_n=(1.0, 2.0, 3.0),
+            force_std_n=(0.1, 0.2, 0.2),
+            force_status=(wire.ForceStatus.VALID, wire.ForceStatus.VALID, status),
+            position_status=(wire.PositionStatus.VALID,) * 3,
+            palm_status=(wire.FrameStatus.VALID,) * 3,
+            **places,
+        )
+    )
+
+
+def test_a_contact_pushes_the_link_against_its_normal_at_its_point() -> None:
+    view = _touched_view()
+    wrench = view.wrenches("link")["index_tip"]
+    assert wrench.force_n == pytest.approx(-2.0 * view.normal["index_tip"], abs=1e-6)
+    assert wrench.point_m == pytest.approx(view.position_m["index_tip"])
+    assert wrench.moment_nm == pytest.approx(np.cross(view.position_m["index_tip"], wrench.force_n), abs=1e-6)
+
+
+def test_the_covariance_of_a_wrench_is_that_of_perturbed_forces_and_positions() -> None:
+    rng = np.random.default_rng(1)
+    position, normal = np.array([0.03, -0.02, 0.05]), np.array([0.6, 0.0, 0.8])
+    tangent = 1e-6 * (np.eye(3) - np.outer(normal, normal))
+    many = 200_000
+    positions = rng.multivariate_normal(position, tangent, size=many)
+    forces = -rng.normal(2.0, 0.1, size=many)[:, None] * normal
+    drawn = np.concatenate([forces, np.cross(positions, forces)], axis=1)
+    (wrench,) = contact_wrenches(
+        position[None], normal[None], tangent[None], np.array([2.0]), np.array([0.1])
+    )
+    scale = np.sqrt(np.outer(*[np.diag(wrench.covariance) + 1e-12] * 2))
+    assert (np.cov(drawn.T) - wrench.covariance) / scale == pytest.approx(np.zeros((6, 6)), abs=0.02)
+
+
+def test_a_finger_s_wrench_is_the_sum_of_its_contacts_and_names_those_it_lacks() -> None:
+    view = _touched_view()
+    each = view.wrenches("palm")
+    total = view.wrench("index_*", "palm")
+    assert total.force_n == pytest.approx(each["index_tip"].force_n + each["index_base"].force_n)
+    assert total.covariance == pytest.approx(each["index_tip"].covariance + each["index_base"].covariance)
+    assert total.missing == ()
+    assert view.total_force_n("index_*") == pytest.approx((5.0, np.hypot(0.2, 0.2)))
+    saturated = _touched_view(wire.ForceStatus.LOWER_BOUND)
+    assert saturated.wrench("index_*", "palm").missing == ("index_base",)
+    assert np.isnan(saturated.total_force_n("index_*")).all()
+    assert saturated.total_force_n("thumb_*") == pytest.approx((1.0, 0.1))
+    with pytest.raises(ValueError, match="a frame of its own"):
+        view.wrench("*", "link")
+    with pytest.raises(LookupError, match="no link matches 'ring_\\*'"):
+        view.wrench("ring_*")
+
+
+def test_the_grasp_matrix_maps_normal_forces_to_the_opposite_of_the_wrench_on_the_hand() -> None:
+    view = _touched_view()
+    grasp = view.grasp_matrix("palm")
+    assert grasp.links == LINKS
+    forces = np.zeros(9)
+    forces[::3] = view.force_n.array
+    total = view.wrench("*", "palm")
+    on_hand = np.concatenate([total.force_n, total.moment_nm])
+    assert grasp.matrix @ forces == pytest.approx(-on_hand, abs=1e-6)
+
+
+@given(normal=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda n: np.linalg.norm(n) > 0.1))
+def test_the_directions_of_a_contact_are_a_right_handed_frame(normal: tuple[float, float, float]) -> None:
+    unit = np.array([normal]) / np.linalg.norm(normal)
+    basis = grasp_matrix(np.zeros((1, 3)), unit)[:3]
+    assert basis.T @ basis == pytest.approx(np.eye(3), abs=1e-9)
+    assert np.linalg.det(basis) == pytest.approx(1.0)
+    assert basis[:, 0] == pytest.approx(unit[0])
+
+
+# --- connection
+
+
+@pytest.fixture
+def publisher(endpoints: dict[str, str]) -> Iterator[Any]:
+    with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.SNDHWM, 0)
+        socket.setsockopt(zmq.XPUB_VERBOSE, 1)
+        socket.bind(endpoints["live"])
+        yield socket
+
+
+def _join(publisher: Any, count: int = 3) -> None:
+    for _ in range(count):
+        assert publisher.poll(1000 * LONGEST_S)
+        publisher.recv()
+
+
+@pytest.fixture
+def hand(publisher: Any, endpoints: dict[str, str]) -> Iterator[handtouch.Hand]:
+    with handtouch.Hand("right", endpoint=endpoints["live"]) as made:
+        _join(publisher)
+        yield made
+
+
+def _wait_for(hand: handtouch.Hand, seq: int) -> HandView:
+    end_s = time.monotonic() + LONGEST_S
+    while time.monotonic() < end_s:
+        if (view := hand.wait(0.1)) is not None and view.frame.seq == seq:
+            return view
+    raise AssertionError(f"frame {seq} never came")
+
+
+def test_latest_returns_the_newest_frame_where_recv_returns_one_of_a_second_ago(
+    publisher: Any, endpoints: dict[str, str], hand: handtouch.Hand
+) -> None:
+    """As after a pause of one second of a program at 200 Hz."""
+    with handtouch.connect("hand/right", endpoint=endpoints["live"]) as frames:
+        _join(publisher, 2)
+        now_ns = time.monotonic_ns()
+        for behind in reversed(range(201)):
+            t_ns = now_ns - 5_000_000 * behind
+            publisher.send_multipart(wire.encode(make_frame(201 - behind, t_ns=t_ns, sample_ns=(t_ns,) * 3)))
+        received = frames.recv(LONGEST_S)
+        assert received is not None
+        assert now_ns - received.t_ns == 10**9
+        while frames.recv(LONGEST_S).seq < 201:  # type: ignore[union-attr]
+            pass  # all have arrived in this process
+        view = _wait_for(hand, 201)
+    assert view.t_ns == now_ns
+    assert hand.latest() is view
+    oldest_s = 1e-9 * (time.monotonic_ns() - now_ns)
+    assert oldest_s <= hand.age_s["index_tip"] <= 1e-9 * (time.monotonic_ns() - now_ns)
+
+
+def test_without_a_daemon_there_is_no_state(
+    publisher: Any, hand: handtouch.Hand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert hand.latest() is None
+    with pytest.raises(LookupError, match="no frame of hand 'right'"):
+        _ = hand.force_n
+    publisher.send_multipart(wire.encode(make_contact("index_tip", "begin", 4)))
+    publisher.send_multipart(wire.encode(make_frame(1, contact_id=(0, 4, 0))))
+    _wait_for(hand, 1)
+    assert list(hand.contacts) == ["index_tip"]
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s + 2.0)
+    assert hand.latest() is None
+    assert not hand.alive
+    assert not hand.contacts
+    with pytest.raises(LookupError):
+        _ = hand.force_n
+
+
+def test_messages_of_other_hands_and_malformed_ones_are_ignored(publisher: Any, hand: handtouch.Hand) -> None:
+    publisher.send_multipart(wire.encode(make_frame(9, hand="right_arm")))
+    publisher.send_multipart([b"contact/right/index_tip", b"\xc1"])
+    publisher.send_multipart([b"hand/right"])
+    publisher.send_multipart(wire.encode(make_frame(2, hand="right")))
+    assert _wait_for(hand, 2).frame.hand == "right"
+    assert not hand.contacts
+    assert hand.malformed_messages >= 1
+
+
+def test_wait_returns_each_frame_once(publisher: Any, hand: handtouch.Hand) -> None:
+    publisher.send_multipart(wire.encode(make_frame(1)))
+    view = _wait_for(hand, 1)
+    assert hand.latest() is view
+    assert hand.wait(0) is None
+    publisher.send_multipart(wire.encode(make_frame(2)))
+    assert _wait_for(hand, 2).frame.seq == 2
+
+
+@pytest.mark.parametrize("name", ["", "right/index", "*"])
+def test_a_pattern_is_no_name_of_a_hand(name: str) -> None:
+    with pytest.raises(ValueError, match="no name of a hand"):
+        handtouch.Hand(name)
+
+
+def test_callbacks_get_every_contact_in_a_thread_of_their_own(publisher: Any, hand: handtouch.Hand) -> None:
+    called: list[tuple[str, int, int]] = []
+    done = threading.Event()
+
+    def note(contact: wire.Contact) -> None:
+        called.append((contact.event, contact.id, threading.get_ident()))
+        if contact.event == "end":
+            done.set()
+
+    with hand.on_contact(note):
+        _join(publisher, 2)
+        for seq, event in enumerate(("begin", "update", "update", "end"), 1):
+            publisher.send_multipart(wire.encode(make_contact("index_tip", event, 4, seq)))  # type: ignore[arg-type]
+        assert done.wait(LONGEST_S)
+    events = [(event, number) for event, number, _ in called]
+    assert events == [("begin", 4), ("update", 4), ("update", 4), ("end", 4)]
+    assert threading.get_ident() not in {thread for *_, thread in called}
+
+
+def test_what_a_callback_raises_is_raised_by_close(publisher: Any, hand: handtouch.Hand) -> None:
+    def fail(view: HandView) -> None:
+        raise ArithmeticError(f"frame {view.frame.seq}")
+
+    listener = hand.on_view(fail)
+    end_s = time.monotonic() + LONGEST_S
+    for seq in itertools.count(1):
+        publisher.send_multipart(wire.encode(make_frame(seq)))
+        if not listener.running:
+            break
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+    with pytest.raises(ArithmeticError, match="frame"):
+        listener.close()
+
+
+def test_all_tasks_that_wait_get_the_newest_frame(publisher: Any, hand: handtouch.Hand) -> None:
+    async def main() -> list[list[int]]:
+        async def read() -> list[int]:
+            seqs = []
+            async for view in hand:
+                seqs.append(view.frame.seq)
+                if seqs[-1] == 20:
+                    break
+            return seqs
+
+        tasks = [asyncio.create_task(read()) for _ in range(3)]
+        for seq in range(1, 21):
+            publisher.send_multipart(wire.encode(make_frame(seq)))
+            await asyncio.sleep(0)
+        async with asyncio.timeout(LONGEST_S):
+            return await asyncio.gather(*tasks)
+
+    for seqs in asyncio.run(main()):
+        assert seqs == sorted(set(seqs))
+        assert seqs[-1] == 20
+
+
+def test_waiting_times_out_in_asyncio(publisher: Any, hand: handtouch.Hand) -> None:
+    async def main() -> tuple[HandView | None, HandView | None]:
+        nothing = await hand.wait_async(0.01)
+        publisher.send_multipart(wire.encode(make_frame(1)))
+        return nothing, await hand.wait_async(LONGEST_S)
+
+    nothing, view = asyncio.run(main())
+    assert nothing is None
+    assert view is not None
+    assert view.frame.seq == 1
+
+
+def test_columns_are_typed() -> None:
+    def types(hand: handtouch.Hand) -> None:  # for mypy: never called
+        assert_type(hand.force_n["x"], float)
+        assert_type(hand.touched["x"], bool)
+        assert_type(hand.contacts["x"].event, wire.ContactEvent)
+        assert_type(handtouch.connect("hand/right").recv(), wire.HandFrame)
+        assert_type(handtouch.connect("contact/left/*").recv(), wire.Contact)
+        assert_type(handtouch.connect("hand/gripper", kind=wire.HandFrame).recv(), wire.HandFrame)
+
+    assert callable(types)
+
+
+def test_a_pattern_of_another_kind_is_refused() -> None:
+    with pytest.raises(ValueError, match="are no HandFrame"):
+        handtouch.connect("contact/*/*", kind=wire.HandFrame)
