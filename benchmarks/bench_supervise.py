@@ -1,8 +1,8 @@
 """Measure effect and cost of baseline tracking and sheet force compensation.
 
-Drift, presses and sheets are drawn with fixed seeds, others than anything was tuned with; drift is the
-simulator's. The estimator knows presets, never the drawn parameters. Two processes share the work.
-Writes docs/benchmarks/supervise.{md,json,png}; `--quick` tries it out in a minute and writes nothing.
+Drift and sheets are those of the worlds `ideal`, `default` and `harsh`, seeds of the reporting family; the
+daemon knows what the deployment file states of them. Two processes share the work. Writes
+docs/benchmarks/supervise.{md,json,png}; `--quick` tries it out in a minute and writes nothing.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
-import supervise_day
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
+from page import made_by, options, output_folder, progress
+from scores import Estimates, EstimateScore, concatenate, slices
+from sheet_use import FULL_N, drawn_sheets, score_use
 
-from handtouch import sheet
 from handtouch.config import Behaviour, load, shipped
 from handtouch.core.cycle import Cycle
 from handtouch.core.pad_model import PadModel
@@ -41,14 +42,12 @@ from matplotlib import pyplot as plt
 FloatArray = NDArray[np.float64]
 Rows = list[dict[str, Any]]
 PERIOD_NS, TICK_NS = 100_000_000, 5_000_000
-DRIFT = WORLDS["default"].only("electronics").draw(Family.REPORTING.seed(71))
+DRIFTS = {name: world.only("electronics").draw(Family.REPORTING.seed(71)) for name, world in WORLDS.items()}
 SPAN_S = 60.0  # of drift that is drawn at once
 HELD = 5  # pads
-FULL_N = 5.0
-DT_S = 0.1
-PART_H = 1.0  # of a day, for what is compared with it
-SEEDS = (31, 32)
-DAY, PARTS = "A day of mixed use of sheets with creep and adaptation", "Effect of the parts"
+PADS, SEEDS = 20, (31, 32)
+"""Sheets of each kind, and seeds of their use."""
+DAY, PARTS = "Hours of mixed use of sheets", "Effect of the parts"
 WARM, TURNED = "A hand that gets warm", "A hand that is turned over"
 INK, FAINT, ACCENT, RED = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c23b22"
 
@@ -64,14 +63,12 @@ def hands(count: int) -> PadModel:
 class Rig:
     """A hand whose channels drift; currents of contacts in the middle of its pads are given in counts."""
 
-    def __init__(self, model: PadModel, seed: int, drifts: bool) -> None:
+    def __init__(self, model: PadModel, seed: int, world: str = "ideal") -> None:
         self.model, self.tick, self.slab = model, TickProcessor(model, PERIOD_NS), Slab(model.size)
         self.cycle = Cycle(PERIOD_NS, 0.6)
         self._rng = np.random.default_rng(seed)
         names = list(zip(model.hands, model.links, strict=True))
-        self._climate = ElectronicsDrift(
-            DRIFT if drifts else WORLDS["ideal"].draw(Family.REPORTING.seed(1)), names
-        )
+        self._climate = ElectronicsDrift(DRIFTS[world], names)
         self._zeros = np.zeros((0, model.size, 4))
         self._at = 0
         pads = np.arange(model.size)
@@ -145,9 +142,9 @@ HALVES: dict[str, Callable[[TickProcessor], None]] = {
 }
 
 
-def held(name: str, seconds: float) -> Rows:
+def held(world: str, name: str, seconds: float) -> Rows:
     """An object held in five pads of fifteen: forces at the end against those at the start."""
-    rig = Rig(hands(1), 71, True)
+    rig = Rig(hands(1), 71, world)
     HALVES[name](rig.tick)
     none = np.zeros(rig.model.size)
     grip = grips(rig.model)
@@ -169,6 +166,7 @@ def held(name: str, seconds: float) -> Rows:
         rig.step(none)
     return [
         {
+            "world": world,
             "": name,
             "force error, worst of five": f"{100 * float(np.abs(off).max()):.2f} %",
             "rms": f"{100 * float(np.sqrt(np.mean(off**2))):.2f} %",
@@ -216,7 +214,7 @@ def follow(rig: Rig, seconds: float, zero: Callable[[float], FloatArray]) -> dic
 
 def warm(alike: float, name: str) -> Rows:
     """8 K more within minutes, and back; channels drift by 2 counts/K rms, `alike` of it in common."""
-    rig, rng = Rig(hands(1), 74, False), np.random.default_rng(74)
+    rig, rng = Rig(hands(1), 74), np.random.default_rng(74)
     HALVES[name](rig.tick)
     own = rng.normal(size=(rig.model.size, 4))
     own *= np.sqrt((1 - alike**2) / np.mean(own**2))
@@ -231,7 +229,7 @@ def warm(alike: float, name: str) -> Rows:
 
 def turned(known: bool) -> Rows:
     """Turned over every quarter of a minute or so; gravity causes 4 counts rms along each axis."""
-    rig, rng = Rig(hands(1), 75, False), np.random.default_rng(75)
+    rig, rng = Rig(hands(1), 75), np.random.default_rng(75)
     by_gravity = rng.normal(0, 4.0, (rig.model.size, 4, 3))
     ways, speeds = rng.normal(size=(2, 3)), np.array([0.21, 0.34, 0.55])
 
@@ -255,7 +253,7 @@ def slow(quick: bool) -> Rows:
     """A press that grows at a steady speed: where it is found, and what the baseline has taken of it."""
     rows = []
     for speed in (3e-3, 1e-2, 1e-1) if quick else (3e-4, 1e-3, 3e-3, 1e-2, 1e-1):
-        rig = Rig(hands(1), 72, False)
+        rig = Rig(hands(1), 72)
         model = rig.model
         per_law = (
             model.begin_threshold_counts[0] / model.begin_threshold_n[0] ** 1.5
@@ -283,7 +281,7 @@ def slow(quick: bool) -> Rows:
     return rows
 
 
-# A day on real sheets
+# Hours on sheets
 
 
 CUTS: dict[str, dict[str, Any]] = {
@@ -296,54 +294,36 @@ CUTS: dict[str, dict[str, Any]] = {
 }
 
 
-def day(preset: str, hours: float, seed: int, changes: dict[str, Any]) -> dict[str, Any]:
-    behaviour = Behaviour.model_validate({"preset": preset, **changes})
-    result: dict[str, Any] = supervise_day.day(preset, behaviour, hours, seed)
-    return result
+def used(world: str, cut: str, hours: float, seed: int, pads: int) -> Estimates:
+    """Return force errors of all kinds of sheets of a world, with a part of the compensation left out."""
+    drawn = WORLDS[world].draw(Family.REPORTING.seed(seed))
+    sheets = [
+        drawn_sheets(drawn, kind, pads, kind.behaviour.model_copy(update=CUTS[cut]))
+        for kind in drawn.world.sheets.kinds(Family.REPORTING)
+    ]
+    return score_use(sheets, hours, drawn.seed)
 
 
-def pooled(days: list[dict[str, Any]], part: Callable[[dict[str, Any]], dict[str, float]]) -> dict[str, Any]:
-    """Figures of several seeds: errors are rms over them, shares are means; the worst interval of any."""
-    rows = [part(found) for found in days]
-    table: dict[str, Any] = {}
-    for head in rows[0]:
-        column = np.array([row[head] for row in rows])
-        whole = column.mean() if head in ("inside 95 %", "valid") else np.sqrt(np.mean(column**2))
-        table[head] = float(whole)
-    table["inside, each day"] = " ".join(f"{100 * row['inside 95 %']:.1f}" for row in rows)
-    return table
+def force_row(some: Estimates, **names: str) -> dict[str, Any]:
+    """Return a row of a table: scores of forces, and the error without compensation."""
+    raw = some.columns["uncompensated"][some.valid]
+    return {
+        **names,
+        **EstimateScore.of_estimates(some).row(bounds=False),
+        "rms error, uncompensated": float(np.sqrt(np.mean(np.square(raw)))) if len(raw) else math.nan,
+    }
 
 
-def loops() -> Rows:
-    """Width of a loop 0 - 5 N - 0 half-way, of sheets whose loop and creep are a fifth more than assumed."""
-    rows = []
-    for preset in ("S1", "S2"):
-        base = {"S1": sheet.S1, "S2": sheet.S2}[preset]
-        assumed = Behaviour(preset=preset, hysteresis_width=0.1, gain_std=0.0, back_force_std_n=0.0)
-        true = replace(
-            base,
-            hysteresis=sheet.PrandtlIshlinskii.from_width(0.12, FULL_N),
-            creep=sheet.Creep.first_order(0.3, 0.3),
-            fluctuation=sheet.Fluctuation(),
-        )
-        state, step = true.initial_state(1), true.discretise(DT_S)
-        strength = SheetForceCompensation([sheet_behaviour_of(assumed)], round(DT_S * 1e9))
-        ramp = np.concatenate([np.linspace(0, FULL_N, 601), np.linspace(FULL_N, 0, 601)[1:]])
-        raw, found, t_ns, one = np.zeros(1201), np.zeros(1201), 10**9, np.ones(1)
-        for number, force in enumerate(ramp):
-            t_ns += round(DT_S * 1e9)
-            apparent = step.forward(state, force * one)
-            strength.compensate_forces(apparent, 0 * one, apparent > 0, t_ns)
-            raw[number], found[number] = apparent[0], strength.force_n[0]
-        rows.append(
-            {
-                "sheet": preset,
-                "loop before, % of full scale": f"{100 * abs(raw[900] - raw[300]) / FULL_N:.1f}",
-                "after": f"{100 * abs(found[900] - found[300]) / FULL_N:.1f}",
-            }
-        )
-        print(rows[-1], flush=True)
-    return rows
+def by_hour(some: Estimates) -> list[list[float]]:
+    """Return hour and rms of errors without and with compensation, and of the stated deviation."""
+    good = some.where(some.valid)
+    hour, found = good.columns["hour"], []
+    for low, high in pairwise(np.linspace(0, math.ceil(hour.max()), 17)):
+        on = (hour >= low) & (hour < high)
+        if on.any():
+            parts = (good.columns["uncompensated"][on], good.error[on, 0], np.sqrt(good.covariance[on, 0, 0]))
+            found.append([float(low), *(float(np.sqrt(np.mean(np.square(part)))) for part in parts)])
+    return found
 
 
 # Cost
@@ -363,7 +343,7 @@ class Parts:
     """Parts of a tick that track baselines and compensate sheets, after presses."""
 
     def __init__(self, hand_count: int) -> None:
-        rig = Rig(hands(hand_count), 73, False)
+        rig = Rig(hands(hand_count), 73)
         self.size = rig.model.size
         grip = rig.model.begin_threshold_counts * 10 * (np.arange(self.size) % 2)
         for _ in range(60):
@@ -424,12 +404,12 @@ def costs(quick: bool) -> Rows:
 
 def draw(curves: dict[str, list[list[float]]], presses: Rows, path: Path) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
-    for axis, (preset, curve) in zip(axes, curves.items(), strict=False):
+    for axis, (world, curve) in zip(axes, curves.items(), strict=False):
         hour, raw, off, std = np.array(curve).T
         axis.plot(hour, raw, color=FAINT, label="uncompensated")
         axis.plot(hour, off, color=ACCENT, label="compensated")
         axis.plot(hour, std, color=RED, ls="--", label="stated")
-        axis.set(title=f"{preset}: mixed use", xlabel="hour", ylabel="force error, rms, % of 5 N")
+        axis.set(title=f"world {world}: mixed use", xlabel="hour", ylabel="force error, rms, N")
         axis.set_ylim(0, None)
         axis.legend(frameon=False)
     speed = [row["speed, N/s"] for row in presses]
@@ -457,15 +437,11 @@ def notes(hours: float, held_s: float) -> dict[str, str]:
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
-    drift = DRIFT.world.electronics
     return {
-        "Held object": f"""Five pads of fifteen hold something for {held_s:g} s. The drift is the
-simulator's: each zero wanders by {drift.zero_drift_counts_per_s} counts a second at most, and the hand's
-temperature by {drift.temperature_drift_k_per_s} K a second, for {drift.offset_counts_per_k.std:g} counts/K
-of either
-sign. The error is that of the force at the end against the same grip at its start; below, without parts of
-the compensation. With so slow a drift it matters only that it isn't tracked in contact; the next two
-sections show the effect of the other parts.""",
+        "Held object": f"""Five pads of fifteen hold something for {held_s:g} s, while zeros, temperature and
+supply drift as in each [world](../worlds.md). The error is that of the force at the end against the same grip
+at its start; below, without parts of the compensation. With so slow a drift it matters only that it isn't
+tracked in contact; the next two sections show the effect of the other parts.""",
         WARM: """8 K more within some minutes, and back 12 minutes later, with the same grip held for 25. The
 other pads are touched lightly, with twice the current of the threshold, before and while it is warm. Channels
 drift by 2 counts/K (rms), a part of it common to all, as with amplifiers of one type on one supply.
@@ -474,18 +450,13 @@ Errors are against the grip's first seconds, and against the touch before.""",
 with the same grip for ten. Each channel reads 4 counts (rms) more for a unit of gravity along each axis of
 its link.""",
         "Slow presses": "On a pad of the shipped hand, begin_threshold_n 0.06 N, max_rise_time_s 20.",
-        DAY: f"""{supervise_day.PADS} sheets of each kind, {hours:g} h each, seeds {SEEDS}: grips
-of 2 to 40 s, some of minutes, 0.1 to 5 N, half of them waxing and waning; breaks, and a night from hour 16.
-The estimator knows the preset only. Truths: the preset with its parameters off by 20 or 50 % (1 sigma);
-or, besides 20 %, creep by a power law (t / 1 s)^{supervise_day.POWER:g} for hours, a Preisach operator with a
-loop of {100 * supervise_day.LOOP:g} % unknown to the estimator, or adaptation of two speeds.
-Gains are off by 5 %. Errors in % of 5 N (rms), with valid force status; `first second`: of a touch;
-`inside 95 %`: part of those readings whose interval holds the ground truth, then that of each seed in %;
-`valid`: part of the time touched.""",
-        PARTS: f"""The first {min(hours, PART_H):g} h of another such day, all kinds together, without
-some parts.""",
-        "Loop": """0 to 5 N and back in two minutes. True loop and creep are a fifth more than the
-estimator assumes.""",
+        DAY: f"""{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family for
+{hours:g} h, {len(SEEDS)} seeds: grips of 2 to 40 s, some of minutes, 0.1 to {FULL_N:g} N, half of them waxing
+and waning, and breaks. The deployment file describes sheets as their builder would; contact layers differ as
+in the world. Contacts are given their load: errors of position, currents and radius are in
+[worlds](worlds.md). One reading of each contact, at a random age. Errors and deviations in N; shares in %,
+with 95 % intervals of binomial counts: contacts of one sheet share its hidden quantities.""",
+        PARTS: "Both seeds, all kinds of a world together, without some parts; an eighth of the time.",
         "Cost": f"Medians in us; {machine}. Sheets: S1, half of the pads touched.",
     }
 
@@ -503,56 +474,64 @@ def page(parts: dict[str, Rows], hours: float, held_s: float) -> str:
     return "\n".join([*lines, f"{made_by()}.", ""])
 
 
-def days(found: dict[tuple[str, str], list[dict[str, Any]]]) -> tuple[Rows, Rows]:
-    """Rows of the day and of its parts, from what was found by preset and cut."""
+def force_tables(found: dict[tuple[str, str], Estimates]) -> tuple[Rows, Rows]:
+    """Return the rows of the whole and of its parts, from what was found by world and cut."""
     whole: Rows = []
-    for preset in supervise_day.PRESETS:
-        of = found[preset, ""]
-        for kind in supervise_day.KINDS:
-            row = pooled(of, lambda one, kind=kind: one["kinds"][kind])  # type: ignore[misc]
-            whole.append({"sheets": preset, "truth": kind, **row})
-        whole.append({"sheets": preset, "truth": "all", **pooled(of, lambda one: one["all"])})
-    parts = [
-        {"sheets": preset, "": cut, **pooled(of, lambda one: one["all"])}
-        for (preset, cut), of in found.items()
-        if cut
-    ]
+    for world in SHEET_WORLDS:
+        every = found[world, ""]
+        whole += [force_row(some, world=world, sheet=kind) for kind, some in slices(every, "kind")]
+        whole += [force_row(some, world=world, sheet=f"all, {age}") for age, some in slices(every, "age")]
+        whole.append(force_row(every, world=world, sheet="all"))
+    parts = [force_row(some, world=world, part=cut) for (world, cut), some in found.items() if cut]
     return whole, parts
+
+
+SHEET_WORLDS = ("default", "harsh")
+"""Worlds whose sheets have a behaviour."""
 
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--hours", type=float, default=24.0, help="length of the day (default: 24)")
+    parser.add_argument("--hours", type=float, default=8.0, help="of mixed use (default: 8)")
     asked = parser.parse_args()
     quick = asked.quick
-    hours, held_s = (0.25, 120.0) if quick else (asked.hours, 3600.0)
+    hours, held_s, pads = (0.25, 120.0, 4) if quick else (asked.hours, 3600.0, PADS)
     names = list(HALVES)
     tasks: list[tuple[str, Callable[..., Any], tuple[Any, ...]]] = []
-    tasks += [("Held object", held, (name, held_s)) for name in names]
+    tasks += [("Held object", held, (world, names[0], held_s)) for world in WORLDS]
+    tasks += [("Held object", held, ("default", name, held_s)) for name in names[1:]]
     tasks += [(WARM, warm, (alike, name)) for alike in (0.0, 0.5, 0.9) for name in names[:3]]
     tasks += [(TURNED, turned, (known,)) for known in (True, False)]
-    tasks += [("Slow presses", slow, (quick,)), ("Loop", loops, ())]
+    tasks += [("Slow presses", slow, (quick,))]
     with ProcessPoolExecutor(2) as pool:
-        presets, seeds = list(supervise_day.PRESETS), SEEDS[: 1 if quick else None]
-        used = {(p, ""): [pool.submit(day, p, hours, seed, {}) for seed in seeds] for p in presets}
-        for cut, changes in CUTS.items():
-            for p in presets:
-                used[p, cut] = [pool.submit(day, p, min(hours, PART_H), SEEDS[-1] + 1, changes)]
+        seeds = SEEDS[: 1 if quick else None]
+        running = {
+            (world, cut): [
+                pool.submit(used, world, cut or "complete", hours / (8 if cut else 1), seed, pads)
+                for seed in seeds
+            ]
+            for cut in ("", *CUTS)
+            for world in SHEET_WORLDS
+        }
         waiting = [(title, pool.submit(call, *given)) for title, call, given in tasks]
+        found: dict[tuple[str, str], Estimates] = {}
+        for key, futures in running.items():
+            found[key] = concatenate([future.result() for future in futures])
+            progress(f"sheets of {key[0]}, {key[1] or 'all hours'}: {len(found[key])} contacts")
         parts: dict[str, Rows] = {title: [] for title in ("Held object", WARM, TURNED, "Slow presses")}
         for title, future in waiting:
-            parts.setdefault(title, []).extend(future.result())
-            print(title, parts[title][-1], flush=True)
-        found = {key: [future.result() for future in futures] for key, futures in used.items()}
-    loop = parts.pop("Loop")
-    parts[DAY], parts[PARTS] = days(found)
-    parts |= {"Loop": loop, "Cost": costs(quick)}
+            parts[title].extend(future.result())
+            progress(f"{title}: {parts[title][-1]}")
+    parts[DAY], parts[PARTS] = force_tables(found)
+    parts["Cost"] = costs(quick)
     text = page(parts, hours, held_s)
     print(text)
     out = output_folder(quick)
-    curves = {p: np.mean([one["curve"] for one in found[p, ""]], axis=0).tolist() for p in presets}
+    curves = {world: by_hour(found[world, ""]) for world in SHEET_WORLDS}
     (out / "supervise.md").write_text(text)
-    (out / "supervise.json").write_text(json.dumps({**parts, "curves": curves}, indent=1) + "\n")
+    scores = {", ".join(key): asdict(EstimateScore.of_estimates(some)) for key, some in found.items()}
+    record = json.dumps({**parts, "curves": curves, "scores": scores}, indent=1).replace("NaN", "null")
+    (out / "supervise.json").write_text(record + "\n")
     draw(curves, parts["Slow presses"], out / "supervise.png")
 
 

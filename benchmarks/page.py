@@ -1,6 +1,9 @@
-"""Options and pages of benchmarks, and the stamp of what they measured.
+"""Options and pages of benchmarks, the stamp of what they measured, and their run times.
 
-Public names: `options`, `output_folder`, `table`, `made_by`; for readers of a page `outdated`.
+Public names: `options`, `output_folder`, `table`, `made_by`, `progress`; for readers of a page `outdated`.
+
+A program that ends without an error notes how long it took in docs/benchmarks/run_times.json, and in the
+table at the end of docs/benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -9,10 +12,15 @@ import argparse
 import ast
 import atexit
 import hashlib
+import json
+import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
+import textwrap
+import time
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -26,6 +34,10 @@ STAMP = re.compile(
     r"Made\s+by\s+`make\s+(bench|soak|stress)\s+ONLY=(\w+)`\s+at\s+commit\s+`([^`]+)`,\s+source\s+`(\w+)`"
 )
 """Kind and name of the program, commit and source digest, as `made_by` writes them."""
+RUN_TIMES = "run_times.json"
+RUN_TIMES_HEAD = "## Run times\n"
+"""Of the last section of docs/benchmarks/README.md, which the programs write."""
+_BEGAN_S = time.monotonic()
 
 
 def options(description: str | None) -> argparse.ArgumentParser:
@@ -41,6 +53,7 @@ def output_folder(quick: bool) -> Path:
     """Return docs/benchmarks or, for a quick pass, a folder that is deleted when the process ends."""
     if not quick:
         OUT.mkdir(parents=True, exist_ok=True)
+        atexit.register(_note_run_time, OUT, _program().stem, os.getpid())
         return OUT
     scratch = tempfile.TemporaryDirectory(prefix="handtouch-bench-")
     atexit.register(scratch.cleanup)
@@ -58,9 +71,48 @@ def table(title: str, note: str, rows: list[dict[str, Any]]) -> list[str]:
     return [*lines, ""]
 
 
+def progress(done: object) -> None:
+    """Print a line about what is done, with the time since the program began."""
+    print(f"[{time.monotonic() - _BEGAN_S:6.0f} s] {done}", file=sys.stderr, flush=True)
+
+
+def keep_run_time(folder: Path, name: str, entry: dict[str, Any]) -> None:
+    """Write how long a program took into the folder's run_times.json and the README's table of all."""
+    path, readme = folder / RUN_TIMES, folder / "README.md"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    known[name] = entry
+    path.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
+    lines = ["| program | minutes | CPU minutes | load average | commit |", "| --- | --- | --- | --- | --- |"]
+    for program, row in sorted(known.items()):
+        numbers = " | ".join(f"{row[key]:.1f}" for key in ("minutes", "cpu_minutes", "load"))
+        lines.append(f"| {program} | {numbers} | {row['commit']} |")
+    all_bench = [row["minutes"] for program, row in known.items() if program.startswith("bench_")]
+    note = (
+        "Of the last full run of each program: wall time, processor time of all its processes, and the load "
+        f"average when it ended. `make bench` runs the {len(all_bench)} benchmarks listed here one after the "
+        f"other, in {sum(all_bench):.0f} minutes."
+    )
+    before = readme.read_text().partition(RUN_TIMES_HEAD)[0] if readme.exists() else ""
+    readme.write_text("\n".join([before + RUN_TIMES_HEAD, *textwrap.wrap(note, 110), "", *lines, ""]))
+
+
+def _note_run_time(folder: Path, name: str, process: int) -> None:
+    """At exit of the program's own process: keep the run time unless it ends by an error."""
+    if os.getpid() != process or hasattr(sys, "last_value"):
+        return
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    entry = {
+        "minutes": (time.monotonic() - _BEGAN_S) / 60,
+        "cpu_minutes": sum(usage.ru_utime + usage.ru_stime for usage in used) / 60,
+        "load": os.getloadavg()[0],
+        "commit": _commit(),
+    }
+    keep_run_time(folder, name, entry)
+
+
 def made_by() -> str:
     """Return the stamp of the running program: its name, commit and source digest."""
-    program = Path(str(sys.modules["__main__"].__file__)).resolve()
+    program = _program()
     kind, _, name = program.stem.partition("_")
     return f"Made by `make {kind} ONLY={name}` at commit `{_commit()}`, source `{source_digest(program)}`"
 
@@ -99,6 +151,10 @@ def source_digest(program: Path) -> str:
     for path in sorted(seen):
         digest.update(f"{path.relative_to(ROOT)} {_code_digest(path)}\n".encode())
     return digest.hexdigest()[:12]
+
+
+def _program() -> Path:
+    return Path(str(sys.modules["__main__"].__file__)).resolve()
 
 
 def _commit() -> str:

@@ -1,7 +1,7 @@
 """Scores of estimates with stated covariance, and of detected events; used by every benchmark of accuracy.
 
-Public names: `Share`, `Rate`; `Estimates` -> `EstimateScore`, `slices`, `bin_labels`, `calibration_curve`,
-`draw_calibration`, `laplace_covariance`; `score_events` -> `EventScore`.
+Public names: `Share`, `ClusterShare`, `Rate`; `Estimates` -> `EstimateScore`, `slices`, `bin_labels`,
+`calibration_curve`, `draw_calibration`, `laplace_covariance`; `score_events` -> `EventScore`.
 
 Rows of `Estimates` are independent touches, one sample of each: samples of one touch share its hidden
 quantities, and binomial intervals of all of them would be too narrow.
@@ -71,6 +71,38 @@ class Share:
     def __str__(self) -> str:
         if not self.total:
             return "-"
+        low, high = (f"{100 * limit:.1f}" for limit in self.interval)
+        return f"{100 * self.value:.1f} ({low}-{high})"
+
+
+@dataclass(frozen=True)
+class ClusterShare:
+    """Share of hits where trials of one cluster (a pad's touches, an hour's contacts) aren't independent.
+
+    `interval` (95 %) is normal, from the scatter between clusters. Raises ValueError for fewer than two.
+    """
+
+    value: float
+    std: float
+
+    @classmethod
+    def of_mask(cls, hits: BoolArray, cluster: NDArray[Any]) -> ClusterShare:
+        """Return the share of a mask (n,) with the clusters of its rows (n,)."""
+        _, row, total = np.unique(cluster, return_inverse=True, return_counts=True)
+        if len(total) < 2:
+            raise ValueError(f"{len(total)} clusters")
+        value = float(hits.mean())
+        excess = np.bincount(row, weights=hits) - value * total
+        scale = len(total) / (len(total) - 1)
+        return cls(value, float(np.sqrt(scale * np.sum(np.square(excess))) / total.sum()))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Lower and upper limit of the probability."""
+        reach = 1.96 * self.std
+        return max(self.value - reach, 0.0), min(self.value + reach, 1.0)
+
+    def __str__(self) -> str:
         low, high = (f"{100 * limit:.1f}" for limit in self.interval)
         return f"{100 * self.value:.1f} ({low}-{high})"
 
@@ -206,10 +238,13 @@ class EstimateScore:
             crps=mean_crps(some),
         )
 
-    def row(self, unit: float = 1.0) -> dict[str, Any]:
-        """Return cells of a table: shares in %, with intervals; lengths or forces times `unit`."""
+    def row(self, unit: float = 1.0, *, bounds: bool = True) -> dict[str, Any]:
+        """Return cells of a table: shares in %, with intervals; lengths or forces times `unit`.
+
+        `bounds`: with oracle and bound.
+        """
         few = f", fewer than {MIN_TOUCHES}" if self.touches < MIN_TOUCHES else ""
-        return {
+        cells = {
             "touches": f"{self.touches}{few}",
             "valid, %": str(self.valid),
             **{f"in {100 * level:g} %": str(share) for level, share in self.coverage.items()},
@@ -221,6 +256,10 @@ class EstimateScore:
             "error / bound, rms": self.ratio_rms,
             "50 / 95 / 99 %": " / ".join(f"{value:.3g}" for value in self.ratio_quantiles),
         }
+        if not bounds:
+            for head in ("oracle", "error / bound, rms", "50 / 95 / 99 %"):
+                del cells[head]
+        return cells
 
 
 def slices(every: Estimates, by: str) -> Iterator[tuple[Any, Estimates]]:

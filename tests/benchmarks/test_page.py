@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -67,3 +69,27 @@ def test_a_page_without_a_stamp_or_a_program_is_outdated(program: Path) -> None:
     assert "doesn't state a commit" in page.outdated("# It\n\nMade by `make bench ONLY=it`; x86_64.")
     program.unlink()
     assert "was removed" in page.outdated(text)
+
+
+def test_a_run_time_is_kept_in_the_readmes_table(tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("# Measurements\n\nText.\n")
+    entry = {"minutes": 2.0, "cpu_minutes": 3.5, "load": 0.4, "commit": "1234567"}
+    page.keep_run_time(tmp_path, "bench_it", entry)
+    page.keep_run_time(tmp_path, "bench_other", {**entry, "minutes": 40.0})
+    page.keep_run_time(tmp_path, "bench_it", {**entry, "minutes": 5.0})
+    text = (tmp_path / "README.md").read_text()
+    assert text.startswith("# Measurements\n\nText.\n")
+    assert text.count("bench_it") == text.count(page.RUN_TIMES_HEAD) == 1
+    assert "| bench_it | 5.0 | 3.5 | 0.4 | 1234567 |" in text
+    assert "45 minutes" in " ".join(text.split())
+
+
+@pytest.mark.parametrize(("ending", "is_kept"), [("", True), ("raise ValueError", False)])
+def test_a_program_keeps_its_run_time_unless_it_fails(tmp_path: Path, ending: str, is_kept: bool) -> None:
+    program = tmp_path / "bench_it.py"
+    program.write_text(
+        f"import sys\nfrom pathlib import Path\nsys.path.insert(0, {str(ROOT / 'benchmarks')!r})\n"
+        f"import page\npage.OUT = Path({str(tmp_path)!r})\npage.output_folder(False)\n{ending}\n"
+    )
+    subprocess.run([sys.executable, program], check=False, capture_output=True)
+    assert (tmp_path / page.RUN_TIMES).exists() is is_kept

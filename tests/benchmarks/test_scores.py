@@ -217,3 +217,19 @@ def test_an_impossible_share_is_refused(count: int, total: int) -> None:
 def test_estimates_refuse_shapes_that_do_not_fit() -> None:
     with pytest.raises(ValueError, match=r"bound of shape \(2,\), not \(1,\)"):
         scores.Estimates(np.zeros((1, 2)), np.eye(2)[None], np.array([True]), np.ones(2), np.eye(2)[None])
+
+
+def test_a_share_of_clusters_covers_the_truth_where_a_binomial_interval_does_not() -> None:
+    rng, held = np.random.default_rng(3), [0, 0]
+    cluster = np.repeat(np.arange(40), 20)
+    for _ in range(300):
+        hits = rng.random(800) < np.repeat(rng.beta(1, 1, 40), 20)  # half on average
+        limits = scores.ClusterShare.of_mask(hits, cluster).interval, scores.Share.of_mask(hits).interval
+        for number, (low, high) in enumerate(limits):
+            held[number] += low <= 0.5 <= high
+    assert held[0] > 0.9 * 300 > 0.75 * 300 > held[1]
+
+
+def test_a_share_of_one_cluster_has_no_interval() -> None:
+    with pytest.raises(ValueError, match="1 clusters"):
+        scores.ClusterShare.of_mask(np.ones(3, np.bool_), np.zeros(3))

@@ -1,0 +1,166 @@
+"""Forces of sheets in hours of mixed use: the daemon's compensation against the worlds' sheets.
+
+Public names: `Sheets`, `drawn_sheets`, `score_use`. True loads go through the simulator's sheet laws,
+apparent ones through the compensation; one reading of each contact is compared, at a random age.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scores import Estimates, bin_labels
+
+from handtouch.config import Behaviour
+from handtouch.core.sheet_force import ForceReliability, SheetForceCompensation, sheet_behaviour_of
+from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
+from handtouch.simulate.worlds import DrawnWorld, SheetKind
+
+FloatArray = NDArray[np.float64]
+FULL_N = 5.0
+ALPHA = 1.5
+"""Exponent of the contact law: a layer of r times the resistance reads r^(-1 / alpha) times the force."""
+DT_S = 0.4
+DETECTED_N = 0.05
+HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """Pads (n,) with sheets of one kind."""
+
+    name: str
+    laws: tuple[SheetLaw, ...]
+    gains: FloatArray
+    """(n,), force that a fresh sheet reads over the true one."""
+    behaviour: Behaviour | None
+    """What the deployment file states of them."""
+
+
+def drawn_sheets(drawn: DrawnWorld, kind: SheetKind, pads: int, behaviour: Behaviour | None = None) -> Sheets:
+    """Return pads of a kind with what the drawn world hides; `behaviour`: another than its builder's."""
+    ratios = drawn.world.sheets.contact_ohm_ratio.sample(np.random.default_rng((drawn.seed, 8)), pads)
+    laws = tuple(kind.varied(*drawn.sheet_factors(f"{kind.name}/{pad}")) for pad in range(pads))
+    return Sheets(kind.name, laws, ratios ** (-1 / ALPHA), behaviour or kind.behaviour)
+
+
+class Use:
+    """Use of a hand: grips of 2 to 40 s, some of minutes, of 0.1 to 5 N, half of them waxing and waning;
+    pauses of 0.3 to 30 s; half of the grips of a pad are alike. Between spells of work, breaks."""
+
+    def __init__(self, pads: int, rng: np.random.Generator) -> None:
+        self._rng, self._usual = rng, rng.uniform(0.5, 4.0, pads)
+        self._force, self._swing, self._turn_s = np.zeros(pads), np.zeros(pads), np.ones(pads)
+        self._left_s, self.age_s = rng.uniform(0, 20, pads), np.zeros(pads)
+        self.sample_s = np.full(pads, np.inf)
+        """(n,), age at which a contact is compared."""
+
+    def spells(self, hours: float) -> Iterator[tuple[float, bool]]:
+        """Yield the length [s] of each spell and whether it is of work."""
+        gone_s, is_work = 0.0, True
+        while gone_s < hours * HOUR_S:
+            long_s = 60 * float(self._rng.uniform(*((15, 40) if is_work else (5, 60))))
+            long_s = DT_S * max(round(min(long_s, hours * HOUR_S - gone_s) / DT_S), 1)
+            yield long_s, is_work
+            gone_s, is_work = gone_s + long_s, not is_work
+
+    def loads_n(self) -> FloatArray:
+        """Return true loads (n,) of the next step."""
+        rng = self._rng
+        self._left_s -= DT_S
+        self.age_s += DT_S
+        if (turn := np.flatnonzero(self._left_s <= 0)).size:
+            free, k = self._force[turn] == 0, len(turn)
+            fresh = np.where(rng.random(k) < 0.5, self._usual[turn], rng.uniform(0.1, FULL_N, k))
+            grip_s = np.where(rng.random(k) < 0.03, rng.uniform(120, 1200, k), rng.uniform(2, 40, k))
+            self._force[turn] = np.where(free, fresh, 0.0)
+            self._left_s[turn] = np.where(free, grip_s, 30 * rng.random(k) ** 3 + 0.3)
+            self._swing[turn] = 0.3 * rng.random(k) * (rng.random(k) < 0.5)
+            self._turn_s[turn], self.age_s[turn] = rng.uniform(2, 20, k), 0.0
+            self.sample_s[turn] = np.where(free, rng.uniform(0, grip_s), np.inf)
+        wave = 1 + self._swing * np.sin(2 * np.pi * self.age_s / self._turn_s)
+        return np.asarray(np.minimum(self._force * wave, FULL_N))
+
+
+def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
+    """Return force errors [N] of one reading of each contact.
+
+    Columns: `kind`, `pad`, `hour`, `age`, `uncompensated` (error without compensation). There is no bound.
+    """
+    rng = np.random.default_rng((seed, 9))
+    laws = [law for some in sheets for law in some.laws]
+    states = [SheetState.fresh(law) for law in laws]
+    behaviours = [
+        sheet_behaviour_of(some.behaviour) if some.behaviour else None for some in sheets for _ in some.laws
+    ]
+    compensation = SheetForceCompensation(behaviours, round(DT_S * 1e9))
+    gains = np.concatenate([some.gains for some in sheets])
+    kind = np.repeat([some.name for some in sheets], [len(some.laws) for some in sheets])
+    pads, use = np.arange(len(laws)), Use(len(laws), rng)
+    compared, press = np.zeros(len(laws), np.bool_), np.ones(len(laws))
+    press_std = np.array([law.press_std for law in laws])
+    noise_std = np.array([law.noise_std for law in laws])
+    touching, none, t_ns, gone_s = np.zeros(len(laws), np.bool_), np.zeros(len(laws)), 10**9, 0.0
+    compensation.compensate_forces(none, none, touching, t_ns)
+    rows: list[dict[str, Any]] = []
+    for long_s, is_work in use.spells(hours):
+        for dt_s in [DT_S] * round(long_s / DT_S) if is_work else [long_s]:
+            load = use.loads_n() if is_work else none
+            t_ns += round(dt_s * 1e9)
+            gone_s += dt_s
+            step = partial(advance, dt_s=dt_s, is_excited=True, warmer_k=0.0)
+            smooth = np.array(
+                [
+                    step(law, state, load_n=newton)
+                    for law, state, newton in zip(laws, states, load.tolist(), strict=True)
+                ]
+            )
+            flicker = 1 + noise_std / np.sqrt(np.maximum(smooth, 1e-3)) * rng.normal(size=len(laws))
+            apparent = np.maximum(gains * press * smooth * flicker, 0.0)
+            now = apparent > DETECTED_N
+            if (began := np.flatnonzero(now & ~touching)).size:
+                press[began] = np.exp(press_std[began] * rng.normal(size=len(began)))
+                apparent[began] = (gains * press * smooth)[began]
+                compensation.begin_contacts(began)
+                compared[began] = False
+            touching = now
+            pressed = compensation.compensate_forces(apparent, none, touching, t_ns)
+            is_modelled = np.isin(pads, pressed)
+            due = np.flatnonzero(touching & ~compared & (load > 0) & (use.age_s >= use.sample_s))
+            compared[due] = True
+            for pad in due.tolist():
+                force_n = compensation.force_n[pad] if is_modelled[pad] else apparent[pad]
+                std_n = compensation.std_n[pad] if is_modelled[pad] else np.nan
+                rows.append(
+                    {
+                        "error": force_n - load[pad], "std": std_n, "kind": kind[pad], "pad": pad,
+                        "hour": gone_s / HOUR_S, "age": use.age_s[pad], "force": load[pad],
+                        "valid": compensation.state[pad] == ForceReliability.RELIABLE,
+                        "uncompensated": apparent[pad] - load[pad],
+                    }
+                )  # fmt: skip
+    return _estimates(rows)
+
+
+def _estimates(rows: Sequence[dict[str, Any]]) -> Estimates:
+    column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    unknown, n = np.full((len(rows), 1, 1), np.nan), len(rows)
+    return Estimates(
+        column["error"].reshape(n, 1),
+        np.square(column["std"]).reshape(n, 1, 1),
+        column["valid"],
+        unknown[:, 0, 0],
+        unknown,
+        {
+            "kind": column["kind"],
+            "pad": column["pad"],
+            "hour": column["hour"],
+            "age": bin_labels(column["age"], (1.0, 10.0), "s"),
+            "force": bin_labels(column["force"], (0.5, 2.0), "N"),
+            "uncompensated": column["uncompensated"],
+        },
+    )
