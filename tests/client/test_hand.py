@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import handtouch
 from handtouch import wire
 from handtouch.client.hand_state import HandState
-from handtouch.client.link_columns import HandView
+from handtouch.client.link_columns import HandArrays
 from handtouch.client.wrench import contact_wrenches, grasp_matrix
 from tests.client.hand_messages import LINKS, make_contact, make_frame
 
@@ -33,9 +33,9 @@ def _state_after(*messages: wire.Message) -> HandState:
     return state
 
 
-def _view(state: HandState) -> HandView:
-    assert state.view is not None
-    return state.view
+def _arrays(state: HandState) -> HandArrays:
+    assert state.arrays is not None
+    return state.arrays
 
 
 # --- arrays by link
@@ -44,33 +44,33 @@ def _view(state: HandState) -> HandView:
 def test_columns_are_read_by_link_and_as_arrays() -> None:
     position_m = np.arange(9.0).reshape(3, 3)
     state = (CLEAR, TOUCHED, STALE)
-    view = HandView(make_frame(force_n=(0.5, 1.5, 2.5), position_m=position_m, state=state))
-    assert view.force_n["index_tip"] == 1.5
-    assert dict(view.force_n) == {"thumb_tip": 0.5, "index_tip": 1.5, "index_base": 2.5}
-    assert np.asarray(view.position_m) == pytest.approx(position_m)
-    assert view.position_m["index_base"] == pytest.approx(position_m[2])
-    assert list(view.touched.values()) == [False, True, False]
-    assert list(view.sampled.values()) == [True, True, False]
+    arrays = HandArrays(make_frame(force_n=(0.5, 1.5, 2.5), position_m=position_m, state=state))
+    assert arrays.force_n["index_tip"] == 1.5
+    assert dict(arrays.force_n) == {"thumb_tip": 0.5, "index_tip": 1.5, "index_base": 2.5}
+    assert np.asarray(arrays.position_m) == pytest.approx(position_m)
+    assert arrays.position_m["index_base"] == pytest.approx(position_m[2])
+    assert list(arrays.touched.values()) == [False, True, False]
+    assert list(arrays.sampled.values()) == [True, True, False]
     with pytest.raises(ValueError, match="read-only"):
-        view.force_n.array[0] = 9.0
+        arrays.force_n.array[0] = 9.0
 
 
 def test_an_unknown_link_is_reported_with_the_closest_one() -> None:
-    view = HandView(make_frame())
+    arrays = HandArrays(make_frame())
     with pytest.raises(KeyError, match="did you mean 'index_tip'"):
-        view.force_n["indx_tip"]
+        arrays.force_n["indx_tip"]
     with pytest.raises(KeyError, match="the links are thumb_tip, index_tip, index_base"):
-        view.force_n["q"]
+        arrays.force_n["q"]
 
 
 def test_an_output_that_no_scene_requests_is_an_error_that_names_the_output() -> None:
     with pytest.raises(LookupError, match='add "palm" to the outputs of the scene'):
-        _ = HandView(make_frame()).palm_position_m
+        _ = HandArrays(make_frame()).palm_position_m
 
 
 def test_ages_are_those_of_samples_at_the_given_time() -> None:
-    view = HandView(make_frame(sample_ns=(10**9, 2 * 10**9, 0)))
-    assert list(view.age_at(3 * 10**9).values()) == [2.0, 1.0, np.inf]
+    arrays = HandArrays(make_frame(sample_ns=(10**9, 2 * 10**9, 0)))
+    assert list(arrays.age_at(3 * 10**9).values()) == [2.0, 1.0, np.inf]
 
 
 # --- state from messages
@@ -78,18 +78,18 @@ def test_ages_are_those_of_samples_at_the_given_time() -> None:
 
 def test_an_older_or_repeated_frame_never_replaces_a_newer_one() -> None:
     state = _state_after(make_frame(7))
-    newest = _view(state)
+    newest = _arrays(state)
     for order, seq in enumerate((6, 7, 1), 1):
         state.feed(make_frame(seq, retained=True), order)
-        assert state.view is newest
+        assert state.arrays is newest
     state.feed(make_frame(8), 9)
-    assert _view(state).frame.seq == 8
+    assert _arrays(state).frame.seq == 8
 
 
 def test_another_session_voids_the_state() -> None:
     state = _state_after(make_frame(7), make_contact("index_tip", "begin", 4))
     state.feed(make_contact("thumb_tip", "begin", 1, session=2), 2)
-    assert state.view is None
+    assert state.arrays is None
     assert list(state.contacts) == ["thumb_tip"]
     state.feed(make_contact("index_tip", "update", 4, seq=2), 1)  # decoded later, received earlier
     assert list(state.contacts) == ["thumb_tip"]
@@ -140,7 +140,7 @@ def test_contacts_do_not_depend_on_when_messages_are_decoded(
 # --- wrenches
 
 
-def _touched_view(status: int = wire.ForceStatus.VALID) -> HandView:
+def _touched_arrays(status: int = wire.ForceStatus.VALID) -> HandArrays:
     rng = np.random.default_rng(3)
     normal = rng.normal(size=(3, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -154,7 +154,7 @@ def _touched_view(status: int = wire.ForceStatus.VALID) -> HandView:
             ("covariance_m2", np.tile(1e-7 * np.eye(3).ravel(), (3, 1))),
         )
     }
-    return HandView(
+    return HandArrays(
         make_frame(
             state=(TOUCHED,) * 3,
             force_n=(1.0, 2.0, 3.0),
@@ -168,11 +168,12 @@ def _touched_view(status: int = wire.ForceStatus.VALID) -> HandView:
 
 
 def test_a_contact_pushes_the_link_against_its_normal_at_its_point() -> None:
-    view = _touched_view()
-    wrench = view.wrenches("link")["index_tip"]
-    assert wrench.force_n == pytest.approx(-2.0 * view.normal["index_tip"], abs=1e-6)
-    assert wrench.point_m == pytest.approx(view.position_m["index_tip"])
-    assert wrench.moment_nm == pytest.approx(np.cross(view.position_m["index_tip"], wrench.force_n), abs=1e-6)
+    arrays = _touched_arrays()
+    wrench = arrays.wrenches("link")["index_tip"]
+    assert wrench.force_n == pytest.approx(-2.0 * arrays.normal["index_tip"], abs=1e-6)
+    assert wrench.point_m == pytest.approx(arrays.position_m["index_tip"])
+    moment_nm = np.cross(arrays.position_m["index_tip"], wrench.force_n)
+    assert wrench.moment_nm == pytest.approx(moment_nm, abs=1e-6)
 
 
 def test_the_covariance_of_a_wrench_is_that_of_perturbed_forces_and_positions() -> None:
@@ -191,30 +192,30 @@ def test_the_covariance_of_a_wrench_is_that_of_perturbed_forces_and_positions() 
 
 
 def test_a_finger_s_wrench_is_the_sum_of_its_contacts_and_names_those_it_lacks() -> None:
-    view = _touched_view()
-    each = view.wrenches("palm")
-    total = view.wrench("index_*", "palm")
+    arrays = _touched_arrays()
+    each = arrays.wrenches("palm")
+    total = arrays.wrench("index_*", "palm")
     assert total.force_n == pytest.approx(each["index_tip"].force_n + each["index_base"].force_n)
     assert total.covariance == pytest.approx(each["index_tip"].covariance + each["index_base"].covariance)
     assert total.missing == ()
-    assert view.total_force_n("index_*") == pytest.approx((5.0, np.hypot(0.2, 0.2)))
-    saturated = _touched_view(wire.ForceStatus.LOWER_BOUND)
+    assert arrays.total_force_n("index_*") == pytest.approx((5.0, np.hypot(0.2, 0.2)))
+    saturated = _touched_arrays(wire.ForceStatus.LOWER_BOUND)
     assert saturated.wrench("index_*", "palm").missing == ("index_base",)
     assert np.isnan(saturated.total_force_n("index_*")).all()
     assert saturated.total_force_n("thumb_*") == pytest.approx((1.0, 0.1))
     with pytest.raises(ValueError, match="a frame of its own"):
-        view.wrench("*", "link")
+        arrays.wrench("*", "link")
     with pytest.raises(LookupError, match="no link matches 'ring_\\*'"):
-        view.wrench("ring_*")
+        arrays.wrench("ring_*")
 
 
 def test_the_grasp_matrix_maps_normal_forces_to_the_opposite_of_the_wrench_on_the_hand() -> None:
-    view = _touched_view()
-    grasp = view.grasp_matrix("palm")
+    arrays = _touched_arrays()
+    grasp = arrays.grasp_matrix("palm")
     assert grasp.links == LINKS
     forces = np.zeros(9)
-    forces[::3] = view.force_n.array
-    total = view.wrench("*", "palm")
+    forces[::3] = arrays.force_n.array
+    total = arrays.wrench("*", "palm")
     on_hand = np.concatenate([total.force_n, total.moment_nm])
     assert grasp.matrix @ forces == pytest.approx(-on_hand, abs=1e-6)
 
@@ -254,11 +255,11 @@ def hand(publisher: Any, endpoints: dict[str, str]) -> Iterator[handtouch.Hand]:
         yield made
 
 
-def _wait_for(hand: handtouch.Hand, seq: int) -> HandView:
+def _wait_for(hand: handtouch.Hand, seq: int) -> HandArrays:
     end_s = time.monotonic() + LONGEST_S
     while time.monotonic() < end_s:
-        if (view := hand.wait(0.1)) is not None and view.frame.seq == seq:
-            return view
+        if (arrays := hand.wait(0.1)) is not None and arrays.frame.seq == seq:
+            return arrays
     raise AssertionError(f"frame {seq} never came")
 
 
@@ -277,9 +278,9 @@ def test_latest_returns_the_newest_frame_where_recv_returns_one_of_a_second_ago(
         assert now_ns - received.t_ns == 10**9
         while frames.recv(LONGEST_S).seq < 201:  # type: ignore[union-attr]
             pass  # all have arrived in this process
-        view = _wait_for(hand, 201)
-    assert view.t_ns == now_ns
-    assert hand.latest() is view
+        arrays = _wait_for(hand, 201)
+    assert arrays.t_ns == now_ns
+    assert hand.latest() is arrays
     oldest_s = 1e-9 * (time.monotonic_ns() - now_ns)
     assert oldest_s <= hand.age_s["index_tip"] <= 1e-9 * (time.monotonic_ns() - now_ns)
 
@@ -315,8 +316,8 @@ def test_messages_of_other_hands_and_malformed_ones_are_ignored(publisher: Any, 
 
 def test_wait_returns_each_frame_once(publisher: Any, hand: handtouch.Hand) -> None:
     publisher.send_multipart(wire.encode(make_frame(1)))
-    view = _wait_for(hand, 1)
-    assert hand.latest() is view
+    arrays = _wait_for(hand, 1)
+    assert hand.latest() is arrays
     assert hand.wait(0) is None
     publisher.send_multipart(wire.encode(make_frame(2)))
     assert _wait_for(hand, 2).frame.seq == 2
@@ -348,10 +349,10 @@ def test_callbacks_get_every_contact_in_a_thread_of_their_own(publisher: Any, ha
 
 
 def test_what_a_callback_raises_is_raised_by_close(publisher: Any, hand: handtouch.Hand) -> None:
-    def fail(view: HandView) -> None:
-        raise ArithmeticError(f"frame {view.frame.seq}")
+    def fail(arrays: HandArrays) -> None:
+        raise ArithmeticError(f"frame {arrays.frame.seq}")
 
-    listener = hand.on_view(fail)
+    listener = hand.on_frame(fail)
     end_s = time.monotonic() + LONGEST_S
     for seq in itertools.count(1):
         publisher.send_multipart(wire.encode(make_frame(seq)))
@@ -367,8 +368,8 @@ def test_all_tasks_that_wait_get_the_newest_frame(publisher: Any, hand: handtouc
     async def main() -> list[list[int]]:
         async def read() -> list[int]:
             seqs = []
-            async for view in hand:
-                seqs.append(view.frame.seq)
+            async for arrays in hand:
+                seqs.append(arrays.frame.seq)
                 if seqs[-1] == 20:
                     break
             return seqs
@@ -386,15 +387,15 @@ def test_all_tasks_that_wait_get_the_newest_frame(publisher: Any, hand: handtouc
 
 
 def test_waiting_times_out_in_asyncio(publisher: Any, hand: handtouch.Hand) -> None:
-    async def main() -> tuple[HandView | None, HandView | None]:
+    async def main() -> tuple[HandArrays | None, HandArrays | None]:
         nothing = await hand.wait_async(0.01)
         publisher.send_multipart(wire.encode(make_frame(1)))
         return nothing, await hand.wait_async(LONGEST_S)
 
-    nothing, view = asyncio.run(main())
+    nothing, arrays = asyncio.run(main())
     assert nothing is None
-    assert view is not None
-    assert view.frame.seq == 1
+    assert arrays is not None
+    assert arrays.frame.seq == 1
 
 
 def test_columns_are_typed() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from handtouch import wire
 from handtouch.client import Subscriber, columns, connect
+from handtouch.client.hand import Hand
 
 LONGEST_S = 60.0
 EVERYTHING = ("contact/*/*", "hand/*", "health/*/*", "service")
@@ -130,3 +131,58 @@ def test_congestion_episodes_of_both_streams_are_named_in_service(rig: Any) -> N
     rig.start("run")
     with rig.subscribe("service") as messages:
         assert messages.recv().congestion_episodes == {"live": 0, "complete": 0}
+
+
+def test_a_hand_has_the_state_that_its_messages_have(working: Any) -> None:
+    endpoints = working.endpoints
+    seen: dict[int, Any] = {}
+    end_s = time.monotonic() + LONGEST_S
+    with (
+        Hand("right", endpoint=endpoints["live"], control=endpoints["control"]) as hand,
+        connect("hand/right", endpoint=endpoints["live"], queue=100_000) as frames,
+    ):
+        began, ended = set[int](), False
+        while len(seen) < 50 or not ended:
+            assert time.monotonic() < end_s, working.all_printed()
+            arrays = hand.wait(LONGEST_S)
+            assert arrays is not None
+            seen[arrays.frame.seq] = arrays
+            for link, contact in hand.contacts.items():
+                assert (contact.hand, contact.link) == ("right", link)
+                assert contact.event != "end"
+                began.add(contact.id)
+            active = {contact.id for contact in hand.contacts.values()}
+            ended = bool(began - active)
+        compared = 0
+        while (frame := frames.recv(LONGEST_S)) is not None:
+            if frame.seq in seen:
+                compared += 1
+                for name, array in columns(frame).items():
+                    assert seen[frame.seq].column(name).array.tobytes() == array.tobytes()
+            if frame.seq >= max(seen):
+                break
+        assert compared > 40
+        assert hand.malformed_messages == 0
+
+
+def test_requests_are_methods_with_typed_results(working: Any) -> None:
+    endpoints = working.endpoints
+    with Hand("right", endpoint=endpoints["live"], control=endpoints["control"]) as hand:
+        status = hand.control.status()
+        assert status.service.hands == {"right": [pad.link for pad in status.pads]}
+        snapshot = hand.control.snapshot()
+        assert snapshot.hands["right"].links == tuple(pad.link for pad in status.pads)
+        scenes = hand.scene(outputs=["position", "force"], name="a test", lease_s=1.0)
+        assert any(scene["owner"] == "client a test" for scene in scenes["scenes"])
+        assert hand.disable("thumb_*", name="a test")
+        assert hand.enable("thumb_*") == {}
+        (tared,) = hand.tare("ring_distal")
+        assert (tared["hand"], tared["link"]) == ("right", "ring_distal")
+        assert tared["tared"] is (tared["reason"] == "")  # too few samples where the machine stalls
+        calibration = hand.control.calibrate("right/ring_distal")
+        assert calibration["calibration_id"] == calibration["previous_calibration_id"]
+        assert len(calibration["gains"]) == 4
+        with pytest.raises(RuntimeError, match='no pad is named "right/ring_tip"'):
+            hand.tare("ring_tip")
+        with pytest.raises(ValueError, match="give a list"):
+            hand.scene(outputs="force")  # type: ignore[arg-type]

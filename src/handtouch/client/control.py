@@ -52,7 +52,7 @@ class ActiveScene(TypedDict):
 
 
 class PadDemand(TypedDict):
-    """What is computed for one pad, and what isn't."""
+    """Computed and other outputs of one pad."""
 
     hand: str
     link: str

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -21,9 +21,9 @@ from zmq import zmq_poll
 
 from handtouch import wire
 from handtouch.client.connection import RECONNECT_OPTIONS, Connection
-from handtouch.client.control import DaemonControl
+from handtouch.client.control import DaemonControl, Output, Scenes, TareResult
 from handtouch.client.hand_state import HandState
-from handtouch.client.link_columns import HandView, LinkColumn, LinkColumns
+from handtouch.client.link_columns import HandArrays, LinkColumn, LinkColumns
 from handtouch.client.listener import Listener
 from handtouch.client.subscriber import SERVICE_TIMEOUT_S, connect
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
@@ -47,7 +47,7 @@ class Hand(LinkColumns):
     `name`: the hand's in the deployment. `endpoint`, `control` and `key` as for `connect` and `request`.
     Raises ValueError for an invalid name or endpoint and for an unusable key file; receiving raises
     PermissionError when the daemon rejects this client. Not thread-safe; callbacks have a thread and a
-    connection of their own (`on_contact`, `on_view`).
+    connection of their own (`on_contact`, `on_frame`).
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class Hand(LinkColumns):
         for prefix in (self._frame_topic, self._contact_prefix, b"service"):
             self._connection.socket.subscribe(prefix)
         self._state = HandState()
-        self._view: HandView | None = None
+        self._arrays: HandArrays | None = None
         self._undecoded: dict[bytes, tuple[int, list[bytes]]] = {}  # newest of each contact topic
         self._received = 0
         self._last_receive_s = 0.0
         self._listeners: list[Listener[Any]] = []
 
-    def latest(self) -> HandView | None:
+    def latest(self) -> HandArrays | None:
         """Return the newest frame that has arrived, the same object while there is no newer one.
 
         Never blocks. None before the first frame, and without a daemon, whose last state is void. Raises
@@ -88,30 +88,30 @@ class Hand(LinkColumns):
             self._drain()
         elif not self.alive:
             self._connection.poll(0)  # rejected?
-            self._view = None
+            self._arrays = None
             return None
-        self._view = self._state.view
-        return self._view
+        self._arrays = self._state.arrays
+        return self._arrays
 
-    def wait(self, timeout_s: float | None = None) -> HandView | None:
+    def wait(self, timeout_s: float | None = None) -> HandArrays | None:
         """Return the newest frame, as soon as it isn't the one returned before; None after the timeout.
 
         Raises PermissionError when the daemon rejects this client.
         """
-        seen = self._view
+        seen = self._arrays
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while (view := self.latest()) is None or view is seen:
+        while (arrays := self.latest()) is None or arrays is seen:
             left_ms = None if end_s is None else max(0, round((end_s - time.monotonic()) * 1000))
             if not self._connection.poll(left_ms) and left_ms is not None:
                 return None
-        return view
+        return arrays
 
-    async def wait_async(self, timeout_s: float | None = None) -> HandView | None:
+    async def wait_async(self, timeout_s: float | None = None) -> HandArrays | None:
         """Do as `wait`, for asyncio: several tasks may wait, and each gets the frame."""
-        seen = self._view
+        seen = self._arrays
         try:
             async with asyncio.timeout(timeout_s):
-                return await self._next_view(seen)
+                return await self._next_arrays(seen)
         except TimeoutError:
             return None
 
@@ -133,12 +133,12 @@ class Hand(LinkColumns):
     @property
     def links(self) -> tuple[str, ...]:
         """Links of the hand, in the order of the rows of all arrays."""
-        return self._require_view().links
+        return self._require_arrays().links
 
     @property
     def age_s(self) -> LinkColumn[float]:
         """Age of each pad's sample now, by `now_ns`; infinite before the first."""
-        return self._require_view().age_at(self.now_ns())
+        return self._require_arrays().age_at(self.now_ns())
 
     def now_ns(self) -> int:
         """Return the present time on the daemon's monotonic clock.
@@ -154,12 +154,12 @@ class Hand(LinkColumns):
 
     def column(self, name: str) -> LinkColumn[Any]:
         """Return a column of the newest frame by its name. Raises LookupError while there is none."""
-        return (self._view or self._require_view()).column(name)
+        return (self._arrays or self._require_arrays()).column(name)
 
     @property
-    def view(self) -> HandView:
+    def arrays(self) -> HandArrays:
         """The frame that `latest` or `wait` returned last. Raises LookupError while there is none."""
-        return self._require_view()
+        return self._require_arrays()
 
     def on_contact(self, callback: Callable[[wire.Contact], object]) -> Listener[wire.Contact]:
         """Call a function for every begin, update and end of a contact, in a thread; until `close`."""
@@ -168,11 +168,36 @@ class Hand(LinkColumns):
         contacts = connect(pattern, kind=wire.Contact, endpoint=endpoint, key=key)
         return self._start(Listener(contacts.recv, contacts.close, callback, f"on_contact of {self.name}"))
 
-    def on_view(self, callback: Callable[[HandView], object]) -> Listener[HandView]:
+    def on_frame(self, callback: Callable[[HandArrays], object]) -> Listener[HandArrays]:
         """Call a function for the newest frame, in a thread; frames that arrive meanwhile are skipped."""
         endpoint, control, key = self._settings
         hand = Hand(self.name, endpoint=endpoint, control=control, key=key)
-        return self._start(Listener(hand.wait, hand.close, callback, f"on_view of {self.name}"))
+        return self._start(Listener(hand.wait, hand.close, callback, f"on_frame of {self.name}"))
+
+    def tare(self, *links: str) -> list[TareResult]:
+        """Zero the pads on links that match the patterns, by default all; errors as for `DaemonControl`."""
+        return self.control.tare(*self._pads_on(links or ("*",)))
+
+    def scene(
+        self,
+        *,
+        outputs: Sequence[Output] | None = None,
+        rate_hz: float | None = None,
+        links: Sequence[str] | None = None,
+        name: str | None = None,
+        lease_s: float | None = None,
+    ) -> Scenes:
+        """Change the base scene, or a client's, as `DaemonControl.scene`; `links`: patterns, of this hand."""
+        pads = None if links is None else self._pads_on(links)
+        return self.control.scene(links=pads, outputs=outputs, rate_hz=rate_hz, name=name, lease_s=lease_s)
+
+    def disable(self, *links: str, name: str | None = None) -> dict[str, str]:
+        """Switch off the pads on links that match the patterns, as `DaemonControl.disable`."""
+        return self.control.disable(*self._pads_on(links), name=name)
+
+    def enable(self, *links: str, name: str | None = None) -> dict[str, str]:
+        """Switch on the pads on links that match the patterns, as `DaemonControl.enable`."""
+        return self.control.enable(*self._pads_on(links), name=name)
 
     def close(self) -> None:
         """Disconnect, and stop callbacks; raises what one of them raised."""
@@ -180,15 +205,15 @@ class Hand(LinkColumns):
         while self._listeners:
             self._listeners.pop().close()
 
-    def __iter__(self) -> Iterator[HandView]:
+    def __iter__(self) -> Iterator[HandArrays]:
         while True:
-            if (view := self.wait()) is not None:
-                yield view
+            if (arrays := self.wait()) is not None:
+                yield arrays
 
-    async def __aiter__(self) -> AsyncIterator[HandView]:
+    async def __aiter__(self) -> AsyncIterator[HandArrays]:
         seen = None
         while True:
-            yield (seen := await self._next_view(seen))
+            yield (seen := await self._next_arrays(seen))
 
     def __enter__(self) -> Self:
         return self
@@ -202,19 +227,24 @@ class Hand(LinkColumns):
     async def __aexit__(self, *_: object) -> None:
         self.close()
 
-    def _require_view(self) -> HandView:
-        if self._view is None:
+    def _require_arrays(self) -> HandArrays:
+        if self._arrays is None:
             raise LookupError(
                 f"there is no frame of hand {self.name!r}: call latest() or wait() until it returns one; "
                 "check the name, and that `handtouch run` is running"
             )
-        return self._view
+        return self._arrays
 
-    async def _next_view(self, seen: HandView | None) -> HandView:
+    async def _next_arrays(self, seen: HandArrays | None) -> HandArrays:
         await asyncio.sleep(0)  # let other tasks run even while the stream never pauses
-        while (view := self.latest()) is None or view is seen:
+        while (arrays := self.latest()) is None or arrays is seen:
             await self._connection.wait()
-        return view
+        return arrays
+
+    def _pads_on(self, links: Sequence[str]) -> list[str]:
+        if isinstance(links, str):
+            raise ValueError(f"{links!r} is one string; give a list, [{links!r}]")
+        return [f"{self.name}/{link}" for link in links]
 
     def _start(self, listener: Listener[T]) -> Listener[T]:
         self._listeners.append(listener)

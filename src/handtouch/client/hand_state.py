@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from handtouch import wire
-from handtouch.client.link_columns import HandView
+from handtouch.client.link_columns import HandArrays
 
 
 class _OrderedContact(NamedTuple):
@@ -21,13 +21,13 @@ class _OrderedContact(NamedTuple):
 class HandState:
     """Newest frame, contacts and service message of one hand; `feed` updates it.
 
-    `view`: None before the first frame of a session.
+    `arrays`: None before the first frame of a session.
     """
 
     def __init__(self) -> None:
-        self.view: HandView | None = None
+        self.arrays: HandArrays | None = None
         self.service: wire.Service | None = None
-        self._view_order = self._newest_order = -1
+        self._frame_order = self._newest_order = -1
         self._session: int | None = None
         self._contacts: dict[str, _OrderedContact] = {}
         self._rows: tuple[tuple[str, ...], Mapping[str, int]] = ((), {})
@@ -41,14 +41,14 @@ class HandState:
         if message.session != self._session:
             if order < self._newest_order:
                 return
-            self.view, self.service, self._session = None, None, message.session
+            self.arrays, self.service, self._session = None, None, message.session
             self._contacts.clear()
         self._newest_order = max(order, self._newest_order)
         match message:
-            case wire.HandFrame() if self.view is None or message.seq > self.view.frame.seq:
-                self.view = HandView(message, self._rows_of(message.links))
+            case wire.HandFrame() if self.arrays is None or message.seq > self.arrays.frame.seq:
+                self.arrays = HandArrays(message, self._rows_of(message.links))
                 if not message.retained:  # a retained one may be older than a contact received before
-                    self._view_order = order
+                    self._frame_order = order
             case wire.Contact(event="end"):
                 self._contacts.pop(message.link, None)
             case wire.Contact():
@@ -59,12 +59,12 @@ class HandState:
     @property
     def contacts(self) -> Mapping[str, wire.Contact]:
         """Active contacts by link; also without the message of an end, once a frame shows it."""
-        active_ids = {} if self.view is None else self.view.contact_id
+        active_ids = {} if self.arrays is None else self.arrays.contact_id
         return MappingProxyType(
             {
                 link: contact
                 for link, (order, contact) in self._contacts.items()
-                if order > self._view_order or active_ids.get(link) == contact.id
+                if order > self._frame_order or active_ids.get(link) == contact.id
             }
         )
 

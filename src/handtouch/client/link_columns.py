@@ -1,6 +1,6 @@
 """Arrays of a hand frame by link, and the wrenches of its contacts.
 
-Public names: `LinkColumn`, `HandView`.
+Public names: `LinkColumn`, `HandArrays`.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class LinkColumns:
         raise NotImplementedError
 
 
-class HandView(LinkColumns):
+class HandArrays(LinkColumns):
     """All pads of a hand at one tick, as arrays by link; immutable."""
 
     def __init__(self, frame: wire.HandFrame, rows: Mapping[str, int] | None = None) -> None:
