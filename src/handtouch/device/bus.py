@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from handtouch.canbus import cia301
 from handtouch.config import shipped
 from handtouch.device.inputs import CHANNELS
+from handtouch.device.lss import StoreId
 from handtouch.device.node import NMT_COMMANDS, RESETS, Device
 from handtouch.device.object_values import Address
 from handtouch.device.pdo import DeviceTpdo
@@ -139,11 +140,25 @@ class DeviceBus:
         `lss_compares` : as `LssSlave.compares`
         """
         spec = DeviceSpec(_eds_path(eds), vendor_id, product_code, serial, channels)
-        unconfigured = UnconfiguredDevice(self, self._rows, spec, lss_compares=lss_compares)
+        return self._append_lss_device(UnconfiguredDevice(self, self._rows, spec, lss_compares=lss_compares))
+
+    def add_stored(self, serial: int, node_id: int | None, store: StoreId) -> UnconfiguredDevice:
+        """Add a node of the shipped EDS with a stored id, None for none, whose inputs the sampler measures.
+
+        `store` is called for an id that LSS has stored. Raises ValueError for an id in use.
+        """
+        if node_id in (device.lss.stored_id for device in self._unconfigured if node_id is not None):
+            raise ValueError(f"node_id must be used once, got {node_id}")
+        spec = DeviceSpec(_eds_path(None), serial=serial, simulates_excitation=False)
+        return self._append_lss_device(
+            UnconfiguredDevice(self, self._rows, spec, node_id=node_id, store=store)
+        )
+
+    def _append_lss_device(self, device: UnconfiguredDevice) -> UnconfiguredDevice:
         self._rows += 1
         with self.lock:
-            self._unconfigured.append(unconfigured)
-        return unconfigured
+            self._unconfigured.append(device)
+        return device
 
     def handle_frame(self, frame: can.Message, now_ns: int) -> None:
         """Handle a frame received at `now_ns`; frames that aren't for a node are ignored."""

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 from handtouch.canbus import cia305
 from handtouch.canbus.cia305 import LssAddress
+
+StoreId = Callable[[int | None], bool]
+"""Stores a node id, None for none, in permanent memory; returns False on failure."""
 
 _UNCOMPARED = {cia305.FAST_SCAN: cia305.IS_SLAVE, cia305.SELECT[-1]: cia305.SELECTED}
 
@@ -16,6 +20,7 @@ class LssSlave:
     `node_id` : the id in use, None before it has one
     `stored_id` : the id after the next `power_on`
     `can_store` : False for a node that can't store its id
+    `store` : stores the id beyond this process
     `compares` : False for a node that in the configuration state responds to every fast scan and every
     selection whatever its data, as several stacks do
     `rejected` : number of malformed requests
@@ -28,11 +33,13 @@ class LssSlave:
         *,
         can_store: bool = True,
         compares: bool = True,
+        store: StoreId = lambda _: True,
     ) -> None:
         self.address = address
         self.stored_id = node_id
         self.can_store = can_store
         self.compares = compares
+        self._store = store
         self.rejected = 0
         self.power_on()
 
@@ -142,7 +149,8 @@ class LssSlave:
         if command == cia305.BIT_TIMING:
             return struct.pack("<BB6x", command, 1)
         if command == cia305.STORE:
-            if self.can_store:
+            stored = self.can_store and self._store(self._pending_id)
+            if stored:
                 self.stored_id = self._pending_id
-            return struct.pack("<BB6x", command, not self.can_store)
+            return struct.pack("<BB6x", command, not stored)
         return None

@@ -264,6 +264,7 @@ class Device(FaultSwitches):
         """True unless the excitation was switched on within the last SETTLE_SAMPLES samples."""
         return (
             self._excited_sample is None
+            or not self.spec.simulates_excitation
             or self._bus.sample_count - self._excited_sample > inputs.SETTLE_SAMPLES
         )
 
@@ -277,7 +278,7 @@ class Device(FaultSwitches):
         """True if its TPDOs carry the sampler's counts unchanged."""
         return (
             self.inputs_settled
-            and self._excited_sample is not None
+            and (self._excited_sample is not None or not self.spec.simulates_excitation)
             and tuple(self.wiring) == inputs.STRAIGHT_WIRING
             and not (self.stuck_counts or self.open_electrodes)
             and self.line is None
@@ -295,8 +296,10 @@ class Device(FaultSwitches):
                 wiring=self.wiring,
                 open_electrodes=self.open_electrodes,
                 stuck_counts=self.stuck_counts,
-                excited=self._excited_sample is not None,
-                settled=max(self._bus.sample_count - (self._excited_sample or 0) - 1, 0),
+                excited=self._excited_sample is not None or not self.spec.simulates_excitation,
+                settled=max(self._bus.sample_count - (self._excited_sample or 0) - 1, 0)
+                if self.spec.simulates_excitation
+                else inputs.SETTLE_SAMPLES,
             )
         return self._counts
 

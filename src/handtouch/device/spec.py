@@ -26,6 +26,8 @@ class DeviceSpec:
     `counts_per_unit` : those that are REAL32 carry the count divided by this
     `excitation` : the object that switches the excitation, None for 0x2100 if it has that name in the EDS
     `strict_pdo` : a valid PDO can't be changed
+    `simulates_excitation` : without excitation the inputs read 0, and after it they settle; False where the
+    sampler measures them
     """
 
     eds: str
@@ -36,6 +38,7 @@ class DeviceSpec:
     counts_per_unit: tuple[float | None, ...] = (None,) * CHANNELS
     excitation: Address | None = None
     strict_pdo: bool = False
+    simulates_excitation: bool = True
 
     def load_dictionary(self, node_id: int) -> ObjectDictionary:
         """Load the EDS. Raises ValueError if it is unreadable, or has no TPDO or one beyond 64 bits."""

@@ -1,4 +1,4 @@
-"""A simulated node that gets its id over the bus by layer setting services (CiA 305)."""
+"""A node that gets its id over the bus by layer setting services (CiA 305)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from canopen import ObjectDictionary
 from handtouch.canbus import cia301
 from handtouch.canbus.cia305 import LssAddress
 from handtouch.config.eds_file import raw_value
-from handtouch.device.lss import LssSlave
+from handtouch.device.lss import LssSlave, StoreId
 from handtouch.device.node import Device, DeviceHost
 from handtouch.device.spec import DeviceSpec
 
@@ -23,13 +23,24 @@ class DeviceRegistry(DeviceHost, Protocol):
 
 
 class UnconfiguredDevice:
-    """A node without an id, which responds to LSS requests only; made by `DeviceBus.add_unconfigured`.
+    """A node with an LSS slave; without an id it responds to LSS requests only. `DeviceBus` makes it.
 
+    `node_id` : id stored in it, None for none; `store` : stores another one beyond this process
     `lss` is its LSS slave, `device` the node with its present id, None while it has none.
     """
 
-    def __init__(self, bus: DeviceRegistry, row: int, spec: DeviceSpec, *, lss_compares: bool = True) -> None:
-        self.lss = LssSlave(_lss_address(spec, spec.load_dictionary(1)), compares=lss_compares)
+    def __init__(
+        self,
+        bus: DeviceRegistry,
+        row: int,
+        spec: DeviceSpec,
+        *,
+        lss_compares: bool = True,
+        node_id: int | None = None,
+        store: StoreId = lambda _: True,
+    ) -> None:
+        address = _lss_address(spec, spec.load_dictionary(1))
+        self.lss = LssSlave(address, node_id, compares=lss_compares, store=store)
         self.device: Device | None = None
         self.plugged = False
         self._bus, self._row, self._spec = bus, row, spec
