@@ -110,8 +110,9 @@ lock: $(BIN)/python ## update the pinned versions of all packages
 	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
 		--no-emit-index-url --no-emit-find-links --output-file requirements.lock pyproject.toml
 
-schema: $(VENV)/.run ## write config/handtouch.schema.json from the models of the deployment file
+schema: $(VENV)/.run ## write config/*.schema.json from the models of the deployment's and the node's file
 	$(BIN)/handtouch check --schema >config/handtouch.schema.json
+	$(BIN)/handtouch node --schema >config/touch_node.schema.json
 
 dist: $(VENV)/.dev ## build the wheel and the source archive
 	rm -rf dist

@@ -20,12 +20,13 @@ from handtouch.cli import (
     daemons,
     keys,
     monitoring,
+    node,
     recording,
     setup,
 )
 from handtouch.cli.options import EXIT_STATUS_HELP, LazyFunction
 
-COMMAND_GROUPS = (daemons, monitoring, recording, control, bridge, keys, setup, calibrations)
+COMMAND_GROUPS = (daemons, monitoring, recording, control, bridge, keys, setup, calibrations, node)
 """Modules with a function `add`, in the order of `--help`."""
 
 

@@ -1,0 +1,96 @@
+"""`handtouch node`: run sensor nodes, or print the noise of their channels."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+from handtouch import config
+from handtouch.host import logs
+from handtouch.host.signals import stop_on_signals
+from handtouch.node import service
+from handtouch.node.adc_fault import AdcError
+from handtouch.node.noise import PadNoise, measure_noise, position_noise
+from handtouch.node.settings import NodeFile, json_schema, load
+
+
+def run_command(config_path: Path | None, *, schema: bool, measure_noise: bool, **options: Any) -> int:
+    """Run the command; exit status 0, 1 (bus, ADC or state file), 2 (wrong usage or invalid file)."""
+    if schema:
+        print(json.dumps(json_schema(), indent=2))
+        return 0
+    if config_path is None:
+        print("handtouch node: give the file of the node, or --schema", file=sys.stderr)
+        return 2
+    try:
+        file = load(config_path)
+        deployment = config.load(options["deployment"]) if options["deployment"] else None
+    except config.ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if measure_noise:
+        return _print_noise(
+            file, deployment, options["samples"], options["period_ms"] * 1e-3, options["as_json"]
+        )
+    return _run(file)
+
+
+def _run(file: NodeFile) -> int:
+    stop = stop_on_signals()
+    log_handler = logs.start_logging(file.settings.log_level)
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)
+    try:
+        service.run(file, stop)
+    except (OSError, ValueError) as error:  # BusError is an OSError
+        print(f"handtouch node: {error}", file=sys.stderr)
+        return 1
+    finally:
+        log_handler.close()
+    return 0
+
+
+def _print_noise(
+    file: NodeFile, deployment: config.Deployment | None, samples: int, period_s: float, as_json: bool
+) -> int:
+    try:
+        measured = measure_noise(file, samples, period_s)
+        positions = [position_noise(noise, deployment) if deployment else [] for noise in measured]
+    except (AdcError, ValueError) as error:
+        print(f"handtouch node: {error}", file=sys.stderr)
+        return 1
+    pairs = list(zip(measured, positions, strict=True))
+    if as_json:
+        print(json.dumps([_noise_map(noise, errors) for noise, errors in pairs], indent=2))
+        return 0
+    for noise, errors in pairs:
+        print(f"pad {noise.pad.name}: {noise.samples} samples")
+        print(f"  {'channel':<20} {'mean, A':>11} {'noise, A':>11} {'counts':>8}   (1 sigma)")
+        columns = zip(noise.pad.channels, noise.mean_ma, noise.std_ma, noise.std_counts, strict=True)
+        for channel, mean, std, counts in columns:
+            print(f"  {channel:<20} {1e-3 * mean:11.3e} {1e-3 * std:11.3e} {counts:8.2f}")
+        for link, force, median, worst in errors:
+            print(
+                f"  position noise on {link} at {force:g} N: {1e3 * median:.2g} mm median, "
+                f"{1e3 * worst:.2g} mm at worst"
+            )
+    if deployment is None:
+        print("give --deployment FILE for the position noise on its pads")
+    return 0
+
+
+def _noise_map(noise: PadNoise, errors: list[tuple[str, float, float, float]]) -> dict[str, Any]:
+    return {
+        "pad": noise.pad.name,
+        "samples": noise.samples,
+        "channels": noise.pad.channels,
+        "mean_a": (1e-3 * noise.mean_ma).tolist(),
+        "std_a": (1e-3 * noise.std_ma).tolist(),
+        "std_counts": noise.std_counts.tolist(),
+        "position": [
+            {"link": link, "force_n": force, "median_m": median, "worst_m": worst}
+            for link, force, median, worst in errors
+        ],
+    }

@@ -1,0 +1,160 @@
+"""Input of one pad: currents and counts of its ADC's channels, and its failures as EMCY messages.
+
+Public names: `PadInput`, `MAX_COUNT`.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.canbus import cia301
+from handtouch.device import Device, UnconfiguredDevice
+from handtouch.node.adc_fault import AdcError, AdcFaultKind, emergency_of
+from handtouch.node.iio import FloatArray
+from handtouch.node.settings import NodePad, Trim
+
+MAX_COUNT = 32767
+_ALL_CHANNELS = 0b1111
+_SATURATED_SAMPLES = 3  # in succession, before a channel is reported
+_SATURATED_HOLD_NS = 1_000_000_000  # since the last one, before it is reported as recovered
+
+_log = logging.getLogger("handtouch.node")
+
+
+class PadInput:
+    """Converts raw values of a pad to counts, and reports its failures.
+
+    `columns` : of its four channels in its ADC's readings; `node` : its CANopen node, None without one;
+    `has_sample` : True unless its ADC has failed or not converted yet. Without a sample the node sends no
+    TPDO, so that no old value passes for a new one; its NMT state stays.
+    """
+
+    def __init__(
+        self, pad: NodePad, trim: Trim, columns: list[int], node: UnconfiguredDevice | None = None
+    ) -> None:
+        self.pad, self.columns, self._node = pad, columns, node
+        self._volt_per_unit = np.array(
+            [1.0 if channel.startswith("current") else pad.gain_ohm for channel in pad.channels]
+        )
+        self._gain, self._offset_ma = np.array(trim.gain), np.array(trim.offset_ma)
+        self.has_sample = False
+        self._faults: dict[AdcFaultKind, bytes] = {}
+        self._saturated_samples = np.zeros(4, np.int64)
+        self._saturated_ns = 0
+
+    @property
+    def faults(self) -> tuple[AdcFaultKind, ...]:
+        """Present failures."""
+        return tuple(self._faults)
+
+    @property
+    def counts_per_ma(self) -> float:
+        """Counts per milliampere."""
+        return MAX_COUNT / self.pad.full_scale_ma
+
+    @property
+    def device(self) -> Device | None:
+        """The node on the bus, None without an id."""
+        return None if self._node is None else self._node.device
+
+    def currents_ma(self, raw: FloatArray, scale: FloatArray, offset: FloatArray) -> FloatArray:
+        """Return the currents (..., 4) [mA] of raw values (..., 4).
+
+        `scale`, `offset` : of the channels (4,), to mV as in IIO, or to mA for channels currentN
+        """
+        measured = (raw + offset) * scale / self._volt_per_unit
+        return np.asarray((measured - self._offset_ma) * self._gain)
+
+    def counts(self, currents_ma: FloatArray) -> NDArray[np.int64]:
+        """Return the counts (..., 4) of currents, limited to 16 bits."""
+        counts = np.rint(currents_ma * self.counts_per_ma)
+        return np.clip(counts, -MAX_COUNT - 1, MAX_COUNT).astype(np.int64)
+
+    def record_sample(self, at_limit: NDArray[np.bool_], now_ns: int) -> None:
+        """Record a successful sample; `at_limit` (4,): the channels at an end of their ranges."""
+        self.has_sample = True
+        for kind in self.faults:
+            if _is_of_adc(kind):
+                self._clear(kind)
+        if at_limit.any() or AdcFaultKind.SATURATED in self._faults:
+            self._record_saturation(at_limit, now_ns)
+        else:
+            self._saturated_samples[:] = 0
+        self._allow_data()
+
+    def record_failure(self, error: AdcError, channels: int = _ALL_CHANNELS) -> None:
+        """Record a failed sample, or a failed switch; `channels`: bit mask of those concerned."""
+        data = bytes((error.kind, channels)) + error.number.to_bytes(2, "little") + b"\0"
+        if _is_of_adc(error.kind):
+            self.has_sample = False
+            self._allow_data()
+        if self._faults.get(error.kind) == data:
+            return
+        if _is_of_adc(error.kind):  # an ADC fails in one way at a time
+            self._faults = {kind: sent for kind, sent in self._faults.items() if not _is_of_adc(kind)}
+        self._faults[error.kind] = data
+        _log.error("pad %s: %s", self.pad.name, error, extra=self._fields)
+        self._send(error.kind)
+
+    def record_excitation(self) -> None:
+        """Record that the excitation could be switched."""
+        if AdcFaultKind.EXCITATION_FAILED in self._faults:
+            self._clear(AdcFaultKind.EXCITATION_FAILED)
+
+    def update_device(self) -> None:
+        """Stop or allow TPDOs, and report present failures again after a reset of the node."""
+        device = self.device
+        if device is None:
+            return
+        self._allow_data()
+        if self._faults and not device.read_object(cia301.ERROR_REGISTER, 0):
+            for kind in self.faults:
+                self._send(kind)
+
+    def _record_saturation(self, at_limit: NDArray[np.bool_], now_ns: int) -> None:
+        self._saturated_samples = np.where(at_limit, self._saturated_samples + 1, 0)
+        if at_limit.any():
+            self._saturated_ns = now_ns
+        lasting = self._saturated_samples >= _SATURATED_SAMPLES
+        if lasting.any() and AdcFaultKind.SATURATED not in self._faults:
+            mask = sum(1 << channel for channel in np.flatnonzero(lasting).tolist())
+            names = ", ".join(self.pad.channels[channel] for channel in np.flatnonzero(lasting))
+            self.record_failure(AdcError(AdcFaultKind.SATURATED, names), mask)
+        elif AdcFaultKind.SATURATED in self._faults and now_ns - self._saturated_ns > _SATURATED_HOLD_NS:
+            self._clear(AdcFaultKind.SATURATED)
+
+    def _clear(self, kind: AdcFaultKind) -> None:
+        del self._faults[kind]
+        _log.warning("pad %s: recovered from %s", self.pad.name, kind.text, extra=self._fields)
+        if self.device is not None:
+            self.device.send_emergency(0, self._register, bytes((kind,)))
+
+    def _send(self, kind: AdcFaultKind) -> None:
+        if self.device is not None:
+            self.device.send_emergency(emergency_of(kind)[0], self._register, self._faults[kind])
+
+    def _allow_data(self) -> None:
+        """Stop TPDOs without a sample, and allow them with one."""
+        device = self.device
+        if device is not None and device.send_data is not self.has_sample:
+            device.send_data = self.has_sample
+
+    @property
+    def _register(self) -> int:
+        """Error register, 0x1001."""
+        register = 0
+        for kind in self._faults:
+            register |= emergency_of(kind)[1]
+        return register
+
+    @property
+    def _fields(self) -> dict[str, dict[str, str]]:
+        return {"fields": {"pad": self.pad.name}}
+
+
+def _is_of_adc(kind: AdcFaultKind) -> bool:
+    """Return True for a failure that leaves no sample."""
+    return kind not in (AdcFaultKind.SATURATED, AdcFaultKind.EXCITATION_FAILED)

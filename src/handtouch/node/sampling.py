@@ -1,0 +1,228 @@
+"""Sampling of all ADCs at SYNC: counts of every pad, timing, failures and recovery.
+
+Public names: `AdcInput`, `Sampling`, `SampleTiming`, `make_inputs`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.device import UnconfiguredDevice
+from handtouch.node.adc_fault import AdcError
+from handtouch.node.buffered import BufferedReader
+from handtouch.node.iio import AdcReader, AdcReading, FloatArray, OneShotReader
+from handtouch.node.pad_input import MAX_COUNT, PadInput
+from handtouch.node.settings import Adc, NodeFile
+
+_WINDOW_SAMPLES = 2000
+_MIN_RETRY_NS, _MAX_RETRY_NS = 100_000_000, 1_000_000_000
+
+
+@dataclass(frozen=True)
+class TimingSummary:
+    """Times of the latest samples relative to the arrival of their SYNC [s].
+
+    `mean_s`, `jitter_s` (standard deviation), `first_s`, `last_s` : of the sample; `span_s` : greatest time
+    between the conversions of one sample; `samples` : their number; `is_timed` : False where a sample's time
+    is that of reading it
+    """
+
+    mean_s: float
+    jitter_s: float
+    first_s: float
+    last_s: float
+    span_s: float
+    samples: int
+    is_timed: bool
+
+    def __str__(self) -> str:
+        mean, jitter, first, last, span = (
+            1e3 * value for value in (self.mean_s, self.jitter_s, self.first_s, self.last_s, self.span_s)
+        )
+        text = f"sampled {mean:+.2f} ms from SYNC, jitter {jitter:.2f} ms ({first:+.2f} to {last:+.2f})"
+        text += f", channels within {span:.2f} ms" if span >= 0.005 else ""
+        return text + ("" if self.is_timed else ", times of reading: the driver has no time stamps")
+
+
+class SampleTiming:
+    """Times of an ADC's latest samples relative to SYNC."""
+
+    def __init__(self) -> None:
+        self._latencies_ns: deque[int] = deque(maxlen=_WINDOW_SAMPLES)
+        self._spans_ns: deque[int] = deque(maxlen=_WINDOW_SAMPLES)
+        self._is_timed = True
+
+    def add(self, sync_ns: int, sample_ns: int, span_ns: int, is_timed: bool) -> None:
+        """Add a sample."""
+        self._latencies_ns.append(sample_ns - sync_ns)
+        self._spans_ns.append(span_ns)
+        self._is_timed = is_timed
+
+    def summary(self) -> TimingSummary | None:
+        """Return the summary, None before the first sample."""
+        if not self._latencies_ns:
+            return None
+        times_s = 1e-9 * np.array(self._latencies_ns)
+        return TimingSummary(
+            float(times_s.mean()),
+            float(times_s.std()),
+            float(times_s.min()),
+            float(times_s.max()),
+            max(self._spans_ns) * 1e-9,
+            len(times_s),
+            self._is_timed,
+        )
+
+
+class AdcInput:
+    """One ADC with the pads connected to it; a failure closes it; reopened after growing delays.
+
+    `rows` : of its pads in the counts of all; `failures` : failed samples; `timing` : of its samples
+    """
+
+    def __init__(self, name: str, reader: AdcReader, pads: Sequence[PadInput], rows: Sequence[int]) -> None:
+        self.name, self.pads, self.rows = name, tuple(pads), tuple(rows)
+        self.failures = 0
+        self.timing = SampleTiming()
+        self._reader = reader
+        self._is_open = False
+        self._retry_ns, self._due_ns = 0, 0
+
+    def sample(self, counts: NDArray[np.int64], now_ns: int, sync_ns: int | None) -> None:
+        """Write the counts of its pads into their rows of `counts` (pads, 4); report failures by EMCY."""
+        if not self._is_open and now_ns < self._due_ns:
+            self.failures += 1
+            return
+        try:
+            reading = self._read()
+        except AdcError as error:
+            self._fail(error, now_ns)
+            return
+        if reading is None:
+            return
+        self._retry_ns = 0
+        if sync_ns is not None:
+            self.timing.add(sync_ns, reading.sample_ns, reading.span_ns, reading.is_timed)
+        currents = self._currents_ma(reading)
+        for pad, row, current_ma in zip(self.pads, self.rows, currents, strict=True):
+            counts[row] = pad.counts(current_ma)
+            raw = reading.raw[pad.columns]
+            low, high = self._reader.limits[pad.columns].T
+            at_limit = (raw <= low) | (raw >= high) | (counts[row] >= MAX_COUNT) | (counts[row] < -MAX_COUNT)
+            pad.record_sample(at_limit, now_ns)
+
+    def read_currents_ma(self) -> list[FloatArray] | None:
+        """Return the currents (4,) of each pad [mA], None before the first conversion. Raises AdcError."""
+        reading = self._read()
+        return None if reading is None else self._currents_ma(reading)
+
+    def maintain(self, now_ns: int) -> None:
+        """Keep the buffer from filling; sample a pad that has none, which reopens a closed ADC when due."""
+        if not all(pad.has_sample for pad in self.pads):
+            self.sample(np.zeros((max(self.rows) + 1, 4), np.int64), now_ns, None)
+            return
+        try:
+            self._reader.drain()
+        except AdcError as error:
+            self._fail(error, now_ns)
+
+    def close(self) -> None:
+        """Close the ADC."""
+        self._reader.close()
+        self._is_open = False
+
+    def _read(self) -> AdcReading | None:
+        if not self._is_open:
+            self._reader.open()
+            self._is_open = True
+        return self._reader.read()
+
+    def _currents_ma(self, reading: AdcReading) -> list[FloatArray]:
+        scale, offset = self._reader.millivolts
+        return [
+            pad.currents_ma(reading.raw[pad.columns], scale[pad.columns], offset[pad.columns])
+            for pad in self.pads
+        ]
+
+    def _fail(self, error: AdcError, now_ns: int) -> None:
+        self.failures += 1
+        self.close()
+        self._due_ns = now_ns + self._retry_ns
+        self._retry_ns = min(max(2 * self._retry_ns, _MIN_RETRY_NS), _MAX_RETRY_NS)
+        for pad in self.pads:
+            pad.record_failure(error)
+
+
+class Sampling:
+    """Sampler of `DeviceBus` for all pads; `sync_ns`: arrival of the SYNC being handled, or None."""
+
+    def __init__(self, adcs: Sequence[AdcInput]) -> None:
+        self.adcs = tuple(adcs)
+        self.sync_ns: int | None = None
+        rows = sum(len(adc.rows) for adc in self.adcs)
+        self._counts = np.zeros((rows, 4), np.int64)
+
+    def __call__(self, now_ns: int) -> NDArray[np.int64]:
+        """Return counts (pads, 4); those of a pad whose ADC has failed are the last ones, and aren't sent."""
+        for adc in self.adcs:
+            adc.sample(self._counts, now_ns, self.sync_ns)
+        return self._counts
+
+    def maintain(self, now_ns: int) -> None:
+        """Maintain the ADCs, and bring the nodes' state up to date; to be called every 20 ms or so."""
+        for adc in self.adcs:
+            adc.maintain(now_ns)
+            for pad in adc.pads:
+                pad.update_device()
+
+    def close(self) -> None:
+        """Close the ADCs."""
+        for adc in self.adcs:
+            adc.close()
+
+
+def make_inputs(
+    file: NodeFile,
+    nodes: Sequence[UnconfiguredDevice | None],
+    clock: Callable[[], int] = time.monotonic_ns,
+) -> list[AdcInput]:
+    """Return the ADCs that pads are connected to, with these pads, each with its node; opens no file."""
+    settings, inputs = file.settings, []
+    for name, adc in settings.adcs.items():
+        rows = [row for row, pad in enumerate(settings.pads) if pad.adc == name]
+        channels = [channel for row in rows for channel in settings.pads[row].channels]
+        pads = [
+            PadInput(settings.pads[row], file.trims[row], list(range(4 * at, 4 * at + 4)), nodes[row])
+            for at, row in enumerate(rows)
+        ]
+        if rows:
+            reader = _make_reader(adc, channels, Path(settings.sysfs), Path(settings.devices), clock)
+            inputs.append(AdcInput(name, reader, pads, rows))
+    return inputs
+
+
+def _make_reader(
+    adc: Adc, channels: Sequence[str], sysfs: Path, devices: Path, clock: Callable[[], int]
+) -> AdcReader:
+    """Return the reader of an ADC's channels; it opens no file."""
+    if adc.mode == "one-shot":
+        return OneShotReader(adc.device, channels, rate_hz=adc.rate_hz, iio=sysfs, clock=clock)
+    return BufferedReader(
+        adc.device,
+        channels,
+        trigger=adc.trigger,
+        rate_hz=adc.rate_hz,
+        buffer_scans=adc.buffer_scans,
+        average_scans=adc.average_scans,
+        timeout_ms=adc.timeout_ms,
+        iio=sysfs,
+        devices=devices,
+        clock=clock,
+    )

@@ -1,0 +1,243 @@
+"""File of a sensor node (TOML) -> frozen, checked objects; errors name file, key, value and remedy.
+
+Public names: `load`, `json_schema`, `NodeFile`, `TouchNode` and its tables.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import Field, ValidationError, model_validator
+
+from handtouch.config.base import Table
+from handtouch.config.problems import ConfigError, Problem, Tables, problems_of
+from handtouch.config.tables import Name, NodeId, Positive
+
+Channel = Annotated[str, Field(pattern=r"^(voltage|current)\d+(-(voltage|current)\d+)?$")]
+FourChannels = Annotated[tuple[Channel, Channel, Channel, Channel], Field(strict=False)]
+PerChannel = Annotated[tuple[float, float, float, float], Field(strict=False)]
+Serial = Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
+_Model = TypeVar("_Model", bound=Table)
+_MAX_DRAIN_PERIOD_S = 0.1  # between two readings of a buffer's queue, on a busy machine
+
+
+class CanInterface(Table):
+    """`[bus]`: the CAN interface, in python-can's terms."""
+
+    interface: str = Field("socketcan", description="python-can interface: socketcan, udp_multicast …")
+    channel: str | int = Field(description="python-can channel, e.g. can0")
+    options: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, description="further options of python-can's interface"
+    )
+
+
+class Adc(Table):
+    """`[adc.NAME]`: an ADC with a driver of the kernel's IIO subsystem."""
+
+    device: str = Field(
+        min_length=1,
+        description="name or label of the device, as in /sys/bus/iio/devices/iio:device*/name, or its folder",
+    )
+    mode: Literal["one-shot", "buffered"] = Field(
+        "one-shot", description="read in_*_raw at each SYNC, or scans from /dev/iio:deviceN"
+    )
+    trigger: str | None = Field(
+        None,
+        min_length=1,
+        description="name of the trigger of a buffered ADC; one of iio-trig-sysfs starts a conversion at "
+        "each SYNC, with any other the ADC runs freely. Default: the driver's own",
+    )
+    rate_hz: Positive | None = Field(None, description="written to sampling_frequency; default: unchanged")
+    buffer_scans: int = Field(256, ge=8, le=65536, description="scans in the kernel's buffer")
+    average_scans: int = Field(
+        1, ge=1, le=1024, description="scans of a freely running ADC that a sample is the mean of"
+    )
+    timeout_ms: float = Field(5.0, gt=0, le=1000, description="time limit for a conversion started at SYNC")
+
+
+class Excitation(Table):
+    """`[pad.excitation]`: output that switches the sheet's excitation: a GPIO line, or a file."""
+
+    chip: str | None = Field(None, min_length=1, description="GPIO chip, e.g. /dev/gpiochip0")
+    line: int | None = Field(None, ge=0, le=1023, description="line of the chip")
+    active_low: bool = Field(False, description="the excitation is on while the line is low")
+    file: str | None = Field(None, min_length=1, description="file that takes 1 (on) and 0 (off)")
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> Self:
+        if (self.file is None) == (self.chip is None) or (self.chip is None) != (self.line is None):
+            raise ValueError("give either chip and line, or file")
+        return self
+
+
+class Trim(Table):
+    """Trim file of a pad: corrections of its four channels, from a measurement with known currents."""
+
+    gain: PerChannel = Field((1.0, 1.0, 1.0, 1.0), description="factors of the currents")
+    offset_ma: PerChannel = Field(
+        (0.0, 0.0, 0.0, 0.0), description="currents measured without any, subtracted before the factors"
+    )
+
+
+class NodePad(Table):
+    """`[[pad]]`: one pad, which is one CANopen node."""
+
+    name: Name = Field(description="name of the pad in log lines and in the state file")
+    node_id: NodeId | None = Field(
+        None, description="node id, until LSS stores another one; default: none, LSS assigns it"
+    )
+    serial: Serial | None = Field(
+        None, description="serial number, 0x1018 sub 4; default: a random one, kept in the state file"
+    )
+    adc: str = Field(description="name of its [adc.NAME]")
+    channels: FourChannels = Field(
+        description="IIO channels of 0x6401:01 to :04, e.g. voltage0, or voltage0-voltage1 (differential)"
+    )
+    gain_ohm: float = Field(
+        description="volts at the ADC per ampere into the electrode, negative for an inverting amplifier; "
+        "ignored for channels currentN"
+    )
+    full_scale_ma: Positive = Field(10.0, description="current at count 32767, as in the deployment")
+    trim: str | None = Field(
+        None, min_length=1, description="trim file of the channels, relative to this file"
+    )
+    excitation: Excitation | None = Field(
+        None, description="output of object 0x2100; default: the excitation is always on"
+    )
+
+    @model_validator(mode="after")
+    def _check_values(self) -> Self:
+        if self.gain_ohm == 0:
+            raise ValueError("gain_ohm must not be 0: it is the feedback resistance of the amplifiers")
+        if len(set(self.channels)) < len(self.channels):
+            raise ValueError("channels must be four different ones")
+        return self
+
+
+class TouchNode(Table):
+    """File of `handtouch node`."""
+
+    bus: CanInterface
+    adcs: dict[Name, Adc] = Field(alias="adc", min_length=1, description="[adc.NAME] tables")
+    pads: Annotated[tuple[NodePad, ...], Field(strict=False)] = Field(
+        alias="pad", min_length=1, max_length=127, description="[[pad]] tables"
+    )
+    state: str | None = Field(
+        None,
+        min_length=1,
+        description="file of node ids and serial numbers, relative to this file; default: FILE.state.json, "
+        "or in the service's state folder",
+    )
+    event_sample_ms: float = Field(
+        5.0, ge=1, le=1000, description="period of samples while TPDOs are event-driven"
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        "info", description="least severity that is logged"
+    )
+    realtime_priority: int = Field(0, ge=0, le=99, description="SCHED_FIFO priority; 0: normal scheduling")
+    cpus: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
+        (), description="CPUs that the node may run on; default: any"
+    )
+    lock_memory: bool = Field(False, description="lock the memory against swapping (mlockall)")
+    sysfs: str = Field(
+        "/sys/bus/iio/devices", min_length=1, description="folder of the IIO devices and triggers"
+    )
+    devices: str = Field("/dev", min_length=1, description="folder of the character devices iio:deviceN")
+
+
+TABLES: Tables = {
+    "": TouchNode,
+    "bus": CanInterface,
+    "adc.*": Adc,
+    "pad": NodePad,
+    "pad.excitation": Excitation,
+}
+
+
+@dataclass(frozen=True)
+class NodeFile:
+    """A checked file: its tables, the trim of each pad, and the path of the state file."""
+
+    settings: TouchNode
+    trims: tuple[Trim, ...]
+    state: Path
+
+
+def load(path: Path) -> NodeFile:
+    """Read and check the file of a node and its trim files. Raises ConfigError with every error."""
+    settings = _read(path, TouchNode, TABLES)
+    if problems := tuple(_problems_in(settings)):
+        raise ConfigError(str(path), problems)
+    trims = tuple(
+        _read(path.parent / pad.trim, Trim, {"": Trim}) if pad.trim else Trim() for pad in settings.pads
+    )
+    return NodeFile(settings, trims, _state_path(path, settings))
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema of the file, for editors, from the models that validate it."""
+    schema = TouchNode.model_json_schema(by_alias=True)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "handtouch node"}
+
+
+def _read(path: Path, model: type[_Model], tables: Tables) -> _Model:
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        problem = Problem("the file", "", f"{reason}; give the path of an existing file")
+        raise ConfigError(str(path), (problem,)) from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(str(path), (Problem("TOML", "", f"{error}; correct the syntax there"),)) from error
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        raise ConfigError(str(path), problems_of(raw, error, tables, {})) from error
+
+
+def _problems_in(settings: TouchNode) -> Iterator[Problem]:
+    """Yield the errors that several tables make together."""
+    for name, adc in settings.adcs.items():
+        if adc.mode == "one-shot":
+            for key in ("trigger", "buffer_scans", "average_scans", "timeout_ms"):
+                if key in adc.model_fields_set:
+                    yield Problem(
+                        f"[adc.{name}]: {key}", "", 'is used only with mode = "buffered"; delete it'
+                    )
+        need = round((adc.rate_hz or 0) * _MAX_DRAIN_PERIOD_S)
+        if adc.mode == "buffered" and adc.buffer_scans < need:
+            yield Problem(
+                f"[adc.{name}]: buffer_scans",
+                f" = {adc.buffer_scans}",
+                f"holds less than {_MAX_DRAIN_PERIOD_S:g} s at that rate_hz; give at least {need}",
+            )
+    used: set[tuple[str, str]] = set()
+    for number, pad in enumerate(settings.pads, 1):
+        section = f'[[pad]] {number} "{pad.name}"'
+        if pad.adc not in settings.adcs:
+            known = ", ".join(settings.adcs)
+            yield Problem(f"{section}: adc", f" = {pad.adc}", f"there is no [adc.{pad.adc}]; known: {known}")
+        for channel in pad.channels:
+            if (pad.adc, channel) in used:
+                yield Problem(f"{section}: channels", f" = {channel}", "another pad has this channel")
+            used.add((pad.adc, channel))
+    for key in ("name", "node_id", "serial"):
+        given = Counter(getattr(pad, key) for pad in settings.pads)
+        for value, count in given.items():
+            if value is not None and count > 1:
+                yield Problem(
+                    f"[[pad]]: {key}", f" = {value}", f"is given {count} times; each pad needs its own"
+                )
+
+
+def _state_path(path: Path, settings: TouchNode) -> Path:
+    if settings.state is not None:
+        return path.parent / settings.state
+    folder = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # of the systemd service
+    return Path(folder) / "state.json" if folder else path.with_name(f"{path.name}.state.json")
