@@ -115,6 +115,17 @@ def test_nodes_lost_together_name_the_bus_and_one_lost_alone_doesnt(rig: Any) ->
     assert all("as from every node of bus can; check this bus's cable" in event.reason for event in lost)
 
 
+def test_a_short_pause_of_the_loop_is_not_the_cause_of_a_long_silence(rig: Any) -> None:
+    rig.boot()
+    rig.wire.cut = {1, 2, 3}
+    rig.run(200)
+    rig.master.excuse_pause(20 * MS, rig.t_ns)
+    lost = [event for event in rig.run(600) if event.new_state is NodeState.ABSENT]
+    assert len(lost) == 3
+    assert all("check this bus's cable" in event.reason for event in lost)
+    assert not any("loop was late" in event.reason for event in lost)
+
+
 def test_nodes_of_a_bus_that_is_down_name_its_problem(rig: Any) -> None:
     rig.boot()
     rig.wire.cut = {1, 2, 3}

@@ -153,6 +153,26 @@ def hue_of(picture: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(colour / np.linalg.norm(colour))
 
 
+def check_tooltips(browser: Browser, unrolled: list[float]) -> None:
+    """A pad's tooltip opens where the pointer or the keyboard reaches it, and closes when they leave."""
+    tooltip = "document.getElementById('tooltip')"
+    browser.ask(move=unrolled)
+    browser.wait(f"!{tooltip}.hidden && {tooltip}.textContent.includes('palm_fingers: ok')")
+    browser.ask(move=browser.evaluate("handtouch.hand.pixelsOf('right/palm_heel')"))
+    browser.wait(f"!{tooltip}.hidden && {tooltip}.textContent.includes('palm_heel: ok')")
+    browser.ask(move=[browser.evaluate("innerWidth") - 2, 2])
+    browser.wait(f"{tooltip}.hidden")
+    browser.evaluate("document.querySelector('#nodes button').focus()")
+    browser.wait(f"!{tooltip}.hidden && {tooltip}.textContent.includes('thumb_proximal')")
+    before = browser.evaluate("handtouch.hand.view.azimuth")
+    browser.evaluate("document.getElementById('hand').focus()")
+    browser.wait(f"{tooltip}.hidden")
+    browser.ask(press="ArrowLeft")
+    browser.wait(f"handtouch.hand.view.azimuth !== {before}")
+    browser.ask(press="0")
+    browser.wait(f"handtouch.hand.view.azimuth === {before}")
+
+
 @pytest.mark.timeout(300)  # the browser renders in software, on a machine under load
 def test_contacts_are_drawn_at_their_positions_and_the_page_survives_restarts(
     rig: Any, browser: Browser, free_port: int, tmp_path: Path
@@ -184,6 +204,8 @@ def test_contacts_are_drawn_at_their_positions_and_the_page_survives_restarts(
     green = np.array(GREEN) / np.linalg.norm(GREEN)
     assert hue_of(picture, heel) @ green > 0.99
 
+    check_tooltips(browser, [x0 + left + wide / 2, y0 + top + high / 2])
+
     rig.processes["run"].kill()
     rig.processes.pop("run").wait()
     browser.wait("document.getElementById('trouble').textContent.includes('daemon disconnected')")
@@ -198,7 +220,12 @@ def test_contacts_are_drawn_at_their_positions_and_the_page_survives_restarts(
     browser.wait(f"handtouch.counts.frames > {drawn}")
     red = np.array(RED) / np.linalg.norm(RED)
     assert hue_of(browser.picture(tmp_path / "lost.png"), heel) @ red > 0.99
-    assert "palm heel" in browser.evaluate("document.getElementById('nodes').textContent")
+    chips = browser.evaluate("[...document.querySelectorAll('#nodes button')].map((chip) => chip.ariaLabel)")
+    statuses = browser.evaluate("Object.values(handtouch.state.pads).map((pad) => pad.status)")
+    assert "palm_heel: lost, node absent" in chips
+    lost = statuses.count("lost")
+    assert sum(": lost" in chip for chip in chips) == lost
+    assert f"{lost} lost" in browser.evaluate("document.getElementById('up').textContent")
     assert "lost: " in browser.evaluate("document.getElementById('messages').textContent")
 
     assert rig.end("view") == 0

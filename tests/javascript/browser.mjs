@@ -2,7 +2,8 @@
 //
 // Each line of standard input is one command as JSON, each line of standard output its answer: {"value"} or
 // {"error"}. Commands: {"open": URL}, {"evaluate": "expression"}, {"wait": "expression"} until it is true,
-// {"screenshot": FILE}, {"size": [WIDTH, HEIGHT]}, {"errors": true} for errors of the page. The end of the input closes the browser.
+// {"screenshot": FILE}, {"size": [WIDTH, HEIGHT]},
+// {"move": [X, Y]} of the pointer, {"press": KEY}, {"errors": true} for errors of the page. The end of the input closes the browser.
 
 import { createInterface } from "node:readline";
 import { chromium } from "playwright-core";
@@ -30,6 +31,8 @@ async function execute(command) {
   if (command.evaluate) return page.evaluate(command.evaluate);
   if (command.wait) return void (await page.waitForFunction(command.wait, null, { polling: 50 }));
   if (command.screenshot) return void (await page.screenshot({ path: command.screenshot }));
+  if (command.move) return void (await page.mouse.move(command.move[0], command.move[1]));
+  if (command.press) return void (await page.keyboard.press(command.press));
   if (command.size) return void (await page.setViewportSize({ width: command.size[0], height: command.size[1] }));
   if (command.errors) return errors;
   throw new Error("unknown command");

@@ -254,6 +254,21 @@ def test_the_same_fault_of_several_pads_is_one_message() -> None:
     assert message_lines(model)[1:] == [f"{LINKS[3]}: lost: unplugged"]
 
 
+def test_an_event_that_repeats_is_one_message_with_its_number_of_times() -> None:
+    model = PageModel()
+    for second in range(50):
+        for link in LINKS[:3]:
+            late = f"no sample for {20 + second} ms"
+            model.add_message(health("stale", link=link, reason=late, t_ns=second * 10**9))
+        for link in LINKS[:3]:
+            model.add_message(health(link=link, t_ns=second * 10**9 + 10**8))
+    links = ", ".join(LINKS[:3])
+    assert message_lines(model) == [f"{links}: stale: no sample for 69 ms", f"{links}: recovered"]
+    assert [line["count"] for line in model.values.changes_since(0)["messages"]] == [50, 50]
+    model.add_message(health("stale", link=LINKS[0], reason="no sample for 9 ms", t_ns=200 * 10**9))
+    assert message_lines(model)[2:] == [f"{LINKS[0]}: stale: no sample for 9 ms"]  # after two minutes
+
+
 def test_contacts_are_cleared_when_the_daemon_disconnects_or_restarts() -> None:
     model = PageModel()
     for message in (deployed(), frame({DISTAL: 7})):

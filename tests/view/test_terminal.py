@@ -225,6 +225,19 @@ def test_the_table_fits_any_terminal_and_lists_touched_pads(width: int, height: 
         assert "12.30   -4.00    5.60" in text
 
 
+@pytest.mark.parametrize("height", [12, 24, 50])
+def test_events_use_the_height_that_the_pads_leave(height: int) -> None:
+    view = HandView()
+    view.update(HEALTH)
+    for number in range(60):
+        view.update(replace(CONTACT, id=number, event="begin"))
+    lines = _page(view, width=120, height=height).splitlines()
+    assert len(lines) == height
+    frame, header, pads = 2, 2, 1
+    assert sum("begins" in line for line in lines) == height - frame - header - pads
+    assert "#59 begins" in lines[-2]
+
+
 def test_touched_pads_come_first_in_a_small_terminal() -> None:
     page = _page(_hand(40, 3), width=100, height=20)
     assert all(f"middle_proximal_{k} " in page for k in (37, 38, 39))

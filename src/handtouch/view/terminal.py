@@ -21,7 +21,9 @@ from handtouch.view.message_lines import (
     position_std_m,
 )
 
-_MAX_EVENTS = 6
+_MAX_EVENTS = 100
+_HEADER_ROWS = 2
+"""State of the daemon, and the titles of the columns"""
 _FRAME_ROWS, _FRAME_COLUMNS = 2, 4
 _FULL_BAR_N = 5.0
 _BAR_CHARACTERS = 8
@@ -83,12 +85,11 @@ class HandView:
         width = options.max_width - _FRAME_COLUMNS
         header = self._header()
         header.truncate(width, overflow="ellipsis")
-        events = list(self._events)[-max(0, min(_MAX_EVENTS, rows - len(self._health) - 3)) :]
-        if rows < len(self._health) + 3:
-            events = []
+        event_rows = max(0, rows - _HEADER_ROWS - len(self._health))
+        events = list(self._events)[-event_rows:] if event_rows else []
         for event in events:
             event.truncate(width, overflow="ellipsis")
-        free_rows = rows - 2 - len(events)
+        free_rows = rows - _HEADER_ROWS - len(events)
         yield Panel(
             Group(header, self._table(width, free_rows), *events), title=self.title, border_style="dim"
         )

@@ -18,6 +18,8 @@ _MISSED_SYNC_PERIODS = 2
 """SYNC periods without a sample of any pad, or without a SYNC, that exclude a cause in one node."""
 _TOGETHER_HEARTBEATS = 1.5
 """Heartbeat periods within which nodes fall silent for a common cause."""
+_MIN_PAUSE_PART = 0.5
+"""Part of a silence that the loop's pause must have to be its cause."""
 _HOST_REMEDY = "reduce the host's load, or run handtouch with real-time priority"
 _BUS_REMEDY = "check this bus's cable, termination, bit rate and adapter"
 
@@ -78,7 +80,8 @@ class BusCauses:
         return f"no SYNC on bus {port.name}{since}; check its SYNC producer and cable"
 
     def _describe_pause(self, silent_ns: int, now_ns: int) -> str:
-        """Describe the loop's last pause if it ended within the silence."""
-        if not self._pause_ns or now_ns - self._pause_end_ns > silent_ns:
+        """Describe the loop's last pause if it ended within the silence and was a main part of it."""
+        ended_within = now_ns - self._pause_end_ns <= silent_ns
+        if not ended_within or self._pause_ns < _MIN_PAUSE_PART * silent_ns:
             return ""
         return f"the loop was late by {self._pause_ns / 1e6:.0f} ms; {_HOST_REMEDY}"

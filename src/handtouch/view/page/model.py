@@ -5,7 +5,9 @@ Public names: `VersionedValues`, `PageModel`. Uses no clock and no socket. Value
 
 from __future__ import annotations
 
-from collections import deque
+import re
+from collections import Counter, deque
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,8 +27,43 @@ _PAD_STATES = tuple(state.name.lower() for state in wire.PadState)
 _OK_STATES = ("clear", "touched")
 _FAULT_STATES = ("stale", "lost", "faulted")
 _MERGE_WINDOW_NS = 1_000_000_000
+_REPEAT_WINDOW_NS = 60_000_000_000
+_MERGED_LINES = 8
+"""Latest lines among which a repeated event is searched."""
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _ELLIPSE_95_SIGMA = 2.4477
 """Half axes of the 95 % ellipse of a two-dimensional Gaussian, in standard deviations."""
+
+
+@dataclass(eq=False)
+class _MessageLine:
+    """A line of the message list: one event of one or several pads, once or several times."""
+
+    kind: tuple[str, str]
+    """text without its numbers, and status"""
+    text: str = ""
+    t_ns: int = 0
+    wall_s: float | None = None
+    times: Counter[str] = field(default_factory=Counter)
+    """link, or "" -> number of times"""
+
+    def is_repeated_by(self, kind: tuple[str, str], link: str, t_ns: int) -> bool:
+        """Return True if the event happens again to a pad of this line."""
+        return self.kind == kind and link in self.times and t_ns - self.t_ns < _REPEAT_WINDOW_NS
+
+    def is_shared_by(self, kind: tuple[str, str], link: str, t_ns: int) -> bool:
+        """Return True if the event happens to another pad at about the same time."""
+        return self.kind == kind and bool(link) and t_ns - self.t_ns < _MERGE_WINDOW_NS
+
+    def values(self) -> dict[str, Any]:
+        """Return plain values for the page."""
+        return {
+            "wall_s": self.wall_s,
+            "links": [link for link in self.times if link],
+            "text": self.text,
+            "status": self.kind[1],
+            "count": max(self.times.values()),
+        }
 
 
 class VersionedValues:
@@ -72,9 +109,8 @@ class PageModel:
         self._health: dict[str, wire.Health] = {}
         self._percepts = PerceptSummaries()
         self._faults: dict[str, tuple[str, str]] = {}
-        self._messages: deque[dict[str, Any]] = deque(maxlen=_MAX_MESSAGES)
+        self._messages: deque[_MessageLine] = deque(maxlen=_MAX_MESSAGES)
         self._wall_offset_ns = 0
-        self._last_message_ns = 0
 
     def add_message(self, message: wire.Message) -> None:
         """Process a message of any topic."""
@@ -154,7 +190,8 @@ class PageModel:
         before, self._health[key] = self._health.get(key), health
         if health.state in _FAULT_STATES and self._faults.get(key) != (health.state, health.reason):
             self._faults[key] = health.state, health.reason
-            why = f": {health.reason}" if health.reason else f", node {health.node_state}"
+            reason = health.reason.removeprefix(f"{health.state}: ")
+            why = f": {reason}" if reason else f", node {health.node_state}"
             self._append_message(health.t_ns, f"{health.state}{why}", health.state, health.link)
         elif health.state in _OK_STATES and key in self._faults:
             del self._faults[key]
@@ -201,21 +238,22 @@ class PageModel:
         self._append_message(t_ns, "daemon restarted", "starting")
 
     def _append_message(self, t_ns: int, text: str, status: str, link: str = "") -> None:
-        """Append a line; the same event of several pads within a second is one line."""
-        last = self._messages[-1] if self._messages else None
-        links = [link] if link else []
-        if (
-            last
-            and link
-            and (last["text"], last["status"]) == (text, status)
-            and t_ns - self._last_message_ns < _MERGE_WINDOW_NS
-        ):
-            self._messages.pop()
-            links = [*last["links"], *(links if link not in last["links"] else [])]
-        self._last_message_ns = t_ns
-        wall_s = round((t_ns + self._wall_offset_ns) * 1e-9, 2) if self._wall_offset_ns else None
-        self._messages.append({"wall_s": wall_s, "links": links, "text": text, "status": status})
-        self.values.set_value("messages", list(self._messages))
+        """Append a line. The same event of several pads within a second, and one that comes again while the
+        lines before it are recent, are one line with its pads and its number of times."""
+        kind = _NUMBER.sub("#", text), status
+        recent = list(self._messages)[-_MERGED_LINES:]
+        line = next((old for old in reversed(recent) if old.is_repeated_by(kind, link, t_ns)), None)
+        if line is None and recent and recent[-1].is_shared_by(kind, link, t_ns):
+            line = recent[-1]
+        if line is None:
+            line = _MessageLine(kind)
+        else:
+            self._messages.remove(line)
+        line.text, line.t_ns = text, t_ns
+        line.times[link] += 1
+        line.wall_s = round((t_ns + self._wall_offset_ns) * 1e-9, 2) if self._wall_offset_ns else None
+        self._messages.append(line)
+        self.values.set_value("messages", [old.values() for old in self._messages])
 
 
 def _service_values(service: wire.Service) -> dict[str, Any]:

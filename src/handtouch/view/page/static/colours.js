@@ -1,19 +1,28 @@
 // Colours of statuses and pads, and texts of forces and problems.
 
+// Distinguishable with each kind of colour blindness (tests/view/test_colours.py); a sign repeats each of them.
 export const STATUS_COLOURS = {
-  clear: "#4fa58b", unreliable: "#e8b23a", stale: "#e07b2e", lost: "#e5484d", faulted: "#e5484d",
-  starting: "#7d8794", off: "#4a525e",
+  clear: "#4fa58b", unreliable: "#f2d64b", stale: "#e07b2e", lost: "#e5484d", faulted: "#e5484d",
+  starting: "#c9d1da", off: "#4a525e",
 };
+export const STATUS_SIGNS = { clear: "●", unreliable: "◆", stale: "▲", lost: "✕", faulted: "✕", starting: "○", off: "–" };
 export const LEGEND = [
   ["clear", "ok"], ["unreliable", "unreliable"], ["stale", "stale"], ["lost", "lost or faulted"], ["starting", "starting"], ["off", "off"],
 ];
 export const BODY = [0.36, 0.4, 0.46];
 export const CONTACT = "#ff5a1f";
 export const ELLIPSE = "#ffe9a8";
-export const MAGNIFIED = 100; // scale of the ellipse: positions are known to hundredths of a millimetre
 
 export const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
-export const colourOfStatus = (pad) => STATUS_COLOURS[pad?.status] ?? STATUS_COLOURS.starting;
+export const statusOf = (pad) => (pad?.status in STATUS_COLOURS ? pad.status : "starting");
+export const colourOfStatus = (pad) => STATUS_COLOURS[statusOf(pad)];
+
+// Returns the state of a pad and its node in words: "ok", "stale", "lost, node absent".
+export function statusText(pad) {
+  const status = statusOf(pad), node = pad?.node_state;
+  if (status === "clear") return "ok";
+  return node && node !== "operational" && node !== status ? `${status}, node ${node}` : status;
+}
 
 // Colour of a pad's trail and force history.
 export const colourOf = (number, lightness = 66) => `hsl(${(number * 137.5 + 190) % 360} 70% ${lightness}%)`;

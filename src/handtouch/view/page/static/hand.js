@@ -2,13 +2,16 @@
 
 import * as m from "./matrix.js";
 import { Renderer, lathe } from "./renderer.js";
-import { BODY, CONTACT, ELLIPSE, MAGNIFIED, forceText, colourOfStatus, problemOf, rgb } from "./colours.js";
+import { BODY, CONTACT, ELLIPSE, STATUS_SIGNS, forceText, colourOfStatus, rgb, statusText } from "./colours.js";
 
 const FIELD_OF_VIEW = (32 * Math.PI) / 180;
 const M_PER_N = 0.012, LONGEST_M = 0.06, SHORTEST_M = 0.004;
 const HEAD_M = 0.006, DOT_M = 0.0017;
 const PAD_NEARER_M = 0.002, CONTACT_NEARER_M = 0.004;
-const LETTER_PX = 6.4, LINE_PX = 17, PADDING_PX = 12; // of a label
+const HOVERED = [1, 1, 1], HOVERED_PART = 0.35; // colour added to the pad under the pointer
+const MAGNIFICATIONS = [100, 30, 10, 3, 1]; // of ellipses
+const LARGEST_ELLIPSE_M = 0.02; // half axis as drawn; what is larger is cut, and paler
+const LINE_PX = 17, PADDING_PX = 12, EDGE_PX = 4; // of a label
 const FAULTS = ["stale", "lost", "faulted", "unreliable"]; // statuses that are labelled
 const MAX_FULL_LABELS = 6; // contacts labelled with all percepts; beyond, with motion only
 const MAX_PIXEL_RATIO = 1.5; // canvas pixels per page pixel
@@ -21,6 +24,8 @@ export class HandView {
     this.canvas = canvas;
     this.labels = labels;
     this.hovered = null;
+    this.magnified = MAGNIFICATIONS[0];
+    this.widths = new Map();
     this.scene = null;
     const circle = Array.from({ length: 9 }, (_, k) => -Math.PI / 2 + (Math.PI * k) / 8);
     this.ball = this.renderer.mesh(...lathe(circle.map((a) => [Math.cos(a), Math.sin(a)])));
@@ -95,8 +100,12 @@ export class HandView {
     this.viewProjection = m.multiply(projection, view);
     renderer.begin(view, projection, Math.min(MAX_PIXEL_RATIO, window.devicePixelRatio || 1));
     for (const body of this.bodies) renderer.draw(body.mesh, this.poses[body.node], BODY);
-    for (const pad of this.pads) renderer.draw(pad.mesh, this.poses[pad.node], rgb(colourOfStatus(state.pads[pad.key])), { nearer: PAD_NEARER_M });
+    for (const pad of this.pads) {
+      const colour = rgb(colourOfStatus(state.pads[pad.key])), hovered = pad.key === this.hovered?.key;
+      renderer.draw(pad.mesh, this.poses[pad.node], hovered ? m.mix(colour, HOVERED, HOVERED_PART) : colour, { nearer: PAD_NEARER_M });
+    }
     const touched = this.pads.map((pad) => [pad, state.contacts[pad.key]]).filter(([, contact]) => contact?.position_m);
+    this.magnified = magnificationOf(touched.map(([, contact]) => contact), this.magnified);
     for (const [pad, contact] of touched) this.drawContact(this.poses[pad.node], contact, false);
     for (const [pad, contact] of touched) this.drawContact(this.poses[pad.node], contact, true);
     this.label(state, touched);
@@ -109,9 +118,10 @@ export class HandView {
     const sized = (wide, high, origin) => m.frame(m.scale(x, wide), m.scale(y, wide), m.scale(z, high), origin);
     const style = { lit: 0, alpha: through ? 0.3 : 1, nearer: CONTACT_NEARER_M, through };
     if (!through) {
-      const axes = contact.axes_m.map((axis) => m.scale(m.direction(link, axis), MAGNIFIED));
+      const scale = Math.min(this.magnified, LARGEST_ELLIPSE_M / Math.max(halfAxisM(contact), 1e-9));
+      const axes = contact.axes_m.map((axis) => m.scale(m.direction(link, axis), scale));
       const disc = m.frame(axes[0], axes[1], z, m.add(at, m.scale(z, 0.0011)));
-      renderer.draw(this.disc, disc, rgb(ELLIPSE), { lit: 0, alpha: 0.8, nearer: PAD_NEARER_M + 0.001 });
+      renderer.draw(this.disc, disc, rgb(ELLIPSE), { lit: 0, alpha: scale < this.magnified ? 0.3 : 0.8, nearer: PAD_NEARER_M + 0.001 });
     }
     renderer.draw(this.ball, sized(DOT_M, DOT_M, at), colour, style);
     if (contact.force_n === null) return;
@@ -152,23 +162,43 @@ export class HandView {
     }
     for (const pad of this.pads) {
       const health = state.pads[pad.key];
-      if (FAULTS.includes(health?.status) && this.countFaults(state) <= 4) labels.push([m.point(this.poses[pad.node], pad.centre), health.status, `${pad.link}: ${health.status}`]);
-      if (pad === this.hovered) {
-        const problem = health ? problemOf(health) : "";
-        labels.push([m.point(this.poses[pad.node], pad.centre), "hover", `${pad.link}: ${health?.state ?? "unknown"}, ${pad.node_text}${problem ? `: ${problem}` : ""}`]);
-      }
+      if (FAULTS.includes(health?.status) && this.countFaults(state) <= 4) labels.push([m.point(this.poses[pad.node], pad.centre), health.status, `${STATUS_SIGNS[health.status]} ${pad.link}: ${statusText(health)}`]);
     }
     while (this.labels.children.length < labels.length) this.labels.append(document.createElement("span"));
-    const corner = this.canvas.getBoundingClientRect(), taken = [];
+    const corner = this.canvas.getBoundingClientRect();
+    const taken = [...this.canvas.parentElement.querySelectorAll("header, footer")].map((part) => boxOf(part.getBoundingClientRect()));
     [...this.labels.children].forEach((label, number) => {
       label.hidden = number >= labels.length;
       if (label.hidden) return;
       const [at, kind, text] = labels[number];
-      const [x, y] = freePosition(this.pixels(at), text, taken);
+      const [x, y] = this.freePosition(this.pixels(at), text, corner, taken);
       label.className = kind;
       if (label.textContent !== text) label.textContent = text;
       label.style.transform = `translate(${(x - corner.left).toFixed(1)}px, ${(y - corner.top).toFixed(1)}px) translate(-50%, -50%)`;
     });
+  }
+
+  // Returns the nearest position below or above, within the canvas, at which a label covers nothing in `taken`, and adds it there.
+  freePosition([wantedX, wantedY], text, corner, taken) {
+    const lines = text.split("\n"), wide = Math.max(...lines.map((line) => this.widthOf(line))) + PADDING_PX, high = LINE_PX * lines.length + 2;
+    const within = (value, low, size, own) => Math.max(low + own / 2 + EDGE_PX, Math.min(low + size - own / 2 - EDGE_PX, value));
+    const x = within(wantedX, corner.left, corner.width, wide), y = within(wantedY, corner.top, corner.height, high);
+    const clear = (at) => taken.every((one) => Math.abs(x - one.x) >= (wide + one.wide) / 2 || Math.abs(at - one.y) >= (high + one.high) / 2);
+    const steps = Array.from({ length: 120 }, (_, k) => within(y + 4 * Math.ceil(k / 2) * (k % 2 ? 1 : -1), corner.top, corner.height, high));
+    const found = steps.find(clear) ?? y;
+    taken.push({ x, y: found, wide, high });
+    return [x, found];
+  }
+
+  // Returns the width of a line of a label, in pixels.
+  widthOf(line) {
+    const shape = line.replace(/\d/g, "0"); // all digits are equally wide
+    if (!this.widths.has(shape)) {
+      this.measure ??= document.createElement("canvas").getContext("2d");
+      this.measure.font = "600 12px system-ui, sans-serif";
+      this.widths.set(shape, this.measure.measureText(shape).width);
+    }
+    return this.widths.get(shape);
   }
 
   countFaults(state) {
@@ -176,14 +206,16 @@ export class HandView {
   }
 }
 
-// Returns the nearest position below or above at which a label covers no other one, and adds it to `taken`.
-function freePosition([x, y], text, taken) {
-  const lines = text.split("\n"), wide = LETTER_PX * Math.max(...lines.map((line) => line.length)) + PADDING_PX, high = LINE_PX * lines.length + 2;
-  const clear = (at) => taken.every((one) => Math.abs(x - one.x) >= (wide + one.wide) / 2 || Math.abs(at - one.y) >= (high + one.high) / 2);
-  const steps = Array.from({ length: 60 }, (_, k) => y + 4 * Math.ceil(k / 2) * (k % 2 ? 1 : -1));
-  const found = steps.find(clear) ?? y;
-  taken.push({ x, y: found, wide, high });
-  return [x, found];
+const boxOf = ({ left, top, width, height }) => ({ x: left + width / 2, y: top + height / 2, wide: width, high: height });
+const halfAxisM = (contact) => Math.max(...contact.axes_m.map((axis) => Math.hypot(...axis)));
+
+// Returns the largest magnification at which every ellipse of a valid position can be drawn whole; a larger one than before
+// only with some room to spare, so that it doesn't flicker.
+function magnificationOf(contacts, before) {
+  const valid = contacts.filter((contact) => contact.position_status === "valid");
+  const largest = Math.max(0, ...(valid.length ? valid : contacts).map(halfAxisM));
+  if (!largest) return before;
+  return MAGNIFICATIONS.find((scale) => scale * largest <= LARGEST_ELLIPSE_M * (scale > before ? 0.7 : 1)) ?? 1;
 }
 
 const m2 = (a, b) => [a[0] - b[0], a[1] - b[1]];

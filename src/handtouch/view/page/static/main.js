@@ -1,9 +1,11 @@
 // Receives changes from `handtouch view` and draws them.
 
+import { controlChips, controlHand, controlPads } from "./controls.js";
 import { HandView } from "./hand.js";
 import { HistoryView } from "./history.js";
 import { PadsView } from "./pads.js";
-import { drawPercepts, drawLegend, drawMessages, drawNodes, drawService } from "./text_panel.js";
+import { Tooltip } from "./tooltip.js";
+import { drawMagnification, drawPercepts, drawLegend, drawMessages, drawNodes, drawService } from "./text_panel.js";
 
 const state = {
   connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, percepts: {}, percepts_enabled: false, messages: [], time_s: 0,
@@ -13,6 +15,7 @@ const SLOW_MS = 40;
 const byId = (id) => document.getElementById(id);
 const hand = new HandView(byId("hand"), byId("labels"));
 const pads = new PadsView(byId("pads"));
+const tooltip = new Tooltip(byId("tooltip"));
 const history = new HistoryView(byId("history"));
 let numbers = new Map(); // of pads, by key
 let dirty = true;
@@ -57,6 +60,8 @@ function draw(now) {
   drawnAt = now;
   hand.draw(state);
   pads.draw(state);
+  tooltip.update(state);
+  drawMagnification(hand.magnified);
   history.draw(state.time_s);
   counts.frames += 1;
 }
@@ -88,37 +93,14 @@ function reportRates() {
   }, 1000);
 }
 
-function handlePointer(canvas) {
-  let from = null;
-  canvas.addEventListener("pointerdown", (event) => {
-    from = [event.clientX, event.clientY];
-    canvas.setPointerCapture(event.pointerId);
-  });
-  canvas.addEventListener("pointerup", () => { from = null; });
-  canvas.addEventListener("pointermove", (event) => {
-    const to = [event.clientX, event.clientY];
-    if (from) {
-      const delta = [to[0] - from[0], to[1] - from[1]];
-      if (event.shiftKey || event.buttons & 6) hand.pan(...delta);
-      else hand.rotate(...delta);
-      from = to;
-    } else hand.hovered = hand.nearest(...to);
-    dirty = true;
-  });
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    hand.zoom(Math.exp(event.deltaY * 0.001));
-    dirty = true;
-  }, { passive: false });
-  canvas.addEventListener("dblclick", () => { hand.resetView(); dirty = true; });
-  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  new ResizeObserver(() => { dirty = true; }).observe(document.body);
-}
-
-window.handtouch = { state, counts, hand, pads }; // for the console and for tests
+window.handtouch = { state, counts, hand, pads, tooltip }; // for the console and for tests
 drawLegend();
 drawService(state);
-handlePointer(byId("hand"));
+const redraw = () => { dirty = true; };
+controlHand(byId("hand"), hand, tooltip, state, redraw);
+controlPads(byId("pads"), pads, hand, tooltip, state, redraw);
+controlChips(byId("nodes"), hand, tooltip, state, redraw);
+new ResizeObserver(redraw).observe(document.body);
 reportRates();
 connect();
 requestAnimationFrame(draw);

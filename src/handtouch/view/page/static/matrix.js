@@ -7,6 +7,7 @@ export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const cross = (a, b) => [
   a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
 ];
+export const mix = (a, b, part) => a.map((value, k) => value + (b[k] - value) * part);
 export const length = (a) => Math.hypot(...a);
 export const unit = (a) => scale(a, 1 / (length(a) || 1));
 

@@ -1,8 +1,8 @@
 // Every pad unrolled, seen from outside with x0 below, arranged as on the hand: contacts and their trails.
 
-import { CONTACT, colourOf, forceText, colourOfStatus } from "./colours.js";
+import { CONTACT, STATUS_SIGNS, colourOf, forceText, colourOfStatus, statusOf } from "./colours.js";
 
-const TRAIL_S = 4, GAP = 6, LABEL = 26, HEADER = 16;
+const TRAIL_S = 4, GAP = 6, LABEL = 26, HEADER = 16, REACH_PX = 5;
 
 export class PadsView {
   constructor(canvas) {
@@ -34,7 +34,8 @@ export class PadsView {
     const tall = columns.map((c) => c.reduce((sum, k) => sum + this.sizes[k][0], 0));
     const most = Math.max(...columns.map((c) => c.length));
     const k = Math.max(200, Math.min((wide - GAP * (columns.length + 1)) / across, (high - HEADER - most * (LABEL + GAP)) / Math.max(...tall)));
-    let x = (wide - across * k - GAP * (columns.length - 1)) / 2;
+    const gap = (wide - across * k) / (columns.length + 1); // columns as far apart as there is room, for their texts
+    let x = gap;
     columns.forEach((column, number) => {
       const middle = x + (widths[number] * k) / 2;
       const used = tall[number] * k + column.length * (LABEL + GAP) - GAP;
@@ -45,8 +46,16 @@ export class PadsView {
         this.drawPad(context, state, pad, middle, y + LABEL + size / 2, k);
         y += size + LABEL + GAP;
       }
-      x += widths[number] * k + GAP;
+      x += widths[number] * k + gap;
     });
+  }
+
+  // Returns the pad at a point of the canvas.
+  padAt(x, y) {
+    return this.scene?.pads.find((pad) => {
+      const [left, top, wide, high] = this.boxes[pad.key] ?? [Infinity, 0, 0, 0];
+      return x > left - REACH_PX && x < left + wide + REACH_PX && y > top - REACH_PX && y < top + high + REACH_PX;
+    }) ?? null;
   }
 
   drawPad(context, state, number, middle, centre, k) {
@@ -63,6 +72,7 @@ export class PadsView {
     context.lineWidth = 1.5;
     context.strokeStyle = colourOfStatus(health);
     context.stroke();
+    if (!["clear", "unreliable"].includes(statusOf(health))) this.write(context, STATUS_SIGNS[statusOf(health)], middle, centre + 5, colourOfStatus(health), 600, 16);
     const trail = (this.trails[pad.key] ?? []).filter((point) => state.time_s - point.t < TRAIL_S);
     this.trails[pad.key] = trail;
     context.lineWidth = 2;
@@ -91,8 +101,8 @@ export class PadsView {
     if (contact) this.write(context, forceText(contact), middle, top, colourOf(number, 74), 600);
   }
 
-  write(context, text, x, y, colour, weight = 400) {
-    context.font = `${weight} 11px system-ui, sans-serif`;
+  write(context, text, x, y, colour, weight = 400, size = 11) {
+    context.font = `${weight} ${size}px system-ui, sans-serif`;
     context.textAlign = "center";
     context.fillStyle = colour;
     context.fillText(text, x, y);

@@ -1,6 +1,6 @@
 // Text of the page: daemon, buses, nodes, percepts and messages.
 
-import { LEGEND, STATUS_COLOURS, colourOfStatus, problemOf } from "./colours.js";
+import { LEGEND, STATUS_COLOURS, STATUS_SIGNS, colourOfStatus, statusOf, statusText } from "./colours.js";
 
 const byId = (id) => document.getElementById(id);
 
@@ -15,11 +15,20 @@ function element(kind, className, text) {
   return made;
 }
 
+function signOf(status) {
+  const sign = element("i", "sign", STATUS_SIGNS[status]);
+  sign.style.color = STATUS_COLOURS[status];
+  return sign;
+}
+
+export function drawMagnification(magnified) {
+  set("magnified", magnified === 1 ? "to scale" : `magnified ${magnified} times`);
+}
+
 export function drawLegend() {
   for (const [status, text] of LEGEND) {
-    const entry = element("span", "", text), dot = element("i", "dot", "");
-    dot.style.background = STATUS_COLOURS[status];
-    entry.prepend(dot);
+    const entry = element("span", "", text);
+    entry.prepend(signOf(status));
     byId("legend").append(entry);
   }
 }
@@ -48,19 +57,35 @@ export function drawService({ connected, alive, service, scene }) {
   }));
 }
 
+// Every pad with its status; count, sign, colour and words follow from the same status.
 export function drawNodes({ scene, pads }) {
   if (!scene) return;
-  const up = scene.pads.filter((pad) => pads[pad.key]?.node_state === "operational").length;
-  set("up", `${up} of ${scene.pads.length} operational`);
-  byId("nodes").replaceChildren(...scene.pads.map((pad) => {
-    const health = pads[pad.key], chip = element("span", "", pad.link.replaceAll("_", " "));
-    const dot = element("i", "dot", "");
-    dot.style.background = colourOfStatus(health);
-    chip.prepend(dot);
-    if (health?.node_state && health.node_state !== "operational") chip.append(element("em", "", health.node_state));
-    chip.title = `${pad.link}, ${pad.node_text}: ${health ? `${health.state}, ${health.node_state ?? "?"}, ${health.rate_hz ?? 0} samples/s` : "unknown"}${health && problemOf(health) ? `\n${problemOf(health)}` : ""}`;
-    return chip;
-  }));
+  const counts = new Map();
+  for (const { key } of scene.pads) {
+    const status = statusOf(pads[key]) === "clear" ? "ok" : statusOf(pads[key]);
+    counts.set(status, (counts.get(status) ?? 0) + 1);
+  }
+  const others = [...counts].filter(([status]) => status !== "ok").map(([status, count]) => `${count} ${status}`);
+  set("up", [`${counts.get("ok") ?? 0} of ${scene.pads.length} ok`, ...others].join(" · "));
+  const list = byId("nodes"), chips = new Map([...list.children].map((chip) => [chip.dataset.key, chip]));
+  const shown = scene.pads.map((pad) => chips.get(pad.key) ?? newChip(pad));
+  if (shown.length !== chips.size || shown.some((chip) => !chip.isConnected)) list.replaceChildren(...shown);
+  shown.forEach((chip, number) => {
+    const health = pads[scene.pads[number].key], words = statusText(health), [sign, , note] = chip.children;
+    sign.textContent = STATUS_SIGNS[statusOf(health)];
+    sign.style.color = colourOfStatus(health);
+    note.textContent = words === "ok" ? "" : words.split(",")[0];
+    chip.setAttribute("aria-label", `${scene.pads[number].link}: ${words}`);
+  });
+}
+
+// Returns the chip of a pad, a button so that the keyboard reaches it; it stays while its pad is shown, and keeps the focus.
+function newChip(pad) {
+  const chip = element("button", "", "");
+  chip.type = "button";
+  chip.dataset.key = pad.key;
+  chip.append(signOf("starting"), element("span", "", pad.link.replaceAll("_", " ")), element("em", "", ""));
+  return chip;
 }
 
 // Percepts of each contact and of the whole hand, and action requests.
@@ -87,12 +112,13 @@ export function drawPercepts({ scene, percepts, percepts_enabled: enabled }) {
 
 export function drawMessages({ messages }) {
   const newest = [...messages].reverse();
-  byId("messages").replaceChildren(...newest.map(({ wall_s, links, text, status }) => {
+  byId("messages").replaceChildren(...newest.map(({ wall_s, links, text, status, count }) => {
     const line = element("li", "", ""), time = wall_s ? new Date(1000 * wall_s).toLocaleTimeString("en-GB") : "";
     line.style.borderColor = STATUS_COLOURS[status] ?? STATUS_COLOURS.starting;
     line.append(element("time", "", time));
     if (links.length) line.append(element("b", "", links.length > 3 ? `${links.length} pads` : links.join(", ")), " ");
     line.append(text);
+    if (count > 1) line.append(" ", element("em", "", `${count} times`));
     line.title = links.length > 3 ? links.join(", ") : "";
     return line;
   }));
