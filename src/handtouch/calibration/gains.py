@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit
 
 from handtouch.field.estimate import estimate
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
@@ -343,7 +342,7 @@ class _OutlierMixture:
             log_odds = (
                 np.log(self.outlier_count / self.point_count) - np.log(wide) / 2 + z * (1 - 1 / wide) / 2
             )
-            other = expit(log_odds)
+            other = (1 + np.tanh(log_odds / 2)) / 2  # logistic function
             self.point_count, self.outlier_count = points + (1 - other).sum(), others + other.sum()
             self.outlier_squares = squares + other @ z
             weight = 1 - other + other / wide

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -57,7 +57,12 @@ class PadModel:
     1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that they tabulate.
     """
 
-    def __init__(self, deployment: Deployment) -> None:
+    def __init__(
+        self,
+        deployment: Deployment,
+        forward_table: Callable[[ElectrodeNetwork], ForwardTable] = ForwardTable.from_network,
+    ) -> None:
+        """Compute the parameters; `forward_table` returns that of a pad's network, once per distinct one."""
         entries = deployment.pads
         pads = [pad for _, pad in entries]
         nodes = [deployment.nodes[pad.node] for pad in pads]
@@ -96,7 +101,7 @@ class PadModel:
         self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]
         networks = networks_of(deployment)
         self.networks = networks
-        tables = {id(network): ForwardTable.from_network(network) for network in networks}
+        tables = {key: forward_table(network) for key, network in {id(n): n for n in networks}.items()}
         self.forward_tables = [tables[id(network)] for network in networks]
         self.surface_tables = [
             SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads

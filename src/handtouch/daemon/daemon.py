@@ -54,6 +54,7 @@ from handtouch.daemon.publisher import Publisher, RetainedMessages
 from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.status_reporter import StatusReporter
 from handtouch.daemon.supervisor_client import SupervisorClient
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand.joints import JointStateBuffer
 from handtouch.hand.robot_models import RobotModels
 from handtouch.host.build import build_info
@@ -166,7 +167,7 @@ class HandtouchDaemon:
         """
         robots = RobotModels(deployment)
         with ExitStack() as stack:
-            resources = _open_resources(stack, deployment, model or PadModel(deployment), robots)
+            resources = _open_resources(stack, deployment, model or build_pad_model(deployment), robots)
             daemon = cls(deployment, resources, robots, time.monotonic_ns(), read, folder, on_message)
             stack.pop_all()
         return daemon

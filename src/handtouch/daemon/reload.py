@@ -18,6 +18,7 @@ from handtouch.config import ConfigError, Deployment, Table
 from handtouch.config.eds import EdsError
 from handtouch.core.pad_model import PadModel
 from handtouch.daemon.control import RefusedError
+from handtouch.daemon.table_cache import build_pad_model
 
 _log = logging.getLogger("handtouch.control")
 _RESTART_REMEDY = "restart the daemon to apply that"
@@ -86,7 +87,9 @@ def _prepare(present: Deployment, read: Callable[[], Deployment], dry_run: bool)
     if obstacles := find_restart_changes(present, deployment):
         raise RefusedError("nothing changed: " + "; ".join(obstacles) + f"; {_RESTART_REMEDY}")
     pads, tables = find_changes(present, deployment)
-    return DeploymentChange(deployment, pads, tables, PadModel(deployment) if pads and not dry_run else None)
+    return DeploymentChange(
+        deployment, pads, tables, build_pad_model(deployment) if pads and not dry_run else None
+    )
 
 
 def find_changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]], list[str]]:
