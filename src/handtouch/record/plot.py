@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,7 @@ _COLOR_OF_STATE = {
     "starting": "#bbbbbb",
     "off": "#eeeeee",
 }
+_END_MARKERS = "x+*1^"
 _COLOR_MAP = "viridis"
 _DPI = 200
 _WIDTH_IN = 7.2
@@ -181,7 +183,7 @@ def _max_force_n(data: PlotData) -> float:
 
 
 def _draw_timeline(data: PlotData) -> Figure:
-    """Draw contacts as bars, a row for each pad, coloured by force."""
+    """Draw contacts as bars, a row for each pad, coloured by force; the legend explains unusual ends."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import Normalize
 
@@ -189,6 +191,7 @@ def _draw_timeline(data: PlotData) -> Figure:
     figure, (axes,) = _figure(1, 1, 0.8 + 0.2 * len(pads))
     scale = Normalize(0, _max_force_n(data))
     bars = None
+    ends_by_reason: dict[str, list[tuple[float, int]]] = defaultdict(list)
     for row, pad in enumerate(pads):
         axes.axhline(row, color=_GRID_COLOR, linewidth=0.5, zorder=0)
         for contact in data.contacts.get(pad, {}).values():
@@ -201,10 +204,12 @@ def _draw_timeline(data: PlotData) -> Figure:
             bars.set_rasterized(True)
             axes.add_collection(bars)
             if contact.end_reason not in ("", "released"):
-                axes.plot(t_s[-1], row, "x", color=_RED, markersize=5)
-                axes.annotate(
-                    contact.end_reason, (t_s[-1], row), (4, 2), textcoords="offset points", color=_RED
-                )
+                ends_by_reason[contact.end_reason].append((t_s[-1], row))
+    for marker, (reason, ends_at) in zip(cycle(_END_MARKERS), sorted(ends_by_reason.items())):
+        label = f"ended: {reason} ({len(ends_at)})"
+        axes.plot(*zip(*ends_at, strict=True), marker, color=_RED, markersize=4, label=label)
+    if ends_by_reason:
+        figure.legend(loc="outside upper right", ncols=4, fontsize=7)
     axes.set_yticks(range(len(pads)), [_pad_label(pad, data) for pad in pads])
     axes.set(xlabel="time [s]", xlim=(_begin_s(data), data.end_s), ylim=(len(pads) - 0.5, -0.5))
     axes.tick_params(axis="y", length=0)

@@ -69,6 +69,8 @@ def _schema_of_type(hint: Any) -> dict[str, Any]:
         return schema
     if origin is dict:
         return {"type": "object"}
+    if origin is typing.Literal:
+        return {"type": "string", "enum": list(arguments)}
     return dict(_SCALAR_SCHEMAS[hint])
 
 
