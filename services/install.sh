@@ -46,12 +46,13 @@ install_program() {
 
 install_services() {
   mkdir -p "$DESTDIR$units" "$DESTDIR$PREFIX/lib/sysctl.d" "$DESTDIR$settings"
-  for unit in handtouch@.service handtouch-can@.service; do
+  for unit in handtouch@.service handtouch-can@.service handtouch-node@.service; do
     sed -e "s|@VENV@|$venv|g" -e "s|@SYSCONFDIR@|$SYSCONFDIR|g" "$here/$unit" >"$DESTDIR$units/$unit"
   done
   cp "$here/sysctl.conf" "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf"
-  cp "$here/../config/handtouch.schema.json" "$DESTDIR$settings/"
+  cp "$here/../config/handtouch.schema.json" "$here/../config/touch_node.schema.json" "$DESTDIR$settings/"
   keep "$here/../config/utah_mit.toml" hand.toml
+  keep "$here/../config/touch_node.toml" node.toml
   keep "$here/environment" environment
   keep "$here/can0.env" can0.env
 }
@@ -63,7 +64,7 @@ keep() { # copy a file that the owner edits, unless it is there
 uninstall() {
   rm -rf "$DESTDIR$venv"
   rm -f "$DESTDIR$PREFIX/bin/handtouch" "$DESTDIR$units/handtouch@.service" "$DESTDIR$units/handtouch-can@.service" \
-    "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf"
+    "$DESTDIR$units/handtouch-node@.service" "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf"
 }
 
 reload() {
@@ -87,7 +88,7 @@ all)
 program) install_program ;;
 uninstall)
   if on_this_machine; then
-    for unit in $(systemctl list-units --all --plain --no-legend 'handtouch@*' 'handtouch-can@*' | cut -d' ' -f1); do
+    for unit in $(systemctl list-units --all --plain --no-legend 'handtouch@*' 'handtouch-can@*' 'handtouch-node@*' | cut -d' ' -f1); do
       systemctl disable --now "$unit"
     done
   fi

@@ -20,7 +20,7 @@ from handtouch import config
 
 from .conftest import ROOT, Installation
 
-UNITS = ("handtouch@.service", "handtouch-can@.service")
+UNITS = ("handtouch@.service", "handtouch-can@.service", "handtouch-node@.service")
 
 
 def unit(installation: Installation, name: str) -> configparser.ConfigParser:
@@ -65,6 +65,23 @@ def test_a_stalled_or_failed_daemon_restarts_and_a_wrong_deployment_does_not(
     assert (service["Type"], service["Restart"], service["WatchdogSec"]) == ("notify", "on-failure", "2")
     assert service["RestartPreventExitStatus"] == "2"
     assert unit(installation, UNITS[0])["Unit"]["StartLimitIntervalSec"] == "0"
+
+
+def test_a_node_may_reach_its_adcs_and_gpio_chips_without_any_capability(installation: Installation) -> None:
+    path = installation.prefix / "lib/systemd/system" / UNITS[2]
+    lines = path.read_text().splitlines()
+    assert {"DeviceAllow=char-iio rw", "DeviceAllow=char-gpiochip rw", "CapabilityBoundingSet="} <= set(lines)
+    service = unit(installation, UNITS[2])["Service"]
+    assert {"DynamicUser", "ProtectKernelTunables", "PrivateDevices"}.isdisjoint(service)  # /sys is root's
+    assert (service["Type"], service["Restart"], service["RestartPreventExitStatus"]) == (
+        "notify",
+        "on-failure",
+        "2",
+    )
+    words = shlex.split(service["ExecStart"].replace("%i", "missing"))
+    environment = installation.environment
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, "missing.toml: the file: No such file" in done.stderr) == (2, True), done.stderr
 
 
 def test_example_ipc_endpoint_is_writable_by_the_service(
