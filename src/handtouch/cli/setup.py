@@ -1,4 +1,4 @@
-"""Arguments of the setup commands: `check`, `doctor`, `scan`, `commission`, `figures`, `design`."""
+"""Arguments of the setup commands: `check`, `doctor`, `scan`, `conformance`, `commission` and drawings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from handtouch.cli.options import (
 
 
 def add(commands: Subparsers) -> None:
-    """Add `check`, `doctor`, `scan`, `commission`, `figures` and `design`."""
+    """Add `check`, `doctor`, `scan`, `conformance`, `commission`, `figures` and `design`."""
     check = add_command(
         commands,
         "check",
@@ -40,6 +40,7 @@ def add(commands: Subparsers) -> None:
     add_json(doctor)
 
     _add_scan(commands)
+    _add_conformance(commands)
     _add_commission(commands)
 
     figures = add_command(
@@ -111,6 +112,66 @@ def _add_scan(commands: Subparsers) -> None:
         default=5.0,
         metavar="MS",
         help="minimum time to wait for an LSS response (default: 5)",
+    )
+
+
+def _add_conformance(commands: Subparsers) -> None:
+    conformance = add_command(
+        commands,
+        "conformance",
+        "handtouch.cli.conformance_text:run",
+        "test sensor nodes on a bus against docs/firmware.md: objects, NMT, heartbeat, EMCY, PDO timing, LSS",
+    )
+    conformance.add_argument(
+        "names",
+        nargs="*",
+        metavar="NODE",
+        help='node id (5, 0x05, can0:5) or, with --config, pad ("right/index_distal", "thumb_*")',
+    )
+    conformance.add_argument(
+        "--all", dest="all_nodes", action="store_true", help="all nodes: of the deployment, or that respond"
+    )
+    conformance.add_argument(
+        "--config",
+        dest="config_path",
+        type=Path,
+        metavar="CONFIG",
+        help="deployment file with the buses, and what it states about the nodes (channels, EDS, identity, "
+        "noise, excitation)",
+    )
+    add_bus(
+        conformance,
+        "bus, e.g. can0=socketcan:can0; with --config, the interface to open for bus NAME instead of the one "
+        "in the file; repeatable",
+    )
+    conformance.add_argument(
+        "--eds", type=Path, metavar="FILE", help="EDS to compare the object dictionary with"
+    )
+    conformance.add_argument(
+        "--sync-ms",
+        type=positive_number,
+        metavar="MS",
+        help="shortest SYNC period; twice and four times that are tested, too (default: that of the "
+        "deployment, or 5)",
+    )
+    conformance.add_argument(
+        "--no-reset",
+        action="store_true",
+        help="send no NMT reset, by which a node loses settings that it hasn't stored",
+    )
+    conformance.add_argument("--no-lss", action="store_true", help="send no LSS request")
+    conformance.add_argument(
+        "--interactive",
+        action="store_true",
+        help="also prompt for a power cycle and a press (keys: s skips a step, q quits)",
+    )
+    add_json(conformance)
+    conformance.add_argument(
+        "--report",
+        dest="report_path",
+        type=Path,
+        metavar="FILE",
+        help="also write the report to a file: JSON if its name ends in .json, else text",
     )
 
 

@@ -1,8 +1,8 @@
 """SDO client of one node: read and write unsigned objects; errors name the object.
 
-Public names: `NodeSdoClient`, `SdoTransport`, `BootStepError`, `BootStepCancelled`. Transfers block until the
-node responds, so they run in a worker thread of the master; `SdoTransport.deliver_response` passes the node's
-responses on from the receiving thread.
+Public names: `NodeSdoClient`, `ObjectTransport`, `SdoTransport`, `BootStepError`, `BootStepCancelled`.
+Transfers block until the node responds, so they run in a worker thread of the master;
+`SdoTransport.deliver_response` passes the node's responses on from the receiving thread.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable
+from typing import Any, Protocol
 
 from canopen import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
@@ -39,6 +40,20 @@ class BootStepError(Exception):
 
 class BootStepCancelled(Exception):  # noqa: N818 - not an error: the node's state has changed meanwhile
     """The boot attempt that a step belongs to has ended."""
+
+
+class ObjectTransport(Protocol):
+    """Runs transfers of one node's objects; `run` gets a client with canopen's `upload` and `download`."""
+
+    def transfer(
+        self,
+        index: int,
+        sub: int,
+        description: str,
+        run: Callable[[Any], bytes | None],
+        is_cancelled: Callable[[], bool],
+    ) -> bytes | None:
+        """Run an upload or download. Raises BootStepError, or BootStepCancelled."""
 
 
 class _SdoNetwork:
@@ -169,7 +184,9 @@ def _never_cancelled() -> bool:
 class NodeSdoClient:
     """Unsigned objects of one node; every method raises BootStepError, or BootStepCancelled."""
 
-    def __init__(self, transport: SdoTransport, is_cancelled: Callable[[], bool] = _never_cancelled) -> None:
+    def __init__(
+        self, transport: ObjectTransport, is_cancelled: Callable[[], bool] = _never_cancelled
+    ) -> None:
         self._transport = transport
         self.is_cancelled = is_cancelled
 

@@ -1,0 +1,214 @@
+"""Output of `handtouch conformance`: a table for each node, JSON, a report file."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from io import StringIO
+from pathlib import Path
+
+from rich.console import Console
+from rich.text import Text
+
+from handtouch import __version__, config
+from handtouch.canbus.bus.port import BusError, Port
+from handtouch.core.slab import Slab
+from handtouch.procedures.commission import daemon_is_running
+from handtouch.procedures.conformance import (
+    BusInUseError,
+    ConformanceOptions,
+    NodeReport,
+    Operator,
+    PortLine,
+    Targets,
+    Verdict,
+    check_bus_is_free,
+    compare_serials,
+    count_verdicts,
+    find_nodes,
+    run_checks,
+    select_targets,
+)
+from handtouch.procedures.dialogue import Dialogue, Key, open_dialogue
+
+_STYLES = {Verdict.PASSED: "green", Verdict.FAILED: "red", Verdict.NOT_TESTED: "dim"}
+_NAME_WIDTH = 24
+_MAX_NAMES = 8
+Progress = Callable[[str], None]
+
+
+def run(
+    names: Sequence[str],
+    *,
+    all_nodes: bool,
+    config_path: Path | None,
+    buses: Sequence[str],
+    eds: Path | None,
+    sync_ms: float | None,
+    no_reset: bool,
+    no_lss: bool,
+    interactive: bool,
+    as_json: bool,
+    report_path: Path | None,
+) -> int:
+    """Test nodes and print the results; exit status 0, 1 (a check failed, no node, bus in use), 2 (usage)."""
+    if bool(names) == all_nodes:
+        print("handtouch conformance: give node ids or pads, or --all", file=sys.stderr)
+        return 2
+    try:
+        deployment = None if config_path is None else config.load(config_path)
+        targets = select_targets(deployment, buses, names, None if eds is None else str(eds))
+    except config.ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the node is set back
+    daemon = (deployment.daemon if deployment else None) or config.Daemon()
+    options = ConformanceOptions(
+        sync_period_ms=sync_ms or daemon.sync_period_ms,
+        window_fraction=daemon.sample_window_fraction,
+        resets=not no_reset,
+        lss=not no_lss,
+    )
+    if deployment is not None and daemon_is_running(daemon.control):
+        print(
+            f"a daemon is running at {daemon.control} and uses these buses; stop it first (Ctrl-C, or "
+            "systemctl stop handtouch), and start it again afterwards",
+            file=sys.stderr,
+        )
+        return 1
+    try:
+        reports = _test_all(targets, options, interactive)
+    except (BusError, BusInUseError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; the node was set back", file=sys.stderr)
+        return 1
+    if not reports:
+        print("no node responds; check power, bit rate and termination", file=sys.stderr)
+        return 1
+    if report_path is not None:
+        text = to_json(reports) if report_path.suffix == ".json" else to_text(reports, terminal=False)
+        try:
+            report_path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            print(f"{report_path}: {error.strerror}", file=sys.stderr)
+            return 1
+    print(to_json(reports) if as_json else to_text(reports, terminal=sys.stdout.isatty()), end="")
+    return 0 if all(report.ok for report in reports) else 1
+
+
+def to_json(reports: Sequence[NodeReport]) -> str:
+    """Format reports as one JSON object: `ok`, `version`, `nodes`."""
+    report = {
+        "ok": all(report.ok for report in reports),
+        "version": __version__,
+        "nodes": [report.to_map() for report in reports],
+    }
+    return json.dumps(report, indent=2) + "\n"
+
+
+def to_text(reports: Sequence[NodeReport], *, terminal: bool) -> str:
+    """Format reports: a line for each check with its measurement, a remedy below failed ones; then those not
+    tested, by reason.
+    """
+    file = StringIO()
+    console = Console(file=file, force_terminal=terminal, highlight=False, emoji=False)
+    for report in reports:
+        name = f" ({report.pad})" if report.pad else ""
+        console.print(Text(f"{report.bus}: node {report.node_id} 0x{report.node_id:02X}{name}", "bold"))
+        for result in report.results:
+            if result.verdict is Verdict.NOT_TESTED:
+                continue
+            line = Text("  ")
+            line.append(f"{result.verdict.value:<11}", _STYLES[result.verdict])
+            line.append(f"{result.name:<{_NAME_WIDTH}}{result.detail}".rstrip())
+            console.print(line, soft_wrap=True)
+            if result.remedy:
+                console.print(Text(f"{'':13}-> {result.remedy}"), soft_wrap=True)
+        for names, why in _group_untested(report):
+            console.print(Text(f"  {Verdict.NOT_TESTED.value:<11}{names}: {why}", "dim"), soft_wrap=True)
+        counts = ", ".join(f"{count} {verdict.value}" for verdict, count in count_verdicts(report))
+        console.print(Text(f"  {counts}", "green" if report.ok else "red"))
+        if report.restore_problem:
+            text = f"  not set back: {report.restore_problem}; switch the node off and on"
+            console.print(Text(text, "red"), soft_wrap=True)
+        console.print()
+    return file.getvalue()
+
+
+def _group_untested(report: NodeReport) -> Iterator[tuple[str, str]]:
+    """Yield the checks that were not made, by reason."""
+    reasons: dict[str, list[str]] = {}
+    for result in report.results:
+        if result.verdict is Verdict.NOT_TESTED:
+            reasons.setdefault(result.detail, []).append(result.name)
+    for why, names in reasons.items():
+        yield ", ".join(names) if len(names) <= _MAX_NAMES else f"{len(names)} other checks", why
+
+
+def _test_all(targets: Targets, options: ConformanceOptions, interactive: bool) -> list[NodeReport]:
+    """Test the nodes of all buses, one after the other. Raises BusError and BusInUseError."""
+    with ExitStack() as stack:
+        if interactive:
+            dialogue = stack.enter_context(open_dialogue())
+            return _test_buses(targets, options, _live_progress(dialogue), DialogueOperator(dialogue))
+        console = Console(stderr=True)
+        if not console.is_terminal:
+            return _test_buses(targets, options, lambda _: None, None)
+        status = stack.enter_context(console.status(""))
+        return _test_buses(targets, options, status.update, None)
+
+
+def _test_buses(
+    targets: Targets, options: ConformanceOptions, progress: Progress, operator: Operator | None
+) -> list[NodeReport]:
+    reports = []
+    for bus in targets.buses:
+        port = Port.open(bus, Slab(1))
+        try:
+            line = PortLine(port)
+            progress(f"{bus.name}: listening")
+            check_bus_is_free(line, bus.name)
+            nodes = targets.nodes_on(bus.name)
+            if targets.find_all:
+                nodes = [targets.describe_found(bus.name, node_id) for node_id in find_nodes(line)]
+            for number, node in enumerate(nodes, 1):
+                report_step = _labelled(
+                    progress, f"{bus.name}: node {node.node_id}, {number} of {len(nodes)}"
+                )
+                reports.append(run_checks(line, node, options, report_step, operator))
+        finally:
+            port.close()
+    compare_serials(reports)
+    return reports
+
+
+def _labelled(progress: Progress, label: str) -> Progress:
+    return lambda text: progress(f"{label}: {text}")
+
+
+def _live_progress(dialogue: Dialogue) -> Progress:
+    return lambda text: dialogue.show_live(time.monotonic_ns(), lambda: Text(text))
+
+
+class DialogueOperator:
+    """The operator at a terminal: prompts as lines, `s` skips a step."""
+
+    def __init__(self, dialogue: Dialogue) -> None:
+        self._dialogue = dialogue
+
+    def prompt(self, text: str) -> None:
+        """Print the requested action."""
+        self._dialogue.print_line(f"{text} (s: skip)", "ask")
+
+    def has_skipped(self) -> bool:
+        """Return True for the key `s`; `q` ends the procedure as Ctrl-C does."""
+        key = self._dialogue.read_key()
+        if key is Key.QUIT:
+            raise KeyboardInterrupt
+        return key is Key.SKIP

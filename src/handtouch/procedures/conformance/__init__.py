@@ -1,0 +1,50 @@
+"""Conformance of sensor nodes on a bus with docs/firmware.md: `handtouch conformance`.
+
+`procedure.run_checks` tests one node over a `Line`, in the line's time, and returns a `NodeReport`; it prints
+nothing. `object_checks`, `network_checks`, `pdo_checks`, `lss_checks` and `operator_checks` are its stages,
+`catalogue` lists the checks, `required_objects` the objects that a node needs.
+"""
+
+from handtouch.procedures.conformance.catalogue import CATALOGUE, Check
+from handtouch.procedures.conformance.line import Line, PortLine
+from handtouch.procedures.conformance.procedure import (
+    BusInUseError,
+    check_bus_is_free,
+    compare_serials,
+    find_nodes,
+    run_checks,
+)
+from handtouch.procedures.conformance.required_objects import REQUIRED_OBJECTS, table_rows
+from handtouch.procedures.conformance.results import (
+    CheckResult,
+    NodeReport,
+    RateMeasurement,
+    Verdict,
+    count_verdicts,
+)
+from handtouch.procedures.conformance.session import ConformanceOptions, NodeUnderTest, Operator
+from handtouch.procedures.conformance.targets import Targets, select_targets
+
+__all__ = [
+    "CATALOGUE",
+    "REQUIRED_OBJECTS",
+    "BusInUseError",
+    "Check",
+    "CheckResult",
+    "ConformanceOptions",
+    "Line",
+    "NodeReport",
+    "NodeUnderTest",
+    "Operator",
+    "PortLine",
+    "RateMeasurement",
+    "Targets",
+    "Verdict",
+    "check_bus_is_free",
+    "compare_serials",
+    "count_verdicts",
+    "find_nodes",
+    "run_checks",
+    "select_targets",
+    "table_rows",
+]

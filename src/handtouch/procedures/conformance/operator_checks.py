@@ -1,0 +1,123 @@
+"""Interactive checks: a power cycle and a press, for which the operator is prompted."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+
+from handtouch.canbus import cia301
+from handtouch.canbus.nodes.boot import read_identity
+from handtouch.canbus.objects.mapping import read_mapping
+from handtouch.canbus.objects.sdo import BootStepError
+from handtouch.procedures.conformance.node_link import MS
+from handtouch.procedures.conformance.pdo_checks import configure, sample_counts
+from handtouch.procedures.conformance.session import NodeSession, Operator
+
+_NAMES = ("operator.power_cycle", "operator.press")
+_POLL_NS = 100 * MS
+_SAMPLES = 10
+_MIN_RISE_SIGMA, _MIN_RISE_COUNTS = 8.0, 5.0
+
+
+def check_with_operator(session: NodeSession) -> None:
+    """Make the interactive checks, if there is an operator."""
+    if session.operator is None:
+        for name in _NAMES:
+            session.report.not_tested(name, "needs --interactive")
+        return
+    _check_power_cycle(session, session.operator)
+    _check_press(session, session.operator)
+
+
+def _check_power_cycle(session: NodeSession, operator: Operator) -> None:
+    name, link, report = "operator.power_cycle", session.link, session.report
+    boots = len(link.boot_ups)
+    operator.prompt("Switch the node's power off and on again.")
+    if not _wait(session, operator, name, lambda: len(link.boot_ups) > boots):
+        return
+    link.wait(1000 * MS)
+    count = len(link.boot_ups) - boots
+    link.commanded_boots += count
+    problems = [f"{count} boot-up messages"] if count > 1 else []
+    try:
+        if read_identity(session.sdo) != report.identity:
+            problems.append("another identity than before")
+        if session.mapping is not None:
+            node = session.node
+            after = read_mapping(session.sdo, node.node_id, node.tpdo_numbers, node.channels)
+            if [t.entries for t in after.tpdos] != [t.entries for t in session.mapping.tpdos]:
+                problems.append("another mapping than before")
+    except BootStepError as error:
+        problems.append(str(error))
+    report.assess(name, problems)
+    session.start_heartbeat()
+
+
+def _check_press(session: NodeSession, operator: Operator) -> None:
+    name, report, mapping = "operator.press", session.report, session.mapping
+    if mapping is None:
+        report.not_tested(name, "no TPDO with the channels")
+        return
+    session.enter_preoperational()
+    configure(session)
+    session.enter(cia301.START_NODE, cia301.OPERATIONAL)
+    rest = sample_counts(session, mapping, 5 * _SAMPLES)
+    if len(rest) < _SAMPLES:
+        report.not_tested(name, "no samples")
+        return
+    columns = list(zip(*rest, strict=True))
+    means = [statistics.fmean(column) for column in columns]
+    limits = [max(_MIN_RISE_SIGMA * statistics.pstdev(column), _MIN_RISE_COUNTS) for column in columns]
+    strongest = [0.0] * 4
+
+    def rises() -> list[float]:
+        now = sample_counts(session, mapping, _SAMPLES)
+        if not now:
+            return [0.0] * 4
+        return [
+            statistics.fmean(column) - mean
+            for column, mean in zip(zip(*now, strict=True), means, strict=True)
+        ]
+
+    def is_pressed() -> bool:
+        present = rises()
+        strongest[:] = [max(a, b, key=abs) for a, b in zip(strongest, present, strict=True)]
+        return all(rise > limit for rise, limit in zip(present, limits, strict=True))
+
+    operator.prompt("Press the pad in its middle with a fingertip, and hold it.")
+    pressed = _wait(session, operator, "", is_pressed)
+    if not pressed:
+        if not any(abs(rise) > limit for rise, limit in zip(strongest, limits, strict=True)):
+            report.not_tested(name, "no channel responded; skipped, or not pressed")
+            return
+        bad = [
+            f"channel {number} {'falls' if rise < -limit else 'does not respond'} ({rise:+.0f} counts)"
+            for number, (rise, limit) in enumerate(zip(strongest, limits, strict=True), 1)
+            if rise <= limit
+        ]
+        report.failed(name, "; ".join(bad) or "the channels didn't respond together")
+        return
+    operator.prompt("Release the pad.")
+
+    def is_released() -> bool:
+        return all(abs(rise) < limit for rise, limit in zip(rises(), limits, strict=True))
+
+    if _wait(session, operator, "", is_released):
+        report.passed(name, ", ".join(f"{rise:+.0f}" for rise in strongest) + " counts")
+    else:
+        report.failed(name, "the counts don't return to those before the press")
+
+
+def _wait(session: NodeSession, operator: Operator, name: str, until: Callable[[], bool]) -> bool:
+    """Wait for the operator's action; return False if it was skipped or didn't come in time."""
+    end_ns = session.link.now_ns() + round(session.options.operator_timeout_s * 1e9)
+    while session.link.now_ns() < end_ns:
+        if session.link.wait(_POLL_NS, until) if name else until():
+            return True
+        if operator.has_skipped():
+            if name:
+                session.report.not_tested(name, "skipped")
+            return False
+    if name:
+        session.report.not_tested(name, f"nothing within {session.options.operator_timeout_s:g} s")
+    return False

@@ -1,0 +1,177 @@
+"""The test of one node: what is tested, with which options, and restoring what it changes.
+
+Public names: `NodeUnderTest`, `ConformanceOptions`, `Operator`, `NodeSession`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from handtouch.canbus import cia301
+from handtouch.canbus.nodes.boot import ExpectedIdentity, IdleSettings
+from handtouch.canbus.objects.mapping import PdoMapping
+from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient
+from handtouch.config.channels import STANDARD_CHANNELS, Channels, WritableObject
+from handtouch.procedures.conformance.node_link import MS, NodeLink
+from handtouch.procedures.conformance.results import NodeReport
+
+BOOT_TIMEOUT_NS = 3000 * MS
+_STATE_HEARTBEAT_MS = 50
+
+
+class Operator(Protocol):
+    """A person at the node, for the interactive steps."""
+
+    def prompt(self, text: str) -> None:
+        """Request an action."""
+
+    def has_skipped(self) -> bool:
+        """Return True once if the operator skips the present step."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeUnderTest:
+    """A node to test; what the deployment states about it, None where there is no deployment.
+
+    `noise_counts`: expected noise of a channel; `eds`: path of its EDS.
+    """
+
+    bus: str
+    node_id: int
+    pad: str = ""
+    channels: Channels = STANDARD_CHANNELS
+    tpdo_numbers: tuple[int, ...] = (2, 1, 3, 4)
+    eds: str | None = None
+    excitation: WritableObject | None = None
+    expected: ExpectedIdentity = field(default_factory=ExpectedIdentity)
+    noise_counts: float | None = None
+    allow_pdo_remapping: bool = True
+    heartbeat_ms: int = 100
+    idle: IdleSettings | None = None
+    event_timer_ms: int = 5
+
+
+@dataclass(frozen=True, slots=True)
+class ConformanceOptions:
+    """Options of the procedure.
+
+    `sync_period_ms`: shortest period of SYNC, also tested at two and four times that; `window_fraction`:
+    part of it in which TPDOs must arrive; `resets`, `lss`: False leaves NMT resets or LSS out.
+    """
+
+    sync_period_ms: float = 5.0
+    window_fraction: float = 0.6
+    syncs: int = 100
+    resets: bool = True
+    lss: bool = True
+    operator_timeout_s: float = 60.0
+
+
+class RestoringSdoClient(NodeSdoClient):
+    """SDO client that remembers the value that an object had before it was first written."""
+
+    def __init__(self, transport: object) -> None:
+        super().__init__(transport)  # type: ignore[arg-type]
+        self.originals: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def write_verified(self, index: int, sub: int, value: int, size: int, name: str) -> None:
+        """Write an object of `size` bytes and read it back."""
+        if (index, sub) not in self.originals:
+            self.originals[index, sub] = (self.read(index, sub, name), size)
+        super().write_verified(index, sub, value, size, name)
+
+
+class NodeSession:
+    """State shared by the checks of one node. `mapping` is set once the PDO checks have found it."""
+
+    def __init__(
+        self,
+        link: NodeLink,
+        node: NodeUnderTest,
+        options: ConformanceOptions,
+        progress: Callable[[str], None],
+        operator: Operator | None,
+    ) -> None:
+        self.link, self.node, self.options, self.operator = link, node, options, operator
+        self.progress = progress
+        self.sdo = RestoringSdoClient(link.transport)
+        self.report = NodeReport(node.bus, node.node_id, node.pad)
+        self.mapping: PdoMapping | None = None
+        self.has_heartbeat = False
+        self._initial_state: int | None = None
+
+    def enter(self, command: int, state: int) -> int | None:
+        """Send an NMT command; return the last NMT state that a heartbeat reports, None without heartbeat."""
+        if not self.has_heartbeat:
+            self.link.send_nmt(command)
+            self.link.wait(_STATE_HEARTBEAT_MS * MS)
+            return None
+        period_ms = self.node.heartbeat_ms
+        sent_ns = self.link.send_nmt(command)
+        return self.link.wait_for_state(sent_ns + MS // 10, state, (4 * period_ms + 200) * MS)
+
+    def enter_preoperational(self) -> None:
+        """Put the node in pre-operational, in which it can be configured."""
+        self.enter(cia301.ENTER_PREOPERATIONAL, cia301.PREOPERATIONAL)
+
+    def start_heartbeat(self) -> None:
+        """Have the node send heartbeats, from which its initial NMT state is known."""
+        try:
+            self.sdo.write_verified(
+                cia301.HEARTBEAT_TIME, 0, self.node.heartbeat_ms, 2, "producer heartbeat time"
+            )
+        except BootStepError:
+            self.has_heartbeat = False
+            return
+        before = len(self.link.heartbeats)
+        self.link.wait((4 * self.node.heartbeat_ms + 200) * MS, lambda: len(self.link.heartbeats) > before)
+        self.has_heartbeat = len(self.link.heartbeats) > before
+        if self.has_heartbeat and self._initial_state is None:
+            self._initial_state = self.link.heartbeats[-1].state
+
+    def restore(self) -> str:
+        """Set back everything that was written, and the NMT state; return the problem, empty without any.
+
+        A node without heartbeat is left in pre-operational.
+        """
+        if not self.sdo.originals:
+            return ""
+        self.enter_preoperational()
+        try:
+            self._restore_objects()
+        except BootStepError as error:
+            return str(error)
+        final = {cia301.OPERATIONAL: cia301.START_NODE, cia301.STOPPED: cia301.STOP_NODE}
+        if self._initial_state in final:
+            self.link.send_nmt(final[self._initial_state])
+        return ""
+
+    def _restore_objects(self) -> None:
+        """Write the original values; parameters of a PDO while it is disabled."""
+        originals = dict(self.sdo.originals)
+        cob_ids = {
+            address: value
+            for address, value in originals.items()
+            if 0 <= address[0] - cia301.TPDO_COMMUNICATION < cia301.MAX_TPDOS and address[1] == 1
+        }
+        heartbeat = originals.pop((cia301.HEARTBEAT_TIME, 0), None)
+        pdo_range = range(cia301.TPDO_COMMUNICATION, cia301.TPDO_MAPPING + cia301.MAX_TPDOS)
+        changed = {
+            address: value
+            for address, value in originals.items()
+            if address not in cob_ids and self.sdo.read(*address, "a setting") != value[0]
+        }
+        if any(index in pdo_range for index, _ in changed):
+            for (index, sub), (value, size) in cob_ids.items():
+                self.sdo.write_if_different(index, sub, value | cia301.INVALID_BIT, size, "COB-ID")
+        for index, sub in changed:
+            if index >= cia301.TPDO_MAPPING and index in pdo_range and sub:
+                self.sdo.write_if_different(index, 0, 0, 1, "number of mapped objects")
+        for (index, sub), (value, size) in sorted(changed.items(), key=lambda item: not item[0][1]):
+            self.sdo.write_if_different(index, sub, value, size, "a setting")  # sub 0 comes last
+        for (index, sub), (value, size) in cob_ids.items():
+            self.sdo.write_if_different(index, sub, value, size, "COB-ID")
+        if heartbeat is not None:
+            self.sdo.write_if_different(cia301.HEARTBEAT_TIME, 0, *heartbeat, "producer heartbeat time")
