@@ -72,8 +72,9 @@ types: $(VENV)/.dev ## check static types
 docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
-tables: $(VENV)/.dev ## write the tables of docs/wire.md and docs/wire.schema.json from the code
+tables: $(VENV)/.dev ## write docs/wire.schema.json and the tables of docs/wire.md and docs/firmware.md from the code
 	$(BIN)/python -m handtouch.wire.tables docs
+	$(BIN)/python -m handtouch.procedures.conformance.page docs
 
 unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
 	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

@@ -1,1 +1,1 @@
-"""Procedures around a deployment: check, doctor, scan, commissioning, calibration by weights."""
+"""Procedures around a deployment: check, doctor, scan, conformance, commissioning, calibration by weights."""

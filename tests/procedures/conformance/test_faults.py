@@ -107,7 +107,7 @@ CASES: dict[str, tuple[Apply, str]] = {
 }
 """Switch -> how it is set, and the check that names it."""
 
-NOT_ON_THE_BUS = {"open_electrodes": "operator.press", "wiring": "`handtouch commission`"}
+NOT_ON_THE_BUS = {"open_electrodes": "`operator.press`", "wiring": "`handtouch commission`"}
 """Switch -> what names it; without a press they show nothing."""
 
 

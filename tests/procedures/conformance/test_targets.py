@@ -16,8 +16,8 @@ def hand() -> config.Deployment:
     return config.load(shipped.path("two_finger.toml"))
 
 
-def keys(*arguments: object) -> list[tuple[str, int]]:
-    return [(node.bus, node.node_id) for node in select_targets(*arguments, None).nodes]  # type: ignore[arg-type]
+def keys(deployment: config.Deployment | None, buses: list[str], names: list[str]) -> list[tuple[str, int]]:
+    return [(node.bus, node.node_id) for node in select_targets(deployment, buses, names, None).nodes]
 
 
 def test_ids_are_decimal_or_hexadecimal_with_or_without_a_bus() -> None:
