@@ -100,7 +100,7 @@ _CHECKS = (
     ),
     Check(
         "nmt.reset_communication",
-        "NMT reset communication: one boot-up message within 3 s, heartbeat time as after power-on",
+        "NMT reset communication: one boot-up message within 3 s",
         "send 0x700 + id [00] once after the reset; restore 0x1000 to 0x1FFF",
     ),
     Check(

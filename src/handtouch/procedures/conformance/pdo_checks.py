@@ -21,6 +21,8 @@ _SILENCE_NS = 300 * MS
 _EVENT_TIMER_MS = 50
 _MAX_LATE_SHARE = 0.01
 _MAX_ATTEMPTS = 3
+_MAX_SYNC_ERROR = 0.2
+"""Of a period; above it this computer may be the cause of late TPDOs."""
 _MAX_NOISE_RATIO = 2.0
 _NOISE_COUNTS_LIMIT = 0.01
 """Fraction of the range above which noise is a fault where the deployment states none."""
@@ -181,6 +183,10 @@ def _assess_rates(session: NodeSession) -> None:
         if rate.late - rate.missing > _MAX_LATE_SHARE * rate.syncs:
             window_ms = rate.period_ms * session.options.window_fraction
             late.append(f"{text}; {rate.late} of {rate.syncs} later than {window_ms:g} ms")
+    period_errors = [rate.worst_sync_error_us / 1e3 / rate.period_ms for rate in report.rates]
+    if (lost or late) and max(period_errors) > _MAX_SYNC_ERROR:
+        remark = f"this computer sent SYNC up to {max(period_errors):.0%} of a period early or late"
+        lost, late = [entries and [*entries, remark] for entries in (lost, late)]
     report.assess("pdo.complete", lost)
     if texts:
         report.assess("pdo.delay", late, "; ".join(texts))
