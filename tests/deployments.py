@@ -12,6 +12,20 @@ end_threshold_n = 0.05
 begin_samples = 2
 end_samples = 2
 """
+EXACT_NODE = "gain_std = 0.0\nseries_std = 0.0\n"
+EXACT_SHEET = "".join(
+    f"{name} = 0.0\n"
+    for name in (
+        *(
+            "ohm_per_square_std",
+            "contact_ohm_std",
+            "alpha_std",
+            "anisotropy_std",
+            "gap_std_mm",
+            "size_std_mm",
+        ),
+    )
+)
 
 
 def deployment_text(
@@ -25,8 +39,11 @@ def deployment_text(
     touch: str = TOUCH,
     buses: Mapping[str, str] | None = None,
     hand: str = "h",
+    exact_parts: bool = False,
 ) -> str:
     """Return the text of a deployment with pads of `pad_text`; `daemon`, `touch`: keys of these tables.
+
+    `exact_parts`: without tolerances.
 
     `buses`: channels by name; one bus `can0` at `channel` if left out.
     """
@@ -43,14 +60,14 @@ def deployment_text(
 drive_v = 5.0
 full_scale_ma = {full_scale_ma}
 noise_counts = {noise_counts}
-
+{EXACT_NODE if exact_parts else ""}
 [sheet.s]
 ohm_per_square = 2400.0
 contact_ohm_mm2 = 20000.0
 alpha = 1.5
 contact_radius_mm = {contact_radius_mm}
 contact_radius_std_mm = {contact_radius_std_mm}
-
+{EXACT_SHEET if exact_parts else ""}
 [touch]
 {touch.strip()}
 

@@ -12,11 +12,14 @@ from handtouch.config import Deployment, parse
 from handtouch.core.pad_model import PadModel
 from tests.deployments import CYLINDER, deployment_text, pad_text
 
-DEPLOYMENT = deployment_text(
+PADS = (
     pad_text("plane", 1, extra="mount = { position_mm = [10.0, 0.0, 5.0], rpy_deg = [0.0, 0.0, 90.0] }"),
     pad_text("round", 2, CYLINDER),
     pad_text("resisted", 3, extra="series_ohm = [336.0, 336.0, 336.0, 336.0]"),
 )
+DEPLOYMENT = deployment_text(*PADS, exact_parts=True)
+TOLERANT_DEPLOYMENT = deployment_text(*PADS)
+"""The same with the tolerances of the default values."""
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from handtouch.config import parse
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.stages import solve
-from tests.core.conftest import DEPLOYMENT
+from tests.core.conftest import TOLERANT_DEPLOYMENT
 
 
 def main(count: int) -> None:
     """Solve contacts of any force that move, jump, and are no points, on pads calibrated and not."""
-    rng, model = np.random.default_rng(7), PadModel(parse(DEPLOYMENT))
+    rng, model = np.random.default_rng(7), PadModel(parse(TOLERANT_DEPLOYMENT))
     n = model.size
     covariance = ((0.01, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.01))
     model.set_gains_and_law(

@@ -17,7 +17,10 @@ from handtouch.hand.robot_models import RobotModels
 MS = 1_000_000
 NONE = np.zeros(0, dtype=np.intp)
 DEPLOYMENT = load(shipped.path("utah_mit.toml"))
-ROBOTS = RobotModels(DEPLOYMENT)
+EXACT_HAND = DEPLOYMENT.hands[0].model_copy(
+    update={"mount_std_mm": 0.0, "mount_std_deg": 0.0, "joint_std_deg": 0.0}
+)
+ROBOTS = RobotModels(DEPLOYMENT.model_copy(update={"hands": (EXACT_HAND,)}))
 PADS = [pad.link for pad in DEPLOYMENT.hands[0].pads]
 NAMES = ROBOTS.joint_names[0]
 TIP, MIDDLE, PROXIMAL = (PADS.index(f"index_{phalanx}") for phalanx in ("distal", "middle", "proximal"))
@@ -122,7 +125,7 @@ def test_uncertainty_of_joints_adds_their_sampled_covariance() -> None:
 
 def stating(**tolerances: float) -> RobotModels:
     """Return the shipped hand with tolerances in its file."""
-    hand = DEPLOYMENT.hands[0].model_copy(update=tolerances)
+    hand = EXACT_HAND.model_copy(update=tolerances)
     return RobotModels(DEPLOYMENT.model_copy(update={"hands": (hand,)}))
 
 

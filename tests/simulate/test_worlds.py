@@ -224,7 +224,30 @@ def test_a_builder_describes_the_nominal_kind_of_his_sheets(deployment: config.D
     kind = drawn.sheet_kind("s")
     assert kind is not None
     assert drawn.describe(deployment).sheets["s"].behaviour == kind.behaviour
-    assert WORLDS["ideal"].draw(3).describe(deployment) == deployment
+    ideal = WORLDS["ideal"].draw(3).describe(deployment)
+    assert ideal.sheets["s"].behaviour is None
+    assert (ideal.nodes["n"].gain_std, ideal.sheets["s"].gap_std_mm) == (0.0, 0.0)
+
+
+def test_default_tolerances_of_a_deployment_are_those_of_the_default_world(
+    deployment: config.Deployment,
+) -> None:
+    described = WORLDS["default"].draw(Family.REPORTING.seed(3)).describe(deployment)
+    for name in ("gain_std", "series_std"):
+        default = config.Node.model_fields[name].default
+        assert getattr(described.nodes["n"], name) == pytest.approx(default, rel=0.05)
+    for name in (
+        *(
+            "ohm_per_square_std",
+            "contact_ohm_std",
+            "alpha_std",
+            "anisotropy_std",
+            "gap_std_mm",
+            "size_std_mm",
+        ),
+    ):
+        default = config.Sheet.model_fields[name].default
+        assert getattr(described.sheets["s"], name) == pytest.approx(default, rel=0.05)
 
 
 PAGE = (Path(__file__).parents[2] / "docs" / "worlds.md").read_text()

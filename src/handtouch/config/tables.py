@@ -162,6 +162,14 @@ class Node(Table):
         description="gain of each channel: current per count, relative to full_scale_ma / full_scale_counts",
     )
     noise_counts: Positive = Field(description="noise of one channel (1 sigma)")
+    gain_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.012,
+        description="relative error of a channel's gain before calibration (1 sigma); default: that of "
+        "amplifiers with parts of 1 %, +-2 %",
+    )
+    series_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.03, description="relative error of a series resistor (1 sigma); default: that of +-5 %"
+    )
     idle: Idle | None = Field(None, description="transmission while untouched; default: with every SYNC")
     excitation_object: str | None = Field(
         None, description="object that switches the pad's excitation: 1 on, 0 off, e.g. 0x2100:0:u8"
@@ -242,6 +250,23 @@ class Sheet(Table):
     alpha: float = Field(gt=0, le=5, description="exponent of pressure in the contact law")
     contact_radius_mm: Positive = Field(description="radius assumed for a contact")
     contact_radius_std_mm: NonNegative = Field(description="error of that radius (1 sigma)")
+    ohm_per_square_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.1, description="relative error of ohm_per_square (1 sigma); default: that of printed carbon"
+    )
+    contact_ohm_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.06, description="relative error of contact_ohm_mm2 (1 sigma); default: from part to part of FSRs"
+    )
+    alpha_std: Annotated[float, Field(ge=0, le=1)] = Field(0.05, description="error of alpha (1 sigma)")
+    anisotropy_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.02, description="relative error of the surface's resistivity_ratio (1 sigma)"
+    )
+    gap_std_mm: NonNegative = Field(
+        0.12,
+        description="error of a pad's gap_mm, each end of an electrode (1 sigma); default: that of +-0.2",
+    )
+    size_std_mm: NonNegative = Field(
+        0.06, description="error of a pad's length and width (1 sigma); default: that of +-0.1"
+    )
     behaviour: Behaviour | None = Field(
         None, description="creep, adaptation and hysteresis; default: none, readings are used unchanged"
     )
@@ -322,15 +347,15 @@ class HandTable(Table):
         "", description="prefix of joint names in joint states, e.g. left_; not applied to joint_names"
     )
     mount_std_mm: NonNegative = Field(
-        0.0,
+        0.2,
         description="position error of a mount along each axis (1 sigma), included in the covariances in "
-        "palm and base; 0: not included",
+        "palm and base; default: that of printed parts; 0: not included",
     )
     mount_std_deg: NonNegative = Field(
-        0.0, description="orientation error of a mount about each axis (1 sigma), included likewise"
+        0.5, description="orientation error of a mount about each axis (1 sigma), included likewise"
     )
     joint_std_deg: NonNegative = Field(
-        0.0,
+        0.2,
         description="error of joint angles, such as their zeros (1 sigma), used where joint states carry no "
         "position_std_rad; included in these covariances; 0: not included",
     )

@@ -13,6 +13,7 @@ from handtouch.core.pad_tables import SEARCH_POINTS, stack_table, view_bytes, vi
 from handtouch.core.stages.locate import Fit
 from handtouch.core.stages.place import Placement
 from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES, ContactSolver
+from handtouch.core.stages.tolerances import Whitening
 
 FloatArray = NDArray[np.float64]
 
@@ -31,20 +32,21 @@ def make_solver(
     """
     n = currents.shape[1]
     raw, gain = _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
-    fit = Fit(_work(n), _work(n), _work(n), _work(n), _work(n), raw, gain)
+    whitening = Whitening(_work(n * n), _work(3 * n), _work(n), n)
+    fit = Fit(_work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, _work(n), gain, whitening)
     return ContactSolver(
         [table.pad_table() for table in model.forward_tables],
+        model.stage_tolerances(),
         model.stage_laws(),
         [surface.pad_surface() for surface in model.surface_tables],
         stack_table(),
         fit,
         Placement(_work(15)),
         n,
-        _work(4 * n),
+        _work(3 * n),
         view_floats(currents),
         view_floats(model.weight),
         view_floats(model.gain_covariance),
-        view_bytes(model.gain_uncertain),
         view_floats(offset_std_a),
         view_bytes(force_requested),
         view_floats(values),

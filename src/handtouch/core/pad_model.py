@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
-from handtouch.calibration.calibration import Calibration, LawParameters
+from handtouch.calibration.calibration import Calibration, LawParameters, matrix
 from handtouch.config import Deployment
 from handtouch.config.channels import (
     ELECTRODES,
@@ -23,6 +23,8 @@ from handtouch.config.channels import (
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, view_floats
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
+from handtouch.core.stages.tolerances import PadTolerances
+from handtouch.core.tolerance_table import ToleranceTable
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
 from handtouch.field.network import ElectrodeNetwork
@@ -34,6 +36,10 @@ from handtouch.hand import (
 )
 
 FloatArray = NDArray[np.float64]
+_NODE_TOLERANCES = {"gain_std", "series_std"}
+_SHEET_TOLERANCES = {
+    *("ohm_per_square_std", "contact_ohm_std", "alpha_std", "anisotropy_std", "gap_std_mm", "size_std_mm"),
+}
 
 
 class PadModel:
@@ -53,8 +59,9 @@ class PadModel:
     `end_samples`: debounce. `max_rise_time_s`: a slower rise to `end_threshold_n` is drift. `behaviours`
     (n,): sheet behaviour, None where it isn't modelled.
 
-    `forward_tables`, `surface_tables` and `law_parameters` are what the stages read; `weight` (n, 4) is
-    1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that they tabulate.
+    `forward_tables`, `tolerance_tables`, `surface_tables` and `law_parameters` are what the stages read;
+    `weight` (n, 4) is 1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that
+    they tabulate.
     """
 
     def __init__(
@@ -87,11 +94,11 @@ class PadModel:
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = np.ones((self.size, 4))
-        self.gain_covariance = np.zeros((self.size, 4, 4))
+        self._stated_gain_covariance = np.stack([node.gain_std**2 * np.eye(4) for node in nodes])
+        self.gain_covariance = self._stated_gain_covariance.copy()
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
         self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
         self.diagnoses: list[tuple[str, ...]] = [()] * self.size
-        self.gain_uncertain = np.zeros(self.size, dtype=np.bool_)
         self.begin_threshold_n = np.array([touch.begin_threshold_n for touch in touches])
         self.end_threshold_n = np.array([touch.end_threshold_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
@@ -103,6 +110,13 @@ class PadModel:
         self.networks = networks
         tables = {key: forward_table(network) for key, network in {id(n): n for n in networks}.items()}
         self.forward_tables = [tables[id(network)] for network in networks]
+        distinct = {id(network): pad for network, pad in zip(networks, pads, strict=True)}
+        changes = {
+            key: ToleranceTable.from_pad(pad, deployment.sheets[pad.sheet], tables[key])
+            for key, pad in distinct.items()
+        }
+        self.tolerance_tables = [changes[id(network)] for network in networks]
+        self._parts = list(zip(pads, nodes, sheets, strict=True))
         self.surface_tables = [
             SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
         ]
@@ -176,17 +190,20 @@ class PadModel:
     def set_uncertainty(
         self,
         pad: int,
-        log_gain_covariance: ArrayLike,
+        log_gain_covariance: ArrayLike | None,
         quarantined: bool,
         position_unreliable: bool = False,
         diagnoses: tuple[str, ...] = (),
     ) -> None:
-        """Set the covariance (4, 4) of a pad's log gains; `quarantined`: publish no force;
-        `position_unreliable`: publish positions as unreliable; because of `diagnoses`."""
-        self.gain_covariance[pad] = log_gain_covariance
+        """Set the covariance (4, 4) of a pad's log gains, None: as the deployment states.
+
+        `quarantined`: publish no force; `position_unreliable`: publish positions as unreliable; because of
+        `diagnoses`.
+        """
+        stated = self._stated_gain_covariance[pad]
+        self.gain_covariance[pad] = stated if log_gain_covariance is None else log_gain_covariance
         self.quarantined[pad], self.position_unreliable[pad] = quarantined, position_unreliable
         self.diagnoses[pad] = diagnoses
-        self.gain_uncertain[pad] = self.gain_covariance[pad].any()
 
     def copy_calibrations(self, other: PadModel) -> None:
         """Take over all calibrations of the model that this one replaces."""
@@ -197,9 +214,10 @@ class PadModel:
             )
             calibration_id = other.calibration_ids[pad] if calibrated else self.calibration_ids[pad]
             self.set_gains_and_law(pad, other.gains[pad], calibration_id, other.laws[pad])
+            is_stated = (other.gain_covariance[pad] == other._stated_gain_covariance[pad]).all()
             self.set_uncertainty(
                 pad,
-                other.gain_covariance[pad],
+                None if is_stated else other.gain_covariance[pad],
                 bool(other.quarantined[pad]),
                 bool(other.position_unreliable[pad]),
                 other.diagnoses[pad],
@@ -266,6 +284,13 @@ class PadModel:
         )
         self.law_parameters[pad, 7:] = (axes * np.sqrt(np.maximum(variances, 0.0))).T.ravel()
 
+    def stage_tolerances(self) -> list[PadTolerances]:
+        """Return the tolerances of the pads' parts as the stages take them."""
+        return [
+            table.pad_tolerances(*parts)
+            for table, parts in zip(self.tolerance_tables, self._parts, strict=True)
+        ]
+
     def stage_laws(self) -> list[PadLaw]:
         """Return the contact laws as the stages take them; they follow later changes."""
         return [
@@ -325,20 +350,18 @@ def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
 
 
 def law_of(sheet: config.Sheet) -> LawParameters:
-    """Return the contact law of a deployment's sheet; without covariance."""
-    return LawParameters(sheet.contact_ohm_mm2, sheet.alpha, sheet.ohm_per_square, ((0.0,) * 3,) * 3)
+    """Return the contact law of a deployment's sheet, with its tolerances."""
+    covariance = np.diag(np.square([sheet.contact_ohm_std, sheet.alpha_std, sheet.ohm_per_square_std]))
+    return LawParameters(sheet.contact_ohm_mm2, sheet.alpha, sheet.ohm_per_square, matrix(covariance))
 
 
 def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
     """Return the id of the default calibration, which changes with the pad's tables in the deployment.
 
     Not with `serial`: calibrations are bound to it anyway, and a replacement node keeps its own when the
-    deployment file gets its serial number.
+    deployment file gets its serial number. Nor with tolerances: they are no part of what is calibrated.
     """
-    parts = (
-        pad.model_copy(update={"serial": None}),
-        deployment.nodes[pad.node],
-        deployment.sheets[pad.sheet],
-    )
-    text = "".join(part.model_dump_json() for part in parts)
+    node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
+    text = pad.model_copy(update={"serial": None}).model_dump_json()
+    text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=_SHEET_TOLERANCES)
     return "nominal-" + hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -95,7 +95,7 @@ class ForwardTable:
         """Tabulate a model with ends of electrodes at x = `ends_x` and at y = `ends_y`, corners aside."""
         axes = _Axis(model.a, ends_x), _Axis(model.b, ends_y)
         nodes_x, nodes_y = (axis.nodes() for axis in axes)
-        x, y = np.meshgrid(*(_inside(at[:, 0]) for at in (nodes_x, nodes_y)))
+        x, y = np.meshgrid(*(inside(at[:, 0]) for at in (nodes_x, nodes_y)))
         fractions = model.fractions(x, y)
         edge = _MIN_RADIUS_DISTANCE
         x, y = (
@@ -183,7 +183,7 @@ class _Axis:
         return np.asarray(density)
 
 
-def _inside(x: FloatArray) -> FloatArray:
+def inside(x: FloatArray) -> FloatArray:
     """Return node coordinates with the outermost off the edges, where a model may have no value."""
     return np.clip(x, _MIN_EDGE_DISTANCE * x[-1], (1 - _MIN_EDGE_DISTANCE) * x[-1])
 

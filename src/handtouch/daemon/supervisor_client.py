@@ -91,7 +91,8 @@ class SupervisorClient:
         self._position_unreliable = np.zeros(pipeline.model.size, dtype=np.bool_)
         self._degrading_kinds: list[tuple[str, ...]] = [()] * pipeline.model.size
         """of each pad, kinds of the diagnoses that invalidate force or position"""
-        self._log_gain_covariance = np.zeros((pipeline.model.size, 4, 4))
+        self._log_gain_covariance: list[NDArray[np.float64] | None] = [None] * pipeline.model.size
+        """of each pad; None: as the deployment states"""
         self._block_buffer = BlockBuffer(pipeline.model.size)
         self._serials: list[int | None] = [None] * pipeline.model.size
         self._previous_serials: list[int | None] = [pad.serial for _, pad in self._pads]
@@ -249,13 +250,15 @@ class SupervisorClient:
         model, serial, given = self._pipeline.model, self._serials[pad], self._manual_parts[pad]
         if serial is None or not given:
             return
+        covariance = self._log_gain_covariance[pad]
+        covariance = model.gain_covariance[pad] if covariance is None else covariance
         law, offsets = model.laws[pad], self._pipeline.tick.baseline.expected_counts[pad]
         message = CalibrationUpdate(
             pad=pad,
             serial=serial,
             calibration_id=model.calibration_ids[pad],
             gains=channel_values(model.gains[pad]),
-            covariance=tuple(self._log_gain_covariance[pad].ravel().tolist()),
+            covariance=tuple(covariance.ravel().tolist()),
             offset_counts=channel_values(offsets) if "offset_counts" in given else None,
             law=ContactLawMessage(**asdict(law)) if law is not None and "law" in given else None,
         )

@@ -176,6 +176,12 @@ class ElectrodeNetwork:
             )
         return np.asarray(self._unmix.T * np.asarray(self.series_ohm))
 
+    @property
+    def series_sensitivity(self) -> FloatArray:
+        """Matrix S (m, m): the logarithm of resistor j changes the measured fractions f by S[:, j] f[j]."""
+        drop = np.asarray(self.series_ohm) / self.sheet_ohm_per_square
+        return -self._mix @ self.conductance * np.where(np.isfinite(drop), drop, 0.0)
+
     @np.errstate(all="ignore")
     def locate(self, currents: npt.ArrayLike) -> Location:
         """Return the point contact that sends `currents` (m, ...), the exact inverse of `currents`.

@@ -60,18 +60,24 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(yaw @ pitch @ roll)
 
 
-def electrode_network(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
-    """Return the pad's electrodes on its rectangle, with the bare corners as measured on the surface."""
-    surface, gap_m = pad_surface(pad), pad.gap_mm * _M_PER_MM
-    (begin, end), _ = surface.to_rectangle([gap_m, surface.extent_m[0] - gap_m], [0.0, 0.0])
-    _, corners = surface.to_rectangle([0.0, surface.extent_m[0]], [gap_m, gap_m])
-    near, far = corners.tolist()
-    electrodes = [
-        Electrode("x0", near, surface.b - near),
-        Electrode("xa", far, surface.b - far),
-        Electrode("y0", float(begin), float(end)),
-        Electrode("yb", float(begin), float(end)),
-    ]
+def electrode_network(
+    pad: config.Pad, sheet: config.Sheet, gap_offsets_m: ArrayLike = 0.0, log_aspect: float = 0.0
+) -> ElectrodeNetwork:
+    """Return the pad's electrodes on its rectangle, with the bare corners as measured on the surface.
+
+    gap_offsets_m: added to the gap at each end of the electrodes, broadcast to (4, 2); a gap below 0 counts
+    as 0. log_aspect: logarithm of a factor of the rectangle's length along x, electrodes included.
+    """
+    surface, length_m = pad_surface(pad), pad_surface(pad).extent_m[0]
+    gaps_m = np.maximum(pad.gap_mm * _M_PER_MM + np.broadcast_to(gap_offsets_m, (4, 2)), 0.0)
+    stretch = math.exp(log_aspect)
+    electrodes = []
+    for side, u_m, (low_m, high_m) in zip(("x0", "xa"), (0.0, length_m), gaps_m[:2], strict=True):
+        _, (start, margin) = surface.to_rectangle([u_m, u_m], [low_m, high_m])
+        electrodes.append(Electrode(side, float(start), float(surface.b - margin)))  # type: ignore[arg-type]
+    for side, (low_m, high_m) in zip(("y0", "yb"), gaps_m[2:], strict=True):
+        (start, stop), _ = surface.to_rectangle([low_m, length_m - high_m], [0.0, 0.0])
+        electrodes.append(Electrode(side, float(stretch * start), float(stretch * stop)))  # type: ignore[arg-type]
     return ElectrodeNetwork.from_electrodes(
-        surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
+        stretch * surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
     )

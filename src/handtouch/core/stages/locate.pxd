@@ -1,9 +1,11 @@
 cimport cython
 from libc cimport math
-from handtouch.core.stages cimport tables
+from handtouch.core.stages cimport tables, tolerances
 
 cdef Py_ssize_t _MAX_STEPS, _CORNER_STEPS, _BISECTIONS
 cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
+cdef Py_ssize_t _MAX_WHITENINGS
+cdef double _MAX_WHITENING_CELLS
 cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
 cdef double _MIN_INFORMATION, _INFINITY, _HALF_PI
 
@@ -13,14 +15,28 @@ cdef class ModelTable:
     cdef double side_x, side_y
 
 cdef class Fit:
-    cdef double[::1] data, weight, fractions, slope_x, slope_y, raw, gain
+    cdef double[::1] readings, data, weight, fractions, slope_x, slope_y, raw, scaled, gain
+    cdef tolerances.Whitening whitening
+    cdef public double whitened_s, whitened_t, sum
     cdef public double s, t, total, cost, norm, mixing_x, mixing_y, gradient_x, gradient_y, xx, xy, yy
     cdef public double step_s, step_t, decrement, x, y, scale_x, scale_y
     cdef public double var_x, var_y, cov_xy, cov_x_total, cov_y_total, var_total
     cdef public bint found
 
-@cython.locals(tracked=bint, settled=bint, variance=double)
-cdef void locate(ModelTable table, Fit fit, double s, double t) noexcept
+@cython.locals(i=Py_ssize_t, tracked=bint, settled=bint, variance=double)
+cdef void locate(
+    ModelTable table, Fit fit, tolerances.PadTolerances pad, double[::1] gain_covariance, Py_ssize_t first,
+    double s, double t) noexcept
+@cython.locals(n=Py_ssize_t)
+cdef void _whiten(
+    ModelTable table, Fit fit, tolerances.PadTolerances pad, double[::1] gain_covariance,
+    Py_ssize_t first) noexcept
+@cython.locals(_=Py_ssize_t)
+cdef void _refine(
+    ModelTable table, Fit fit, tolerances.PadTolerances pad, double[::1] gain_covariance,
+    Py_ssize_t first) noexcept
+@cython.locals(i=Py_ssize_t)
+cdef void _whiten_column(ModelTable table, Fit fit, Py_ssize_t first, double[::1] out) noexcept
 cdef double _clamp(ModelTable table, double s) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef double _coordinate(double[::1] nodes, Py_ssize_t cells, double s) noexcept

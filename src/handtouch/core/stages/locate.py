@@ -2,15 +2,16 @@
 
 Gauss-Newton on the position with the total current eliminated (variable projection), steps halved until the
 likelihood rises. Positions are in cells of the pad's table, which shrink towards edges and electrode ends as
-the distances do over which currents vary. The same likelihood, limits and covariance as
-`handtouch.field.estimate`, which is the reference.
+the distances do over which currents vary. The likelihood is that of noise and of the tolerances of the
+pad's parts, whose covariance is computed at the position found before. Without tolerances: the same
+likelihood, limits and covariance as `handtouch.field.estimate`, which is the reference.
 """
 
 from __future__ import annotations
 
 import math
 
-from handtouch.core.stages import tables
+from handtouch.core.stages import tables, tolerances
 from handtouch.field.estimate import CORNER_RADIUS_FACTOR, MAX_STD_SIDES
 
 _MAX_STEPS = 30
@@ -20,6 +21,8 @@ _FIRST_DAMPING, _MIN_DAMPING = 1e-2, 1e-3
 _BISECTIONS = 50
 _MAX_TRACKED_COST = 25.0  # sum of squares beyond which, and
 _MAX_TRACKED_VARIANCE = 2.5e-3  # variance of a coordinate, in sides, beyond which other starts are tried
+_MAX_WHITENING_CELLS = 1.0  # distance from the position for which tolerances were whitened, and
+_MAX_WHITENINGS = 3
 _MAX_START_COST = 40.0  # cost beyond twice the best start's at which another one is still tried
 _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR = MAX_STD_SIDES, CORNER_RADIUS_FACTOR
 _MAX_CORNER_RADIUS = 0.25  # in shorter sides
@@ -61,25 +64,32 @@ class ModelTable:
 class Fit:
     """Working memory of the fit of one contact, and its result.
 
-    `data`, `weight`, `fractions`, `slope_x`, `slope_y` (n,): currents and what the model gives for them per
-    total, all divided by the noise; slopes by cell, less the part that the total absorbs. `raw` (3 columns,):
-    what was read from the table. `gain` (points,): reduction of the cost by a contact at each search point.
+    `weight` (n,): 1 / noise. `readings` (n,): currents over noise. `data`, `fractions`, `slope_x`, `slope_y`
+    (n,): currents and what the model gives for them per total, all whitened; slopes by cell, less the part
+    that the total absorbs. `raw` (3 columns,): what was read from the table. `scaled` (n,): working memory.
+    `gain` (points,): reduction of the cost by a contact at each search point.
     """
 
     def __init__(
         self,
+        readings: memoryview[float],
         data: memoryview[float],
         weight: memoryview[float],
         fractions: memoryview[float],
         slope_x: memoryview[float],
         slope_y: memoryview[float],
         raw: memoryview[float],
+        scaled: memoryview[float],
         gain: memoryview[float],
+        whitening: tolerances.Whitening,
     ) -> None:
-        self.data, self.weight = data, weight
+        self.readings, self.data, self.weight = readings, data, weight
+        self.scaled, self.whitening = scaled, whitening
         self.fractions, self.slope_x, self.slope_y = fractions, slope_x, slope_y
         self.raw, self.gain = raw, gain
         self.s = self.t = 0.0  # position, in cells
+        self.whitened_s = self.whitened_t = 0.0  # the same for which tolerances were whitened
+        self.sum = 0.0  # of the currents
         self.total = self.cost = 0.0
         self.norm = self.mixing_x = self.mixing_y = 0.0  # of fractions; slopes' part that the total absorbs
         self.gradient_x = self.gradient_y = 0.0
@@ -92,25 +102,68 @@ class Fit:
         self.found = False
 
 
-def locate(table: ModelTable, fit: Fit, s: float, t: float) -> None:
-    """Find the most likely contact for the currents in `fit`; (s, t): last position in cells, NaN if new.
+def locate(
+    table: ModelTable,
+    fit: Fit,
+    pad: tolerances.PadTolerances,
+    gain_covariance: memoryview[float],
+    first: int,
+    s: float,
+    t: float,
+) -> None:
+    """Find the most likely contact for the readings in `fit`; (s, t): last position in cells, NaN if new.
 
-    `fit.found` is False where no contact explains the currents better than none.
+    gain_covariance: of log gains, (n n,) from index `first` on. `fit.found` is False where no contact
+    explains the currents better than none.
     """
+    fit.sum = 0.0
+    for i in range(table.electrodes):
+        fit.sum += fit.readings[i] / fit.weight[i]
     tracked, settled = s == s and t == t, False
     if tracked:
         fit.s, fit.t = s, t
+        _whiten(table, fit, pad, gain_covariance, first)
         settled = _maximise(table, fit, True)
     if settled:
-        _compute_covariance(table, fit)
+        _refine(table, fit, pad, gain_covariance, first)
         variance = max(fit.var_x / (table.side_x * table.side_x), fit.var_y / (table.side_y * table.side_y))
         settled = fit.cost <= _MAX_TRACKED_COST and variance <= _MAX_TRACKED_VARIANCE
     if not settled:
+        tolerances.whiten_by_gains(fit.whitening, gain_covariance, first, fit.readings)
+        tolerances.apply_whitening(fit.whitening, fit.readings, 0, fit.data)
+        fit.whitened_s = fit.whitened_t = _INFINITY
+        if not tracked:
+            fit.s = fit.t = 0.5 * table.cells
         _search(table, fit, tracked)
-        _compute_covariance(table, fit)
+        _refine(table, fit, pad, gain_covariance, first)
     fit.found = fit.total > 0.0
     if fit.found:
         _move_out_of_corner(table, fit)
+
+
+def _whiten(
+    table: ModelTable, fit: Fit, pad: tolerances.PadTolerances, gain_covariance: memoryview[float], first: int
+) -> None:
+    """Whiten for noise and tolerances at (s, t)."""
+    n = table.electrodes
+    tables.read_table(table.values, 0, table.cells, n + 1, fit.s, fit.t, fit.raw)
+    total = max(fit.sum, 0.0)
+    tolerances.whiten(fit.whitening, pad, gain_covariance, first, fit.raw, fit.weight, total, fit.s, fit.t)
+    tolerances.apply_whitening(fit.whitening, fit.readings, 0, fit.data)
+    fit.whitened_s, fit.whitened_t = fit.s, fit.t
+
+
+def _refine(
+    table: ModelTable, fit: Fit, pad: tolerances.PadTolerances, gain_covariance: memoryview[float], first: int
+) -> None:
+    """Maximise again while the position is far from that of the tolerances; compute the covariance."""
+    for _ in range(_MAX_WHITENINGS):
+        away = max(abs(fit.s - fit.whitened_s), abs(fit.t - fit.whitened_t))
+        if away <= _MAX_WHITENING_CELLS or not fit.total > 0.0:
+            break
+        _whiten(table, fit, pad, gain_covariance, first)
+        _maximise(table, fit, False)
+    _compute_covariance(table, fit)
 
 
 def _clamp(table: ModelTable, s: float) -> float:
@@ -152,13 +205,12 @@ def _linearise(table: ModelTable, fit: Fit) -> None:
     """Evaluate the model at (s, t), with the total eliminated."""
     n = table.electrodes
     tables.read_table(table.values, 0, table.cells, n + 1, fit.s, fit.t, fit.raw)
+    _whiten_column(table, fit, 0, fit.fractions)
+    _whiten_column(table, fit, n + 1, fit.slope_x)
+    _whiten_column(table, fit, 2 * n + 2, fit.slope_y)
     norm = along = mixing_x = mixing_y = 0.0
     for i in range(n):
-        weight = fit.weight[i]
-        f = fit.raw[i] * weight
-        fx = fit.raw[n + 1 + i] * weight
-        fy = fit.raw[2 * n + 2 + i] * weight
-        fit.fractions[i], fit.slope_x[i], fit.slope_y[i] = f, fx, fy
+        f, fx, fy = fit.fractions[i], fit.slope_x[i], fit.slope_y[i]
         norm += f * f
         along += f * fit.data[i]
         mixing_x += f * fx
@@ -182,6 +234,13 @@ def _linearise(table: ModelTable, fit: Fit) -> None:
     fit.mixing_x, fit.mixing_y = mixing_x, mixing_y
     fit.xx, fit.xy, fit.yy = xx, xy, yy
     fit.gradient_x, fit.gradient_y = gradient_x, gradient_y
+
+
+def _whiten_column(table: ModelTable, fit: Fit, first: int, out: memoryview[float]) -> None:
+    """Whiten what was read from the table, from index `first` on, into `out`."""
+    for i in range(table.electrodes):
+        fit.scaled[i] = fit.raw[first + i] * fit.weight[i]
+    tolerances.apply_whitening(fit.whitening, fit.scaled, 0, out)
 
 
 def _compute_step(table: ModelTable, fit: Fit, damping: float) -> None:
@@ -257,15 +316,20 @@ def _search(table: ModelTable, fit: Fit, located: bool) -> None:
     for i in range(n):
         power += fit.data[i] * fit.data[i]
     for k in range(points * points):
+        for i in range(n):
+            fit.scaled[i] = table.search_fractions[k * n + i] * fit.weight[i]
+        tolerances.apply_whitening(fit.whitening, fit.scaled, 0, fit.fractions)
         along = norm = 0.0
         for i in range(n):
-            f = table.search_fractions[k * n + i] * fit.weight[i]
+            f = fit.fractions[i]
             along += f * fit.data[i]
             norm += f * f
         fit.gain[k] = along * along / norm if along > 0.0 else 0.0
     best_s, best_t, best_cost = fit.s, fit.t, _INFINITY
-    if located and fit.total > 0.0:
-        best_cost = fit.cost
+    if located:
+        _linearise(table, fit)
+        if fit.total > 0.0:
+            best_cost = fit.cost
     first, second = _highest_peak(fit, points, -1), -1
     if first >= 0:
         second = _highest_peak(fit, points, first)

@@ -1,21 +1,21 @@
 cimport cython
 from libc cimport math
-from handtouch.core.stages cimport force, locate, place
+from handtouch.core.stages cimport force, locate, place, tolerances
 
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
 cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _COUNT
 cdef double _NAN, _MAX_SQUARED_MISFIT
 
 cdef class ContactSolver:
-    cdef list tables, laws, surfaces
+    cdef list tables, pad_tolerances, laws, surfaces
     cdef force.StackTable stack
     cdef locate.Fit fit
     cdef place.Placement placement
     cdef force.ForceResult result
     cdef Py_ssize_t electrodes
-    cdef double[::1] by_x, by_y, by_total, by_residual
+    cdef double[::1] by_x, by_y, by_total
     cdef double[::1] currents, weight, gain_covariance, offset_std, values
-    cdef unsigned char[::1] gain_uncertain, force_requested
+    cdef unsigned char[::1] force_requested
     @cython.locals(k=Py_ssize_t)
     cpdef solve_contacts(self, Py_ssize_t[::1] pads)
 
@@ -24,13 +24,13 @@ cdef class ContactSolver:
 cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(row=Py_ssize_t, fit=locate.Fit, values='double[::1]')
+@cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, values='double[::1]')
 cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, fit=locate.Fit)
-cdef double _add_gain_covariance(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, values='double[::1]', law=force.PadLaw)
 cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(fit=locate.Fit, at=place.Placement, values='double[::1]')
-cdef void _write_position(ContactSolver solver, Py_ssize_t row) noexcept
+@cython.locals(row=Py_ssize_t, fit=locate.Fit, at=place.Placement, values='double[::1]')
+cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(fit=locate.Fit, table=locate.ModelTable, parts=tolerances.PadTolerances)
+cdef void _add_size(ContactSolver solver, Py_ssize_t pad) noexcept
 cdef void _write_row(
     double[::1] values, Py_ssize_t first, locate.Fit fit, place.Placement at, double t, double w) noexcept

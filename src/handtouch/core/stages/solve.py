@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from handtouch.core.stages import force, locate, place
+from handtouch.core.stages import force, locate, place, tolerances
 
 _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD = 0, 2, 4, 5, 8, 11, 12, 13
 _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _COUNT = 14, 23, 26, 27, 29
@@ -29,16 +29,16 @@ VALUE_SLICES = {
 """Layout of a row of values."""
 _NAN = float("nan")
 _MAX_SQUARED_MISFIT = 9.0
-"""Squared misfit of a point contact, of one degree of freedom, that noise explains. Beyond it the covariance
-is inflated by the excess (Birge, Phys. Rev. 40, 1932): where a contact is no point, or gains are off, the
-errors of currents along the directions that move the position are as large as along the observable one."""
+"""Squared misfit of a point contact, of one degree of freedom, that noise and tolerances explain. Beyond it
+the covariance is inflated by the excess (Birge, Phys. Rev. 40, 1932): where a contact is no point, the errors
+of currents along the directions that move the position are as large as along the observable one."""
 
 
 class ContactSolver:
     """Solves contacts of the pads of a model; arrays are flat, with a row a pad.
 
-    currents, weight: (pads n,) currents [A] and 1 / noise [1/A]. gain_covariance: (pads n n,) of log gains;
-    gain_uncertain: (pads,), 1 where it isn't 0. offset_std: (pads,) of the sum of the currents, from the
+    currents, weight: (pads n,) currents [A] and 1 / noise [1/A]. gain_covariance: (pads n n,) of log gains.
+    offset_std: (pads,) of the sum of the currents, from the
     baseline [A]; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
     force is to be estimated. values: (pads VALUE_COUNT,), the result; NaN for a new contact, else the search
     begins at the position in it.
@@ -47,6 +47,7 @@ class ContactSolver:
     def __init__(
         self,
         tables: list[locate.ModelTable],
+        pad_tolerances: list[tolerances.PadTolerances],
         laws: list[force.PadLaw],
         surfaces: list[place.PadSurface],
         stack: force.StackTable,
@@ -57,21 +58,20 @@ class ContactSolver:
         currents: memoryview[float],
         weight: memoryview[float],
         gain_covariance: memoryview[float],
-        gain_uncertain: memoryview[int],
         offset_std: memoryview[float],
         force_requested: memoryview[int],
         values: memoryview[float],
     ) -> None:
-        self.tables, self.laws, self.surfaces = tables, laws, surfaces
+        self.tables, self.pad_tolerances = tables, pad_tolerances
+        self.laws, self.surfaces = laws, surfaces
         self.stack, self.fit, self.placement = stack, fit, placement
         self.result = force.ForceResult()
         self.electrodes = electrodes
         self.by_x, self.by_y, self.by_total = (
             work[:electrodes], work[electrodes : 2 * electrodes], work[2 * electrodes : 3 * electrodes],
         )  # fmt: skip
-        self.by_residual = work[3 * electrodes : 4 * electrodes]
         self.currents, self.weight = currents, weight
-        self.gain_covariance, self.gain_uncertain = gain_covariance, gain_uncertain
+        self.gain_covariance = gain_covariance
         self.offset_std, self.force_requested = offset_std, force_requested
         self.values = values
 
@@ -90,8 +90,16 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
         weight = solver.weight[pad * n + i]
         weight /= math.sqrt(1.0 + offset2 * weight * weight)
         fit.weight[i] = weight
-        fit.data[i] = solver.currents[pad * n + i] * weight
-    locate.locate(table, fit, values[row + _CELLS], values[row + _CELLS + 1])
+        fit.readings[i] = solver.currents[pad * n + i] * weight
+    locate.locate(
+        table,
+        fit,
+        solver.pad_tolerances[pad],
+        solver.gain_covariance,
+        pad * n * n,
+        values[row + _CELLS],
+        values[row + _CELLS + 1],
+    )
     for i in range(_COUNT):
         values[row + i] = _NAN
     if not fit.found:
@@ -101,29 +109,32 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     _propagate(solver, pad)
     if solver.force_requested[pad]:
         _estimate_force(solver, pad)
-    _write_position(solver, row)
+    _write_position(solver, pad)
 
 
 def _propagate(solver: ContactSolver, pad: int) -> None:
-    """Compute residual and derivatives by the currents; add the gains' covariance, inflate for misfit."""
+    """Compute residual and derivatives by the currents; inflate the covariance for misfit."""
     n, row, fit, values = solver.electrodes, pad * _COUNT, solver.fit, solver.values
     total, pair, modelled, noise = fit.total, 0.0, 0.0, 0.0
-    # derivatives of (x, y, total) by each current, from slopes by cell
+    # derivatives of (x, y, total) by each whitened current, from slopes by cell; then by each current
     per_x, per_y = total / fit.scale_x, total / fit.scale_y
     var_x = fit.var_x if fit.var_x < 1e300 else 0.0
     var_y = fit.var_y if fit.var_y < 1e300 else 0.0
     for i in range(n):
-        weight = fit.weight[i]
-        sx, sy = fit.slope_x[i] * per_x * weight, fit.slope_y[i] * per_y * weight
-        solver.by_x[i] = var_x * sx + fit.cov_xy * sy
-        solver.by_y[i] = fit.cov_xy * sx + var_y * sy
-        solver.by_total[i] = (
-            fit.fractions[i] * weight / fit.norm
-            - fit.mixing_x * per_x * solver.by_x[i]
-            - fit.mixing_y * per_y * solver.by_y[i]
+        sx, sy = fit.slope_x[i] * per_x, fit.slope_y[i] * per_y
+        fit.data[i] = var_x * sx + fit.cov_xy * sy
+        fit.scaled[i] = fit.cov_xy * sx + var_y * sy
+    tolerances.transpose_whitening(fit.whitening, fit.data, fit.weight, solver.by_x)
+    tolerances.transpose_whitening(fit.whitening, fit.scaled, fit.weight, solver.by_y)
+    for i in range(n):
+        fit.data[i] = (
+            fit.fractions[i] / fit.norm
+            - fit.mixing_x * per_x * fit.data[i]
+            - fit.mixing_y * per_y * fit.scaled[i]
         )
+    tolerances.transpose_whitening(fit.whitening, fit.data, fit.weight, solver.by_total)
     for i in range(2):
-        pair += fit.data[i] / fit.weight[i]
+        pair += fit.readings[i] / fit.weight[i]
         modelled += fit.raw[i]
     slope_x = (fit.raw[n + 1] + fit.raw[n + 2]) / fit.scale_x
     slope_y = (fit.raw[2 * n + 2] + fit.raw[2 * n + 3]) / fit.scale_y
@@ -134,13 +145,10 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
         )
         if i < 2:
             by += 1.0 / total
-        solver.by_residual[i] = by
         noise += (by / fit.weight[i]) * (by / fit.weight[i])
     values[row + _RESIDUAL], values[row + _RESIDUAL_STD] = residual, math.sqrt(noise)
     _write_pad_noise(solver, pad)
-    if solver.gain_uncertain[pad]:
-        noise += _add_gain_covariance(solver, pad)
-    excess = residual * residual / noise - _MAX_SQUARED_MISFIT if noise > 0.0 else 0.0
+    excess = fit.cost - _MAX_SQUARED_MISFIT
     if excess > 0.0:
         fit.var_x *= 1.0 + excess
         fit.var_y *= 1.0 + excess
@@ -148,44 +156,19 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
 
 
 def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
-    """Write the covariance of the arc lengths from channel noise, without the baseline's."""
-    fit, values, row = solver.fit, solver.values, pad * _COUNT
-    noise = fit.weight[0] / solver.weight[pad * solver.electrodes]  # over noise and offset
-    along, around = noise * solver.placement.along_m, noise * solver.placement.around_m
-    values[row + _PAD_NOISE] = fit.var_x * along * along
-    values[row + _PAD_NOISE + 1] = fit.cov_xy * along * around
-    values[row + _PAD_NOISE + 2] = fit.var_y * around * around
-
-
-def _add_gain_covariance(solver: ContactSolver, pad: int) -> float:
-    """Add the covariance of log gains to that of (x, y, total); return what it adds to the residual's."""
-    n, fit = solver.electrodes, solver.fit
-    xx = xy = yy = xt = yt = tt = rr = 0.0
+    """Write the covariance of the arc lengths from channel noise alone."""
+    n, values, row = solver.electrodes, solver.values, pad * _COUNT
+    xx = xy = yy = 0.0
     for i in range(n):
-        current = solver.currents[pad * n + i]
-        ax, ay, at = solver.by_x[i] * current, solver.by_y[i] * current, solver.by_total[i] * current
-        ar = solver.by_residual[i] * current
-        bx = by = bt = br = 0.0
-        for j in range(n):
-            covariance = solver.gain_covariance[(pad * n + i) * n + j] * solver.currents[pad * n + j]
-            bx += covariance * solver.by_x[j]
-            by += covariance * solver.by_y[j]
-            bt += covariance * solver.by_total[j]
-            br += covariance * solver.by_residual[j]
-        xx += ax * bx
-        xy += ax * by
-        yy += ay * by
-        xt += ax * bt
-        yt += ay * bt
-        tt += at * bt
-        rr += ar * br
-    fit.var_x += xx
-    fit.var_y += yy
-    fit.cov_xy += xy
-    fit.cov_x_total += xt
-    fit.cov_y_total += yt
-    fit.var_total += tt
-    return rr
+        noise = 1.0 / solver.weight[pad * n + i]
+        x, y = solver.by_x[i] * noise, solver.by_y[i] * noise
+        xx += x * x
+        xy += x * y
+        yy += y * y
+    along, around = solver.placement.along_m, solver.placement.around_m
+    values[row + _PAD_NOISE] = xx * along * along
+    values[row + _PAD_NOISE + 1] = xy * along * around
+    values[row + _PAD_NOISE + 2] = yy * around * around
 
 
 def _estimate_force(solver: ContactSolver, pad: int) -> None:
@@ -214,18 +197,29 @@ def _estimate_force(solver: ContactSolver, pad: int) -> None:
     values[row + _FORCE_STATUS] = 1.0 * solver.result.status
 
 
-def _write_position(solver: ContactSolver, row: int) -> None:
+def _write_position(solver: ContactSolver, pad: int) -> None:
     """Write position, normal and covariance; NaN what the currents don't determine."""
-    fit, at, values = solver.fit, solver.placement, solver.values
+    fit, at, values, row = solver.fit, solver.placement, solver.values, pad * _COUNT
     if not fit.var_x < 1e300 or not fit.var_y < 1e300:
         return
     values[row + _X], values[row + _X + 1] = fit.x, fit.y
     values[row + _U], values[row + _U + 1] = at.u_m, at.v_m
     values[row + _POSITION], values[row + _POSITION + 1], values[row + _POSITION + 2] = at.px, at.py, at.pz
     values[row + _NORMAL], values[row + _NORMAL + 1], values[row + _NORMAL + 2] = at.nx, at.ny, at.nz
+    _add_size(solver, pad)
     _write_row(values, row + _COVARIANCE, fit, at, at.tx, at.wx)
     _write_row(values, row + _COVARIANCE + 3, fit, at, at.ty, at.wy)
     _write_row(values, row + _COVARIANCE + 6, fit, at, at.tz, at.wz)
+
+
+def _add_size(solver: ContactSolver, pad: int) -> None:
+    """Add the covariance of positions by the pad's size, which is in proportion to the distance from the
+    middle."""
+    fit, table, parts = solver.fit, solver.tables[pad], solver.pad_tolerances[pad]
+    aside_x = (solver.placement.u_m - parts.middle_u_m) * parts.size_x / solver.placement.along_m
+    aside_y = (fit.y - 0.5 * table.side_y) * parts.size_y
+    fit.var_x += aside_x * aside_x
+    fit.var_y += aside_y * aside_y
 
 
 def _write_row(

@@ -217,13 +217,25 @@ class DrawnWorld:
         return kinds[int(self._stream("kind", sheet).integers(len(kinds)))] if kinds else None
 
     def describe(self, deployment: config.Deployment) -> config.Deployment:
-        """Return the deployment with the nominal behaviour of the drawn kinds, as its builder writes it."""
-        described = {
-            name: sheet.model_copy(update={"behaviour": kind.behaviour})
-            for name, sheet in deployment.sheets.items()
-            if (kind := self.sheet_kind(name))
+        """Return the deployment as its builder writes it: with the nominal behaviour of the drawn kinds, and
+        with the tolerances of his parts."""
+        parts, law = self.world.parts, self.world.sheets
+        of_node = {"gain_std": parts.gain_ratio.std, "series_std": parts.resistor_ratio.std}
+        of_sheet = {
+            "ohm_per_square_std": parts.sheet_ohm_ratio.std,
+            "contact_ohm_std": law.contact_ohm_ratio.std,
+            "alpha_std": law.alpha_offset.std,
+            "anisotropy_std": parts.anisotropy_ratio.std,
+            "gap_std_mm": parts.gap_offset_mm.std,
+            "size_std_mm": max(parts.length_offset_mm.std, parts.width_offset_mm.std),
         }
-        return deployment.model_copy(update={"sheets": {**deployment.sheets, **described}})
+        sheets = {}
+        for name, sheet in deployment.sheets.items():
+            kind = self.sheet_kind(name)
+            behaviour = {"behaviour": kind.behaviour} if kind else {}
+            sheets[name] = sheet.model_copy(update=of_sheet | behaviour)
+        nodes = {name: node.model_copy(update=of_node) for name, node in deployment.nodes.items()}
+        return deployment.model_copy(update={"sheets": sheets, "nodes": nodes})
 
     def offset_counts_per_k(self, pad_name: str) -> FloatArray:
         """Return the temperature coefficients (4,) of the zeros of a pad, "hand/link"."""

@@ -1,0 +1,35 @@
+cimport cython
+from libc cimport math
+from handtouch.core.stages cimport tables
+
+cdef class PadTolerances:
+    cdef double[::1] values, end_vectors, series_vectors
+    cdef Py_ssize_t cells
+    cdef double cell_ratio, aspect_std, series_std, sheet_std, middle_u_m, size_x, size_y
+    cdef bint has_series, is_shape_exact
+
+cdef class Whitening:
+    cdef double[::1] matrix, fields, vector
+    cdef Py_ssize_t electrodes
+
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]')
+cdef void whiten_by_gains(
+    Whitening whitening, double[::1] gain_covariance, Py_ssize_t first, double[::1] readings) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]', vector='double[::1]')
+cdef void whiten(
+    Whitening whitening, PadTolerances pad, double[::1] gain_covariance, Py_ssize_t first,
+    double[::1] fractions, double[::1] weight, double total, double s, double t) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
+cdef void apply_whitening(
+    Whitening whitening, double[::1] values, Py_ssize_t first, double[::1] out) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
+cdef void transpose_whitening(
+    Whitening whitening, double[::1] values, double[::1] weight, double[::1] out) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, vector='double[::1]', fields='double[::1]')
+cdef void _add_shape(
+    Whitening whitening, PadTolerances pad, double[::1] fractions, double[::1] weight, double total,
+    double s, double t) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]', vector='double[::1]')
+cdef void _add_square(Whitening whitening) noexcept
+@cython.locals(i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t)
+cdef void _invert_root(double[::1] matrix, Py_ssize_t n) noexcept

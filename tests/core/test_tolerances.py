@@ -1,0 +1,144 @@
+"""Positions on pads whose parts aren't exactly as in the deployment lie in the stated regions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from handtouch.config import Deployment, parse
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.pad_model import PadModel
+from handtouch.field.network import ElectrodeNetwork
+from handtouch.hand import electrode_network
+from tests.core.conftest import DEPLOYMENT, TOLERANT_DEPLOYMENT
+
+FloatArray = NDArray[np.float64]
+RESISTED = 2
+
+
+@pytest.fixture(scope="module")
+def deployment() -> Deployment:
+    return parse(TOLERANT_DEPLOYMENT)
+
+
+@pytest.fixture(scope="module")
+def model(deployment: Deployment) -> PadModel:
+    return PadModel(deployment)
+
+
+def other_network(
+    deployment: Deployment,
+    row: int,
+    gap_offsets_m: FloatArray | float = 0.0,
+    log_aspect: float = 0.0,
+    log_series: FloatArray | float = 0.0,
+    log_sheet: float = 0.0,
+) -> ElectrodeNetwork:
+    """Return the network of a pad with other parts."""
+    pad = deployment.pads[row].pad
+    ohm = tuple((np.array(pad.series_ohm) * np.exp(log_series)).tolist())
+    sheet = deployment.sheets[pad.sheet]
+    sheet = sheet.model_copy(update={"ohm_per_square": sheet.ohm_per_square * np.exp(log_sheet)})
+    return electrode_network(pad.model_copy(update={"series_ohm": ohm}), sheet, gap_offsets_m, log_aspect)
+
+
+def drawn_network(deployment: Deployment, row: int, rng: np.random.Generator) -> ElectrodeNetwork:
+    """Return the network of a pad with parts drawn as the default values of the tolerances state."""
+    sheet = deployment.sheets["s"]
+    return other_network(
+        deployment,
+        row,
+        rng.normal(0, 1e-3 * sheet.gap_std_mm, (4, 2)),
+        rng.normal(0, sheet.anisotropy_std / 2),
+        rng.normal(0, deployment.nodes["n"].series_std, 4),
+        rng.normal(0, sheet.ohm_per_square_std),
+    )
+
+
+@pytest.mark.parametrize("row", range(3))
+def test_tables_of_tolerances_agree_with_networks_of_other_parts(
+    deployment: Deployment, model: PadModel, row: int
+) -> None:
+    """At the nodes, derivatives are those of the exact theory, except next to singular ends."""
+    table, forward = model.tolerance_tables[row], model.forward_tables[row]
+    nodes_x, nodes_y = forward.nodes_x[::3, 0], forward.nodes_y[::3, 0]
+    x, y = np.meshgrid(nodes_x[2:-2] / nodes_x[-1], nodes_y[2:-2] / nodes_y[-1])
+    values = table.nodes[2:-2, 2:-2, 0]
+
+    def change(one: ElectrodeNetwork, other: ElectrodeNetwork) -> FloatArray:
+        return np.asarray(one.fractions(x * one.a, y * one.b) - other.fractions(x * other.a, y * other.b))
+
+    for number, end in enumerate(np.eye(8).reshape(8, 4, 2)):
+        exact = change(*(other_network(deployment, row, step * end) for step in (5e-5, -5e-5))) / 1e-4
+        tabulated = values[..., number] * table.end_vectors[number][:, None, None]
+        assert np.quantile(np.abs(tabulated - exact) / np.abs(exact).max(), 0.98) < 1e-3
+    exact = change(*(other_network(deployment, row, 0.0, step) for step in (1e-3, -1e-3))) / 2e-3
+    assert np.abs(np.moveaxis(values[..., 8:], -1, 0) - exact).max() < 1e-4 * np.abs(exact).max()
+    if row == RESISTED:
+        fractions = model.networks[row].fractions(x * model.networks[row].a, y * model.networks[row].b)
+        for number, one in enumerate(np.eye(4)):
+            exact = change(*(other_network(deployment, row, log_series=step * one) for step in (1e-3, -1e-3)))
+            tabulated = table.series_vectors[number][:, None, None] * fractions[number]
+            assert np.abs(tabulated - exact / 2e-3).max() < 1e-4 * np.abs(exact / 2e-3).max()
+
+
+def test_regions_hold_for_parts_within_their_tolerances(deployment: Deployment, model: PadModel) -> None:
+    """Of contacts on sixty hands, 93 to 98 % lie in the region of 95 %; with exact parts stated, fewer than
+    half."""
+    inside = {}
+    for name, stated in (("tolerant", model), ("exact", PadModel(parse(DEPLOYMENT)))):
+        rng = np.random.default_rng(3)
+        distances = np.concatenate([squared_distances(deployment, stated, rng) for _ in range(60)])
+        inside[name] = np.mean(distances < chi2.ppf(0.95, 2))
+    assert 0.93 < inside["tolerant"] < 0.98
+    assert inside["exact"] < 0.5
+
+
+def test_size_of_a_pad_makes_positions_uncertain_in_proportion_to_the_distance_from_its_middle() -> None:
+    exact = parse(DEPLOYMENT)
+    sheets = {"s": exact.sheets["s"].model_copy(update={"size_std_mm": 0.5})}
+    model, unsized = PadModel(exact.model_copy(update={"sheets": sheets})), PadModel(exact)
+    for x, expected_mm in ((0.5, 0.0), (0.75, 0.125), (0.9, 0.2)):
+        at = np.full((3, 2), [x, 0.5])
+        added = np.diagonal(solve(model, at)[0][0] - solve(unsized, at)[0][0])
+        # the ratio of the sides changes positions as well, by less
+        assert expected_mm <= 1e3 * np.sqrt(added.max()) < expected_mm + 0.25
+
+
+def solve(
+    model: PadModel, xy: FloatArray, networks: list[ElectrodeNetwork] | None = None,
+    gains: FloatArray | float = 1.0, rng: np.random.Generator | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Return covariances (3, 3, 3), positions and normals (3, 3) of contacts at xy (3, 2), in sides."""
+    networks = networks or model.networks
+    fractions = np.array([net.fractions(*at) for net, at in zip(networks, xy * sides(networks), strict=True)])
+    currents, values = gains * 2e-3 * fractions, np.full((3, VALUE_COUNT), np.nan)
+    if rng:
+        currents += model.noise_a * rng.normal(size=(3, 4))
+    solver = make_solver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
+    solver.solve_contacts(np.arange(3).data)
+    columns = [values[:, VALUE_SLICES[name]] for name in ("covariance_m2", "position_m", "normal")]
+    return columns[0].reshape(3, 3, 3), columns[1], columns[2]
+
+
+def squared_distances(deployment: Deployment, model: PadModel, rng: np.random.Generator) -> FloatArray:
+    """Return squared Mahalanobis distances of contacts on a hand drawn by `rng`, five on each pad."""
+    networks = [drawn_network(deployment, row, rng) for row in range(3)]
+    gains = np.exp(rng.normal(0, deployment.nodes["n"].gain_std, (3, 4)))
+    found = []
+    for _ in range(5):
+        xy = rng.uniform(0.02, 0.98, (3, 2))
+        covariance, position, normal = solve(model, xy, networks, gains, rng)
+        x, y = (xy * sides(model.networks)).T
+        true = model.placement.to_link_frame(np.arange(3), x, y, np.zeros((3, 2, 2)))
+        for row in np.flatnonzero(np.isfinite(position[:, 0])):
+            tangents = np.linalg.svd(normal[row][None])[2][1:]
+            error = tangents @ (position[row] - true.position_m[row])
+            found.append(error @ np.linalg.solve(tangents @ covariance[row] @ tangents.T, error))
+    return np.array(found)
+
+
+def sides(networks: list[ElectrodeNetwork]) -> FloatArray:
+    return np.array([(network.a, network.b) for network in networks])
