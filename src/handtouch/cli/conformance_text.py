@@ -91,6 +91,7 @@ def run(
     if not reports:
         print("no node responds; check power, bit rate and termination", file=sys.stderr)
         return 1
+    print(to_json(reports) if as_json else to_text(reports, terminal=sys.stdout.isatty()), end="")
     if report_path is not None:
         text = to_json(reports) if report_path.suffix == ".json" else to_text(reports, terminal=False)
         try:
@@ -98,7 +99,6 @@ def run(
         except OSError as error:
             print(f"{report_path}: {error.strerror}", file=sys.stderr)
             return 1
-    print(to_json(reports) if as_json else to_text(reports, terminal=sys.stdout.isatty()), end="")
     return 0 if all(report.ok for report in reports) else 1
 
 
@@ -173,10 +173,11 @@ def _test_buses(
         try:
             line = PortLine(port)
             progress(f"{bus.name}: listening")
-            check_bus_is_free(line, bus.name)
+            heard = check_bus_is_free(line, bus.name)
             nodes = targets.nodes_on(bus.name)
             if targets.find_all:
-                nodes = [targets.describe_found(bus.name, node_id) for node_id in find_nodes(line)]
+                found = heard.union(find_nodes(line))
+                nodes = [targets.describe_found(bus.name, node_id) for node_id in sorted(found)]
             for number, node in enumerate(nodes, 1):
                 report_step = _labelled(
                     progress, f"{bus.name}: node {node.node_id}, {number} of {len(nodes)}"

@@ -160,12 +160,13 @@ def _add_conformance(commands: Subparsers) -> None:
         help="send no NMT reset, by which a node loses settings that it hasn't stored",
     )
     conformance.add_argument("--no-lss", action="store_true", help="send no LSS request")
-    conformance.add_argument(
+    output = conformance.add_mutually_exclusive_group()  # prompts are no JSON
+    output.add_argument(
         "--interactive",
         action="store_true",
         help="also prompt for a power cycle and a press (keys: s skips a step, q quits)",
     )
-    add_json(conformance)
+    output.add_argument("--json", dest="as_json", action="store_true", help="print JSON")
     conformance.add_argument(
         "--report",
         dest="report_path",

@@ -165,6 +165,37 @@ def test_a_master_that_starts_meanwhile_is_named_and_the_node_is_set_back(line: 
     assert device.read_object(0x1017, 0) == 200
 
 
+def test_a_node_that_handtouch_has_stopped_is_tested_and_stopped_again(line: Any, check: Check) -> None:
+    device = line.add()
+    line.send(0, bytes((2, NODE)))
+    line.frames.clear()
+    assert find_nodes(line) == []
+    assert check_bus_is_free(line, "can0") == {NODE}
+    assert check().ok
+    assert device.state == "STOPPED"
+
+
+def test_an_operational_node_without_sdo_server_stays_operational(line: Any, check: Check) -> None:
+    device = line.add()
+    device.sdo.frozen = True
+    line.send(0, bytes((1, NODE)))
+    assert not check().ok
+    assert device.state == "OPERATIONAL"
+
+
+def test_a_node_is_set_back_when_the_procedure_is_interrupted(line: Any) -> None:
+    device = line.add()
+    line.send(0, bytes((1, NODE)))
+
+    def interrupt(step: str) -> None:
+        if step == "SYNC every 10 ms":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_checks(line, NodeUnderTest("can0", NODE), ConformanceOptions(syncs=10), interrupt)
+    assert (device.state, device.read_object(0x1017, 0)) == ("OPERATIONAL", 200)
+
+
 def test_equal_serial_numbers_fail_on_all_nodes_that_share_one(line: Any) -> None:
     for node_id, serial in ((4, 7), (5, 7), (6, 8)):
         line.add(node_id, serial=serial)

@@ -50,6 +50,13 @@ def test_an_id_of_the_deployment_is_described_by_it(hand: config.Deployment) -> 
     assert node.pad == "gripper/index_tip"
 
 
+@pytest.mark.parametrize("role", ["guest", "listener"])
+def test_a_bus_on_which_handtouch_sends_no_nmt_is_refused(hand: config.Deployment, role: str) -> None:
+    bus = hand.buses[0].model_copy(update={"role": role})
+    with pytest.raises(ConfigError, match=f"role = {role}"):
+        select_targets(hand.model_copy(update={"buses": (bus,)}), [], ["1"], None)
+
+
 @pytest.mark.parametrize(
     ("buses", "names", "text"),
     [

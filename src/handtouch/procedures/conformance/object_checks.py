@@ -26,7 +26,12 @@ _MAX_PROBLEMS = 8
 
 
 def check_server(session: NodeSession) -> bool:
-    """Check that the node responds; return False if nothing else can be tested."""
+    """Check that the node responds; return False if nothing else can be tested.
+
+    A stopped node, as handtouch leaves its nodes when it ends, is made pre-operational first.
+    """
+    if not session.link.answers_sdo(round(SDO_TIMEOUT_S * 1e9)):
+        session.leave_stopped()
     try:
         session.sdo.read_or_none(cia301.DEVICE_TYPE, 0, "device type")
     except BootStepError as error:

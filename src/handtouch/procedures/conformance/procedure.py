@@ -36,17 +36,24 @@ class BusInUseError(Exception):
     """Another master is active on the bus; `str` names it, with a remedy."""
 
 
-def check_bus_is_free(line: Line, name: str, listen_ns: int = LISTEN_NS) -> None:
-    """Listen before the first frame is sent. Raises BusInUseError if another master is active."""
+def check_bus_is_free(line: Line, name: str, listen_ns: int = LISTEN_NS) -> set[int]:
+    """Listen before the first frame is sent; return the node ids of the heartbeats received.
+
+    Raises BusInUseError if another master is active.
+    """
     end_ns = line.now_ns() + listen_ns
     found: Counter[str] = Counter()
+    heard: set[int] = set()
     while (frame := line.receive(end_ns)) is not None:
+        if 0 < frame[0] - cia301.NMT_ERROR_CONTROL < 128:
+            heard.add(frame[0] - cia301.NMT_ERROR_CONTROL)
         if is_from_master(frame[0]):
             found[_MASTER_NAMES.get(frame[0], f"an SDO client of node {frame[0] & 0x7F}")] += 1
         if frame[2] > end_ns:
             break
     if found:
         raise BusInUseError(_describe_masters(name, found))
+    return heard
 
 
 def find_nodes(line: Line, ids: Iterable[int] = range(1, 128)) -> list[int]:

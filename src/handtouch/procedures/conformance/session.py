@@ -12,13 +12,14 @@ from typing import Protocol
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.boot import ExpectedIdentity, IdleSettings
 from handtouch.canbus.objects.mapping import PdoMapping
-from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient
+from handtouch.canbus.objects.sdo import SDO_TIMEOUT_S, BootStepError, NodeSdoClient
 from handtouch.config.channels import STANDARD_CHANNELS, Channels, WritableObject
 from handtouch.procedures.conformance.node_link import MS, NodeLink
 from handtouch.procedures.conformance.results import NodeReport
 
 BOOT_TIMEOUT_NS = 3000 * MS
 _STATE_HEARTBEAT_MS = 50
+_HEARTBEAT_WAIT_NS = 1100 * MS
 
 
 class Operator(Protocol):
@@ -115,6 +116,19 @@ class NodeSession:
     def enter_preoperational(self) -> None:
         """Put the node in pre-operational, in which it can be configured."""
         self.enter(cia301.ENTER_PREOPERATIONAL, cia301.PREOPERATIONAL)
+
+    def leave_stopped(self) -> None:
+        """Make a silent node pre-operational if it is stopped, in which it serves no SDO; `restore` stops it.
+
+        A node whose heartbeat reports another state is left in it.
+        """
+        heartbeats = self.link.heartbeats
+        self.link.wait(_HEARTBEAT_WAIT_NS, lambda: bool(heartbeats))
+        if heartbeats and heartbeats[-1].state != cia301.STOPPED:
+            return
+        self.link.send_nmt(cia301.ENTER_PREOPERATIONAL)
+        if self.link.answers_sdo(round(SDO_TIMEOUT_S * 1e9)):
+            self._initial_state = cia301.STOPPED
 
     def start_heartbeat(self) -> None:
         """Have the node send heartbeats, from which its initial NMT state is known."""

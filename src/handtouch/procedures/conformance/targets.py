@@ -50,6 +50,13 @@ def select_targets(
         for text in bus_texts:
             deployment = config.with_bus(deployment, text)
         buses = deployment.buses
+        for bus in buses:
+            if bus.role != "master":
+                raise _error(
+                    f'[[bus]] "{bus.name}": role',
+                    f" = {bus.role}",
+                    "the test sends NMT commands and SYNC; connect the node to a bus without another master",
+                )
         known = _nodes_of(deployment, eds)
     else:
         if not bus_texts:
