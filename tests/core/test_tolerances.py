@@ -62,10 +62,10 @@ def test_tables_of_tolerances_agree_with_networks_of_other_parts(
     deployment: Deployment, model: PadModel, row: int
 ) -> None:
     """At the nodes, derivatives are those of the exact theory, except next to singular ends."""
-    table, forward = model.tolerance_tables[row], model.forward_tables[row]
-    nodes_x, nodes_y = forward.nodes_x[::3, 0], forward.nodes_y[::3, 0]
+    table = model.forward_tables[row]
+    nodes_x, nodes_y = table.nodes_x[::3, 0], table.nodes_y[::3, 0]
     x, y = np.meshgrid(nodes_x[2:-2] / nodes_x[-1], nodes_y[2:-2] / nodes_y[-1])
-    values = table.nodes[2:-2, 2:-2, 0]
+    values = table.tolerance_nodes[2:-2, 2:-2, 0]
 
     def change(one: ElectrodeNetwork, other: ElectrodeNetwork) -> FloatArray:
         return np.asarray(one.fractions(x * one.a, y * one.b) - other.fractions(x * other.a, y * other.b))

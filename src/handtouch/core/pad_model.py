@@ -21,10 +21,10 @@ from handtouch.config.channels import (
     resolve_channels,
 )
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, view_floats
+from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.core.stages.tolerances import PadTolerances
-from handtouch.core.tolerance_table import ToleranceTable
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
 from handtouch.field.network import ElectrodeNetwork
@@ -59,9 +59,8 @@ class PadModel:
     `end_samples`: debounce. `max_rise_time_s`: a slower rise to `end_threshold_n` is drift. `behaviours`
     (n,): sheet behaviour, None where it isn't modelled.
 
-    `forward_tables`, `tolerance_tables`, `surface_tables` and `law_parameters` are what the stages read;
-    `weight` (n, 4) is 1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that
-    they tabulate.
+    `forward_tables`, `surface_tables` and `law_parameters` are what the stages read; `weight` (n, 4) is
+    1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that they tabulate.
     """
 
     def __init__(
@@ -110,12 +109,6 @@ class PadModel:
         self.networks = networks
         tables = {key: forward_table(network) for key, network in {id(n): n for n in networks}.items()}
         self.forward_tables = [tables[id(network)] for network in networks]
-        distinct = {id(network): pad for network, pad in zip(networks, pads, strict=True)}
-        changes = {
-            key: ToleranceTable.from_pad(pad, deployment.sheets[pad.sheet], tables[key])
-            for key, pad in distinct.items()
-        }
-        self.tolerance_tables = [changes[id(network)] for network in networks]
         self._parts = list(zip(pads, nodes, sheets, strict=True))
         self.surface_tables = [
             SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
@@ -286,10 +279,8 @@ class PadModel:
 
     def stage_tolerances(self) -> list[PadTolerances]:
         """Return the tolerances of the pads' parts as the stages take them."""
-        return [
-            table.pad_tolerances(*parts)
-            for table, parts in zip(self.tolerance_tables, self._parts, strict=True)
-        ]
+        columns = zip(self._parts, self.networks, self.forward_tables, strict=True)
+        return [stage_tolerances(*parts, network, table) for parts, network, table in columns]
 
     def stage_laws(self) -> list[PadLaw]:
         """Return the contact laws as the stages take them; they follow later changes."""

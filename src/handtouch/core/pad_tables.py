@@ -8,8 +8,9 @@ distances do over which its fractions vary.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import cast
 
@@ -20,14 +21,16 @@ from handtouch.core.stages.force import StackTable
 from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.place import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
-from handtouch.field.model import ForwardModel, spreading_radius
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import spreading_radius
+from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.surface import Surface
 
 FloatArray = NDArray[np.float64]
 
 _STENCIL = 7  # nodes that a slope is computed from
 _FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB
+CELLS_PER_TOLERANCE_CELL = 3  # tables of tolerances have 0.5 MB
+_TOLERANCE_STEP = 3e-5  # of differences, in sides
 _EDGE_CELL, _ELECTRODE_END_CELL = 0.003, 0.008
 """Distances from an edge and from an electrode's end below which cells shrink no further, in sides."""
 SEARCH_POINTS = 9
@@ -80,6 +83,11 @@ class ForwardTable:
     nodes: (cells + 1, cells + 1, 4, n + 1), see `hermite_table`. nodes_x, nodes_y: (cells + 1, 2) coordinates
     of the nodes and their derivatives by cell. search_fractions: (81, n), search_cells: (2, 9), see
     `ModelTable`.
+
+    tolerance_nodes: (37, 37, 4, 3 n), on every third node: fields of the 2 n ends of electrodes, and
+    derivatives of the fractions by the logarithm of a / b, see `PadTolerances`. end_vectors: (2 n, n),
+    derivatives of the fractions by the bare length at each end, two of each electrode, per its field.
+    series_vectors: (n, n), by the logarithm of each resistor, per its electrode's fraction.
     """
 
     nodes: FloatArray
@@ -87,15 +95,22 @@ class ForwardTable:
     nodes_y: FloatArray
     search_fractions: FloatArray
     search_cells: FloatArray
+    tolerance_nodes: FloatArray
+    end_vectors: FloatArray
+    series_vectors: FloatArray
 
     @classmethod
-    def from_model(
-        cls, model: ForwardModel, ends_x: Sequence[float] = (), ends_y: Sequence[float] = ()
-    ) -> ForwardTable:
-        """Tabulate a model with ends of electrodes at x = `ends_x` and at y = `ends_y`, corners aside."""
-        axes = _Axis(model.a, ends_x), _Axis(model.b, ends_y)
+    def from_network(cls, model: ElectrodeNetwork) -> ForwardTable:
+        """Tabulate a pad's electrode network."""
+        ends: tuple[set[float], set[float]] = {0.0, model.a}, {0.0, model.b}
+        for electrode in model.electrodes:
+            ends[_axis_along(electrode)].update((electrode.start, electrode.stop))
+        axes = (
+            _Axis(model.a, sorted(ends[0] - {0.0, model.a})),
+            _Axis(model.b, sorted(ends[1] - {0.0, model.b})),
+        )
         nodes_x, nodes_y = (axis.nodes() for axis in axes)
-        x, y = np.meshgrid(*(inside(at[:, 0]) for at in (nodes_x, nodes_y)))
+        x, y = np.meshgrid(*(_inside(at[:, 0]) for at in (nodes_x, nodes_y)))
         fractions = model.fractions(x, y)
         edge = _MIN_RADIUS_DISTANCE
         x, y = (
@@ -111,17 +126,11 @@ class ForwardTable:
             nodes_y,
             np.ascontiguousarray(model.fractions(x, y).T),
             np.stack([axis.cells(search * axis.side) for axis in axes]),
+            *_tabulate_tolerances(
+                model, nodes_x[::CELLS_PER_TOLERANCE_CELL], nodes_y[::CELLS_PER_TOLERANCE_CELL]
+            ),
+            np.ascontiguousarray(model.series_sensitivity.T),
         )
-
-    @classmethod
-    def from_network(cls, network: ElectrodeNetwork) -> ForwardTable:
-        """Tabulate a pad's electrode network."""
-        ends_x: set[float] = set()
-        ends_y: set[float] = set()
-        for electrode in network.electrodes:
-            ends = ends_x if electrode.side in ("y0", "yb") else ends_y
-            ends.update((electrode.start, electrode.stop))
-        return cls.from_model(network, sorted(ends_x - {0.0, network.a}), sorted(ends_y - {0.0, network.b}))
 
     @property
     def electrodes(self) -> int:
@@ -183,7 +192,52 @@ class _Axis:
         return np.asarray(density)
 
 
-def inside(x: FloatArray) -> FloatArray:
+def _tabulate_tolerances(
+    network: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return nodes of the fields of a network's ends and of the derivatives by its aspect, and the vectors of
+    its ends.
+
+    By differences to networks that are slightly different.
+    """
+    s, t = np.meshgrid(_inside(nodes_x[:, 0]) / network.a, _inside(nodes_y[:, 0]) / network.b)
+    nominal = network.fractions(s * network.a, t * network.b)
+
+    def slope(stretch: float, electrodes: Sequence[Electrode], step: float) -> FloatArray:
+        """Return derivatives (n, y, x) at fixed fractions of the sides."""
+        other = ElectrodeNetwork.from_electrodes(
+            stretch * network.a, network.b, electrodes, network.sheet_ohm_per_square, network.series_ohm
+        )
+        return np.asarray((other.fractions(s * other.a, t * other.b) - nominal) / step)
+
+    fields, vectors = [], []
+    for number, electrode in enumerate(network.electrodes):
+        step = _TOLERANCE_STEP * (network.a, network.b)[_axis_along(electrode)]
+        for other in (
+            replace(electrode, start=electrode.start + step), replace(electrode, stop=electrode.stop - step),
+        ):  # fmt: skip
+            electrodes = (*network.electrodes[:number], other, *network.electrodes[number + 1 :])
+            by_end = slope(1.0, electrodes, step)  # of rank 1
+            left, singular, right = np.linalg.svd(by_end.reshape(len(by_end), -1), full_matrices=False)
+            vectors.append(left[:, 0] * singular[0])
+            fields.append(right[0].reshape(s.shape))
+    stretch = math.exp(_TOLERANCE_STEP)
+    longer = [
+        electrode
+        if _axis_along(electrode)
+        else replace(electrode, start=stretch * electrode.start, stop=stretch * electrode.stop)
+        for electrode in network.electrodes
+    ]
+    by_aspect = slope(stretch, longer, _TOLERANCE_STEP)
+    return hermite_table(np.stack([*fields, *by_aspect], axis=-1)), np.array(vectors)
+
+
+def _axis_along(electrode: Electrode) -> int:
+    """Return the axis along which an electrode lies, 0 for x."""
+    return 0 if electrode.side in ("y0", "yb") else 1
+
+
+def _inside(x: FloatArray) -> FloatArray:
     """Return node coordinates with the outermost off the edges, where a model may have no value."""
     return np.clip(x, _MIN_EDGE_DISTANCE * x[-1], (1 - _MIN_EDGE_DISTANCE) * x[-1])
 

@@ -47,7 +47,7 @@ _EXCLUDED_ATTRIBUTES = {
     ("Pipeline", "_sink"), ("Pipeline", "journal"), ("Pipeline", "external_inputs"),
     ("ContactTransforms", "_robots"), ("TickMessages", "_encoders"),
     ("PadModel", "networks"), ("PadModel", "forward_tables"), ("PadModel", "surface_tables"),
-    ("PadModel", "tolerance_tables"), ("PadModel", "_parts"),
+    ("PadModel", "_parts"),
 }  # fmt: skip
 """Message output and its encoding, inputs not applied yet, robots, which are optional, and what follows from
 the deployment: no state."""
