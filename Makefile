@@ -57,7 +57,7 @@ examples: $(VENV)/.dev ## run examples/, each a control loop with a simulated gr
 
 # --- test
 
-.PHONY: test lint types unit coverage socketcan docs tables
+.PHONY: test lint types unit coverage socketcan docs tables wiring
 test: ## run everything that CI runs
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan lint types docs
 	@$(MAKE) --no-print-directory unit
@@ -75,6 +75,9 @@ docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are error
 tables: $(VENV)/.dev ## write docs/wire.schema.json and the tables of docs/wire.md and docs/firmware.md from the code
 	$(BIN)/python -m handtouch.wire.tables docs
 	$(BIN)/python -m handtouch.procedures.conformance.page docs
+
+wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
+	$(BIN)/python docs/wiring.py >docs/wiring.svg
 
 unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
 	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

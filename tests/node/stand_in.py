@@ -1,8 +1,9 @@
 """Files that stand in for the kernel's: an IIO device in sysfs, its character device, and its triggers.
 
 The files are real; a FIFO takes the place of /dev/iio:deviceN, and another one that of trigger_now, at which
-a thread waits as the kernel does. `python -m tests.node.stand_in FOLDER --deployment FILE` plays touches on
-such files for the pads of a deployment, for a node without parts.
+a thread waits as the kernel does. A node without parts: `python -m tests.node.stand_in FOLDER --deployment
+FILE` makes such files for the pads of a deployment, and FOLDER/node.toml. Each line LINK X Y MA [S] on its
+standard input is a press: fractions of the pad's sides from x0 and y0, the current, and how long (0.5 s).
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ import argparse
 import contextlib
 import os
 import struct
+import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,8 @@ import numpy.typing as npt
 from handtouch import config
 from handtouch.hand import electrode_network
 
-FULL_SCALE_MA, GAIN_OHM = 10.0, -240.0
+FULL_SCALE_MA, GAIN_OHM, NOISE_MA = 10.0, -240.0, 0.0003
+PRESS_S = 0.5
 SCALE_MV = 2400 / (1 << 23)  # 24 bits, reference of 2.4 V
 
 
@@ -150,40 +153,63 @@ def node_text(deployment: config.Deployment, folder: Path, channel: str, *, more
     return "\n".join(lines)
 
 
+class Presses:
+    """Presses on pads by lines LINK X Y MA [S]: fractions of the sides, current, duration."""
+
+    def __init__(self, deployment: config.Deployment) -> None:
+        self._pads = {entry.pad.link: number for number, entry in enumerate(deployment.pads)}
+        self._deployment = deployment
+        self._pressed: dict[int, tuple[npt.NDArray[np.float64], float]] = {}
+
+    def read(self, lines: Iterable[str]) -> None:
+        """Carry out lines as they come."""
+        for line in lines:
+            link, x, y, total_ma, *seconds = line.split()
+            number = self._pads[link]
+            pad = self._deployment.pads[number].pad
+            sheet = self._deployment.sheets[pad.sheet]
+            currents_ma = touch_ma(pad, sheet, float(x), float(y), float(total_ma))
+            duration_s = float(seconds[0]) if seconds else PRESS_S
+            self._pressed[number] = currents_ma, time.monotonic() + duration_s
+
+    def currents_ma(self, number: int) -> npt.NDArray[np.float64]:
+        """Currents of a pad at this time."""
+        currents_ma, end_s = self._pressed.get(number, (np.zeros(4), 0.0))
+        return currents_ma if time.monotonic() < end_s else np.zeros(4)
+
+
 def play(
-    adcs: Sequence[AdcStandIn], touches: Sequence[npt.NDArray[np.float64]], seconds: float, noise_ma: float
+    adcs: Sequence[AdcStandIn], currents_ma: Callable[[int], npt.NDArray[np.float64]], seconds: float
 ) -> None:
-    """Touch every pad for half of each second, with noise, at 500 values a second."""
+    """Convert at 500 Hz, with noise."""
     noise = np.random.default_rng(1)
     end_s = time.monotonic() + seconds
-    while (now_s := time.monotonic()) < end_s:
-        for number, (adc, touch) in enumerate(zip(adcs, touches, strict=True)):
-            on = (now_s + 0.5 * number) % 1.0 < 0.5
-            values = raw_of_ma((touch if on else 0 * touch) + noise.normal(0.0, noise_ma, 4))
+    while time.monotonic() < end_s:
+        for number, adc in enumerate(adcs):
+            values = raw_of_ma(currents_ma(number) + noise.normal(0.0, NOISE_MA, 4))
             adc.set_raw(values)
             adc.push(values, time.monotonic_ns())
         time.sleep(0.002)
 
 
 def main() -> None:
-    """Play touches for a deployment, and write the node's file."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Carry out presses for the pads of a deployment, and write the node's file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--deployment", type=Path, required=True)
-    parser.add_argument("--channel", default="vcan0")
     parser.add_argument("--mode", choices=("one-shot", "buffered"), default="one-shot")
     parser.add_argument("--seconds", type=float, default=float("inf"))
     options = parser.parse_args()
     deployment = config.load(options.deployment)
     adcs = [AdcStandIn(options.folder, number) for number in range(len(deployment.pads))]
-    sheets = deployment.sheets
-    touches = [touch_ma(entry.pad, sheets[entry.pad.sheet], 0.4, 0.6, 2.0) for entry in deployment.pads]
     more = f'mode = "{options.mode}"\n'
-    text = node_text(deployment, options.folder, options.channel, more=more)
+    text = node_text(deployment, options.folder, str(deployment.buses[0].channel), more=more)
     (options.folder / "node.toml").write_text(text)
     print(options.folder / "node.toml", flush=True)
+    presses = Presses(deployment)
+    threading.Thread(target=presses.read, args=(sys.stdin,), daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt):
-        play(adcs, touches, options.seconds, 0.0003)
+        play(adcs, presses.currents_ma, options.seconds)
 
 
 if __name__ == "__main__":

@@ -269,6 +269,17 @@ def test_an_id_assigned_by_lss_is_kept_over_a_restart(bench: Any) -> None:
     assert bench.send(0, bytes((130, 9)))[0] == (0x709, b"\0")
 
 
+def test_a_pad_without_an_id_is_silent_until_lss_assigns_one(bench: Any) -> None:
+    path = bench.write()
+    path.write_text(path.read_text().replace("node_id = 5\n", ""))
+    bench.write = lambda *_: path
+    assert bench.start() == []
+    assert "tip no node id" in bench.service.status()
+    bench.send(0x7E5, bytes((cia305.SWITCH_GLOBAL, 1)) + bytes(6))
+    bench.send(0x7E5, bytes((cia305.CONFIGURE_ID, 9)) + bytes(6))
+    assert bench.send(0x7E5, bytes((cia305.SWITCH_GLOBAL, 0)) + bytes(6)) == [(0x709, b"\0")]
+
+
 def test_an_id_that_cannot_be_stored_is_refused_by_lss(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.start()
 

@@ -1,0 +1,29 @@
+"""The wiring diagram in the docs is the one that its program draws, and agrees with the shipped node."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from handtouch.node.settings import load
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_diagram_is_current() -> None:
+    drawn = subprocess.run(
+        [sys.executable, str(ROOT / "docs/wiring.py")], capture_output=True, text=True, check=True
+    ).stdout
+    assert (ROOT / "docs/wiring.svg").read_text() == drawn, "run `make wiring`"
+
+
+def test_the_diagram_has_the_channels_gain_and_line_of_the_shipped_node() -> None:
+    drawing = ET.parse(ROOT / "docs/wiring.svg")
+    texts = [element.text for element in drawing.iter() if element.tag.endswith("text")]
+    pad = load(ROOT / "config/touch_node.toml").settings.pads[0]
+    assert set(pad.channels) <= set(texts)
+    assert any(str(text).startswith(f"{-pad.gain_ohm:g} Ω") for text in texts)
+    assert pad.excitation is not None
+    assert f"GPIO {pad.excitation.line}" in texts
