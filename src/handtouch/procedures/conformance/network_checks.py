@@ -55,9 +55,9 @@ def check_heartbeat(session: NodeSession) -> None:
 def check_states(session: NodeSession) -> None:
     """Check the NMT states and what the node sends in each; it ends in pre-operational."""
     link, report = session.link, session.report
-    if not session.has_heartbeat:
+    if not session.shows_state:
         for name in ("nmt.preoperational", "nmt.operational", "nmt.stopped", "nmt.addressed"):
-            report.not_tested(name, "no heartbeat, so its NMT state can't be observed")
+            report.not_tested(name, "neither heartbeat nor guarding, so its NMT state can't be observed")
         return
     state = session.enter(cia301.ENTER_PREOPERATIONAL, cia301.PREOPERATIONAL)
     problems = _describe_state(state, cia301.PREOPERATIONAL)
@@ -74,7 +74,7 @@ def check_states(session: NodeSession) -> None:
 
     other = 127 if session.node.node_id != 127 else 126
     sent_ns = link.send_nmt(cia301.STOP_NODE, other)
-    later = link.wait_for_state(sent_ns + MS // 10, cia301.STOPPED, 3 * session.node.heartbeat_ms * MS)
+    later = session.observe_state(sent_ns + MS // 10, cia301.STOPPED)
     changed = later is not None and later != state
     report.assess("nmt.addressed", [f"a command to node {other} changes its state"] if changed else [])
 
@@ -142,23 +142,25 @@ def summarise_errors(session: NodeSession) -> None:
 
 def _check_guarding(session: NodeSession) -> None:
     link, report = session.link, session.report
-    report.failed("heartbeat.period", "no heartbeat after 0x1017 was written") if (
-        _has_heartbeat_object(session)
-    ) else report.not_tested("heartbeat.period", "no 0x1017")
     report.not_tested("heartbeat.off", "no heartbeat")
-    toggles = []
-    for _ in range(_GUARD_REQUESTS):
-        before = len(link.heartbeats)
-        link.send_guard_request()
-        link.wait(_SILENCE_NS, lambda before=before: len(link.heartbeats) > before)  # type: ignore[misc]
-        toggles += [beat.data[0] >> 7 for beat in link.heartbeats[before:] if len(beat.data) == 1]
     if _has_heartbeat_object(session):
+        report.failed("heartbeat.period", "no heartbeat after 0x1017 was written")
         report.not_tested("guarding.response", "the node has 0x1017")
-    elif len(toggles) < _GUARD_REQUESTS:
-        report.failed("guarding.response", f"{len(toggles)} responses to {_GUARD_REQUESTS} requests")
-    else:
-        alternates = all(a != b for a, b in pairwise(toggles))
-        report.assess("guarding.response", [] if alternates else ["the toggle bit doesn't alternate"])
+        return
+    report.not_tested("heartbeat.period", "no 0x1017")
+    start = len(link.heartbeats)
+    for number in range(1, _GUARD_REQUESTS + 1):
+        link.send_guard_request()
+        expected = start + number
+        link.wait(_SILENCE_NS, lambda expected=expected: len(link.heartbeats) >= expected)  # type: ignore[misc]
+    toggles = [beat.data[0] >> 7 for beat in link.heartbeats[start:] if len(beat.data) == 1]
+    problems = []
+    if len(toggles) != _GUARD_REQUESTS:
+        problems.append(f"{len(toggles)} responses to {_GUARD_REQUESTS} requests")
+    elif any(a == b for a, b in pairwise(toggles)):
+        problems.append("the toggle bit doesn't alternate")
+    report.assess("guarding.response", problems)
+    session.is_guarded = not problems
 
 
 def _has_heartbeat_object(session: NodeSession) -> bool:
@@ -171,8 +173,8 @@ def _has_heartbeat_object(session: NodeSession) -> bool:
 def _describe_state(state: int | None, expected: int) -> list[str]:
     if state == expected:
         return []
-    name = "no heartbeat" if state is None else cia301.NMT_NAMES.get(state, f"illegal NMT state {state}")
-    return [f"{name} instead of {cia301.NMT_NAMES[expected]} in its heartbeats"]
+    name = "no NMT state" if state is None else cia301.NMT_NAMES.get(state, f"illegal NMT state {state}")
+    return [f"{name} instead of {cia301.NMT_NAMES[expected]}"]
 
 
 def _describe_errors(session: NodeSession) -> list[str]:

@@ -18,7 +18,9 @@ from handtouch.procedures.conformance.node_link import MS, NodeLink
 from handtouch.procedures.conformance.results import NodeReport
 
 BOOT_TIMEOUT_NS = 3000 * MS
-_STATE_HEARTBEAT_MS = 50
+_SETTLE_NS = 50 * MS
+"""Time in which a node without heartbeat follows an NMT command."""
+_GUARD_TIMEOUT_NS = 100 * MS
 _HEARTBEAT_WAIT_NS = 1100 * MS
 
 
@@ -100,18 +102,29 @@ class NodeSession:
         self.sdo = RestoringSdoClient(link.transport)
         self.report = NodeReport(node.bus, node.node_id, node.pad)
         self.mapping: PdoMapping | None = None
-        self.has_heartbeat = False
+        self.has_heartbeat = self.is_guarded = False
         self._initial_state: int | None = None
 
+    @property
+    def shows_state(self) -> bool:
+        """True if the node's NMT state can be observed."""
+        return self.has_heartbeat or self.is_guarded
+
     def enter(self, command: int, state: int) -> int | None:
-        """Send an NMT command; return the last NMT state that a heartbeat reports, None without heartbeat."""
-        if not self.has_heartbeat:
-            self.link.send_nmt(command)
-            self.link.wait(_STATE_HEARTBEAT_MS * MS)
-            return None
-        period_ms = self.node.heartbeat_ms
+        """Send an NMT command; return the NMT state that the node then reports, None if it reports none."""
         sent_ns = self.link.send_nmt(command)
-        return self.link.wait_for_state(sent_ns + MS // 10, state, (4 * period_ms + 200) * MS)
+        if not self.has_heartbeat:
+            self.link.wait(_SETTLE_NS)
+        return self.observe_state(sent_ns + MS // 10, state)
+
+    def observe_state(self, since_ns: int, expected: int) -> int | None:
+        """Wait for an NMT state by heartbeat or guarding; return the latest one since then, None for none."""
+        if self.is_guarded:
+            self.link.send_guard_request()
+            return self.link.wait_for_state(since_ns, expected, _GUARD_TIMEOUT_NS)
+        if not self.has_heartbeat:
+            return None
+        return self.link.wait_for_state(since_ns, expected, (4 * self.node.heartbeat_ms + 200) * MS)
 
     def enter_preoperational(self) -> None:
         """Put the node in pre-operational, in which it can be configured."""
