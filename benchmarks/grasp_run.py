@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import zmq
 from daemon_settings import pipeline_of
+from inline_process import InlineProcess
 from numpy.typing import NDArray
 
 from handtouch import wire
@@ -149,12 +150,14 @@ class _Run:
         self.pipeline.transforms.joints_at = self.inputs.joints_at
         all_pads = np.ones(model.size, np.bool_)
         requested = RequestedOutputs(all_pads, all_pads, np.ones(model.size, np.int64), all_pads, ~all_pads)
-        self.pipeline.apply_demand(requested)
-        self._perceiving = PerceptPublisher(self.pipeline, self)
         if perceive:
-            self._perceiving.set_requested(
-                requested._replace(percepts=np.ones((len(PERCEPT_KINDS), model.size), np.bool_))
-            )
+            percepts = np.ones((len(PERCEPT_KINDS), model.size), np.bool_)
+            requested = requested._replace(percepts=percepts)
+        self.pipeline.apply_demand(requested)
+        self._perceiving = PerceptPublisher(
+            deployment, self.pipeline, self, process=InlineProcess(deployment)
+        )
+        self._perceiving.set_requested(requested, _START_NS)
         self.contacts: list[wire.Contact] = []
         self.percepts: list[wire.Percept] = []
         self.used: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -181,7 +184,7 @@ class _Run:
             self.pipeline.slab.write_pdo(pad, now.astype("<i2").tobytes(), t_ns + 1)
         ticked = self.pipeline.tick_if_due(t_ns + 7 * _PERIOD_NS // 10)
         assert ticked is not None
-        self._perceiving.process_tick(ticked)
+        self._perceiving.process_tick(ticked, t_ns)
         self.pipeline.prepare_next_tick()
         if self.pipeline.transforms.used_joints:
             self.used[step] = (

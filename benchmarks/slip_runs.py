@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from daemon_settings import pipeline_of
+from inline_process import InlineProcess
 
 from handtouch import wire
 from handtouch.config import Deployment, load
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
 from handtouch.daemon.percepts import PerceptPublisher
-from handtouch.percept.motion import MotionEstimator
 from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -52,8 +52,10 @@ class Record:
     running: npt.NDArray[np.bool_]
     tick_s: FloatArray
     """(k,), duration of the tick."""
-    perceive_s: FloatArray
-    """(k,), duration of the percepts."""
+    slip_s: FloatArray
+    """(k,), duration of the slip stage, after the messages of the contacts."""
+    report_s: FloatArray
+    """(k,), duration of the motion percepts."""
     percepts: list[wire.Percept]
     information: tuple[FloatArray, FloatArray]
     """At `information_s`: ages [s] of ramps (pads, onsets), and information of 1 m/s along either axis.
@@ -98,17 +100,19 @@ def run(
     counts = np.stack([hand.counts(row, times) for row in range(len(hand.pads))], axis=1)
     collector, model = PerceptCollector(), PadModel(deployment)
     pipeline = pipeline_of(deployment, collector, model=model, period_ns=period_ns)
-    perceiving = PerceptPublisher(pipeline, collector)
+    perceiving = PerceptPublisher(deployment, pipeline, collector, process=InlineProcess(deployment))
     all_pads = np.ones(model.size, dtype=np.bool_)
     percepts = np.zeros((len(PERCEPT_KINDS), model.size), dtype=np.bool_)
     percepts[PERCEPT_KINDS.index("motion")] = True
     requested = RequestedOutputs(all_pads, all_pads, np.ones(model.size, np.int64), ~all_pads, ~all_pads)
+    requested = requested._replace(percepts=percepts)
     pipeline.apply_demand(requested)
-    perceiving.set_requested(requested._replace(percepts=percepts))
-    motion = next(part for part in perceiving._perceiver.estimators if isinstance(part, MotionEstimator))  # type: ignore[union-attr]
+    perceiving.set_requested(requested, 0)
+    slip, queued_s = pipeline.tick.slip, [0.0]
+    pipeline.on_messages_queued = lambda: queued_s.append(time.perf_counter())
     shape = len(times), model.size
     log_odds, force, running = np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
-    durations_s = np.empty((2, len(times)))
+    durations_s = np.empty((3, len(times)))
     payload, information = counts.astype("<i2"), (np.zeros((model.size, 0)), np.zeros((model.size, 0)))
     for k, t_s in enumerate(times.tolist()):
         t_ns = 10**9 + round(t_s * 1e9)
@@ -119,13 +123,14 @@ def run(
         ticked = pipeline.tick_if_due(t_ns + round(0.7 * period_ns))
         assert ticked is not None
         ticked_s = time.perf_counter()
-        perceiving.process_tick(ticked)
+        perceiving.process_tick(ticked, t_ns)
         perceived_s = time.perf_counter()
         pipeline.prepare_next_tick()
-        durations_s[:, k] = ticked_s - began_s, perceived_s - ticked_s
-        log_odds[k], running[k] = motion.slip_test.log_odds, motion.slipping
+        durations_s[:, k] = queued_s[-1] - began_s, ticked_s - queued_s[-1], perceived_s - ticked_s
+        log_odds[k], running[k] = slip.column("log_ratio"), slip.column("slipping") != 0
         if k == round(information_s * hz):
-            information = motion.slip_test.onset_information()
+            per_axis = [slip.column(f"information_{axis}") for axis in "xy"]
+            information = slip.column("onset_ages_s").copy(), np.mean(per_axis, axis=0)
         force[k] = pipeline.tick.columns.force_n
     return Record(
         times - from_s,
@@ -134,7 +139,8 @@ def run(
         running,
         durations_s[0],
         durations_s[1],
+        durations_s[2],
         collector.percepts,
         information,
-        motion.slip_test.samples_per_false_alarm,
+        slip.samples_per_false_alarm,
     )

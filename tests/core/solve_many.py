@@ -11,6 +11,7 @@ from handtouch.calibration.calibration import LawParameters
 from handtouch.config import parse
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.core.slip import SlipDetector
 from handtouch.core.stages import solve
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
@@ -27,6 +28,9 @@ def main(count: int) -> None:
     currents, values = np.zeros((n, 4)), np.full((n, VALUE_COUNT), np.nan)
     offset_std = np.full(n, 1e-7)
     solver = make_solver(model, currents, offset_std, np.ones(n, np.bool_), values)
+    summed_a, times = np.zeros(n), np.zeros(n, dtype=np.int64)
+    slip = SlipDetector(5e-3, values, summed_a, times, np.ones(n, dtype=np.uint32))
+    slip.set_requested(np.ones(n, dtype=np.bool_))
     at, digest = rng.uniform(0, 1, (n, 2)), hashlib.sha256()
     for number in range(-(-count // n)):
         if number % 7 == 0:
@@ -38,7 +42,10 @@ def main(count: int) -> None:
             bend = 1 + 0.05 * (number % 11 == 0) * rng.normal(size=4)
             currents[pad] = total_a * fractions * bend + model.noise_a[pad] * rng.normal(size=4)
         solver.solve_contacts(np.arange(n).data)
-        digest.update(np.nan_to_num(values, nan=-7.0).tobytes())
+        summed_a[:], times[:] = currents.sum(axis=1), 5_000_000 * (number + 1)
+        slip.detect_slips(np.arange(n))
+        for result in (values, slip.state):
+            digest.update(np.nan_to_num(result, nan=-7.0).tobytes())
     print("compiled" if solve.__file__.endswith(".so") else "interpreted", digest.hexdigest())
 
 

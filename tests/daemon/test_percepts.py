@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from handtouch import wire
 from handtouch.config.tables import SceneRequest
@@ -15,8 +19,11 @@ from handtouch.core.scene import (
     Demand,
     RequestedOutputs,
 )
+from handtouch.daemon.child_process import ChildProcess
 from handtouch.daemon.percepts import PerceptPublisher
+from handtouch.percept.messages import PerceptMessageError, pack_message, unpack_input, unpack_output
 from handtouch.percept.shape import pair_distance
+from handtouch.percept.worker import PerceptWorker
 from handtouch.view.message_lines import message_line
 from handtouch.wire import PERCEPT_KINDS, PadState
 
@@ -25,6 +32,38 @@ PERIOD_NS, PLANE = 5_000_000, 0
 
 def _no_commands(hand: str, t_ns: int) -> None:
     """Return no joint commands."""
+
+
+class WorkerHere(ChildProcess):
+    """The worker of the percept process in this process, reached by the same messages."""
+
+    def __init__(self, deployment: Any) -> None:
+        super().__init__("", "percept", lambda: b"")
+        self.worker = PerceptWorker(deployment)
+        self.waiting: list[bytes] = []
+        self.received: list[wire.PerceptInput] = []
+        self.full = False
+        """messages to it are dropped"""
+
+    @property
+    def pid(self) -> int | None:
+        return 1 if self.enabled else None
+
+    def start(self, now_ns: int) -> None:  # noqa: ARG002
+        self.enabled = True
+
+    def poll(self, now_ns: int) -> bool:  # noqa: ARG002
+        return False
+
+    def send(self, message: bytes) -> bool:
+        if not self.full:
+            self.received.append(unpack_input(message))
+            self.waiting += map(pack_message, self.worker.process_input(self.received[-1]))
+        return not self.full
+
+    def receive(self, now_ns: int, max_messages: int = 8) -> list[bytes]:  # noqa: ARG002
+        received, self.waiting = self.waiting[:max_messages], self.waiting[max_messages:]
+        return received
 
 
 class Rig:
@@ -36,12 +75,20 @@ class Rig:
         self._bench = bench
         self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
         self.pipeline.node_state[:] = PadState.CLEAR
-        self.percepts = PerceptPublisher(self.pipeline, self, session=7, commanded_joints_at=_no_commands)
+        self.process = WorkerHere(bench.deployment)
+        self.percepts = PerceptPublisher(
+            bench.deployment,
+            self.pipeline,
+            self,
+            session=7,
+            commanded_joints_at=_no_commands,
+            process=self.process,
+        )
+        self.t_ns = 10**9
         names = list(zip(bench.model.hands, bench.model.links, strict=True))
         self.demand = Demand(ActiveScenes(scene, names), self, 200.0, self._apply)
         self.demand.transformable[:] = False
         self.demand.update(0)
-        self.t_ns = 10**9
 
     def has_subscriber(self, topic: str) -> bool:
         return any(topic.encode().startswith(prefix) for prefix in self.subscriptions)
@@ -51,7 +98,7 @@ class Rig:
 
     def _apply(self, requested: RequestedOutputs, *_: object) -> None:
         self.pipeline.apply_demand(requested)
-        self.percepts.set_requested(requested)
+        self.percepts.set_requested(requested, self.t_ns)
 
     def run_contact(self, ticks: int, current_a: float = 1e-3, m_per_s: float = 0.0) -> list[wire.Percept]:
         already = len(self.sent)
@@ -66,7 +113,7 @@ class Rig:
             ticked = self.pipeline.tick_if_due(self.t_ns + PERIOD_NS * 7 // 10)
             assert ticked is not None
             if self.percepts.enabled:
-                self.percepts.process_tick(ticked)
+                self.percepts.process_tick(ticked, self.t_ns)
             self.pipeline.prepare_next_tick()
         return [message for message in self.sent[already:] if isinstance(message, wire.Percept)]
 
@@ -103,7 +150,7 @@ def test_no_percepts_without_a_request(bench: Any) -> None:
     rig = Rig(bench, frozenset([b"contact/", b"hand/"]), PLAIN)
     rig.run_contact(20)
     assert not rig.percepts.enabled
-    assert rig.percepts.contacts is None
+    assert not rig.process.received
     assert rig.demand.requested.percepts is None
 
 
@@ -149,16 +196,17 @@ def test_only_subscribed_percepts_of_pads_in_the_scene_are_requested(
 @pytest.mark.parametrize(("residual", "axis"), [(0.02, 0), (-0.02, 1)])
 def test_pair_distance_follows_from_the_residual(bench: Any, residual: float, axis: int) -> None:
     """In metres on the surface, along x of the pad or along y."""
-    rig = Rig(bench, MOTION, PLAIN)
-    assert np.isinf(rig.percepts.pair_distance_m(PLANE, residual, 1e-3)[1])  # no contact, no position
+    rig = Rig(bench, frozenset([b"percept/h/shape"]), PLAIN)
+    worker = rig.process.worker
+    assert np.isinf(worker.pair_distance_m(PLANE, residual, 1e-3)[1])  # no contact, no position
     rig.run_contact(20)
-    locator, (x, y) = bench.model.locator, rig.pipeline.tick.columns.xy[PLANE].tolist()
-    on_sheet, std = pair_distance(locator, PLANE, x, y, residual, 1e-3)
+    x, y = rig.pipeline.tick.columns.xy[PLANE].tolist()
+    on_sheet, std = pair_distance(bench.model.networks[PLANE], x, y, residual, 1e-3)
     points = np.array([x, y]) + np.outer([-0.5, 0.5], np.eye(2)[axis]) * on_sheet
     placed = bench.model.placement.to_link_frame(
         np.full(2, PLANE), points[:, 0], points[:, 1], np.zeros((2, 2, 2))
     ).position_m
-    distance_m, std_m = rig.percepts.pair_distance_m(PLANE, residual, 1e-3)
+    distance_m, std_m = worker.pair_distance_m(PLANE, residual, 1e-3)
     assert distance_m == pytest.approx(float(np.linalg.norm(placed[1] - placed[0])), rel=1e-6)
     assert std_m == pytest.approx(std * distance_m / on_sheet)
 
@@ -177,10 +225,117 @@ def test_commanded_motion_replaces_missing_joint_states(bench: Any) -> None:
 
     rig.pipeline.transforms.poses_from_joints = poses  # type: ignore[method-assign,assignment]
     rig.run_contact(30)
-    assert rig.percepts.contacts is not None
-    window = rig.percepts.contacts.window(PLANE)
+    window = rig.process.worker.contacts.window(PLANE)
     assert requests[-1] == ([PLANE], rig.t_ns)
     facing = float(window["commanded_normal"][-1] @ outward)
     motion = window["commanded_m"]
     assert motion[0] == 0.0
     assert np.diff(motion) == pytest.approx(np.full(len(motion) - 1, 1e-3 * facing))
+
+
+# The stream to the percept process, and back ------------------------------------------------------------
+
+SHAPE = frozenset([b"percept/h/shape"])
+
+
+def test_motion_alone_needs_no_percept_process(bench: Any) -> None:
+    rig = Rig(bench, MOTION, PLAIN)
+    assert rig.run_contact(50)
+    assert rig.process.state == "stopped"
+    assert not rig.process.received
+
+
+def test_stream_carries_what_the_tick_computed(bench: Any) -> None:
+    rig = Rig(bench, SHAPE | MOTION, PLAIN)
+    rig.run_contact(20)
+    columns, last = rig.pipeline.tick.columns, rig.process.received[-1]
+    sent = {
+        name: column.to_array(data)
+        for name, column in wire.COLUMNS[wire.PerceptInput].items()
+        if (data := getattr(last, name))
+    }
+    assert (last.hand, last.t_ns, last.seq) == ("h", rig.t_ns, len(rig.process.received))
+    assert sent["row"].tolist() == [PLANE]
+    assert sent["contact_id"].tolist() == [1, 0, 0]
+    for name in ("xy", "pad_m", "position_m", "normal", "force_n", "force_std_n", "residual"):
+        assert np.array_equal(sent[name][0], getattr(columns, name)[PLANE]), name
+    assert sent["covariance_m2"][0].tolist() == columns.covariance_m2[PLANE].ravel().tolist()
+    assert np.isfinite(sent["slip_log_odds"]).all()
+    assert "palm_position_m" not in sent
+
+
+def test_percepts_of_the_process_are_published_with_session_and_sequence(bench: Any) -> None:
+    rig = Rig(bench, SHAPE, PLAIN)
+    percepts = rig.run_contact(400)
+    assert {(percept.kind, percept.link) for percept in percepts} == {("shape", "plane")}
+    assert [percept.seq for percept in percepts] == list(range(1, 1 + len(percepts)))
+    assert {percept.session for percept in percepts} == {7}
+
+
+def test_stream_continues_without_contacts_so_that_the_process_knows_the_time(bench: Any) -> None:
+    rig = Rig(bench, SHAPE, PLAIN)
+    rig.run_contact(200, current_a=0.0)
+    times = np.array([message.t_ns for message in rig.process.received])
+    assert np.diff(times).max() <= 50_000_000
+    assert len(times) <= 25
+
+
+def test_lost_messages_hide_no_end_of_a_contact(bench: Any) -> None:
+    rig = Rig(bench, SHAPE, PLAIN)
+    rig.run_contact(20)
+    contacts = rig.process.worker.contacts
+    assert contacts.contact_id[PLANE] == 1
+    rig.process.full = True
+    rig.run_contact(20, current_a=0.0)
+    rig.process.full = False
+    rig.run_contact(20)
+    assert contacts.contact_id[PLANE] == 2
+    assert contacts.sample_count[PLANE] <= 20
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kind": "motion"},
+        {"hand": "another"},
+        {"link": "another"},
+        {"probabilities": {"flat": 2.0}},
+        {"probabilities": {"flat": "often"}},
+        {"evidence": {"samples": "many"}},
+        {"values": {"radius_m": [[1.0]]}},
+        {"values": {str(k): 1.0 for k in range(1000)}},
+        {"reason": "x" * 10_000},
+    ],
+)
+def test_malformed_messages_of_the_process_are_counted_and_ignored(
+    bench: Any, change: dict[str, Any]
+) -> None:
+    rig = Rig(bench, SHAPE, PLAIN)
+    percept = rig.run_contact(400)[0]
+    assert rig.percepts.client.malformed == 0
+    rig.process.waiting = [pack_message(percept), pack_message(replace(percept, **change))]
+    rig.process.full = True
+    assert len(rig.run_contact(1)) == 1
+    assert rig.percepts.client.malformed == 1
+
+
+@given(st.binary(max_size=200), st.sampled_from([b"", b"status\0", b"percept/h/shape\0"]))
+def test_any_bytes_of_the_process_are_a_message_or_an_error(data: bytes, start: bytes) -> None:
+    with contextlib.suppress(PerceptMessageError):
+        unpack_output(start + data)
+
+
+def test_process_stops_half_a_minute_after_the_last_request(bench: Any) -> None:
+    rig = Rig(bench, SHAPE, PLAIN)
+    rig.run_contact(20)
+    rig.subscriptions = frozenset()
+    rig.demand.update(rig.t_ns)
+    rig.run_contact(20)
+    assert rig.process.enabled
+    assert rig.percepts.enabled
+    assert rig.process.worker.contacts.contact_id.tolist() == [0, 0, 0]
+    rig.t_ns += 31 * 10**9
+    rig.run_contact(2)
+    assert rig.process.state == "stopped"
+    assert not rig.percepts.enabled
+    assert rig.percepts.client.statistics()["lag_s"] is None

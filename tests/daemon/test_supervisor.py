@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import time
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +15,6 @@ from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.config import Behaviour
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.supervisor_client import SupervisorClient
-from handtouch.daemon.supervisor_process import SupervisorProcess
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
@@ -316,48 +311,3 @@ def test_state_of_the_process_is_published(rig: Rig) -> None:
     assert statistics["summary"] == "3 nominal"
     assert statistics["store_error"] == "the store is damaged"
     assert statistics["lag_s"] >= 1.0
-
-
-# The process itself -----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def process() -> Iterator[SupervisorProcess]:
-    made = SupervisorProcess(lambda: b"not a deployment")
-    yield made
-    made.close()
-
-
-def until(process: SupervisorProcess, state: str, t_ns: int) -> int:
-    for _ in range(3000):
-        process.poll(t_ns)
-        process.receive(t_ns)
-        if process.state == state:
-            return t_ns
-        time.sleep(0.01)
-    raise AssertionError(f"never {state}: {process.state}")
-
-
-def test_exited_process_is_restarted_after_growing_delays(process: SupervisorProcess) -> None:
-    process.start(0)
-    delays = []
-    now_ns = 0
-    for _ in range(3):
-        until(process, "running", now_ns)
-        os.kill(process.pid or 0, signal.SIGKILL)
-        until(process, "waiting", now_ns)
-        delay_ns = 0
-        while process.state == "waiting":
-            now_ns += SECOND_NS // 2
-            delay_ns += SECOND_NS // 2
-            process.poll(now_ns)
-        delays.append(delay_ns / SECOND_NS)
-    assert delays == [1.0, 2.0, 4.0]
-    assert process.restarts == 3
-
-
-def test_stopped_process_neither_takes_nor_sends_messages(process: SupervisorProcess) -> None:
-    assert process.state == "stopped"
-    assert process.pid is None
-    assert not process.send(b"x")
-    assert process.receive(0) == []

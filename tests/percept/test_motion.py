@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.percept.action_request import CandidateAction, Question
-from handtouch.percept.motion import MOTION_CLASSES, MotionEstimator
-from handtouch.percept.pipeline import PerceptPipeline
+from handtouch.core.slip import SlipDetector
+from handtouch.core.stages.slip import MOTION_CLASSES
+from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+from handtouch.percept.motion import MotionReporter
 from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
-from handtouch.wire import PERCEPT_KINDS
 
 FloatArray = NDArray[np.float64]
 PERIOD_NS, NOISE_M = 5_000_000, 8e-6
@@ -26,13 +25,13 @@ class Held:
     def __init__(self, pads: int = 1, seed: int = 1, joints_m: float = 0.0) -> None:
         """joints_m: deviation of positions in the palm from joints, as reported."""
         self._joints_m = joints_m
-        self.stream = ContactBuffer(pads)
-        self.motion = MotionEstimator(self.stream, PERIOD_NS)
-        self.perceiver = PerceptPipeline(self.stream, [self.motion])
-        requested = np.zeros((len(PERCEPT_KINDS), pads), dtype=np.bool_)
-        requested[PERCEPT_KINDS.index("motion")] = True
-        self.perceiver.set_requested(requested, np.ones(pads, dtype=np.bool_))
-        self.asks: list[str] = []
+        self._values = np.full((pads, VALUE_COUNT), np.nan)
+        self._current_a, self._times = np.zeros(pads), np.zeros(pads, dtype=np.int64)
+        self._ids = np.arange(1, pads + 1, dtype=np.uint32)
+        self.slip = SlipDetector(PERIOD_NS * 1e-9, self._values, self._current_a, self._times, self._ids)
+        self.slip.set_requested(np.ones(pads, dtype=np.bool_))
+        self.poses = ContactBuffer(pads, length=12)
+        self.reporter = MotionReporter(self.slip, self.poses, PERIOD_NS * 1e-9)
         self._rng = np.random.default_rng(seed)
         self._k = 0
 
@@ -44,32 +43,36 @@ class Held:
         along_m: the first pad's centroid; links_m: of links, along x in the palm.
         """
         percepts = []
-        pads = np.arange(self.stream.size)
+        pads = np.arange(len(self._ids))
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             t_s, self._k = self._k * PERIOD_NS * 1e-9, self._k + 1
-            t_ns = np.full(len(pads), 10**9 + self._k * PERIOD_NS)
-            sample = ContactSamples(pads, t_ns, (pads + 1).astype(np.uint32))
+            self._times[:] = 10**9 + self._k * PERIOD_NS
             place = NOISE_M * self._rng.standard_normal((len(pads), 2))
             place[0, 0] += along_m(t_s)
-            sample["pad_m"] = place
-            sample["pad_noise_m2"] = np.tile(NOISE_M**2 * np.eye(2), (len(pads), 1, 1))
-            sample["covariance_m2"] = np.tile(NOISE_M**2 * np.eye(3), (len(pads), 1, 1))
-            sample["force_n"] = np.full(len(pads), force(t_s))
-            sample["total_current_a"] = 1e-3 * sample["force_n"]
+            self._values[:, VALUE_SLICES["pad_m"]] = place
+            self._values[:, VALUE_SLICES["pad_noise_m2"]] = NOISE_M**2 * np.array([1.0, 0.0, 1.0])
+            self._values[:, VALUE_SLICES["force_n"]] = force(t_s)
+            self._current_a[:] = 1e-3 * force(t_s)
+            self.slip.detect_slips(pads)
             if links_m:
-                on_link = np.hstack([place, np.zeros((len(pads), 1))])
-                sample["position_m"] = on_link
-                link = np.zeros((len(pads), 3))
-                link[:, 0] = [way(t_s) for way in links_m]
-                link[:, 1] = 0.03 * pads
-                sample["palm_position_m"] = on_link + link
-                sample["palm_normal"] = np.tile([0.0, 0.0, 1.0], (len(pads), 1))
-                sample["palm_rotation"] = np.tile(np.eye(3), (len(pads), 1, 1))
-                sample["palm_joints_m2"] = np.full(len(pads), self._joints_m**2)
-            found, asks = self.perceiver.process_tick(sample, np.zeros(0, np.intp), int(t_ns[0]))
+                self.poses.add_samples(self._posed(place, [way(t_s) for way in links_m]))
+            found = self.reporter.report_contacts(pads, int(self._times[0]))
             percepts += [percept for percept in found if percept.pad == 0]
-            self.asks += [ask.action.kind for ask in asks]
         return percepts
+
+    def _posed(self, place: FloatArray, links_m: list[float]) -> ContactSamples:
+        pads = np.arange(len(place))
+        sample = ContactSamples(pads, self._times.copy(), self._ids)
+        on_link = np.hstack([place, np.zeros((len(pads), 1))])
+        sample["position_m"] = on_link
+        link = np.zeros((len(pads), 3))
+        link[:, 0] = links_m
+        link[:, 1] = 0.03 * pads
+        sample["palm_position_m"] = on_link + link
+        sample["palm_normal"] = np.tile([0.0, 0.0, 1.0], (len(pads), 1))
+        sample["palm_rotation"] = np.tile(np.eye(3), (len(pads), 1, 1))
+        sample["palm_joints_m2"] = np.full(len(pads), self._joints_m**2)
+        return sample
 
 
 def still(_: float) -> float:
@@ -121,19 +124,12 @@ def test_vanishing_force_is_lift_off() -> None:
 def test_ended_contact_has_lifted_off() -> None:
     held = Held()
     held.feel(0.5, still)
-    none = ContactSamples(np.zeros(0, np.intp), np.zeros(0, np.int64), np.zeros(0, np.uint32))
-    (last,), _ = held.perceiver.process_tick(none, np.array([0]), 2 * 10**9)
+    (last,) = held.reporter.end_contacts(np.array([0]), 2 * 10**9)
     assert (last.label, last.contact) == ("lift-off", 1)
-    assert held.stream.contact_id[0] == 0
 
 
-def test_possible_slow_slip_poses_a_hold_question() -> None:
-    held = Held()
-    held.feel(2.0, ramp(1.0, 1.5e-3))
-    assert "hold" in held.asks
-    firm = Held()
-    firm.feel(1.0, still)
-    assert firm.asks == []
+def test_contact_that_nothing_is_known_of_ends_silently() -> None:
+    assert Held().reporter.end_contacts(np.array([0]), 2 * 10**9) == []
 
 
 def test_ripple_and_tremor_are_sticking() -> None:
@@ -185,23 +181,6 @@ def test_object_dragged_under_resting_centroids_slides_despite_noise() -> None:
     assert 1.0 < (first.estimate_ns - 10**9) * 1e-9 < 1.15
 
 
-def test_evidence_near_the_threshold_does_not_chatter() -> None:
-    """R that goes up and down about even odds, a few samples each: one alarm, until it is gone for long."""
-    held = Held()
-    held.feel(1.0, still)
-    motion, pad, one = held.motion, np.array([0]), np.array([PERIOD_NS * 1e-9])
-    even = -math.log(0.05 * PERIOD_NS * 1e-9)
-    alarms, before = 0, False
-    for k in range(200):
-        motion.slip_test.log_odds[0] = (
-            even + (0.8 if k % 6 < 3 else -1.5 if k < 100 else -9.0) if k < 106 else 0.0
-        )
-        now = bool(motion.classify(pad, one)[0] == MOTION_CLASSES.index("incipient"))
-        alarms, before = alarms + (now and not before), now
-    assert alarms == 1
-    assert not before
-
-
 def test_single_contact_assumes_a_static_object() -> None:
     percepts = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[ramp(1.0, -15e-3)])[-1]
     assert percepts.values["object_reference"] == "static"
@@ -212,79 +191,3 @@ def test_moving_centroid_on_a_resting_link_slides_without_other_contacts() -> No
     percepts = Held(1).feel(1.3, ramp(1.0, 15e-3), links_m=[still])[-1]
     assert percepts.values["object_reference"] == "static"
     assert percepts.label == "sliding"
-
-
-def test_samples_without_position_or_force_are_tolerated() -> None:
-    held = Held()
-    held.feel(0.5, still)
-    t_ns = 10**9 + round(0.501e9)
-    sample = ContactSamples(np.array([0]), np.array([t_ns]), np.array([1], np.uint32))
-    held.perceiver.process_tick(sample, np.zeros(0, np.intp), t_ns)
-    assert held.feel(0.5, still)[-1].label in MOTION_CLASSES
-
-
-class Slow:
-    """A part whose fits are always due."""
-
-    # ruff: noqa: ARG002
-
-    kind = "shape"
-
-    def __init__(self) -> None:
-        self.requested = np.zeros(2, dtype=np.bool_)
-        self.fitted: list[int] = []
-        self.stepped = 0
-
-    def process_samples(
-        self, stream: ContactBuffer, sample: ContactSamples, began: NDArray[np.intp]
-    ) -> list[PerceptEstimate]:
-        self.stepped += 1
-        assert self.requested[sample.pads].all()
-        return []
-
-    def next_pad_to_fit(self, stream: ContactBuffer, t_ns: int) -> int | None:
-        return 1
-
-    def fit_contact(self, stream: ContactBuffer, pad: int, t_ns: int) -> list[PerceptEstimate]:
-        self.fitted.append(t_ns)
-        return []
-
-    def end_contacts(self, stream: ContactBuffer, pads: NDArray[np.intp], t_ns: int) -> list[PerceptEstimate]:
-        return []
-
-    def open_questions(self, t_ns: int) -> list[Question]:
-        action = CandidateAction("squeeze", {"force_ratio": 2.0}, {"flat": (0.0, 1.0), "round": (9.0, 1.0)})
-        return [Question("area", 0, 1, 2, {"flat": 0.5, "round": 0.5}, [action])]
-
-
-@pytest.mark.parametrize("period_ns", [1_000_000, 5_000_000])
-def test_fits_run_one_at_a_time_and_at_most_a_hundred_per_second(period_ns: int) -> None:
-    stream, first, second = ContactBuffer(2), Slow(), Slow()
-    perceiver = PerceptPipeline(stream, [first, second])
-    requested = np.ones((len(PERCEPT_KINDS), 2), dtype=np.bool_)
-    perceiver.set_requested(requested, np.ones(2, dtype=np.bool_))
-    for k in range(1, 1 + 10**9 // period_ns):
-        sample = ContactSamples(np.array([1]), np.array([k * period_ns]), np.array([2], np.uint32))
-        perceiver.process_tick(sample, np.zeros(0, np.intp), k * period_ns)
-    together = sorted(first.fitted + second.fitted)
-    assert 90 <= len(together) <= 100
-    assert len(set(together)) == len(together)
-    assert abs(len(first.fitted) - len(second.fitted)) <= 1
-
-
-def test_estimator_processes_only_its_requested_pads() -> None:
-    slow = Slow()
-    perceiver = PerceptPipeline(ContactBuffer(2), [slow])
-    requested = np.zeros((len(PERCEPT_KINDS), 2), dtype=np.bool_)
-    requested[PERCEPT_KINDS.index("shape"), 1] = True
-    perceiver.set_requested(requested, np.zeros(2, dtype=np.bool_))
-    both = ContactSamples(np.array([0, 1]), np.array([1, 1]), np.array([1, 2], np.uint32))
-    _, asks = perceiver.process_tick(both, np.zeros(0, np.intp), 1)
-    only = ContactSamples(np.array([0]), np.array([2]), np.array([1], np.uint32))
-    perceiver.process_tick(only, np.zeros(0, np.intp), 2)
-    assert slow.stepped == 1
-    assert asks == []  # action requests aren't requested
-    perceiver.set_requested(requested, np.ones(2, dtype=np.bool_))
-    assert [ask.action.kind for ask in perceiver.process_tick(both, np.zeros(0, np.intp), 10**9)[1]] == [
-        "squeeze"
-    ]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.field import LocatorBank, Rectangle
+from handtouch.field import Rectangle
 from handtouch.percept.action_request import expected_information_bits
 from handtouch.percept.classify import ShapeClassification, classify_shape, classify_shape_stepwise
 from handtouch.percept.pipeline import PerceptPipeline
@@ -210,12 +210,11 @@ def test_residual_distinguishes_points_from_elongated_contacts(residual: float, 
 @pytest.mark.parametrize("along_y", [False, True])
 def test_distance_of_two_points_follows_from_the_residual(along_y: bool) -> None:
     pad = Rectangle(1.0, 1.0)
-    bank = LocatorBank([pad])
     half = np.array([0.0, 0.05] if along_y else [0.05, 0.0])
     shares = (pad.fractions(np.array(0.5 + s * half[0]), np.array(0.5 + s * half[1])) / 2 for s in (-1, 1))
     pair = np.sum(list(shares), axis=0)
     residual = float(pair[0] + pair[1] - 0.5)  # in the middle a point gives a half
-    distance, std = pair_distance(bank, 0, 0.5, 0.5, residual, abs(residual) / 10)
+    distance, std = pair_distance(pad, 0.5, 0.5, residual, abs(residual) / 10)
     assert distance == pytest.approx(0.1, rel=0.02)
     assert std == pytest.approx(distance / 20)
-    assert math.isinf(pair_distance(bank, 0, 0.5, 0.5, residual, abs(residual))[1])
+    assert math.isinf(pair_distance(pad, 0.5, 0.5, residual, abs(residual))[1])

@@ -25,7 +25,7 @@ _ACTIONS = st.one_of(
         st.integers(0, 6_000_000),
     ),
     st.tuples(st.just("node"), st.sampled_from([PadState.LOST, PadState.FAULTED, PadState.OFF])),
-    st.tuples(st.just("request"), st.booleans(), st.booleans(), st.integers(1, 3)),
+    st.tuples(st.just("request"), st.booleans(), st.booleans(), st.integers(1, 3), st.booleans()),
     st.tuples(st.just("discard"), st.integers(0, 1)),
     st.tuples(st.just("solve")),
 )
@@ -39,9 +39,10 @@ def _do(hand: Any, action: tuple[Any, ...]) -> None:
     elif action[0] == "node":
         hand.step({}, node_state=int(action[1]))
     elif action[0] == "request":
-        _, position, force, every = action
+        _, position, force, every, motion = action
         requested = np.array([position, True]), np.array([force, True])
         tick.set_requested(*requested, np.array([every, 1]))
+        tick.slip.set_requested(np.array([motion, True]))
     elif action[0] == "discard":
         tick.discard_solutions(np.array([action[1]]))
     else:
@@ -60,6 +61,7 @@ def test_a_restored_pipeline_continues_as_the_saved_one(
     make_hand: Callable[..., Any], before: list[Any], after: list[Any]
 ) -> None:
     first, second = make_hand(), make_hand()
+    first.pipeline.tick.slip.set_requested(np.ones(2, dtype=np.bool_))
     for action in before:
         _do(first, action)
     state.restore(second.pipeline, state.unpack(state.pack(state.save(first.pipeline))))

@@ -44,7 +44,7 @@ def test_every_map_of_the_schema_has_its_table() -> None:
         assert selections in ([""], [" required", " optional"]), name
 
 
-@pytest.mark.parametrize("kind", [topic.payload for topic in wire.TOPICS])
+@pytest.mark.parametrize("kind", [topic.payload for topic in (*wire.TOPICS, *wire.INTERNAL_TOPICS)])
 def test_every_field_has_a_meaning(kind: type[Any]) -> None:
     without = {field.name for field in declared_fields(kind) if not field.meaning}
     assert without == ENVELOPE - {"t_ns"}

@@ -48,7 +48,7 @@ def _messages(draw: st.DrawFn, kind: type[Any]) -> Any:
     return kind(**{**values, "v": wire.SCHEMA_VERSION})
 
 
-any_message = st.one_of(*(_messages(topic.payload) for topic in wire.TOPICS))
+any_message = st.one_of(*(_messages(topic.payload) for topic in (*wire.TOPICS, *wire.INTERNAL_TOPICS)))
 
 
 @given(any_message)

@@ -21,7 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-STAGES = ("tables", "tolerances", "locate", "force", "place", "solve", "receive")
+STAGES = ("tables", "tolerances", "locate", "force", "place", "solve", "slip", "receive")
 """Modules of `handtouch.core.stages`, lowest first."""
 DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"
 """Environment variable that makes Python run the sources, for debugging."""

@@ -51,6 +51,8 @@ class Pipeline:
         """ticks per hand frame"""
         self.on_tick_computed: Callable[[], None] = lambda: None
         """called between a tick and its messages, to measure time"""
+        self.on_messages_queued: Callable[[], None] = lambda: None
+        """called after the messages of a tick, to send them before what can wait is computed"""
         self.external_inputs = ExternalInputs()
         """reference forces and gravity, applied when the next cycle begins"""
         self._sink = sink
@@ -69,15 +71,15 @@ class Pipeline:
     def apply_demand(self, requested: RequestedOutputs) -> None:
         """Compute the requested outputs only."""
         self.tick.set_requested(requested.position, requested.force, requested.interval_ticks)
+        self.tick.slip.set_requested(requested.motion)
         self.transforms.set_requested(requested.palm, requested.base)
 
-    def begin_cycle(self, sync_ns: int, now_ns: int) -> None:
+    def begin_cycle(self, sync_ns: int, now_ns: int) -> TickResult | None:
         """Begin a cycle at a SYNC, sent or received: samples that arrived since `sync_ns` belong to it.
 
-        If the tick of the previous cycle is still due, it runs first.
+        If the tick of the previous cycle is still due, it runs first; its result is returned.
         """
-        if not self.cycle.ticked:
-            self._run_tick(now_ns, sync_ns)
+        late = None if self.cycle.ticked else self._run_tick(now_ns, sync_ns)
         self.prepare_next_tick()
         self.journal.publish_changed_state(now_ns)
         self.external_inputs.apply(self.tick)  # after the state: it doesn't contain them yet
@@ -85,6 +87,7 @@ class Pipeline:
         self.cycle.begin_cycle(sync_ns)
         self._expected_pads = self.tick.expected_pads()
         self._expected_count = int(np.count_nonzero(self._expected_pads))
+        return late
 
     def tick_if_due(self, now_ns: int) -> TickResult | None:
         """Run the tick and send its messages if all expected samples have arrived or their window is over."""
@@ -130,6 +133,8 @@ class Pipeline:
         if self.ticks % self.ticks_per_hand_frame == 0:
             self.messages.send_hand_frames(self.slab, self.ticks, self.cycle.sync_ns, self._sink)
         self.journal.publish_tick_inputs(now_ns, until_ns)
+        self.on_messages_queued()
+        self.tick.detect_slips(result)
         return result
 
     def _samples_complete(self) -> bool:

@@ -178,6 +178,13 @@ class RequestedOutputs(NamedTuple):
     action_requests: BoolArray | None = None
     """pads that may get action requests"""
 
+    @property
+    def motion(self) -> BoolArray:
+        """Pads (n,) whose slip and lift-off are detected."""
+        if self.percepts is None:
+            return np.zeros(len(self.position), dtype=np.bool_)
+        return np.asarray(self.percepts[PERCEPT_KINDS.index("motion")])
+
 
 class Demand:
     """Scenes joined with subscriptions; call `update` after every tick: it calls `apply` after changes.

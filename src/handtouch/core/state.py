@@ -20,6 +20,7 @@ import numpy as np
 
 from handtouch.core.contact_solver import ContactSolver
 from handtouch.core.slab import Slab
+from handtouch.core.stages.slip import SlipStage
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw
 from handtouch.hand import PadGeometry
@@ -37,7 +38,7 @@ _IMMUTABLE_TYPES = (
     partial,
 )
 _DERIVED_TYPES = (
-    *(LocatorBank, ContactSolver),
+    *(LocatorBank, ContactSolver, SlipStage),
     *(PadGeometry, ContactLaw, RobotModels),
 )
 """Follow from the deployment."""

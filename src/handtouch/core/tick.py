@@ -20,6 +20,7 @@ from handtouch.core.cycle import Cycle
 from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import ForceReference, ForceReliability, SheetForceCompensation
 from handtouch.core.slab import Slab
+from handtouch.core.slip import SlipDetector
 from handtouch.field.contact_law import ForceEstimateStatus
 from handtouch.wire import PadState
 
@@ -174,6 +175,14 @@ class TickProcessor:
         """counts of untouched pads"""
         self.sheet_force = SheetForceCompensation(model.behaviours, period_ns)
         """compensation of creep, adaptation and hysteresis"""
+        self.slip = SlipDetector(
+            period_ns * 1e-9,
+            self.columns.values,
+            self.columns.total_current_a,
+            self.columns.sample_ns,
+            self.contacts.id,
+        )
+        """slip and lift-off of contacts, where requested"""
         self._contact_rows = self.columns.contact_columns.view("<f4").reshape(model.size, -1)
         self._no_pads = np.zeros(model.size, dtype=np.bool_)
         self._sampled, self._trusted = self._no_pads.copy(), self._no_pads.copy()  # of the last tick
@@ -275,6 +284,7 @@ class TickProcessor:
         """Discard the contact values of these pads, because what they are computed from changed."""
         self.solved[pads] = False
         self.state_changed = True
+        self.slip.restart_contacts(pads)  # a position that a new calibration moves doesn't slip
         np.greater(self.force_requested, self.model.quarantined, out=self._estimate_force)
         self.columns.values[pads] = self._contact_rows[pads] = np.nan
         self.columns.uncompensated_force_n[pads] = np.nan
@@ -439,6 +449,11 @@ class TickProcessor:
         columns.force_n[pads], columns.force_std_n[pads] = force, std
         columns.contact_columns["force_n"][pads] = force
         self.columns.contact_columns["force_std_n"][pads] = np.where(np.isfinite(std), std, np.nan)
+
+    def detect_slips(self, result: TickResult) -> None:
+        """Detect slip and lift-off of a tick's contacts; call it once the tick's messages are out."""
+        if self.slip.any_requested:
+            self.slip.detect_slips(np.concatenate([result.began, result.updated]))
 
     def prepare_next_tick(self) -> None:
         """Update the baseline. Call between two ticks, off the critical path: it changes no contact."""

@@ -294,6 +294,8 @@ class ControlCommands:
         self.deployment = change.deployment
         if self._reporter.supervisor is not None and change.changed_keys_of_pad:
             self._reporter.supervisor.restart_with(change.deployment, now_ns)
+        if self._reporter.percepts is not None and change.changed_keys_of_pad:
+            self._reporter.percepts.restart_with(change.deployment, now_ns)
         files = deployment_files(change.deployment)
         self._pipeline.journal.publish_config(change.deployment, files, build_info(), now_ns)
         self._demand.scenes.set_file(change.deployment.scene)

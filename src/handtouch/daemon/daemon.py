@@ -42,6 +42,7 @@ from handtouch.core.scene import (
     RequestedOutputs,
     SceneRequirements,
 )
+from handtouch.core.tick import TickResult
 from handtouch.daemon import stage_timer
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.commands import ControlCommands
@@ -106,13 +107,15 @@ class HandtouchDaemon:
         self.inputs, self.ports, self.pipeline = resources.inputs, resources.ports, resources.pipeline
         self._stack = resources.stack
         self._next_background_ns = 0
+        self._sent_ns = 0  # when the last tick's messages were sent
         settings, pipeline, inputs, publisher = deployment.daemon, self.pipeline, self.inputs, self.publisher
         period_ns, session = pipeline.cycle.period_ns, publisher.session
         self._busy_poll = BusyPoll(round(settings.busy_poll_us * 1e3))
         pipeline.transforms.joints_at = inputs.joints_at
         self.joint_publisher = JointPublisher(robots, inputs.joints_at, publisher, session)
         self.gravity = GravityTracker(robots, pipeline.model.size, inputs.joints_at, inputs.gravity_direction)
-        self.percepts = PerceptPublisher(pipeline, publisher, session, inputs.commanded_joints_at)
+        self.percepts = PerceptPublisher(deployment, pipeline, publisher, session, inputs.commanded_joints_at)
+        self._stack.callback(self.percepts.close)
         self.master = Master(self.ports, self._node_specs(), period_ns)
         self.sync = Sync(list(self.ports.values()), period_ns)
         self.supervisor = self._build_supervisor(folder)
@@ -129,6 +132,7 @@ class HandtouchDaemon:
             refusals=self._refusals,
             input_statistics=inputs.statistics,
             supervisor=self.supervisor,
+            percepts=self.percepts.client,
             on_message=on_message,
         )
         scenes = ActiveScenes(deployment.scene, pad_names(deployment))
@@ -238,6 +242,7 @@ class HandtouchDaemon:
             self.master.stop(now_ns)
             if self.supervisor is not None:
                 self.supervisor.close()
+            self.percepts.close()
             gc.unfreeze()
 
     def _loop(self, stop: threading.Event, on_tick: Callable[[int], None]) -> None:
@@ -249,6 +254,7 @@ class HandtouchDaemon:
         busy_poll = self._busy_poll
         sync, sampling, master, stages = self.sync, self.sampling, self.master, self.reporter.stage_timer
         pipeline.on_tick_computed = self._on_tick_computed
+        pipeline.on_messages_queued = self._on_messages_queued
         pause = LoopPause(sync.period_ns)
         sync.start(time.monotonic_ns())
         stages.start(time.monotonic_ns())
@@ -279,16 +285,9 @@ class HandtouchDaemon:
             if ticked is None and sampling.slow_sync and pipeline.slab.fresh_count:
                 ticked = pipeline.tick_without_sync(now_ns)
             if ticked is not None:
-                sent = self.publisher.release()
-                sent_ns = time.monotonic_ns()
-                stages.lap(stage_timer.SEND, sent_ns)
-                self.reporter.record_tick(now_ns, sent_ns)
-                if sent:
-                    self._yield_processor()
+                self.reporter.record_tick(now_ns, self._sent_ns)
                 busy_poll.update_usual_latency(cycle.sync_ns, int(pipeline.slab.arrival_ns.max()))
-                if self.percepts.enabled:
-                    self.percepts.process_tick(ticked)
-                    stages.lap(stage_timer.PERCEIVE, time.monotonic_ns())
+                self._process_percepts(ticked)
                 self._after_tick(on_tick)
             elif now_ns >= master.wake_ns:
                 master.poll(self._received_until_ns)
@@ -296,6 +295,19 @@ class HandtouchDaemon:
     def _on_tick_computed(self) -> None:
         self.reporter.stage_timer.lap(stage_timer.TICK, time.monotonic_ns())
         self.publisher.hold()
+
+    def _on_messages_queued(self) -> None:
+        sent = self.publisher.release()
+        self._sent_ns = time.monotonic_ns()
+        self.reporter.stage_timer.lap(stage_timer.SEND, self._sent_ns)
+        if sent:
+            self._yield_processor()
+
+    def _process_percepts(self, ticked: TickResult) -> None:
+        if self.percepts.enabled:
+            now_ns = time.monotonic_ns()
+            self.percepts.process_tick(ticked, now_ns)
+            self.reporter.stage_timer.lap(stage_timer.PERCEIVE, time.monotonic_ns())
 
     def _yield_processor(self) -> None:
         """Let the threads run that transport messages, if they wait for this CPU."""
@@ -309,8 +321,9 @@ class HandtouchDaemon:
         self.inputs.poll(now_ns)  # before the journal records the inputs of the next tick
         if (gravity := self.gravity.update_directions(now_ns)) is not None:
             self.pipeline.external_inputs.set_gravity(gravity)
-        self.pipeline.begin_cycle(sync_ns, now_ns)
-        self.publisher.release()
+        late = self.pipeline.begin_cycle(sync_ns, now_ns)
+        if late is not None:
+            self._process_percepts(late)
         self.reporter.stage_timer.lap(stage_timer.SYNC, time.monotonic_ns())
 
     def _receive_frames(self, ports: list[Port]) -> None:
@@ -340,7 +353,7 @@ class HandtouchDaemon:
     ) -> None:
         """Apply the outputs that scenes and subscriptions request."""
         self.pipeline.apply_demand(requested)
-        self.percepts.set_requested(requested)
+        self.percepts.set_requested(requested, now_ns)
         self.pipeline.ticks_per_hand_frame = self.demand.ticks_per_hand_frame
         self._raw_pads = needs.raw
         if self.supervisor is None:

@@ -26,6 +26,7 @@ from handtouch.config import Deployment
 from handtouch.core.compiled import Compilation
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.pad_explanation import explain_pad_state
+from handtouch.daemon.percept_client import PerceptClient
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.stage_timer import StageTimer
 from handtouch.daemon.supervisor_client import SupervisorClient
@@ -78,6 +79,7 @@ class StatusReporter:
         refusals: Callable[[], Mapping[str, int]],
         input_statistics: Callable[[int], dict[str, Any]],
         supervisor: SupervisorClient | None = None,
+        percepts: PerceptClient | None = None,
         on_message: Callable[[wire.Health | wire.Service], None] | None = None,
     ) -> None:
         n = pipeline.model.size
@@ -89,6 +91,7 @@ class StatusReporter:
         self._publisher = publisher
         self._wall_offset_ns, self._process_statistics = wall_offset_ns, process_statistics
         self._refusals, self._input_statistics = refusals, input_statistics
+        self.percepts = percepts
         self._on_message = on_message
         self.supervisor = supervisor
         self._pads = deployment.pads
@@ -339,6 +342,7 @@ class StatusReporter:
             ),
             retained=False,
             supervisor=self.supervisor.statistics() if self.supervisor is not None else None,
+            percepts=self.percepts.statistics() if self.percepts is not None else None,
             inputs=self._input_statistics(now_ns),
         )
 

@@ -1,6 +1,6 @@
 """The daemon's side of supervision: sends blocks of ticks to the supervisor process and applies its results.
 
-Public name: `SupervisorClient`. Everything here runs in the hot thread; `SupervisorProcess` runs the process.
+Public name: `SupervisorClient`. Everything here runs in the hot thread; `ChildProcess` runs the process.
 A replaced node is quarantined here at once, whether the supervisor process is running or not.
 """
 
@@ -24,8 +24,8 @@ from handtouch.canbus.nodes.master import (
 from handtouch.config import Deployment
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.block_buffer import BlockBuffer
+from handtouch.daemon.child_process import ChildProcess
 from handtouch.daemon.excitation import ExcitationSchedule
-from handtouch.daemon.supervisor_process import SupervisorProcess
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
@@ -70,14 +70,16 @@ class SupervisorClient:
         pipeline: Pipeline,
         master: Master,
         store: str,
-        process: SupervisorProcess | None = None,
+        process: ChildProcess | None = None,
         on_excitation_changed: Callable[[int], None] = lambda _: None,
     ) -> None:
         self._pipeline, self._master = pipeline, master
         self._pads = deployment.pads
         self._store = store
         self._start_message = self._make_start_message(deployment)
-        self.process = process or SupervisorProcess(lambda: self._start_message.dump())
+        self.process = process or ChildProcess(
+            "handtouch.supervisor.child", "supervisor", lambda: self._start_message.dump()
+        )
         self.assessments: list[CalibrationAssessment | None] = [None] * pipeline.model.size
         self.malformed = self.late = 0
         self.changed_pads: set[int] = set()

@@ -1,6 +1,8 @@
 """Pipeline of percept estimators: per-tick updates, one slow fit at a time, and action requests.
 
-Public names: `PerceptPipeline`.
+A new kind of percept is added in `PerceptPipeline.build`.
+
+Public name: `PerceptPipeline`.
 """
 
 from __future__ import annotations
@@ -18,6 +20,10 @@ from handtouch.percept.samples import (
     PerceptEstimate,
     PerceptEstimator,
 )
+from handtouch.percept.shape import PairDistanceFunction, ShapeEstimator
+from handtouch.percept.slip_questions import slip_questions
+from handtouch.percept.stiffness_estimator import StiffnessEstimator
+from handtouch.percept.texture import TextureEstimator
 from handtouch.wire import PERCEPT_KINDS
 
 _FIT_PERIOD_NS = 10_000_000
@@ -33,6 +39,8 @@ class PerceptPipeline:
     def __init__(self, buffer: ContactBuffer, estimators: Sequence[PerceptEstimator]) -> None:
         self.buffer = buffer
         self.estimators = list(estimators)
+        self.motion_pads = np.zeros(buffer.size, dtype=np.bool_)
+        """pads (n,) whose motion is requested; the core detects it, here it only raises questions"""
         self.action_selector = ActionSelector()
         self.action_request_pads = np.zeros(buffer.size, dtype=np.bool_)
         """pads (n,) about which actions may be requested"""
@@ -41,11 +49,23 @@ class PerceptPipeline:
         self._last_fit_ns = 0
         self._next_estimator = 0  # the first to offer a fit
 
+    @classmethod
+    def build(cls, buffer: ContactBuffer, pair_m: PairDistanceFunction | None = None) -> PerceptPipeline:
+        """Return a pipeline of all estimators. pair_m: see `ShapeEstimator`."""
+        parts = (
+            StiffnessEstimator(buffer.size),
+            ShapeEstimator(buffer.size, pair_m=pair_m),
+            TextureEstimator(buffer.size),
+        )
+        return cls(buffer, parts)
+
     def set_requested(self, requested: NDArray[np.bool_], action_request_pads: NDArray[np.bool_]) -> None:
         """Set the pads of each estimator (kinds, n), rows as PERCEPT_KINDS, and those of action requests
         (n,).
         """
-        changed = np.zeros(self.buffer.size, dtype=np.bool_)
+        motion = requested[PERCEPT_KINDS.index("motion")]
+        changed = motion != self.motion_pads
+        self.motion_pads = motion.copy()
         for estimator in self.estimators:
             pads = requested[PERCEPT_KINDS.index(estimator.kind)]
             changed |= pads != estimator.requested
@@ -109,8 +129,8 @@ class PerceptPipeline:
             for estimator in self.estimators
             if estimator.requested.any()
             for question in estimator.open_questions(tick_ns)
-            if self._is_requested(question)
-        ]
+        ] + slip_questions(self.buffer, self.motion_pads)
+        questions = [question for question in questions if self._is_requested(question)]
         return self.action_selector.select_requests(questions, tick_ns)
 
     def _is_requested(self, question: Question) -> bool:

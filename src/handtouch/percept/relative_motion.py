@@ -1,6 +1,6 @@
 """Velocity of a link's surface relative to the object it touches, from joint states and other contacts.
 
-Public names: `LinkMotions`, `relative_to_object`, `RelativeMotion`.
+Public names: `LinkMotions`, `relative_to_object`, `RelativeMotion`, `VELOCITY_WINDOW_S`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from handtouch.percept.samples import ContactBuffer, IntArray
 
 FloatArray = NDArray[np.float64]
-_VELOCITY_WINDOW_S = 0.05  # over which velocities are measured
+VELOCITY_WINDOW_S = 0.05
+"""Time over which velocities of links are measured."""
 _LINK_VELOCITY_STD_M_PER_S = 1e-3  # from the elasticity of links
 _OBJECT_ROTATION_STD_RAD_PER_S, _OBJECT_VELOCITY_STD_M_PER_S = (
     3.0,
@@ -72,7 +73,7 @@ class LinkMotions(NamedTuple):
         if not len(pads):  # common case: no joint states
             none = np.zeros((0, 3))
             return cls(pads, none, none, none, np.zeros(0))
-        back = np.minimum(max(round(_VELOCITY_WINDOW_S / period_s), 1), buffer.sample_count[pads] - 1)
+        back = np.minimum(max(round(VELOCITY_WINDOW_S / period_s), 1), buffer.sample_count[pads] - 1)
         last_ns, then_ns = buffer.latest_sample_ns(pads), buffer.latest_sample_ns(pads, back)
         palm, link, normal = (
             buffer.latest_field(pads, name) for name in ("palm_position_m", "position_m", "palm_normal")
@@ -84,7 +85,7 @@ class LinkMotions(NamedTuple):
         moved = palm - was - (rotation @ (link - was_on_link)[:, :, None])[:, :, 0]
         known = (
             np.isfinite(moved).all(axis=1)
-            & (now_ns - last_ns <= _VELOCITY_WINDOW_S * 1e9)
+            & (now_ns - last_ns <= VELOCITY_WINDOW_S * 1e9)
             & (last_ns > then_ns)
         )
         over_s = (last_ns - then_ns)[known] * 1e-9

@@ -40,6 +40,9 @@ SAMPLE_FIELDS: dict[str, tuple[int, ...]] = {
     "palm_rotation": (3, 3),  # of the link frame in the palm frame
     "palm_joints_m2": (),  # contribution of joints to palm_covariance_m2, mean per axis
     "joints_age_s": (),
+    "slip_log_odds": (),  # ln of the odds of slip; infinite while it slips
+    "slip_velocity_m_per_s": (2,),  # on the pad, where slip is likely
+    "tremor_std_m": (2,),  # as learnt
     "commanded_m": (),  # commanded displacement of the link along the normal since the contact began
     "commanded_normal": (3,),  # in the palm frame, at the commanded joint positions
 }

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.field.bank import LocatorBank
+from handtouch.field import estimate
+from handtouch.field.model import ForwardModel
 from handtouch.percept.action_request import CandidateAction, Question
 from handtouch.percept.classify import ShapeClassification, classify_shape_stepwise
 from handtouch.percept.primitives import SHAPE_CLASSES, SIZE_PARAMETERS, ShapePrior
@@ -69,7 +70,7 @@ def spot_probabilities(residual: FloatArray, residual_std: FloatArray) -> dict[s
 
 
 def pair_distance(
-    bank: LocatorBank, pad: int, x: float, y: float, residual: float, residual_std: float
+    network: ForwardModel, x: float, y: float, residual: float, residual_std: float
 ) -> tuple[float, float]:
     """Return the distance of two equal points about (x, y) on a pad that leave this residual, and its
     deviation.
@@ -78,13 +79,13 @@ def pair_distance(
     smallest extent that explains the residual. The deviation is infinite where the residual doesn't differ
     significantly from 0.
     """
-    at, side = np.array([x, y]), bank.sides[pad]
+    at, side = np.array([x, y]), np.array([network.a, network.b])
     axis = 0 if residual >= 0 else 1
     half = 0.05 * float(min(side.min(), 2 * at[axis], 2 * (side - at)[axis]))
     xs, ys = at[:, None] + half * np.eye(2)[axis][:, None] * [-1.0, 1.0]
-    pair = bank.fractions(np.full(2, pad), xs, ys).mean(axis=1, keepdims=True)
-    found = bank.estimate(np.array([pad]), pair, 1e-6, start=at[:, None])
-    point = bank.fractions(np.array([pad]), found.x, found.y)
+    pair = network.fractions(xs, ys).mean(axis=1)
+    found = estimate(network, pair, 1e-6, at)
+    point = network.fractions(found.x, found.y)
     known = abs(float((pair - point)[:2].sum()))  # grows as the square of the distance
     distance = 2 * half * math.sqrt(abs(residual) / max(known, 1e-12))
     determined = abs(residual) > 2 * residual_std

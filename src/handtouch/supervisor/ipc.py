@@ -23,8 +23,6 @@ from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN
 from handtouch.config import Deployment, Table
 from handtouch.wire.diagnosis import Diagnosis
 
-MAX_WORKER_MESSAGE_BYTES = 32_768
-"""Longer messages of the supervisor process are not read."""
 MAX_DIAGNOSES = 8
 """Number of diagnoses of one pad in a message."""
 MAX_TEXT = 1000

@@ -2,7 +2,7 @@
 
 Import all names from here, but those of inputs from `handtouch.wire.inputs`. Payloads about contacts:
 `Contact`, `HandFrame`, `Percept`; about pads, joints and the daemon: `Health`, `JointPositions`, `Service`;
-for recorders: `Raw`, `TickInputs`, `StateSnapshot`, `Config`.
+for recorders: `Raw`, `TickInputs`, `StateSnapshot`, `Config`; for the percept process: `PerceptInput`.
 
 docs/wire.md describes every field for readers in other languages. SI units; `t_ns` is of the host's monotonic
 clock; an unknown number is nil, never NaN. Optional fields are left out where they have their default.
@@ -30,6 +30,7 @@ from handtouch.wire.contact import (
     Vector3,
 )
 from handtouch.wire.health import Health, JointPositions, NodeStateName
+from handtouch.wire.percept_input import PerceptInput
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.sequence import SequenceTracker
 from handtouch.wire.service import Service
@@ -37,6 +38,7 @@ from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PadStateNa
 from handtouch.wire.topics import (
     COLUMNS,
     HEALTH,
+    INTERNAL_TOPICS,
     JOINTS,
     SERVICE,
     TOPICS,
@@ -51,6 +53,7 @@ from handtouch.wire.topics import (
 __all__ = [
     "COLUMNS",
     "HEALTH",
+    "INTERNAL_TOPICS",
     "JOINTS",
     "PERCEPT_KINDS",
     "SCHEMA_VERSION",
@@ -74,6 +77,7 @@ __all__ = [
     "PadState",
     "PadStateName",
     "Percept",
+    "PerceptInput",
     "PerceptKind",
     "PositionStatus",
     "Raw",

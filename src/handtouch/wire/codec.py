@@ -13,7 +13,16 @@ from typing import Any, Literal, NamedTuple, Union
 
 import msgpack
 
-from handtouch.wire.topics import COLUMNS, TOPICS, EncodedMessage, Message, OutgoingMessage, Topic, topic_of
+from handtouch.wire.topics import (
+    COLUMNS,
+    INTERNAL_TOPICS,
+    TOPICS,
+    EncodedMessage,
+    Message,
+    OutgoingMessage,
+    Topic,
+    topic_of,
+)
 
 SCHEMA_VERSION = 1
 """Rules for raising it: docs/wire.md, "Versions"."""
@@ -27,10 +36,11 @@ class UnknownTopicError(WireError):
     """A message of no known topic; the text lists the topics."""
 
 
-_TOPIC_OF_PREFIX = {topic.prefix: topic for topic in TOPICS}
+_ALL_TOPICS = (*TOPICS, *INTERNAL_TOPICS)
+_TOPIC_OF_PREFIX = {topic.prefix: topic for topic in _ALL_TOPICS}
 _DEFAULTS = {
     topic.payload: {f.name: f.default for f in fields(topic.payload) if f.default is not MISSING}
-    for topic in TOPICS
+    for topic in _ALL_TOPICS
 }
 _FIELDS = {
     kind: (names := [f.name for f in fields(kind) if f.name not in defaults], attrgetter(*names))
@@ -108,7 +118,7 @@ def unpack(parts: Sequence[bytes], topics: Mapping[str, Topic]) -> Received:
     prefix, *keys = name.split("/")
     topic = topics.get(prefix)
     if topic is None or len(keys) != len(topic.keys) or not all(keys):
-        known = ", ".join(t.pattern for t in topics.values())
+        known = ", ".join(t.pattern for t in topics.values() if t not in INTERNAL_TOPICS)
         raise UnknownTopicError(f"unknown topic {name[:80]!r}; the topics are {known}")
     try:
         payload = msgpack.unpackb(parts[1])

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-_TYPE_NAMES = {"<u1": "uint8", "<u4": "uint32", "<i8": "int64", "<f4": "float32"}
+_TYPE_NAMES = {"<u1": "uint8", "<u4": "uint32", "<i8": "int64", "<f4": "float32", "<f8": "float64"}
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Column:
     """Layout of a column."""
 
     dtype: str
-    """numpy name of the element type, little-endian: <u1, <u4, <i8 or <f4"""
+    """numpy name of the element type, little-endian: <u1, <u4, <i8, <f4 or <f8"""
     elements: int = 1
     """per row"""
     codes: type[IntEnum] | None = None
@@ -32,7 +32,7 @@ class Column:
 
     @property
     def type_name(self) -> str:
-        """Name of the element type: uint8, uint32, int64 or float32."""
+        """Name of the element type: uint8, uint32, int64, float32 or float64."""
         return _TYPE_NAMES[self.dtype]
 
     @property

@@ -155,6 +155,26 @@ class SupervisorStatistics(TypedDict):
     """fault of the calibration store; empty without one"""
 
 
+class PerceptStatistics(TypedDict):
+    """`percepts`: the percept process."""
+
+    state: Literal["stopped", "starting", "running", "waiting"]
+    """state of the process: `stopped` while no percept is requested that needs it, `starting`, `running`,
+    `waiting` for its next restart"""
+    pid: int | None
+    """its process id"""
+    restarts: int
+    """restarts after it exited or hung"""
+    exit_reason: str
+    """reason of the last exit"""
+    lag_s: float | None
+    """how far it is behind the tick"""
+    dropped: int
+    """`percept_input` messages dropped because its queue was full"""
+    malformed: int
+    """malformed messages from it"""
+
+
 @dataclass(frozen=True, slots=True)
 class Service:
     """`service`: the daemon's heartbeat, twice a second; after three missed ones it is disconnected."""
@@ -205,6 +225,8 @@ class Service:
     retained: bool
     supervisor: Annotated[dict[str, Any], SupervisorStatistics] | None = None
     """the supervisor process; absent without supervision"""
+    percepts: Annotated[dict[str, Any], PerceptStatistics] | None = None
+    """the percept process"""
     inputs: Annotated[dict[str, Any], InputStatistics] | None = None
     """statistics of the inputs endpoint"""
     stopping: bool = False

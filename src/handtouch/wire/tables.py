@@ -2,8 +2,9 @@
 
 Public names: `with_tables`. `python -m handtouch.wire.tables docs` writes both files in a folder.
 
-The page marks each table by a comment: `<!-- table: NAME -->` with `topics`, `status codes` or the name of a
-class; `required` or `optional` after it selects the keys that are always present, or the others.
+The page marks each table by a comment: `<!-- table: NAME -->` with `topics`, `internal topics`,
+`status codes` or the name of a class; `required` or `optional` after it selects the keys that are always
+present, or the others.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from handtouch.wire.declarations import (
 from handtouch.wire.inputs import INPUT_TOPICS
 from handtouch.wire.schema import json_schema
 from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus
-from handtouch.wire.topics import TOPICS
+from handtouch.wire.topics import INTERNAL_TOPICS, TOPICS, Topic
 
 _TABLE = re.compile(r"(?<=<!-- table: )([\w ]+?)(?: (required|optional))?( -->\n)(?:\|.*\n)*")
 _ENVELOPE = ("v", "session", "seq", "t_ns", "retained")
@@ -50,7 +51,9 @@ def with_tables(page: str) -> str:
 
 def _table(name: str, selection: str | None) -> str:
     if name == "topics":
-        return _format_table(("topic", "published", "time in `t_ns`"), _topic_rows())
+        return _format_table(("topic", "published", "time in `t_ns`"), _topic_rows(TOPICS))
+    if name == "internal topics":
+        return _format_table(("topic", "sent", "time in `t_ns`"), _topic_rows(INTERNAL_TOPICS))
     if name == "status codes":
         return _format_table(("code", *_STATUS_HEADS), _status_rows())
     rows = (
@@ -70,8 +73,8 @@ def _format_table(head: Sequence[str], rows: Iterator[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n".replace("  ", " ") for cells in lines)
 
 
-def _topic_rows() -> Iterator[Sequence[str]]:
-    for topic in TOPICS:
+def _topic_rows(topics: Sequence[Topic]) -> Iterator[Sequence[str]]:
+    for topic in topics:
         name = "/".join([topic.prefix, *(f"<{key}>" for key in topic.keys)])
         t_ns = next(field for field in declared_fields(topic.payload) if field.name == "t_ns")
         yield f"`{name}`", topic.published, t_ns.meaning
@@ -127,7 +130,7 @@ def _fields_by_class() -> dict[str, tuple[FieldDeclaration, ...]]:
             for inner in _classes_in(field.hint):
                 add(inner, inner_fields(inner))
 
-    for topic in TOPICS:
+    for topic in (*TOPICS, *INTERNAL_TOPICS):
         fields = declared_fields(topic.payload)
         add(topic.payload, tuple(field for field in fields if field.name not in _ENVELOPE))
     for topic in INPUT_TOPICS:

@@ -1,7 +1,7 @@
 """The table of topics: payload, keys and rate of each; everything else about topics is derived from it.
 
-Public names: `Topic`, `TOPICS`, `COLUMNS`, `HEALTH`, `JOINTS`, `SERVICE`, `topic_of`, `topics_of`,
-`EncodedMessage`, `Message`, `OutgoingMessage`.
+Public names: `Topic`, `TOPICS`, `INTERNAL_TOPICS`, `COLUMNS`, `HEALTH`, `JOINTS`, `SERVICE`, `topic_of`,
+`topics_of`, `EncodedMessage`, `Message`, `OutgoingMessage`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, cast
 from handtouch.wire.columns import Column, columns_of
 from handtouch.wire.contact import ACTION_REQUEST, PERCEPT_KINDS, Contact, HandFrame, Percept
 from handtouch.wire.health import Health, JointPositions
+from handtouch.wire.percept_input import PerceptInput
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.service import Service
 
@@ -32,6 +33,7 @@ Message = (
     | HandFrame
     | Health
     | Percept
+    | PerceptInput
     | Raw
     | JointPositions
     | Service
@@ -101,11 +103,15 @@ TOPICS = (
     Topic("state", StateSnapshot, (), "on subscription, and when an event other than a tick changes it"),
     Topic("config", Config, (), "on subscription, and on reload"),
 )
+INTERNAL_TOPICS = (
+    Topic("percept_input", PerceptInput, ("hand",), "per tick with contacts, else 20 times a second"),
+)
+"""Topics between processes of the daemon; no client can subscribe to them."""
 COLUMNS: dict[type[Any], dict[str, Column]] = {
-    topic.payload: columns for topic in TOPICS if (columns := columns_of(topic.payload))
+    topic.payload: columns for topic in (*TOPICS, *INTERNAL_TOPICS) if (columns := columns_of(topic.payload))
 }
 """Payload -> its columns by name."""
-_FORMATTERS = {topic.payload: topic.formatter() for topic in TOPICS}
+_FORMATTERS = {topic.payload: topic.formatter() for topic in (*TOPICS, *INTERNAL_TOPICS)}
 
 
 def topics_of(hands: Mapping[str, Sequence[str]]) -> list[str]:

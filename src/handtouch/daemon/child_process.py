@@ -1,11 +1,12 @@
-"""The supervisor process: started by a helper thread; the hot thread exchanges messages without blocking.
+"""A child process of the daemon: a helper thread starts it, the hot thread exchanges messages with it.
 
-Public name: `SupervisorProcess`.
+Public name: `ChildProcess`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import queue
@@ -15,44 +16,50 @@ import sys
 import threading
 from collections.abc import Callable
 
-from handtouch.supervisor.ipc import MAX_WORKER_MESSAGE_BYTES
+from handtouch.host.child import MAX_CHILD_MESSAGE_BYTES
 
 _MIN_RESTART_DELAY_NS, _MAX_RESTART_DELAY_NS = 1_000_000_000, 60_000_000_000
 _MIN_STABLE_UPTIME_NS = 60_000_000_000
 """After this uptime the restart delay starts at its minimum again"""
-_HANG_TIMEOUT_NS = 60_000_000_000
-"""Without a message for this long, the process counts as hung"""
 _SEND_BUFFER_BYTES = 1 << 20
-_MAX_MESSAGES_PER_POLL = 8
 _STOP_TIMEOUT_S = 2.0
-_log = logging.getLogger("handtouch.supervisor")
 
 
-class SupervisorProcess:
-    """Keeps `python -m handtouch.supervisor.child` running; `make_start_message` returns its configuration.
+class ChildProcess:
+    """Keeps `python -m MODULE` running, whose main is `host.child.run_child`.
+
+    `name` is that in logs, "supervisor" for instance. `make_start_message` returns its configuration, in the
+    helper thread. Without a message from it for `hang_timeout_ns`, it counts as hung and is killed.
 
     `restarts`: number of restarts; `dropped`: messages dropped because the process was too slow;
     `exit_reason`: reason of its last exit. Times in ns.
     """
 
-    def __init__(self, make_start_message: Callable[[], bytes]) -> None:
+    def __init__(
+        self,
+        module: str,
+        name: str,
+        make_start_message: Callable[[], bytes],
+        hang_timeout_ns: int = 60_000_000_000,
+    ) -> None:
         self.restarts = self.dropped = 0
         self.exit_reason = ""
-        self._make_start_message = make_start_message
+        self.enabled = False
+        """the process is kept running; set by `start` and `stop`"""
+        self._module, self._name = module, name
+        self._log = logging.getLogger(f"handtouch.{name}")
+        self._make_start_message, self._hang_timeout_ns = make_start_message, hang_timeout_ns
         self._cpus = os.sched_getaffinity(0)
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._helper_thread = threading.Thread(
-            target=self._run_tasks, name="handtouch-supervise", daemon=True
-        )
+        self._helper_thread = threading.Thread(target=self._run_tasks, name=f"handtouch-{name}", daemon=True)
         self._started: queue.SimpleQueue[tuple[subprocess.Popen[bytes], socket.socket] | None] = (
             queue.SimpleQueue()
         )
         self._starting = False
         self._started_ns = self._last_message_ns = self._next_start_ns = 0
         self._restart_delay_ns = _MIN_RESTART_DELAY_NS
-        self._enabled = False
 
     @property
     def pid(self) -> int | None:
@@ -62,14 +69,25 @@ class SupervisorProcess:
     @property
     def state(self) -> str:
         """running, starting, waiting (for the next restart) or stopped."""
-        if not self._enabled:
+        if not (self.enabled or self._starting):
             return "stopped"
         return "running" if self._socket is not None else "starting" if self._starting else "waiting"
 
     def start(self, now_ns: int) -> None:
         """Enable the process: `poll` starts it and keeps it running."""
-        self._enabled, self._next_start_ns = True, now_ns
-        self._helper_thread.start()  # now, as starting a thread blocks
+        self.enabled, self._next_start_ns = True, now_ns
+        if self._helper_thread.ident is None:
+            self._helper_thread.start()
+
+    def stop(self) -> None:
+        """Stop the process until `start` is called again; it is killed if that takes longer than 2 s."""
+        self.enabled = False
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+            process, self._process = self._process, None
+            assert process is not None
+            self._tasks.put(lambda: _wait_or_kill(process))
 
     def restart(self, now_ns: int) -> None:
         """Stop the process and start a new one at once: its configuration has changed."""
@@ -78,14 +96,20 @@ class SupervisorProcess:
             self._next_start_ns = now_ns
 
     def poll(self, now_ns: int) -> bool:
-        """Start, supervise and restart the process; return True if a new process has just started."""
+        """Start, supervise and restart the process; return True if a new process has just started.
+
+        Call it after `receive`: else messages that wait, as the daemon itself was paused, count as missing.
+        """
         if self._socket is not None:
-            if now_ns - self._last_message_ns > _HANG_TIMEOUT_NS:
-                self._discard_process("no message for 60 s", now_ns)
+            if now_ns - self._last_message_ns > self._hang_timeout_ns:
+                self._discard_process(f"no message for {self._hang_timeout_ns * 1e-9:.0f} s", now_ns)
             return False
         if self._starting:
-            return self._finish_start(now_ns)
-        if self._enabled and now_ns >= self._next_start_ns:
+            started = self._finish_start(now_ns)
+            if started and not self.enabled:
+                self.stop()
+            return started and self.enabled
+        if self.enabled and now_ns >= self._next_start_ns:
             self._starting = True
             self._tasks.put(self._start_process)
         return False
@@ -96,21 +120,21 @@ class SupervisorProcess:
             return False
         try:
             self._socket.send(message, socket.MSG_DONTWAIT)
-        except BlockingIOError:
-            self.dropped += 1
-            return False
-        except OSError:  # disconnected: `receive` handles it
+        except OSError as error:  # where it is disconnected, `receive` handles it
+            self.dropped += isinstance(error, BlockingIOError) or error.errno == errno.EMSGSIZE
             return False
         return True
 
-    def receive(self, now_ns: int) -> list[bytes]:
-        """Return waiting messages, a bounded number of them; one that is too long is truncated."""
+    def receive(self, now_ns: int, max_messages: int = 8) -> list[bytes]:
+        """Return waiting messages, `max_messages` at most; one that is too long is truncated."""
         messages: list[bytes] = []
-        while self._socket is not None and len(messages) < _MAX_MESSAGES_PER_POLL:
+        while self._socket is not None and len(messages) < max_messages:
             try:
-                data = self._socket.recv(MAX_WORKER_MESSAGE_BYTES, socket.MSG_DONTWAIT)
+                data = self._socket.recv(MAX_CHILD_MESSAGE_BYTES, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 break
+            except ConnectionResetError:  # it exited with messages unread
+                data = b""
             except OSError as error:
                 self._discard_process(str(error), now_ns)
                 break
@@ -123,7 +147,7 @@ class SupervisorProcess:
 
     def close(self) -> None:
         """Stop the process: it stores its data, and is killed if that takes longer than 2 s."""
-        self._enabled = False
+        self.enabled = False
         if self._helper_thread.ident is not None:
             self._tasks.put(None)
             self._helper_thread.join(_STOP_TIMEOUT_S)
@@ -132,11 +156,7 @@ class SupervisorProcess:
             self._socket.close()
             self._socket = None
         if self._process is not None:
-            try:
-                self._process.wait(_STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+            _wait_or_kill(self._process)
             self._process = None
 
     # Details ----------------------------------------------------------------------------------------------
@@ -153,7 +173,7 @@ class SupervisorProcess:
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
             ours.setblocking(False)
             cpus = ",".join(map(str, sorted(self._cpus)))
-            command = [sys.executable, "-m", "handtouch.supervisor.child", str(theirs.fileno()), cpus]
+            command = [sys.executable, "-m", self._module, str(theirs.fileno()), cpus]
             environment = {
                 name: value for name, value in os.environ.items()
                 if name not in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
@@ -202,8 +222,10 @@ class SupervisorProcess:
             status = process.wait()
             if not reason:
                 self.exit_reason = f"signal {-status}" if status < 0 else f"exit status {status}"
-            _log.error(
-                "supervisor process: exited (%s); restarting, contact output is unaffected", self.exit_reason
+            self._log.error(
+                "%s process: exited (%s); restarting, contact output is unaffected",
+                self._name,
+                self.exit_reason,
             )
 
         self._tasks.put(reap)
@@ -213,3 +235,12 @@ class SupervisorProcess:
         self.restarts += 1
         self._next_start_ns = now_ns + self._restart_delay_ns
         self._restart_delay_ns = min(2 * self._restart_delay_ns, _MAX_RESTART_DELAY_NS)
+
+
+def _wait_or_kill(process: subprocess.Popen[bytes]) -> None:
+    """Wait for the end of a process that has been asked to stop; kill it after 2 s."""
+    try:
+        process.wait(_STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
