@@ -32,6 +32,7 @@ from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel, networks_of
+from handtouch.hand import networks_with_other_parts
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
@@ -122,8 +123,9 @@ def learnt_gains(hand: VirtualHand, deployment: Deployment, model: PadModel, num
     period_s = deployment.daemon.sync_period_ms * 1e-3
     held = SAMPLE_S - period_s * np.arange(LEARNT_SAMPLES)[::-1]
     times_s = (REST_S + np.array(numbers)[:, None] * STEP_S + held).ravel()
-    for row, network in enumerate(networks_of(deployment)):
-        calibrator = AutoCalibrator(network)
+    for row, (network, (_, pad)) in enumerate(zip(networks_of(deployment), deployment.pads, strict=True)):
+        node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
+        calibrator = AutoCalibrator(network, networks_with_other_parts(pad, node, sheet))
         calibrator.assign_node(row + 1, None, None, "", 0)
         readings = hand.counts(row, times_s).reshape(len(numbers), LEARNT_SAMPLES, 4).mean(axis=1)
         noise_a = model.noise_a[row] / np.sqrt(LEARNT_SAMPLES)

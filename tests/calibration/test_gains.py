@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,7 +17,7 @@ from handtouch.calibration.gains import (
     fisher_covariance,
     gain_deviation,
 )
-from handtouch.field import ElectrodeNetwork, Rectangle
+from handtouch.field import Electrode, ElectrodeNetwork, Rectangle
 from handtouch.field.model import ForwardModel
 
 FloatArray = NDArray[np.float64]
@@ -42,7 +44,7 @@ def contacts(
     )
 
 
-def plain(model: ForwardModel = SQUARE, **options: float) -> GainEstimator:
+def plain(model: ForwardModel = SQUARE, **options: Any) -> GainEstimator:
     return GainEstimator(model, **{"drift_per_day": 0.0, "model_error": 0.0, **options})
 
 
@@ -229,7 +231,7 @@ def test_estimation_continues_from_stored_gains() -> None:
     first = plain()
     first.add_contacts(contacts(SQUARE, 320, 1e-3), 1e-3, 0)
     found = first.estimate
-    second = plain(start=found.gains, covariance=found.covariance)  # type: ignore[arg-type]
+    second = plain(start=found.gains, covariance=found.covariance)
     np.testing.assert_allclose(second.estimate.gains, found.gains, rtol=1e-12)
     np.testing.assert_allclose(second.estimate.covariance, found.covariance, rtol=1e-6, atol=1e-12)
     second.add_contacts(contacts(SQUARE, 320, 1e-3, seed=2), 1e-3, 5)
@@ -266,9 +268,35 @@ def test_any_currents_give_finite_estimates(readings: list[list[float]]) -> None
         ({"start": (1.0, 1.0, 1.0, 0.0)}, "four positive"),
     ],
 )
-def test_invalid_parameters_are_refused_by_name(options: dict[str, float], message: str) -> None:
+def test_invalid_parameters_are_refused_by_name(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         GainEstimator(SQUARE, **options)
+
+
+def test_gains_of_pads_with_other_gaps_are_within_their_covariance() -> None:
+    """Squared errors in units of the covariance are 3 on average, one for each direction of the gains; where
+    gaps aren't parameters, they are many times more."""
+    nominal, generator = ElectrodeNetwork(30.0, 24.0, 0.8, 1.0), np.random.default_rng(8)
+
+    def with_gaps(more: FloatArray) -> ElectrodeNetwork:
+        electrodes = [
+            Electrode(electrode.side, electrode.start + before, electrode.stop - after)
+            for electrode, (before, after) in zip(nominal.electrodes, more.reshape(4, 2), strict=True)
+        ]
+        return ElectrodeNetwork.from_electrodes(30.0, 24.0, electrodes, 1.0)
+
+    parts = [with_gaps(0.1 * one) for one in np.eye(8)]
+    distances: dict[bool, list[float]] = {False: [], True: []}
+    for number in range(12):
+        readings = contacts(with_gaps(0.1 * generator.normal(size=8)), 64, 1e-4, seed=number)
+        for known in (False, True):
+            estimator = plain(nominal, parts=parts if known else ())
+            estimator.add_contacts(readings, 1e-4, 0)
+            found = estimator.estimate
+            error = np.log(found.gains) - TRUTH
+            distances[known].append(float(error @ np.linalg.pinv(found.covariance, rcond=1e-6) @ error))
+    assert 1.5 < np.mean(distances[True]) < 4.5
+    assert np.mean(distances[False]) > 30
 
 
 def test_invalid_calls_are_refused() -> None:

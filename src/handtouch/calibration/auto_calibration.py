@@ -8,6 +8,7 @@ clock; time is an argument.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -66,9 +67,12 @@ class GainUpdate:
     store: bool = False
 
 
-def new_gain_estimator(model: ForwardModel, attempt: int = 0, own: Gains | None = None) -> GainEstimator:
+def new_gain_estimator(
+    model: ForwardModel, attempt: int = 0, own: Gains | None = None, parts: Sequence[ForwardModel] = ()
+) -> GainEstimator:
     """Return the estimator of a pad's gains, about gains of its `own` or the deployment's.
 
+    `parts`: see `GainEstimator`.
     `attempt`: 0, then 1, with a wider prior, where no gains near these explain the contacts.
     """
     return GainEstimator(
@@ -77,14 +81,18 @@ def new_gain_estimator(model: ForwardModel, attempt: int = 0, own: Gains | None 
         required_std=_MAX_CALIBRATED_LOG_GAIN_STD,
         start=own.factors if own else None,
         covariance=own.covariance if own else None,
+        parts=parts,
     )
 
 
 class AutoCalibrator:
-    """Calibration state and gain estimate of the node at one pad; `model` is the pad's."""
+    """Calibration state and gain estimate of the node at one pad.
 
-    def __init__(self, model: ForwardModel) -> None:
-        self._model = model
+    model: the pad's. parts: models in each of which one of its parts differs by one standard deviation.
+    """
+
+    def __init__(self, model: ForwardModel, parts: Sequence[ForwardModel] = ()) -> None:
+        self._model, self._parts = model, parts
         self.serial: int | None = None
         self.calibration_state = CalibrationState.DEFAULT
         self.can_learn = False
@@ -95,7 +103,7 @@ class AutoCalibrator:
         self.since_ns, self._attempt, self._store_at_contacts = 0, 0, 0
         self._has_own_gains = False  # the estimate started from gains of its own
         self._mean_gain = 1.0  # geometric mean, not observable by contacts
-        self._estimator = new_gain_estimator(model)
+        self._estimator = new_gain_estimator(model, parts=parts)
         self.estimate = self._estimator.estimate
 
     def assign_node(
@@ -259,6 +267,6 @@ class AutoCalibrator:
     def _restart_estimator(self, attempt: int, own: Gains | None = None) -> None:
         self._attempt, self._pending, self._has_own_gains = attempt, [], own is not None
         self._mean_gain = math.exp(np.log(own.factors).mean()) if own else 1.0
-        self._estimator = new_gain_estimator(self._model, attempt, own)
+        self._estimator = new_gain_estimator(self._model, attempt, own, self._parts)
         self.estimate = self._estimator.estimate
         self._store_at_contacts = _MIN_CONTACTS_TO_STORE_AGAIN

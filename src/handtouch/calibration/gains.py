@@ -9,6 +9,10 @@ gains are right. Log gains with an error d (summing to zero) move it by h . d, w
 currents / noise. So each contact is one linear equation for d; contacts are fitted again with the gains found
 (Gauss-Newton), which makes it the maximum-likelihood estimate with the positions as nuisance parameters.
 
+Scores also depend on the other parts of the pad that aren't exactly as stated: gaps, sides, resistors. They
+are parameters of the same equations, with their tolerances as priors, so that the covariance of the gains
+includes what they could explain.
+
 Contacts come in batches. A batch is iterated to convergence around the former gains, then only its
 information matrix is kept: the state has a fixed size. Contacts that are no points are recognised by a
 mixture of two normal distributions of the score, whose shares are estimated too.
@@ -16,6 +20,7 @@ mixture of two normal distributions of the score, whose shares are estimated too
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -91,8 +96,10 @@ class GainEstimator:
     drift_per_day: standard deviation of a log gain's random walk, after a day.
     model_error: standard deviation of the model's fractions. It is the same for all contacts in one cell of
         the pad, so a cell never adds more information than this allows, however often it is touched.
-    required_std: of the least certain log gain, at which the gains count as estimated.
+    required_std: of the least certain log gain, at which the gains count as estimated; for other parts as
+        stated, as no number of contacts tells them apart from gains.
     start: initial gains (4,), their covariance (4, 4) of logarithms as `covariance`, both as stored.
+    parts: models in each of which one part, such as a gap, differs by one standard deviation.
 
     Raises ValueError for a model with other channels, or a parameter out of range.
     """
@@ -107,6 +114,7 @@ class GainEstimator:
         required_std: float = 5e-3,
         start: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
+        parts: Sequence[ForwardModel] = (),
     ) -> None:
         for name, value, least in (
             ("tolerance", tolerance, 1e-9),
@@ -120,10 +128,11 @@ class GainEstimator:
         self._model = model
         self._drift_per_day, self._model_error, self._required_std = drift_per_day, model_error, required_std
         self._log_gains = np.zeros(4) if start is None else _normalised_logs(start)
-        self._information: FloatArray = np.eye(3) / tolerance**2
+        self._parts, self._part_offsets = tuple(parts), np.zeros(len(parts))
+        self._information: FloatArray = np.diag([tolerance**-2] * 3 + [1.0] * len(parts))
         if covariance is not None:
             known = _BASIS.T @ np.asarray(covariance, dtype=np.float64) @ _BASIS
-            self._information = _inverse(known + 1e-18 * np.eye(3))
+            self._information[:3, :3] = _inverse(known + 1e-18 * np.eye(3))
         # the positions behind given gains are unknown: each cell starts with half of the information it can
         # add
         already = 0.0 if covariance is None or model_error == 0 else model_error**-2
@@ -169,9 +178,10 @@ class GainEstimator:
         squares, counted = self._misfit_sums
         misfit = float(np.sqrt(squares / counted)) if counted > 0 else float("nan")
         # scores wider than by noise: model errors of the points widen the covariance of the gains too
-        covariance = _BASIS @ _inverse(self._information) @ _BASIS.T * max(1.0, np.nan_to_num(misfit) ** 2)
-        std = float(np.sqrt(np.diag(covariance).max()))
-        status, reason = self._assess(std)
+        widening = max(1.0, np.nan_to_num(misfit) ** 2)
+        covariance = _BASIS @ _inverse(self._information)[:3, :3] @ _BASIS.T * widening
+        with_parts_as_stated = _BASIS @ _inverse(self._information[:3, :3]) @ _BASIS.T * widening
+        status, reason = self._assess(float(np.sqrt(np.diag(with_parts_as_stated).max())))
         return GainEstimate(
             np.exp(self._log_gains),
             covariance,
@@ -224,25 +234,31 @@ class GainEstimator:
         self._last_ns = now_ns
         if days > 0 and self._drift_per_day > 0:
             before = _inverse(self._information)
-            after = before + self._drift_per_day**2 * days * np.eye(3)
+            after = before.copy()
+            after[:3, :3] += self._drift_per_day**2 * days * np.eye(3)
             self._information = _inverse(after)
-            self._cell_information *= np.trace(before) / np.trace(after)
+            self._cell_information *= np.trace(before[:3, :3]) / np.trace(after[:3, :3])
 
     def _process_batch(self, currents: FloatArray, sigma: FloatArray) -> None:
         """Process a batch (4, n): iterate around the former gains, then keep its information."""
-        known, positions = self._log_gains, None
+        known, known_parts, positions = self._log_gains, self._part_offsets, None
         for _ in range(_MAX_BATCH_ITERATIONS):
             gains = np.exp(self._log_gains)[:, None]
-            view = _ContactLinearisation.linearise(self._model, currents * gains, sigma * gains, positions)
+            view = _ContactLinearisation.linearise(
+                self._model, self._parts, currents * gains, sigma * gains, positions
+            )
             positions = view.positions
             share, cells = self._information_shares(view)
             spread = np.sqrt(1 + (self._model_error * view.score_sensitivity) ** 2)
             mixture = replace(self._mixture)
-            prior = _BASIS.T @ (known - self._log_gains)
+            prior = np.concatenate([_BASIS.T @ (known - self._log_gains), known_parts])
             found = mixture.solve(view, share, spread, self._information, prior)
             information = self._information + (view.score_slope * found.precision) @ view.score_slope.T
-            self._log_gains = self._log_gains + _BASIS @ found.step
-            if found.step @ information @ found.step < _CONVERGED_STEP_SIGMA**2:
+            # the step of the gains is from the present ones; scores are linear in the parts' offsets
+            self._log_gains = self._log_gains + _BASIS @ found.step[:3]
+            step = np.concatenate([found.step[:3], found.step[3:] - self._part_offsets])
+            self._part_offsets = found.step[3:]
+            if step @ information @ step < _CONVERGED_STEP_SIGMA**2:
                 break
         self._information, self._mixture, self._cell_information = information, mixture, cells
         self._contacts += len(share)
@@ -319,7 +335,7 @@ class _OutlierMixture:
         information: FloatArray,
         prior: FloatArray,
     ) -> _GainStep:
-        """Return the most likely step of the gains for contacts and prior, (3,) with its information.
+        """Return the most likely step of gains and parts for contacts and prior, (p,) with its information.
 
         share (n,): of a contact's information that counts; spread (n,): standard deviation of a point's
         score. Starts from the least absolute scores, which are robust against a minority, then
@@ -359,7 +375,7 @@ class _OutlierMixture:
 
 
 class _GainStep(NamedTuple):
-    """Step (3,); for each contact (n,): precision of its score, probability of a point, squared score."""
+    """Step (p,); for each contact (n,): precision of its score, probability of a point, squared score."""
 
     step: FloatArray
     precision: FloatArray
@@ -371,8 +387,8 @@ class _GainStep(NamedTuple):
 class _ContactLinearisation:
     """Linearisation of the scores of contacts (n,) around the gains that correct them.
 
-    positions (2, n); score (n,); slope (3, n): what a step of the gains adds to the score; sharpness (n,):
-    score per error of the fractions.
+    positions (2, n); score (n,); score_slope (p, n): what a step of gains and parts adds to the score;
+    score_sensitivity (n,): score per error of the fractions.
     """
 
     positions: FloatArray
@@ -382,7 +398,12 @@ class _ContactLinearisation:
 
     @classmethod
     def linearise(
-        cls, model: ForwardModel, currents: FloatArray, sigma: FloatArray, start: FloatArray | None
+        cls,
+        model: ForwardModel,
+        parts: Sequence[ForwardModel],
+        currents: FloatArray,
+        sigma: FloatArray,
+        start: FloatArray | None,
     ) -> _ContactLinearisation:
         found = estimate(model, currents, sigma, start)
         positions = np.stack([found.x, found.y])
@@ -390,6 +411,10 @@ class _ContactLinearisation:
         x, y = np.where(known, positions, [[model.a / 2], [model.b / 2]])
         total = np.where(known, found.total, 1.0)
         null, slope = _score_slopes(model, x, y, sigma, total)
+        if parts:
+            changes = [part.fractions(x * (part.a / model.a), y * (part.b / model.b)) for part in parts]
+            by_part = np.stack(changes) - model.fractions(x, y)
+            slope = np.concatenate([slope, -np.einsum("nc,pcn->pn", null, by_part * total / sigma)])
         score = np.einsum("nc,cn->n", null, currents / sigma)
         sharpness = total * np.linalg.norm(null.T / sigma, axis=0)
         return cls(np.stack([x, y]), np.where(known, score, 0.0), slope * known, sharpness)

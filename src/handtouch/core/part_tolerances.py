@@ -5,15 +5,13 @@ Public names: `stage_tolerances`.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from handtouch import config
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable, view_floats
 from handtouch.core.stages.tolerances import PadTolerances
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import pad_surface
+from handtouch.hand.pads import log_aspect_std, pad_surface, relative_size_stds
 
 _M_PER_MM = 1e-3
 
@@ -27,9 +25,8 @@ def stage_tolerances(
 ) -> PadTolerances:
     """Return the tolerances of a pad, gains aside; `network` and `table` are the pad's."""
     surface = pad_surface(pad)
-    length_m, width_m = surface.extent_m[0], surface.b * surface.scale(surface.a / 2, surface.b / 2)
-    size_x, size_y = (sheet.size_std_mm * _M_PER_MM / float(side) for side in (length_m, width_m))
-    aspect_std = math.sqrt(size_x**2 + size_y**2 + (sheet.anisotropy_std / 2) ** 2)
+    size_x, size_y = relative_size_stds(pad, sheet)
+    aspect_std = log_aspect_std(pad, sheet)
     end_stds = sheet.gap_std_mm * _M_PER_MM / np.array(_metres_per_unit(pad, network))
     end_vectors = np.ascontiguousarray(end_stds[:, None] * table.end_vectors)
     has_series = any(pad.series_ohm)
@@ -43,7 +40,7 @@ def stage_tolerances(
         node.series_std,
         sheet.ohm_per_square_std,
         has_series,
-        length_m / 2,
+        surface.extent_m[0] / 2,
         size_x,
         size_y,
         not (end_vectors.any() or aspect_std or has_series),

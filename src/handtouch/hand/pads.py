@@ -1,6 +1,7 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `rotation_from_rpy`, `MountUncertainty`.
+Public names: `pad_surface`, `mount_transform`, `electrode_network`, `networks_with_other_parts`,
+`relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -81,3 +82,33 @@ def electrode_network(
     return ElectrodeNetwork.from_electrodes(
         stretch * surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
     )
+
+
+def networks_with_other_parts(
+    pad: config.Pad, node: config.Node, sheet: config.Sheet
+) -> tuple[ElectrodeNetwork, ...]:
+    """Return networks in each of which one part of the pad differs by one standard deviation; gains aside."""
+    networks = []
+    if gap_std_m := sheet.gap_std_mm * _M_PER_MM:
+        networks += [electrode_network(pad, sheet, gap_std_m * end) for end in np.eye(8).reshape(8, 4, 2)]
+    if aspect_std := log_aspect_std(pad, sheet):
+        networks.append(electrode_network(pad, sheet, log_aspect=aspect_std))
+    if any(pad.series_ohm):
+        nominal, ohm = electrode_network(pad, sheet), np.array(pad.series_ohm)
+        changes = [node.series_std * one for one in np.eye(4)] + [np.full(4, -sheet.ohm_per_square_std)]
+        networks += [nominal.with_series_ohm(ohm * np.exp(change)) for change in changes]
+    return tuple(networks)
+
+
+def relative_size_stds(pad: config.Pad, sheet: config.Sheet) -> tuple[float, float]:
+    """Return the relative standard deviations of a pad's length, and of its width in the middle."""
+    surface = pad_surface(pad)
+    width_m = float(surface.b * surface.scale(surface.a / 2, surface.b / 2))
+    std_m = sheet.size_std_mm * _M_PER_MM
+    return std_m / surface.extent_m[0], std_m / width_m
+
+
+def log_aspect_std(pad: config.Pad, sheet: config.Sheet) -> float:
+    """Return the standard deviation of the logarithm of the ratio of the rectangle's sides."""
+    size_x, size_y = relative_size_stds(pad, sheet)
+    return math.sqrt(size_x**2 + size_y**2 + (sheet.anisotropy_std / 2) ** 2)

@@ -31,7 +31,7 @@ from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_back_force
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import electrode_network
+from handtouch.hand import electrode_network, networks_with_other_parts
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
     MAX_TEXT,
@@ -93,17 +93,21 @@ class SupervisorWorker:
     ) -> None:
         deployment = start.deployment
         entries = deployment.pads
-        models: dict[object, ElectrodeNetwork] = {}
+        models: dict[object, tuple[ElectrodeNetwork, tuple[ElectrodeNetwork, ...]]] = {}
         self._pads = []
         noise = start.noise_counts[:, None] * start.ampere_per_count
         for number, (hand, pad) in enumerate(entries):
-            design = (pad.surface, pad.gap_mm, pad.series_ohm, pad.sheet)
+            design, sheet = (
+                (pad.surface, pad.gap_mm, pad.series_ohm, pad.sheet, pad.node),
+                deployment.sheets[pad.sheet],
+            )
             if design not in models:
-                models[design] = electrode_network(pad, deployment.sheets[pad.sheet])
+                others = networks_with_other_parts(pad, deployment.nodes[pad.node], sheet)
+                models[design] = electrode_network(pad, sheet), others
             mounting_point = MountingPoint(hand, pad.link, start.default_calibration_ids[number])
             self._pads.append(
                 _PadEntry(
-                    mounting_point, AutoCalibrator(models[design]), StationaryContactDetector(noise[number])
+                    mounting_point, AutoCalibrator(*models[design]), StationaryContactDetector(noise[number])
                 )
             )
         self._ampere_per_count = start.ampere_per_count
