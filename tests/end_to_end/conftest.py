@@ -22,6 +22,7 @@ from handtouch.client import Subscriber, connect, request
 from handtouch.config import shipped
 from tests.starter import Started, Starter, find_port, own_endpoints
 
+ROOT = Path(__file__).parents[2]
 START_S = 90.0
 """Longest that anything may take on a busy machine; nothing waits so long when all is well."""
 
@@ -194,7 +195,28 @@ def javascript(pytestconfig: pytest.Config) -> Path:
         done = subprocess.run(install, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
             _missing(f"npm can't install the packages of tests/javascript: {done.stderr}")
+    shutil.copytree(ROOT / "clients/js", folder / "node_modules/handtouch", dirs_exist_ok=True)
     return folder
+
+
+@pytest.fixture(scope="session")
+def cpp(shared: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """Folder with the programs of tests/cpp, built with the installed package of clients/cpp."""
+    if not all(map(shutil.which, ("cmake", "c++"))) or not Path("/usr/include/zmq.h").exists():
+        _missing("no C++ compiler, cmake or zmq.h; on Debian: apt-get install g++ cmake libzmq3-dev")
+
+    def build(folder: Path) -> None:
+        package, prefix = folder / "package", folder / "prefix"
+        for command in (
+            ["cmake", "-S", ROOT / "clients/cpp", "-B", package, f"-DCMAKE_INSTALL_PREFIX={prefix}"],
+            ["cmake", "--build", package, "--target", "install"],
+            ["cmake", "-S", ROOT / "tests/cpp", "-B", folder, f"-DCMAKE_PREFIX_PATH={prefix}"],
+            ["cmake", "--build", folder],
+        ):
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stdout + done.stderr
+
+    return shared("cpp_programs", build)
 
 
 @pytest.fixture(scope="session")

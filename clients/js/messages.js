@@ -1,0 +1,122 @@
+// Decoding of the messages of docs/wire.md that a controller reads: contacts and hand frames.
+
+import { decode } from "@msgpack/msgpack";
+
+export const SCHEMA_VERSION = 1;
+export const PAD_STATES = ["clear", "touched", "stale", "lost", "faulted", "starting", "off"];
+export const POSITION_STATUSES = ["not_computed", "valid", "unreliable", "invalid"];
+export const FORCE_STATUSES = ["not_computed", "valid", "lower_bound", "unreliable", "invalid"];
+export const FRAME_STATUSES = ["not_computed", "valid", "stale", "invalid"];
+
+const PLACE = { position_m: [Float32Array, 3], normal: [Float32Array, 3], covariance_m2: [Float32Array, 9] };
+const inFrame = (prefix) => Object.entries(PLACE).map(([name, layout]) => [prefix + name, layout]);
+const REQUIRED = {
+  state: [Uint8Array, 1],
+  contact_id: [Uint32Array, 1],
+  sample_ns: [BigInt64Array, 1],
+  total_current_a: [Float32Array, 1],
+  ...PLACE,
+  pad_m: [Float32Array, 2],
+  position_status: [Uint8Array, 1],
+  force_n: [Float32Array, 1],
+  force_std_n: [Float32Array, 1],
+  force_status: [Uint8Array, 1],
+  residual: [Float32Array, 1],
+  residual_std: [Float32Array, 1],
+};
+const OPTIONAL = {
+  group: [Uint32Array, 1],
+  palm_status: [Uint8Array, 1],
+  base_status: [Uint8Array, 1],
+  ...Object.fromEntries([...inFrame("palm_"), ...inFrame("base_")]),
+  joints_age_s: [Float32Array, 1],
+};
+
+/** A message that violates the wire contract. */
+export class WireError extends Error {}
+
+const isInteger = (value) => typeof value === "bigint" || Number.isSafeInteger(value);
+
+// Integers of nanoseconds are BigInt, however they were encoded; all others are numbers where they fit.
+function decodeMap(payload) {
+  let map;
+  try {
+    map = decode(payload, { useBigInt64: true });
+  } catch (error) {
+    throw new WireError(`not msgpack: ${error.message}`);
+  }
+  if (map === null || typeof map !== "object" || map.v !== SCHEMA_VERSION) {
+    throw new WireError("another schema version");
+  }
+  for (const key of ["session", "seq", "t_ns"]) {
+    if (!isInteger(map[key])) throw new WireError(`${key} is missing`);
+  }
+  for (const [key, value] of Object.entries(map)) {
+    if (!isInteger(value)) continue;
+    if (key.endsWith("_ns")) map[key] = BigInt(value);
+    else if (Number.isSafeInteger(Number(value))) map[key] = Number(value);
+  }
+  return map;
+}
+
+/** Decode the payload of `contact/<hand>/<link>`; optional keys that are absent stay absent. */
+export function decodeContact(payload) {
+  const contact = decodeMap(payload);
+  if (!["begin", "update", "end"].includes(contact.event) || typeof contact.link !== "string") {
+    throw new WireError("a contact without event or link");
+  }
+  return contact;
+}
+
+/** `hand/<hand>`: the whole hand at one tick; columns are typed arrays with a row for each link. */
+export class Frame {
+  #rows;
+
+  constructor(map) {
+    if (!Array.isArray(map.links)) throw new WireError("links is missing");
+    for (const [name, layout] of Object.entries(REQUIRED)) map[name] = column(map, name, layout);
+    for (const [name, layout] of Object.entries(OPTIONAL)) {
+      if (name in map) map[name] = column(map, name, layout);
+    }
+    Object.assign(this, map);
+    this.#rows = new Map(this.links.map((link, row) => [link, row]));
+  }
+
+  /** The row of a link. Throws RangeError for an unknown one. */
+  row(link) {
+    const row = this.#rows.get(link);
+    if (row === undefined) throw new RangeError(`no link ${link}; the links are ${this.links.join(", ")}`);
+    return row;
+  }
+
+  /** The values of a link in a column: a number, or the elements of its row. */
+  at(name, link) {
+    const values = this[name];
+    const size = values.length / this.links.length;
+    const row = this.row(link);
+    return size === 1 ? values[row] : values.subarray(row * size, (row + 1) * size);
+  }
+
+  touched(link) {
+    return PAD_STATES[this.at("state", link)] === "touched";
+  }
+
+  /** True where the pad is sampled, so that no contact means none. */
+  sampled(link) {
+    return ["clear", "touched"].includes(PAD_STATES[this.at("state", link)]);
+  }
+}
+
+function column(map, name, [Type, elements]) {
+  const bytes = map[name];
+  const size = map.links.length * elements * Type.BYTES_PER_ELEMENT;
+  if (!(bytes instanceof Uint8Array) || bytes.length !== size) {
+    throw new WireError(`${name} doesn't match its links`);
+  }
+  return new Type(new Uint8Array(bytes).buffer); // a copy, as columns aren't aligned in the message
+}
+
+/** Decode the payload of `hand/<hand>`. */
+export function decodeFrame(payload) {
+  return new Frame(decodeMap(payload));
+}
