@@ -213,7 +213,7 @@ def cpp(shared: Callable[[str, Callable[[Path], None]], Path]) -> Path:
             ["cmake", "-S", ROOT / "tests/cpp", "-B", folder, f"-DCMAKE_PREFIX_PATH={prefix}"],
             ["cmake", "--build", folder],
         ):
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stdout + done.stderr
 
     return shared("cpp_programs", build)
