@@ -111,16 +111,20 @@ format: $(VENV)/.dev ## format the source
 
 lock: $(BIN)/python ## update the pinned versions of all packages
 	@$(PIP) install uv
-	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
+	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra dev --extra dist --no-header --no-annotate \
 		--no-emit-index-url --no-emit-find-links --output-file requirements.lock pyproject.toml
 
 schema: $(VENV)/.run ## write config/*.schema.json from the models of the deployment's and the node's file
 	$(BIN)/handtouch check --schema >config/handtouch.schema.json
 	$(BIN)/handtouch node --schema >config/touch_node.schema.json
 
-dist: $(VENV)/.dev ## build the wheel and the source archive
-	rm -rf dist
-	HANDTOUCH_REQUIRE_COMPILED=1 $(BIN)/python -m build --no-isolation
+# for any Linux with glibc 2.17 or later on these machines; ziglang has a C compiler for both
+dist: $(VENV)/.dev ## build the source archive and wheels for x86_64 and aarch64
+	@$(PIP) install --no-compile -c requirements.lock -e '.[dist]'
+	rm -rf dist build
+	$(BIN)/python -m build --no-isolation --sdist
+	for machine in x86_64 aarch64; do \
+		HANDTOUCH_WHEEL_MACHINE=$$machine $(BIN)/python -m build --no-isolation --wheel || exit 1; done
 
 clean: ## remove build results and .venv
 	rm -rf $(VENV) dist build .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis

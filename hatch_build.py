@@ -12,6 +12,8 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 REQUIRE_VARIABLE = "HANDTOUCH_REQUIRE_COMPILED"
 """Environment variable that makes a build without compiled stages fail."""
+MACHINE_VARIABLE = "HANDTOUCH_WHEEL_MACHINE"
+"""Environment variable with the machine that a wheel is for, x86_64 or aarch64; by default this one."""
 
 
 class CustomBuildHook(BuildHookInterface):  # type: ignore[type-arg]
@@ -28,14 +30,18 @@ class CustomBuildHook(BuildHookInterface):  # type: ignore[type-arg]
         assert spec.loader is not None
         build = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(build)
+        machine = os.environ.get(MACHINE_VARIABLE, "")
         try:
-            files = build.build_stages(source)
+            files = build.build_stages(source, machine)
         except build.BuildError as error:
-            if os.environ.get(REQUIRE_VARIABLE):
+            if machine or os.environ.get(REQUIRE_VARIABLE):
                 raise
             self.app.display_warning(f"handtouch will run uncompiled: {error}")
             return
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        if machine:
+            platform = "manylinux_{}_{}_{}".format(*build.MIN_GLIBC, machine)
         build_data["pure_python"] = False
         build_data["tag"] = f"cp311-abi3-{platform}"
-        build_data["force_include"].update({str(file): str(file.relative_to(source)) for file in files})
+        folder = "handtouch/core/stages/_compiled"
+        build_data["force_include"].update({str(file): f"{folder}/{file.name}" for file in files})

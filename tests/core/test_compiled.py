@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -55,6 +56,15 @@ def test_stages_compiled_from_other_sources_are_refused(copied: Path) -> None:
     compiled, used, *reason = run("-c", STATE, source=copied).stdout.split()
     assert (compiled, used) == ("False", "False")
     assert "of other sources" in " ".join(reason)
+
+
+def test_modules_for_another_machine_are_never_of_this_one(copied: Path) -> None:
+    other = "x86_64" if platform.machine() == "aarch64" else "aarch64"
+    build = f"from pathlib import Path; from handtouch.core.build import build_stages; \
+build_stages(Path({str(copied)!r}), {other!r})"
+    failed = run("-c", build, source=copied, CC="cc")  # instead of a cross compiler
+    assert f"compiles for another machine than {other}" in failed.stderr
+    assert not list((copied.parent / "build").rglob("*.so"))
 
 
 def test_a_build_without_a_compiler_names_the_package_to_install(copied: Path) -> None:

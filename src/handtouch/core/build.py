@@ -1,13 +1,14 @@
 """Compile the stages of the core: `python -m handtouch.core.build`.
 
-Public names: `build_stages`, `BuildError`. Needs Cython, a C compiler and Python's headers, and nothing else
-of handtouch, so that a build of the package can use it before that is installed.
+Public names: `build_stages`, `BuildError`, `MIN_GLIBC`. Needs Cython, a C compiler and Python's headers, and
+nothing else of handtouch, so that a build of the package can use it before that is installed.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -26,31 +27,39 @@ _DIRECTIVES = {
     "annotation_typing": "False",  # types are in the .pxd files
     "binding": "False",
 }
-_FLAGS = ("-O2", "-fPIC", "-shared", "-fno-strict-aliasing", "-ffp-contract=off", "-w")
+_FLAGS = ("-O2", "-fPIC", "-shared", "-s", "-fno-strict-aliasing", "-ffp-contract=off", "-w")
 _LIMITED_API = ("-DCYTHON_LIMITED_API=1", "-DPy_LIMITED_API=0x030B0000")
 """The stable ABI of Python 3.11: one file for this and all later versions."""
+MIN_GLIBC = (2, 17)
+"""Oldest C library that files compiled for other machines run with, as manylinux2014 has it."""
+_ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 
 
 class BuildError(Exception):
     """The stages can't be compiled here; says what is missing and which package has it."""
 
 
-def build_stages(source: Path) -> list[Path]:
+def build_stages(source: Path, machine: str = "") -> list[Path]:
     """Compile the stages of a source tree's `handtouch` package; return the files, new or up to date.
 
-    Older files are removed. Raises BuildError.
+    Older files are removed. With `machine`, x86_64 or aarch64, the files are for any Linux on it that has
+    MIN_GLIBC, and are in the folder `build` beside `source`. Raises BuildError.
+
+    A machine's own Python.h isn't needed: within the stable ABI, it is the same on all 64-bit Linux.
     """
     compiled = _load_compiled(source)
-    files = [compiled.compiled_file(name) for name in compiled.STAGES]
+    files = [compiled.compiled_file(name, f"linux_{machine}" if machine else "") for name in compiled.STAGES]
+    if machine:
+        files = [source.parent / "build" / machine / file.name for file in files]
     if all(file.exists() for file in files):
         return files
-    compiler, include = _find_compiler(), sysconfig.get_path("include")
+    compiler, include = _find_compiler(machine), sysconfig.get_path("include")
     if importlib.util.find_spec("Cython") is None:
         raise BuildError("Cython is missing; pip install cython")
     if not (Path(include) / "Python.h").exists():
         raise BuildError(f"{include}/Python.h is missing; on Debian: apt-get install python3-dev")
     folder = files[0].parent
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as work:
         for name, file in zip(compiled.STAGES, files, strict=True):
             generated, built = Path(work) / f"{name}.c", Path(work) / f"{name}.so"
@@ -61,6 +70,8 @@ def build_stages(source: Path) -> list[Path]:
                 [*compiler, *_FLAGS, *_LIMITED_API, f"-I{include}", str(generated), "-o", str(built), "-lm"],
                 source,
             )
+            if machine:
+                _check_portable(built, machine)
             shutil.copy(built, file.with_suffix(".new"))
             file.with_suffix(".new").replace(file)  # never half written where another process loads it
     for old in set(folder.glob("*.so")) - set(files):
@@ -89,16 +100,33 @@ def _load_compiled(source: Path) -> ModuleType:
     return module
 
 
-def _find_compiler() -> list[str]:
-    """Return the command of a C compiler: CC, the system's, or that of the package ziglang."""
+def _find_compiler(machine: str) -> list[str]:
+    """Return the command of a C compiler: CC, the system's, or that of the package ziglang.
+
+    Of these only ziglang's is for another machine, or an older C library.
+    """
     if os.environ.get("CC"):
         return os.environ["CC"].split()
     for name in ("cc", "gcc", "clang"):
-        if shutil.which(name):
+        if shutil.which(name) and not machine:
             return [name]
     if importlib.util.find_spec("ziglang") is not None:
-        return [sys.executable, "-m", "ziglang", "cc"]
+        target = ["-target", f"{machine}-linux-gnu.{MIN_GLIBC[0]}.{MIN_GLIBC[1]}"] if machine else []
+        return [sys.executable, "-m", "ziglang", "cc", *target]
+    if machine:
+        raise BuildError(f"there is no C compiler for {machine}; pip install ziglang")
     raise BuildError("there is no C compiler; on Debian: apt-get install build-essential")
+
+
+def _check_portable(file: Path, machine: str) -> None:
+    """Raise BuildError unless a compiled file is for this machine and MIN_GLIBC."""
+    content = file.read_bytes()
+    if int.from_bytes(content[18:20], "little") != _ELF_MACHINES[machine]:
+        raise BuildError(f"the C compiler compiles for another machine than {machine}")
+    versions = re.findall(rb"GLIBC_(\d+)\.(\d+)", content)
+    newest = max(((int(major), int(minor)) for major, minor in versions), default=MIN_GLIBC)
+    if newest > MIN_GLIBC:
+        raise BuildError(f"the compiled modules need glibc {newest[0]}.{newest[1]}")
 
 
 def _run(command: list[str], folder: Path) -> None:

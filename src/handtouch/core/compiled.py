@@ -1,6 +1,6 @@
 """Compiled stages: which files hold them, and whether they are used.
 
-Public names: `STAGES`, `source_hash`, `compiled_file`, `CompiledFinder`, `Compilation`.
+Public names: `STAGES`, `source_hash`, `compiled_file`, `this_platform`, `CompiledFinder`, `Compilation`.
 
 The modules of `handtouch.core.stages` are plain Python that Cython compiles as it stands. A compiled module
 carries the hash of all their sources in its file's name; one of other sources isn't loaded, and Python runs
@@ -58,9 +58,17 @@ def source_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-def compiled_file(stage: str) -> Path:
-    """Return the file that holds a stage compiled from the present sources, whether it exists or not."""
-    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+def this_platform() -> str:
+    """Return this machine's platform as the files name it, such as linux_x86_64."""
+    return sysconfig.get_platform().replace("-", "_").replace(".", "_")
+
+
+def compiled_file(stage: str, platform: str = "") -> Path:
+    """Return the file that holds a stage compiled from the present sources, whether it exists or not.
+
+    `platform` : this machine's by default
+    """
+    platform = platform or this_platform()
     return _FOLDER / "_compiled" / f"{stage}-{source_hash()}-{platform}.abi3.so"
 
 
