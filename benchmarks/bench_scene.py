@@ -75,8 +75,7 @@ class Case:
         self.sent_bytes += sum(map(len, wire.encode(message)))
 
     def _apply(self, requested: Any, needed: Any, *_: Any) -> None:
-        self.pipeline.apply_demand(requested)
-        self.pipeline.ticks_per_hand_frame = self.demand.ticks_per_hand_frame
+        self.pipeline.apply_demand(requested, self.demand.ticks_per_hand_frame)
         self.pipeline.node_state[~needed.pads] = wire.PadState.OFF
 
     def tick(self, t_ns: int, counts: Counts) -> None:

@@ -237,7 +237,7 @@ def turned(known: bool) -> Rows:
         way = ways[0] * np.sin(speeds * t_s) + ways[1] * np.cos(speeds[::-1] * t_s)
         way /= np.linalg.norm(way)
         if known:
-            rig.tick.set_gravity(np.tile(way, (rig.model.size, 1)))
+            rig.tick.baseline.set_gravity(np.tile(way, (rig.model.size, 1)))
         return np.asarray(by_gravity @ way)
 
     none = np.zeros(rig.model.size)

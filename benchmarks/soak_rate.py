@@ -245,7 +245,7 @@ def watch(
     def totals() -> NDArray[np.int64]:
         tick, bus = daemon.pipeline.tick, [(c.samples, c.overflow) for c in counters]
         samples, overflow = np.sum(bus, axis=0).tolist()
-        missed, taken = int(tick.missed_sample_counts.sum()), int(tick.sample_counts.sum())
+        missed, taken = int(tick.state.missed_sample_counts.sum()), int(tick.state.sample_counts.sum())
         return np.array(
             [nodes.answered, daemon.pipeline.ticks, daemon.sync.overruns, missed, taken, samples, overflow]
         )

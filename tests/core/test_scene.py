@@ -121,8 +121,7 @@ class TouchedPads:
 
     def _apply(self, requested: Any, needed: Any, enabled: Any, now_ns: int) -> None:
         del needed, enabled, now_ns
-        self.pipeline.apply_demand(requested)
-        self.pipeline.ticks_per_hand_frame = self.demand.ticks_per_hand_frame
+        self.pipeline.apply_demand(requested, self.demand.ticks_per_hand_frame)
 
     def has_subscriber(self, topic: str) -> bool:
         return any(topic.encode().startswith(prefix) for prefix in self.subscriptions)

@@ -146,7 +146,7 @@ def test_a_missing_sample_is_counted_and_its_contact_continues(driver: Driver) -
     result = driver.step(touch, silent=(PLANE,))
     assert not len(result.updated)
     assert not len(result.ended)
-    assert driver.tick.missed_sample_counts.tolist() == [1, 0, 0]
+    assert driver.tick.state.missed_sample_counts.tolist() == [1, 0, 0]
     assert driver.step(touch).updated.tolist() == [PLANE]
 
 
@@ -177,7 +177,7 @@ def test_a_pad_with_late_samples_is_neither_stale_nor_ignored(driver: Driver) ->
     assert driver.state(PLANE) == PadState.TOUCHED
     assert result.updated.tolist() == [PLANE]
     assert driver.tick.columns.sample_ns[PLANE] == sync_ns - PERIOD_NS
-    assert driver.tick.missed_sample_counts[PLANE] >= 3
+    assert driver.tick.state.missed_sample_counts[PLANE] >= 3
 
 
 def test_a_sample_is_used_once(driver: Driver) -> None:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
+from handtouch.core.state import TickState
 from handtouch.core.tick import PadColumns, TickResult
 from handtouch.core.transforms import ContactTransforms
 from handtouch.hand.joints import JointSnapshot, JointStateBuffer
@@ -34,7 +35,7 @@ class TouchedHand:
         self, *pads: int, joints: JointStateBuffer | None = None, robots: RobotModels = ROBOTS
     ) -> None:
         n = len(PADS)
-        self.columns, self.ids = PadColumns.empty(n), np.zeros(n, dtype=np.uint32)
+        self.columns, self.ids = PadColumns.of_state(TickState.empty(n)), np.zeros(n, dtype=np.uint32)
         rng = np.random.default_rng(1)
         for pad in pads:
             self.ids[pad] = pad + 1

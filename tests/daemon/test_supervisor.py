@@ -13,6 +13,7 @@ from handtouch import wire
 from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.config import Behaviour
+from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.supervisor.ipc import (
@@ -150,11 +151,12 @@ def test_manual_calibration_is_sent_until_a_better_one_is_estimated(rig: Rig) ->
     def sent() -> list[dict[str, Any]]:
         return [m for m in map(msgpack.unpackb, rig.process.sent) if m["kind"] == "manual_calibration"]
 
-    rig.pipeline.model.set_gains_and_law(1, np.array([1.1, 1.0, 1.0, 0.9]), "bench-1")
+    rig.pipeline.set_calibration(1, PadCalibration("bench-1", (1.1, 1.0, 1.0, 0.9)))
     rig.supervisor.register_manual_calibration(1, {"gains"})
     assert sent()[-1]["given"] == ["gains"]
     update = CalibrationUpdate.model_validate_json(sent()[-1]["update"])
     assert (update.serial, update.calibration_id, update.gains) == (12, "bench-1", (1.1, 1.0, 1.0, 0.9))
+    rig.step()
     assert np.diag(rig.pipeline.model.gain_covariance[1]) == pytest.approx([0.01**2 * 0.75] * 4)
     rig.swap(0, 11, 11)  # as after a restart of the process, which applies stored calibrations first
     rig.receive(calibrate(1, 12), update)
@@ -186,6 +188,7 @@ def test_invalid_message_is_counted_and_changes_nothing(
 def test_replaced_node_is_quarantined_at_once(rig: Rig) -> None:
     rig.receive(calibrate(0, 11))
     rig.swap(0, 11, 21)
+    rig.step()
     model = rig.pipeline.model
     assert model.quarantined.tolist() == [True, False, False]
     assert model.gains[0].tolist() == [1.0] * 4
@@ -207,6 +210,7 @@ def test_replaced_node_is_quarantined_at_once(rig: Rig) -> None:
 
 def test_node_without_serial_number_counts_as_replaced(rig: Rig) -> None:
     rig.swap(0, 11, None)
+    rig.step()
     assert rig.pipeline.model.quarantined[0]
 
 

@@ -23,7 +23,7 @@ def step(
 ) -> list[int]:
     places = np.stack([[x, 0.0, 0.0] for x in x_m])
     made.update_groups(np.array(ids, dtype=np.uint32), places, np.stack(normals or [UP] * len(ids)))
-    return made.group_id.tolist()
+    return list(map(int, made.group_id))
 
 
 def test_near_contacts_form_a_group() -> None:

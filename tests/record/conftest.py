@@ -14,6 +14,7 @@ import pytest
 from handtouch import wire
 from handtouch.config import Deployment, parse
 from handtouch.config.files import deployment_files
+from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.host.build import build_info
@@ -169,16 +170,16 @@ class RecordingSession:
         self.hand.pipeline.journal.publish_config(
             deployment, deployment_files(deployment), build_info(), self.hand.t_ns
         )
-        self.hand.pipeline.tick.state_changed = True
+        self.send_retained("state")
 
     def take(self, parts: list[bytes]) -> None:
         """Record a message of the daemon."""
         if not parts or not self.lose(parts[0]):
             self.recorder.add_message(parts, self.hand.t_ns if hasattr(self, "hand") else 0)
 
-    def send_retained(self) -> None:
-        """Record the retained messages, as after a new subscription."""
-        for topic in ("config", "state"):
+    def send_retained(self, *topics: str) -> None:
+        """Record the retained messages, by default all, as after a new subscription."""
+        for topic in topics or ("config", "state"):
             message = self.hand.pipeline.journal.retained_messages()[topic](self.hand.t_ns)
             assert message is not None
             self.take(wire.encode(message))
@@ -200,15 +201,15 @@ def recorded(make_hand: Callable[..., Hand], tmp_path_factory: pytest.TempPathFa
     hand = session.hand
     hand.stroke(130)
     session.take(health(1, hand.t_ns))
-    hand.pipeline.tick.model.gains[0] *= 1.05
-    hand.pipeline.tick.model.calibration_ids[0] = "another"
-    hand.pipeline.tick.discard_solutions(np.array([0]))
+    hand.pipeline.set_calibration(0, PadCalibration("another", (1.05,) * 4))
     hand.stroke(130, seed=2)
     session.take(health(2, hand.t_ns, "lost", "its heartbeat timed out"))
     for _ in range(5):
         hand.step({}, node_state=PadState.LOST)
-    hand.pipeline.tick.solve_all()
-    hand.stroke(125, seed=3)
+    session.send_retained()
+    hand.stroke(60, seed=3)
+    session.send_retained()
+    hand.stroke(65, seed=4)
     session.take(service(2, hand.t_ns))
     hand.pipeline.end_session(hand.t_ns + PERIOD_NS)
     session.recorder.poll(hand.t_ns)

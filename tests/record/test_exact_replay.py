@@ -99,7 +99,7 @@ def test_after_missing_ticks_replay_continues_from_the_next_state(session: Recor
     session.hand.stroke(3)
     session.lose = lambda _: False
     session.hand.stroke(20)
-    session.hand.pipeline.tick.state_changed = True
+    session.send_retained()
     session.hand.stroke(60)
     session.recorder.finish()
     result = _replayed(Recording(session.paths[0]))[0].result

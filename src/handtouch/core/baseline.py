@@ -20,6 +20,8 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.core.state import TickState
+
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.intp]
@@ -60,34 +62,32 @@ class Baseline:
         end_counts: FloatArray,
         max_rise_time_s: FloatArray,
         hands: Iterable[slice],
+        state: TickState | None = None,
     ) -> None:
-        n = len(noise_counts)
+        n, hands = len(noise_counts), list(hands)
+        held = TickState.empty(n, len(hands)) if state is None else state
         self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
-        self.offset = np.zeros((n, 4))
-        self.std = begin_counts / _CONFIDENCE_SIGMA
-        self.noise_squared = np.repeat(np.square(noise_counts)[:, None], 4, axis=1)
-        self.held = np.zeros(n, np.bool_)
-        self.unverified = np.ones(n, np.bool_)
-        self.known = np.zeros(n, np.bool_)
-        self.touching = np.zeros(n, np.bool_)
-        self.drift_speed = _INITIAL_DRIFT_SIGMA_PER_S * noise_counts
-        self.gravity_slope = np.zeros((n, 4, 3))
-        self.gravity: FloatArray | None = None
-        """(n, 3) unit gravity in each link's frame, of the last `set_gravity`; 0: never known"""
-        self.smoothed_gravity = np.zeros((n, 3))  # with the time constant of the offset
+        self.offset, self.std, self.noise_squared = held.offset, held.offset_std, held.noise_squared
+        self.held, self.unverified, self.known = held.held, held.unverified, held.known
+        self.touching, self.drift_speed = held.block_touching, held.drift_speed
+        self.gravity, self.gravity_slope = held.gravity, held.gravity_slope
+        """`gravity` (n, 3): unit direction in each link's frame, of the last `set_gravity`; 0: never known"""
+        self.smoothed_gravity = held.smoothed_gravity  # with the time constant of the offset
+        self.common_drift = held.common_drift
+        """drift per channel common to each hand's pads"""
+        self.std[:] = begin_counts / _CONFIDENCE_SIGMA
+        self.noise_squared[:] = np.square(noise_counts)[:, None]
+        self.drift_speed[:] = _INITIAL_DRIFT_SIGMA_PER_S * noise_counts
         self.expected_counts = np.zeros((n, 4))
         """(n, 4) counts to subtract from a reading"""
-        self._hand_membership = np.zeros((len(hands := list(hands)), n))
+        self._hand_membership = np.zeros((len(hands), n))
         for row, pads in enumerate(hands):
             self._hand_membership[row, pads] = 1.0
-        self.common_drift = np.zeros(len(hands))
-        """drift per channel common to each hand's pads"""
-        self._sum, self._squares, self._buffer = np.zeros((n, 4)), np.zeros((n, 4)), np.zeros((n, 4))
-        self._count = np.zeros(n)
-        self._blocks = np.zeros(1, np.int64)
-        self._block_begin_ns = np.full(1, -_MAX_PAUSE_NS)
-        self._drift_until_ns = np.zeros(n, np.int64)  # time of each pad's last offset update
-        self._anchor, self._anchored_s = np.zeros(n), np.zeros(n)
+        self._sum, self._squares, self._count = held.block_sum, held.block_squares, held.block_count
+        self._buffer = np.zeros((n, 4))
+        self._blocks, self._block_begin_ns = held.blocks, held.block_begin_ns
+        self._drift_until_ns = held.drift_until_ns  # time of each pad's last offset update
+        self._anchor, self._anchored_s = held.drift_anchor, held.drift_anchored_s
 
     def set_settings(
         self,
@@ -96,15 +96,15 @@ class Baseline:
         end_counts: FloatArray,
         max_rise_time_s: FloatArray,
     ) -> None:
-        """Change the settings of all pads."""
+        """Change the settings of all pads. Call it also after the state was loaded."""
         self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
+        self._update_expected()
 
     def set_offset(self, pad: int, offset: npt.ArrayLike, std: npt.ArrayLike = 0.0) -> None:
         """Set a pad's offsets (4,) and their standard deviations (4,) or () [counts], from a store or a tare.
         The next reading is a contact only if it differs by more than these explain."""
         self.offset[pad] = offset
-        if self.gravity is not None:
-            self.offset[pad] -= self.gravity_slope[pad] @ self.gravity[pad]
+        self.offset[pad] -= self.gravity_slope[pad] @ self.gravity[pad]
         self.std[pad] = np.sqrt(np.sum(np.square(np.broadcast_to(std, 4))))
         self.unverified[pad] = self.known[pad] = True
         self.held[pad] = self.touching[pad]
@@ -123,8 +123,6 @@ class Baseline:
     def set_gravity(self, gravity: FloatArray) -> None:
         """Set the unit direction of gravity in each link's frame (n, 3); NaN where unknown: the last one
         holds."""
-        if self.gravity is None:
-            self.gravity = np.zeros_like(gravity)
         known = ~np.isnan(gravity[:, 0])
         first = known & ~self.gravity.any(axis=1)
         self.gravity[known] = gravity[known]
@@ -181,7 +179,7 @@ class Baseline:
         self._blocks[0] += 1
         if self._blocks[0] % _NOISE_PERIOD_BLOCKS == 0:
             self._update_noise(mean, free)
-        if self.gravity is not None:
+        if np.count_nonzero(self.gravity):
             self._update_gravity_slope(mean, free, dt_s)
         self._update_expected()
         self._sum[:] = 0.0
@@ -268,7 +266,6 @@ class Baseline:
     def _update_gravity_slope(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> None:
         """Update gravity slopes from the unexplained rest of offsets and the change of gravity (normalised
         LMS); both are smoothed alike, so a constant offset isn't attributed to gravity."""
-        assert self.gravity is not None
         turn = self.gravity - self.smoothed_gravity
         self.smoothed_gravity += turn * (-np.expm1(-dt_s / _TRACKING_TIME_S) * free)[:, None]
         gain = _GRAVITY_GAIN * free / (np.square(turn).sum(axis=1) + _MIN_TURN_SQUARED)
@@ -283,7 +280,7 @@ class Baseline:
 
     def _update_expected(self) -> None:
         np.copyto(self.expected_counts, self.offset)
-        if self.gravity is not None:
+        if np.count_nonzero(self.gravity):
             self.expected_counts += np.matmul(self.gravity_slope, self.gravity[:, :, None])[:, :, 0]
 
     def _set_limits(

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.state import TickState
+
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 FloatArray = NDArray[np.float64]
@@ -36,19 +38,14 @@ class ContactDetector:
         end: FloatArray,
         begin_samples: NDArray[np.int64],
         end_samples: NDArray[np.int64],
+        state: TickState | None = None,
     ) -> None:
-        n = len(begin)
-        self.touching = np.zeros(n, dtype=np.bool_)
-        self.id = np.zeros(n, dtype=np.uint32)
-        self.begin_ns = np.zeros(n, dtype=np.int64)
-        self.peak_force_n = np.full(n, np.nan)
-        self._begin_threshold, self._end_threshold = begin, np.nextafter(end, -np.inf)
-        self._threshold = begin.copy()  # the one that applies now: begin, or end while touching
-        self._required_samples = np.stack([begin_samples, end_samples])
-        self._contradicting_samples = np.zeros(n, dtype=np.int64)  # successive, against `touching`
-        self._debouncing = False  # any of them isn't 0
-        self._first_sample_ns = np.zeros(n, dtype=np.int64)
-        self._next_id = 1
+        held = TickState.empty(len(begin)) if state is None else state
+        self.touching, self.id, self.begin_ns = held.touching, held.contact_id, held.begin_ns
+        self.peak_force_n, self._next_id = held.peak_force_n, held.next_contact_id
+        self._first_sample_ns = held.first_sample_ns
+        self._contradicting_samples = held.contradicting_samples  # successive, against `touching`
+        self.set_settings(begin, end, begin_samples, end_samples)
 
     def detect_contacts(
         self, level: FloatArray, sampled: BoolArray, trusted: BoolArray, sample_ns: NDArray[np.int64]
@@ -70,22 +67,25 @@ class ContactDetector:
         # a sample below the threshold has no position: the last one holds until the debounce decides
         return ContactChanges(began, ended, (touching & sampled & above).nonzero()[0])
 
-    def set_thresholds(
+    def set_settings(
         self,
         begin: FloatArray,
         end: FloatArray,
         begin_samples: NDArray[np.int64],
         end_samples: NDArray[np.int64],
     ) -> None:
-        """Change thresholds and debounce counts; they apply to present contacts too."""
+        """Set thresholds and debounce counts; they apply to present contacts too. Call it also after the
+        state was loaded."""
         self._begin_threshold, self._end_threshold = begin, np.nextafter(end, -np.inf)
+        # the one that applies now
         self._threshold = np.where(self.touching, self._end_threshold, begin)
         self._required_samples = np.stack([begin_samples, end_samples])
+        self._debouncing = bool(self._contradicting_samples.any())
 
     @property
     def begun_count(self) -> int:
         """Number of contacts begun so far."""
-        return self._next_id - 1
+        return int(self._next_id[0]) - 1
 
     def clear_ended(self, ended: IntArray) -> None:
         """Clear the ids of ended contacts, after their last message was built."""
@@ -110,8 +110,8 @@ class ContactDetector:
         self.touching[ended] = False
         self._threshold[began] = self._end_threshold[began]
         self._threshold[ended] = self._begin_threshold[ended]
-        self.id[began] = np.arange(self._next_id, self._next_id + len(began))
-        self._next_id += len(began)
+        self.id[began] = np.arange(self._next_id[0], self._next_id[0] + len(began))
+        self._next_id[0] += len(began)
         self.begin_ns[began] = self._first_sample_ns[began]
         self.peak_force_n[began] = np.nan
         return began, ended

@@ -1,14 +1,12 @@
 """Recording of ticks: publish the inputs of each tick, so that a replay repeats it bit for bit.
 
-Public name: `TickJournal`.
-
-Whatever changes the state between two ticks, other than what `wire.TickInputs` holds, sets
-`tick.state_changed`; the whole state is published then. Nothing is encoded without a subscriber.
+Public name: `TickJournal`. A recording is a state and the inputs of every tick since, events included;
+nothing else exists. Nothing is encoded without a subscriber.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,11 +14,13 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment
-from handtouch.core import state
 from handtouch.core.cycle import Cycle
+from handtouch.core.events import Event, encode_calibration, encode_event
 from handtouch.core.slab import Slab
+from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor
 from handtouch.core.tick_messages import MessageSink
+from handtouch.core.transforms import ContactTransforms
 
 _NO_LIMIT_NS = np.iinfo(np.int64).max
 
@@ -31,26 +31,20 @@ class _Pipeline(Protocol):
     tick: TickProcessor
     cycle: Cycle
     slab: Slab
+    transforms: ContactTransforms
     node_state: NDArray[np.uint8]
-    ticks: int
+
+    @property
+    def ticks(self) -> int: ...
+    def save_state(self) -> bytes: ...
 
 
 class TickJournal:
-    """Publisher of a pipeline's `tick`, `state` and `config`.
+    """Publisher of a pipeline's `tick`, `state` and `config`."""
 
-    `extra_inputs`: name -> further inputs of a tick as msgpack values, empty if there are none.
-    """
-
-    def __init__(
-        self,
-        pipeline: _Pipeline,
-        session: int,
-        sink: MessageSink,
-        extra_inputs: Mapping[str, Callable[[], Any]],
-    ) -> None:
+    def __init__(self, pipeline: _Pipeline, session: int, sink: MessageSink) -> None:
         self._pipeline, self._session, self._sink = pipeline, session, sink
-        self._extra_inputs = dict(extra_inputs)
-        self._tick_seq = self._state_seq = self._config_seq = 0  # seq of each topic
+        self._tick_seq = self._config_seq = 0  # seq of each topic
         self._published_limits = b""
         self._config: tuple[str, Mapping[str, bytes], Mapping[str, Any]] | None = None
 
@@ -58,7 +52,7 @@ class TickJournal:
         """Return topic -> function that makes its retained message."""
         return {
             "config": lambda now_ns: self._config_message(now_ns, retained=True),
-            "state": lambda now_ns: self._state_message(now_ns, retained=True),
+            "state": self._state_message,
         }
 
     def publish_config(
@@ -72,16 +66,9 @@ class TickJournal:
             self._sink.send(message)
             self._sink.send(message)
 
-    def publish_changed_state(self, now_ns: int) -> None:
-        """Publish the state if something other than a tick changed it, before samples of the next one."""
-        tick = self._pipeline.tick
-        if tick.state_changed:
-            tick.state_changed = False
-            self._state_seq += 1
-            if self._sink.has_subscriber("state"):
-                self._sink.send(self._state_message(now_ns, retained=False))
-
-    def publish_tick_inputs(self, now_ns: int, until_ns: int, stopped: bool = False) -> None:
+    def publish_tick_inputs(
+        self, events: Sequence[Event], now_ns: int, until_ns: int, stopped: bool = False
+    ) -> None:
         """Publish the inputs of the last tick."""
         self._tick_seq += 1
         if not self._sink.has_subscriber("tick"):
@@ -105,25 +92,25 @@ class TickJournal:
                 arrival_ns=slab.arrival_ns.astype("<i8", copy=False).tobytes(),
                 fresh=slab.fresh.tobytes(),
                 node_state=pipeline.node_state.tobytes(),
-                synchronous=tick.synchronous.tobytes(),
-                period_ns=tick.max_sample_period_ns.astype("<i8", copy=False).tobytes(),
-                period_since_ns=tick.period_since_ns.astype("<i8", copy=False).tobytes(),
                 limits=limits if changed else None,
-                extra_inputs={name: value for name, read in self._extra_inputs.items() if (value := read())},
+                events=tuple(map(encode_event, events)),
+                joints=pipeline.transforms.recorded_joints(),
                 retained=False,
             )
         )
 
-    def _state_message(self, now_ns: int, retained: bool) -> wire.StateSnapshot:
+    def _state_message(self, now_ns: int) -> wire.StateSnapshot:
         return wire.StateSnapshot(
             v=wire.SCHEMA_VERSION,
             session=self._session,
-            seq=self._state_seq,
+            seq=0,
             t_ns=now_ns,
             tick=self._pipeline.ticks,
-            state=state.pack(state.save(self._pipeline)),
+            layout=TickState.layout(),
+            state=self._pipeline.save_state(),
+            calibrations=tuple(map(encode_calibration, self._pipeline.tick.model.calibrations)),
             limits=self._pipeline.slab.limits.tobytes(),
-            retained=retained,
+            retained=True,
         )
 
     def _config_message(self, now_ns: int, retained: bool) -> wire.Config | None:

@@ -20,6 +20,7 @@ from handtouch.config.channels import (
     order_by_electrode,
     resolve_channels,
 )
+from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, view_floats
 from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
@@ -46,13 +47,12 @@ class PadModel:
     """Columns of the n pads of a deployment, in its order, which is also the slab's.
 
     `hands`, `links`, `frame_links` (URDF links) and `calibration_ids` (n,) are names; `rows_of_hand`: hand ->
-    slice of rows. `ampere_per_count` (n, 4) of the electrodes x0, xa, y0, yb includes `gains` (n, 4);
-    `noise_counts` (n,) and `noise_a` (n, 4) are standard deviations of a channel. The counts of untouched
-    pads are state of the tick: see `Baseline`.
+    slice of rows; `calibrations` (n,): the active ones. `ampere_per_count` (n, 4) of the electrodes x0, xa,
+    y0, yb includes `gains` (n, 4); `noise_counts` (n,) and `noise_a` (n, 4) are standard deviations of a
+    channel. The counts of untouched pads are state of the tick: see `Baseline`.
 
     `gain_covariance` (n, 4, 4) is that of log gains; `quarantined` (n,): no force is published;
-    `position_unreliable` (n,); `diagnoses` (n,): names of the diagnoses responsible for either. `laws` (n,)
-    are contact laws of calibrations, None where the deployment's applies.
+    `position_unreliable` (n,).
 
     A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
     `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_samples`,
@@ -80,7 +80,7 @@ class PadModel:
         self.frame_links = [pad.mount.link or pad.link for pad in pads]
         self.rows_of_hand = _rows_of_hands(self.hands)
         self.default_calibration_ids = [default_calibration_id_of(pad, deployment) for pad in pads]
-        self.calibration_ids = list(self.default_calibration_ids)
+        self.calibrations = [PadCalibration(name) for name in self.default_calibration_ids]
         kinds = {name: resolve_channels(node.channels, node.eds) for name, node in deployment.nodes.items()}
         self.ampere_per_count = np.array(
             [_ampere_per_count(pad, deployment, kinds[pad.node]) for pad in pads]
@@ -97,7 +97,6 @@ class PadModel:
         self.gain_covariance = self._stated_gain_covariance.copy()
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
         self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
-        self.diagnoses: list[tuple[str, ...]] = [()] * self.size
         self.begin_threshold_n = np.array([touch.begin_threshold_n for touch in touches])
         self.end_threshold_n = np.array([touch.end_threshold_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
@@ -115,7 +114,6 @@ class PadModel:
         ]
         self.placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
-        self.laws: list[LawParameters | None] = [None] * self.size
         self._file_laws = [law_of(sheet) for sheet in sheets]
         self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
         self._series_form = np.stack([network.series_quadratic_form for network in networks])
@@ -149,22 +147,38 @@ class PadModel:
         gains = calibration.gains.factors if calibration.gains else (1.0,) * 4
         self.set_gains_and_law(pad, gains, name, calibration.law)
 
+    def set_calibration(self, pad: int, calibration: PadCalibration) -> None:
+        """Apply a calibration as a whole. Where series resistors matter, contacts are located with the
+        deployment's sheet resistance."""
+        before, self.calibrations[pad] = self.calibrations[pad], calibration
+        if calibration.law != before.law:
+            self._set_law(pad, calibration.law)
+        self.gains[pad] = calibration.gains
+        self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
+        self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
+        self.weight[pad] = 1 / self.noise_a[pad]
+        self.mean_ampere_per_count[pad] = self.ampere_per_count[pad].mean()
+        stated, covariance = self._stated_gain_covariance[pad], calibration.gain_covariance
+        self.gain_covariance[pad] = stated if covariance is None else np.reshape(covariance, (4, 4))
+        self.quarantined[pad] = calibration.quarantined
+        self.position_unreliable[pad] = calibration.position_unreliable
+
     def set_gains_and_law(
         self, pad: int, gains: ArrayLike, calibration_id: str, law: LawParameters | None = None
     ) -> None:
         """Set the gains of the channels x0, xa, y0, yb of a pad, its contact law and calibration id.
 
-        `law` None: the deployment's. Where series resistors matter, contacts are located with the
-        deployment's sheet resistance.
+        `law` None: the deployment's.
         """
-        if law != self.laws[pad]:
-            self._set_law(pad, law)
-        self.gains[pad] = gains
-        self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
-        self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
-        self.weight[pad] = 1 / self.noise_a[pad]
-        self.mean_ampere_per_count[pad] = self.ampere_per_count[pad].mean()
-        self.calibration_ids[pad] = calibration_id
+        values = tuple(np.asarray(gains, np.float64).tolist())
+        self.set_calibration(
+            pad, replace(self.calibrations[pad], calibration_id=calibration_id, gains=values, law=law)
+        )
+
+    @property
+    def calibration_ids(self) -> list[str]:
+        """Names of the calibrations (n,)."""
+        return [calibration.calibration_id for calibration in self.calibrations]
 
     @property
     def begin_threshold_counts(self) -> FloatArray:
@@ -178,7 +192,11 @@ class PadModel:
 
     def law(self, pad: int) -> LawParameters:
         """Return the contact law of a pad: its calibration's, or the deployment's."""
-        return self.laws[pad] or self._file_laws[pad]
+        return self.calibrations[pad].law or self._file_laws[pad]
+
+    def default_law(self, pad: int) -> LawParameters:
+        """Return the contact law of the deployment."""
+        return self._file_laws[pad]
 
     def set_uncertainty(
         self,
@@ -193,28 +211,37 @@ class PadModel:
         `quarantined`: publish no force; `position_unreliable`: publish positions as unreliable; because of
         `diagnoses`.
         """
-        stated = self._stated_gain_covariance[pad]
-        self.gain_covariance[pad] = stated if log_gain_covariance is None else log_gain_covariance
-        self.quarantined[pad], self.position_unreliable[pad] = quarantined, position_unreliable
-        self.diagnoses[pad] = diagnoses
+        covariance = None
+        if log_gain_covariance is not None:
+            covariance = tuple(np.ravel(np.asarray(log_gain_covariance, np.float64)).tolist())
+        self.set_calibration(
+            pad,
+            replace(
+                self.calibrations[pad],
+                gain_covariance=covariance,
+                quarantined=quarantined,
+                position_unreliable=position_unreliable,
+                diagnoses=diagnoses,
+            ),
+        )
 
     def copy_calibrations(self, other: PadModel) -> None:
         """Take over all calibrations of the model that this one replaces."""
-        for pad in range(self.size):
-            calibrated = (
-                bool((other.gains[pad] != 1).any())
-                or other.calibration_ids[pad] != other.default_calibration_ids[pad]
-            )
-            calibration_id = other.calibration_ids[pad] if calibrated else self.calibration_ids[pad]
-            self.set_gains_and_law(pad, other.gains[pad], calibration_id, other.laws[pad])
-            is_stated = (other.gain_covariance[pad] == other._stated_gain_covariance[pad]).all()
-            self.set_uncertainty(
-                pad,
-                None if is_stated else other.gain_covariance[pad],
-                bool(other.quarantined[pad]),
-                bool(other.position_unreliable[pad]),
-                other.diagnoses[pad],
-            )
+        for pad, calibration in enumerate(self.continued_calibrations(other, other.calibrations)):
+            self.set_calibration(pad, calibration)
+
+    def continued_calibrations(
+        self, other: PadModel, calibrations: Sequence[PadCalibration]
+    ) -> list[PadCalibration]:
+        """Return calibrations (n,) of the model that this one replaces as this one has them: default ones
+        change their name."""
+        defaults = zip(other.default_calibration_ids, self.default_calibration_ids, strict=True)
+        return [
+            replace(calibration, calibration_id=after)
+            if calibration.calibration_id == before and all(gain == 1 for gain in calibration.gains)
+            else calibration
+            for calibration, (before, after) in zip(calibrations, defaults, strict=True)
+        ]
 
     def estimate_force(
         self,
@@ -248,7 +275,6 @@ class PadModel:
 
     def _set_law(self, pad: int, law: LawParameters | None) -> None:
         """Apply a contact law, and the thresholds [A] that follow from it."""
-        self.laws[pad] = law
         applied, old = law or self._file_laws[pad], self._law
         contact, alpha = np.array(old.contact_ohm_m2), np.array(old.alpha)
         contact[pad], alpha[pad] = applied.contact_ohm_mm2 * 1e-6, applied.alpha

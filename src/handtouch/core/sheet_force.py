@@ -8,16 +8,17 @@ Public names: `SheetForceCompensation`, `SheetBehaviour`, `sheet_behaviour_of`, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from handtouch import sheet
 from handtouch.config import Behaviour
+from handtouch.core.state import SHEET_ELEMENTS, SHEET_PLAYS, TickState
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -74,58 +75,81 @@ class SheetForceCompensation:
     (n,): log of the factor applied to compensated forces, from reference forces.
     """
 
-    def __init__(self, behaviours: Sequence[SheetBehaviour | None], period_ns: int) -> None:
+    def __init__(
+        self,
+        behaviours: Sequence[SheetBehaviour | None],
+        period_ns: int,
+        state: TickState | None = None,
+    ) -> None:
         n = len(behaviours)
+        held = TickState.empty(n) if state is None else state
+        self._held = held
         self.modelled = np.array([behaviour is not None for behaviour in behaviours], np.bool_)
         self.any_modelled = bool(self.modelled.any())
-        self.force_n, self.std_n = np.full(n, np.nan), np.full(n, np.nan)
-        self.state = np.where(self.modelled, ForceReliability.UNRELIABLE, ForceReliability.RELIABLE).astype(
-            np.uint8
+        self.force_n, self.std_n = held.compensated_force_n, held.compensated_std_n
+        self.state, self.contacts, self.touched_s = (
+            held.force_reliability,
+            held.evidence_contacts,
+            held.touched_s,
         )
-        self.contacts, self.touched_s = np.zeros(n, np.int64), np.zeros(n)
-        self.log_gain = np.zeros(n)
-        self.log_gain_std = np.array([0.0 if b is None else b.gain_std for b in behaviours])
-        self._first_gain_std = self.log_gain_std.copy()
+        self.log_gain, self.log_gain_std = held.log_gain, held.log_gain_std
+        self._first_gain_std = np.array([0.0 if b is None else b.gain_std for b in behaviours])
         self._slow_creep = np.array([0.0 if b is None else b.slow_creep for b in behaviours])
-        self._last_touch_ns = np.zeros(n, np.int64)
-        self._gain = np.ones(n)
-        self._confirmed = np.zeros(n, np.bool_)
-        self._begin_s = np.zeros(n)  # `touched_s` when the contact began
-        self._compared_ns = np.zeros(n, np.int64)
+        self._last_touch_ns, self._compared_ns = held.last_touch_ns, held.compared_ns
+        self._confirmed, self._begin_s = held.force_confirmed, held.touched_at_begin_s
+        self._updated_ns = held.sheets_updated_ns  # time of the sheets' state
+        self._waited_s = held.uncertainty_waited_s  # since the last update of uncertainties
+        self._new_contacts = held.new_contact  # since then
+        self._relative_std = held.relative_std  # standard deviation over force
         self._period_ns = period_ns
-        self._updated_ns = np.zeros(1, np.int64)  # time of the sheets' state
-        self._apparent = np.zeros(n)
-        self._waited_s = np.zeros(1)  # since the last update of uncertainties
-        self._new_contacts = np.zeros(n, np.bool_)  # since then
-        self._relative_std = np.full(n, np.nan)  # standard deviation over force
-        self.groups = _BehaviourGroups(behaviours)
+        self._apparent, self._gain = np.zeros(n), np.ones(n)
+        self._reset()
+        self.groups = _make_groups(behaviours, held)
 
     def with_behaviours(
         self, before: Sequence[SheetBehaviour | None], behaviours: Sequence[SheetBehaviour | None]
     ) -> SheetForceCompensation:
-        """Return self, or another object if behaviours changed; state of unchanged pads is kept."""
+        """Return self, or an object that replaces it if behaviours changed; state of unchanged pads is
+        kept."""
         if behaviours == before:
             return self
-        fresh = SheetForceCompensation(behaviours, self._period_ns)
         kept = np.array([old == new for old, new in zip(before, behaviours, strict=True)])
-        for name in ("force_n", "std_n", "state", "contacts", "touched_s", "log_gain", "log_gain_std"):
-            getattr(fresh, name)[kept] = getattr(self, name)[kept]
-        fresh._gain[:] = np.exp(fresh.log_gain)
-        fresh._updated_ns[:] = self._updated_ns
+        names = ("force_n", "std_n", "state", "contacts", "touched_s", "log_gain", "log_gain_std")
+        values = {name: getattr(self, name)[kept] for name in (*names, "_confirmed")}
+        updated_ns, (back_n, back_std_n) = self._updated_ns.copy(), self.back_force
+        fresh = SheetForceCompensation(behaviours, self._period_ns, self._held)
+        for name in names:
+            getattr(fresh, name)[kept] = values[name]
+        fresh.refresh()
+        fresh._updated_ns[:] = updated_ns
         for pad in np.flatnonzero(kept & self.modelled).tolist():
-            group, row = self.groups.find(pad)
-            fresh.set_back_force(
-                pad, group.compensator.back_n[row], group.compensator.back_std_n[row], confirmed=False
-            )
-        fresh._confirmed[kept] = self._confirmed[kept]
+            fresh.set_back_force(pad, back_n[pad], back_std_n[pad], confirmed=False)
+        fresh._confirmed[kept] = values["_confirmed"]
         return fresh
+
+    def refresh(self) -> None:
+        """Compute what follows from the state, after that was loaded."""
+        np.exp(self.log_gain, out=self._gain)
+
+    def _reset(self) -> None:
+        """Begin with fresh sheets, without evidence."""
+        unreliable, reliable = ForceReliability.UNRELIABLE, ForceReliability.RELIABLE
+        self.state[:] = np.where(self.modelled, unreliable, reliable)
+        self.force_n[:] = self.std_n[:] = self._relative_std[:] = np.nan
+        zero: tuple[npt.NDArray[Any], ...] = (
+            *(self.contacts, self.touched_s, self.log_gain, self._last_touch_ns, self._compared_ns),
+            *(self._confirmed, self._begin_s, self._updated_ns, self._waited_s, self._new_contacts),
+        )
+        for column in zero:
+            column[:] = 0
+        self.log_gain_std[:] = self._first_gain_std
 
     def set_back_force(self, pad: int, back_n: float, std_n: float, *, confirmed: bool = True) -> None:
         """Set the back force of a pad's sheet [N], e.g. from a store; `confirmed`: its forces are reliable
         without further evidence. Ignored for a pad without sheet model."""
         if not self.modelled[pad]:
             return
-        group, row = self.groups.find(pad)
+        group, row = self._find_group(pad)
         back, spread = group.compensator.back_n.copy(), group.compensator.back_std_n.copy()
         back[row], spread[row] = back_n, std_n
         group.compensator.set_back_force(back, spread)
@@ -140,27 +164,31 @@ class SheetForceCompensation:
         if self.modelled[pad]:
             self.state[pad] = ForceReliability.UNRELIABLE
             if new_sheet:
-                group, row = self.groups.find(pad)
+                group, row = self._find_group(pad)
                 group.compensator.reset_pads(np.array([row]))
 
     def set_excitation(self, on: BoolArray) -> None:
         """Set the pads (n,) whose sheet has its potential."""
-        for group in self.groups.all:
+        for group in self.groups:
             group.compensator.set_powered(on[group.pads])
 
     @property
     def back_force(self) -> tuple[FloatArray, FloatArray]:
         """Back force of each sheet and its standard deviation (n,) [N]; NaN where not modelled."""
         back, std = np.full(len(self.force_n), np.nan), np.full(len(self.force_n), np.nan)
-        for group in self.groups.all:
+        for group in self.groups:
             back[group.rows], std[group.rows] = group.compensator.back_n, group.compensator.back_std_n
         return back, std
+
+    def _find_group(self, pad: int) -> tuple[_BehaviourGroup, int]:
+        """Return the group of a pad, and its row there."""
+        return next((g, int(g.pads.searchsorted(pad))) for g in self.groups if pad in g.pads)
 
     def begin_contacts(self, began: IntArray) -> None:
         """Note contacts that began on these pads. In the pause before, a press below the threshold may have
         wiped the back force: take the mean of both possibilities, and their difference as uncertainty."""
         pause_s = (self._updated_ns[0] - self._last_touch_ns[began]) * 1e-9
-        for group in self.groups.all:
+        for group in self.groups:
             rows = np.searchsorted(group.pads, began)
             here = np.flatnonzero(group.pads[np.minimum(rows, len(group.pads) - 1)] == began)
             group.decay_back_force(rows[here], pause_s[here])
@@ -180,7 +208,7 @@ class SheetForceCompensation:
         apparent = self._apparent
         apparent.fill(0.0)
         np.copyto(apparent, uncompensated_n, where=touching)
-        for group in self.groups.all:
+        for group in self.groups:
             load = group.compensator.compensate(apparent[group.rows], dt_s)
             self.force_n[group.rows] = load
         self._waited_s[0] += dt_s
@@ -239,7 +267,7 @@ class SheetForceCompensation:
         self.touched_s += self._waited_s * touching
         self._waited_s[0] = 0.0
         self._new_contacts[:] = False
-        for group in self.groups.all:
+        for group in self.groups:
             self.std_n[group.rows] = group.compensator.std_n()
         variance = np.square(self.std_n[pressed]) + np.square(uncompensated_std_n[pressed])
         held_s = self.touched_s[pressed] - self._begin_s[pressed]
@@ -263,35 +291,16 @@ class SheetForceCompensation:
         return periods * self._period_ns * 1e-9
 
 
-class _BehaviourGroups:
-    """Pads by sheet behaviour; groups are attributes, where `core.state` finds their state."""
-
-    def __init__(self, behaviours: Sequence[SheetBehaviour | None]) -> None:
-        kinds = dict.fromkeys(b for b in behaviours if b is not None)
-        for number, kind in enumerate(kinds):
-            setattr(
-                self, f"group{number}", _BehaviourGroup(kind, np.flatnonzero([b == kind for b in behaviours]))
-            )
-
-    @property
-    def all(self) -> Iterable[_BehaviourGroup]:
-        return vars(self).values()
-
-    def find(self, pad: int) -> tuple[_BehaviourGroup, int]:
-        """Return the group of a pad, and its row there."""
-        return next((g, int(g.pads.searchsorted(pad))) for g in self.all if pad in g.pads)
-
-
 class _BehaviourGroup:
-    """Pads of equal sheet behaviour."""
+    """Pads of equal sheet behaviour; `state`: of their sheets."""
 
-    def __init__(self, behaviour: SheetBehaviour, pads: IntArray) -> None:
+    def __init__(self, behaviour: SheetBehaviour, pads: IntArray, state: sheet.CompensatorState) -> None:
         self.pads = pads
         whole = len(pads) == pads[-1] - pads[0] + 1
         self.rows: slice | IntArray = slice(int(pads[0]), int(pads[-1]) + 1) if whole else pads
         self._forget_time_s = behaviour.forget_time_s
         self.compensator = sheet.SheetCompensator(
-            behaviour.model, len(pads), behaviour.uncertainty, update_period_s=UPDATE_PERIOD_S
+            behaviour.model, len(pads), behaviour.uncertainty, update_period_s=UPDATE_PERIOD_S, state=state
         )
         if behaviour.back_force_std_n:
             self.compensator.set_back_force(0.0, behaviour.back_force_std_n)
@@ -307,6 +316,31 @@ class _BehaviourGroup:
         )
         std[rows] = np.sqrt(kept * (np.square(std[rows]) + (1 - kept) * np.square(back[rows])))
         back[rows] *= kept
+
+
+def _make_groups(behaviours: Sequence[SheetBehaviour | None], held: TickState) -> list[_BehaviourGroup]:
+    """Return the pads by sheet behaviour, with fresh sheets in consecutive rows of the state."""
+    groups, first = [], 0
+    for number, kind in enumerate(dict.fromkeys(b for b in behaviours if b is not None)):
+        pads = np.flatnonzero([b == kind for b in behaviours])
+        rows = slice(first, first + len(pads))
+        first += len(pads)
+        elements, plays = 1 + len(kind.model.creep.times_s), len(kind.model.hysteresis.widths_n)
+        if elements > SHEET_ELEMENTS or plays > SHEET_PLAYS:
+            raise ValueError(f"a sheet model of {elements} elements and {plays} plays is too large")
+        state = sheet.CompensatorState(
+            held.sheet_elements[rows].T[:elements],
+            held.sheet_plays[rows].T[:plays],
+            *(held.back_n[rows], held.current_flow_s[rows], held.back_std_n[rows], held.press_n[rows]),
+            *(held.flow_s[rows], held.impulse_ns[rows], held.powered[rows]),
+            held.back_waited_s[number : number + 1],
+            held.load_is_old[number : number + 1],
+        )
+        for part in vars(state).values():
+            part[:] = 0
+        state.powered[:] = True
+        groups.append(_BehaviourGroup(kind, pads, state))
+    return groups
 
 
 def sheet_behaviour_of(behaviour: Behaviour) -> SheetBehaviour:

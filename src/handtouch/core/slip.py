@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.pad_tables import view_floats
-from handtouch.core.stages.slip import SLIP_COUNT, SLIP_PARAMETERS, SLIP_SLICES, SLIP_WORK, SlipStage
+from handtouch.core.stages.slip import SLIP_PARAMETERS, SLIP_SLICES, SLIP_WORK, SlipStage
+
+from handtouch.core.state import TickState
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -86,12 +88,11 @@ class SlipDetector:
         ids: NDArray[np.uint32],
         false_alarm_s: float = FALSE_ALARM_S,
         grip: GripModel | None = None,
+        held: TickState | None = None,
     ) -> None:
-        n = len(ids)
-        self.state = np.zeros((n, SLIP_COUNT))
-        self.contact_id = np.zeros(n, dtype=np.uint32)
-        self.sample_ns = np.zeros(n, dtype=np.int64)
-        self.requested: BoolArray = np.zeros(n, dtype=np.bool_)
+        held = TickState.empty(len(ids)) if held is None else held
+        self.state, self.contact_id = held.slip, held.slip_contact_id
+        self.sample_ns, self.requested = held.slip_sample_ns, held.slip_requested
         self.any_requested = False
         self.samples_per_false_alarm = max(false_alarm_s / period_s, 2.0)
         self._stage = SlipStage(
@@ -110,7 +111,11 @@ class SlipDetector:
         """Set the pads (n,) it runs for; contacts on changed ones start afresh."""
         self.restart_contacts(np.flatnonzero(pads != self.requested))
         self.requested[:] = pads
-        self.any_requested = bool(pads.any())
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Compute what follows from the state, after that was loaded."""
+        self.any_requested = bool(self.requested.any())
 
     def restart_contacts(self, pads: IntArray) -> None:
         """Start the contacts on these pads (k,) afresh with their next sample."""

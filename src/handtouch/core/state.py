@@ -1,248 +1,239 @@
-"""State of a pipeline between two ticks: saved from one, restored into another of the same deployment.
+"""The state of a pipeline between two ticks: everything that survives a tick, in named arrays of one block.
 
-Public names: `save`, `restore`, `pack`, `unpack`.
+Public names: `TickState`, `StateLayoutError`.
 
-A walk over the attributes of the pipeline and its parts finds every array and number, so that new state is
-saved without registration here. A value of unknown type is an error; nothing is left out silently.
+The parts of the tick hold views of these arrays and write them in place, so that the block's bytes are the
+state. What isn't here follows from it and the model (`TickProcessor.refresh`), or is an input of the tick.
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
+import typing
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass, replace
-from enum import Enum
-from functools import partial
-from types import BuiltinFunctionType, FunctionType, MethodType
-from typing import Any
+from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Annotated, Any
 
-import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
-from handtouch.core.contact_solver import ContactSolver
-from handtouch.core.slab import Slab
-from handtouch.core.stages.slip import SlipStage
-from handtouch.field import LocatorBank
-from handtouch.field.contact_law import ContactLaw
-from handtouch.hand import PadGeometry
-from handtouch.hand.robot_models import RobotModels
+from handtouch.core.stages.slip import SLIP_COUNT
+from handtouch.core.stages.solve import VALUE_COUNT
+from handtouch.wire import PadState
 
-_IMMUTABLE_TYPES = (
-    slice,
-    range,
-    frozenset,
-    type,
-    memoryview,
-    FunctionType,
-    MethodType,
-    BuiltinFunctionType,
-    partial,
-)
-_DERIVED_TYPES = (
-    *(LocatorBank, ContactSolver, SlipStage),
-    *(PadGeometry, ContactLaw, RobotModels),
-)
-"""Follow from the deployment."""
-_INPUT_TYPES = (Slab,)
-"""Filled in every tick."""
-_EXCLUDED_ATTRIBUTES = {
-    ("Pipeline", "_sink"), ("Pipeline", "journal"), ("Pipeline", "external_inputs"),
-    ("ContactTransforms", "_robots"), ("TickMessages", "_encoders"),
-    ("PadModel", "networks"), ("PadModel", "forward_tables"), ("PadModel", "surface_tables"),
-    ("PadModel", "_parts"),
-}  # fmt: skip
-"""Message output and its encoding, inputs not applied yet, robots, which are optional, and what follows from
-the deployment: no state."""
-_SCALAR_TYPES = (bool, int, float, str, type(None))
-_NOT_STATE_TYPES = _IMMUTABLE_TYPES + _DERIVED_TYPES + _INPUT_TYPES
-_LEAF_TYPES = {*_SCALAR_TYPES, np.ndarray}
+VERSION = 1
+"""Of what the fields mean; their names, types and shapes are in the hash of the layout."""
+PUBLISHED_VALUES = 21
+PALM_VALUES = 31
+SHEET_ELEMENTS = SHEET_PLAYS = 8
+_ALIGNMENT = 64
+_MAX_PAUSE_NS = 3600 * 10**9
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Uint8Array = NDArray[np.uint8]
+Uint32Array = NDArray[np.uint32]
 
 
-def save(pipeline: object) -> dict[str, Any]:
-    """Return path -> value of all state; arrays as [type, shape, bytes].
-
-    Raises TypeError naming an attribute of unknown type.
-    """
-    return {
-        path: _serialised(getattr(owner, name), path) for path, owner, name in _state_attributes(pipeline)
-    }
+class StateLayoutError(ValueError):
+    """A state was saved with another layout, number of pads or number of hands."""
 
 
-def restore(pipeline: object, saved: dict[str, Any]) -> None:
-    """Restore state saved from a pipeline of the same deployment; arrays keep their identity.
+class Stored:
+    """Type, shape ("pads", "hands" or a number for each dimension) and first value of a field."""
 
-    Raises ValueError naming attributes that only one of the two has: they are of different builds.
-    """
-    attributes = list(_state_attributes(pipeline))
-    paths = {path for path, _, _ in attributes}
-    if differing := sorted(paths ^ saved.keys()):
-        raise ValueError(f"the state is of another build: it differs in {', '.join(differing[:5])}")
-    for path, owner, name in attributes:
-        before = getattr(owner, name)
-        after = _deserialised(before, saved[path], path)
-        if after is not before:
-            object.__setattr__(owner, name, after)  # some are frozen
+    def __init__(self, dtype: str, *shape: int | str, fill: float = 0) -> None:
+        self.dtype, self.shape, self.fill = np.dtype(dtype), shape, fill
 
 
-def pack(saved: dict[str, Any]) -> bytes:
-    """Encode what `save` returned."""
-    return bytes(msgpack.packb(saved))
+_PADS, _HANDS = "pads", "hands"
 
 
-def unpack(data: bytes) -> dict[str, Any]:
-    """Decode what `pack` returned. Raises ValueError for malformed bytes."""
-    try:
-        saved = msgpack.unpackb(data, strict_map_key=False)
-    except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:
-        raise ValueError(f"malformed state: {error}") from error
-    if not isinstance(saved, dict):
-        raise ValueError("malformed state: not a map")
-    return saved
+@dataclass(frozen=True)
+class TickState:
+    """State of `pads` pads on `hands` hands; made by `empty`. All arrays are views of `block`."""
+
+    pads: int
+    hands: int
+    block: Uint8Array = field(repr=False)
+
+    ticks: Annotated[IntArray, Stored("<i8", 1)]
+    """number of ticks"""
+
+    # samples
+    pad_state: Annotated[Uint8Array, Stored("u1", _PADS, fill=PadState.STARTING)]
+    """PadState"""
+    sample_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    """SYNC of the newest sample, 0 before the first"""
+    arrival_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    """arrival of the newest sample used"""
+    sample_counts: Annotated[IntArray, Stored("<i8", _PADS)]
+    """samples received"""
+    missed_sample_counts: Annotated[IntArray, Stored("<i8", _PADS)]
+    """expected samples that arrived after their tick or not at all"""
+    synchronous: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
+    """pads sampled by SYNC; the others are event-driven and not waited for"""
+    max_sample_period_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    """longest regular time between two samples"""
+    awaited_since_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    """time since which samples are awaited: of the last change of sampling, later by the loop's pauses"""
+    total_current_a: Annotated[FloatArray, Stored("<f8", _PADS)]
+    """sum of the channels"""
+
+    # contacts
+    touching: Annotated[BoolArray, Stored("?", _PADS)]
+    contact_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
+    """0 without contact"""
+    next_contact_id: Annotated[IntArray, Stored("<i8", 1, fill=1)]
+    begin_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    """first sample of the contact above the begin threshold"""
+    first_sample_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    """first of the contradicting samples"""
+    contradicting_samples: Annotated[IntArray, Stored("<i8", _PADS)]
+    """successive samples against `touching`"""
+    peak_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
+    solved: Annotated[BoolArray, Stored("?", _PADS)]
+    """contacts that were solved since they began and their outputs were requested"""
+    values: Annotated[FloatArray, Stored("<f8", _PADS, VALUE_COUNT, fill=math.nan)]
+    """values of the contact's last solved sample, see `stages.solve.VALUE_SLICES`"""
+    published: Annotated[Float32Array, Stored("<f4", _PADS, PUBLISHED_VALUES, fill=math.nan)]
+    """columns of the hand frame that are written per contact"""
+    uncompensated_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
+    uncompensated_std_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
+    force_saturated: Annotated[BoolArray, Stored("?", _PADS)]
+
+    # requested outputs
+    position_requested: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
+    force_requested: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
+    palm_requested: Annotated[BoolArray, Stored("?", _PADS)]
+    base_requested: Annotated[BoolArray, Stored("?", _PADS)]
+    update_interval_ticks: Annotated[IntArray, Stored("<i8", _PADS, fill=1)]
+    ticks_per_hand_frame: Annotated[IntArray, Stored("<i8", 1, fill=1)]
+
+    # baselines, see `Baseline`
+    offset: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
+    offset_std: Annotated[FloatArray, Stored("<f8", _PADS)]
+    noise_squared: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
+    held: Annotated[BoolArray, Stored("?", _PADS)]
+    unverified: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
+    known: Annotated[BoolArray, Stored("?", _PADS)]
+    block_touching: Annotated[BoolArray, Stored("?", _PADS)]
+    """contacts when the last block ended"""
+    drift_speed: Annotated[FloatArray, Stored("<f8", _PADS)]
+    drift_until_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    drift_anchor: Annotated[FloatArray, Stored("<f8", _PADS)]
+    drift_anchored_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    common_drift: Annotated[FloatArray, Stored("<f8", _HANDS)]
+    gravity: Annotated[FloatArray, Stored("<f8", _PADS, 3)]
+    smoothed_gravity: Annotated[FloatArray, Stored("<f8", _PADS, 3)]
+    gravity_slope: Annotated[FloatArray, Stored("<f8", _PADS, 4, 3)]
+    block_sum: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
+    block_squares: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
+    block_count: Annotated[FloatArray, Stored("<f8", _PADS)]
+    block_begin_ns: Annotated[IntArray, Stored("<i8", 1, fill=-_MAX_PAUSE_NS)]
+    blocks: Annotated[IntArray, Stored("<i8", 1)]
+
+    # compensation of sheet behaviour, see `SheetForceCompensation`
+    compensated_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
+    compensated_std_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
+    relative_std: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
+    force_reliability: Annotated[Uint8Array, Stored("u1", _PADS)]
+    evidence_contacts: Annotated[IntArray, Stored("<i8", _PADS)]
+    touched_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    touched_at_begin_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    last_touch_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    new_contact: Annotated[BoolArray, Stored("?", _PADS)]
+    force_confirmed: Annotated[BoolArray, Stored("?", _PADS)]
+    log_gain: Annotated[FloatArray, Stored("<f8", _PADS)]
+    log_gain_std: Annotated[FloatArray, Stored("<f8", _PADS)]
+    compared_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    sheets_updated_ns: Annotated[IntArray, Stored("<i8", 1)]
+    uncertainty_waited_s: Annotated[FloatArray, Stored("<f8", 1)]
+    # rows below are pads with a sheet model, ordered by their behaviour; then behaviours
+    sheet_elements: Annotated[FloatArray, Stored("<f8", _PADS, SHEET_ELEMENTS)]
+    sheet_plays: Annotated[FloatArray, Stored("<f8", _PADS, SHEET_PLAYS)]
+    back_n: Annotated[FloatArray, Stored("<f8", _PADS)]
+    back_std_n: Annotated[FloatArray, Stored("<f8", _PADS)]
+    press_n: Annotated[FloatArray, Stored("<f8", _PADS)]
+    current_flow_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    flow_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    impulse_ns: Annotated[FloatArray, Stored("<f8", _PADS)]
+    powered: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
+    back_waited_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    load_is_old: Annotated[BoolArray, Stored("?", _PADS)]
+
+    # palm and base frames, see `ContactTransforms` and `ContactGroups`
+    palm_status: Annotated[Uint8Array, Stored("u1", _PADS)]
+    base_status: Annotated[Uint8Array, Stored("u1", _PADS)]
+    palm_values: Annotated[FloatArray, Stored("<f8", _PADS, PALM_VALUES, fill=math.nan)]
+    palm_rotation: Annotated[FloatArray, Stored("<f8", _PADS, 3, 3, fill=math.nan)]
+    joint_variance_m2: Annotated[FloatArray, Stored("<f8", _PADS)]
+    group_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
+    grouped_contact_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
+    grouped: Annotated[BoolArray, Stored("?", _PADS, _PADS)]
+
+    # slip, see `SlipDetector`
+    slip: Annotated[FloatArray, Stored("<f8", _PADS, SLIP_COUNT)]
+    """see `stages.slip.SLIP_SLICES`"""
+    slip_contact_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
+    slip_sample_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    slip_requested: Annotated[BoolArray, Stored("?", _PADS)]
+
+    # messages
+    contact_seq: Annotated[IntArray, Stored("<i8", _PADS)]
+    frame_seq: Annotated[IntArray, Stored("<i8", 1)]
+    frame_tick: Annotated[IntArray, Stored("<i8", 1)]
+    frame_sync_ns: Annotated[IntArray, Stored("<i8", 1)]
+
+    @classmethod
+    def empty(cls, pads: int, hands: int = 1) -> TickState:
+        """Return the state before the first tick."""
+        sizes = {_PADS: pads, _HANDS: hands}
+        places: list[tuple[str, Stored, tuple[int, ...], int]] = []
+        end = 0
+        for name, stored in _stored_fields():
+            shape = tuple(sizes[size] if isinstance(size, str) else size for size in stored.shape)
+            places.append((name, stored, shape, end))
+            end += -(-math.prod(shape) * stored.dtype.itemsize // _ALIGNMENT) * _ALIGNMENT
+        block: Uint8Array = np.zeros(end, dtype=np.uint8)
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, stored, shape, begin in places:
+            size = math.prod(shape) * stored.dtype.itemsize
+            arrays[name] = block[begin : begin + size].view(stored.dtype).reshape(shape)
+            arrays[name].fill(stored.fill)
+        return cls(pads, hands, block, **arrays)
+
+    @staticmethod
+    @cache
+    def layout() -> str:
+        """Return version and hash of the declared fields."""
+        text = "\n".join(f"{name} {stored.dtype.str} {stored.shape}" for name, stored in _stored_fields())
+        return f"{VERSION}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+
+    def save(self) -> bytes:
+        """Return the bytes of all arrays."""
+        return self.block.tobytes()
+
+    def load(self, saved: bytes, layout: str) -> None:
+        """Write a saved state into the arrays. Raises StateLayoutError, changing nothing."""
+        if layout != self.layout():
+            raise StateLayoutError(
+                f"the state has the layout {layout or 'none'}, this handtouch {self.layout()}"
+            )
+        if len(saved) != len(self.block):
+            raise StateLayoutError(
+                f"the state has {len(saved)} bytes, one of {self.pads} pads on {self.hands} hands has "
+                f"{len(self.block)}"
+            )
+        self.block[:] = np.frombuffer(saved, dtype=np.uint8)
 
 
-def _state_attributes(root: object) -> Iterator[tuple[str, Any, str]]:
-    """Yield path, owner and name of every attribute that holds values, visiting each object once."""
-    seen = {id(root)}
-    waiting: list[tuple[str, Any]] = [("", root)]
-    while waiting:
-        prefix, owner = waiting.pop()
-        for name in _attribute_names(owner):
-            value = getattr(owner, name)
-            path = f"{prefix}{name}"
-            if (type(owner).__name__, name) in _EXCLUDED_ATTRIBUTES:
-                continue
-            if type(value) in _LEAF_TYPES:  # most of them: this runs in the hot thread
-                yield path, owner, name
-                continue
-            if isinstance(value, _NOT_STATE_TYPES):
-                continue
-            if isinstance(value, dict) and all(isinstance(item, _IMMUTABLE_TYPES) for item in value.values()):
-                continue
-            inside = _nested_objects(value)
-            if inside is None:
-                yield path, owner, name
-                continue
-            for suffix, item in inside:
-                if id(item) not in seen:
-                    seen.add(id(item))
-                    waiting.append((f"{path}{suffix}.", item))
-
-
-def _attribute_names(owner: object) -> list[str]:
-    slots = [name for kind in type(owner).__mro__ for name in getattr(kind, "__slots__", ())]
-    return [*getattr(owner, "__dict__", {}), *slots]
-
-
-def _nested_objects(value: Any) -> list[tuple[str, Any]] | None:
-    """Return the objects to walk into, by path from the attribute; None for a plain value."""
-    if _is_walked(value):
-        return [("", value)]
-    pairs: list[tuple[Any, Any]] = []
-    if isinstance(value, dict):
-        pairs = list(value.items())
-    elif isinstance(value, list) or type(value) is tuple:
-        pairs = list(enumerate(value))
-    objects = [(f"[{key!r}]", item) for key, item in pairs if _is_walked(item)]
-    return (
-        objects if objects and len(objects) + sum(item is None for _, item in pairs) == len(pairs) else None
-    )
-
-
-def _is_walked(value: object) -> bool:
-    """Return True for mutable objects of handtouch; named tuples, enums and frozen dataclasses are values."""
-    if isinstance(value, (tuple, Enum, *_NOT_STATE_TYPES)) or not _is_ours(value):
-        return False
-    frozen_values = is_dataclass(value) and not any(
-        _holds_array(getattr(value, part.name)) for part in fields(value)
-    )
-    return not (frozen_values and type(value).__setattr__ is not object.__setattr__)
-
-
-def _holds_array(value: object) -> bool:
-    return isinstance(value, np.ndarray) or _is_ours(value)
-
-
-def _is_ours(value: object) -> bool:
-    return type(value).__module__.startswith("handtouch.")
-
-
-def _serialised(value: Any, path: str) -> Any:
-    if type(value) is np.ndarray and not value.dtype.hasobject:
-        return [value.dtype.str, value.shape, value.tobytes()]
-    if type(value) in _SCALAR_TYPES:
-        return value
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, Enum):
-        value = value.value
-    if isinstance(value, _SCALAR_TYPES):
-        return value
-    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
-        return [value.dtype.str, value.shape, value.tobytes()]
-    if isinstance(value, bytes | bytearray):
-        return bytes(value)
-    if isinstance(value, list | tuple):
-        return [_serialised(item, f"{path}[{number}]") for number, item in enumerate(value)]
-    if isinstance(value, dict):
-        pairs = (
-            (_serialised(key, path), _serialised(item, f"{path}[{key!r}]")) for key, item in value.items()
-        )
-        return [list(pair) for pair in pairs]
-    if is_dataclass(value) and _is_ours(value):
-        return {
-            part.name: _serialised(getattr(value, part.name), f"{path}.{part.name}") for part in fields(value)
-        }
-    raise TypeError(f"{path}: no rule in state.py for saving a {type(value).__name__}")
-
-
-def _deserialised(before: Any, saved: Any, path: str) -> Any:
-    """Return the saved value, written into the existing object where that is mutable."""
-    if _is_array(saved):
-        array = np.frombuffer(saved[2], dtype=_dtype_of(before, saved[0])).reshape(saved[1])
-        if isinstance(before, np.ndarray) and before.shape == array.shape and before.flags.writeable:
-            before[...] = array
-            return before
-        return array.copy()
-    if isinstance(before, bytearray):
-        before[:] = saved
-        return before
-    if isinstance(before, list):
-        before[:] = _deserialised_items(before, saved, path)
-        return before
-    if isinstance(before, tuple):
-        items = _deserialised_items(before, saved, path)
-        return type(before)(*items) if hasattr(before, "_fields") else tuple(items)
-    if isinstance(before, dict):
-        pairs = {key: _deserialised(before.get(key), item, path) for key, item in saved}
-        before.clear()
-        before.update(pairs)
-        return before
-    if isinstance(before, Enum):
-        return type(before)(saved)
-    if is_dataclass(before) and not isinstance(before, type):
-        parts = {name: _deserialised(getattr(before, name), item, path) for name, item in saved.items()}
-        return replace(before, **parts)
-    return saved
-
-
-def _deserialised_items(before: Any, saved: Any, path: str) -> list[Any]:
-    if not isinstance(saved, list):
-        raise ValueError(f"the state is of another build: {path} is no sequence in it")
-    known = [*before, *[None] * len(saved)]
-    return [_deserialised(old, new, path) for old, new in zip(known, saved, strict=False)]
-
-
-def _is_array(saved: Any) -> bool:
-    return (
-        isinstance(saved, list)
-        and len(saved) == 3
-        and isinstance(saved[0], str)
-        and isinstance(saved[2], bytes)
-    )
-
-
-def _dtype_of(before: Any, name: str) -> np.dtype[Any]:
-    """Return a dtype by name; structured ones have none, so they are taken from the existing array."""
-    if isinstance(before, np.ndarray) and before.dtype.str == name:
-        return np.dtype(before.dtype)
-    known: np.dtype[Any] = np.dtype(name)
-    return known
+def _stored_fields() -> Iterator[tuple[str, Stored]]:
+    hints = typing.get_type_hints(TickState, include_extras=True)
+    for declared in fields(TickState):
+        for about in getattr(hints[declared.name], "__metadata__", ()):
+            yield declared.name, about

@@ -1,7 +1,7 @@
 """The tick: one vectorised pass from the slab's counts to the contacts of all hands.
 
 counts -> currents -> touched pads -> position and force of those -> link frame -> begin, update, end.
-Free of I/O and clocks: the state is in `TickProcessor`, the time is an argument.
+Free of I/O and clocks: the state is in `TickState`, the time is an argument.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch import wire
 from handtouch.core.baseline import Baseline
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
+from handtouch.core.contact_solver import VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, IntArray
 from handtouch.core.cycle import Cycle
+from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import ForceReference, ForceReliability, SheetForceCompensation
 from handtouch.core.slab import Slab
 from handtouch.core.slip import SlipDetector
+from handtouch.core.state import TickState
 from handtouch.field.contact_law import ForceEstimateStatus
 from handtouch.wire import PadState
 
@@ -92,18 +94,14 @@ class PadColumns:
     """published contact columns, as CONTACT_DTYPE; all NaN without contact"""
 
     @classmethod
-    def empty(cls, n: int) -> PadColumns:
-        """Return columns of n pads without samples."""
-
-        def unknown(*shape: int) -> FloatArray:
-            return np.full((n, *shape), np.nan)
-
-        values = unknown(VALUE_COUNT)
+    def of_state(cls, state: TickState) -> PadColumns:
+        """Return views of a state's arrays."""
+        values = state.values
         views = {name: values[:, columns] for name, columns in VALUE_SLICES.items()}
         return cls(
-            state=np.full(n, PadState.STARTING, dtype=np.uint8),
-            sample_ns=np.zeros(n, dtype=np.int64),
-            total_current_a=np.zeros(n),
+            state=state.pad_state,
+            sample_ns=state.sample_ns,
+            total_current_a=state.total_current_a,
             values=values,
             xy=views["xy"],
             position_m=views["position_m"],
@@ -113,15 +111,13 @@ class PadColumns:
             residual=views["residual"][:, 0],
             residual_std=views["residual_std"][:, 0],
             covariance_m2=np.lib.stride_tricks.as_strided(
-                views["covariance_m2"], (n, 3, 3), (values.strides[0], 24, 8)
+                views["covariance_m2"], (len(values), 3, 3), (values.strides[0], 24, 8)
             ),
             force_n=views["force_n"][:, 0],
             force_std_n=views["force_std_n"][:, 0],
-            uncompensated_force_n=unknown(),
-            force_saturated=np.zeros(n, dtype=np.bool_),
-            contact_columns=np.full((n, CONTACT_DTYPE.itemsize // 4), np.nan, dtype="<f4").view(
-                CONTACT_DTYPE
-            )[:, 0],
+            uncompensated_force_n=state.uncompensated_force_n,
+            force_saturated=state.force_saturated,
+            contact_columns=state.published.view(CONTACT_DTYPE)[:, 0],
         )
 
 
@@ -136,44 +132,24 @@ class TickResult(NamedTuple):
 
 
 class TickProcessor:
-    """State of all pads from tick to tick."""
+    """The tick of all pads of a model; `state`: its state, of the model's size."""
 
-    def __init__(self, model: PadModel, period_ns: int) -> None:
+    def __init__(self, model: PadModel, period_ns: int, state: TickState | None = None) -> None:
         self.model = model
-        self.columns = PadColumns.empty(model.size)
+        self.state = held = TickState.empty(model.size, len(model.rows_of_hand)) if state is None else state
+        self.columns = PadColumns.of_state(held)
         self.contacts = ContactDetector(
-            model.begin_threshold_a, model.end_threshold_a, model.begin_samples, model.end_samples
+            *(model.begin_threshold_a, model.end_threshold_a, model.begin_samples, model.end_samples), held
         )
         self.counts: NDArray[np.int64] = np.zeros((model.size, 4), dtype=np.int64)
         """counts of the last tick"""
-        self.sample_counts = np.zeros(model.size, dtype=np.int64)
-        """samples received"""
-        self.missed_sample_counts = np.zeros(model.size, dtype=np.int64)
-        """expected samples that arrived after their tick or not at all"""
-        self.max_sample_period_ns = np.full(model.size, period_ns, dtype=np.int64)
-        """longest time between two samples of a pad"""
-        self.period_since_ns = np.zeros(model.size, dtype=np.int64)
-        """time since which samples are awaited: `max_sample_period_ns` was set, or later by the loop's
-        pauses"""
-        self.synchronous = np.ones(model.size, dtype=np.bool_)
-        """pads sampled by SYNC; the others are event-driven and not waited for"""
-        self.solved = np.zeros(model.size, dtype=np.bool_)
-        """contacts that were solved since they began and their outputs were requested"""
-        self.position_requested = np.ones(model.size, dtype=np.bool_)
-        """pads whose contact position is computed; see `set_requested`"""
-        self.force_requested = np.ones(model.size, dtype=np.bool_)
-        """pads whose force is computed"""
-        self.state_changed = False
-        """something other than a tick changed the state; read and reset by `TickJournal`"""
+        held.max_sample_period_ns[:] = period_ns
         self.baseline = Baseline(
-            model.noise_counts,
-            model.begin_threshold_counts,
-            model.end_threshold_counts,
-            model.max_rise_time_s,
-            model.rows_of_hand.values(),
+            *(model.noise_counts, model.begin_threshold_counts, model.end_threshold_counts),
+            *(model.max_rise_time_s, model.rows_of_hand.values(), held),
         )
         """counts of untouched pads"""
-        self.sheet_force = SheetForceCompensation(model.behaviours, period_ns)
+        self.sheet_force = SheetForceCompensation(model.behaviours, period_ns, held)
         """compensation of creep, adaptation and hysteresis"""
         self.slip = SlipDetector(
             period_ns * 1e-9,
@@ -181,38 +157,53 @@ class TickProcessor:
             self.columns.total_current_a,
             self.columns.sample_ns,
             self.contacts.id,
+            held=held,
         )
         """slip and lift-off of contacts, where requested"""
-        self._contact_rows = self.columns.contact_columns.view("<f4").reshape(model.size, -1)
         self._no_pads = np.zeros(model.size, dtype=np.bool_)
-        self._sampled, self._trusted = self._no_pads.copy(), self._no_pads.copy()  # of the last tick
-        self._baseline_samples_added = True  # of the last tick
-        self._tick_count = 0
-        self._update_interval_ticks = np.ones(model.size, dtype=np.int64)
-        self._some_skipped = False  # some output isn't requested in every tick
-        self._min_counts = -_MAX_NEGATIVE_SIGMA * model.noise_counts[:, None]
+        # of the last tick, until `prepare_next_tick`
+        self._sampled, self._trusted = self._no_pads.copy(), self._no_pads.copy()
         self._excess = np.zeros((model.size, 4))  # counts above the baseline
-        self._currents = np.zeros((model.size, 4))
-        self._uncompensated_std_n = np.full(model.size, np.nan)
+        self._baseline_samples_added = True
         self._sync_ns = 0
-        self._used_arrival_ns = np.zeros(model.size, dtype=np.int64)  # arrival of the newest used samples
+        self._currents = np.zeros((model.size, 4))
         self._offset_std_a = np.zeros(model.size)  # of the baseline
-        self._estimate_force = self.force_requested.copy()  # and the pad isn't in quarantine
+        self._min_counts = np.zeros((model.size, 1))
+        self._some_skipped = False  # some output isn't requested in every tick
+        self._estimate_force = self._no_pads.copy()  # requested, and the pad isn't in quarantine
         self._solver = self._make_solver(model)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Compute what follows from state and model, after either was changed as a whole."""
+        model, held = self.model, self.state
+        self.contacts.set_settings(
+            model.begin_threshold_a, model.end_threshold_a, model.begin_samples, model.end_samples
+        )
+        self.baseline.set_settings(
+            *(model.noise_counts, model.begin_threshold_counts, model.end_threshold_counts),
+            model.max_rise_time_s,
+        )
+        self.sheet_force.refresh()
+        self.slip.refresh()
+        self._min_counts = -_MAX_NEGATIVE_SIGMA * model.noise_counts[:, None]
+        np.greater(held.force_requested, model.quarantined, out=self._estimate_force)
+        self._some_skipped = not (held.position_requested.all() and (held.update_interval_ticks == 1).all())
 
     def expected_pads(self) -> NDArray[np.bool_]:
         """Return the pads whose sample a tick waits for: those alive and sampled by SYNC."""
-        return np.asarray((self.columns.state <= _TOUCHED) & self.synchronous)
+        return np.asarray((self.columns.state <= _TOUCHED) & self.state.synchronous)
 
     def set_requested(self, position: BoolArray, force: BoolArray, interval_ticks: NDArray[np.int64]) -> None:
         """Restrict positions, forces and updates to the requested pads; all (n,), copied."""
+        held = self.state
         if self.sheet_force.any_modelled:  # the sheet's history needs every contact
             position, force = position | self.sheet_force.modelled, force | self.sheet_force.modelled
-        changed = np.flatnonzero((position != self.position_requested) | (force != self.force_requested))
-        self.position_requested[:], self._update_interval_ticks[:] = position, interval_ticks
-        self.force_requested[:] = force
+        changed = np.flatnonzero((position != held.position_requested) | (force != held.force_requested))
+        held.position_requested[:], held.force_requested[:] = position, force
+        held.update_interval_ticks[:] = interval_ticks
         self.discard_solutions(changed)
-        self._some_skipped = not (position.all() and (interval_ticks == 1).all())
+        self.refresh()
 
     def is_force_unreliable(self, pads: slice | int) -> BoolArray:
         """Return the touched pads whose force is unreliable: baseline or sheet state is not known well
@@ -226,13 +217,13 @@ class TickProcessor:
 
     def excuse_pause(self, excused_ns: int) -> None:
         """Make pads stale later, since the loop or the whole host paused for so long."""
-        reference_ns = np.maximum(self.columns.sample_ns, self.period_since_ns)
-        np.add(reference_ns, excused_ns, out=self.period_since_ns)
+        reference_ns = np.maximum(self.state.sample_ns, self.state.awaited_since_ns)
+        np.add(reference_ns, excused_ns, out=self.state.awaited_since_ns)
 
     def solve_all(self) -> None:
-        """Compute position and force of every touched pad, requested or not; valid until `set_requested`."""
+        """Compute position and force of every touched pad, requested or not; the state's owner undoes it."""
         everything = ~self._no_pads
-        self.set_requested(everything, everything, self._update_interval_ticks)
+        self.set_requested(everything, everything, self.state.update_interval_ticks)
         touching = np.flatnonzero(self.contacts.touching)
         if len(touching):
             self._solve_contacts(touching)
@@ -241,53 +232,42 @@ class TickProcessor:
     def set_baseline(self, pad: int, offset_counts: ArrayLike, std_counts: ArrayLike = 0.0) -> None:
         """Set the untouched counts (4,) of a pad and their standard deviation, from a store or a tare."""
         self.baseline.set_offset(pad, offset_counts, std_counts)
-        self.state_changed = True
+        self.discard_solutions(np.array([pad]))
 
-    def set_excitation(self, on: BoolArray) -> None:
-        """Set the pads (n,) whose sheet has its potential; the back force of the others decays."""
-        self.sheet_force.set_excitation(on)
-        self.state_changed = True
+    def set_calibration(self, pad: int, calibration: PadCalibration) -> None:
+        """Apply a pad's calibration as a whole; forces by another contact law need new evidence."""
+        if calibration.law != self.model.calibrations[pad].law:
+            self.sheet_force.reset_evidence(pad)
+        self.model.set_calibration(pad, calibration)
+        self.refresh()
+        self.discard_solutions(np.array([pad]))
 
     def reset_pad(self, pad: int) -> None:
         """Forget what was learned of a pad: its node and sheet were replaced."""
         self.baseline.reset_pad(pad)
         self.sheet_force.reset_evidence(pad, new_sheet=True)
-        self.state_changed = True
-
-    def set_gravity(self, gravity: FloatArray) -> None:
-        """Set the direction of gravity in each link's frame (n, 3), NaN where unknown."""
-        self.baseline.set_gravity(gravity)
+        self.discard_solutions(np.array([pad]))
 
     def update_force_gains(self, reference: ForceReference) -> int:
         """Compare forces with an external measurement; return the number of pads whose gain was updated."""
-        return self.sheet_force.update_gains(reference, self.columns.sample_ns, self.contacts.touching)
+        return self.sheet_force.update_gains(reference, self.state.sample_ns, self.contacts.touching)
 
     def replace_model(self, model: PadModel, changed: IntArray) -> None:
         """Continue with another model of the same pads, `changed` of which differ; contacts continue."""
         self.sheet_force = self.sheet_force.with_behaviours(self.model.behaviours, model.behaviours)
-        self.baseline.set_settings(
-            model.noise_counts,
-            model.begin_threshold_counts,
-            model.end_threshold_counts,
-            model.max_rise_time_s,
-        )
         for pad in changed.tolist():
             self.sheet_force.reset_evidence(pad)
         self.model, self._solver = model, self._make_solver(model)
-        self._min_counts = -_MAX_NEGATIVE_SIGMA * model.noise_counts[:, None]
+        self.refresh()
         self.discard_solutions(changed)
-        self.contacts.set_thresholds(
-            model.begin_threshold_a, model.end_threshold_a, model.begin_samples, model.end_samples
-        )
 
     def discard_solutions(self, pads: IntArray) -> None:
         """Discard the contact values of these pads, because what they are computed from changed."""
-        self.solved[pads] = False
-        self.state_changed = True
+        held = self.state
+        held.solved[pads] = False
+        held.values[pads] = held.published[pads] = np.nan
+        held.uncompensated_force_n[pads] = np.nan
         self.slip.restart_contacts(pads)  # a position that a new calibration moves doesn't slip
-        np.greater(self.force_requested, self.model.quarantined, out=self._estimate_force)
-        self.columns.values[pads] = self._contact_rows[pads] = np.nan
-        self.columns.uncompensated_force_n[pads] = np.nan
 
     def run_tick(
         self,
@@ -319,25 +299,25 @@ class TickProcessor:
         )
         self._resolve_states(node_state, operational, implausible, stale)
         if len(began):
-            self.solved[began] = False
+            self.state.solved[began] = False
             columns.values[began] = np.nan  # not a starting point: it is of the contact before
             self.baseline.begin_contacts(began)
             self.sheet_force.begin_contacts(began)
         self._sampled, self._trusted, self._baseline_samples_added = sampled, trusted, False
         self._sync_ns = cycle.sync_ns
-        self._tick_count += 1
+        self.state.ticks[0] += 1
         solved = measured
         if self._some_skipped:
-            due = self._tick_count % self._update_interval_ticks[measured] == 0
+            due = self.state.ticks[0] % self.state.update_interval_ticks[measured] == 0
             measured = measured[due | np.isin(measured, began)]
-            solved = measured[self.position_requested[measured]]
+            solved = measured[self.state.position_requested[measured]]
         if len(solved):
             self._solve_contacts(solved)
         if self.sheet_force.any_modelled:
             raw = self.columns.uncompensated_force_n
             self._store_compensated_forces(
                 self.sheet_force.compensate_forces(
-                    raw, self._uncompensated_std_n, contacts.touching, cycle.sync_ns
+                    raw, self.state.uncompensated_std_n, contacts.touching, cycle.sync_ns
                 )
             )
         if len(solved):
@@ -345,7 +325,7 @@ class TickProcessor:
                 contacts.peak_force_n, columns.force_n, out=contacts.peak_force_n, where=contacts.touching
             )
         if len(ended):
-            self._contact_rows[ended] = np.nan
+            self.state.published[ended] = np.nan
         updated = np.setdiff1d(measured, began) if len(began) else measured
         return TickResult(cycle.sync_ns, began, updated, ended)
 
@@ -355,21 +335,22 @@ class TickProcessor:
     def _update_samples(self, slab: Slab, operational: BoolArray, cycle: Cycle, until_ns: int) -> BoolArray:
         """Set the sample times of new samples; return the pads (n,) that have one."""
         columns, size = self.columns, self.model.size
-        sampled: BoolArray = (slab.arrival_ns != self._used_arrival_ns) & operational
+        sampled: BoolArray = (slab.arrival_ns != self.state.arrival_ns) & operational
         in_time = slab.fresh.view(np.bool_)
         if until_ns == _NO_LIMIT_NS:
-            np.copyto(self._used_arrival_ns, slab.arrival_ns)
+            np.copyto(self.state.arrival_ns, slab.arrival_ns)
         else:
             here = slab.arrival_ns < until_ns
             sampled &= here
             in_time = in_time & here
-            np.copyto(self._used_arrival_ns, slab.arrival_ns, where=here)
+            np.copyto(self.state.arrival_ns, slab.arrival_ns, where=here)
         np.copyto(columns.sample_ns, cycle.sync_ns, where=sampled)
         if np.count_nonzero(in_time) < size:
-            self.missed_sample_counts += self.expected_pads() & operational & ~in_time
+            missed = self.state.missed_sample_counts
+            np.add(missed, self.expected_pads() & operational & ~in_time, out=missed)
             np.copyto(columns.sample_ns, cycle.previous_sync_ns, where=sampled & ~in_time)
-        if np.count_nonzero(self.synchronous) < size:
-            np.copyto(columns.sample_ns, slab.arrival_ns, where=sampled & ~self.synchronous)
+        if np.count_nonzero(self.state.synchronous) < size:
+            np.copyto(columns.sample_ns, slab.arrival_ns, where=sampled & ~self.state.synchronous)
         return sampled
 
     def _find_implausible(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
@@ -391,9 +372,9 @@ class TickProcessor:
         """Return the pads (n,) without a sample for three periods."""
         if np.count_nonzero(sampled) == self.model.size:
             return self._no_pads
-        since_ns = np.maximum(self.columns.sample_ns, self.period_since_ns)
+        since_ns = np.maximum(self.columns.sample_ns, self.state.awaited_since_ns)
         return np.asarray(
-            (now_ns - since_ns > _MAX_SAMPLE_AGE_PERIODS * self.max_sample_period_ns) & ~sampled
+            (now_ns - since_ns > _MAX_SAMPLE_AGE_PERIODS * self.state.max_sample_period_ns) & ~sampled
         )
 
     def _resolve_states(
@@ -415,14 +396,14 @@ class TickProcessor:
         columns = self.columns
         np.multiply(self.baseline.std, self.model.mean_ampere_per_count, out=self._offset_std_a)
         self._solver.solve_contacts(touched.data)
-        self.solved[touched] = True
+        self.state.solved[touched] = True
         values = columns.values[touched]
         published = values[:, _PUBLISHED_VALUES]
-        self._contact_rows[touched] = np.where(np.isfinite(published), published, np.nan)
+        self.state.published[touched] = np.where(np.isfinite(published), published, np.nan)
         columns.force_saturated[touched] = values[:, _FORCE_STATUS] == _LOWER_BOUND
         if self.sheet_force.any_modelled:
             columns.uncompensated_force_n[touched] = values[:, _FORCE]
-            self._uncompensated_std_n[touched] = values[:, _FORCE_STD]
+            self.state.uncompensated_std_n[touched] = values[:, _FORCE_STD]
 
     def _make_solver(self, model: PadModel) -> ContactSolver:
         return make_solver(
@@ -435,7 +416,7 @@ class TickProcessor:
         if self._baseline_samples_added:
             return
         self._baseline_samples_added = True
-        self.sample_counts += self._sampled
+        np.add(self.state.sample_counts, self._sampled, out=self.state.sample_counts)
         free = self._sampled & self._trusted
         free &= self.columns.total_current_a <= self.model.begin_threshold_a
         free &= ~self.contacts.touching

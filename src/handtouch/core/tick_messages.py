@@ -57,9 +57,7 @@ class TickMessages:
         self._transforms = transforms or ContactTransforms(model.hands)
         self._tick = tick
         self._session = session
-        self._seq: NDArray[np.int64] = np.zeros(model.size, dtype=np.int64)
-        self._frame_seq = 0
-        self._frame_tick = 0, 0  # number and SYNC time of the last frames' tick
+        self._state = tick.state
         self._end_reason: EndReason = ""  # of all contacts, when the daemon stops
         self._position_status = np.zeros(model.size, dtype=np.uint8)
         self._force_status = np.zeros(model.size, dtype=np.uint8)
@@ -76,7 +74,7 @@ class TickMessages:
         }
         for event, rows in events.items():
             if len(rows):
-                self._seq[rows] += 1
+                self._state.contact_seq[rows] += 1
             for pad in rows.tolist():
                 if sink.has_subscriber(self._topics[pad]):
                     sink.send(self._contact_message(pad, event, result.sync_ns, now_ns))
@@ -94,13 +92,14 @@ class TickMessages:
         none = np.zeros(0, dtype=np.intp)
         self.send_contacts(TickResult(now_ns, none, none, touching), now_ns, sink)
         self._tick.contacts.touching[:] = False
-        self._tick.columns.contact_columns.view("<f4")[:] = np.nan
+        self._state.published[:] = np.nan
         self._tick.columns.state[:] = PadState.STARTING
 
     def send_hand_frames(self, slab: Slab, tick_number: int, sync_ns: int, sink: MessageSink) -> None:
         """Send the frame and the raw counts of every hand with a subscriber."""
-        self._frame_seq += 1
-        self._frame_tick = tick_number, sync_ns
+        held = self._state
+        held.frame_seq[0] += 1
+        held.frame_tick[0], held.frame_sync_ns[0] = tick_number, sync_ns
         for hand, topic, raw in self._hand_topics:
             if sink.has_subscriber(topic):
                 sink.send(self._hand_frame(hand))
@@ -120,14 +119,19 @@ class TickMessages:
         return self._contact_message(pad, "update", 0, now_ns, retained=True)
 
     def _retained_hand(self, hand: str, _: int) -> wire.EncodedMessage | None:
-        return self._hand_frame(hand, retained=True) if self._frame_seq else None
+        return self._hand_frame(hand, retained=True) if self._state.frame_seq[0] else None
 
     def _hand_frame(self, hand: str, retained: bool = False) -> wire.EncodedMessage:
         rows = self._model.rows_of_hand[hand]
         optional = self._transforms.hand_columns(rows)
         self._update_statuses(rows)
-        tick_number, sync_ns = self._frame_tick
-        return self._encoders[hand].encode(self._frame_seq, sync_ns, tick_number, retained, optional)
+        seq, tick_number, sync_ns = self._frame_numbers()
+        return self._encoders[hand].encode(seq, sync_ns, tick_number, retained, optional)
+
+    def _frame_numbers(self) -> tuple[int, int, int]:
+        """Return seq, number of the tick and its SYNC of the last frames."""
+        held = self._state
+        return int(held.frame_seq[0]), int(held.frame_tick[0]), int(held.frame_sync_ns[0])
 
     def _update_statuses(self, rows: slice) -> None:
         """Write the status columns of a hand's pads; the encoder copies them."""
@@ -138,11 +142,11 @@ class TickMessages:
         if not np.count_nonzero(touching):
             return
         located = touching & np.isfinite(columns.contact_columns["position_m"][rows, 0])
-        solved = touching & tick.solved[rows]
-        position[solved & tick.position_requested[rows]] = PositionStatus.INVALID
+        solved = touching & tick.state.solved[rows]
+        position[solved & tick.state.position_requested[rows]] = PositionStatus.INVALID
         position[located] = PositionStatus.VALID
         position[located & self._model.position_unreliable[rows]] = PositionStatus.UNRELIABLE
-        requested = solved & tick.force_requested[rows]
+        requested = solved & tick.state.force_requested[rows]
         force[requested] = ForceStatus.VALID
         force[requested & tick.is_force_unreliable(rows)] = ForceStatus.UNRELIABLE
         force[requested & columns.force_saturated[rows]] = ForceStatus.LOWER_BOUND
@@ -163,12 +167,13 @@ class TickMessages:
 
     def _raw_message(self, hand: str, slab: Slab) -> wire.Raw:
         rows = self._model.rows_of_hand[hand]
+        seq, tick_number, sync_ns = self._frame_numbers()
         return wire.Raw(
             v=wire.SCHEMA_VERSION,
             session=self._session,
-            seq=self._frame_seq,
-            t_ns=self._frame_tick[1],
-            tick=self._frame_tick[0],
+            seq=seq,
+            t_ns=sync_ns,
+            tick=tick_number,
             hand=hand,
             links=tuple(self._model.links[rows]),
             counts=self._tick.counts[rows].astype("<i8").tobytes(),
@@ -197,7 +202,7 @@ class TickMessages:
         return wire.Contact(
             v=wire.SCHEMA_VERSION,
             session=self._session,
-            seq=int(self._seq[pad]),
+            seq=int(self._state.contact_seq[pad]),
             t_ns=t_ns,
             event=event,
             id=int(contacts.id[pad]),
@@ -221,11 +226,11 @@ class TickMessages:
             residual_std=_finite_or_none(columns.residual_std[pad]),
             begin_threshold_n=float(model.begin_threshold_n[pad]),
             end_threshold_n=float(model.end_threshold_n[pad]),
-            calibration_id=model.calibration_ids[pad],
+            calibration_id=model.calibrations[pad].calibration_id,
             end_reason=self._end_reason or END_REASONS.get(state, "released") if event == "end" else "",
             retained=retained,
             uncompensated_force_n=_finite_or_none(columns.uncompensated_force_n[pad]) if modelled else None,
-            diagnoses=model.diagnoses[pad],
+            diagnoses=model.calibrations[pad].diagnoses,
             **self._transforms.contact_fields(pad),
         )
 
@@ -233,11 +238,11 @@ class TickMessages:
         if located:
             unreliable = self._model.position_unreliable[pad]
             return PositionStatus.UNRELIABLE if unreliable else PositionStatus.VALID
-        failed = self._tick.position_requested[pad] and self._tick.solved[pad]
+        failed = self._state.position_requested[pad] and self._state.solved[pad]
         return PositionStatus.INVALID if failed else PositionStatus.NOT_COMPUTED
 
     def _force_status_of(self, pad: int, force_n: float | None) -> ForceStatus:
-        if not (self._tick.force_requested[pad] and self._tick.solved[pad]):
+        if not (self._state.force_requested[pad] and self._state.solved[pad]):
             return ForceStatus.NOT_COMPUTED
         if force_n is None:
             return ForceStatus.INVALID

@@ -6,12 +6,13 @@ Public name: `ContactTransforms`. Free of I/O and clocks; joint states come from
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.state import TickState
 from handtouch.hand.groups import ContactGroups
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.kinematics import HandKinematics
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from handtouch.hand.robot_models import RobotModels
 
 FloatArray = NDArray[np.float64]
-_PALM, _BASE, _AGE, _VALUE_COUNT = slice(0, 15), slice(15, 30), 30, 31
+_PALM, _BASE, _AGE = slice(0, 15), slice(15, 30), 30
 _PUBLISHED_SLICES = {"position_m": slice(0, 3), "normal": slice(3, 6), "covariance_m2": slice(6, 15)}
 _NOT_COMPUTED, _VALID, _STALE, _INVALID = map(int, FrameStatus)
 _STATUS_NAMES = tuple(status.text for status in FrameStatus)
@@ -41,29 +42,34 @@ class ContactTransforms:
     positions, ages and standard deviations of the joints used by the last tick, for recorders.
     """
 
-    def __init__(self, hands: list[str], robots: RobotModels | None = None) -> None:
+    def __init__(
+        self, hands: list[str], robots: RobotModels | None = None, state: TickState | None = None
+    ) -> None:
         n = len(hands)
+        held = TickState.empty(n) if state is None else state
         self.joints_at: Callable[[str, int], JointSnapshot | None] = _no_joints
         self.used_joints: list[tuple[str, int, FloatArray, FloatArray, FloatArray]] = []
         self.any_requested = False
         """any pad is requested in palm or base"""
-        self.palm_status = np.zeros(n, dtype=np.uint8)
+        self.palm_status, self.base_status = held.palm_status, held.base_status
         """FrameStatus"""
-        self.base_status = np.zeros(n, dtype=np.uint8)
-        self._rotation = np.full((n, 3, 3), np.nan)  # of the link in the palm
-        self._joint_variance_m2 = np.zeros(n)  # of joints, in the palm position, mean over the axes
-        self._values = np.full(
-            (n, _VALUE_COUNT), np.nan
-        )  # position, normal, covariance in palm; in base; age
-        self._palm_requested, self._base_requested, self._requested = (
-            np.zeros(n, dtype=np.bool_) for _ in range(3)
-        )
+        self._rotation = held.palm_rotation  # of the link in the palm
+        self._joint_variance_m2 = held.joint_variance_m2  # of the palm position, mean over the axes
+        self._values = held.palm_values  # position, normal, covariance in palm; in base; age
+        self._palm_requested, self._base_requested = held.palm_requested, held.base_requested
+        self._requested = np.zeros(n, dtype=np.bool_)
         self._robots = robots
         within_m = np.zeros(n)
         for rows, group_m in zip(robots.pad_rows, robots.group_distance_m, strict=True) if robots else ():
             within_m[rows] = group_m
         number = {hand: k for k, hand in enumerate(dict.fromkeys(hands))}
-        self._groups = ContactGroups(within_m, np.array([number[hand] for hand in hands]))
+        self._groups = ContactGroups(
+            within_m,
+            np.array([number[hand] for hand in hands]),
+            held.group_id,
+            held.grouped_contact_id,
+            held.grouped,
+        )
 
     @property
     def group(self) -> NDArray[np.uint32]:
@@ -74,9 +80,13 @@ class ContactTransforms:
         """Restrict palm and base outputs to these pads (n,); copied."""
         changed = np.flatnonzero((palm != self._palm_requested) | (base != self._base_requested))
         self._palm_requested[:], self._base_requested[:] = palm, base
-        np.logical_or(palm, base, out=self._requested)
-        self.any_requested = bool(self._requested.any())
         self.discard(changed)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Compute what follows from the state, after that was loaded."""
+        np.logical_or(self._palm_requested, self._base_requested, out=self._requested)
+        self.any_requested = bool(self._requested.any())
         if not self.any_requested:
             self.used_joints.clear()
 
@@ -167,19 +177,27 @@ class ContactTransforms:
             }
         return columns
 
-    def recorded_joints(self) -> list[list[Any]]:
-        """Return `used_joints` as msgpack values: hand, time, and float64 columns of positions, ages,
-        standard deviations."""
-        return [
-            [hand, t_ns, *(column.tobytes() for column in columns)]
-            for hand, t_ns, *columns in self.used_joints
-        ]
+    def recorded_joints(self) -> tuple[dict[str, Any], ...]:
+        """Return `used_joints` as msgpack values, see `wire.recording.UsedJoints`."""
+        return tuple(
+            {
+                "hand": hand,
+                "t_ns": t_ns,
+                "position_rad": position_rad.tobytes(),
+                "age_s": age_s.tobytes(),
+                "std_rad": std_rad.tobytes(),
+            }
+            for hand, t_ns, position_rad, age_s, std_rad in self.used_joints
+        )
 
-    def replay_joints(self, recorded: Sequence[Sequence[Any]]) -> None:
+    def replay_joints(self, recorded: Sequence[Mapping[str, Any]]) -> None:
         """Use the joints of a record of `recorded_joints` in the next tick."""
         known = {
-            (hand, t_ns): JointSnapshot(t_ns, *(np.frombuffer(column, np.float64) for column in columns))
-            for hand, t_ns, *columns in recorded
+            (joints["hand"], joints["t_ns"]): JointSnapshot(
+                joints["t_ns"],
+                *(np.frombuffer(joints[name], np.float64) for name in ("position_rad", "age_s", "std_rad")),
+            )
+            for joints in recorded
         }
         self.joints_at = lambda hand, t_ns: known.get((hand, t_ns))
 

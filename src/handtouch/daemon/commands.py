@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,7 @@ from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LawParameters
 from handtouch.config import Deployment, Table
 from handtouch.config.files import deployment_files
 from handtouch.config.tables import Output, SceneRequest
+from handtouch.core.events import BaselineEvent, EvidenceEvent
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import Demand, select_pads
 from handtouch.daemon.arguments import parse_arguments
@@ -146,13 +148,8 @@ class ControlCommands:
     def _snapshot(self, arguments: dict[str, Any], now_ns: int) -> Reply:
         """Return all hands and contacts now, computed whether requested or not."""
         parse_arguments(_NoArguments, arguments)
-        tick, requested = self._pipeline.tick, self._demand.requested
-        tick.solve_all()
-        messages = {
-            topic: make(now_ns) for topic, make in self._pipeline.messages.retained_messages().items()
-        }
-        self._pipeline.apply_demand(requested)
-        maps = {topic: wire.to_map(message) for topic, message in messages.items() if message is not None}
+        messages = self._pipeline.solved_messages(now_ns)
+        maps = {topic: wire.to_map(message) for topic, message in messages.items()}
         return {
             "hands": {topic[len("hand/") :]: m for topic, m in maps.items() if topic.startswith("hand/")},
             "contacts": [message for topic, message in maps.items() if topic.startswith("contact/")],
@@ -192,12 +189,12 @@ class ControlCommands:
 
     def _tare(self, arguments: dict[str, Any], now_ns: int) -> Job:
         selected = self._select_pads(parse_arguments(_PadArguments, arguments).pads)
-        return TareJob(self._pad_names, selected, self._pipeline.tick, self._sampling, now_ns, self._on_tared)
+        return TareJob(self._pad_names, selected, self._pipeline, self._sampling, now_ns, self._on_tared)
 
-    def _on_tared(self, pad: int) -> None:
+    def _on_tared(self, pad: int, offset_counts: tuple[float, ...]) -> None:
         self._status_ns = None
         if self._reporter.supervisor is not None:
-            self._reporter.supervisor.register_manual_calibration(pad, {"offset_counts"})
+            self._reporter.supervisor.register_manual_calibration(pad, {"offset_counts"}, offset_counts)
 
     def _calibrate(self, arguments: dict[str, Any], now_ns: int) -> Reply:  # noqa: ARG002
         """Change the given parts of a pad's calibration, and return the whole calibration."""
@@ -206,44 +203,47 @@ class ControlCommands:
         if len(pads) != 1:
             raise RefusedError(f"pad = {request.pad!r} matches {len(pads)} pads; name exactly one")
         (pad,) = pads.tolist()
-        model = self._pipeline.model
-        before = model.calibration_ids[pad]
+        pipeline = self._pipeline
+        before, offsets = pipeline.calibrations[pad].calibration_id, request.offset_counts
         if request.model_fields_set > {"pad"}:
             if request.name is None:
                 raise RefusedError("name is missing: contacts are published with it as calibration_id")
             self._apply_calibration(pad, request, request.name)
             _log.info("%s: calibration %s -> %s", "/".join(self._pad_names[pad]), before, request.name)
         hand, link = self._pad_names[pad]
-        law = model.law(pad)
+        calibration, model = pipeline.calibrations[pad], pipeline.model
+        law = calibration.law or model.default_law(pad)
         return {
             "hand": hand,
             "link": link,
             "previous_calibration_id": before,
-            "calibration_id": model.calibration_ids[pad],
+            "calibration_id": calibration.calibration_id,
             "default_calibration_id": model.default_calibration_ids[pad],
-            "gains": model.gains[pad].tolist(),
-            "offset_counts": self._pipeline.tick.baseline.expected_counts[pad].tolist(),
+            "gains": list(calibration.gains),
+            "offset_counts": list(offsets or pipeline.tick.baseline.expected_counts[pad].tolist()),
             "law": {key: getattr(law, key) for key in _LawArguments.model_fields},
         }
 
     def _apply_calibration(self, pad: int, request: _CalibrateArguments, name: str) -> None:
-        model = self._pipeline.model
-        offsets, max_counts = request.offset_counts, float(model.max_counts[pad]) / 2
+        pipeline = self._pipeline
+        offsets, max_counts = request.offset_counts, float(pipeline.model.max_counts[pad]) / 2
         if offsets is not None and max(map(abs, offsets)) > max_counts:
             raise RefusedError(
                 f"offset_counts = {list(offsets)}: larger than half the range, {max_counts:.0f} counts"
             )
-        law = model.laws[pad]
+        before = pipeline.calibrations[pad]
+        law = before.law
         if request.law is not None:
             law = LawParameters(**request.law.model_dump(), covariance=((0.0,) * 3,) * 3)
-        model.set_gains_and_law(pad, model.gains[pad] if request.gains is None else request.gains, name, law)
-        self._pipeline.replace_model(model, np.array([pad]))
+        gains = before.gains if request.gains is None else request.gains
+        pipeline.set_calibration(pad, replace(before, calibration_id=name, gains=gains, law=law))
+        pipeline.add_event(EvidenceEvent(pad))
         if offsets is not None:
-            self._pipeline.tick.set_baseline(pad, offsets)
+            pipeline.add_event(BaselineEvent(pad, offsets, (0.0,) * 4))
         if self._reporter.supervisor is not None:
             parts = ("gains", "law", "offset_counts")
             self._reporter.supervisor.register_manual_calibration(
-                pad, {part for part in parts if getattr(request, part) is not None}
+                pad, {part for part in parts if getattr(request, part) is not None}, offsets
             )
 
     def _disable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
@@ -285,10 +285,7 @@ class ControlCommands:
         """Apply a reloaded deployment completely, between two ticks."""
         self._status_ns = None
         if change.model is not None:
-            change.model.copy_calibrations(self._pipeline.model)
-            self._pipeline.replace_model(
-                change.model, np.array(sorted(change.changed_keys_of_pad), dtype=np.intp)
-            )
+            self._pipeline.replace_model(change.model, sorted(change.changed_keys_of_pad))
         if change.deployment.daemon.log_level != self.deployment.daemon.log_level:
             set_level(change.deployment.daemon.log_level)
         self.deployment = change.deployment

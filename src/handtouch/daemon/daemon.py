@@ -33,6 +33,7 @@ from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
 from handtouch.core.compiled import Compilation
 from handtouch.core.cycle import BusyPoll
+from handtouch.core.events import PauseEvent
 from handtouch.core.gravity import GravityTracker
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
@@ -318,9 +319,9 @@ class HandtouchDaemon:
     def _begin_cycle(self, sync_ns: int, now_ns: int) -> None:
         """Begin a cycle at a SYNC that was sent or received."""
         self.reporter.stage_timer.begin_period(self.sync.overruns, not self.pipeline.cycle.ticked)
-        self.inputs.poll(now_ns)  # before the journal records the inputs of the next tick
+        self.inputs.poll(now_ns)
         if (gravity := self.gravity.update_directions(now_ns)) is not None:
-            self.pipeline.external_inputs.set_gravity(gravity)
+            self.pipeline.set_gravity(gravity)
         late = self.pipeline.begin_cycle(sync_ns, now_ns)
         if late is not None:
             self._process_percepts(late)
@@ -343,7 +344,7 @@ class HandtouchDaemon:
         """Extend timeouts by a pause of this loop, in which it may have sent no SYNC and read no frame."""
         self.sync.excuse_pause(paused_ns)
         self.master.excuse_pause(paused_ns, now_ns)
-        self.pipeline.tick.excuse_pause(paused_ns)
+        self.pipeline.add_event(PauseEvent(paused_ns))
         if paused_ns > _LOGGED_PAUSE_NS:
             late_ms = (paused_ns + self.sync.period_ns) * 1e-6
             _log.warning("the loop was late by %.0f ms; timeouts of nodes and pads are extended", late_ms)
@@ -352,9 +353,8 @@ class HandtouchDaemon:
         self, requested: RequestedOutputs, needs: SceneRequirements, enabled: NDArray[np.bool_], now_ns: int
     ) -> None:
         """Apply the outputs that scenes and subscriptions request."""
-        self.pipeline.apply_demand(requested)
+        self.pipeline.apply_demand(requested, self.demand.ticks_per_hand_frame)
         self.percepts.set_requested(requested, now_ns)
-        self.pipeline.ticks_per_hand_frame = self.demand.ticks_per_hand_frame
         self._raw_pads = needs.raw
         if self.supervisor is None:
             self.sampling.set_needed_pads(needs.pads & enabled, needs.raw, now_ns)
@@ -437,7 +437,7 @@ def _open_resources(
         authenticator,
         joints,
         pad_names(deployment),
-        pipeline.external_inputs.add_force_reference,
+        pipeline.add_force_reference,
     )
     opened.callback(inputs.close)
     ports: dict[str, Port] = {}

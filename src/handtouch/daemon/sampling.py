@@ -14,6 +14,7 @@ from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master
 from handtouch.config import Deployment
 from handtouch.config.tables import Scene
+from handtouch.core.events import SamplingEvent
 from handtouch.core.pipeline import Pipeline
 from handtouch.wire import PadState
 
@@ -57,6 +58,7 @@ class SamplingController:
         self._idle_counts = np.zeros((len(pads), 4), dtype=np.int64)
         self._next_idle_check_ns = 0
         self._sampling_changes = 0
+        self._synchronous = np.ones(len(pads), dtype=np.bool_)  # as the tick has it, or will have
 
     def set_idle_settings(self, scene: Scene) -> None:
         """Apply the scene table's idle time and idle SYNC period."""
@@ -72,7 +74,7 @@ class SamplingController:
     def request_full_rate(self, pads: NDArray[np.bool_], now_ns: int) -> None:
         """Sample these pads (n,) at every SYNC, as if they had been touched."""
         self._last_active_ns[pads] = now_ns
-        if (pads & ~self._pipeline.tick.synchronous).any():
+        if (pads & ~self._synchronous).any():
             self._next_idle_check_ns = 0
 
     def update_sampling(self, now_ns: int) -> None:
@@ -91,20 +93,20 @@ class SamplingController:
         """Switch pads to full rate that are touched, or event-driven with changed counts."""
         tick = self._pipeline.tick
         moved = np.abs(tick.counts - self._idle_counts).max(axis=1) >= self._delta_counts
-        active = np.where(tick.synchronous, tick.columns.state == PadState.TOUCHED, moved)
+        active = np.where(self._synchronous, tick.columns.state == PadState.TOUCHED, moved)
         if active.any():
             self._last_active_ns[active] = now_ns
             np.copyto(self._idle_counts, tick.counts, where=active[:, None])
-            for slot in np.flatnonzero(active & ~tick.synchronous).tolist():
+            for slot in np.flatnonzero(active & ~self._synchronous).tolist():
                 self._master.set_transmission(slot, False, now_ns)
             if self.slow_sync:
                 self._set_slow_sync(False, now_ns)
 
     def _update_node_modes(self, now_ns: int) -> None:
-        master, tick = self._master, self._pipeline.tick
+        master = self._master
         for slot in np.flatnonzero(self.needed == (master.states == NodeState.STOPPED)).tolist():
             master.set_standby(slot, not self.needed[slot], now_ns)
-        waiting = self.needed & ~tick.synchronous & (master.states == NodeState.OPERATIONAL)
+        waiting = self.needed & ~self._synchronous & (master.states == NodeState.OPERATIONAL)
         if self._can_idle:
             self._update_idle_pads(now_ns)
         idle = bool(waiting.any()) or not self.needed.any()
@@ -117,26 +119,31 @@ class SamplingController:
         master, tick = self._master, self._pipeline.tick
         self._last_active_ns[self.full_rate] = now_ns
         untouched = now_ns - self._last_active_ns > self._idle_after_ns
-        for slot in np.flatnonzero(self.needed & untouched & tick.synchronous).tolist():
+        for slot in np.flatnonzero(self.needed & untouched & self._synchronous).tolist():
             self._idle_counts[slot] = tick.counts[slot]
             master.set_transmission(slot, True, now_ns)
-        for slot in np.flatnonzero(self.needed & ~untouched & ~tick.synchronous).tolist():
+        for slot in np.flatnonzero(self.needed & ~untouched & ~self._synchronous).tolist():
             master.set_transmission(slot, False, now_ns)
 
     def _sync_driven_pads(self) -> NDArray[np.bool_]:
         """Return the pads (n,) whose node is up and sampled at every SYNC."""
         states = self._master.states
         up = (states >= NodeState.SETTLING) & (states <= NodeState.STALE)
-        return np.asarray(self.needed & up & self._pipeline.tick.synchronous)
+        return np.asarray(self.needed & up & self._synchronous)
 
     def _copy_node_modes(self, now_ns: int) -> None:
         """Copy the nodes' transmission modes to the tick; a node new at full rate restarts its idle time."""
-        tick, master = self._pipeline.tick, self._master
+        master = self._master
         self._sampling_changes = master.transmission_changes
-        self._last_active_ns[tick.synchronous < ~master.idle] = now_ns
-        np.logical_not(master.idle, out=tick.synchronous)
-        np.copyto(tick.max_sample_period_ns, master.sample_period_ns)
-        np.copyto(tick.period_since_ns, master.transmission_since_ns)
+        self._last_active_ns[self._synchronous < ~master.idle] = now_ns
+        np.logical_not(master.idle, out=self._synchronous)
+        self._pipeline.add_event(
+            SamplingEvent(
+                tuple(self._synchronous.tolist()),
+                tuple(master.sample_period_ns.tolist()),
+                tuple(master.transmission_since_ns.tolist()),
+            )
+        )
 
     def _set_slow_sync(self, slow: bool, now_ns: int) -> None:
         if slow != self.slow_sync:

@@ -230,7 +230,7 @@ class StatusReporter:
         due = range(first, self._published_this_period)
         if passed_ns >= _HEALTH_PERIOD_NS:
             self._sample_rate_hz = self._sample_rate_window.per_second(
-                now_ns, self._pipeline.tick.sample_counts
+                now_ns, self._pipeline.tick.state.sample_counts
             )
             self._published_this_period = 0
         return due
@@ -288,8 +288,8 @@ class StatusReporter:
             or explain_pad_state(state, status.state, status.reason, counts, railed),
             serial=status.serial,
             rate_hz=float(self._sample_rate_hz[pad]) if state <= PadState.TOUCHED else 0.0,
-            samples=int(self._pipeline.tick.sample_counts[pad]),
-            missed_samples=int(self._pipeline.tick.missed_sample_counts[pad]),
+            samples=int(self._pipeline.tick.state.sample_counts[pad]),
+            missed_samples=int(self._pipeline.tick.state.missed_sample_counts[pad]),
             age_s=(now_ns - sample_ns) * 1e-9 if sample_ns else None,
             reboots=status.reboots,
             heartbeats_missed=status.heartbeats_missed,

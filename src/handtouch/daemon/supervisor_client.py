@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,13 @@ from handtouch.canbus.nodes.master import (
     SerialChanged,
 )
 from handtouch.config import Deployment
+from handtouch.core.events import (
+    BackForceEvent,
+    BaselineEvent,
+    ExcitationEvent,
+    ReplacementEvent,
+)
+from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.block_buffer import BlockBuffer
 from handtouch.daemon.child_process import ChildProcess
@@ -151,7 +158,9 @@ class SupervisorClient:
                 self._quarantine_pad(pad)
         self._send_serials(now_ns)
 
-    def register_manual_calibration(self, pad: int, parts: Collection[str]) -> None:
+    def register_manual_calibration(
+        self, pad: int, parts: Collection[str], offset_counts: Sequence[float] | None = None
+    ) -> None:
         """Forward manually set parts (gains, law, offset_counts) of a calibration to the supervisor process.
 
         Gains and law are sent again whenever it restarts. They apply until the daemon ends, the node is
@@ -159,9 +168,9 @@ class SupervisorClient:
         """
         if "gains" in parts:
             self._log_gain_covariance[pad] = _MANUAL_LOG_GAIN_COVARIANCE
-            self._update_model_uncertainty(pad, bool(self._pipeline.model.quarantined[pad]))
+            self._update_uncertainty(pad, self._pipeline.calibrations[pad].quarantined)
         self._manual_parts[pad] = self._manual_parts.get(pad, set()) | set(parts)
-        self._send_manual_calibration(pad)
+        self._send_manual_calibration(pad, offset_counts)
         self._manual_parts[pad].discard("offset_counts")  # the baseline tracks them from now on
 
     def process_tick(self, now_ns: int) -> None:
@@ -203,8 +212,8 @@ class SupervisorClient:
     def health_fields(self, pad: int) -> dict[str, Any]:
         """Return the fields of `health` about calibration and diagnoses of a pad."""
         assessment = self.assessments[pad]
-        quarantined = bool(self._pipeline.model.quarantined[pad])
-        calibration_id = self._pipeline.model.calibration_ids[pad]
+        calibration = self._pipeline.calibrations[pad]
+        quarantined, calibration_id = calibration.quarantined, calibration.calibration_id
         excitation_off = (self._excitation_off_diagnosis(pad),) if self.excitation.off[pad] else ()
         if assessment is None:
             state = "quarantined" if quarantined else "default"
@@ -228,7 +237,7 @@ class SupervisorClient:
             self._pipeline.model.begin_threshold_n,
         ):
             return
-        self._pipeline.tick.set_excitation(~schedule.off)
+        self._pipeline.add_event(ExcitationEvent(tuple((~schedule.off).tolist())))
         for pad in np.flatnonzero(schedule.off != before).tolist():
             self._log_pad(pad, _EXCITATION_OFF_TEXT if schedule.off[pad] else "excitation on again")
             self.changed_pads.add(pad)
@@ -248,20 +257,21 @@ class SupervisorClient:
         for pad in self._manual_parts:
             self._send_manual_calibration(pad)
 
-    def _send_manual_calibration(self, pad: int) -> None:
-        model, serial, given = self._pipeline.model, self._serials[pad], self._manual_parts[pad]
+    def _send_manual_calibration(self, pad: int, offset_counts: Sequence[float] | None = None) -> None:
+        serial, given = self._serials[pad], self._manual_parts[pad]
         if serial is None or not given:
             return
         covariance = self._log_gain_covariance[pad]
-        covariance = model.gain_covariance[pad] if covariance is None else covariance
-        law, offsets = model.laws[pad], self._pipeline.tick.baseline.expected_counts[pad]
+        covariance = self._pipeline.model.gain_covariance[pad] if covariance is None else covariance
+        calibration = self._pipeline.calibrations[pad]
+        law, (x0, xa, y0, yb) = calibration.law, calibration.gains
         message = CalibrationUpdate(
             pad=pad,
             serial=serial,
-            calibration_id=model.calibration_ids[pad],
-            gains=channel_values(model.gains[pad]),
+            calibration_id=calibration.calibration_id,
+            gains=(x0, xa, y0, yb),
             covariance=tuple(covariance.ravel().tolist()),
-            offset_counts=channel_values(offsets) if "offset_counts" in given else None,
+            offset_counts=channel_values(offset_counts) if offset_counts is not None else None,
             law=ContactLawMessage(**asdict(law)) if law is not None and "law" in given else None,
         )
         if {"gains", "law"} & given:  # the supervisor process confirms these
@@ -270,29 +280,37 @@ class SupervisorClient:
 
     def _quarantine_pad(self, pad: int) -> None:
         """Discard the calibration of a pad whose node was replaced, until the new node is calibrated."""
-        model = self._pipeline.model
-        model.set_gains_and_law(pad, np.ones(4), model.default_calibration_ids[pad])
+        pipeline = self._pipeline
+        default = PadCalibration(pipeline.model.default_calibration_ids[pad])
         self._log_gain_covariance[pad] = _UNKNOWN_LOG_GAIN_COVARIANCE
         self._manual_parts.pop(pad, None)
         self._unconfirmed_calibrations.pop(pad, None)
         self._position_unreliable[pad], self._degrading_kinds[pad] = False, (FaultKind.NODE_REPLACED.value,)
-        self._update_model_uncertainty(pad, quarantined=True)
-        self._pipeline.replace_model(model, np.array([pad]))
-        self._pipeline.tick.reset_pad(pad)
+        self._set_calibration(pad, default, quarantined=True)
+        pipeline.add_event(ReplacementEvent(pad))
         self.changed_pads.add(pad)
         _log.warning(
             "%s: node replaced (serial %s -> %s); quarantined until it is calibrated",
             self._pad_name(pad), self._previous_serials[pad], self._serials[pad], extra=self._log_fields(pad),
         )  # fmt: skip
 
-    def _update_model_uncertainty(self, pad: int, quarantined: bool) -> None:
-        covariance = (
-            _POSITION_UNKNOWN_LOG_GAIN_COVARIANCE
-            if self._position_unreliable[pad]
-            else self._log_gain_covariance[pad]
+    def _update_uncertainty(self, pad: int, quarantined: bool) -> None:
+        self._set_calibration(pad, self._pipeline.calibrations[pad], quarantined)
+
+    def _set_calibration(self, pad: int, calibration: PadCalibration, quarantined: bool) -> None:
+        """Apply a calibration with what is known about its quality."""
+        unreliable = bool(self._position_unreliable[pad])
+        covariance = _POSITION_UNKNOWN_LOG_GAIN_COVARIANCE if unreliable else self._log_gain_covariance[pad]
+        self._pipeline.set_calibration(
+            pad,
+            replace(
+                calibration,
+                gain_covariance=None if covariance is None else tuple(covariance.ravel().tolist()),
+                quarantined=quarantined,
+                position_unreliable=unreliable,
+                diagnoses=self._degrading_kinds[pad],
+            ),
         )
-        unreliable, kinds = bool(self._position_unreliable[pad]), self._degrading_kinds[pad]
-        self._pipeline.model.set_uncertainty(pad, covariance, quarantined, unreliable, kinds)
 
     def _handle_message(self, data: bytes) -> None:
         """Apply a message of the supervisor process completely, or count and ignore it."""
@@ -318,48 +336,38 @@ class SupervisorClient:
             self._apply_assessment(message)
 
     def _apply_calibration(self, message: CalibrationUpdate) -> None:
-        model, pad = self._pipeline.model, message.pad
-        offsets, tick, pads = message.offset_counts, self._pipeline.tick, np.array([pad])
-        if offsets is not None and max(map(abs, offsets)) > model.max_counts[pad] / 2:
+        pipeline, pad, offsets = self._pipeline, message.pad, message.offset_counts
+        if offsets is not None and max(map(abs, offsets)) > pipeline.model.max_counts[pad] / 2:
             self.malformed += 1
             return
         if self._unconfirmed_calibrations.get(pad) == message.calibration_id:
             del self._unconfirmed_calibrations[pad]
         elif pad not in self._unconfirmed_calibrations:  # newer knowledge replaces manual settings
             self._manual_parts.pop(pad, None)
-        law = model.laws[pad] if message.law is None else LawParameters(**message.law.model_dump())
-        law_changed = law != model.laws[pad]
-        model.set_gains_and_law(pad, message.gains, message.calibration_id, law)
+        before = pipeline.calibrations[pad]
+        law = before.law if message.law is None else LawParameters(**message.law.model_dump())
         self._log_gain_covariance[pad] = np.reshape(message.covariance, (4, 4))
-        self._update_model_uncertainty(pad, bool(model.quarantined[pad]))
-        if law_changed:
-            self._pipeline.replace_model(model, pads)
+        calibration = replace(before, calibration_id=message.calibration_id, gains=message.gains, law=law)
+        self._set_calibration(pad, calibration, before.quarantined)
         if offsets is not None:
-            tick.set_baseline(pad, offsets, message.offset_std or 0.0)
+            pipeline.add_event(BaselineEvent(pad, offsets, message.offset_std or (0.0,) * 4))
         if message.back_n is not None:
-            tick.sheet_force.set_back_force(pad, message.back_n, message.back_std_n)
-        tick.discard_solutions(pads)
+            pipeline.add_event(BackForceEvent(pad, message.back_n, message.back_std_n))
         self.changed_pads.add(pad)
         _log.info(
             "%s: calibration %s", self._pad_name(pad), message.calibration_id, extra=self._log_fields(pad)
         )
 
     def _apply_assessment(self, message: CalibrationAssessment) -> None:
-        model, pad, before = self._pipeline.model, message.pad, self.assessments[message.pad]
+        pad, before = message.pad, self.assessments[message.pad]
         self.assessments[pad] = message
         force_invalid = message.calibration_state in ("quarantined", "manual_required") or not all(
             diagnosis.force_valid for diagnosis in message.diagnoses
         )
         position_unreliable = not all(diagnosis.position_valid for diagnosis in message.diagnoses)
         kinds = tuple(f.kind for f in message.diagnoses if not (f.position_valid and f.force_valid))
-        if (force_invalid, position_unreliable, kinds) != (
-            model.quarantined[pad],
-            self._position_unreliable[pad],
-            self._degrading_kinds[pad],
-        ):
-            self._position_unreliable[pad], self._degrading_kinds[pad] = position_unreliable, kinds
-            self._update_model_uncertainty(pad, force_invalid)
-            self._pipeline.tick.discard_solutions(np.array([pad]))
+        self._position_unreliable[pad], self._degrading_kinds[pad] = position_unreliable, kinds
+        self._update_uncertainty(pad, force_invalid)
         known = {diagnosis.kind for diagnosis in before.diagnoses} if before else set()
         old_state = before.calibration_state if before else "default"
         for diagnosis in message.diagnoses:

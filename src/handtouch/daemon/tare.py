@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.config.channels import ELECTRODES
+from handtouch.core.events import BaselineEvent
 from handtouch.core.pad_model import PadModel
-from handtouch.core.tick import TickProcessor
+from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.sampling import SamplingController
 from handtouch.wire import PadState
 
@@ -32,16 +33,18 @@ class TareJob:
         self,
         names: list[tuple[str, str]],
         selected: NDArray[np.bool_],
-        tick: TickProcessor,
+        pipeline: Pipeline,
         pacer: SamplingController,
         now_ns: int,
-        on_tared: Callable[[int], None] = lambda _: None,
+        on_tared: Callable[[int, tuple[float, ...]], None] = lambda _, __: None,
     ) -> None:
-        """Start measuring; `on_tared` is called with the row of each tared pad."""
-        self._names, self._selected, self._tick, self._sampling = names, selected, tick, pacer
+        """Start measuring; `on_tared` is called with the row and the offsets (4,) of each tared pad."""
+        self._names, self._selected, self._sampling = names, selected, pacer
+        self._pipeline, self._tick = pipeline, pipeline.tick
+        tick = self._tick
         self._on_tared = on_tared
-        self._end_ns = now_ns + max(_MIN_DURATION_NS, 10 * int(tick.max_sample_period_ns.max()))
-        self._samples = tick.sample_counts.copy()
+        self._end_ns = now_ns + max(_MIN_DURATION_NS, 10 * int(tick.state.max_sample_period_ns.max()))
+        self._samples = tick.state.sample_counts.copy()
         self._count = np.zeros(len(names), dtype=np.int64)
         self._sum = np.zeros((len(names), 4))
         self._sum_of_squares = np.zeros((len(names), 4))
@@ -55,8 +58,8 @@ class TareJob:
         """Add the tick's samples; after a second, return the result of every pad."""
         tick, selected = self._tick, self._selected
         self._sampling.request_full_rate(selected, now_ns)
-        new = selected & (tick.sample_counts != self._samples)
-        self._samples[:] = tick.sample_counts
+        new = selected & (tick.state.sample_counts != self._samples)
+        self._samples[:] = tick.state.sample_counts
         self._count += new
         difference = np.where(new[:, None], tick.counts - self._reference_counts, 0.0)
         self._sum += difference
@@ -86,9 +89,9 @@ class TareJob:
         result |= {"mean_counts": mean.tolist(), "std_counts": std.tolist()}
         if why := self._refusal_reason(pad, model, mean, std):
             return {**result, "tared": False, "reason": why}
-        self._tick.set_baseline(pad, mean, std / np.sqrt(count))
-        self._tick.discard_solutions(np.array([pad]))
-        self._on_tared(pad)
+        offsets, spread = tuple(mean.tolist()), tuple((std / np.sqrt(count)).tolist())
+        self._pipeline.add_event(BaselineEvent(pad, offsets, spread))
+        self._on_tared(pad, offsets)
         return {**result, "tared": True, "reason": "", "offset_counts": mean.tolist()}
 
     def _refusal_reason(

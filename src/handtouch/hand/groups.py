@@ -23,12 +23,21 @@ class ContactGroups:
     contact that gave the id keeps it, else the one with the oldest contact.
     """
 
-    def __init__(self, within_m: FloatArray, hand: NDArray[np.intp]) -> None:
+    def __init__(
+        self,
+        within_m: FloatArray,
+        hand: NDArray[np.intp],
+        group_id: NDArray[np.uint32] | None = None,
+        contact_id: NDArray[np.uint32] | None = None,
+        joined: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Use these arrays (n,), (n,), (n, n) of zeros for the state, if given."""
         n = len(hand)
-        self.group_id = np.zeros(n, dtype=np.uint32)
+        none: NDArray[np.uint32] = np.zeros(n, dtype=np.uint32)
+        self.group_id: NDArray[np.uint32] = none if group_id is None else group_id
+        self._contact_id = none.copy() if contact_id is None else contact_id
+        self._joined = np.zeros((n, n), dtype=np.bool_) if joined is None else joined
         self._join_distance2, self._hand = within_m**2, hand
-        self._joined = np.zeros((n, n), dtype=np.bool_)
-        self._contact_id = np.zeros(n, dtype=np.uint32)
 
     def update_groups(self, contact: NDArray[np.uint32], position_m: FloatArray, normal: FloatArray) -> None:
         """Update the groups from contact ids (n,), 0 for none, and positions and normals (n, 3).

@@ -22,11 +22,18 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment
-from handtouch.core import state
+from handtouch.core.events import (
+    DemandEvent,
+    Event,
+    ModelEvent,
+    decode_calibration,
+    decode_event,
+)
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import ActiveScenes, RequestedOutputs
 from handtouch.core.slab import Slab
+from handtouch.core.state import StateLayoutError
 from handtouch.core.tick_messages import MessageSink
 from handtouch.hand.robot_models import RobotModels
 from handtouch.host.build import build_info
@@ -147,21 +154,29 @@ class ExactReplay:
         if payload["deployment"] == self._config_text:
             return
         self._config_text = payload["deployment"]
+        self._read_deployment(payload)
+
+    def _read_deployment(self, payload: dict[str, Any]) -> None:
         with recorded_deployment(payload) as deployment:
             self._deployment, self._model, self._robots = (
                 deployment,
                 PadModel(deployment),
                 RobotModels(deployment),
             )
-        self.pipeline = None  # the state follows
+        if self.pipeline is not None:
+            self.pipeline.next_model = self._model  # an event of the next tick applies it
 
     def _restore(self, payload: dict[str, Any]) -> None:
-        if self._model is None:
+        """Load a state, unless replay has come to the same. Raises ValueError for one of another version."""
+        if self._model is None or self._is_at(payload):
             return
-        if self.pipeline is None:
-            self.pipeline = self._new_pipeline(payload["session"], self._robots)
-        state.restore(self.pipeline, state.unpack(payload["state"]))
-        self._limits = _limits(payload["limits"])
+        pipeline = self._new_pipeline(payload["session"], self._robots)
+        load_state(pipeline, payload, self.result.build)
+        self.pipeline, self._limits = pipeline, _limits(payload["limits"])
+
+    def _is_at(self, payload: dict[str, Any]) -> bool:
+        """Return True if replay has come to the tick of a `state` message."""
+        return self.pipeline is not None and self.pipeline.ticks == payload["tick"]
 
     def _new_pipeline(self, session: int, robots: RobotModels | None) -> Pipeline:
         """Build a pipeline of the recorded deployment."""
@@ -185,12 +200,17 @@ class ExactReplay:
         if payload["limits"] is not None:
             self._limits = _limits(payload["limits"])
         load_tick(pipeline, payload, tick_columns(payload), self._limits)
+        for event in self._events(payload):
+            pipeline.add_event(event)
         if payload["stopped"]:
             pipeline.end_session(payload["now_ns"])
         else:
             pipeline.replay_tick(payload["now_ns"], payload["cycle_end_ns"])
             self.result.ticks += 1
         self._compare()
+
+    def _events(self, payload: dict[str, Any]) -> list[Event]:
+        return [decode_event(event) for event in payload["events"]]
 
     def _compare(self) -> None:
         recorded, result = self._recorded, self.result
@@ -229,43 +249,41 @@ class DeploymentReplay(ExactReplay):
     ) -> None:
         super().__init__(on_contact, publisher)
         self._new_deployment, self._on_recorded = deployment, on_recorded
-        self._recorded_pipeline: Pipeline | None = None  # of the recorded deployment
-        self._calibrations: dict[str, Any] = {}
 
     def _restore(self, payload: dict[str, Any]) -> None:
-        if self._model is None:
+        if self._model is None or self._is_at(payload):
             return
-        saved = state.unpack(payload["state"])
-        self._limits = _limits(payload["limits"])
-        calibrations = {path: value for path, value in saved.items() if path.startswith("model.")}
-        if self.pipeline is None:
-            self._recorded_pipeline = self._new_pipeline(payload["session"], self._robots)
-            self.pipeline = self._continued_pipeline(saved, payload["session"])
-        elif calibrations != self._calibrations and self._recorded_pipeline is not None:
-            state.restore(self._recorded_pipeline, saved)
-            self.pipeline.model.copy_calibrations(self._model)
-            self.pipeline.replace_model(self.pipeline.model, np.arange(self._model.size))
-        self._calibrations = calibrations
+        model = self._other_model(self._model)
+        super()._restore(payload)
+        assert self.pipeline is not None
+        names = list(zip(model.hands, model.links, strict=True))
+        needed = ActiveScenes(self._new_deployment.scene, names).requirements
+        every = np.ones(model.size, dtype=np.int64)
+        force = needed.pads & needed.force
+        self.pipeline.replace_model(model, range(model.size))
+        self.pipeline.apply_demand(RequestedOutputs(needed.pads, force, every, needed.palm, needed.base))
 
-    def _continued_pipeline(self, saved: dict[str, Any], session: int) -> Pipeline:
-        """Build a pipeline of the other deployment with the saved state. Raises ValueError for other pads."""
-        assert self._model is not None
+    def _read_deployment(self, payload: dict[str, Any]) -> None:
+        if self.pipeline is None:  # else a reload, which doesn't concern the other deployment
+            super()._read_deployment(payload)
+            self._robots = RobotModels(self._new_deployment)
+
+    def _other_model(self, recorded: PadModel) -> PadModel:
+        """Return the model of the other deployment. Raises ValueError for other pads."""
         model = PadModel(self._new_deployment)
-        names = [list(zip(m.hands, m.links, strict=True)) for m in (self._model, model)]
+        names = [list(zip(m.hands, m.links, strict=True)) for m in (recorded, model)]
         if names[0] != names[1]:
             differing = ["/".join(name) for name in sorted(set(names[0]) ^ set(names[1]))]
             raise ValueError(
                 f"its pads differ from the recording's: {', '.join(differing) or 'in their order'}"
             )
-        pipeline = self._new_pipeline(session, RobotModels(self._new_deployment))
-        state.restore(pipeline, saved)
-        model.copy_calibrations(self._model)
-        pipeline.replace_model(model, np.arange(model.size))
-        needed = ActiveScenes(self._new_deployment.scene, names[1]).requirements
-        every = np.ones(model.size, dtype=np.int64)
-        force = needed.pads & needed.force
-        pipeline.apply_demand(RequestedOutputs(needed.pads, force, every, needed.palm, needed.base))
-        return pipeline
+        return model
+
+    def _events(self, payload: dict[str, Any]) -> list[Event]:
+        """Return the recorded events without those of scenes and reloads."""
+        return [
+            event for event in super()._events(payload) if not isinstance(event, DemandEvent | ModelEvent)
+        ]
 
     def _compare(self) -> None:
         for payload in self._recorded.values():
@@ -305,13 +323,22 @@ def load_tick(
     """Load the inputs of a recorded tick into the pipeline."""
     assert isinstance(pipeline.slab, ReplaySlab)
     pipeline.slab.load_columns(columns, limits)
-    pipeline.transforms.replay_joints(payload["extra_inputs"].get("joints", ()))
-    pipeline.external_inputs.replay_inputs(payload["extra_inputs"].get("external_inputs", {}))
+    pipeline.transforms.replay_joints(payload["joints"])
     pipeline.node_state[:] = columns["node_state"]
     pipeline.cycle.sync_ns, pipeline.cycle.previous_sync_ns = payload["t_ns"], payload["previous_sync_ns"]
-    tick = pipeline.tick
-    tick.synchronous[:] = columns["synchronous"].astype(np.bool_)
-    tick.max_sample_period_ns[:], tick.period_since_ns[:] = columns["period_ns"], columns["period_since_ns"]
+
+
+def load_state(pipeline: Pipeline, payload: dict[str, Any], build: dict[str, Any]) -> None:
+    """Load the state of a `state` message. Raises ValueError for one of another layout or version."""
+    try:
+        calibrations = [decode_calibration(calibration) for calibration in payload["calibrations"]]
+        pipeline.load_state(payload["state"], payload["layout"], calibrations)
+    except (KeyError, StateLayoutError) as error:
+        reason = error if isinstance(error, StateLayoutError) else "the state has no layout"
+        raise ValueError(
+            f"recorded by handtouch {build.get('handtouch', '?')} ({build.get('source', '?')}), which can "
+            f"replay it: {reason}; `handtouch export` reads its contacts and hand frames with any version"
+        ) from error
 
 
 def _limits(data: bytes) -> NDArray[np.int64]:

@@ -134,13 +134,15 @@ def _tick_rows(entry: RecordedMessage, names: list[tuple[str, str]]) -> Rows:
                 "node_state": _PAD_STATES[state],
             },
         )
-    for hand, t_ns, positions, ages, _ in payload["extra_inputs"].get("joints", ()):
-        values = zip(np.frombuffer(positions).tolist(), np.frombuffer(ages).tolist(), strict=True)
+    for joints in payload.get("joints", ()):
+        values = zip(
+            *(np.frombuffer(joints[name]).tolist() for name in ("position_rad", "age_s")), strict=True
+        )
         for number, (position, age) in enumerate(values):
             row = {
                 **about,
-                "hand": hand,
-                "joints_ns": t_ns,
+                "hand": joints["hand"],
+                "joints_ns": joints["t_ns"],
                 "joint": number,
                 "position": position,
                 "age_s": age,

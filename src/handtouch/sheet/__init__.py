@@ -8,7 +8,11 @@ from handtouch.sheet.behaviour import (
     SheetStep,
     TemperatureResponse,
 )
-from handtouch.sheet.compensator import ParameterUncertainty, SheetCompensator
+from handtouch.sheet.compensator import (
+    CompensatorState,
+    ParameterUncertainty,
+    SheetCompensator,
+)
 from handtouch.sheet.creep import Creep
 from handtouch.sheet.fluctuation import Fluctuation, FluctuationState
 from handtouch.sheet.hysteresis import PrandtlIshlinskii
@@ -30,6 +34,7 @@ __all__ = [
     "Adaptation",
     "AdaptationState",
     "BenchCircuit",
+    "CompensatorState",
     "Creep",
     "Fluctuation",
     "FluctuationState",

@@ -1,6 +1,6 @@
 """Inverse model of a sheet: apparent load -> load, with its standard deviation.
 
-Public names: `SheetCompensator`, `ParameterUncertainty`.
+Public names: `SheetCompensator`, `CompensatorState`, `ParameterUncertainty`.
 
 Hysteresis, adaptation, creep and temperature are inverted exactly if their parameters are right and the load
 is above the threshold of response; fluctuations are not. A press below the threshold isn't detected but may
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.sheet.adaptation import AdaptationState
 from handtouch.sheet.behaviour import SheetModel
 
 FloatArray = npt.NDArray[np.float64]
@@ -41,12 +42,50 @@ class ParameterUncertainty:
         return cls(0.0, 0.0, 0.0, math.inf, 0.0)
 
 
+@dataclass(frozen=True)
+class CompensatorState:
+    """State of n pads' sheets, which a compensator updates in place."""
+
+    elements: FloatArray
+    """(1 + modes, n) of creep"""
+    plays: FloatArray
+    """(plays, n) of the inverse hysteresis"""
+    back_n: FloatArray
+    """(n,) back force [N]"""
+    current_flow_s: FloatArray
+    """(n,) total time of current flow"""
+    back_std_n: FloatArray
+    """(n,) standard deviation of the back force, without the present press's contribution"""
+    press_n: FloatArray
+    """(n,) that: error of the back force per standard deviation of this press"""
+    flow_s: FloatArray
+    """(n,) time of current flow since the last update of the back force"""
+    impulse_ns: FloatArray
+    """(n,) load times time since then"""
+    powered: npt.NDArray[np.bool_]
+    """(n,)"""
+    waited_s: FloatArray
+    """(1,) time since then"""
+    load_is_old: npt.NDArray[np.bool_]
+    """(1,) treat the present load as present for ever, as far as creep is concerned"""
+
+    @classmethod
+    def empty(cls, model: SheetModel, pads: int) -> CompensatorState:
+        """Return the state of fresh sheets under potential."""
+        plays = model.hysteresis.inverse.initial_state(pads)
+        back_n, flow_total_s, back_std_n, press_n, flow_s, impulse_ns = np.zeros((6, pads))
+        return cls(
+            *(model.creep.initial_state(pads), plays, back_n, flow_total_s, back_std_n, press_n),
+            *(flow_s, impulse_ns, np.ones(pads, np.bool_), np.zeros(1), np.zeros(1, np.bool_)),
+        )
+
+
 class SheetCompensator:
     """Inverse model of n pads' sheets; starts with fresh sheets under potential, at the law's temperature.
 
-    update_period_s: period of updates of the back force [s]. 0, in every step, makes the inverse exact;
-    otherwise the back force is held in between, an error of at most update_period_s / time_s of the load,
-    and most steps cost a third.
+    state: arrays to use, of fresh sheets; None: own ones. update_period_s: period of updates of the back
+    force [s]. 0, in every step, makes the inverse exact; otherwise the back force is held in between, an
+    error of at most update_period_s / time_s of the load, and most steps cost a third.
     """
 
     def __init__(
@@ -56,18 +95,17 @@ class SheetCompensator:
         uncertainty: ParameterUncertainty | None = None,
         *,
         update_period_s: float = 0.0,
+        state: CompensatorState | None = None,
     ) -> None:
         self.model, self.uncertainty = model, ParameterUncertainty() if uncertainty is None else uncertainty
-        self._inverse_hysteresis = model.hysteresis.inverse
-        self._plays = self._inverse_hysteresis.initial_state(pads)
-        self._adaptation = model.adaptation.initial_state(pads)
-        self._elements = model.creep.initial_state(pads)
-        self.back_std_n = np.zeros(pads)
+        state = CompensatorState.empty(model, pads) if state is None else state
+        self._state, self._inverse_hysteresis = state, model.hysteresis.inverse
+        self._plays, self._elements, self._powered = state.plays, state.elements, state.powered
+        self._adaptation = AdaptationState(state.back_n, np.zeros(pads), state.current_flow_s)
+        self.back_std_n = state.back_std_n
         """Standard deviation of the back force (n,) [N], without the present press's contribution."""
-        self._press_n = np.zeros(pads)  # that: error of the back force per standard deviation of this press
-        self._powered, self._temperature_rise_k = np.ones(pads, np.bool_), 0.0
-        self._update_period_s, self._waited_s = update_period_s, 0.0
-        self._flow_s, self._impulse = np.zeros(pads), np.zeros(pads)  # of load, since the last update
+        self._press_n, self._flow_s, self._impulse = state.press_n, state.flow_s, state.impulse_ns
+        self._temperature_rise_k, self._update_period_s = 0.0, update_period_s
         self._ones = np.ones(pads)
         self._threshold_n = np.array(np.broadcast_to(model.adaptation.threshold_n, pads), np.float64)
         noise, swelling, warmth_k = model.fluctuation, model.temperature, self.uncertainty.temperature_k
@@ -77,8 +115,7 @@ class SheetCompensator:
             (swelling.preload_n_per_k * warmth_k) ** 2,
         )
         """Variances proportional to the square of the effective load, to the effective load, and constant."""
-        self._last_result = tuple(np.zeros(pads) for _ in range(4))  # four arrays: a restored state has four
-        self._load_is_old = False  # treat the present load as present for ever, as far as creep is concerned
+        self._last_result = tuple(np.zeros(pads) for _ in range(4))
         self._set_interval(0.0)
 
     @property
@@ -97,7 +134,7 @@ class SheetCompensator:
         self._update_back_force()
         self.back_n[:] = back_n
         self.back_std_n[:] = std_n
-        self._load_is_old = True
+        self._state.load_is_old[0] = True
 
     def reset_pads(self, pads: npt.NDArray[np.intp]) -> None:
         """Reset some pads to fresh sheets."""
@@ -149,9 +186,9 @@ class SheetCompensator:
         swelling = self.model.temperature
         if self._temperature_rise_k:
             reading /= 1 + swelling.gain_per_k * self._temperature_rise_k
-        creep = self.model.creep.discretise(math.inf) if self._load_is_old else self._creep_step
+        creep = self.model.creep.discretise(math.inf) if self._state.load_is_old[0] else self._creep_step
         effective = creep.inverse(self._elements, reading)
-        self._load_is_old = False
+        self._state.load_is_old[0] = False
         flows = effective > 0
         before = (
             self._hold_back_force(effective, flows)
@@ -187,8 +224,8 @@ class SheetCompensator:
         load *= flows
         self._impulse += self._dt_s * load
         self._flow_s += self._dt_s * flows
-        self._waited_s += self._dt_s
-        if self._waited_s >= self._update_period_s:
+        self._state.waited_s[0] += self._dt_s
+        if self._state.waited_s[0] >= self._update_period_s:
             self._update_back_force()
         return load
 
@@ -198,10 +235,10 @@ class SheetCompensator:
         remaining = step.remaining_fraction(state)
         load = self._impulse / np.where(flow > 0, flow, 1.0)
         step.update_back_force(state, load, flow > 0, remaining)
-        self._propagate_uncertainty(load, remaining, self._waited_s - flow)
+        self._propagate_uncertainty(load, remaining, self._state.waited_s[0] - flow)
         if not self._powered.all():
-            self.model.adaptation.discretise(self._waited_s).recover(state, self._powered)
-        self._waited_s = 0.0
+            self.model.adaptation.discretise(float(self._state.waited_s[0])).recover(state, self._powered)
+        self._state.waited_s[0] = 0.0
         flow[:] = self._impulse[:] = 0.0
 
     def _propagate_uncertainty(self, load: FloatArray, remaining: FloatArray, pause_s: FloatArray) -> None:

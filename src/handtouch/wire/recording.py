@@ -33,6 +33,21 @@ class Raw:
     retained: bool
 
 
+class UsedJoints(TypedDict):
+    """`joints`: the joints of a hand at one time, as columns of float64."""
+
+    hand: str
+    """name of the hand"""
+    t_ns: int
+    """time of the samples"""
+    position_rad: bytes
+    """positions; metres for prismatic joints"""
+    age_s: bytes
+    """time to the nearest joint state"""
+    std_rad: bytes
+    """standard deviations, 0 where the robot gives none"""
+
+
 @dataclass(frozen=True, slots=True)
 class TickInputs:
     """`tick`: all inputs of one tick of all hands, for an exact replay with `state` and `config`.
@@ -63,16 +78,13 @@ class TickInputs:
     """as in `raw`"""
     node_state: Annotated[bytes, Column("<u1", codes=PadState)]
     """0 where the node is operational, else the resulting state of its pad"""
-    synchronous: Annotated[bytes, Column("<u1")]
-    """1 where the node samples with SYNC"""
-    period_ns: Annotated[bytes, Column("<i8")]
-    """maximum time between two samples"""
-    period_since_ns: Annotated[bytes, Column("<i8")]
-    """since when `period_ns` is valid"""
     limits: bytes | None
     """8 int64 per pad: limits of the four channels' ranges, all lower ones first; nil: unchanged"""
-    extra_inputs: dict[str, Any]
-    """other inputs, by name; those without any are left out"""
+    events: tuple[dict[str, Any], ...]
+    """changes since the tick before, in the order in which the tick applied them before its samples; each has
+    a `kind`"""
+    joints: Annotated[tuple[dict[str, Any], ...], tuple[UsedJoints, ...]]
+    """joint states used by the tick"""
     retained: bool
 
 
@@ -87,8 +99,12 @@ class StateSnapshot:
     """publication"""
     tick: int
     """number of that tick"""
+    layout: str
+    """version and hash of the layout of `state`"""
     state: bytes
-    """msgpack map of every value inside the pipeline by its path; valid for the same build only"""
+    """all arrays of the tick's state, one after another"""
+    calibrations: tuple[dict[str, Any], ...]
+    """calibration of each pad, as in an event of the kind `calibration`"""
     limits: bytes
     """as in `tick`"""
     retained: bool

@@ -100,7 +100,7 @@ TOPICS = (
     JOINTS,
     SERVICE,
     Topic("tick", TickInputs, (), "per tick"),
-    Topic("state", StateSnapshot, (), "on subscription, and when an event other than a tick changes it"),
+    Topic("state", StateSnapshot, (), "on subscription"),
     Topic("config", Config, (), "on subscription, and on reload"),
 )
 INTERNAL_TOPICS = (

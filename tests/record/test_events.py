@@ -10,6 +10,7 @@ import pytest
 
 from handtouch import wire
 from handtouch.config import parse
+from handtouch.core.events import ExcitationEvent
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.sheet_force import ForceReference
@@ -28,43 +29,41 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> RecordingSession:
         sink = CollectingSink(take)
         return Hand(deployment, Pipeline(model, PERIOD_NS, 0.6, sink, SESSION), sink)
 
-    made = RecordingSession(make, tmp_path_factory.mktemp("external"))
-    made.hand.step({})  # publishes the state once
-    return made
+    return RecordingSession(make, tmp_path_factory.mktemp("external"))
 
 
-def test_external_inputs_are_replayed_from_ticks_without_additional_states(session: RecordingSession) -> None:
+def test_reference_forces_and_gravity_are_replayed_from_any_state(session: RecordingSession) -> None:
     hand, random = session.hand, np.random.default_rng(3)
-    states = sum(isinstance(m, wire.StateSnapshot) for m in hand.sink.messages)
+    hand.pipeline.tick.baseline.gravity_slope[:] = random.normal(0, 5, (2, 4, 3))  # so that it has an effect
+    session.send_retained()
     samples = {0: hand.counts(0, 0.4, 0.3, 1e-3), 1: hand.counts(1, 0.5, 0.6, 2e-3)}
     for tick in range(600):
         if tick % 20 == 0:
             down = random.normal(size=(2, 3))
-            hand.pipeline.external_inputs.set_gravity(down / np.linalg.norm(down, axis=1, keepdims=True))
-        if tick == 300:  # so that gravity has an effect
-            hand.pipeline.tick.baseline.gravity_slope[:] = random.normal(0, 5, (2, 4, 3))
-            hand.pipeline.tick.state_changed = True
+            hand.pipeline.set_gravity(down / np.linalg.norm(down, axis=1, keepdims=True))
+        if tick == 300:
+            session.send_retained()
         if tick % 30 == 15 and tick > 300:
             force = 1.3 * hand.pipeline.tick.sheet_force.force_n
-            hand.pipeline.external_inputs.add_force_reference(
+            hand.pipeline.add_force_reference(
                 ForceReference(np.array([1, 0]), force[::-1], 0.02 * force, hand.t_ns)
             )
         if tick == 450:
-            hand.pipeline.tick.state_changed = True  # a state between an input and its tick
-            hand.pipeline.external_inputs.add_force_reference(
+            session.send_retained()  # a state between an input and its tick
+            hand.pipeline.add_force_reference(
                 ForceReference(np.array([0]), np.ones(1), np.ones(1), hand.t_ns)
             )
         hand.step(samples if tick > 40 else {0: b"\0" * 8, 1: b"\0" * 8})
     gains = hand.pipeline.tick.sheet_force.log_gain
     assert (np.abs(gains) > 0.02).all()
-    assert hand.pipeline.tick.baseline.gravity is not None
+    assert hand.pipeline.tick.baseline.gravity.any()
     hand.pipeline.end_session(hand.t_ns + PERIOD_NS)
     session.recorder.finish()
-    messages = hand.sink.messages
-    assert sum(isinstance(m, wire.StateSnapshot) for m in messages) == states + 2
-    assert sum("external_inputs" in m.extra_inputs for m in messages if isinstance(m, wire.TickInputs)) < 60
+    with_events = sum(len(m.events) > 0 for m in hand.sink.messages if isinstance(m, wire.TickInputs))
+    assert 30 < with_events < 60
     entries = list(Recording(Path(session.paths[0])))
-    starts = [number for number, entry in enumerate(entries) if entry.topic == "state"]
+    starts = [number for number, entry in enumerate(entries) if entry.topic == "state"][1:]
+    assert len(starts) == 3
     config = next(entry for entry in entries if entry.topic == "config")
     for start in starts:
         contacts: list[wire.Contact] = []
@@ -89,7 +88,7 @@ def test_a_replay_is_exact_after_excitation_was_switched_off(tmp_path: Path) -> 
     hand, press = made.hand, {0: made.hand.counts(0, 0.4, 0.3, 1e-3)}
     for tick in range(600):
         if tick in (250, 400):
-            hand.pipeline.tick.set_excitation(np.full(2, tick == 400))
+            hand.pipeline.add_event(ExcitationEvent((tick == 400,) * 2))
         hand.step(press if tick < 240 or tick > 420 else {})
     hand.pipeline.end_session(hand.t_ns + PERIOD_NS)
     made.recorder.finish()
