@@ -13,7 +13,7 @@ from handtouch import wire
 from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.config import Behaviour
-from handtouch.core.pad_calibration import PadCalibration
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.supervisor.ipc import (
@@ -151,7 +151,7 @@ def test_manual_calibration_is_sent_until_a_better_one_is_estimated(rig: Rig) ->
     def sent() -> list[dict[str, Any]]:
         return [m for m in map(msgpack.unpackb, rig.process.sent) if m["kind"] == "manual_calibration"]
 
-    rig.pipeline.set_calibration(1, PadCalibration("bench-1", (1.1, 1.0, 1.0, 0.9)))
+    rig.pipeline.set_calibration(1, ActiveCalibration("bench-1", (1.1, 1.0, 1.0, 0.9)))
     rig.supervisor.register_manual_calibration(1, {"gains"})
     assert sent()[-1]["given"] == ["gains"]
     update = CalibrationUpdate.model_validate_json(sent()[-1]["update"])

@@ -14,7 +14,7 @@ import pytest
 from handtouch import wire
 from handtouch.config import Deployment, parse
 from handtouch.config.files import deployment_files
-from handtouch.core.pad_calibration import PadCalibration
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.host.build import build_info
@@ -201,7 +201,7 @@ def recorded(make_hand: Callable[..., Hand], tmp_path_factory: pytest.TempPathFa
     hand = session.hand
     hand.stroke(130)
     session.take(health(1, hand.t_ns))
-    hand.pipeline.set_calibration(0, PadCalibration("another", (1.05,) * 4))
+    hand.pipeline.set_calibration(0, ActiveCalibration("another", (1.05,) * 4))
     hand.stroke(130, seed=2)
     session.take(health(2, hand.t_ns, "lost", "its heartbeat timed out"))
     for _ in range(5):

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handtouch import wire
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.events import BaselineEvent
-from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.slab import Slab
 from handtouch.core.state import StateLayoutError, TickState
@@ -51,7 +51,7 @@ def _do(hand: Any, action: tuple[Any, ...]) -> None:
         hand.pipeline.apply_demand(RequestedOutputs(*requested, no_pads, no_pads, percepts), every)
     elif action[0] == "calibrate":
         gains = (1.0 + 0.01 * action[2], 1.0, 1.0, 1.0)
-        hand.pipeline.set_calibration(action[1], PadCalibration(f"c{action[2]}", gains))
+        hand.pipeline.set_calibration(action[1], ActiveCalibration(f"c{action[2]}", gains))
     elif action[0] == "tare":
         hand.pipeline.add_event(BaselineEvent(action[1], (float(action[2]),) * 4, (1.0,) * 4))
     else:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from handtouch.core.pad_calibration import PadCalibration
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.sheet_force import ForceReference
 from handtouch.core.tick import TickProcessor
@@ -63,7 +63,7 @@ class CalibrationEvent:
 
     kind: ClassVar[str] = "calibration"
     pad: int
-    calibration: PadCalibration
+    calibration: ActiveCalibration
 
     def apply(self, target: EventTarget) -> None:
         target.tick.set_calibration(self.pad, self.calibration)
@@ -235,14 +235,14 @@ def decode_event(recorded: Mapping[str, Any]) -> Event:
     return event
 
 
-def encode_calibration(calibration: PadCalibration) -> dict[str, Any]:
+def encode_calibration(calibration: ActiveCalibration) -> dict[str, Any]:
     """Return a calibration as msgpack values."""
     return asdict(calibration)
 
 
-def decode_calibration(recorded: Any) -> PadCalibration:
+def decode_calibration(recorded: Any) -> ActiveCalibration:
     """Return a recorded calibration. Raises ValueError for an invalid one."""
-    calibration: PadCalibration = TypeAdapter(PadCalibration).validate_json(json.dumps(recorded))
+    calibration: ActiveCalibration = TypeAdapter(ActiveCalibration).validate_json(json.dumps(recorded))
     return calibration
 
 

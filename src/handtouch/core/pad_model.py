@@ -20,7 +20,7 @@ from handtouch.config.channels import (
     order_by_electrode,
     resolve_channels,
 )
-from handtouch.core.pad_calibration import PadCalibration
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, view_floats
 from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
@@ -80,7 +80,7 @@ class PadModel:
         self.frame_links = [pad.mount.link or pad.link for pad in pads]
         self.rows_of_hand = _rows_of_hands(self.hands)
         self.default_calibration_ids = [default_calibration_id_of(pad, deployment) for pad in pads]
-        self.calibrations = [PadCalibration(name) for name in self.default_calibration_ids]
+        self.calibrations = [ActiveCalibration(name) for name in self.default_calibration_ids]
         kinds = {name: resolve_channels(node.channels, node.eds) for name, node in deployment.nodes.items()}
         self.ampere_per_count = np.array(
             [_ampere_per_count(pad, deployment, kinds[pad.node]) for pad in pads]
@@ -147,7 +147,7 @@ class PadModel:
         gains = calibration.gains.factors if calibration.gains else (1.0,) * 4
         self.set_gains_and_law(pad, gains, name, calibration.law)
 
-    def set_calibration(self, pad: int, calibration: PadCalibration) -> None:
+    def set_calibration(self, pad: int, calibration: ActiveCalibration) -> None:
         """Apply a calibration as a whole. Where series resistors matter, contacts are located with the
         deployment's sheet resistance."""
         before, self.calibrations[pad] = self.calibrations[pad], calibration
@@ -231,8 +231,8 @@ class PadModel:
             self.set_calibration(pad, calibration)
 
     def continued_calibrations(
-        self, other: PadModel, calibrations: Sequence[PadCalibration]
-    ) -> list[PadCalibration]:
+        self, other: PadModel, calibrations: Sequence[ActiveCalibration]
+    ) -> list[ActiveCalibration]:
         """Return calibrations (n,) of the model that this one replaces as this one has them: default ones
         change their name."""
         defaults = zip(other.default_calibration_ids, self.default_calibration_ids, strict=True)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.cycle import Cycle
 from handtouch.core.events import CalibrationEvent, DemandEvent, Event, ForceEvent, GravityEvent, ModelEvent
 from handtouch.core.journal import TickJournal
-from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.sheet_force import ForceReference
@@ -77,7 +77,7 @@ class Pipeline:
         """Change the state at the start of the next tick."""
         self._events.append(event)
 
-    def set_calibration(self, pad: int, calibration: PadCalibration) -> None:
+    def set_calibration(self, pad: int, calibration: ActiveCalibration) -> None:
         """Change a pad's calibration, unless it is the present one."""
         if calibration != self.calibrations[pad]:
             self.calibrations[pad] = calibration
@@ -191,7 +191,7 @@ class Pipeline:
         return {topic: message for topic, message in messages.items() if message is not None}
 
     def load_state(
-        self, saved: bytes, layout: str, calibrations: Sequence[PadCalibration] | None = None
+        self, saved: bytes, layout: str, calibrations: Sequence[ActiveCalibration] | None = None
     ) -> None:
         """Load a state of a pipeline of the same deployment, and the calibrations of its pads.
 

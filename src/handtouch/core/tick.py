@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import wire
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline
 from handtouch.core.contact_solver import VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, IntArray
 from handtouch.core.cycle import Cycle
-from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import ForceReference, ForceReliability, SheetForceCompensation
 from handtouch.core.slab import Slab
@@ -234,7 +234,7 @@ class TickProcessor:
         self.baseline.set_offset(pad, offset_counts, std_counts)
         self.discard_solutions(np.array([pad]))
 
-    def set_calibration(self, pad: int, calibration: PadCalibration) -> None:
+    def set_calibration(self, pad: int, calibration: ActiveCalibration) -> None:
         """Apply a pad's calibration as a whole; forces by another contact law need new evidence."""
         if calibration.law != self.model.calibrations[pad].law:
             self.sheet_force.reset_evidence(pad)

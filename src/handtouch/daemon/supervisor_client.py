@@ -22,13 +22,13 @@ from handtouch.canbus.nodes.master import (
     SerialChanged,
 )
 from handtouch.config import Deployment
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.events import (
     BackForceEvent,
     BaselineEvent,
     ExcitationEvent,
     ReplacementEvent,
 )
-from handtouch.core.pad_calibration import PadCalibration
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.block_buffer import BlockBuffer
 from handtouch.daemon.child_process import ChildProcess
@@ -281,7 +281,7 @@ class SupervisorClient:
     def _quarantine_pad(self, pad: int) -> None:
         """Discard the calibration of a pad whose node was replaced, until the new node is calibrated."""
         pipeline = self._pipeline
-        default = PadCalibration(pipeline.model.default_calibration_ids[pad])
+        default = ActiveCalibration(pipeline.model.default_calibration_ids[pad])
         self._log_gain_covariance[pad] = _UNKNOWN_LOG_GAIN_COVARIANCE
         self._manual_parts.pop(pad, None)
         self._unconfirmed_calibrations.pop(pad, None)
@@ -297,7 +297,7 @@ class SupervisorClient:
     def _update_uncertainty(self, pad: int, quarantined: bool) -> None:
         self._set_calibration(pad, self._pipeline.calibrations[pad], quarantined)
 
-    def _set_calibration(self, pad: int, calibration: PadCalibration, quarantined: bool) -> None:
+    def _set_calibration(self, pad: int, calibration: ActiveCalibration, quarantined: bool) -> None:
         """Apply a calibration with what is known about its quality."""
         unreliable = bool(self._position_unreliable[pad])
         covariance = _POSITION_UNKNOWN_LOG_GAIN_COVARIANCE if unreliable else self._log_gain_covariance[pad]

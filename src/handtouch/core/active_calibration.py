@@ -1,6 +1,6 @@
 """The calibration of one pad as the core applies it: one immutable object, replaced as a whole.
 
-Public name: `PadCalibration`.
+Public name: `ActiveCalibration`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from handtouch.calibration.calibration import LawParameters
 
 
 @dataclass(frozen=True, slots=True)
-class PadCalibration:
+class ActiveCalibration:
     """Calibration of a pad, and what is known about its quality.
 
     gains: of the electrodes x0, xa, y0, yb. law: None, the deployment's. gain_covariance: (16,) of log gains; None, as the deployment states.
