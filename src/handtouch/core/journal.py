@@ -44,7 +44,8 @@ class TickJournal:
 
     def __init__(self, pipeline: _Pipeline, session: int, sink: MessageSink) -> None:
         self._pipeline, self._session, self._sink = pipeline, session, sink
-        self._tick_seq = self._config_seq = 0  # seq of each topic
+        self._tick_seq = self._state_seq = self._config_seq = 0  # seq of each topic
+        self._has_subscriber = False  # to ticks
         self._published_limits = b""
         self._config: tuple[str, Mapping[str, bytes], Mapping[str, Any]] | None = None
 
@@ -52,7 +53,7 @@ class TickJournal:
         """Return topic -> function that makes its retained message."""
         return {
             "config": lambda now_ns: self._config_message(now_ns, retained=True),
-            "state": self._state_message,
+            "state": lambda now_ns: self._state_message(now_ns, retained=True),
         }
 
     def publish_config(
@@ -65,6 +66,14 @@ class TickJournal:
         if message is not None and self._sink.has_subscriber("config"):
             self._sink.send(message)
             self._sink.send(message)
+
+    def publish_first_state(self, now_ns: int) -> None:
+        """Publish the state before a tick, if the messages `tick` begin with this one."""
+        subscribed = self._sink.has_subscriber("tick")
+        if subscribed and not self._has_subscriber:
+            self._state_seq += 1
+            self._sink.send(self._state_message(now_ns, retained=False))
+        self._has_subscriber = subscribed
 
     def publish_tick_inputs(
         self, events: Sequence[Event], now_ns: int, until_ns: int, stopped: bool = False
@@ -99,18 +108,18 @@ class TickJournal:
             )
         )
 
-    def _state_message(self, now_ns: int) -> wire.StateSnapshot:
+    def _state_message(self, now_ns: int, retained: bool) -> wire.StateSnapshot:
         return wire.StateSnapshot(
             v=wire.SCHEMA_VERSION,
             session=self._session,
-            seq=0,
+            seq=self._state_seq,
             t_ns=now_ns,
             tick=self._pipeline.ticks,
             layout=TickState.layout(),
             state=self._pipeline.save_state(),
             calibrations=tuple(map(encode_calibration, self._pipeline.tick.model.calibrations)),
             limits=self._pipeline.slab.limits.tobytes(),
-            retained=True,
+            retained=retained,
         )
 
     def _config_message(self, now_ns: int, retained: bool) -> wire.Config | None:

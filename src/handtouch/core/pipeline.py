@@ -153,6 +153,7 @@ class Pipeline:
 
     def _run_tick(self, now_ns: int, until_ns: int) -> TickResult:
         self.prepare_next_tick()
+        self.journal.publish_first_state(now_ns)
         events, self._events = self._events, []
         for event in events:
             event.apply(self)

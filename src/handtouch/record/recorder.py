@@ -71,6 +71,7 @@ class MessageRecorder:
         self._seq: dict[str, int] = {}
         self._state_requested_ns = self._flushed_ns = self._file_opened_ns = 0
         self._needs_state = True
+        self._state_tick: int | None = None  # of a state without a tick since
         self._file_lost = 0
 
     @property
@@ -162,7 +163,11 @@ class MessageRecorder:
             for repeated, (kept, kept_ns) in self._repeated.items():
                 self._write(repeated, kept, kept_ns)
         if topic == "state":
-            self._needs_state = False
+            self._needs_state, self._state_tick = False, payload["tick"]
+        elif topic == "tick" and self._state_tick is not None:
+            # a state before the ticks that reach this recorder is of no use
+            self._needs_state |= payload["tick"] > self._state_tick + 1
+            self._state_tick = None
         prefix = topic.split("/")[0]
         if ENCODING[prefix] == "json":
             try:
