@@ -170,16 +170,15 @@ class RecordingSession:
         self.hand.pipeline.journal.publish_config(
             deployment, deployment_files(deployment), build_info(), self.hand.t_ns
         )
-        self.send_retained("state")
 
     def take(self, parts: list[bytes]) -> None:
         """Record a message of the daemon."""
         if not parts or not self.lose(parts[0]):
             self.recorder.add_message(parts, self.hand.t_ns if hasattr(self, "hand") else 0)
 
-    def send_retained(self, *topics: str) -> None:
-        """Record the retained messages, by default all, as after a new subscription."""
-        for topic in topics or ("config", "state"):
+    def send_retained(self) -> None:
+        """Record the retained messages, as after a new subscription."""
+        for topic in ("config", "state"):
             message = self.hand.pipeline.journal.retained_messages()[topic](self.hand.t_ns)
             assert message is not None
             self.take(wire.encode(message))

@@ -163,10 +163,10 @@ class MessageRecorder:
             for repeated, (kept, kept_ns) in self._repeated.items():
                 self._write(repeated, kept, kept_ns)
         if topic == "state":
-            self._needs_state, self._state_tick = False, payload["tick"]
+            self._needs_state, self._state_tick = False, payload.get("tick")
         elif topic == "tick" and self._state_tick is not None:
             # a state before the ticks that reach this recorder is of no use
-            self._needs_state |= payload["tick"] > self._state_tick + 1
+            self._needs_state |= payload.get("tick") != self._state_tick + 1
             self._state_tick = None
         prefix = topic.split("/")[0]
         if ENCODING[prefix] == "json":
