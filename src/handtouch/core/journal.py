@@ -68,10 +68,12 @@ class TickJournal:
             self._sink.send(message)
 
     def publish_first_state(self, now_ns: int) -> None:
-        """Publish the state before a tick, if the messages `tick` begin with this one."""
+        """Publish config and state before a tick, if the messages `tick` begin with this one."""
         subscribed = self._sink.has_subscriber("tick")
         if subscribed and not self._has_subscriber:
             self._state_seq += 1
+            if (config := self._config_message(now_ns, retained=True)) is not None:
+                self._sink.send(config)
             self._sink.send(self._state_message(now_ns, retained=False))
         self._has_subscriber = subscribed
 

@@ -22,7 +22,10 @@ from handtouch.host.endpoints import COMPLETE_ENDPOINT, to_connect
 from handtouch.record.mcap_file import RecordingFile
 from handtouch.record.recorder import MessageRecorder, RotationLimits
 
-PATTERNS = tuple(topic.pattern for topic in wire.TOPICS if topic.prefix not in ("hand", "raw", "percept"))
+PATTERNS = (
+    "config",  # before the state, which is read with it
+    *(topic.pattern for topic in wire.TOPICS if topic.prefix not in ("config", "hand", "raw", "percept")),
+)
 """Recorded topics: all but hand frames, which follow from `tick`, and percepts, computed on request."""
 BYTES_PER_MB = 1_000_000
 _QUEUE_MESSAGES = 200_000
