@@ -14,9 +14,9 @@ from handtouch.calibration.calibration import LawParameters
 class ActiveCalibration:
     """Calibration of a pad, and what is known about its quality.
 
-    gains: of the electrodes x0, xa, y0, yb. law: None, the deployment's. gain_covariance: (16,) of log gains; None, as the deployment states.
-    quarantined: no force is published. diagnoses: names of those responsible for `quarantined` or
-    `position_unreliable`.
+    gains: of the electrodes x0, xa, y0, yb. law: None, the deployment's. gain_covariance: (16,) of log gains;
+    None, as the deployment states. quarantined: no force is published. diagnoses: names of those responsible
+    for `quarantined` or `position_unreliable`.
     """
 
     calibration_id: str
