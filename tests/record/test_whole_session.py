@@ -22,9 +22,9 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import ActiveScenes, Demand
 from handtouch.core.sheet_force import ForceReference
+from handtouch.daemon.child_process import ChildProcess
 from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.supervisor_client import SupervisorClient
-from handtouch.daemon.supervisor_process import SupervisorProcess
 from handtouch.daemon.tare import TareJob
 from handtouch.host.build import build_info
 from handtouch.record.exact_replay import ExactReplay
@@ -100,7 +100,7 @@ class Session:
             self.pipeline,
             cast(Master, self.nodes),
             "",
-            cast(SupervisorProcess, self.worker),
+            cast(ChildProcess, self.worker),
         )
         self.swap(0, None, 11)
         names = list(zip(self.pipeline.model.hands, self.pipeline.model.links, strict=True))

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from handtouch.core.pad_tables import view_floats
 from handtouch.core.stages.slip import SLIP_PARAMETERS, SLIP_SLICES, SLIP_WORK, SlipStage
-
 from handtouch.core.state import TickState
 
 FloatArray = NDArray[np.float64]
