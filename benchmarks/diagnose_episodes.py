@@ -15,7 +15,7 @@ from handtouch.simulate.faults import FAULTS, INFLUENCES, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, Family
+from handtouch.simulate.worlds import Family, World
 from handtouch.supervisor.diagnose import HandSamples
 from handtouch.wire.faults import FaultKind
 
@@ -50,6 +50,8 @@ class Episode:
     link: str
     begin_s: float
     details: dict[str, Any]
+    deployment: config.Deployment
+    """As the builder of the drawn hand describes it."""
     hand: VirtualHand
 
     def blocks(self, length_s: float = LENGTH_S) -> Iterator[HandSamples]:
@@ -74,12 +76,12 @@ def deployment() -> config.Deployment:
 
 
 def hand_of(seed: int) -> int:
-    """The world that the seed's hand is built in; one for many seeds, as its sheets are costly."""
-    return 1 + seed // 25
+    """Return the number of the hand of a seed; one for many seeds, as its sheets are costly."""
+    return seed // 25
 
 
-def episode(name: str, seed: int) -> Episode:
-    """The episode of that name and seed; the same every time."""
+def episode(name: str, seed: int, world: World) -> Episode:
+    """Return the episode of that name and seed, on a hand drawn in a world for the reporting family."""
     rng = np.random.default_rng((seed, sum(name.encode())))
     link = PADS[int(rng.integers(len(PADS)))]
     begin_s = float(rng.uniform(15, 30))
@@ -112,13 +114,10 @@ def episode(name: str, seed: int) -> Episode:
         for pad in PADS:
             play.use(pad, 0.5, LENGTH_S)
     touches = tuple(play.touches)
-    hand = VirtualHand(
-        deployment(),
-        Scenario(touch=touches),
-        WORLDS["default"].only("parts", "contacts").draw(Family.REPORTING.seed(hand_of(seed))),
-        faults=tuple(faults),
-    )
-    return Episode(name, seed, link, begin_s, details, hand)
+    drawn = world.draw(Family.REPORTING.seed(hand_of(seed)))
+    described = drawn.describe(deployment())
+    hand = VirtualHand(described, Scenario(touch=touches), drawn, faults=tuple(faults))
+    return Episode(name, seed, link, begin_s, details, described, hand)
 
 
 class _Play:

@@ -1,0 +1,154 @@
+"""Single touches all over a hand through the daemon's pipeline: position and force of one sample of each.
+
+Public names: `draw_touches`, `serve`, `sampled`, `compare`, `position_error`, `force_error`, and the times of
+a touch `REST_S`, `STEP_S`, `TOUCH_S`, `SAMPLE_S`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from daemon_settings import pipeline_of
+from numpy.typing import NDArray
+from oracle import PadOracle
+from scores import Estimates, bin_labels
+
+from handtouch import wire
+from handtouch.config import Deployment
+from handtouch.core.pad_model import PadModel
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.truth import GroundTruth
+from handtouch.simulate.virtual_hand import VirtualHand
+
+FloatArray = NDArray[np.float64]
+FORCES_N = (0.2, 12.0)
+REST_S, STEP_S, TOUCH_S, SAMPLE_S = 2.0, 0.65, 0.5, 0.32
+"""Time before the first touch, from touch to touch of a pad, of a touch, and from its begin to its sample."""
+_FIRST_NS = 1_000_000_000
+Key = tuple[int, str]
+"""Number of a touch, and its link."""
+Sampled = tuple[dict[Key, wire.Contact], dict[Key, GroundTruth]]
+
+
+class Collector:
+    """Subscriber to all contacts that keeps those of the sampled ticks, by link."""
+
+    def __init__(self) -> None:
+        self.contacts: dict[tuple[int, str], wire.Contact] = {}
+        self.sampled: int | None = None
+
+    def has_subscriber(self, topic: str) -> bool:
+        return topic.startswith("contact/")
+
+    def send(self, message: wire.OutgoingMessage) -> None:
+        if self.sampled is not None and isinstance(message, wire.Contact) and message.event != "end":
+            self.contacts[self.sampled, message.link] = message
+
+
+def draw_touches(links: Sequence[str], count: int, seed: int) -> tuple[ScenarioTouch, ...]:
+    """Return `count` touches of each pad, one after the other: places uniform, forces log-uniform."""
+    rng = np.random.default_rng((seed, 5))
+    low, high = np.log(FORCES_N)
+    return tuple(
+        ScenarioTouch(
+            link=link,
+            from_s=REST_S + number * STEP_S,
+            duration_s=TOUCH_S,
+            path=((float(x), float(y)),),
+            force_n=(float(np.exp(force)),),
+        )
+        for number in range(count)
+        for link, (x, y), force in zip(
+            links, rng.uniform(0.02, 0.98, (len(links), 2)), rng.uniform(low, high, len(links)), strict=True
+        )
+    )
+
+
+def serve(
+    model: PadModel, deployment: Deployment, counts: NDArray[np.int64], sampled: Mapping[int, int]
+) -> dict[tuple[int, str], wire.Contact]:
+    """Return the contacts in the `sampled` ticks by touch number and link; counts (ticks, pads, 4)."""
+    period_ns = round(deployment.daemon.sync_period_ms * 1e6)
+    collector = Collector()
+    pipeline = pipeline_of(deployment, collector, model=model)
+    for tick, rows in enumerate(counts.astype("<i2")):
+        t_ns = _FIRST_NS + tick * period_ns
+        collector.sampled = sampled.get(tick)
+        pipeline.begin_cycle(t_ns, t_ns)
+        for pad, row in enumerate(rows):
+            pipeline.slab.write_pdo(pad, row.tobytes(), t_ns + 1)
+        pipeline.tick_if_due(t_ns + period_ns)
+        pipeline.prepare_next_tick()
+    return collector.contacts
+
+
+def sampled(hand: VirtualHand, model: PadModel, deployment: Deployment, numbers: range) -> Sampled:
+    """Serve all touches up to the last of these numbers, `STEP_S` apart; return contacts and truths."""
+    period_s = deployment.daemon.sync_period_ms * 1e-3
+    times_s = period_s * np.arange(round((REST_S + numbers.stop * STEP_S) / period_s))
+    counts = np.stack([hand.counts(row, times_s) for row in range(model.size)], axis=1)
+    ticks = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
+    truths = {
+        (k, truth.link): truth for tick, k in ticks.items() for truth in hand.truth(float(times_s[tick]))
+    }
+    return serve(model, deployment, counts, ticks), truths
+
+
+def compare(
+    found: Sequence[tuple[wire.Contact | None, GroundTruth]], oracle: PadOracle, labels: Mapping[str, str]
+) -> tuple[Estimates, Estimates]:
+    """Return position and force of one pad's touches; a touch without a contact isn't valid."""
+    u, v, true_n = np.array([(truth.u_m, truth.v_m, truth.force_n) for _, truth in found]).T
+    stated = oracle.covariances(u, v, true_n)
+    columns = {name: np.full(len(found), label) for name, label in labels.items()}
+    columns |= {
+        "surface": np.full(len(found), oracle.surface_name),
+        "aspect": bin_labels(np.full(len(found), oracle.aspect), (1.3, 1.8)),
+        "force": bin_labels(true_n, (0.5, 2.0, 5.0), "N"),
+        "edge distance": bin_labels(100 * oracle.edge_distance(u, v), (5.0, 15.0), "%"),
+    }
+    bound_m = np.array([truth.bound_m for _, truth in found])
+    return (
+        estimates([position_error(*pair) for pair in found], bound_m, stated.position_m2, columns),
+        estimates([force_error(*pair) for pair in found], stated.force_bound_n, stated.force_n2, columns),
+    )
+
+
+def estimates(
+    found: Sequence[tuple[FloatArray, FloatArray]],
+    bound: FloatArray,
+    oracle_covariance: FloatArray,
+    columns: Mapping[str, NDArray[Any]],
+) -> Estimates:
+    """Return a table of errors with covariances; valid are those that aren't NaN."""
+    error, covariance = (np.array(values) for values in zip(*found, strict=True))
+    return Estimates(error, covariance, ~np.isnan(error[:, 0]), bound, oracle_covariance, columns)
+
+
+def position_error(contact: wire.Contact | None, truth: GroundTruth) -> tuple[FloatArray, FloatArray]:
+    """Return error (2,) [m] and covariance (2, 2) along the surface; NaN without a valid position."""
+    if not contact or not contact.position_m or not contact.normal or not contact.covariance_m2:
+        return np.full(2, np.nan), np.full((2, 2), np.nan)
+    if contact.position_status != "valid":
+        return np.full(2, np.nan), np.full((2, 2), np.nan)
+    across = tangent_basis(np.array(contact.normal))
+    covariance = across @ np.reshape(contact.covariance_m2, (3, 3)) @ across.T
+    return across @ np.subtract(contact.position_m, truth.position_m), covariance
+
+
+def force_error(contact: wire.Contact | None, truth: GroundTruth) -> tuple[FloatArray, FloatArray]:
+    """Return error (1,) [N] and variance (1, 1) of the force; NaN without a valid force."""
+    if not contact or contact.force_n is None or contact.force_std_n is None:
+        return np.full(1, np.nan), np.full((1, 1), np.nan)
+    if contact.force_status != "valid":
+        return np.full(1, np.nan), np.full((1, 1), np.nan)
+    return np.array([contact.force_n - truth.force_n]), np.array([[contact.force_std_n**2]])
+
+
+def tangent_basis(normal: FloatArray) -> FloatArray:
+    """Return two orthonormal rows (2, 3) at right angles to a unit vector."""
+    along = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    along /= np.linalg.norm(along)
+    return np.stack([along, np.cross(normal, along)])
