@@ -38,6 +38,8 @@ FAULTY = {
     "hysteresis tail": FaultKind.HYSTERESIS_TAIL,
 }
 """Fault played, and its right diagnosis."""
+EPISODES_OF_HAND = 5
+"""Seeds that share a drawn hand, as its sheets are costly."""
 FAULT_FREE = ("plain use", "long grasp", "wet object", "sweeping wipes", "hot cup", "two objects")
 
 
@@ -76,8 +78,8 @@ def deployment() -> config.Deployment:
 
 
 def hand_of(seed: int) -> int:
-    """Return the number of the hand of a seed; one for many seeds, as its sheets are costly."""
-    return seed // 25
+    """Return the number of the hand of a seed."""
+    return seed // EPISODES_OF_HAND
 
 
 def episode(name: str, seed: int, world: World) -> Episode:

@@ -368,7 +368,9 @@ class EventScore:
             "events": self.recall.total,
             "recall, %": str(self.recall),
             "precision, %": str(self.precision),
-            "delay, median / 95 % [ms]": " / ".join(f"{1e3 * self.delay_s(q):.0f}" for q in (0.5, 0.95)),
+            "delay, median / 95 % [ms]": " / ".join(f"{1e3 * self.delay_s(q):.0f}" for q in (0.5, 0.95))
+            if len(self.delays_s)
+            else "-",
             "repeated": self.repeated,
             "false alarms per hour": str(self.false_alarms),
         }

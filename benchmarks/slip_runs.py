@@ -94,7 +94,7 @@ def run(
     information_s: float = 0.0,
 ) -> Record:
     """Process grips, each one contact on its link's pad, from `from_s` of the scenario on."""
-    deployment, period_ns = DEPLOYMENT, round(1e9 / hz)
+    deployment, period_ns = world.describe(DEPLOYMENT), round(1e9 / hz)
     hand = VirtualHand(deployment, Scenario.model_validate({"touch": grips}), world)
     times = from_s + np.arange(1, round(seconds * hz) + 1) / hz
     counts = np.stack([hand.counts(row, times) for row in range(len(hand.pads))], axis=1)
