@@ -291,8 +291,8 @@ def main() -> None:
         "their builder would; parts, sheets, drift of zeros, temperature and supply are hidden. As a "
         "hand's week is, it mostly rests; between, single touches and slides, things taken and put down, "
         f"long grasps, wipes, hot cups (10 to 30 K), two objects on a pad. Sampled at {BUSY_HZ} Hz in "
-        f"use and {LINGER_S:g} s longer, and at {IDLE_HZ} Hz at rest, as the daemon's own idling does. Wet objects "
-        "are in the [episodes](diagnose.md).", "",
+        f"use and {LINGER_S:g} s longer, and at {IDLE_HZ} Hz at rest, as the daemon's own idling does. Wet "
+        "objects are in the [episodes](diagnose.md).", "",
     ]  # fmt: skip
     out = output_folder(args.quick)
     (out / "alarms.md").write_text("\n".join([*head, *page]))

@@ -330,8 +330,8 @@ def report(results: dict[str, Any]) -> str:
 
 The shipped hand, 15 pads at once, drawn in each [world](../worlds.md) for a seed of the reporting family,
 through the daemon's own pipeline and percepts. A grip has tremor: 10 % ripple of force and 15 um of sway,
-both of eight tones from 1 to 10 Hz, and the centroid rolls 0.1 mm a newton. In half of the slips the force stays
-constant, in half it falls to 70 % within 20 ms. {made_by()}
+both of eight tones from 1 to 10 Hz, and the centroid rolls 0.1 mm a newton. In half of the slips the force
+stays constant, in half it falls to 70 % within 20 ms. {made_by()}
 on {platform.machine()}, Python {platform.python_version()}, {os.cpu_count()}
 shared cores.
 
