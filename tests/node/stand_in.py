@@ -54,7 +54,7 @@ class AdcStandIn:
         self.device = self.devices / self.folder.name
         os.mkfifo(self.device)
         self._queue = os.open(self.device, os.O_RDWR | os.O_NONBLOCK)  # it has a writer at all times
-        self._threads: list[threading.Thread] = []
+        self._triggers: list[tuple[Path, threading.Thread]] = []
 
     def write(self, attribute: str, text: str) -> None:
         """Replace an attribute as a whole."""
@@ -94,18 +94,15 @@ class AdcStandIn:
         (folder / "name").write_text(f"{name}\n")
         if values is not None:
             os.mkfifo(folder / "trigger_now")
-            thread = threading.Thread(
-                target=self._convert, args=(folder / "trigger_now", values), daemon=True
-            )
+            trigger = folder / "trigger_now"
+            thread = threading.Thread(target=self._convert, args=(trigger, values), daemon=True)
             thread.start()
-            self._threads.append(thread)
+            self._triggers.append((trigger, thread))
 
     def close(self) -> None:
-        for path in self.sysfs.glob("trigger*/trigger_now"):
-            for thread in self._threads:
-                if thread.is_alive():
-                    path.write_bytes(b"end")
-                    thread.join(10)
+        for trigger, thread in self._triggers:
+            trigger.write_bytes(b"end")
+            thread.join(10)
         os.close(self._queue)
 
     def _add_element(self, channel: str, index: int, kind: str) -> None:

@@ -168,7 +168,9 @@ def test_an_adc_that_stops_converting_is_named(bench: Any) -> None:
     bench.start(FREE)
     bench.adc.push([0] * 4, bench.t_ns + 5 * MS)
     assert bench.counts() == (0, 0, 0, 0)
-    kinds = [emergency[2] for emergency in emergencies(bench.sync())]
+    assert bench.counts() is not None  # 5 ms old
+    assert bench.counts() is None  # too old for a sample
+    kinds = [emergency[2] for emergency in emergencies([frame for _ in range(20) for frame in bench.sync()])]
     assert kinds == [AdcFaultKind.NO_CONVERSION]
 
 
@@ -254,6 +256,15 @@ def test_structures_of_the_gpio_ioctls_are_those_of_the_kernels_header(tmp_path:
     offsets = [packed.rindex(part) for part in (b"consumer", b"attributes", struct.pack("=II", 3, 4))]
     own = [GET_LINE, SET_VALUES, LINE_REQUEST.size, LINE_VALUES.size, *offsets, LINE_REQUEST.size - 4]
     assert printed.split() == [str(number) for number in own]
+
+
+def test_after_a_pause_only_the_newest_sync_is_answered(bench: Any) -> None:
+    bench.start()
+    for identifier, data in ((0x80, b""), (0x605, bytes.fromhex("4018100400000000")), (0x80, b"")):
+        bench.wire.incoming.append(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+    bench.service.poll(0.0)
+    assert [identifier for identifier, _ in bench.take()] == [0x585, 0x285]
+    assert bench.service.status().endswith("; 1 SYNCs missed in pauses")
 
 
 def test_an_id_assigned_by_lss_is_kept_over_a_restart(bench: Any) -> None:

@@ -19,8 +19,8 @@ from handtouch.node.iio import IIO_FOLDER, AdcReading, FloatArray, IioDevice, fi
 from handtouch.node.scan import ScanLayout
 
 DEVICES_FOLDER = Path("/dev")
-_MAX_AGE_NS = 20_000_000  # of the newest scan, where the rate isn't known
-_MAX_AGE_PERIODS = 3
+_MAX_AGE_NS, _MAX_AGE_PERIODS = 5_000_000, 3  # of a scan used for a sample, the longer of both
+_MAX_SILENCE_NS = 50_000_000  # without a scan, before that is a failure
 _CLOCK = "current_timestamp_clock"
 
 
@@ -49,7 +49,8 @@ class BufferedReader:
         self._name, self._channels, self._trigger, self._rate_hz = device, tuple(channels), trigger, rate_hz
         self._buffer_scans, self._timeout_ms = buffer_scans, timeout_ms
         self._iio, self._devices, self._clock = iio, devices, clock
-        self._max_age_ns = round(_MAX_AGE_PERIODS * 1e9 / rate_hz) if rate_hz else _MAX_AGE_NS
+        self._max_age_ns = max(round(_MAX_AGE_PERIODS * 1e9 / rate_hz) if rate_hz else 0, _MAX_AGE_NS)
+        self._max_silence_ns = max(self._max_age_ns, _MAX_SILENCE_NS)
         self._recent: deque[tuple[FloatArray, int]] = deque(maxlen=average_scans)
         self._file = -1
         self._opened_ns = 0
@@ -93,7 +94,7 @@ class BufferedReader:
         self._opened_ns = self._clock()
 
     def read(self) -> AdcReading | None:
-        """Return a sample: a new conversion, or the mean of the newest scans; None before the first scan.
+        """Return a sample: a new conversion, or the mean of the newest scans; None without a recent scan.
 
         Raises AdcError, also for an ADC that runs freely and gives no more scans.
         """
@@ -108,11 +109,11 @@ class BufferedReader:
         self.drain()
         now_ns = self._clock()
         newest_ns = self._recent[-1][1] if self._recent else self._opened_ns
-        if now_ns - newest_ns > self._max_age_ns:
+        if now_ns - newest_ns > self._max_silence_ns:
             raise AdcError(
-                AdcFaultKind.NO_CONVERSION, f"{self._path}: no scan for {self._max_age_ns / 1e6:g} ms"
+                AdcFaultKind.NO_CONVERSION, f"{self._path}: no scan for {self._max_silence_ns / 1e6:g} ms"
             )
-        if not self._recent:
+        if not self._recent or now_ns - newest_ns > self._max_age_ns:
             return None
         raw = np.mean([values for values, _ in self._recent], axis=0)
         times = [sample_ns for _, sample_ns in self._recent]

@@ -42,7 +42,7 @@ class AdcReading:
 class AdcReader(Protocol):
     """An ADC: opened, read, and closed again after a failure. All methods but `close` raise AdcError.
 
-    `read` returns None before the first conversion of an ADC that runs freely.
+    `read` returns None without a recent conversion of an ADC that runs freely.
     """
 
     @property

@@ -28,7 +28,7 @@ class PadInput:
     """Converts raw values of a pad to counts, and reports its failures.
 
     `columns` : of its four channels in its ADC's readings; `node` : its CANopen node, None without one;
-    `has_sample` : True unless its ADC has failed or not converted yet. Without a sample the node sends no
+    `has_sample` : False while its ADC has failed or hasn't converted. Without a sample the node sends no
     TPDO, so that no old value passes for a new one; its NMT state stays.
     """
 
@@ -85,12 +85,16 @@ class PadInput:
             self._saturated_samples[:] = 0
         self._allow_data()
 
+    def record_no_sample(self) -> None:
+        """Record that there is no sample at this time, which may be no failure yet."""
+        self.has_sample = False
+        self._allow_data()
+
     def record_failure(self, error: AdcError, channels: int = _ALL_CHANNELS) -> None:
         """Record a failed sample, or a failed switch; `channels`: bit mask of those concerned."""
         data = bytes((error.kind, channels)) + error.number.to_bytes(2, "little") + b"\0"
         if _is_of_adc(error.kind):
-            self.has_sample = False
-            self._allow_data()
+            self.record_no_sample()
         if self._faults.get(error.kind) == data:
             return
         if _is_of_adc(error.kind):  # an ADC fails in one way at a time

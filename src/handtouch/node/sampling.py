@@ -106,6 +106,8 @@ class AdcInput:
             self._fail(error, now_ns)
             return
         if reading is None:
+            for pad in self.pads:
+                pad.record_no_sample()
             return
         self._retry_ns = 0
         if sync_ns is not None:
@@ -119,7 +121,7 @@ class AdcInput:
             pad.record_sample(at_limit, now_ns)
 
     def read_currents_ma(self) -> list[FloatArray] | None:
-        """Return the currents (4,) of each pad [mA], None before the first conversion. Raises AdcError."""
+        """Return the currents (4,) of each pad [mA], None without a recent conversion. Raises AdcError."""
         reading = self._read()
         return None if reading is None else self._currents_ma(reading)
 

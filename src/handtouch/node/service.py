@@ -10,7 +10,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import can
@@ -34,6 +34,7 @@ from handtouch.node.settings import NodeFile, NodePad
 _MAINTENANCE_PERIOD_NS = 20_000_000
 _REPORT_PERIOD_NS = 60_000_000_000
 _MAX_WAIT_S = 0.02
+_MAX_FRAMES = 1000  # handled at a time
 _RETRY_S = 0.1  # between attempts on a failing bus
 _MAX_STAMP_AGE_NS = 1_000_000_000  # of a SYNC; an older stamp is of another clock
 
@@ -42,6 +43,8 @@ _log = logging.getLogger("handtouch.node")
 
 class NodeService:
     """The nodes of one file on an open CAN bus, which the caller shuts down.
+
+    `missed_syncs` : SYNCs not answered, since a newer one had arrived
 
     Raises OSError if a new serial number can't be stored, ValueError for a damaged state file or an id that
     two nodes have.
@@ -59,6 +62,7 @@ class NodeService:
         self._switches = {pad.pad.name: make_switch(pad.pad.excitation) for pad in self._pads}
         self._excited: dict[str, bool] = {}
         self._bus_failed = False
+        self.missed_syncs = 0
         _limit_to_node_frames(bus)
 
     def start(self) -> None:
@@ -81,20 +85,26 @@ class NodeService:
             watchdog.notify_tick(self._clock())
 
     def poll(self, timeout_s: float) -> None:
-        """Wait for a frame or a due time, at most `timeout_s`, then handle all received frames."""
+        """Wait for a frame or a due time, at most `timeout_s`, then handle all received frames.
+
+        After a pause only the newest SYNC is answered: a TPDO that comes after the next SYNC is taken for
+        that one's sample.
+        """
         now_ns = self._clock()
         due_ns = self.devices.advance(now_ns)
         if due_ns is not None:
             timeout_s = min(timeout_s, max(0.0, (due_ns - now_ns) * 1e-9))
-        frame = self._bus.recv(timeout_s)
-        while frame is not None:
+        frames = list(self._receive(timeout_s))
+        syncs = [number for number, frame in enumerate(frames) if _is_sync(frame)]
+        self.missed_syncs += len(syncs[:-1])
+        for number, frame in enumerate(frames):
+            if number in syncs[:-1]:
+                continue
             now_ns = self._clock()
-            is_sync = frame.arbitration_id == cia301.SYNC and not frame.is_extended_id
-            self.sampling.sync_ns = self._arrival_ns(frame, now_ns) if is_sync else None
+            self.sampling.sync_ns = self._arrival_ns(frame, now_ns) if _is_sync(frame) else None
             self.devices.handle_frame(frame, now_ns)
             self.sampling.sync_ns = None
             self.devices.advance(self._clock())  # a flood of frames must not delay heartbeats
-            frame = self._bus.recv(0.0)
 
     def status(self) -> str:
         """Return states, failures and timing as one line."""
@@ -108,6 +118,8 @@ class NodeService:
             summary = adc.timing.summary()
             if summary is not None:
                 parts.append(f"{adc.name}: {summary}")
+        if self.missed_syncs:
+            parts.append(f"{self.missed_syncs} SYNCs missed in pauses")
         return "; ".join(parts)
 
     def close(self) -> None:
@@ -118,6 +130,15 @@ class NodeService:
                     switch.set(False)
                 switch.close()
         self.sampling.close()
+
+    def _receive(self, timeout_s: float) -> Iterator[can.Message]:
+        """Yield the received frames, at most _MAX_FRAMES."""
+        for _ in range(_MAX_FRAMES):
+            frame = self._bus.recv(timeout_s)
+            if frame is None:
+                return
+            yield frame
+            timeout_s = 0.0
 
     def _sample(self, now_ns: int) -> NDArray[np.int64]:
         return self.sampling(now_ns)
@@ -209,6 +230,10 @@ class _ReportingWatchdog(ServiceWatchdog):
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + _REPORT_PERIOD_NS
             _log.info("%s", self._report_status())
+
+
+def _is_sync(frame: can.Message) -> bool:
+    return frame.arbitration_id == cia301.SYNC and not frame.is_extended_id
 
 
 def _limit_to_node_frames(bus: can.BusABC) -> None:
