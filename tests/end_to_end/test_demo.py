@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import TextIO
 
 
 def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
@@ -26,6 +27,18 @@ def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
     ratio, false_positives = float(total[4]), int(total[-1])
     assert ratio < 2.5  # dominated by a few weak samples in so short a time; below 1.5 in the whole session
     assert false_positives == 0
+
+
+def test_demo_without_compiled_core_lowers_its_rate_and_shows_contacts(tmp_path: Path) -> None:
+    with (tmp_path / "stderr").open("w") as errors:
+        uncompiled = {**os.environ, "HANDTOUCH_UNCOMPILED": "1"}
+        rest = _interrupted_at(" begin ", "--world", "ideal", env=uncompiled, stderr=errors)
+    assert "touches missed  false" in rest
+    printed = (tmp_path / "stderr").read_text()
+    lowered = re.search(r"core uncompiled: SYNC rate lowered from 200 to (\S+) Hz", printed)
+    assert lowered, printed
+    assert float(lowered[1]) < 200
+    assert "HANDTOUCH_UNCOMPILED is set" in printed
 
 
 STUCK = """
@@ -58,10 +71,12 @@ def test_ctrl_c_ends_demo_with_summary() -> None:
     assert "touches missed  false" in _interrupted_at(" begin ")
 
 
-def _interrupted_at(pattern: str, *options: str, env: dict[str, str] | None = None) -> str:
+def _interrupted_at(
+    pattern: str, *options: str, env: dict[str, str] | None = None, stderr: TextIO | None = None
+) -> str:
     """Interrupt a demo once a line matches `pattern`; return the rest of its output."""
     command = [sys.executable, "-m", "handtouch", "demo", "--plain", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as demo:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=env) as demo:
         assert demo.stdout is not None
         try:
             assert any(re.search(pattern, line) for line in demo.stdout)

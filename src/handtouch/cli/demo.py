@@ -20,9 +20,11 @@ from tempfile import TemporaryDirectory
 from typing import Literal, Self
 
 from handtouch import wire
+from handtouch.cli.demo_rate import lower_rate
 from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load, shipped
 from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import kinematics
 from handtouch.host.signals import stop_on_signals
 from handtouch.simulate.grasp import grasp_stimulus as grasped
@@ -66,8 +68,8 @@ def run(
     With `grasp`, an object, the hand grasps it instead. `world` is one of `WORLDS`, changed by `sheet` and
     `drift` as in `world_with`. The deployment gets the nominal behaviour of its sheets. Worlds other than the
     ideal one, and `scenario_path`, start the supervisor, with a temporary store. With `view` the scenario
-    repeats until `seconds` have passed or Ctrl-C. Exit status 0; 1 if no contact was received; 2 for an
-    unusable configuration.
+    repeats until `seconds` have passed or Ctrl-C. The SYNC rate is that of `lower_rate`. Exit status 0; 1 if
+    no contact was received; 2 for an unusable configuration.
     """
     logging.basicConfig(level=logging.ERROR)
     try:
@@ -77,6 +79,8 @@ def run(
         hidden = world_with(WORLDS[world], sheet=sheet, drift=drift).draw(seed)
         if scenario_path or hidden.world != WORLDS["ideal"]:
             deployment = _with_supervisor(hidden.describe(deployment))
+        model = build_pad_model(deployment)
+        deployment = lower_rate(deployment, model)
         file = scenario_path or (None if config_path else shipped.path(DEFAULT_SCENARIO))
         scenario = _scenario(deployment, file, grasp=grasp, world=hidden, repeat=view)
     except ValueError as error:  # of a file, or of an impossible grasp
@@ -92,7 +96,7 @@ def run(
         with (
             hand,
             TemporaryDirectory(prefix="handtouch-demo-") as folder,
-            HandtouchDaemon.open(deployment, folder=Path(folder)) as daemon,
+            HandtouchDaemon.open(deployment, model, folder=Path(folder)) as daemon,
             _subscribe(daemon) as messages,
             _browser_view(daemon) if view else nullcontext("") as url,
         ):

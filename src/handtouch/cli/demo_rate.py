@@ -1,0 +1,67 @@
+"""SYNC rate of the demo where the core is uncompiled: as high as this machine holds with every pad touched.
+
+Public names: `lower_rate`, `sustained_period_ms`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+
+from handtouch.config import Deployment
+from handtouch.core.compiled import Compilation
+from handtouch.core.contact_solver import VALUE_COUNT, make_solver
+from handtouch.core.pad_model import PadModel
+
+_MAX_LOAD = 0.25
+"""Of a period, for solving contacts; the simulated hand and the view share the interpreter."""
+_MAX_PERIOD_MS = 1000.0  # of a deployment
+_TRIALS = 5
+_CONTACT_RADII = 10.0  # current of a trial's contacts, in thresholds of detection
+
+
+def lower_rate(deployment: Deployment, model: PadModel) -> Deployment:
+    """Return the deployment with a SYNC rate that this machine holds, and report it on stderr if it is lower.
+
+    Unchanged where the core is compiled.
+    """
+    compilation = Compilation.current()
+    if compilation.compiled:
+        return deployment
+    configured_ms = deployment.daemon.sync_period_ms
+    period_ms = sustained_period_ms(configured_ms, _solving_time_s(model))
+    if period_ms == configured_ms:
+        return deployment
+    print(
+        f"core uncompiled: SYNC rate lowered from {1e3 / configured_ms:g} to {1e3 / period_ms:g} Hz, "
+        f"which this machine holds; {compilation.reason}",
+        file=sys.stderr,
+    )
+    settings = deployment.daemon.model_copy(update={"sync_period_ms": period_ms})
+    return deployment.model_copy(update={"daemon": settings})
+
+
+def sustained_period_ms(configured_ms: float, solving_s: float) -> float:
+    """Return the configured SYNC period, doubled until solving all contacts takes at most a quarter of it."""
+    period_ms = configured_ms
+    while solving_s * 1e3 > _MAX_LOAD * period_ms and 2 * period_ms <= _MAX_PERIOD_MS:
+        period_ms *= 2
+    return period_ms
+
+
+def _solving_time_s(model: PadModel) -> float:
+    """Return the median time of a tick's contacts, one on every pad."""
+    currents = np.stack([network.fractions(network.a / 3, network.b / 3) for network in model.networks])
+    currents = np.ascontiguousarray(currents * _CONTACT_RADII * model.begin_threshold_a[:, None])
+    values = np.full((model.size, VALUE_COUNT), np.nan)
+    requested = np.ones(model.size, dtype=np.bool_)
+    solver = make_solver(model, currents, np.zeros(model.size), requested, values)
+    pads = np.arange(model.size, dtype=np.intp).data
+    times_s = []
+    for _ in range(_TRIALS):
+        start_s = time.perf_counter()
+        solver.solve_contacts(pads)
+        times_s.append(time.perf_counter() - start_s)
+    return float(np.median(times_s))
