@@ -164,7 +164,7 @@ def _add_conformance(commands: Subparsers) -> None:
     output.add_argument(
         "--interactive",
         action="store_true",
-        help="also prompt for a power cycle and a press (keys: s skips a step, q quits)",
+        help="also prompt for a power cycle, a press and an error (keys: s skips a step, q quits)",
     )
     output.add_argument("--json", dest="as_json", action="store_true", help="print JSON")
     conformance.add_argument(

@@ -53,6 +53,7 @@ def test_the_shipped_node_passes_every_check_that_needs_no_operator(line: Any, c
         "lss.compares",
         "operator.power_cycle",
         "operator.press",
+        "operator.error",
     }
     assert [rate.period_ms for rate in report.rates] == [20.0, 10.0, 5.0]
     assert all(rate.missing == rate.extra == rate.late == 0 for rate in report.rates)
@@ -141,7 +142,29 @@ def test_no_frame_is_addressed_to_another_node(line: Any, check: Check) -> None:
     assert check().ok
     assert other.state == "OPERATIONAL"
     assert {data[1] for can_id, data in line.sent if can_id == 0} == {NODE, 127}
-    assert {can_id for can_id, _ in line.sent if can_id & 0x780 == 0x600} == {0x600 + NODE}
+    assert {can_id for can_id, _ in line.sent if can_id & 0x780 == 0x600} == {0x600 + NODE, 0x600 + 127}
+
+
+def test_no_command_is_sent_to_a_node_that_is_present(line: Any, check: Check) -> None:
+    """The test of addressing needs an id that no node has."""
+    line.add()
+    other = line.add(127)
+    line.send(0, bytes((1, 127)))
+    report = check()
+    assert report.verdict("nmt.addressed") is Verdict.PASSED
+    assert other.state == "OPERATIONAL"
+
+
+def test_a_node_that_cannot_be_set_back_is_reported(line: Any) -> None:
+    device = line.add()
+
+    def freeze(step: str) -> None:
+        if step == "SDO protocol":
+            device.sdo.frozen = True
+
+    report = run_checks(line, NodeUnderTest("can0", NODE), ConformanceOptions(syncs=10), freeze)
+    assert "no response" in report.restore_problem
+    assert not report.ok
 
 
 @pytest.mark.parametrize(

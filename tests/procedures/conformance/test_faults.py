@@ -146,7 +146,18 @@ def test_a_press_and_a_power_cycle_of_a_good_node_pass(line: Any, check: Callabl
     device = line.add()
     report = check(operator=Presser(line, device))
     assert not report.failures
-    assert report.verdict("operator.press") == report.verdict("operator.power_cycle") == "passed"
+    for name in ("operator.press", "operator.power_cycle", "operator.error"):
+        assert report.verdict(name) == "passed"
+
+
+def test_an_error_that_is_never_cleared_is_named(line: Any, check: Callable[..., NodeReport]) -> None:
+    device = line.add()
+    operator = Presser(line, device)
+    operator.clears = False
+    report = check(operator=operator)
+    assert [(result.name, result.detail) for result in report.failures] == [
+        ("operator.error", "no EMCY 0x0000 after the error was removed")
+    ]
 
 
 class Presser:
@@ -154,10 +165,16 @@ class Presser:
 
     def __init__(self, line: Any, device: Device) -> None:
         self.line, self.device = line, device
+        self.clears = True
 
     def prompt(self, text: str) -> None:
         if "power" in text:
             self.line.at(500, lambda: self.device.brown_out(200 * MS))
+        elif text.startswith("Cause"):
+            self.line.at(500, lambda: self.device.send_emergency(0x3200, 5))
+        elif text == "Remove the error.":
+            if self.clears:
+                self.line.at(500, lambda: self.device.send_emergency(0))
         elif text.startswith("Press"):
             self.line.at(500, lambda: self.line.counts.__setitem__(slice(None), (900, 700, 800, 600)))
         else:

@@ -220,6 +220,11 @@ _CHECKS = (
         "a press in the middle increases all four channels, its end restores them",
         "a channel without response has an open electrode wire; one that falls has reversed polarity",
     ),
+    Check(
+        "operator.error",
+        "an error caused by the operator is reported by EMCY and 0x1001, and its end by EMCY 0x0000",
+        "send EMCY when an error begins and 0x0000 when none is left, each with the error register",
+    ),
 )
 
 CATALOGUE: Mapping[str, Check] = MappingProxyType({check.name: check for check in _CHECKS})

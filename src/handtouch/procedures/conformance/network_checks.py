@@ -72,7 +72,7 @@ def check_states(session: NodeSession) -> None:
         problems += _describe_errors(session)
     report.assess("nmt.operational", problems)
 
-    other = 127 if session.node.node_id != 127 else 126
+    other = link.find_unused_id()
     sent_ns = link.send_nmt(cia301.STOP_NODE, other)
     later = session.observe_state(sent_ns + MS // 10, cia301.STOPPED)
     changed = later is not None and later != state

@@ -19,6 +19,7 @@ from handtouch.wire.emergency import Emergency
 MS = 1_000_000
 _STRAY_WAIT_NS = 5 * MS
 """Time after a response in which a second one to the same request is recognised."""
+_PROBE_NS = 100 * MS
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,7 @@ class NodeLink:
     `pdo_ids` : COB-IDs that are recorded in `pdos`
     `commanded_boots` : boot-ups that were caused on purpose
     `stray_responses` : SDO responses without a request
+    `other_nodes` : ids of other nodes that sent a heartbeat or an SDO response
     `foreign` : identifiers of frames that only another master sends
     """
 
@@ -64,6 +66,7 @@ class NodeLink:
         self.stray_responses = 0
         self.slowest_sdo_ns = 0
         self.foreign: set[int] = set()
+        self.other_nodes: set[int] = set()
         self.client = DirectSdoClient(self.exchange_sdo)
         self.transport = DirectTransport(self.client)
         self._line = line
@@ -143,6 +146,16 @@ class NodeLink:
         self.wait(round(timeout_s * 1e9), lambda: bool(self._lss_responses))
         return self._lss_responses.popleft() if self._lss_responses else None
 
+    def find_unused_id(self) -> int:
+        """Return the highest node id that no node responds to."""
+        for node_id in range(127, 0, -1):
+            if node_id != self.node_id:
+                self._line.send(cia301.SDO_REQUEST + node_id, b"\x40\x00\x10" + bytes(5))
+                self.wait(_PROBE_NS, lambda node_id=node_id: node_id in self.other_nodes)  # type: ignore[misc]
+                if node_id not in self.other_nodes:
+                    return node_id
+        raise ValueError("all 127 node ids are in use")
+
     def answers_sdo(self, timeout_ns: int) -> bool:
         """Request the device type once; return True if there is any response."""
         self._drain()
@@ -200,6 +213,8 @@ class NodeLink:
                 self.emergencies.append(emergency)
         elif can_id == cia301.LSS_RESPONSE:
             self._lss_responses.append(data)
+        elif can_id & 0x780 in (cia301.SDO_RESPONSE, cia301.NMT_ERROR_CONTROL):
+            self.other_nodes.add(can_id & 0x7F)
         elif is_from_master(can_id) and not self._line.echoes:
             self.foreign.add(can_id)
 

@@ -1,9 +1,9 @@
-"""Interactive checks: a power cycle and a press, for which the operator is prompted."""
+"""Interactive checks: a power cycle, a press and an error, for which the operator is prompted."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.boot import read_identity
@@ -13,7 +13,7 @@ from handtouch.procedures.conformance.node_link import MS
 from handtouch.procedures.conformance.pdo_checks import configure, sample_counts
 from handtouch.procedures.conformance.session import NodeSession, Operator
 
-_NAMES = ("operator.power_cycle", "operator.press")
+_NAMES = ("operator.power_cycle", "operator.press", "operator.error")
 _POLL_NS = 100 * MS
 _SAMPLES = 10
 _MIN_RISE_SIGMA, _MIN_RISE_COUNTS = 8.0, 5.0
@@ -27,13 +27,15 @@ def check_with_operator(session: NodeSession) -> None:
         return
     _check_power_cycle(session, session.operator)
     _check_press(session, session.operator)
+    _check_error(session, session.operator)
 
 
 def _check_power_cycle(session: NodeSession, operator: Operator) -> None:
     name, link, report = "operator.power_cycle", session.link, session.report
     boots = len(link.boot_ups)
     operator.prompt("Switch the node's power off and on again.")
-    if not _wait(session, operator, name, lambda: len(link.boot_ups) > boots):
+    if why := _wait(session, operator, lambda: link.wait(_POLL_NS, lambda: len(link.boot_ups) > boots)):
+        report.not_tested(name, why)
         return
     link.wait(1000 * MS)
     count = len(link.boot_ups) - boots
@@ -85,10 +87,9 @@ def _check_press(session: NodeSession, operator: Operator) -> None:
         return all(rise > limit for rise, limit in zip(present, limits, strict=True))
 
     operator.prompt("Press the pad in its middle with a fingertip, and hold it.")
-    pressed = _wait(session, operator, "", is_pressed)
-    if not pressed:
+    if why := _wait(session, operator, is_pressed):
         if not any(abs(rise) > limit for rise, limit in zip(strongest, limits, strict=True)):
-            report.not_tested(name, "no channel responded; skipped, or not pressed")
+            report.not_tested(name, f"no channel responded; {why}")
             return
         bad = [
             f"channel {number} {'falls' if rise < -limit else 'does not respond'} ({rise:+.0f} counts)"
@@ -102,22 +103,41 @@ def _check_press(session: NodeSession, operator: Operator) -> None:
     def is_released() -> bool:
         return all(abs(rise) < limit for rise, limit in zip(rises(), limits, strict=True))
 
-    if _wait(session, operator, "", is_released):
-        report.passed(name, ", ".join(f"{rise:+.0f}" for rise in strongest) + " counts")
-    else:
+    if _wait(session, operator, is_released):
         report.failed(name, "the counts don't return to those before the press")
+    else:
+        report.passed(name, ", ".join(f"{rise:+.0f}" for rise in strongest) + " counts")
 
 
-def _wait(session: NodeSession, operator: Operator, name: str, until: Callable[[], bool]) -> bool:
-    """Wait for the operator's action; return False if it was skipped or didn't come in time."""
+def _check_error(session: NodeSession, operator: Operator) -> None:
+    name, link, report = "operator.error", session.link, session.report
+    start = len(link.emergencies)
+    operator.prompt("Cause an error that the node detects, if there is one: a connector, its supply, heat.")
+    if why := _wait(session, operator, lambda: link.wait(_POLL_NS, lambda: len(link.emergencies) > start)):
+        report.not_tested(name, why)
+        return
+    problems = list(_register_problems(session))
+    operator.prompt("Remove the error.")
+    if _wait(session, operator, lambda: link.wait(_POLL_NS, lambda: link.emergencies[-1].code == 0)):
+        problems.append("no EMCY 0x0000 after the error was removed")
+    problems += _register_problems(session)
+    report.assess(name, list(dict.fromkeys(problems)), f"EMCY {link.emergencies[start].text}")
+
+
+def _register_problems(session: NodeSession) -> Iterator[str]:
+    """Compare 0x1001 with the latest EMCY message."""
+    latest = session.link.emergencies[-1]
+    register = session.sdo.read(cia301.ERROR_REGISTER, 0, "error register")
+    if register != latest.register:
+        yield f"0x1001 is 0x{register:02X}, in the EMCY message it is 0x{latest.register:02X}"
+
+
+def _wait(session: NodeSession, operator: Operator, until: Callable[[], bool]) -> str:
+    """Poll `until`, which takes some time, until it is true; return why it isn't, empty if it is."""
     end_ns = session.link.now_ns() + round(session.options.operator_timeout_s * 1e9)
     while session.link.now_ns() < end_ns:
-        if session.link.wait(_POLL_NS, until) if name else until():
-            return True
+        if until():
+            return ""
         if operator.has_skipped():
-            if name:
-                session.report.not_tested(name, "skipped")
-            return False
-    if name:
-        session.report.not_tested(name, f"nothing within {session.options.operator_timeout_s:g} s")
-    return False
+            return "skipped"
+    return f"nothing within {session.options.operator_timeout_s:g} s"

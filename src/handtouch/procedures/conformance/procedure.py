@@ -135,8 +135,8 @@ def _run_stages(session: NodeSession) -> None:
         ("TPDOs", pdo_checks.check_stream),
         ("LSS", lss_checks.check_lss),
         ("NMT reset communication", _reset_communication),
-        ("operator", operator_checks.check_with_operator),
         ("errors", network_checks.summarise_errors),
+        ("operator", operator_checks.check_with_operator),
         ("NMT reset node", _reset_node),
         ("SDO protocol", object_checks.summarise_transfers),
     )
