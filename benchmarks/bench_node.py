@@ -193,7 +193,7 @@ def main() -> int:
     }
     out = output_folder(asked.quick)
     note = (
-        f"SYNC at {SYNC_HZ:g} Hz for {asked.seconds:g} s; an ADC that runs freely converts at {SCAN_HZ:g} Hz. "
+        f"SYNC at {SYNC_HZ:g} Hz for {asked.seconds:g} s; a freely running ADC converts at {SCAN_HZ:g} Hz. "
         "TPDOs are timed from the latest SYNC before them."
     )
     lines = [

@@ -18,6 +18,7 @@ from handtouch.canbus import cia305
 from handtouch.node.adc_fault import AdcError, AdcFaultKind
 from handtouch.node.excitation import GET_LINE, LINE_REQUEST, LINE_VALUES, SET_VALUES, GpioLine
 from handtouch.node.identity_store import IdentityStore
+from handtouch.node.iio import IioDevice
 from handtouch.node.noise import measure_noise
 from handtouch.node.settings import load
 from tests.node.stand_in import AdcStandIn, raw_of_ma
@@ -185,6 +186,18 @@ def test_saturated_channels_are_reported_and_still_sent(bench: Any) -> None:
     assert emergencies(frames) == [(0, 0, AdcFaultKind.SATURATED, 0, 0)]
 
 
+def test_an_adc_is_found_by_its_label_where_two_have_one_name(adc: AdcStandIn, tmp_path: Path) -> None:
+    second = AdcStandIn(tmp_path, 1)
+    second.write("name", "adc0")
+    assert adc.read("name") == second.read("name")
+    with pytest.raises(AdcError, match='"adc0" is the name of iio:device0 and iio:device1; give the label'):
+        IioDevice.find("adc0", second.sysfs)
+    second.write("label", "index")
+    assert IioDevice.find("index", second.sysfs).folder == second.folder
+    assert IioDevice.find(str(second.folder)).folder == second.folder
+    second.close()
+
+
 def test_a_node_boots_with_a_failed_adc_and_reports_it_after_each_reset(bench: Any) -> None:
     (bench.adc.folder / "in_voltage0_raw").unlink()
     assert [emergency[2] for emergency in emergencies(bench.start())] == [AdcFaultKind.FILE_MISSING]
@@ -197,7 +210,8 @@ def test_a_vanished_device_is_found_again(bench: Any) -> None:
     bench.start()
     away = bench.folder / "away"
     bench.adc.folder.rename(away)
-    assert bench.counts() is None
+    frames = [frame for _ in range(100) for frame in bench.sync()]
+    assert emergencies(frames) == [(0x5000, 0x81, AdcFaultKind.FILE_MISSING, 0b1111, errno.ENOENT)]
     away.rename(bench.adc.folder)
     bench.run(1200)
     assert bench.counts() == (0, 0, 0, 0)

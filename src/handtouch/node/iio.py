@@ -5,6 +5,8 @@ Public names: `IioDevice`, `find_trigger`, `AdcReading`, `AdcReader`, `OneShotRe
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import re
 import time
@@ -203,15 +205,17 @@ class OneShotReader:
 
 
 def _find(name: str, iio: Path, pattern: str) -> Path:
-    found: dict[str, Path] = {}
-    for folder in sorted(iio.glob(pattern)):
+    found: dict[str, set[Path]] = {}
+    for folder in iio.glob(pattern):
         for attribute in ("label", "name"):
-            path = folder / attribute
-            if path.exists():
-                found.setdefault(path.read_text(errors="replace").strip(), folder)
-    if name in found:
-        return found[name]
-    known = ", ".join(sorted(found)) or "none"
-    raise AdcError(
-        AdcFaultKind.FILE_MISSING, f'{iio}/{pattern}: none has the name "{name}"; present: {known}'
-    )
+            with contextlib.suppress(AdcError):  # a device may have no label, or vanish
+                found.setdefault(IioDevice(folder).read(attribute), set()).add(folder)
+    matches = sorted(found.get(name, ()))
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        shared = " and ".join(folder.name for folder in matches)
+        problem = f'"{name}" is the name of {shared}; give the label of one, or its folder'
+    else:
+        problem = f'none has the name "{name}"; present: {", ".join(sorted(found)) or "none"}'
+    raise AdcError(AdcFaultKind.FILE_MISSING, f"{iio}/{pattern}: {problem}", errno.ENOENT)

@@ -1,0 +1,49 @@
+"""The pages about nodes agree with the code: wiring diagram, keys, kinds of failures."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from handtouch.node.adc_fault import AdcFaultKind, emergency_of
+from handtouch.node.settings import TABLES, Trim, load
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/node.md").read_text()
+
+
+def test_the_diagram_is_current() -> None:
+    drawn = subprocess.run(
+        [sys.executable, str(ROOT / "docs/wiring.py")], capture_output=True, text=True, check=True
+    ).stdout
+    assert (ROOT / "docs/wiring.svg").read_text() == drawn, "run `make wiring`"
+
+
+def test_the_diagram_has_the_channels_gain_and_line_of_the_shipped_node() -> None:
+    drawing = ET.parse(ROOT / "docs/wiring.svg")
+    texts = [element.text for element in drawing.iter() if element.tag.endswith("text")]
+    pad = load(ROOT / "config/touch_node.toml").settings.pads[0]
+    assert set(pad.channels) <= set(texts)
+    assert any(str(text).startswith(f"{-pad.gain_ohm:g} Ω") for text in texts)
+    assert pad.excitation is not None
+    assert f"GPIO {pad.excitation.line}" in texts
+
+
+def test_the_page_has_every_key() -> None:
+    models: list[type[BaseModel]] = [*TABLES.values(), Trim]
+    keys = {field.alias or name for model in models for name, field in model.model_fields.items()}
+    internal = {"sysfs", "devices", "bus", "adc", "pad"}  # of stand-ins; headers of tables
+    assert not [key for key in keys - internal if not re.search(rf"\b{key}\b", PAGE)]
+    assert all(header in PAGE for header in ("`[bus]`", "`[adc.NAME]`", "`[[pad]]`"))
+
+
+def test_the_page_has_every_kind_of_failure_with_its_emcy_message() -> None:
+    rows = re.findall(r"^\| (\d+) ([a-z ]+) \| (0x\w+) \| (0x\w+) \|", PAGE, re.MULTILINE)
+    assert [(int(kind), text, int(code, 16), int(bits, 16)) for kind, text, code, bits in rows] == [
+        (kind.value, kind.text, *emergency_of(kind)) for kind in AdcFaultKind
+    ]
