@@ -230,6 +230,16 @@ def test_equal_serial_numbers_fail_on_all_nodes_that_share_one(line: Any) -> Non
     assert [report.verdict("identity.serial") for report in reports] == ["failed", "failed", "passed"]
 
 
+def test_a_node_that_refuses_operational_fails_with_its_error_and_no_more(line: Any, check: Check) -> None:
+    device = line.add()
+    device.latch_error(0x5000)
+    line.frames.clear()
+    report = check()
+    assert [result.name for result in report.failures] == ["nmt.operational", "emcy.none"]
+    assert "0x5000 device hardware" in report.failures[0].detail
+    assert verdicts(report, "pdo.complete", "pdo.event_timer") == [Verdict.NOT_TESTED] * 2
+
+
 def test_a_frame_loss_is_counted_for_each_rate(line: Any, check: Check) -> None:
     device = line.add()
     device.send_data = False

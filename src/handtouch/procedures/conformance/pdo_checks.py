@@ -18,6 +18,7 @@ from handtouch.procedures.conformance.results import RateMeasurement, Verdict
 from handtouch.procedures.conformance.session import NodeSession
 
 _SILENCE_NS = 300 * MS
+_TRIAL_PERIOD_NS, _TRIAL_SYNCS = 20 * MS, 5
 _EVENT_TIMER_MS = 50
 _MAX_LATE_SHARE = 0.01
 _MAX_ATTEMPTS = 3
@@ -91,8 +92,14 @@ def check_stream(session: NodeSession) -> None:
         for name in _STREAM_CHECKS:
             report.not_tested(name, "the TPDO can't be configured")
         return
-    session.enter(cia301.START_NODE, cia301.OPERATIONAL)
+    state = session.enter(cia301.START_NODE, cia301.OPERATIONAL)
     link = session.link
+    if state not in (None, cia301.OPERATIONAL) and not any(
+        cycle.pdos for cycle in link.send_syncs(_TRIAL_PERIOD_NS, _TRIAL_SYNCS)
+    ):
+        for name in _STREAM_CHECKS:
+            report.not_tested(name, "the node doesn't enter operational")
+        return
     link.pdos.clear()
     link.wait(_SILENCE_NS)
     silent = len(link.pdos)
