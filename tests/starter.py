@@ -24,6 +24,7 @@ from typing import IO, Any
 LOADED = (
     "handtouch.bridge.runner",
     "handtouch.daemon.serve",
+    "handtouch.node.service",
     "handtouch.simulate.simulated_hand",
     "handtouch.simulate.worlds",
     "handtouch.cli.status",
