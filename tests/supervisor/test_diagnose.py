@@ -122,8 +122,14 @@ def test_gain_beyond_tolerance_is_a_gain_step() -> None:
     assert [found.kind for found in diagnosis.diagnoses()] == [FaultKind.GAIN_STEP]
 
 
-def test_static_contact_without_tremor_is_gum() -> None:
-    diagnosis, _ = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 60)
+def stuck(t: float) -> Counts:
+    """A constant contact from 5 s on; every fourth second another one beside it."""
+    beside = fractions(0.7, 0.3) * 1500.0 if t % 4 > 3 else np.zeros(4)
+    return np.asarray(fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0) + beside)
+
+
+def test_static_contact_that_outlasts_others_on_its_pad_is_gum() -> None:
+    diagnosis, _ = play(lambda t, _: stuck(t), 60)
     (found,) = diagnosis.diagnoses()
     assert found.kind == FaultKind.GUM
     assert found.is_fault
@@ -133,6 +139,12 @@ def test_static_contact_without_tremor_is_gum() -> None:
     assert found.published.size_m is not None
     assert found.published.pad_m[0] == pytest.approx(0.3 * 0.042, abs=1e-3)
     assert found.published.pad_m[1] == pytest.approx(0.6 * 0.032, abs=1e-3)
+
+
+def test_still_contact_is_no_gum_while_nothing_else_happens() -> None:
+    """A robot that rests a finger on a table gives the same currents."""
+    _, changes = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 120)
+    assert changes == []
 
 
 def test_static_contact_with_tremor_is_a_held_object() -> None:

@@ -19,7 +19,7 @@ from handtouch.supervisor.worker import SupervisorWorker
 
 from .conftest import LINKS, NOW, Bench
 
-PERIOD_NS, TOGETHER, SECONDS = 20_000_000, 5, 24.0
+PERIOD_NS, TOGETHER, SECONDS = 20_000_000, 5, 34.0
 SCENARIO = """
 repeat = false
 pause_s = 60.0
@@ -38,7 +38,17 @@ from_s = 4.0
 duration_s = 3.0
 path = [[0.3, 0.4], [0.7, 0.6]]
 force_n = [1.0]
+""" + "".join(
+    f"""
+[[touch]]
+link = "square"
+from_s = {from_s}
+duration_s = 1.0
+path = [[0.7, 0.3]]
+force_n = [1.5]
 """
+    for from_s in range(10, 32, 4)
+)
 
 
 def block(counts: NDArray[np.int64], since: int) -> dict[str, Any]:

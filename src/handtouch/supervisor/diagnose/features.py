@@ -1,6 +1,7 @@
 """Extract the features that the detectors use from blocks of samples: short means, repeats, saturation.
 
-Public: `BlockFeatures`, `extract_features`. One vectorised pass over all pads of a hand.
+Public: `BlockFeatures`, `extract_features`, `approximate_position`. One vectorised pass over all pads of a
+hand.
 """
 
 from __future__ import annotations
@@ -64,3 +65,9 @@ def extract_features(block: HandSamples, model: DiagnosisModel, offset_counts: F
         counts[-1].astype(np.int64),
         at_end.mean(axis=0),
     )
+
+
+def approximate_position(reading: FloatArray) -> FloatArray:
+    """Return the position as fractions of the sides, by ratios: enough to distinguish positions."""
+    x0, xa, y0, yb = np.maximum(reading, 1.0)
+    return np.asarray(np.clip([xa / (x0 + xa), yb / (y0 + yb)], 0.0, 0.999))

@@ -24,7 +24,12 @@ from handtouch.supervisor.diagnose.descriptions import (
     describe_static_load,
     named_electrodes,
 )
-from handtouch.supervisor.diagnose.features import GROUP_SAMPLES, BlockFeatures, extract_features
+from handtouch.supervisor.diagnose.features import (
+    GROUP_SAMPLES,
+    BlockFeatures,
+    approximate_position,
+    extract_features,
+)
 from handtouch.supervisor.diagnose.model import (
     DiagnosisModel,
     FloatArray,
@@ -111,7 +116,7 @@ class HandDiagnostics:
         strongest = totals.argmax(axis=0)
         for pad in np.flatnonzero((totals.max(axis=0) > least) & healthy).tolist():
             reading = excess[strongest[pad], pad]
-            position = _approximate_position(reading)
+            position = approximate_position(reading)
             if _is_sliding(excess[:, pad], int(strongest[pad]), position):
                 continue
             if (
@@ -174,17 +179,11 @@ class HandDiagnostics:
         return changes
 
 
-def _approximate_position(reading: FloatArray) -> FloatArray:
-    """Return the position as fractions of the sides, by ratios: enough to distinguish positions."""
-    x0, xa, y0, yb = np.maximum(reading, 1.0)
-    return np.asarray(np.clip([xa / (x0 + xa), yb / (y0 + yb)], 0.0, 0.999))
-
-
 def _is_sliding(excess: FloatArray, at: int, position: FloatArray) -> bool:
     """Return whether the contact slides so fast that the short mean (g, 4) at `at` smears it."""
     near = [excess[k] for k in (at - 1, at + 1) if 0 <= k < len(excess)]
     there = [e for e in near if e.sum() > 0.3 * excess[at].sum()]
-    return any(np.abs(_approximate_position(e) - position).max() > _MAX_SMEAR_FRACTION for e in there)
+    return any(np.abs(approximate_position(e) - position).max() > _MAX_SMEAR_FRACTION for e in there)
 
 
 def _differs(before: PadDiagnosis, now: PadDiagnosis) -> bool:

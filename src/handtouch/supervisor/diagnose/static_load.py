@@ -3,7 +3,10 @@
 Public: `StaticLoadDetector`, `StaticLoad`. The lowest of a pad's short means in the last seconds is its
 floor. While the floor is off zero, the pad has a static load, whatever contacts begin and end above it. Naive
 Bayes classifies it by features of the floor since its begin; their probabilities under each cause are the
-table below. A held object shows the hand's tremor, in position and magnitude; a stuck object doesn't.
+table below. A held object shows the hand's tremor in its position within the half second of a block; its
+magnitude is no evidence, as the sheet relaxes after other presses. That a load is still is weak evidence
+of a stuck object, as firm robots hold still too. Strong evidence is what a held object can't do: presses
+elsewhere on the pad come and go while it stays, the hand's other pads are used meanwhile, it lasts.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from handtouch.supervisor.diagnose.features import GROUP_SAMPLES
+from handtouch.supervisor.diagnose.features import GROUP_SAMPLES, approximate_position
 from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.wire.faults import FaultKind
 
@@ -38,10 +41,11 @@ _MIN_AGE_S = dict(zip(_CAUSES, (8.0, 15.0, 8.0, 6.0, 15.0, 15.0), strict=True))
 _LOG_PRIOR = np.log([0.969, 0.008, 0.012, 0.005, 0.003, 0.003])
 # probability of each feature, by cause
 _FEATURE_PROBABILITIES = {
-    "one channel": (0.002, 0.002, 0.002, 0.998, 0.0005, 0.01),
+    "one channel": (0.0005, 0.0005, 0.0005, 0.998, 0.0005, 0.01),
     "negative": (0.0005, 0.0005, 0.0005, 0.45, 0.0005, 0.2),
     "abrupt": (0.99, 0.99, 0.99, 0.99, 0.002, 0.02),
-    "decays": (0.15, 0.002, 0.998, 0.002, 0.05, 0.2),
+    "decays": (0.15, 0.05, 0.998, 0.002, 0.05, 0.2),
+    "fades": (0.01, 0.003, 0.9, 0.001, 0.01, 0.05),
     "grows": (0.15, 0.005, 0.003, 0.005, 0.5, 0.3),
     "with others": (0.7, 0.01, 0.2, 0.01, 0.01, 0.5),
     "slowly with others": (0.003, 0.003, 0.003, 0.003, 0.003, 0.99),
@@ -50,10 +54,24 @@ _FEATURE_PROBABILITIES = {
 _TREMOR_CAUSES = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _TREMOR_POSITION_STDS = np.geomspace(4e-4, 3e-2, 10)  # standard deviations of a held object's fractions
 _STILL_POSITION_STDS = np.array([0.0, 5e-5, 1.5e-4])
-_TREMOR_FORCE_STDS, _STILL_FORCE_STDS = np.geomspace(4e-3, 0.2, 10), np.array([0.0, 1e-3, 3e-3, 8e-3])
 _MAX_FLOOR_RATIO = 1.25
+_MAX_FADED_PART = 0.67
 _MIN_TREMOR_NATS = 3.0
-_MAX_TREMOR_NATS = 15.0
+_MAX_TREMOR_NATS, _MAX_STILL_NATS = 15.0, 3.0
+_LASTING_CAUSES = np.array([0.0, 1.0, 0.0, 1.0, 1.0, 0.0])
+_PRESS_NATS, _MAX_PRESS_NATS = 1.5, 9.0
+"""Of a press elsewhere on the pad, after which the load is as before."""
+_OTHER_PAD_NATS, _MAX_OTHER_PAD_NATS = 0.2, 2.0
+"""Of a contact that begins on another pad."""
+_HOLD_TIME_S, _HOLD_EXPONENT = 30.0, 1.5
+"""An object is held for longer than t with probability (1 + t / time)^-exponent."""
+_MIN_PRESS_COUNTS, _MIN_PRESS_AWAY, _MAX_FLOOR_MOVE = 100.0, 0.12, 0.06
+"""A press elsewhere: counts above the load, its distance from it, and the load's change of position."""
+_AFTER_PRESS_NS = 1_500_000_000
+"""Time after a press in which the sheet relaxes too fast for the search of tremor."""
+_BEGIN_COUNTS = 250.0
+_MIN_SCATTER_BLOCKS = 6
+_NOISE_GAIN = 0.05  # of a block without a load
 
 
 @dataclass
@@ -76,6 +94,15 @@ class StaticLoad:
     classified_age_s: float = 0.0
     channel: int = 0
     """channel of the highest reading, when last classified"""
+    scatter: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_BLOCKS))
+    """variance of the current fractions in each quiet block"""
+    last_press_ns: int = 0
+    pressed_from: FloatArray | None = None
+    """position of the load before the present press elsewhere"""
+    presses: int = 0
+    """presses elsewhere on the pad, after which the load was as before"""
+    contacts_before: int = 0
+    """contacts of the hand's other pads before its begin"""
 
 
 class StaticLoadDetector:
@@ -83,13 +110,15 @@ class StaticLoadDetector:
 
     def __init__(self, noise_counts: FloatArray) -> None:
         n = len(noise_counts)
-        self._noise = noise_counts
+        self._variance = np.square(noise_counts) / GROUP_SAMPLES  # of a channel's short mean, as measured
         self._zero = np.zeros((n, 4))
         self._recent_floors: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._last_unloaded_ns = np.full(n, -1, dtype=np.int64)
         self._recent_peaks: deque[tuple[int, FloatArray]] = deque()
         self.floor_counts = np.zeros((n, 4))
         self.loads: dict[int, StaticLoad] = {}
+        self._touched = np.zeros(n, dtype=np.bool_)
+        self._contacts = np.zeros(n, dtype=np.int64)  # begun
         self._last_ns = -1
 
     def process_block(self, sample_ns: int, counts: FloatArray, valid: FloatArray) -> None:
@@ -125,8 +154,15 @@ class StaticLoadDetector:
         self._zero += np.where(quiet[:, None], drift, 0.0)
         for pad in [pad for pad in self.loads if quiet[pad]]:
             del self.loads[pad]
+        if len(counts) > 3:
+            for pad in np.flatnonzero(size.max(axis=0) <= MIN_LOAD_COUNTS).tolist():
+                self._variance[pad] += _NOISE_GAIN * (_scatter(counts[:, pad]) - self._variance[pad])
+        touched = size.max(axis=0) > np.abs(self.floor_counts).sum(axis=1) + _BEGIN_COUNTS
+        self._contacts += touched & ~self._touched
+        self._touched = touched
         for pad in np.flatnonzero(~quiet).tolist():
             self._track_load(pad, sample_ns, floor[pad], float(total[pad]))
+            self._track_presses(self.loads[pad], sample_ns, counts[:, pad])
         for pad, load in self.loads.items():
             age_s = (sample_ns - load.since_ns) * 1e-9
             if age_s - load.classified_age_s >= (1.0 if age_s < 60 else 5.0) and age_s >= 6.0:
@@ -143,12 +179,31 @@ class StaticLoadDetector:
             since = int(self._last_unloaded_ns[pad])
             peak = max(peaks[pad] for _, peaks in self._recent_peaks)
             load = self.loads[pad] = StaticLoad(since, floor, float(peak))
+            load.contacts_before = int(self._contacts.sum() - self._contacts[pad])
             for at, older, size in self._recent_floors:  # its begin
                 if at > since:
                     self._record_floor(load, (at - since) * 1e-9, older[pad], float(size[pad]))
             return
         load.level_counts = self.floor_counts[pad]
         self._record_floor(load, (sample_ns - load.since_ns) * 1e-9, floor, total)
+
+    def _track_presses(self, load: StaticLoad, sample_ns: int, counts: FloatArray) -> None:
+        """Count presses elsewhere on the pad that leave the load as it was; measure scatter in between."""
+        level = load.level_counts
+        size, totals = float(np.abs(level).sum()), counts.sum(axis=1)
+        if totals.max() > _MAX_FLOOR_RATIO * size:
+            load.last_press_ns = sample_ns
+            excess, place = counts[totals.argmax()] - level, approximate_position(level)
+            away = np.abs(approximate_position(excess) - place).max()
+            if excess.sum() > max(_MIN_PRESS_COUNTS, 0.5 * size) and away > _MIN_PRESS_AWAY:
+                load.pressed_from = place if load.pressed_from is None else load.pressed_from
+            return
+        if load.pressed_from is not None:
+            moved = np.abs(approximate_position(counts.mean(axis=0)) - load.pressed_from).max()
+            load.presses += int(moved < _MAX_FLOOR_MOVE)
+            load.pressed_from = None
+        if totals.min() > 0 and len(counts) > 3 and sample_ns - load.last_press_ns > _AFTER_PRESS_NS:
+            load.scatter.append(_scatter(counts / totals[:, None]))
 
     def _record_floor(self, load: StaticLoad, age_s: float, floor: FloatArray, total: float) -> None:
         if 0.5 < age_s < 3.0:
@@ -160,7 +215,9 @@ class StaticLoadDetector:
 
     def _classify(self, pad: int, load: StaticLoad, age_s: float) -> None:
         features, tremor_nats = self._features(pad, load, age_s)
-        score = _LOG_PRIOR + np.clip(tremor_nats, -_MAX_TREMOR_NATS, _MAX_TREMOR_NATS) * _TREMOR_CAUSES
+        lasting_nats = self._lasting_nats(pad, load, age_s)
+        score = _LOG_PRIOR + np.clip(tremor_nats, -_MAX_STILL_NATS, _MAX_TREMOR_NATS) * _TREMOR_CAUSES
+        score = score + lasting_nats * _LASTING_CAUSES
         for name, there in features.items():
             if there is not None:
                 chance = np.array(_FEATURE_PROBABILITIES[name])
@@ -172,6 +229,7 @@ class StaticLoadDetector:
         known = _MIN_HELD_PROBABILITY if cause == FaultKind.HELD_OBJECT else MIN_FAULT_PROBABILITY
         load.evidence["tremor_nats"] = tremor_nats
         load.evidence["age_s"] = age_s
+        load.evidence["presses"] = load.presses
         observable = (
             cause != FaultKind.HELD_OBJECT or tremor_nats > _MIN_TREMOR_NATS or features["with others"]
         )
@@ -187,9 +245,11 @@ class StaticLoadDetector:
     def _features(self, pad: int, load: StaticLoad, age_s: float) -> tuple[dict[str, bool | None], float]:
         level = load.level_counts
         size = float(np.abs(level).sum())
-        others = size - float(np.abs(level).max())
         times, floors = np.array(load.ages_s), np.array(load.floors_counts)
-        totals = np.abs(floors).sum(axis=1)
+        sizes = np.abs(floors).sum(axis=1)
+        # when the sheet's rests of other presses were least
+        others = float((sizes - np.abs(floors).max(axis=1))[sizes > 0.5 * size].min(initial=size))
+        totals = sizes
         late = times > max(age_s - 30.0, 2.0)
         times, floors, totals = times[late], floors[late], totals[late]
         slope = _relative_slope(times, totals)
@@ -212,55 +272,53 @@ class StaticLoadDetector:
             "negative": bool(level.min() < -(4 + 0.03 * size)),
             "abrupt": abrupt,
             "decays": slope < -0.008 if steady else None,
+            "fades": _fades(totals) if steady else None,
             "grows": slope > 0.004 if steady else None,
             "with others": together,
             "slowly with others": not abrupt and slow >= 2,
             "after a press": load.peak_counts > 4 * size,
         }
-        return features, self._tremor_nats(pad, times, floors)
+        return features, self._tremor_nats(pad, load)
 
-    def _tremor_nats(self, pad: int, times: FloatArray, floors: FloatArray) -> float:
-        """Return the log likelihood ratio of tremor against a still contact for floors (k, 4)."""
-        if len(times) < 12:
-            return 0.0
-        total = floors.sum(axis=1)
-        if (total <= 0).any():
-            return 0.0
-        noise = self._noise[pad] / np.sqrt(GROUP_SAMPLES) / float(np.median(total))
-        fractions = _roughness(times, floors / total[:, None])
-        force = _roughness(times, np.log(total)[:, None])
-        place = _log_bayes_factor(
-            fractions, np.sqrt(0.75) * noise, _TREMOR_POSITION_STDS, _STILL_POSITION_STDS
+    def _lasting_nats(self, pad: int, load: StaticLoad, age_s: float) -> float:
+        """Return the evidence that the load isn't held: presses beside it, use of other pads, its age."""
+        others = int(self._contacts.sum() - self._contacts[pad]) - load.contacts_before
+        return float(
+            min(_PRESS_NATS * load.presses, _MAX_PRESS_NATS)
+            + min(_OTHER_PAD_NATS * others, _MAX_OTHER_PAD_NATS)
+            + _HOLD_EXPONENT * np.log1p(age_s / _HOLD_TIME_S)
         )
-        return place + _log_bayes_factor(force, 2 * noise, _TREMOR_FORCE_STDS, _STILL_FORCE_STDS)
+
+    def _tremor_nats(self, pad: int, load: StaticLoad) -> float:
+        """Return the log likelihood ratio of tremor against a still contact, by the scatter within blocks."""
+        if len(load.scatter) < _MIN_SCATTER_BLOCKS:
+            return 0.0
+        noise = float(np.sqrt(self._variance[pad])) / max(float(np.abs(load.level_counts).sum()), 1.0)
+        variance, blocks = float(np.median(load.scatter)), len(load.scatter)
+        return _log_bayes_factor(
+            variance, 3 * blocks, np.sqrt(0.75) * noise, _TREMOR_POSITION_STDS, _STILL_POSITION_STDS
+        )
 
 
-def _roughness(times: FloatArray, values: FloatArray) -> FloatArray:
-    """Return deviations of values (k, c) from a line through their neighbours, scaled to one sigma: (l, c).
-
-    Insensitive to trends; neighbours more than some seconds away are left out.
-    """
-    before, after = np.diff(times)[:-1], np.diff(times)[1:]
-    part = (before / (before + after))[:, None]
-    off = values[1:-1] - (1 - part) * values[:-2] - part * values[2:]
-    off /= np.sqrt(1 + (1 - part) ** 2 + part**2)
-    return np.asarray(off[before + after < 4.0])
+def _scatter(values: FloatArray) -> float:
+    """Return the mean variance of values (k, c) about straight lines in time."""
+    times = np.arange(len(values)) - (len(values) - 1) / 2
+    off = values - values.mean(axis=0)
+    off = off - times[:, None] * (times @ off) / (times @ times)
+    return float(np.square(off).sum() / (values.shape[1] * (len(values) - 2)))
 
 
-def _log_bayes_factor(off: FloatArray, noise: float, moving: FloatArray, still: FloatArray) -> float:
+def _log_bayes_factor(
+    variance: float, freedom: int, noise: float, moving: FloatArray, still: FloatArray
+) -> float:
     """Return the log Bayes factor of a standard deviation among `moving` against one among `still`.
 
-    Both add to noise. By the median, which a few presses on top don't change; half of the values count, as
-    they are correlated.
+    Both add to noise. Half of the degrees of freedom count, as values are correlated.
     """
-    if len(off) < 8:
-        return 0.0
-    variance = 2.2 * float(np.mean(np.median(np.abs(off), axis=0) ** 2))
-    freedom = min(off.shape[1], 3) * len(off) / 2
 
     def level(std: FloatArray) -> float:
         expected = (1.2 * noise) ** 2 + std**2
-        logs = -0.5 * freedom * (np.log(expected) + variance / expected)
+        logs = -0.25 * freedom * (np.log(expected) + variance / expected)
         return float(np.logaddexp.reduce(logs) - np.log(len(std)))
 
     return level(moving) - level(still)
@@ -274,6 +332,14 @@ def _relative_slope(times: FloatArray, totals: FloatArray) -> float:
     before, after = np.quantile(totals[:third], 0.25), np.quantile(totals[-third:], 0.25)
     between = times[-third:].mean() - times[:third].mean()
     return float((after - before) / between / max(0.5 * (before + after), 1e-9))
+
+
+def _fades(totals: FloatArray) -> bool:
+    """Return whether the load falls steadily, from third to third, by a third or more."""
+    if len(totals) < 24:
+        return False
+    first, middle, last = (float(np.quantile(part, 0.25)) for part in np.array_split(totals, 3))
+    return last < _MAX_FADED_PART * first and last < 0.95 * middle and middle < 0.95 * first
 
 
 def _is_abrupt(load: StaticLoad) -> bool:
