@@ -67,7 +67,7 @@ async def contacts_on(live: str, link: str) -> AsyncIterator[Contact | None]:
 async def insert_object(gripper: GripperClient, kind: str, live: str, **parameters: float) -> None:
     """Open the gripper, insert a new object, and wait until no pad is touched."""
     gripper.reset(kind, **parameters)
-    async with handtouch.connect("hand/*", endpoint=live) as frames:
-        async for frame in frames:
-            if not frame.retained and set(handtouch.columns(frame)["state"]) == {PadState.CLEAR}:
+    async with handtouch.Hand("gripper", endpoint=live) as hand:
+        async for arrays in hand:
+            if not arrays.frame.retained and set(arrays.state.values()) == {PadState.CLEAR}:
                 return

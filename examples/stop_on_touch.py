@@ -23,23 +23,21 @@ async def stop_on_touch(
 ) -> GripperState:
     """Close a finger until its pad is touched. Raises RuntimeError without samples or without an object.
 
-    Every hand frame contains the pad's state, so a missing sample is never taken for "no contact": each
-    command responds to a sample, and without commands the gripper stops by itself.
+    Every frame contains the pad's state, so a missing sample is never taken for "no contact": each command
+    responds to a sample, and without commands the gripper stops by itself.
     """
     link, sampled_ns = f"{finger}_tip", time.monotonic_ns()
-    async with handtouch.connect("hand/*", endpoint=live) as frames:
-        async for frame in frames:
-            row, columns = frame.links.index(link), handtouch.columns(frame)
-            pad, sample_ns = columns["state"][row], int(columns["sample_ns"][row])
-            if pad == PadState.TOUCHED:
-                return gripper.move(sample_ns=sample_ns)  # zero speed: all joints stop
-            if pad == PadState.CLEAR:
-                sampled_ns = frame.t_ns
-                state = gripper.move(sample_ns=sample_ns, **{finger: speed_m_s})
+    async with handtouch.Hand("gripper", endpoint=live) as hand:
+        async for arrays in hand:
+            if arrays.touched[link]:
+                return gripper.move(sample_ns=arrays.sample_ns[link])  # zero speed: all joints stop
+            if arrays.sampled[link]:
+                sampled_ns = arrays.t_ns
+                state = gripper.move(sample_ns=arrays.sample_ns[link], **{finger: speed_m_s})
                 if state.position_m[finger] > CLOSED_M:
                     raise RuntimeError(f"{finger} closed without contact")
-            elif frame.t_ns - sampled_ns > SAMPLE_TIMEOUT_NS:
-                raise RuntimeError(f"{link}: no valid sample, pad is {PadState(pad).text}")
+            elif arrays.t_ns - sampled_ns > SAMPLE_TIMEOUT_NS:
+                raise RuntimeError(f"{link}: no valid sample, pad is {PadState(arrays.state[link]).text}")
             else:
                 gripper.move()  # no valid sample: wait
     raise RuntimeError("no more hand frames")

@@ -1,0 +1,192 @@
+"""Cost of `handtouch.Hand` in a control loop, beside bare ZeroMQ calls; age of its frame after a pause.
+
+A publisher in the same process sends hand frames of 15 pads over a local socket.
+Writes docs/benchmarks/client.{md,json}.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import platform
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgpack
+import zmq
+from page import made_by, options, output_folder, table
+
+import handtouch
+from handtouch import wire
+from handtouch.client.hand import Hand
+
+LINKS = tuple(f"finger_{number}" for number in range(15))
+PERIOD_S, PAUSE_S = 0.005, 1.0
+JOIN_MS = 10_000
+ARRIVAL_S = 0.001
+"""From the arrival at one subscriber to that at the other"""
+
+
+def make_frame(seq: int) -> list[bytes]:
+    """Return an encoded frame of 15 touched pads, stamped now."""
+    t_ns = time.monotonic_ns()
+    columns: dict[str, Any] = {}
+    for name, column in wire.COLUMNS[wire.HandFrame].items():
+        if name.split("_")[0] not in ("group", "palm", "base", "joints"):
+            columns[name] = bytes(len(LINKS) * column.row_bytes)
+    columns["state"] = bytes([wire.PadState.TOUCHED]) * len(LINKS)
+    return wire.encode(
+        wire.HandFrame(
+            v=1, session=1, seq=seq, t_ns=t_ns, tick=seq, hand="right", links=LINKS, retained=False, **columns
+        )
+    )
+
+
+@contextmanager
+def publisher() -> Iterator[tuple[Any, str]]:
+    """Open a publisher; yield it with its endpoint."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        zmq.Context() as context,
+        context.socket(zmq.XPUB) as socket,
+    ):
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.XPUB_VERBOSE, 1)
+        endpoint = f"ipc://{folder}/live"
+        socket.bind(endpoint)
+        yield socket, endpoint
+
+
+def join(socket: Any, count: int) -> None:
+    """Wait for subscriptions."""
+    for _ in range(count):
+        if not socket.poll(JOIN_MS):
+            raise TimeoutError("no subscription")
+        socket.recv()
+
+
+def microseconds(call: Callable[[], object], before: Callable[[], None], repeat: int, number: int) -> float:
+    """Return the median time of a call; `before` runs before every `number` calls."""
+    times = []
+    for _ in range(repeat):
+        before()
+        begin_s = time.perf_counter()
+        for _ in range(number):
+            call()
+        times.append((time.perf_counter() - begin_s) / number * 1e6)
+    return statistics.median(times)
+
+
+def measure_cost(repeat: int) -> list[dict[str, Any]]:
+    """Return the time of calls of `Hand` and of bare ZeroMQ [us], and their ratio."""
+    sent = itertools.count(1)
+    with (
+        publisher() as (socket, endpoint),
+        Hand("right", endpoint=endpoint) as hand,
+        zmq.Context() as context,
+        context.socket(zmq.SUB) as bare,
+    ):
+        bare.connect(endpoint)
+        bare.subscribe("hand/right")
+        join(socket, 4)
+        items = [(bare, int(zmq.POLLIN))]
+
+        def poll() -> None:
+            zmq.zmq_poll(items, 0)
+
+        def receive() -> None:
+            msgpack.unpackb(bare.recv_multipart()[1])
+
+        def read() -> None:
+            hand.latest()
+            _ = hand.force_n["finger_3"], hand.touched["finger_3"]
+
+        def send() -> None:
+            hand.latest()
+            while bare.poll(0):
+                bare.recv_multipart()
+            socket.send_multipart(make_frame(next(sent)))
+            bare.poll(JOIN_MS)
+            time.sleep(ARRIVAL_S)
+
+        def settle() -> None:
+            send()
+            hand.latest()
+            bare.recv_multipart()
+
+        rows = []
+        for name, call in (("latest()", hand.latest), ("latest() and two values", read)):
+            for waits, reference, before, number in (
+                ("no message", poll, settle, 200),
+                ("one frame", receive, send, 1),
+            ):
+                many = repeat if number > 1 else 10 * repeat
+                time_us, bare_us = (microseconds(c, before, many, number) for c in (call, reference))
+                values = {"Hand, us": time_us, "bare, us": bare_us, "ratio": time_us / bare_us}
+                rows.append({"call": name, "waiting": waits, **values})
+        return rows
+
+
+def measure_age() -> list[dict[str, Any]]:
+    """Return the age [ms] of what `recv` and `latest` return after a pause, and the frames behind it."""
+    stop = threading.Event()
+    with (
+        publisher() as (socket, endpoint),
+        Hand("right", endpoint=endpoint) as hand,
+        handtouch.connect("hand/right", endpoint=endpoint) as frames,
+    ):
+        join(socket, 5)
+
+        def publish() -> None:
+            for seq in itertools.count(1):
+                if stop.wait(PERIOD_S):
+                    break
+                socket.send_multipart(make_frame(seq))
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            hand.wait(10.0)
+            frames.recv(10.0)
+            time.sleep(PAUSE_S)
+            received, received_ns = frames.recv(0), time.monotonic_ns()
+            newest, newest_ns = hand.latest(), time.monotonic_ns()
+        finally:
+            stop.set()
+            thread.join()
+        assert received is not None
+        assert newest is not None
+        behind = sum(1 for _ in iter(lambda: frames.recv(0.1), None))
+    return [
+        {"call": "recv()", "age, ms": (received_ns - received.t_ns) * 1e-6, "frames behind it": behind},
+        {"call": "latest()", "age, ms": (newest_ns - newest.t_ns) * 1e-6, "frames behind it": 0},
+    ]
+
+
+def main() -> None:
+    """Measure and write the page."""
+    quick = options(__doc__).parse_args().quick
+    out = output_folder(quick)
+    machine = f"{platform.machine()}, Python {platform.python_version()}, pyzmq {zmq.__version__}"
+    lines = ["# Cost of reading the newest state", "", f"{made_by()}; {machine}.", ""]
+    cost, age = measure_cost(20 if quick else 500), measure_age()
+    note = (
+        "Median of a call, beside `zmq_poll` where no message waits, and `recv_multipart` with `unpackb` "
+        "where one does; frames of 15 pads."
+    )
+    lines += table("Cost", note, cost)
+    note = f"Of a program that pauses for {PAUSE_S:g} s while {1 / PERIOD_S:g} frames a second arrive."
+    lines += table("Age after a pause", note, age)
+    (out / "client.md").write_text("\n".join(lines))
+    (out / "client.json").write_text(
+        json.dumps({"machine": machine, "cost": cost, "age": age}, indent=1) + "\n"
+    )
+
+
+if __name__ == "__main__":
+    main()
