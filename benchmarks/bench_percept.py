@@ -35,7 +35,11 @@ from handtouch.percept.primitives import SHAPE_CLASSES, fit_primitive
 from handtouch.percept.primitives import ShapePrior as ShapePrior
 from handtouch.percept.samples import ContactBuffer, ContactSamples
 from handtouch.percept.spectrum import estimate_texture
-from handtouch.percept.stiffness import estimate_stiffness, estimate_stiffness_from_area
+from handtouch.percept.stiffness import (
+    UNCOMPENSATED_SHEET_STD,
+    estimate_stiffness,
+    estimate_stiffness_from_area,
+)
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -138,7 +142,12 @@ def stiffnesses(seeds: int) -> Rows:
             ]
             for k in STIFFNESSES:
                 rows.append(
-                    {"sheet": name, "compensated": compensated, "k": float(k), **assess(runs, float(k))}
+                    {
+                        "sheet": name,
+                        "compensated": compensated,
+                        "k": float(k),
+                        **assess(runs, float(k), compensated),
+                    }
                 )
             print(
                 name,
@@ -149,8 +158,11 @@ def stiffnesses(seeds: int) -> Rows:
     return rows
 
 
-def assess(runs: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]], k: float) -> dict[str, Any]:
+def assess(
+    runs: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]], k: float, compensated: bool
+) -> dict[str, Any]:
     """Objects with stiffness k at 2 N, springs and spheres in turn."""
+    sheet_std = 0.0 if compensated else UNCOMPENSATED_SHEET_STD  # as in the daemon
     chance = np.random.default_rng((101, int(k)))
     errors, held, known, widths, scales = [], 0, 0, [], []
     for times, truth, force, std in runs:
@@ -161,7 +173,7 @@ def assess(runs: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]], k:
                 p = (1.0, 1.5)[(pad + press) % 2]
                 c = (k / (p * 2.0 ** (1 - 1 / p))) ** p
                 depth = (truth[at, pad] / c) ** (1 / p) + ENCODER_M * chance.normal(size=len(at))
-                found = estimate_stiffness(force[at, pad], depth, std[at, pad])
+                found = estimate_stiffness(force[at, pad], depth, std[at, pad], sheet_relative_std=sheet_std)
                 if not found.samples:
                     errors.append(math.nan)
                     continue

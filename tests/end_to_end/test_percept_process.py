@@ -14,8 +14,8 @@ import pytest
 
 from handtouch import wire
 from handtouch.cli.demo import in_process_deployment
-from handtouch.client import connect
-from handtouch.config import parse
+from handtouch.client import connect, request
+from handtouch.config import Deployment, parse
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.host.process import process_statistics
 from handtouch.simulate.scenario import Scenario
@@ -95,7 +95,12 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     stop = threading.Event()
     folder: Path = tmp_path_factory.mktemp("percepts")
     hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), WORLDS["ideal"].draw(1))
-    with hand, HandtouchDaemon.open(deployment, folder=folder) as daemon:
+    with (
+        hand,
+        HandtouchDaemon.open(
+            deployment, read=lambda: _with_thicker_sheet(deployment), folder=folder
+        ) as daemon,
+    ):
         hand.start()
         made = Bench(daemon)
         threads = [
@@ -110,6 +115,11 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
             stop.set()
             for thread in threads:
                 thread.join()
+
+
+def _with_thicker_sheet(deployment: Deployment) -> Deployment:
+    sheet = deployment.sheets["s"].model_copy(update={"ohm_per_square": 2000.0})
+    return deployment.model_copy(update={"sheets": {"s": sheet}})
 
 
 class Undisturbed:
@@ -165,4 +175,15 @@ def test_hung_percept_process_delays_no_contact_and_takes_no_memory(bench: Bench
             bench.wait_percepts("motion")
         finally:
             os.kill(before["pid"], signal.SIGCONT)
+        bench.wait_percepts("shape")
+
+
+def test_reload_that_changes_pads_restarts_the_percept_process(bench: Bench) -> None:
+    bench.wait_percepts("shape")
+    before = bench.process
+    with Undisturbed(bench):
+        reply = request("reload", endpoint=bench.daemon.control.endpoint, timeout_s=MAX_WAIT_S)
+        assert reply["applied"]
+        bench.wait("replaced", lambda: bench.process["pid"] not in (None, before["pid"]))
+        assert bench.process["exit_reason"] == "deployment reloaded"
         bench.wait_percepts("shape")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -131,7 +132,7 @@ def test_area_that_violates_hertz_law_is_invalid() -> None:
 
 
 def played(
-    k: float, partner: bool, joints: bool = True, commanded: bool = False
+    k: float, partner: bool, joints: bool = True, commanded: bool = False, compensated: bool = False
 ) -> tuple[list[PerceptEstimate], StiffnessEstimator, ContactBuffer]:
     """A part on a stream: one pad presses along z, while a second gives way or closes as well."""
     stream, part = ContactBuffer(2), StiffnessEstimator(2)
@@ -144,6 +145,8 @@ def played(
         sample = ContactSamples(pads, np.full(len(pads), i * 5_000_000), np.full(len(pads), 7, np.uint32))
         sample["force_n"] = np.full(len(pads), force[i])
         sample["force_std_n"] = np.full(len(pads), 0.02 * force[i])
+        if compensated:
+            sample["uncompensated_force_n"] = sample["force_n"]
         if commanded:
             sample["commanded_m"] = np.full(len(pads), depth[i] / len(pads))
             sample["commanded_normal"] = np.array([[0, 0, 1.0], [0, 0, -1.0]])[: len(pads)]
@@ -170,6 +173,17 @@ def test_percept_has_stiffness_and_label(k: float, label: str, partner: bool) ->
     assert closed.source == "joints"
     assert np.ptp(closed.depth_m) == pytest.approx(3 / k, rel=0.02, abs=8 * NOISE_M)
     assert last.values["indentation_source"] == "joints"
+
+
+def test_interval_contains_what_a_sheet_of_unknown_behaviour_may_lose() -> None:
+    """Creep of a fifth of the force's rise in the squeeze: outside the interval of a compensated sheet."""
+    intervals = {}
+    for compensated in (False, True):
+        values: dict[str, Any] = dict(played(3e3, False, compensated=compensated)[0][-1].values)
+        assert values["sheet_compensated"] is compensated
+        intervals[compensated] = values["low_n_per_m"], values["high_n_per_m"]
+    assert intervals[False][0] < 0.8 * 3e3 < intervals[True][0] < 3e3 < intervals[True][1]
+    assert intervals[True][1] < 1.25 * 3e3 < intervals[False][1]
 
 
 def test_large_common_force_error_leaves_stiffness_undetermined() -> None:

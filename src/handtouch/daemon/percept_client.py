@@ -32,7 +32,6 @@ _IDLE_PERIOD_NS = 50_000_000
 _STOP_DELAY_NS = 30_000_000_000
 """From the last request to the process' end: starting it takes a second"""
 _MAX_MESSAGES_PER_TICK = 2
-_HANG_TIMEOUT_NS = 30_000_000_000
 _VALUE_COLUMNS = (
     *("xy", "pad_m", "pad_noise_m2", "position_m", "normal", "covariance_m2"),
     *("force_n", "force_std_n", "residual", "residual_std"),
@@ -63,7 +62,6 @@ class PerceptClient:
             "handtouch.percept.child",
             "percept",
             lambda: self._deployment.model_dump_json(by_alias=True).encode(),
-            _HANG_TIMEOUT_NS,
         )
         self.malformed = 0
         self._links = deployment.links_by_hand

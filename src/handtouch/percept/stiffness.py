@@ -9,7 +9,7 @@ Forces must be those on the object: a sheet's own creep must have been compensat
 object's. Depth is that of object, skin and the object's support in series.
 
 Public names: `estimate_stiffness`, `estimate_stiffness_from_area`, `StiffnessEstimate`,
-`class_probabilities`, `STIFFNESS_CLASSES`.
+`class_probabilities`, `STIFFNESS_CLASSES`, `UNCOMPENSATED_SHEET_STD`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ CLASS_BOUNDS_N_PER_M = (1e3, 1e4)
 PRIOR_RANGE_N_PER_M = (10.0, 1e7)
 """Prior: the logarithm of the stiffness is uniform within this range."""
 EXPONENTS = (1.0, 1.5, 2.0)
+UNCOMPENSATED_SHEET_STD = 0.25
+"""Relative deviation of a stiffness from creep, adaptation and hysteresis of a sheet whose behaviour isn't
+modelled: between a sheet without any and one that loses four tenths of the force's rise."""
 
 _MIN_SAMPLES = 16
 _MIN_FORCE_RISE_SIGMA = 8.0  # of the force, relative to a sample's noise
@@ -82,6 +85,7 @@ def estimate_stiffness(
     skin_m_per_n: float = 0.0,
     skin_std_m_per_n: float = 0.0,
     object_motion_fraction: float = 0.0,
+    sheet_relative_std: float = 0.0,
 ) -> StiffnessEstimate:
     """Estimate the stiffness of a squeezed object from forces (n,) and depths (n,), in order of time.
 
@@ -89,7 +93,9 @@ def estimate_stiffness(
     forces share, such as that of a wrong contact radius; the noise of single samples is estimated from their
     scatter. depth_std_m: noise of depths; None: estimated from the samples as white noise. skin_m_per_n:
     compliance of the pad's own skin, with its deviation; it is subtracted. object_motion_fraction: part of
-    the depth that may be motion of the object (1 sigma). Raises ValueError unless shapes match.
+    the depth that may be motion of the object (1 sigma). sheet_relative_std: of the result, because the
+    sheet's behaviour isn't compensated; UNCOMPENSATED_SHEET_STD for an unknown sheet. Raises ValueError
+    unless shapes match.
     """
     force, depth = np.asarray(force_n, np.float64), np.asarray(depth_m, np.float64)
     if force.ndim != 1 or force.shape != depth.shape:
@@ -105,7 +111,7 @@ def estimate_stiffness(
     depth_noise = _white_noise_std(depth) if depth_std_m is None else depth_std_m
     loading, unloading = _loading_branches(force)
     noises = noise, max(depth_noise, 1e-9)
-    more = *noises, skin_std_m_per_n, object_motion_fraction
+    more = *noises, skin_std_m_per_n, object_motion_fraction, sheet_relative_std
     found, back = _fit_branch(force[loading], depth[loading], spread[loading], *more), math.nan
     if not found.samples:  # the contact began under load
         found = _fit_branch(force[unloading], depth[unloading], spread[unloading], *more)
@@ -253,6 +259,7 @@ def _fit_branch(
     depth_noise: float,
     skin_std: float,
     object_motion_fraction: float,
+    sheet_relative_std: float,
 ) -> StiffnessEstimate:
     """Return the posterior of the tangent stiffness of one branch."""
     keep = force > max(_MIN_FORCE_FRACTION * float(force.max(initial=0.0)), 3 * noise)
@@ -278,6 +285,7 @@ def _fit_branch(
         _common_relative_std(force, spread),
         skin_std * math.exp(float(weights @ logs)),
         object_motion_fraction,
+        sheet_relative_std,
     )
     return _from_log_posterior(logs, weights, scale, at_n, EXPONENTS[best], len(force), independent - 2)
 

@@ -20,6 +20,7 @@ from handtouch.percept.stiffness import (
     CLASS_BOUNDS_N_PER_M,
     PRIOR_RANGE_N_PER_M,
     STIFFNESS_CLASSES,
+    UNCOMPENSATED_SHEET_STD,
     StiffnessEstimate,
     estimate_stiffness,
 )
@@ -49,9 +50,10 @@ class StiffnessEstimator(WindowEstimator[tuple[int, int, StiffnessEstimate, Inde
     def _fit_window(self, buffer: ContactBuffer, pad: int, now_ns: int) -> PerceptEstimate:
         contact, hand = int(buffer.contact_id[pad]), int(buffer.hand_index[pad])
         window = buffer.window(pad)
+        compensated = bool(np.isfinite(window["uncompensated_force_n"]).any())
         indentation = estimate_indentation(window, other_contacts_of_hand(buffer, pad))
         if indentation.source:
-            found = self._fit_squeeze(window, indentation)
+            found = self._fit_squeeze(window, indentation, compensated)
         else:
             reason = "no joint states or commands, and one sheet can't separate area from force"
             found = StiffnessEstimate("undetermined", reason)
@@ -65,15 +67,23 @@ class StiffnessEstimator(WindowEstimator[tuple[int, int, StiffnessEstimate, Inde
         if before is not None and kept and _quality(before[2]) > _quality(found):
             found, indentation = before[2:]
         self._best[pad] = contact, hand, found, indentation
-        compensated = bool(np.isfinite(window["uncompensated_force_n"]).any())
         return _percept(found, hand, pad, contact, now_ns, compensated, indentation.source)
 
-    def _fit_squeeze(self, window: SampleWindow, indentation: Indentation) -> StiffnessEstimate:
+    def _fit_squeeze(
+        self, window: SampleWindow, indentation: Indentation, compensated: bool
+    ) -> StiffnessEstimate:
         """Fit stiffness; undetermined if most of the depth may be motion of the object."""
         fraction = min(indentation.object_motion_fraction, _OBJECT_MOTION_FRACTION_LIMIT)
         force, std = (window[name][indentation.rows] for name in ("force_n", "force_std_n"))
         skin = {name: indentation.contact_sides * each for name, each in self._skin_compliance.items()}
-        found = estimate_stiffness(force, indentation.depth_m, std, object_motion_fraction=fraction, **skin)
+        found = estimate_stiffness(
+            force,
+            indentation.depth_m,
+            std,
+            object_motion_fraction=fraction,
+            sheet_relative_std=0.0 if compensated else UNCOMPENSATED_SHEET_STD,
+            **skin,
+        )
         if found.samples and fraction > _MAX_OBJECT_MOTION_FRACTION:
             reason = "other contacts move the object: the indentation of this one isn't known"
             return replace(found, state="undetermined", reason=reason)
