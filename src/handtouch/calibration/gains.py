@@ -97,7 +97,7 @@ class GainEstimator:
     model_error: standard deviation of the model's fractions. It is the same for all contacts in one cell of
         the pad, so a cell never adds more information than this allows, however often it is touched.
     required_std: of the least certain log gain, at which the gains count as estimated; for other parts as
-        stated, as no number of contacts tells them apart from gains.
+        stated, as no number of contacts separates them from gains.
     start: initial gains (4,), their covariance (4, 4) of logarithms as `covariance`, both as stored.
     parts: models in each of which one part, such as a gap, differs by one standard deviation.
 
