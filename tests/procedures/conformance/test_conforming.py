@@ -12,6 +12,7 @@ import pytest
 from handtouch.canbus.nodes.boot import ExpectedIdentity
 from handtouch.config import shipped
 from handtouch.config.channels import WritableObject
+from handtouch.device import LineFaults
 from handtouch.procedures.conformance import (
     BusInUseError,
     ConformanceOptions,
@@ -238,6 +239,23 @@ def test_a_node_that_refuses_operational_fails_with_its_error_and_no_more(line: 
     assert [result.name for result in report.failures] == ["nmt.operational", "emcy.none"]
     assert "0x5000 device hardware" in report.failures[0].detail
     assert verdicts(report, "pdo.complete", "pdo.event_timer") == [Verdict.NOT_TESTED] * 2
+
+
+def test_late_tpdos_while_this_computer_pauses_are_no_failure_of_the_node(line: Any) -> None:
+    line.add().line = LineFaults(late_ns=4 * MS)
+
+    def pause() -> None:
+        line.t_ns += 20 * MS
+
+    def disturb(step: str) -> None:
+        if step == "SYNC every 5 ms":
+            for delay_ms in range(20, 1000, 60):
+                line.at(delay_ms, pause)
+
+    report = run_checks(line, NodeUnderTest("can0", NODE), ConformanceOptions(syncs=40), disturb)
+    (result,) = [result for result in report.results if result.name == "pdo.delay"]
+    assert result.verdict is Verdict.NOT_TESTED
+    assert "this computer paused" in result.detail
 
 
 def test_a_frame_loss_is_counted_for_each_rate(line: Any, check: Check) -> None:

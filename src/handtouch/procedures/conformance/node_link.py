@@ -20,6 +20,8 @@ MS = 1_000_000
 _STRAY_WAIT_NS = 5 * MS
 """Time after a response in which a second one to the same request is recognised."""
 _PROBE_NS = 100 * MS
+_LATE_NS = 100 * MS
+"""Time for TPDOs that a node sends late, after the last SYNC."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,9 +174,9 @@ class NodeLink:
         self._drain()
 
     def send_syncs(self, period_ns: int, count: int) -> list[SyncCycle]:
-        """Send SYNCs with a period and return what followed each; the last has a period, too.
+        """Send SYNCs with a period and return what followed each; TPDOs after the last one belong to it.
 
-        A SYNC that this computer sends late is followed by a whole period.
+        A SYNC that this computer sends late is followed by at least half a period.
         """
         cycles = []
         due_ns = self.now_ns()
@@ -187,6 +189,9 @@ class NodeLink:
             self.wait(due_ns - self.now_ns())
             cycle.pdos += self.pdos
             cycles.append(cycle)
+        self.pdos.clear()
+        self.wait(_LATE_NS)
+        cycles[-1].pdos += self.pdos
         self.pdos.clear()
         return cycles
 
