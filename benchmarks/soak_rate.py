@@ -3,6 +3,9 @@
 The daemon's hot loop runs in a thread, on in-process buses of 8 pads each with their bounded queues. Its
 nodes are simulated ones until they are booted; then each SYNC is answered with messages made before, a tenth
 of the pads touched by sliding contacts, while it is sent: their share of a core is measured separately.
+With --socket the nodes are a process of their own, which answers over pairs of sockets that carry
+`struct can_frame`, PADS_PER_SOCKET pads each: the daemon reads them as it does SocketCAN.
+
 --minutes says how long the run of 60 pads at 1 kHz takes, --hours how much of the memory run, in which
 samples of 15 pads at 1 kHz go through pipeline and publisher as fast as they can, contacts
 begin and end, and their stamps are the clock. --trial runs a short version of all parts and writes nothing.
@@ -31,6 +34,7 @@ import zmq
 from bench_latency import PATHS, descriptors, film, machine, resident_mb
 from numpy.typing import NDArray
 from page import made_by, options, output_folder
+from socket_nodes import SocketNodes
 
 from handtouch import wire
 from handtouch.config import (
@@ -46,10 +50,20 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.device import DeviceBus
 from handtouch.wire import PadState
 
-PADS_PER_BUS = 8
+PADS_PER_BUS, PADS_PER_SOCKET = 8, 60
 AIM = 0.60
-LIMITS = ((30, 500), (60, 500), (30, 1000), (240, 200), (60, 1000), (120, 500), (480, 200), (240, 500))
+LIMITS: tuple[tuple[int, int], ...] = (
+    (30, 500),
+    (60, 500),
+    (30, 1000),
+    (240, 200),
+    (60, 1000),
+    (120, 500),
+    (480, 200),
+    (240, 500),
+)
 """Pads and SYNC rates [Hz] tried, by their product, to find the overrun of the loop"""
+SOCKET_LIMITS = ((60, 1000), (120, 1000), (240, 500), (240, 1000), (480, 500), (480, 1000))
 LIMIT_S = 8.0
 MISSED = 1e-3
 """Fraction of late samples or skipped periods above which a run counts as overrun"""
@@ -64,22 +78,22 @@ GIL_SWITCH_S = 0.0005
 REPORT_PERIOD_S = 15.0
 
 
-def hands_of(pads: int, rate_hz: float, folder: Path) -> Deployment:
-    """Return a deployment of shipped hands with PADS_PER_BUS pads per in-process bus."""
+def hands_of(
+    pads: int, rate_hz: float, folder: Path, interface: str = "virtual", per_bus: int = PADS_PER_BUS
+) -> Deployment:
+    """Return a deployment of shipped hands with `per_bus` pads per bus."""
     shipped_hand = load(shipped.path("utah_mit.toml"))
     (hand,) = shipped_hand.hands
     hands = []
     for first in range(0, pads, len(hand.pads)):
         some = tuple(
-            pad.model_copy(
-                update={"bus": f"b{n // PADS_PER_BUS}", "node_id": 1 + n % PADS_PER_BUS, "serial": 1000 + n}
-            )
+            pad.model_copy(update={"bus": f"b{n // per_bus}", "node_id": 1 + n % per_bus, "serial": 1000 + n})
             for n, pad in enumerate(hand.pads[: pads - first], first)
         )
         hands.append(hand.model_copy(update={"name": f"h{first}", "pads": some}))
     buses = tuple(
-        Bus(name=f"b{n}", interface="virtual", channel=f"{folder.name}.{n}")
-        for n in range(-(-pads // PADS_PER_BUS))
+        Bus(name=f"b{n}", interface=interface, channel=f"{folder.name}.{n}")
+        for n in range(-(-pads // per_bus))
     )
     endpoints = {name: f"ipc://{folder}/{name}" for name in ("live", "complete", "control", "inputs")}
     own = {**endpoints, "store": str(folder / "calibrations.db")}
@@ -112,8 +126,8 @@ class Nodes:
         """Replace the simulated nodes after the daemon has booted them all."""
         for devices in self._simulated:
             devices.stop()
-        receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
-        for receiver, bus, answers in zip(receivers, self._buses, self._answers, strict=True):
+        self._receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
+        for receiver, bus, answers in zip(self._receivers, self._buses, self._answers, strict=True):
             answers.inbox = receiver._bus.queue
             bus.channel[bus.channel.index(bus.queue)] = bus.queue = answers
 
@@ -125,6 +139,10 @@ class Nodes:
     def busy_s(self) -> float:
         """Time spent answering."""
         return 1e-9 * sum(answers.busy_ns for answers in self._answers)
+
+    def waiting(self) -> int:
+        """Frames waiting for the daemon on the bus that has most."""
+        return max(len(receiver._queue) for receiver in self._receivers)
 
     def stop(self) -> None:
         """Stop answering."""
@@ -186,11 +204,16 @@ def touches(pads: int, part: float) -> NDArray[np.int64]:
     return counts
 
 
-def served(pads: int, rate_hz: int, seconds: float) -> dict[str, Any]:
-    """Run the daemon at this rate for a time."""
+def served(pads: int, rate_hz: int, seconds: float, socket: bool = False) -> dict[str, Any]:
+    """Run the daemon at this rate for a time, with its nodes in process or beyond sockets."""
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, ExitStack() as opened:
-        deployment = hands_of(pads, rate_hz, Path(folder))
-        nodes = Nodes(deployment, touches(pads, 0.1))
+        nodes: Nodes | SocketNodes
+        if socket:
+            deployment = hands_of(pads, rate_hz, Path(folder), "socketcan", PADS_PER_SOCKET)
+            nodes = SocketNodes(deployment, touches(pads, 0.1))
+        else:
+            deployment = hands_of(pads, rate_hz, Path(folder))
+            nodes = Nodes(deployment, touches(pads, 0.1))
         opened.callback(nodes.stop)
         daemon = opened.enter_context(HandtouchDaemon.open(deployment))
         period_ns = daemon.sync.period_ns
@@ -231,7 +254,7 @@ def wait_until_up(daemon: HandtouchDaemon) -> None:
 
 def watch(
     daemon: HandtouchDaemon,
-    nodes: Nodes,
+    nodes: Nodes | SocketNodes,
     thread: threading.Thread,
     pads: int,
     rate_hz: int,
@@ -239,7 +262,6 @@ def watch(
 ) -> dict[str, Any]:
     """Measure the daemon for a time, while a subscriber reads its hand frames."""
     clock = time.pthread_getcpuclockid(thread.ident or 0)
-    receivers: list[Any] = [port._receiver for port in daemon.ports.values()]
     counters = [port.counters for port in daemon.ports.values()]
 
     def totals() -> NDArray[np.int64]:
@@ -254,7 +276,7 @@ def watch(
     feeding_s = nodes.busy_s()
     longest, reported_s = 0, start_s
     while (now_s := time.monotonic()) - start_s < seconds:
-        longest = max(longest, *(len(receiver._queue) for receiver in receivers))
+        longest = max(longest, nodes.waiting())
         time.sleep(0.05)
         if now_s - reported_s > REPORT_PERIOD_S:
             reported_s = now_s
@@ -359,10 +381,20 @@ def write(new: dict[str, Any], out: Path) -> str:
             "",
             *table([long]),
         ]
-    if rows := results.get("limits"):
+    if long := results.get("long_socket"):
         text += [
-            f"Rate limits, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples late,",
-            "or of the periods skipped, without a SYNC:",
+            f"Over pairs of sockets that carry `struct can_frame`, {PADS_PER_SOCKET} pads each, with",
+            f"the nodes in a process of their own; load average when it ended {long['load']:.1f}:",
+            "",
+            *table([long]),
+        ]
+    for key, bus in (("limits", "in-process buses"), ("limits_socket", "pairs of sockets")):
+        rows = results.get(key, [])
+        if not rows:
+            continue
+        text += [
+            f"Rate limits over {bus}, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples",
+            "late, or of the periods skipped, without a SYNC:",
             "",
             *table(rows),
         ]
@@ -416,22 +448,29 @@ def main() -> int:
     parser.add_argument(
         "--limits", action=argparse.BooleanOptionalAction, default=True, help="how far it goes"
     )
+    parser.add_argument("--socket", action="store_true", help="over pairs of sockets; without the memory run")
     asked = parser.parse_args()
     sys.setswitchinterval(GIL_SWITCH_S)
-    limits, limit_s, out, failed = [*LIMITS], LIMIT_S, output_folder(asked.quick), False
+    limits, limit_s, out, failed = LIMITS, LIMIT_S, output_folder(asked.quick), False
+    kind = ""
+    if asked.socket:
+        limits, asked.hours, kind = SOCKET_LIMITS, 0.0, "_socket"
     if asked.quick:
-        asked.minutes, asked.hours, limits, limit_s = 0.05, 0.01, [(30, 500)], 3.0
+        asked.minutes, asked.hours, limits, limit_s = 0.05, min(asked.hours, 0.01), ((30, 500),), 3.0
     if asked.minutes:
-        long = served(60, 1000, 60 * asked.minutes) | {"machine": machine(), "load": os.getloadavg()[0]}
+        long = served(60, 1000, 60 * asked.minutes, asked.socket) | {
+            "machine": machine(),
+            "load": os.getloadavg()[0],
+        }
         print(long, flush=True)
         failed |= long["lost"] > 0
-        write({"long": long}, out)
+        write({f"long{kind}": long}, out)
     if asked.limits:
         rows = []
         for pads, rate_hz in limits:
-            rows.append(served(pads, rate_hz, limit_s))
+            rows.append(served(pads, rate_hz, limit_s, asked.socket))
             print(rows[-1], flush=True)
-        write({"limits": rows}, out)
+        write({f"limits{kind}": rows}, out)
     if asked.hours:
         memory = remember(asked.hours)
         print(memory)
