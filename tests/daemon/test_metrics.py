@@ -90,19 +90,26 @@ def one(values: dict[tuple[str, frozenset[tuple[str, str]]], float], name: str, 
     return values[name, frozenset(labels.items())]
 
 
-def test_diagnoses_are_exported_by_pad_and_kind() -> None:
+@pytest.mark.parametrize(("key", "name"), [("supervisor", "supervisor"), ("percepts", "percept")])
+def test_state_of_child_processes_is_exported(key: str, name: str) -> None:
     figures = {"pid": 8, "restarts": 2, "dropped": 3, "malformed": 4}
+    values = parsed(render_metrics(service(**{key: figures}), [], 0.1))
+    assert one(values, f"{name}_up") == 1
+    assert one(values, f"{name}_restarts_total") == 2
+    assert one(values, f"{name}_dropped_total") == 3
+    assert one(values, f"{name}_malformed_total") == 4
+    stopped = parsed(render_metrics(service(**{key: {**figures, "pid": None}}), [], 0.1))
+    assert one(stopped, f"{name}_up") == 0
+    assert not any(metric.startswith(name) for metric, _ in parsed(render_metrics(service(), [], 0.1)))
+
+
+def test_diagnoses_are_exported_by_pad_and_kind() -> None:
     gum = {"kind": "gum", "cause": "gum"}
     pads = [pad("thumb_tip", diagnoses=(gum,)), pad("palm", calibration_state="quarantined")]
-    values = parsed(render_metrics(service(supervisor=figures), pads, 0.1))
-    assert one(values, "supervisor_up") == 1
-    assert one(values, "supervisor_restarts_total") == 2
-    assert one(values, "supervisor_dropped_total") == 3
-    assert one(values, "supervisor_malformed_total") == 4
+    values = parsed(render_metrics(service(), pads, 0.1))
     assert one(values, "pad_diagnosis", hand="left", link="thumb_tip", kind="gum") == 1
     assert one(values, "pad_calibration_state", hand="left", link="palm", state="quarantined") == 1
     assert one(values, "pad_calibration_state", hand="left", link="palm", state="calibrated") == 0
-    assert not any(name.startswith("supervisor") for name, _ in parsed(render_metrics(service(), [], 0.1)))
 
 
 def test_all_statistics_of_the_daemon_are_exported() -> None:

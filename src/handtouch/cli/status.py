@@ -69,6 +69,10 @@ def print_status(answer: dict[str, Any], console: Console) -> None:
         console.print(line, highlight=False, markup=False)
     _print_pads(answer["pads"], console)
     _print_supervisor(answer, console)
+    percepts = service.get("percepts")
+    if percepts is not None and (percepts["state"] != "stopped" or percepts["restarts"]):
+        text = f"percepts {_process_text(percepts)}; {percepts['dropped']} messages dropped"
+        console.print(text, highlight=False)
 
 
 def _print_daemon(service: dict[str, Any], console: Console) -> None:
@@ -133,17 +137,21 @@ def _active_errors(pad: dict[str, Any]) -> list[str]:
     return [f"EMCY {e['text']}" for e in active[-2:] if f"0x{e['code']:04X}" not in pad["reason"]]
 
 
+def _process_text(figures: dict[str, Any]) -> str:
+    """Describe the state of a child process."""
+    lag = "" if figures["lag_s"] is None else f", {figures['lag_s']:.1f} s behind"
+    exited = f" (last exit: {figures['exit_reason']})" if figures["exit_reason"] else ""
+    process = "" if figures["pid"] is None else f", process {figures['pid']}"
+    return f"{figures['state']}{process}{lag}, {figures['restarts']} restarts{exited}"
+
+
 def _print_supervisor(answer: dict[str, Any], console: Console) -> None:
     """Print the state of the supervisor process and its diagnoses."""
     figures = answer["service"].get("supervisor")
     if figures is None:
         return
-    lag = "" if figures["lag_s"] is None else f", {figures['lag_s']:.1f} s behind"
-    exited = f" (last exit: {figures['exit_reason']})" if figures["exit_reason"] else ""
-    process = "" if figures["pid"] is None else f", process {figures['pid']}"
     console.print(
-        f"supervisor {figures['state']}{process}{lag}, {figures['restarts']} restarts{exited}; "
-        f"calibrations: {figures['summary'] or 'not known yet'}",
+        f"supervisor {_process_text(figures)}; calibrations: {figures['summary'] or 'not known yet'}",
         highlight=False,
     )
     if figures["store_error"]:

@@ -45,7 +45,8 @@ def render_metrics(service: wire.Service | None, pads: Iterable[wire.Health], ag
         _add_bus_metrics(page, service.buses)
         _add_loss_metrics(page, service)
         _add_process_metrics(page, service.process)
-        _add_supervisor_metrics(page, service.supervisor)
+        _add_child_metrics(page, "supervisor", service.supervisor)
+        _add_child_metrics(page, "percept", service.percepts)
     _add_pad_metrics(page, list(pads))
     return page.text()
 
@@ -186,26 +187,18 @@ def _add_diagnosis_metrics(page: _MetricsPage, pads: list[wire.Health], names: l
     page.add_values("pad_diagnosis", "gauge", "1 while the supervisor diagnoses this fault", rows)
 
 
-def _add_supervisor_metrics(page: _MetricsPage, statistics: Mapping[str, Any] | None) -> None:
+def _add_child_metrics(page: _MetricsPage, name: str, statistics: Mapping[str, Any] | None) -> None:
+    """Add the state of a child process, the supervisor or the percept process."""
     if statistics is None:
         return
-    running = int(statistics["pid"] is not None)
-    page.add_value("supervisor_up", "gauge", "1 while the supervisor process runs", running)
-    page.add_value(
-        "supervisor_restarts_total", "counter", "restarts of the supervisor process", statistics["restarts"]
-    )
-    page.add_value(
-        "supervisor_dropped_total",
-        "counter",
-        "blocks dropped because the supervisor process was too slow",
-        statistics["dropped"],
-    )
-    page.add_value(
-        "supervisor_malformed_total",
-        "counter",
-        "malformed messages of the supervisor process",
-        statistics["malformed"],
-    )
+    process = f"the {name} process"
+    page.add_value(f"{name}_up", "gauge", f"1 while {process} runs", int(statistics["pid"] is not None))
+    for key, meaning in (
+        ("restarts", f"restarts of {process}"),
+        ("dropped", f"messages dropped because {process} was too slow"),
+        ("malformed", f"malformed messages of {process}"),
+    ):
+        page.add_value(f"{name}_{key}_total", "counter", meaning, statistics[key])
 
 
 def _bus_values(buses: Mapping[str, Any], key: str) -> list[tuple[Labels, str]]:

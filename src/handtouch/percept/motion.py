@@ -41,7 +41,6 @@ class MotionReporter:
         n = len(slip.contact_id)
         self._slip, self._poses, self._period_s = slip, poses, period_s
         self._last_report_ns = np.zeros(n, dtype=np.int64)
-        self._label = np.zeros(n, dtype=np.intp)
         self._detected_label = np.zeros(n, dtype=np.intp)
         self._reported_contact = np.zeros(n, dtype=np.uint32)
 
@@ -53,7 +52,7 @@ class MotionReporter:
             return []
         fresh = pads[self._reported_contact[pads] != slip.contact_id[pads]]
         self._reported_contact[fresh] = slip.contact_id[fresh]
-        self._label[fresh] = self._detected_label[fresh] = -1
+        self._detected_label[fresh] = -1
         self._last_report_ns[fresh] = 0
         due = self._pads_to_report(pads, now_ns)
         if not len(due):
@@ -65,7 +64,7 @@ class MotionReporter:
         """Return the lift-off of contacts that ended on these pads."""
         pads = pads[self._slip.contact_id[pads] > 0]
         lifted = {name: float(name == "lift-off") for name in MOTION_CLASSES}
-        return [self._percept(pad, now_ns, lifted, at_once=True) for pad in pads.tolist()]
+        return [self._percept(pad, now_ns, lifted) for pad in pads.tolist()]
 
     # Details ----------------------------------------------------------------------------------------------
 
@@ -84,11 +83,9 @@ class MotionReporter:
         uncertain = (slip.column("slipping") != 0) | (slip.column("log_odds") > _MAX_STICKING_LOG_ODDS)
         relative = relative_to_object(links, pad, self._poses.hand_index, uncertain)
         probabilities = self._class_probabilities(pad, relative)
-        best = max(range(len(MOTION_CLASSES)), key=lambda k: probabilities[MOTION_CLASSES[k]])
-        changed = best != self._label[pad]
-        self._label[pad], self._last_report_ns[pad] = best, now_ns
+        self._last_report_ns[pad] = now_ns
         self._detected_label[pad] = int(slip.column("label")[pad])
-        return self._percept(pad, now_ns, probabilities, bool(changed), relative)
+        return self._percept(pad, now_ns, probabilities, relative)
 
     def _class_probabilities(self, pad: int, relative: RelativeMotion | None) -> dict[str, float]:
         state = self._slip.state[pad]
@@ -115,7 +112,6 @@ class MotionReporter:
         pad: int,
         now_ns: int,
         probabilities: dict[str, float],
-        at_once: bool,
         relative: RelativeMotion | None = None,
     ) -> PerceptEstimate:
         part = {name: self._slip.state[pad, columns] for name, columns in SLIP_SLICES.items()}
@@ -150,7 +146,6 @@ class MotionReporter:
                 "slips": int(part["slips"][0]),
             },
             f"contact has just begun: at least {_MIN_SAMPLES} samples are needed" if few else "",
-            at_once,
         )
 
 

@@ -197,8 +197,6 @@ class PerceptEstimate:
     evidence: Mapping[str, float | int] = field(default_factory=dict)
     """counts of the data used: samples, contacts, seconds"""
     reason: str = ""
-    urgent: bool = False
-    """publish at once, regardless of the kind's period"""
 
 
 class PerceptEstimator(Protocol):
