@@ -90,7 +90,7 @@ class Rig:
         self.cycle.begin_cycle(self.t_ns)
         for slot, data in enumerate(np.rint(counts).astype("<i2")):
             self.slab.write_pdo(slot, data.tobytes(), self.t_ns + 1000)
-        self.tick.run_tick(self.slab, self._up, self.cycle, self.t_ns + 2000)
+        self.tick.run_tick(self.slab, self._up, self.cycle)
 
 
 # Held object

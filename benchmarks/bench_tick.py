@@ -80,7 +80,7 @@ class Driver:
 
     def run_tick(self) -> None:
         """Run the measured tick."""
-        self.tick.run_tick(self.slab, self._up, self.cycle, self._t_ns + 2000)
+        self.tick.run_tick(self.slab, self._up, self.cycle)
 
     def floor(self) -> None:
         """Convert counts to currents and find touched pads."""

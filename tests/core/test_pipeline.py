@@ -77,6 +77,21 @@ def test_a_contact_ends_with_the_state_of_its_node(rig: Rig, state: PadState, re
     assert (last.event, last.end_reason) == ("end", reason)
 
 
+def test_messages_of_a_gap_are_marked_and_age(rig: Rig) -> None:
+    fresh = rig.sink.contacts()[-1]
+    for _ in range(4):
+        rig.cycle(pads=(1, 2))
+        rig.pipeline.tick_if_due(rig.t_ns + PERIOD_NS * 3 // 4)
+    gap = rig.sink.contacts()[-4:]
+    assert [(m.event, m.id, m.t_ns, m.fresh) for m in gap] == [("update", fresh.id, fresh.t_ns, False)] * 4
+    assert [m.position_m for m in gap] == [fresh.position_m] * 4
+    ages = [message.age_s for message in gap]
+    assert ages == sorted(ages)
+    assert ages[-1] - ages[0] > 2 * PERIOD_NS * 1e-9
+    rig.cycle()
+    assert (rig.sink.contacts()[-1].fresh, rig.sink.contacts()[-1].id) == (True, fresh.id)
+
+
 def test_end_of_session_ends_contacts_and_sends_a_last_frame(rig: Rig) -> None:
     rig.pipeline.end_session(rig.t_ns + PERIOD_NS)
     last = rig.sink.contacts()[-1]

@@ -53,7 +53,9 @@ class TouchedHand:
         self.transforms.set_requested(everything, everything)
 
     def step(self) -> ContactTransforms:
-        self.transforms.transform_updated(TickResult(100 * MS, self.pads, NONE, NONE), self.columns, self.ids)
+        self.transforms.transform_updated(
+            TickResult(100 * MS, self.pads, NONE, NONE, NONE), self.columns, self.ids
+        )
         return self.transforms
 
 

@@ -17,7 +17,7 @@ from handtouch.canbus.nodes.master import Master, SerialChanged
 from handtouch.config import Deployment, parse
 from handtouch.config.files import deployment_files
 from handtouch.config.tables import SceneRequest
-from handtouch.core.events import PauseEvent, SamplingEvent
+from handtouch.core.events import SamplingEvent
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import ActiveScenes, Demand
@@ -213,8 +213,7 @@ def entries(tmp_path_factory: pytest.TempPathFactory) -> list[RecordedMessage]:
     session.stroke(40, 9)
     down = np.array([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]])
     pipeline.set_gravity(down)
-    pipeline.add_event(PauseEvent(600_000_000))
-    pipeline.add_event(SamplingEvent((True, False), (PERIOD_NS, 20 * PERIOD_NS), (0, hand.t_ns)))
+    pipeline.add_event(SamplingEvent((True, False), (PERIOD_NS, 20 * PERIOD_NS), (1,)))
     session.stroke(60, 10)
     pipeline.end_session(hand.t_ns + PERIOD_NS)
     session.recording.recorder.finish()
@@ -230,7 +229,7 @@ def test_everything_happened_in_the_session(entries: list[RecordedMessage]) -> N
     events = [event["kind"] for e in entries if e.topic == "tick" for event in e.payload["events"]]
     assert set(events) >= {
         *("baseline", "calibration", "replacement", "back_force", "model", "excitation", "demand"),
-        *("sampling", "pause", "gravity", "force"),
+        *("sampling", "gravity", "force"),
     }
     ends = {e.payload["end_reason"] for e in entries if e.topic.startswith("contact/")}
     assert ends >= {"released", "lost", "stopped"}

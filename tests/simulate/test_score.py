@@ -22,6 +22,7 @@ class Contact:
     position_m: Vector | None
     force_n: float | None = 1.0
     hand: str = "right"
+    fresh: bool = True
 
 
 def touch(link: str, start: int, samples: int, number: int = 0) -> list[GroundTruth]:

@@ -295,6 +295,13 @@ class Touch(Table):
     end_samples: int = Field(
         2, ge=1, le=100, description="consecutive samples below end_threshold_n that end a contact"
     )
+    max_gap_periods: int = Field(
+        10,
+        ge=3,
+        le=1000,
+        description="a contact continues with its id while at most so many samples in a row are missing; its "
+        "messages have fresh = false meanwhile",
+    )
     max_rise_time_s: Positive = Field(
         20.0,
         description="a reading that takes longer to rise to end_threshold_n is drift, which the baseline "

@@ -157,29 +157,19 @@ class DemandEvent:
 
 @dataclass(frozen=True, slots=True)
 class SamplingEvent:
-    """Sampling of the pads (n,): by SYNC, longest regular time between samples, time of the last change."""
+    """Sampling of the pads (n,): by SYNC, longest regular time between samples; and pads (k,) that changed,
+    whose first sample is awaited from now on."""
 
     kind: ClassVar[str] = "sampling"
     synchronous: tuple[bool, ...]
     max_sample_period_ns: tuple[int, ...]
-    awaited_since_ns: tuple[int, ...]
+    changed: tuple[int, ...]
 
     def apply(self, target: EventTarget) -> None:
         state = target.tick.state
         state.synchronous[:] = self.synchronous
         state.max_sample_period_ns[:] = self.max_sample_period_ns
-        state.awaited_since_ns[:] = self.awaited_since_ns
-
-
-@dataclass(frozen=True, slots=True)
-class PauseEvent:
-    """The loop or the whole host paused for so long; pads become stale later."""
-
-    kind: ClassVar[str] = "pause"
-    excused_ns: int
-
-    def apply(self, target: EventTarget) -> None:
-        target.tick.excuse_pause(self.excused_ns)
+        state.silent_ns[list(self.changed)] = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +204,7 @@ _EVENTS: dict[str, type[Any]] = {
     event.kind: event
     for event in (
         *(BaselineEvent, CalibrationEvent, EvidenceEvent, ReplacementEvent, BackForceEvent, ModelEvent),
-        *(ExcitationEvent, DemandEvent, SamplingEvent, PauseEvent, GravityEvent, ForceEvent),
+        *(ExcitationEvent, DemandEvent, SamplingEvent, GravityEvent, ForceEvent),
     )
 }
 

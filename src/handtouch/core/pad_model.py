@@ -56,8 +56,9 @@ class PadModel:
 
     A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
     `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_samples`,
-    `end_samples`: debounce. `max_rise_time_s`: a slower rise to `end_threshold_n` is drift. `behaviours`
-    (n,): sheet behaviour, None where it isn't modelled.
+    `end_samples`: debounce; `max_gap_periods`: missing samples that a contact survives. `max_rise_time_s`: a
+    slower rise to `end_threshold_n` is drift. `behaviours` (n,): sheet behaviour, None where it isn't
+    modelled.
 
     `forward_tables`, `surface_tables` and `law_parameters` are what the stages read; `weight` (n, 4) is
     1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that they tabulate.
@@ -101,6 +102,7 @@ class PadModel:
         self.end_threshold_n = np.array([touch.end_threshold_n for touch in touches])
         self.begin_samples = np.array([touch.begin_samples for touch in touches])
         self.end_samples = np.array([touch.end_samples for touch in touches])
+        self.max_gap_periods = np.array([touch.max_gap_periods for touch in touches])
         self.max_rise_time_s = np.array([touch.max_rise_time_s for touch in touches])
         kinds_of_sheet = {name: _behaviour_of_sheet(sheet) for name, sheet in deployment.sheets.items()}
         self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]

@@ -158,7 +158,7 @@ class Pipeline:
         for event in events:
             event.apply(self)
         self.cycle.ticked = True
-        result = self.tick.run_tick(self.slab, self.node_state, self.cycle, now_ns, until_ns)
+        result = self.tick.run_tick(self.slab, self.node_state, self.cycle, until_ns)
         self.transforms.transform_updated(result, self.tick.columns, self.tick.contacts.id)
         self.on_tick_computed()
         self.messages.send_contacts(result, now_ns, self._sink)

@@ -30,6 +30,7 @@ PALM_VALUES = 31
 SHEET_ELEMENTS = SHEET_PLAYS = 8
 _ALIGNMENT = 64
 _MAX_PAUSE_NS = 3600 * 10**9
+_NEVER_SAMPLED_NS = 1 << 60
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -79,8 +80,9 @@ class TickState:
     """pads sampled by SYNC; the others are event-driven and not waited for"""
     max_sample_period_ns: Annotated[IntArray, Stored("<i8", _PADS)]
     """longest regular time between two samples"""
-    awaited_since_ns: Annotated[IntArray, Stored("<i8", _PADS)]
-    """time since which samples are awaited: of the last change of sampling, later by the loop's pauses"""
+    silent_ns: Annotated[IntArray, Stored("<i8", _PADS, fill=_NEVER_SAMPLED_NS)]
+    """time in which cycles began and the pad sent no sample, since its last one or a change of sampling; a
+    cycle counts for one sample period at most, however long it was"""
     total_current_a: Annotated[FloatArray, Stored("<f8", _PADS)]
     """sum of the channels"""
 

@@ -27,7 +27,7 @@ from handtouch.field.contact_law import ForceEstimateStatus
 from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
-_MAX_SAMPLE_AGE_PERIODS = 3
+_MAX_SILENT_PERIODS = 3
 _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION = 10.0, 0.02
 """Most negative plausible current of a channel: in noise sigma, and as a fraction of all channels."""
 # plain ints: looking up enum members costs a microsecond each
@@ -54,6 +54,7 @@ _FORCE, _FORCE_STD, _FORCE_STATUS = (
 )
 _LOWER_BOUND = float(ForceEstimateStatus.LOWER_BOUND)
 _ALL_CHANNELS = np.ones(4)
+_NO_ROWS: IntArray = np.zeros(0, dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,8 @@ class TickResult(NamedTuple):
     updated: IntArray
     """contacts with a new sample that did not begin in this tick"""
     ended: IntArray
+    silent: IntArray
+    """contacts whose sample is missing; their values are those of the last one"""
 
 
 class TickProcessor:
@@ -215,11 +218,6 @@ class TickProcessor:
         """Return the covariance (k, 2, 2) of arc lengths on pads (k,) that is independent in each sample."""
         return self.columns.pad_noise_m2[pads][:, [[0, 1], [1, 2]]]
 
-    def excuse_pause(self, excused_ns: int) -> None:
-        """Make pads stale later, since the loop or the whole host paused for so long."""
-        reference_ns = np.maximum(self.state.sample_ns, self.state.awaited_since_ns)
-        np.add(reference_ns, excused_ns, out=self.state.awaited_since_ns)
-
     def solve_all(self) -> None:
         """Compute position and force of every touched pad, requested or not; the state's owner undoes it."""
         everything = ~self._no_pads
@@ -274,13 +272,12 @@ class TickProcessor:
         slab: Slab,
         node_state: NDArray[np.uint8],
         cycle: Cycle,
-        now_ns: int,
         until_ns: int = _NO_LIMIT_NS,
     ) -> TickResult:
         """Process the samples of a cycle, and those of the previous one that arrived after its tick.
 
-        `now_ns` is the time of the tick; samples that arrived at `until_ns` or later belong to the next
-        cycle. `node_state` (n,): PadState.CLEAR where the node is up, else the state to give its pad.
+        Samples that arrived at `until_ns` or later belong to the next cycle. `node_state` (n,):
+        PadState.CLEAR where the node is up, else the state to give its pad.
         """
         model, columns, contacts = self.model, self.columns, self.contacts
         self._add_baseline_samples()
@@ -288,10 +285,13 @@ class TickProcessor:
         sampled = self._update_samples(slab, operational, cycle, until_ns)
         self.counts = counts = slab.unpack_counts()
         excess = np.subtract(counts, self.baseline.expected_counts, out=self._excess)
-        implausible, stale = self._find_implausible(counts, slab), self._find_stale(now_ns, sampled)
+        implausible, (stale, silenced) = (
+            self._find_implausible(counts, slab),
+            self._find_silent(sampled, cycle),
+        )
         trusted = operational
         if not (implausible is self._no_pads is stale):
-            trusted = operational & ~(implausible | stale)
+            trusted = operational & ~(implausible | silenced)
         np.multiply(excess, model.ampere_per_count, out=self._currents)
         np.copyto(columns.total_current_a, self._currents @ _ALL_CHANNELS, where=sampled)
         began, ended, measured = contacts.detect_contacts(
@@ -327,7 +327,7 @@ class TickProcessor:
         if len(ended):
             self.state.published[ended] = np.nan
         updated = np.setdiff1d(measured, began) if len(began) else measured
-        return TickResult(cycle.sync_ns, began, updated, ended)
+        return TickResult(cycle.sync_ns, began, updated, ended, self._find_gaps(sampled))
 
     # Details of every tick. A ufunc on few elements costs its call, so rare conditions are tested first, by
     # `count_nonzero`, the fastest of numpy's calls ----------------------------------------------------------
@@ -353,6 +353,20 @@ class TickProcessor:
             np.copyto(columns.sample_ns, slab.arrival_ns, where=sampled & ~self.state.synchronous)
         return sampled
 
+    def _find_gaps(self, sampled: BoolArray) -> IntArray:
+        """Return the contacts (k,) without the sample that was expected in this tick."""
+        missing = self.contacts.touching > sampled
+        if not np.count_nonzero(missing):
+            return _NO_ROWS
+        rows = np.flatnonzero(missing & self.state.synchronous)
+        return np.asarray(rows[self.state.ticks[0] % self.state.update_interval_ticks[rows] == 0])
+
+    def is_fresh(self, pad: int) -> bool:
+        """Return True if the pad sent its last expected sample."""
+        held = self.state
+        limit_ns = 0 if held.synchronous[pad] else _MAX_SILENT_PERIODS * held.max_sample_period_ns[pad]
+        return bool(held.silent_ns[pad] <= limit_ns)
+
     def _find_implausible(self, counts: NDArray[np.int64], slab: Slab) -> BoolArray:
         """Return the pads (n,) with a channel at the end of its range, or sourcing current.
 
@@ -368,14 +382,21 @@ class TickProcessor:
             sources &= (excess.max(axis=1) > -least[:, 0]) | (amount_a > self.model.begin_threshold_a)
         return np.asarray(railed.any(axis=1) | sources)
 
-    def _find_stale(self, now_ns: int, sampled: BoolArray) -> BoolArray:
-        """Return the pads (n,) without a sample for three periods."""
+    def _find_silent(self, sampled: BoolArray, cycle: Cycle) -> tuple[BoolArray, BoolArray]:
+        """Add the cycle to the silence of pads without a sample; return the pads (n,) that are stale, silent
+        for three periods, and those whose contact ends for it."""
+        silent_ns, period_ns = self.state.silent_ns, self.state.max_sample_period_ns
         if np.count_nonzero(sampled) == self.model.size:
-            return self._no_pads
-        since_ns = np.maximum(self.columns.sample_ns, self.state.awaited_since_ns)
-        return np.asarray(
-            (now_ns - since_ns > _MAX_SAMPLE_AGE_PERIODS * self.state.max_sample_period_ns) & ~sampled
+            if np.count_nonzero(silent_ns):
+                silent_ns.fill(0)
+            return self._no_pads, self._no_pads
+        np.add(
+            silent_ns, np.minimum(max(cycle.sync_ns - cycle.previous_sync_ns, 0), period_ns), out=silent_ns
         )
+        silent_ns[sampled] = 0
+        half_ns = cycle.period_ns // 2  # times of SYNCs vary
+        stale = silent_ns > _MAX_SILENT_PERIODS * period_ns - half_ns
+        return np.asarray(stale), np.asarray(silent_ns > self.model.max_gap_periods * period_ns + half_ns)
 
     def _resolve_states(
         self,

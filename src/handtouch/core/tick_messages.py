@@ -69,7 +69,9 @@ class TickMessages:
         """Send begin, update and end of contacts, and clear those that ended."""
         events: dict[ContactEvent, NDArray[np.intp]] = {
             "begin": result.began,
-            "update": result.updated,
+            "update": np.concatenate([result.updated, result.silent])
+            if len(result.silent)
+            else result.updated,
             "end": result.ended,
         }
         for event, rows in events.items():
@@ -90,7 +92,7 @@ class TickMessages:
         touching = np.flatnonzero(self._tick.contacts.touching)
         self._end_reason = _STOPPED
         none = np.zeros(0, dtype=np.intp)
-        self.send_contacts(TickResult(now_ns, none, none, touching), now_ns, sink)
+        self.send_contacts(TickResult(now_ns, none, none, touching, none), now_ns, sink)
         self._tick.contacts.touching[:] = False
         self._state.published[:] = np.nan
         self._tick.columns.state[:] = PadState.STARTING
@@ -231,6 +233,7 @@ class TickMessages:
             retained=retained,
             uncompensated_force_n=_finite_or_none(columns.uncompensated_force_n[pad]) if modelled else None,
             diagnoses=model.calibrations[pad].diagnoses,
+            fresh=self._tick.is_fresh(pad),
             **self._transforms.contact_fields(pad),
         )
 

@@ -33,7 +33,6 @@ from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
 from handtouch.core.compiled import Compilation
 from handtouch.core.cycle import BusyPoll
-from handtouch.core.events import PauseEvent
 from handtouch.core.gravity import GravityTracker
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
@@ -344,7 +343,6 @@ class HandtouchDaemon:
         """Extend timeouts by a pause of this loop, in which it may have sent no SYNC and read no frame."""
         self.sync.excuse_pause(paused_ns)
         self.master.excuse_pause(paused_ns, now_ns)
-        self.pipeline.add_event(PauseEvent(paused_ns))
         if paused_ns > _LOGGED_PAUSE_NS:
             late_ms = (paused_ns + self.sync.period_ns) * 1e-6
             _log.warning("the loop was late by %.0f ms; timeouts of nodes and pads are extended", late_ms)

@@ -59,6 +59,7 @@ class SamplingController:
         self._next_idle_check_ns = 0
         self._sampling_changes = 0
         self._synchronous = np.ones(len(pads), dtype=np.bool_)  # as the tick has it, or will have
+        self._transmission_since_ns = np.zeros(len(pads), dtype=np.int64)  # as reported to it
 
     def set_idle_settings(self, scene: Scene) -> None:
         """Apply the scene table's idle time and idle SYNC period."""
@@ -137,11 +138,13 @@ class SamplingController:
         self._sampling_changes = master.transmission_changes
         self._last_active_ns[self._synchronous < ~master.idle] = now_ns
         np.logical_not(master.idle, out=self._synchronous)
+        changed = np.flatnonzero(master.transmission_since_ns != self._transmission_since_ns)
+        self._transmission_since_ns[:] = master.transmission_since_ns
         self._pipeline.add_event(
             SamplingEvent(
                 tuple(self._synchronous.tolist()),
                 tuple(master.sample_period_ns.tolist()),
-                tuple(master.transmission_since_ns.tolist()),
+                tuple(changed.tolist()),
             )
         )
 

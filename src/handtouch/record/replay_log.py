@@ -26,8 +26,6 @@ from handtouch.wire import PadState
 _NODE_COB_BASES = (0x080, 0x580, 0x600, 0x700)
 """COB-ID bases of EMCY, SDO and heartbeat, which a deployment's nodes send besides TPDOs."""
 _PERIOD_SYNCS = 50
-_MAX_PAUSE_TICKS = 8
-"""Ticks by the timer in a pause of the log: enough for every pad to become stale."""
 
 
 @dataclass
@@ -76,6 +74,8 @@ class _LogReplayer:
                 self.routers[pad.bus].route(tpdo.cob_id, slot, number, tpdo.size_bytes)
             self._known_ids |= {base + pad.node_id for base in _NODE_COB_BASES}
         self.pipeline.node_state[:] = PadState.CLEAR
+        # by the timer in a pause of the log: enough for every contact to end
+        self._max_pause_ticks = int(self.pipeline.model.max_gap_periods.max()) + 2
 
     def process_frame(self, message: can.Message, t_ns: int) -> None:
         """Process a frame of the log."""
@@ -99,7 +99,7 @@ class _LogReplayer:
         if cycle.sync_ns == 0:
             cycle.sync_ns = t_ns
         pipeline.tick_if_due(t_ns)
-        for _ in range(_MAX_PAUSE_TICKS):
+        for _ in range(self._max_pause_ticks):
             if t_ns < cycle.sync_overdue_ns:
                 return
             sync_ns = cycle.sync_ns + cycle.period_ns

@@ -34,6 +34,8 @@ class ContactLike(Protocol):
     @property
     def event(self) -> str: ...
     @property
+    def fresh(self) -> bool: ...
+    @property
     def position_m(self) -> Vector | None: ...
     @property
     def force_n(self) -> float | None: ...
@@ -122,7 +124,8 @@ class _MatchedLink:
                 distance_ns is None or distance_ns > _MAX_DELAY_PERIODS * period_ns
             ):
                 self.false_positives += 1
-            if distance_ns is not None and 2 * distance_ns <= period_ns and contact.event != "end":
+            measured = contact.event != "end" and contact.fresh
+            if distance_ns is not None and 2 * distance_ns <= period_ns and measured:
                 pairs.append((contact, nearest))
         self.touches = touch_of[-1] + 1 if touch_of else 0
         self.missed = self.touches - len({touch_of[row] for _, row in pairs})

@@ -119,6 +119,9 @@ class Contact:
     diagnoses: tuple[str, ...] = ()
     """kinds of the `diagnoses` in `health` that make position or force unreliable or invalid; absent if there
     are none"""
+    fresh: bool = True
+    """false while samples of the pad are missing: the contact continues with the values of its last sample,
+    at `t_ns`; absent where true"""
 
 
 @dataclass(frozen=True, slots=True)
