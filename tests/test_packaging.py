@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import tarfile
@@ -63,6 +64,15 @@ def test_version_is_the_same_everywhere(wheel: Path) -> None:
     newest = re.search(r"^## (\S+)", changes, re.MULTILINE)
     assert newest is not None
     assert {PROJECT["version"], newest[1], wheel.name.split("-")[1]} == {handtouch.__version__}
+
+
+def test_clients_in_other_languages_have_the_version_of_the_package() -> None:
+    package = json.loads((ROOT / "clients/js/package.json").read_text())
+    project = re.search(
+        r"project\(handtouch VERSION (\S+)", (ROOT / "clients/cpp/CMakeLists.txt").read_text()
+    )
+    assert project is not None
+    assert package["version"] == project[1] == handtouch.__version__
 
 
 def test_every_requirement_is_pinned() -> None:

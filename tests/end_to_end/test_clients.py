@@ -196,13 +196,16 @@ def test_the_newest_frames_of_a_daemon_are_those_of_its_messages(working: Any, p
                 break
     assert compared > 90
     active: dict[str, int] = {}
+    shown = 0
     for line in lines:
         if line["kind"] == "hand":
-            assert line["contacts"] == active
+            assert line["contacts"] in (active, {})  # none when the program stalled for 1.5 s
+            shown += line["contacts"] == active != {}
         elif line["event"] == "end":
             active.pop(line["link"], None)
         else:
             active[line["link"]] = line["id"]
+    assert shown > 10
 
 
 @pytest.mark.parametrize("program", LANGUAGES, indirect=True)
