@@ -32,6 +32,10 @@ cdef double series_resistance(PadLaw law, double[::1] currents, Py_ssize_t first
 cdef double _squared_change(
     StackTable stack, PadLaw law, double force, double log_ratio, double log_spreading_m, double whole,
     double resistors) noexcept
+@cython.locals(p='double[::1]')
+cdef double _squared_change_along(
+    StackTable stack, PadLaw law, double force, Py_ssize_t axis, double sigma, double spread, double whole,
+    double resistors) noexcept
 cdef double _force_at(
     StackTable stack, double log_layer, double alpha, double log_radius_m, double log_sheet,
     double factor) noexcept

@@ -1,7 +1,8 @@
 """Force: from a contact's total current through the contact law, with its standard deviation.
 
 The same law as `handtouch.field.contact_law`, which is the reference. The standard deviation is by quadrature
-over the contact radius, not by a slope: on soft sheets the slope passes through zero.
+over contact radius and law, not by slopes: on soft sheets that by the radius passes through zero, and towards
+the maximum current of the sheet forces grow without bound.
 """
 
 from __future__ import annotations
@@ -124,13 +125,14 @@ def estimate_force(
         )
     for k in range(_AXES, _AXES + 9, 3):
         if p[k] != 0.0 or p[k + 1] != 0.0 or p[k + 2] != 0.0:
-            # a larger sheet resistance makes the factor smaller
-            changed = max((whole - resistors) * math.exp(-p[k + 2]) - spread, least)
-            changed_alpha = max(alpha + p[k + 1], _MIN_ALPHA)
-            log_layer = p[_LOG_LAYER] + p[k] + (changed_alpha - alpha) * p[_LOG_REFERENCE]
-            log_sheet = p[_LOG_SHEET] + p[k + 2]
-            change = _force_at(stack, log_layer, changed_alpha, p[_LOG_RADIUS], log_sheet, changed) - force
-            square += change * change
+            square += _NEAR_WEIGHT * (
+                _squared_change_along(stack, law, force, k, _NEAR_NODE, spread, whole, resistors)
+                + _squared_change_along(stack, law, force, k, -_NEAR_NODE, spread, whole, resistors)
+            )
+            square += _FAR_WEIGHT * (
+                _squared_change_along(stack, law, force, k, _FAR_NODE, spread, whole, resistors)
+                + _squared_change_along(stack, law, force, k, -_FAR_NODE, spread, whole, resistors)
+            )
     result.force_n, result.std_n, result.status = force, math.sqrt(square), _VALID
 
 
@@ -170,6 +172,30 @@ def _squared_change(
     least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
     factor = max(whole - resistors - spread, least)
     change = _force_at(stack, p[_LOG_LAYER], p[_ALPHA], log_radius_m, p[_LOG_SHEET], factor) - force
+    return change * change
+
+
+def _squared_change_along(
+    stack: StackTable,
+    law: PadLaw,
+    force: float,
+    axis: int,
+    sigma: float,
+    spread: float,
+    whole: float,
+    resistors: float,
+) -> float:
+    """Return the squared change of the force with a law that differs by `sigma` along an axis of its
+    covariance."""
+    p = law.parameters
+    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
+    # a larger sheet resistance makes the factor smaller
+    log_sheet_change = sigma * p[axis + 2]
+    factor = max((whole - resistors) * math.exp(-log_sheet_change) - spread, least)
+    alpha = max(p[_ALPHA] + sigma * p[axis + 1], _MIN_ALPHA)
+    log_layer = p[_LOG_LAYER] + sigma * p[axis] + (alpha - p[_ALPHA]) * p[_LOG_REFERENCE]
+    log_sheet = p[_LOG_SHEET] + log_sheet_change
+    change = _force_at(stack, log_layer, alpha, p[_LOG_RADIUS], log_sheet, factor) - force
     return change * change
 
 

@@ -2,12 +2,12 @@ cimport cython
 from libc cimport math
 from handtouch.core.stages cimport tables, tolerances
 
-cdef Py_ssize_t _MAX_STEPS, _CORNER_STEPS, _BISECTIONS
+cdef Py_ssize_t _MAX_STEPS, _CORNER_STEPS, _BISECTIONS, _EDGE_BISECTIONS
 cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
 cdef Py_ssize_t _MAX_WHITENINGS
 cdef double _MAX_WHITENING_CELLS
 cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
-cdef double _MIN_INFORMATION, _INFINITY, _HALF_PI
+cdef double _MAX_EDGE_CELLS, _MIN_INFORMATION, _INFINITY, _HALF_PI
 
 cdef class ModelTable:
     cdef double[::1] values, nodes_x, nodes_y, search_fractions, search_cells
@@ -63,3 +63,5 @@ cdef void _invert_information(ModelTable table, Fit fit) noexcept
 @cython.locals(i=Py_ssize_t, _=Py_ssize_t, far_x=bint, far_y=bint)
 cdef void _move_out_of_corner(ModelTable table, Fit fit) noexcept
 cdef void _linearise_on_arc(ModelTable table, Fit fit, bint far_x, bint far_y, double radius, double angle) noexcept
+@cython.locals(_=Py_ssize_t, nodes='double[::1]')
+cdef void _widen_at_edge(ModelTable table, Fit fit, bint along_x) noexcept

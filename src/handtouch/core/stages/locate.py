@@ -27,6 +27,8 @@ _MAX_START_COST = 40.0  # cost beyond twice the best start's at which another on
 _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR = MAX_STD_SIDES, CORNER_RADIUS_FACTOR
 _MAX_CORNER_RADIUS = 0.25  # in shorter sides
 _CORNER_STEPS = 6
+_MAX_EDGE_CELLS = 0.5  # of a position on an edge
+_EDGE_BISECTIONS = 12
 _MIN_CORNER_ANGLE_RAD = 0.02
 _MIN_INFORMATION = 1e-300
 _INFINITY, _HALF_PI = math.inf, 0.5 * math.pi
@@ -139,6 +141,8 @@ def locate(
     fit.found = fit.total > 0.0
     if fit.found:
         _move_out_of_corner(table, fit)
+        _widen_at_edge(table, fit, True)
+        _widen_at_edge(table, fit, False)
 
 
 def _whiten(
@@ -484,3 +488,39 @@ def _linearise_on_arc(
     _linearise(table, fit)
     fit.step_s = fit.step_t = fit.decrement = 0.0
     _compute_position(table, fit)
+
+
+def _widen_at_edge(table: ModelTable, fit: Fit, along_x: bool) -> None:
+    """Widen the variance across an edge that the position is on, to the distance from it that is likely.
+
+    Currents may not change across an edge, as on the bare length next to a corner, where the information is
+    0; how far inside the contact is follows from the likelihood itself.
+    """
+    s, t, cost, cells = fit.s, fit.t, fit.cost, 1.0 * table.cells
+    at = s if along_x else t
+    if at > _MAX_EDGE_CELLS and at < cells - _MAX_EDGE_CELLS:
+        return
+    nodes = table.nodes_x if along_x else table.nodes_y
+    sign = 1.0 if at < 0.5 * cells else -1.0
+    likely, unlikely = 0.0, cells
+    for _ in range(_EDGE_BISECTIONS):
+        inward = 0.5 * (likely + unlikely)
+        if along_x:
+            fit.s = _clamp(table, s + sign * inward)
+        else:
+            fit.t = _clamp(table, t + sign * inward)
+        _linearise(table, fit)
+        if fit.total > 0.0 and fit.cost <= cost + 1.0:
+            likely = inward
+        else:
+            unlikely = inward
+    fit.s, fit.t = s, t
+    _linearise(table, fit)
+    fit.step_s = fit.step_t = fit.decrement = 0.0
+    distance = _coordinate(nodes, table.cells, _clamp(table, at + sign * likely))
+    distance -= _coordinate(nodes, table.cells, at)
+    variance = distance * distance
+    if along_x and (fit.var_x > 1e300 or variance > fit.var_x):
+        fit.var_x, fit.cov_xy, fit.cov_x_total = variance, 0.0, 0.0
+    elif not along_x and (fit.var_y > 1e300 or variance > fit.var_y):
+        fit.var_y, fit.cov_xy, fit.cov_y_total = variance, 0.0, 0.0
