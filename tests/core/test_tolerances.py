@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from handtouch.config import Deployment, parse
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import electrode_network
@@ -85,15 +85,14 @@ def test_tables_of_tolerances_agree_with_networks_of_other_parts(
 
 
 def test_regions_hold_for_parts_within_their_tolerances(deployment: Deployment, model: PadModel) -> None:
-    """Of contacts on sixty hands, 93 to 98 % lie in the region of 95 %; with exact parts stated, fewer than
-    half."""
+    """Of contacts on sixty hands, 93 to 98 % lie in the region of 95 %; with exact parts stated, fewer."""
     inside = {}
     for name, stated in (("tolerant", model), ("exact", PadModel(parse(DEPLOYMENT)))):
         rng = np.random.default_rng(3)
         distances = np.concatenate([squared_distances(deployment, stated, rng) for _ in range(60)])
         inside[name] = np.mean(distances < chi2.ppf(0.95, 2))
     assert 0.93 < inside["tolerant"] < 0.98
-    assert inside["exact"] < 0.5
+    assert inside["exact"] < 0.75
 
 
 def test_a_position_next_to_a_corner_has_a_bounded_covariance(
@@ -105,7 +104,25 @@ def test_a_position_next_to_a_corner_has_a_bounded_covariance(
         networks = [drawn_network(deployment, row, rng) for row in range(3)]
         covariance, position, _ = solve(model, rng.uniform(0.02, 0.08, (3, 2)), networks, 1.0, rng)
         assert np.isfinite(position).all()
-        assert (np.trace(covariance, axis1=1, axis2=2) < 0.01**2).all()  # a third of the shortest side
+        anywhere = (sides(model.networks) ** 2).sum(axis=1) / 12
+        assert (np.trace(covariance, axis1=1, axis2=2) < anywhere).all()
+
+
+def test_two_contacts_along_a_side_are_no_point_and_their_covariance_includes_their_distance(
+    model: PadModel,
+) -> None:
+    networks, apart = model.networks, 0.3
+    side_x, side_y = sides(networks).T
+    pair = [
+        net.fractions((0.5 - apart / 2) * a, 0.5 * b) + net.fractions((0.5 + apart / 2) * a, 0.5 * b)
+        for net, a, b in zip(networks, side_x, side_y, strict=True)
+    ]
+    currents, values = 1e-3 * np.array(pair), np.full((3, VALUE_COUNT), np.nan)
+    solver = make_solver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
+    solver.solve_contacts(np.arange(3).data)
+    assert (values[:, VALUE_SLICES["squared_misfit"]] > MAX_SQUARED_MISFIT).all()
+    longest = np.linalg.eigvalsh(values[:, VALUE_SLICES["covariance_m2"]].reshape(3, 3, 3))[:, -1]
+    assert (np.sqrt(longest) > 0.8 * apart / 2 * side_x).all()
 
 
 def test_size_of_a_pad_makes_positions_uncertain_in_proportion_to_the_distance_from_its_middle() -> None:

@@ -1,6 +1,7 @@
 """The stages on the arrays of a pad model: position, force and covariance of contacts, in one call a tick.
 
-Public names: `make_solver`, `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`.
+Public names: `make_solver`, `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`,
+`MAX_SQUARED_MISFIT`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import SEARCH_POINTS, stack_table, view_bytes, view_floats
 from handtouch.core.stages.locate import Fit
 from handtouch.core.stages.place import Placement
-from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES, ContactSolver
+from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, ContactSolver
 from handtouch.core.stages.tolerances import Whitening
 
 FloatArray = NDArray[np.float64]
@@ -31,9 +32,11 @@ def make_solver(
     force_requested: (pads,). values: (pads, VALUE_COUNT), laid out as VALUE_SLICES; NaN for new contacts.
     """
     n = currents.shape[1]
-    raw, gain = _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
+    raw, beside, gain = _work(3 * (n + 1)), _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
     whitening = Whitening(_work(n * n), _work(3 * n), _work(n), n)
-    fit = Fit(_work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, _work(n), gain, whitening)
+    fit = Fit(
+        _work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, beside, _work(n), gain, whitening
+    )
     return ContactSolver(
         [table.pad_table() for table in model.forward_tables],
         model.stage_tolerances(),
@@ -57,4 +60,4 @@ def _work(size: int) -> memoryview[float]:
     return view_floats(np.zeros(size))
 
 
-__all__ = ["VALUE_COUNT", "VALUE_SLICES", "ContactSolver", "make_solver"]
+__all__ = ["MAX_SQUARED_MISFIT", "VALUE_COUNT", "VALUE_SLICES", "ContactSolver", "make_solver"]

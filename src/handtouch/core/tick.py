@@ -82,6 +82,8 @@ class PadColumns:
     residual: FloatArray
     residual_std: FloatArray
     """of a point contact, from channel noise"""
+    squared_misfit: FloatArray
+    """of a point contact, in variances of noise and tolerances; above MAX_SQUARED_MISFIT it is no point"""
     covariance_m2: FloatArray
     """(n, 3, 3) of position_m"""
     force_n: FloatArray
@@ -111,6 +113,7 @@ class PadColumns:
             pad_noise_m2=views["pad_noise_m2"],
             residual=views["residual"][:, 0],
             residual_std=views["residual_std"][:, 0],
+            squared_misfit=views["squared_misfit"][:, 0],
             covariance_m2=np.lib.stride_tricks.as_strided(
                 views["covariance_m2"], (len(values), 3, 3), (values.strides[0], 24, 8)
             ),

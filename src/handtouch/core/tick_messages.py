@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.core.contact_solver import MAX_SQUARED_MISFIT
 from handtouch.core.hand_frame import HandFrameEncoder
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
@@ -147,7 +148,8 @@ class TickMessages:
         solved = touching & tick.state.solved[rows]
         position[solved & tick.state.position_requested[rows]] = PositionStatus.INVALID
         position[located] = PositionStatus.VALID
-        position[located & self._model.position_unreliable[rows]] = PositionStatus.UNRELIABLE
+        no_point = columns.squared_misfit[rows] > MAX_SQUARED_MISFIT
+        position[located & (no_point | self._model.position_unreliable[rows])] = PositionStatus.UNRELIABLE
         requested = solved & tick.state.force_requested[rows]
         force[requested] = ForceStatus.VALID
         force[requested & tick.is_force_unreliable(rows)] = ForceStatus.UNRELIABLE
@@ -239,7 +241,8 @@ class TickMessages:
 
     def _position_status_of(self, pad: int, located: bool) -> PositionStatus:
         if located:
-            unreliable = self._model.position_unreliable[pad]
+            no_point = self._tick.columns.squared_misfit[pad] > MAX_SQUARED_MISFIT
+            unreliable = no_point or self._model.position_unreliable[pad]
             return PositionStatus.UNRELIABLE if unreliable else PositionStatus.VALID
         failed = self._state.position_requested[pad] and self._state.solved[pad]
         return PositionStatus.INVALID if failed else PositionStatus.NOT_COMPUTED

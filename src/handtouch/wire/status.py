@@ -46,7 +46,8 @@ class PositionStatus(IntEnum):
     """no scene requests it, or no contact"""
     VALID = 1
     UNRELIABLE = 2
-    """published, but degraded by what `diagnoses` name"""
+    """published, but degraded by what `diagnoses` name, or as the contact is no point: several objects, or
+    a long one; the covariance includes an extent that explains its currents"""
     INVALID = 3
     """no position agrees with the currents"""
 

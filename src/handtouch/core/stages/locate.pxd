@@ -7,7 +7,7 @@ cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPIN
 cdef Py_ssize_t _MAX_WHITENINGS
 cdef double _MAX_WHITENING_CELLS
 cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
-cdef double _MAX_EDGE_CELLS, _MIN_INFORMATION, _INFINITY, _HALF_PI
+cdef double _MAX_EDGE_CELLS, _UNIFORM_VARIANCE, _MIN_INFORMATION, _INFINITY, _HALF_PI
 
 cdef class ModelTable:
     cdef double[::1] values, nodes_x, nodes_y, search_fractions, search_cells
@@ -15,7 +15,7 @@ cdef class ModelTable:
     cdef double side_x, side_y
 
 cdef class Fit:
-    cdef double[::1] readings, data, weight, fractions, slope_x, slope_y, raw, scaled, gain
+    cdef double[::1] readings, data, weight, fractions, slope_x, slope_y, raw, beside, scaled, gain
     cdef tolerances.Whitening whitening
     cdef public double whitened_s, whitened_t, sum
     cdef public double s, t, total, cost, norm, mixing_x, mixing_y, gradient_x, gradient_y, xx, xy, yy
@@ -65,3 +65,4 @@ cdef void _move_out_of_corner(ModelTable table, Fit fit) noexcept
 cdef void _linearise_on_arc(ModelTable table, Fit fit, bint far_x, bint far_y, double radius, double angle) noexcept
 @cython.locals(_=Py_ssize_t, nodes='double[::1]')
 cdef void _widen_at_edge(ModelTable table, Fit fit, bint along_x) noexcept
+cdef void _bound_by_pad(ModelTable table, Fit fit) noexcept

@@ -27,6 +27,7 @@ _MAX_START_COST = 40.0  # cost beyond twice the best start's at which another on
 _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR = MAX_STD_SIDES, CORNER_RADIUS_FACTOR
 _MAX_CORNER_RADIUS = 0.25  # in shorter sides
 _CORNER_STEPS = 6
+_UNIFORM_VARIANCE = 1.0 / 12.0  # of a position anywhere on a side, in squares of the side
 _MAX_EDGE_CELLS = 0.5  # of a position on an edge
 _EDGE_BISECTIONS = 12
 _MIN_CORNER_ANGLE_RAD = 0.02
@@ -68,7 +69,8 @@ class Fit:
 
     `weight` (n,): 1 / noise. `readings` (n,): currents over noise. `data`, `fractions`, `slope_x`, `slope_y`
     (n,): currents and what the model gives for them per total, all whitened; slopes by cell, less the part
-    that the total absorbs. `raw` (3 columns,): what was read from the table. `scaled` (n,): working memory.
+    that the total absorbs. `raw` (3 columns,): what was read from the table; `beside`: the same elsewhere.
+    `scaled` (n,): working memory.
     `gain` (points,): reduction of the cost by a contact at each search point.
     """
 
@@ -81,6 +83,7 @@ class Fit:
         slope_x: memoryview[float],
         slope_y: memoryview[float],
         raw: memoryview[float],
+        beside: memoryview[float],
         scaled: memoryview[float],
         gain: memoryview[float],
         whitening: tolerances.Whitening,
@@ -88,7 +91,7 @@ class Fit:
         self.readings, self.data, self.weight = readings, data, weight
         self.scaled, self.whitening = scaled, whitening
         self.fractions, self.slope_x, self.slope_y = fractions, slope_x, slope_y
-        self.raw, self.gain = raw, gain
+        self.raw, self.beside, self.gain = raw, beside, gain
         self.s = self.t = 0.0  # position, in cells
         self.whitened_s = self.whitened_t = 0.0  # the same for which tolerances were whitened
         self.sum = 0.0  # of the currents
@@ -143,6 +146,7 @@ def locate(
         _move_out_of_corner(table, fit)
         _widen_at_edge(table, fit, True)
         _widen_at_edge(table, fit, False)
+        _bound_by_pad(table, fit)
 
 
 def _whiten(
@@ -524,3 +528,18 @@ def _widen_at_edge(table: ModelTable, fit: Fit, along_x: bool) -> None:
         fit.var_x, fit.cov_xy, fit.cov_x_total = variance, 0.0, 0.0
     elif not along_x and (fit.var_y > 1e300 or variance > fit.var_y):
         fit.var_y, fit.cov_xy, fit.cov_y_total = variance, 0.0, 0.0
+
+
+def _bound_by_pad(table: ModelTable, fit: Fit) -> None:
+    """Bound the covariance by that of a contact anywhere on the pad, unless both coordinates are unknown."""
+    if not (fit.var_x < 1e300 or fit.var_y < 1e300):
+        return
+    bound_x = _UNIFORM_VARIANCE * table.side_x * table.side_x
+    bound_y = _UNIFORM_VARIANCE * table.side_y * table.side_y
+    shrink_x = 1.0 / math.sqrt(1.0 + fit.var_x / bound_x)
+    shrink_y = 1.0 / math.sqrt(1.0 + fit.var_y / bound_y)
+    fit.var_x = fit.var_x * shrink_x * shrink_x if fit.var_x < 1e300 else bound_x
+    fit.var_y = fit.var_y * shrink_y * shrink_y if fit.var_y < 1e300 else bound_y
+    fit.cov_xy *= shrink_x * shrink_y
+    fit.cov_x_total *= shrink_x
+    fit.cov_y_total *= shrink_y

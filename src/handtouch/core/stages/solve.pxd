@@ -1,10 +1,10 @@
 cimport cython
 from libc cimport math
-from handtouch.core.stages cimport force, locate, place, tolerances
+from handtouch.core.stages cimport force, locate, place, tables, tolerances
 
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
-cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _COUNT
-cdef double _NAN, _MAX_SQUARED_MISFIT
+cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT
+cdef double _NAN, _MAX_SQUARED_MISFIT, _MAX_EXTENT_SIDES
 
 cdef class ContactSolver:
     cdef list tables, pad_tolerances, laws, surfaces
@@ -34,3 +34,5 @@ cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept
 cdef void _add_size(ContactSolver solver, Py_ssize_t pad) noexcept
 cdef void _write_row(
     double[::1] values, Py_ssize_t first, locate.Fit fit, place.Placement at, double t, double w) noexcept
+@cython.locals(n=Py_ssize_t)
+cdef void _add_extent(locate.ModelTable table, locate.Fit fit, double residual) noexcept

@@ -1,16 +1,16 @@
 """Contacts of a tick: locate, estimate the force, place; one row of `values` a pad.
 
-Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`.
+Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`, `MAX_SQUARED_MISFIT`.
 """
 
 from __future__ import annotations
 
 import math
 
-from handtouch.core.stages import force, locate, place, tolerances
+from handtouch.core.stages import force, locate, place, tables, tolerances
 
 _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD = 0, 2, 4, 5, 8, 11, 12, 13
-_COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _COUNT = 14, 23, 26, 27, 29
+_COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT = 14, 23, 26, 27, 29, 30
 VALUE_COUNT = _COUNT
 VALUE_SLICES = {
     "xy": slice(_X, _X + 2),  # on the pad's rectangle
@@ -25,13 +25,17 @@ VALUE_SLICES = {
     "pad_noise_m2": slice(_PAD_NOISE, _PAD_NOISE + 3),  # of pad_m from channel noise: uu, uv, vv
     "force_status": slice(_FORCE_STATUS, _FORCE_STATUS + 1),  # ForceEstimateStatus
     "cells": slice(_CELLS, _CELLS + 2),  # position in the pad's table, where the next tick starts from
+    "squared_misfit": slice(_MISFIT, _MISFIT + 1),  # of a point, in variances of noise and tolerances
 }
 """Layout of a row of values."""
 _NAN = float("nan")
-_MAX_SQUARED_MISFIT = 9.0
+MAX_SQUARED_MISFIT = 9.0
 """Squared misfit of a point contact, of one degree of freedom, that noise and tolerances explain. Beyond it
-the covariance is inflated by the excess (Birge, Phys. Rev. 40, 1932): where a contact is no point, the errors
-of currents along the directions that move the position are as large as along the observable one."""
+the contact is no point: the covariance is inflated by the excess (Birge, Phys. Rev. 40, 1932), as the errors
+of currents along the directions that move the position are as large as along the observable one, and by the
+extent that explains the residual."""
+_MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
+_MAX_EXTENT_SIDES = 0.5
 
 
 class ContactSolver:
@@ -109,6 +113,8 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     _propagate(solver, pad)
     if solver.force_requested[pad]:
         _estimate_force(solver, pad)
+    if fit.cost > _MAX_SQUARED_MISFIT:
+        _add_extent(table, fit, values[row + _RESIDUAL])
     _write_position(solver, pad)
 
 
@@ -147,12 +153,35 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
             by += 1.0 / total
         noise += (by / fit.weight[i]) * (by / fit.weight[i])
     values[row + _RESIDUAL], values[row + _RESIDUAL_STD] = residual, math.sqrt(noise)
+    values[row + _MISFIT] = fit.cost
     _write_pad_noise(solver, pad)
     excess = fit.cost - _MAX_SQUARED_MISFIT
     if excess > 0.0:
         fit.var_x *= 1.0 + excess
         fit.var_y *= 1.0 + excess
         fit.cov_xy *= 1.0 + excess
+
+
+def _add_extent(table: locate.ModelTable, fit: locate.Fit, residual: float) -> None:
+    """Add the extent of the contact that explains its residual.
+
+    A contact whose current spreads along x with a variance v adds v / 2 times the second derivative by x to
+    every fraction; one along y subtracts as much, as potentials are harmonic.
+    """
+    n = table.electrodes
+    low, high = max(fit.s - 1.0, 0.0), min(fit.s + 1.0, 1.0 * table.cells)
+    tables.read_table(table.values, 0, table.cells, n + 1, high, fit.t, fit.beside)
+    slope = fit.beside[n + 1] + fit.beside[n + 2]
+    tables.read_table(table.values, 0, table.cells, n + 1, low, fit.t, fit.beside)
+    curvature = slope - fit.beside[n + 1] - fit.beside[n + 2]
+    curvature /= (high - low) * fit.scale_x * fit.scale_x
+    if curvature == 0.0:
+        return
+    variance = 2.0 * abs(residual / curvature)
+    if residual * curvature > 0.0:
+        fit.var_x += min(variance, _MAX_EXTENT_SIDES * _MAX_EXTENT_SIDES * table.side_x * table.side_x)
+    else:
+        fit.var_y += min(variance, _MAX_EXTENT_SIDES * _MAX_EXTENT_SIDES * table.side_y * table.side_y)
 
 
 def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
