@@ -58,6 +58,8 @@ export interface Contact extends Envelope {
   joints_age_s?: number | null;
   uncompensated_force_n?: number | null;
   diagnoses?: string[];
+  /** false while samples are missing: values of the last sample; absent where true */
+  fresh?: boolean;
 }
 
 interface RequiredColumns {

@@ -140,7 +140,7 @@ def test_contacts_do_not_depend_on_when_messages_are_decoded(
 # --- wrenches
 
 
-def _touched_arrays(status: int = wire.ForceStatus.VALID) -> HandArrays:
+def _touched_arrays(status: int = wire.ForceStatus.VALID, last: int = TOUCHED) -> HandArrays:
     rng = np.random.default_rng(3)
     normal = rng.normal(size=(3, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -156,7 +156,7 @@ def _touched_arrays(status: int = wire.ForceStatus.VALID) -> HandArrays:
     }
     return HandArrays(
         make_frame(
-            state=(TOUCHED,) * 3,
+            state=(TOUCHED, TOUCHED, last),
             force_n=(1.0, 2.0, 3.0),
             force_std_n=(0.1, 0.2, 0.2),
             force_status=(wire.ForceStatus.VALID, wire.ForceStatus.VALID, status),
@@ -203,6 +203,12 @@ def test_a_finger_s_wrench_is_the_sum_of_its_contacts_and_names_those_it_lacks()
     assert saturated.wrench("index_*", "palm").missing == ("index_base",)
     assert np.isnan(saturated.total_force_n("index_*")).all()
     assert saturated.total_force_n("thumb_*") == pytest.approx((1.0, 0.1))
+    stale = _touched_arrays(last=STALE)  # a contact that continues without samples, or none: not known
+    assert stale.wrench("index_*", "palm").missing == ("index_base",)
+    assert np.isnan(stale.total_force_n("index_*")).all()
+    clear = _touched_arrays(last=CLEAR)
+    assert clear.wrench("index_*", "palm").missing == ()
+    assert clear.total_force_n("index_*") == pytest.approx((2.0, 0.2))
     with pytest.raises(ValueError, match="a frame of its own"):
         arrays.wrench("*", "link")
     with pytest.raises(LookupError, match="no link matches 'ring_\\*'"):

@@ -67,6 +67,7 @@ void print_contact(const handtouch::Contact& c) {
     field("id", c.id); field("group", c.group); field("event", c.event); field("hand", c.hand);
     field("link", c.link); field("end_reason", c.end_reason); field("calibration_id", c.calibration_id);
     field("force_status", c.force_status); field("retained", c.retained); field("duration_s", c.duration_s);
+    field("fresh", c.fresh);
     field("age_s", c.age_s); field("begin_threshold_n", c.begin_threshold_n);
     field("end_threshold_n", c.end_threshold_n); field("pad_m", c.pad_m); field("force_n", c.force_n);
     field("force_std_n", c.force_std_n); field("peak_force_n", c.peak_force_n);

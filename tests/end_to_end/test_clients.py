@@ -145,6 +145,7 @@ def _random_messages(count: int) -> Iterator[wire.Message]:
                 pad_m=maybe(2),
                 total_current_a=float(real()),
                 group=int(rng.integers(2)),
+                fresh=bool(rng.integers(2)),
                 position_status=pick(wire.PositionStatus),
                 force_status=pick(wire.ForceStatus),
                 palm_status=pick(wire.FrameStatus),

@@ -161,23 +161,23 @@ class HandArrays(LinkColumns):
     def wrench(self, links: str = "*", frame: FrameName = "palm") -> Wrench:
         """Return the total wrench of the contacts on links that match a pattern, such as a finger's.
 
-        `missing` names the contacts that it lacks because their force or position isn't valid. In the frame
+        `missing` names the links that it lacks: without a valid sample, force or position. In the frame
         "link" the pattern must match one link. Raises LookupError for a pattern without a link and while no
         scene requests the frame, ValueError for several links in the frame "link".
         """
         rows = self._rows_of(links)
         if frame == "link" and rows.sum() > 1:
             raise ValueError(f"{links!r} matches {rows.sum()} links, and each has a frame of its own")
-        missing = self._names(rows & self.touched.array & ~self._usable(frame))
+        missing = self._names(rows & ~self._is_clear & ~self._usable(frame))
         return sum_wrenches(list(self.wrenches(frame, links).values()), missing)
 
     def total_force_n(self, links: str = "*") -> tuple[float, float]:
         """Return the sum of the normal forces on links that match a pattern, and its standard deviation.
 
-        It is NaN if one of the contacts has no valid force. Raises LookupError for a pattern without a link.
+        NaN if one of them has no valid sample or force. Raises LookupError for a pattern without a link.
         """
-        rows = self._rows_of(links) & self.touched.array
-        if (self.force_status.array[rows] != wire.ForceStatus.VALID).any():
+        rows = self._rows_of(links) & ~self._is_clear
+        if not self._valid_force[rows].all():
             return float("nan"), float("nan")
         force_n, std_n = self._forces(rows)
         return float(force_n.sum()), float(np.sqrt((std_n**2).sum()))
@@ -190,6 +190,10 @@ class HandArrays(LinkColumns):
         rows = self._rows_of(links) & self._is_located(frame)
         position_m, normal, _ = self._geometry(frame, rows)
         return GraspMatrix(grasp_matrix(position_m, normal), self._names(rows))
+
+    @cached_property
+    def _is_clear(self) -> NDArray[np.bool_]:
+        return np.asarray(self.state.array == wire.PadState.CLEAR)
 
     @cached_property
     def _valid_force(self) -> NDArray[np.bool_]:

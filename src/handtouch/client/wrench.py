@@ -29,7 +29,7 @@ class Wrench:
     point_m: FloatArray | None
     """(3,) contact position; None for a sum"""
     missing: tuple[str, ...] = ()
-    """links whose contacts aren't included, as their force or position isn't valid"""
+    """links that aren't included: without a valid sample, or a contact without valid force or position"""
 
 
 class GraspMatrix(NamedTuple):

@@ -36,6 +36,7 @@ struct Contact {
     std::int64_t session = 0, seq = 0, t_ns = 0, begin_ns = 0, id = 0, group = 0;
     std::string event, hand, link, end_reason, calibration_id, force_status;
     bool retained = false;
+    bool fresh = true;  // false while samples are missing: values of the last sample
     double duration_s = 0.0, age_s = 0.0, begin_threshold_n = 0.0, end_threshold_n = 0.0;
     Place in_link, in_palm, in_base;
     std::optional<Vector<2>> pad_m;
@@ -167,6 +168,7 @@ inline Contact decode_contact(std::string_view payload) {
     made.calibration_id = map.at("calibration_id").as_text();
     made.force_status = map.at("force_status").as_text();
     made.retained = map.at("retained").as_bool();
+    if (const Value* fresh = map.find("fresh")) made.fresh = fresh->as_bool();
     made.duration_s = map.at("duration_s").as_double();
     made.age_s = map.at("age_s").as_double();
     made.begin_threshold_n = map.at("begin_threshold_n").as_double();
