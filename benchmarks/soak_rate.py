@@ -68,7 +68,7 @@ LIMIT_S = 8.0
 MISSED = 1e-3
 """Fraction of late samples or skipped periods above which a run counts as overrun"""
 PERIOD_NS = 1_000_000
-HEARTBEAT_SYNCS = 100
+HEARTBEAT_S = 0.1
 """Heartbeat period of a node"""
 BOOT_PERIOD_NS = 50_000_000
 SAMPLES = 1000
@@ -111,6 +111,7 @@ class Nodes:
     def __init__(self, deployment: Deployment, samples: NDArray[np.int64]) -> None:
         self._pads = [pad for hand in deployment.hands for pad in hand.pads]
         self._names = [bus.name for bus in deployment.buses]
+        self._period_ms = deployment.daemon.sync_period_ms
         self._buses: list[Any] = [can.Bus(bus.channel, interface="virtual") for bus in deployment.buses]
         self._simulated = []
         for name, bus in zip(self._names, self._buses, strict=True):
@@ -155,7 +156,8 @@ class Nodes:
         """Return the nodes of one bus, with samples (k, pads, 4)."""
         numbers = [(n, pad.node_id) for n, pad in enumerate(self._pads) if pad.bus == name]
         frames = [[frame(0x280 + node_id, row[n].tobytes()) for n, node_id in numbers] for row in data]
-        return Answers(frames, [frame(0x700 + node_id, b"\x05") for _, node_id in numbers])
+        alive = [frame(0x700 + node_id, b"\x05") for _, node_id in numbers]
+        return Answers(frames, alive, max(len(alive), round(HEARTBEAT_S * 1e3 / self._period_ms)))
 
 
 class Answers(queue.Queue[can.Message]):
@@ -163,9 +165,11 @@ class Answers(queue.Queue[can.Message]):
 
     inbox: Any
 
-    def __init__(self, frames: list[list[can.Message]], alive: list[can.Message]) -> None:
+    def __init__(
+        self, frames: list[list[can.Message]], alive: list[can.Message], heartbeat_syncs: int
+    ) -> None:
         super().__init__()
-        self._frames, self._alive = frames, alive
+        self._frames, self._alive, self._heartbeat_syncs = frames, alive, heartbeat_syncs
         self.count = self.busy_ns = 0
 
     def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:  # noqa: ARG002
@@ -176,7 +180,7 @@ class Answers(queue.Queue[can.Message]):
         put = self.inbox.put
         for answer in self._frames[self.count % len(self._frames)]:
             put(answer)
-        turn = self.count % HEARTBEAT_SYNCS
+        turn = self.count % self._heartbeat_syncs
         if turn < len(self._alive):
             put(self._alive[turn])
         self.count += 1
@@ -304,7 +308,9 @@ def watch(
         "longest_queue": longest,
         "hot_core": (busy_s - feeding_s) / took_s,
         "generator_core": feeding_s / took_s,
-        "sustained": missed <= MISSED * samples and overruns <= MISSED * rate_hz * took_s,
+        "sustained": missed <= MISSED * samples
+        and overruns <= MISSED * rate_hz * took_s
+        and taken >= (1 - 10 * MISSED) * samples,  # no node timed out
     }
 
 

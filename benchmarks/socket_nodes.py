@@ -10,6 +10,7 @@ import multiprocessing
 import select
 import socket
 import struct
+import time
 from typing import Any
 
 import can
@@ -20,7 +21,8 @@ from handtouch.config import Deployment
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.device import DeviceBus
 
-HEARTBEAT_SYNCS = 100
+HEARTBEAT_S = 0.1
+"""Period of a node's heartbeat"""
 _FRAME = struct.Struct("=IB3x8s")
 _SYNC = _FRAME.pack(0x80, 0, b"")
 _QUEUE_BYTES = 4 << 20
@@ -129,8 +131,9 @@ def _answer(
     counts: Any,
     fed: Any,
 ) -> None:
-    """Answer each SYNC on each end, with a heartbeat now and then."""
+    """Answer each SYNC on each end; send the heartbeats of its nodes in turn."""
     fed.wait()
+    sent_heartbeats, start_s = [0] * len(ends), time.monotonic()
     numbers = {end.fileno(): number for number, end in enumerate(ends)}
     poll = select.poll()
     for end in ends:
@@ -143,7 +146,9 @@ def _answer(
                 continue
             for frame in answers[number][count % len(answers[number])]:
                 end.send(frame)
-            turn = count % HEARTBEAT_SYNCS
-            if turn < len(heartbeats[number]):
-                end.send(heartbeats[number][turn])
             counts[number] = count + 1
+            nodes = len(heartbeats[number])
+            due = int((time.monotonic() - start_s) / HEARTBEAT_S * nodes)
+            for turn in range(max(sent_heartbeats[number], due - nodes), due):
+                end.send(heartbeats[number][turn % nodes])
+            sent_heartbeats[number] = due
