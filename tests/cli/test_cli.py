@@ -107,3 +107,16 @@ def test_closed_output_pipe_is_no_error() -> None:
     done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 0
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "closest"),
+    [(["statsu"], "status"), (["keys", "lst", "x"], "list"), (["log", "wanring"], "warning")],
+)
+def test_an_unknown_command_or_choice_is_reported_with_the_closest(
+    arguments: list[str], closest: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert f"did you mean '{closest}'?" in capsys.readouterr().err

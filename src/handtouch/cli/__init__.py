@@ -24,7 +24,7 @@ from handtouch.cli import (
     recording,
     setup,
 )
-from handtouch.cli.options import EXIT_STATUS_HELP, LazyFunction
+from handtouch.cli.options import EXIT_STATUS_HELP, LazyFunction, SuggestingParser
 
 COMMAND_GROUPS = (daemons, monitoring, recording, control, bridge, keys, setup, calibrations, node)
 """Modules with a function `add`, in the order of `--help`."""
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    parser = argparse.ArgumentParser(
+    parser = SuggestingParser(
         prog="handtouch",
         epilog=EXIT_STATUS_HELP,
         description="Middleware for tactile sensors of a robot hand: reads CANopen sensor nodes and "

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 EXIT_STATUS_HELP = "Exit status: 0 success; 1 failure, or a problem was found; 2 wrong usage or invalid file."
 
@@ -30,6 +32,19 @@ class LazyFunction:
 
     def __call__(self, **options: Any) -> int:
         return self.load()(**options)
+
+
+class SuggestingParser(argparse.ArgumentParser):
+    """Parser whose error for an unknown command or choice names the closest one, if one is close."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the error, and exit with status 2."""
+        found = re.fullmatch(r"(.*invalid choice: '(.*)') \(choose from (.*)\)", message, re.DOTALL)
+        if found is not None:
+            choices = re.findall(r"[\w-]+", found[3])
+            if close := difflib.get_close_matches(found[2], choices, 1):
+                message = f"{found[1]}; did you mean {close[0]!r}?"
+        super().error(message)
 
 
 def add_command(commands: Subparsers, name: str, function: str, text: str) -> argparse.ArgumentParser:
