@@ -19,7 +19,7 @@ import matplotlib
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, table
+from page import made_by, options, output_folder, progress, table
 from scipy.special import ndtri
 from scores import Estimates, EstimateScore, laplace_covariance
 
@@ -103,6 +103,7 @@ def efficiency(trials: int) -> list[dict[str, Any]]:
                     f"{method}: not converged": float(1 - found.converged.mean()),
                 }
             rows.append(row)
+        progress(f"efficiency on a pad of {label}")
     return rows
 
 
@@ -119,6 +120,7 @@ def false_alarms(trials: int) -> list[dict[str, Any]]:
         for rate in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
             count, expected = int((score > -ndtri(rate / 2)).sum()), rate * trials
             row[f"at {rate:.0e}"] = f"{count / expected:.2f} +- {expected**-0.5:.2f}"
+        progress(f"false alarms with noise {noise:g}")
         rows.append(row)
     return rows
 

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
+from page import made_by, options, output_folder, progress
 from ratio_table import RatioTable
 from scipy.special import elliprf
 
@@ -216,6 +216,7 @@ def measure(label: str, pad: Rectangle, name: str, bulk: int) -> Row | None:
         error = np.hypot(found[0] - x, found[1] - y) / min(pad.a, pad.b)
         sixteen = np.ascontiguousarray(currents[:, :16])
         times = microseconds(partial(locate, sixteen)), microseconds(partial(locate, currents)) / bulk
+    progress(f"pad {label}: {name}")
     return Row(label, name, float(np.where(np.isnan(error), np.inf, error).max()), *times)
 
 

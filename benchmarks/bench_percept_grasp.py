@@ -1,7 +1,7 @@
 """Compare percepts of grasps with MuJoCo's ground truth: slip, stiffness, shape.
 
 The shipped hand closes on a ball, a box, a pen and a cup, squeezes twice, and each is pulled out of the hand,
-slipping; pads, joints and sheets have the errors of bench_grasp. Writes
+slipping, in the world `default`. Writes
 docs/benchmarks/percept_grasp.{md,json}. Quick: --seeds 1 --objects ball.
 """
 
@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from page import made_by, options, output_folder
+from page import made_by, options, output_folder, progress
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from grasp_run import Served, served, usual
+from grasp_run import Served, drawn_world, served
 from numpy.typing import NDArray
 
 from handtouch import wire
@@ -490,8 +490,8 @@ def main() -> None:
     runs = []
     for seed in range(1, args.seeds + 1):
         for name in args.objects:
-            runs.append(served(deployment, name, seed, usual(seed), perceive=True))
-            print(f"seed {seed}: {name}, {len(runs[-1].percepts)} percepts", flush=True)
+            runs.append(served(deployment, name, seed, drawn_world("default", seed), perceive=True))
+            progress(f"seed {seed}: {name}, {len(runs[-1].percepts)} percepts")
     runs.sort(key=lambda run: args.objects.index(run.grasp.grasped_object.name))
     print(write({"mujoco": mujoco.__version__} | collect(runs), args.seeds, output_folder(args.quick)))
 

@@ -1,4 +1,6 @@
-"""Measure the sheet models: agreement with the paper's experiments, compensation, cost.
+"""Measure the sheet models: agreement with the paper's experiments, power laws as modes, cost.
+
+For errors of compensation on the sheets of the worlds see bench_supervise.
 
 Prints its tables and writes docs/benchmarks/sheet.md, sheet.json and sheet.png.
 """
@@ -160,48 +162,7 @@ def history() -> tuple[float, float]:
     return float(added / fresh[0]), float(back / fresh[1])
 
 
-# Residual errors of compensation
-
-
-def loops() -> Rows:
-    """Return the width of a loop 0 - 5 N - 0 at half load, in % of 5 N, one minute up and down."""
-    model = replace(
-        calm(S1), hysteresis=PrandtlIshlinskii.from_width(LOOP, FULL_N), creep=Creep.power_law(0.05)
-    )
-    wrong = replace(
-        model,
-        hysteresis=PrandtlIshlinskii.from_width(0.8 * LOOP, FULL_N),
-        creep=Creep.power_law(0.04),
-        adaptation=replace(S1.adaptation, time_s=3750.0),
-    )
-    rows = []
-    for name, known in (
-        ("all parameters known", model),
-        ("hysteresis, creep and adaptation 20 % low", wrong),
-    ):
-        state, compensator = model.initial_state(1), SheetCompensator(known, 1)
-        load = np.concatenate([np.linspace(0, FULL_N, 601), np.linspace(FULL_N, 0, 601)[1:]])
-        apparent, found, stated = np.empty((3, len(load)))
-        for i, value in enumerate(load):
-            reading = model.discretise(0.1).forward(state, np.full(1, value))
-            apparent[i], found[i] = reading[0], compensator.compensate(reading, 0.1)[0]
-            stated[i] = compensator.std_n()[0]
-        rows.append(
-            {
-                "model": name,
-                "loop before, %": percent(apparent[900] - apparent[300]),
-                "after, %": percent(found[900] - found[300]),
-                "worst error before, %": percent(apparent - load),
-                "worst error after, %": percent(found - load),
-                "greatest stated std, %": percent(stated),
-            }
-        )
-    return rows
-
-
-def percent(value_n: npt.ArrayLike) -> float:
-    """Return the greatest difference, in % of full scale."""
-    return float(np.abs(value_n).max() / FULL_N * 100)
+# Power laws
 
 
 def prony() -> Rows:
@@ -361,12 +322,6 @@ def main() -> None:
             "model was; *follows*: nothing was chosen for it. The paper gives no decay "
             "times and no split into runs: these are ours.",
             experiments(),
-        ),
-        "Residual errors of compensation": (
-            "S1 with a loop of 10 % and power-law creep (exponent 0.05), 0 to 5 N and back in two minutes, "
-            "without fluctuation; % of 5 N. The worst error of a known sheet is at the end, where the "
-            "load is less than the back force, without response. Stated: with the default uncertainty.",
-            loops(),
         ),
         "Power law as a sum of exponentials": (
             "Greatest relative error of t^p from 1 ms to 1 h, by number of modes.",

@@ -1,6 +1,6 @@
 """Process one MuJoCo grasp with the daemon's pipeline, and compare the output with MuJoCo's ground truth.
 
-Public names: `usual` (world), `served` -> `Served`; `against` and `at_best` score its contacts. Samples enter
+Public names: `drawn_world`, `served` -> `Served`; `against` and `at_best` score its contacts. Samples enter
 at
 200 Hz, joint states at 100 Hz through the decoder of the inputs endpoint, in the order of their arrival, not
 in real time.
@@ -51,9 +51,9 @@ _START_NS = 1_000_000_000
 _PER_TICK = 5  # steps of MuJoCo
 
 
-def usual(seed: int) -> DrawnWorld:
-    """Return a world of tolerances of parts, misaligned pads and encoders, and delayed joint states."""
-    return WORLDS["default"].only("parts", "mounts", "contacts").draw(Family.REPORTING.seed(seed))
+def drawn_world(name: str, seed: int) -> DrawnWorld:
+    """Return a named world of the reporting family, with misaligned pads and late joint states."""
+    return WORLDS[name].draw(Family.REPORTING.seed(seed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +98,12 @@ def served(
     duration_s: float = DURATION_S,
     done: GraspRecord | None = None,
 ) -> Served:
-    """Let the first hand grasp and process the samples.
+    """Let the first hand grasp and process the samples; its file describes sheets as their builder would.
 
     `assumed_radius` replaces the discs of each pad by one of the radius that the force estimate assumes;
     `perceive` requests all percepts; `done` is the grasp if it has been simulated already.
     """
+    deployment = world.describe(deployment)
     hand = deployment.hands[0]
     grasp = done or simulate_grasp(hand, name, seed, world, duration_s=duration_s)
     patches = contact_patches(grasp)
