@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from page import made_by, options, output_folder, progress
+from scores import Share
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -33,6 +34,7 @@ from handtouch.config import (
 )
 from handtouch.simulate.grasp.event_score import EventScore
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
+from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -71,23 +73,38 @@ def position_errors(runs: Sequence[Served], wide: bool | None = None) -> dict[st
     }
 
 
-def covered(runs: Sequence[Served], wide: bool | None = None, stated: bool = True) -> list[float]:
-    """Return samples, fraction within the reported 95 % region, and median reported standard deviation [mm].
+def covered(runs: Sequence[Served], wide: bool | None = None, stated: bool = True) -> dict[str, Any]:
+    """Return touches, the share within the reported 95 % region, and median reported std [mm].
 
-    Without stated mounts the region is flat, and errors count in its plane.
+    One sample of each touch, as samples of one touch share its errors. Without stated mounts the region is
+    flat, and errors count in its plane.
     """
     inside, size, dimensions = [], [], 3 if stated else 2
     for run in runs:
-        rows = chosen(run, wide)
+        rows = chosen(run, wide) & one_of_each_touch(run)
         values, axes = np.linalg.eigh(run.covariance_m2[rows])
         along = np.einsum("kji,kj->ki", axes, total(run)[rows])[:, -dimensions:]
         squared = (along**2 / np.maximum(values[:, -dimensions:], 1e-18)).sum(1)
         inside.append(squared < _WITHIN_95[dimensions])
         size.append(1e3 * np.sqrt(values.sum(1)))
     all_inside, sizes = np.concatenate(inside), np.concatenate(size)
-    if not len(sizes):
-        return [0]
-    return [len(sizes), float(np.mean(all_inside)), float(np.median(sizes))]
+    return {
+        "touches": len(sizes),
+        "within": str(Share.of_mask(all_inside)),
+        "std_mm": float(np.median(sizes)) if len(sizes) else None,
+    }
+
+
+def one_of_each_touch(run: Served) -> NDArray[np.bool_]:
+    """Return the mask (k,) of the sample nearest the middle of each reported contact."""
+    mask = np.zeros(len(run.step), np.bool_)
+    for pad, spans in enumerate(run.spans):
+        own = np.flatnonzero(run.pad == pad)
+        for begin_s, end_s in spans if len(own) else []:
+            middle = (begin_s + end_s) / 2
+            nearest = own[np.argmin(np.abs(run.step[own] * TIME_STEP_S - middle))]
+            mask[nearest] |= begin_s <= run.step[nearest] * TIME_STEP_S <= end_s
+    return mask
 
 
 def chosen(run: Served, wide: bool | None) -> NDArray[np.bool_]:
@@ -202,8 +219,9 @@ def write(figures: dict[str, Any], seeds: int, out: Path) -> str:
             f"| {of['late']} | {pair(of['begin_ms'])} | {pair(of['end_ms'])} | {f1} | {f1_end} |"
         )
 
-    def region_row(name: str, of: list[float]) -> str:
-        return f"| {name} | {of[0]} | {of[1]:.0%} | {of[2]:.3f} |" if of[0] else f"| {name} | 0 | | |"
+    def region_row(name: str, of: dict[str, Any]) -> str:
+        size = "" if of["std_mm"] is None else f"{of['std_mm']:.3f}"
+        return f"| {name} | {of['touches']} | {of['within']} | {size} |"
 
     objects = figures["objects"]
     position_rows = "\n".join(
@@ -256,9 +274,10 @@ zeros and noise of the joints; *time*: motion of the joints since their last sta
 centre of force. For a load along a line or on two points the currents give another centre, which differs
 by the square of their distance: four currents can't resolve it.
 
-Fraction of the true positions within the 95 % region of the reported covariance, and its size:
+True positions within the 95 % region of the reported covariance, in % with 95 % intervals, and its size; one
+sample of each touch:
 
-| | samples | within | reported std, mm |
+| | touches | within | reported std, mm |
 | --- | --- | --- | --- |
 {region_rows}
 
