@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,21 @@ def publisher(endpoints: dict[str, str]) -> Iterator[Any]:
         yield socket
 
 
-def _run(program: list[str], *arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen([*program, *arguments], stdout=subprocess.PIPE, text=True)
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Return a function that starts a program; it ends with the test."""
+    with contextlib.ExitStack() as stack:
+
+        def started(program: list[str], *arguments: str) -> subprocess.Popen[str]:
+            process = subprocess.Popen([*program, *arguments], stdout=subprocess.PIPE, text=True)
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            return process
+
+        yield started
 
 
 def _lines(process: subprocess.Popen[str]) -> list[dict[str, Any]]:
@@ -155,9 +169,9 @@ def _random_messages(count: int) -> Iterator[wire.Message]:
 
 
 def test_every_message_is_read_as_python_reads_it(
-    publisher: Any, endpoints: dict[str, str], programs: dict[str, list[str]]
+    publisher: Any, endpoints: dict[str, str], programs: dict[str, list[str]], start: Start
 ) -> None:
-    processes = [_run(program, "all", endpoints["live"], str(MESSAGES)) for program in programs.values()]
+    processes = [start(program, "all", endpoints["live"], str(MESSAGES)) for program in programs.values()]
     with connect("contact/*/*", "hand/*", endpoint=endpoints["live"], queue=2 * MESSAGES) as messages:
         for _ in range(len(processes) + 3):  # each has one subscription, the Python client three
             assert publisher.poll(1000 * LONGEST_S)
@@ -175,11 +189,13 @@ def test_every_message_is_read_as_python_reads_it(
 
 
 @pytest.mark.parametrize("program", LANGUAGES, indirect=True)
-def test_the_newest_frames_of_a_daemon_are_those_of_its_messages(working: Any, program: list[str]) -> None:
+def test_the_newest_frames_of_a_daemon_are_those_of_its_messages(
+    working: Any, program: list[str], start: Start
+) -> None:
     endpoint = working.endpoints["live"]
     with connect("contact/right/*", "hand/right", endpoint=endpoint, queue=100_000) as messages:
         assert messages.recv(LONGEST_S) is not None
-        lines = _lines(_run(program, "newest", endpoint, "100"))
+        lines = _lines(start(program, "newest", endpoint, "100"))
         frames = [line for line in lines if line["kind"] == "hand"]
         assert len(frames) == 100
         seqs = [line["seq"] for line in frames]
