@@ -2,7 +2,8 @@
 
 Each row repeats a figure of that check, made with its own seeds, pads, sheets and scenes, in worlds of the
 reporting family with the daemon's settings. `--as-found` keeps the figures as those before estimators
-changed; later runs are shown beside them, and without them that column is empty. Writes docs/benchmarks/claims.{md,json}.
+changed; later runs are shown beside them, and without them that column is empty. Writes
+docs/benchmarks/claims.{md,json}.
 """
 
 from __future__ import annotations
