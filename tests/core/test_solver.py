@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.field import estimate
 from handtouch.field.contact_law import ForceEstimateStatus
@@ -99,7 +99,9 @@ def test_a_contact_equals_its_reference(bench: Any, seed: int, total_a: float) -
     np.testing.assert_allclose(contacts.residual, expected.residual, atol=1e-5)
     np.testing.assert_allclose(contacts.residual_std, expected.residual_std, rtol=0.02)
     scale = np.abs(expected.covariance_m2).max(axis=(1, 2))[:, None, None]
-    np.testing.assert_allclose(contacts.covariance_m2 / scale, expected.covariance_m2 / scale, atol=0.03)
+    points = contacts.squared_misfit <= MAX_SQUARED_MISFIT  # the others have an extent
+    got, wanted = contacts.covariance_m2 / scale, expected.covariance_m2 / scale
+    np.testing.assert_allclose(got[points], wanted[points], atol=0.03)
 
 
 @settings(max_examples=30, deadline=None)
