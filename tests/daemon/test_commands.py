@@ -230,7 +230,7 @@ def test_snapshot_solves_unrequested_outputs_and_leaves_no_trace(served: Bench) 
     assert np.isnan(columns.position_m[0]).all()
     (contact,) = served.ask("snapshot")["contacts"]
     assert (contact["position_status"], contact["force_status"], contact["link"]) == (
-        "valid",
+        "unreliable",  # no point of a pad of 30 x 24 mm sends the same current to every electrode
         "valid",
         "plane",
     )
