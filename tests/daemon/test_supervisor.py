@@ -244,7 +244,7 @@ def test_fault_invalidates_force_and_position_until_it_ends(rig: Rig) -> None:
 
 def test_contacts_carry_the_effects_of_diagnoses_while_they_last(rig: Rig) -> None:
     rig.receive(
-        calibrate(0, 11),
+        calibrate(0, 11, gains=(1.0,) * 4),
         CalibrationAssessment(pad=0, serial=11, calibration_state=CalibrationState.CALIBRATED),
     )
     rig.touched = True
