@@ -105,7 +105,8 @@ def test_touch_on_moving_finger_is_reported_in_palm_until_joints_are_stale(
             elif isinstance(message, wire.HandFrame) and message.palm_status:
                 frame = columns(message)
                 row = message.links.index(LINK)
-                if frame["palm_status"][row] == wire.FrameStatus.VALID:
+                current = frame["joints_age_s"][row] < MAX_JOINTS_AGE_S
+                if current and frame["palm_status"][row] == wire.FrameStatus.VALID:
                     frames += 1
                     expected = palm_of(MOUNT_M, int(frame["sample_ns"][row]))
                     assert np.linalg.norm(frame["palm_position_m"][row] - expected) < 1e-3
