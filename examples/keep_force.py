@@ -1,7 +1,8 @@
 """Grip an object that relaxes with a constant force.
 
-`ForceControl` is a PI controller of the closing speed. Deviations within the force's standard deviation are
-ignored, so that it doesn't follow noise. It stops where the force isn't valid.
+`ForceControl` is a PI controller of the closing speed. Small deviations are ignored, so that it doesn't follow
+noise; the force's standard deviation is no measure of noise, as it contains the tolerances of parts, which don't
+change. It stops where the force isn't valid.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from handtouch.wire import Contact
 
 P_M_S_N = 0.004  # times the object's stiffness, about 2 N/mm: 8 per second
 I_M_S_NS = 0.004
+NOISE_N = 0.02
 MAX_SPEED_M_S = 0.02
 MAX_STEP_S = 0.05  # integration step after a missed sample
 
@@ -31,10 +33,10 @@ class ForceControl:
 
     def speed_m_s(self, contact: Contact) -> float:
         """Return the closing speed of both fingers. Raises RuntimeError where the force isn't valid."""
-        if contact.force_status != "valid" or contact.force_n is None or contact.force_std_n is None:
+        if contact.force_status != "valid" or contact.force_n is None:
             raise RuntimeError(f"{contact.link}: force_status is {contact.force_status}")
         deviation_n = self.force_n - contact.force_n
-        error_n = math.copysign(max(abs(deviation_n) - contact.force_std_n, 0.0), deviation_n)
+        error_n = math.copysign(max(abs(deviation_n) - NOISE_N, 0.0), deviation_n)
         passed_s = 0.0 if self._last_ns is None else min(1e-9 * (contact.t_ns - self._last_ns), MAX_STEP_S)
         self._last_ns = contact.t_ns
         self._sum_ns = self._sum_ns + error_n * passed_s if error_n else 0.0
