@@ -161,7 +161,7 @@ def shares(control: str, pid: int, view_pid: int | None, seconds: float) -> dict
         after["ticks"] - before["ticks"],
     )
     stages = after["loop"]["stages"]
-    perceive_s = stages["perceive"]["sum_s"] - before["loop"]["stages"]["perceive"]["sum_s"]
+    perceive_s = stages["percepts"]["sum_s"] - before["loop"]["stages"]["percepts"]["sum_s"]
     counts = [late["loop"]["latency"]["counts"] for late in (before, after)]
     return row | {
         "tick_ms": 1e3 * loop_s / max(1, ticks),

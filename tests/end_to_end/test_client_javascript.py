@@ -157,7 +157,7 @@ def _service(seq: int, session: int = 1, retained: bool = False) -> wire.Service
         "core_compiled": True,
         "subscriptions": (),
     }
-    values |= {"inputs": {}, "supervisor": None}
+    values |= {"inputs": {}, "supervisor": None, "percepts": None}
     return wire.Service(**{**values, "retained": retained})
 
 

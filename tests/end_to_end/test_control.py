@@ -19,7 +19,7 @@ from handtouch.client import request
 from handtouch.config import load
 
 LONGEST_S = 60.0
-PRESS = [900, 700, 800, 600]
+PRESS = [1311, 1021, 415, 253]  # as of a point near the middle of palm_heel
 BASELINE = [6, -5, 4, 6]
 NODES = """
 import sys, time

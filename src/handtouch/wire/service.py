@@ -34,7 +34,7 @@ class LoopStatistics(TypedDict):
     """time from the last sample of a tick to its last message"""
     stages: dict[str, DurationHistogram]
     """stage of the loop -> time per period; the stages are `sync`, `wait`, `receive`, `tick`, `send`,
-    `percepts`, `settle`, `supervise`, `nodes`, `report`, `requests` and `warm_caches`"""
+    `percepts`, `settle`, `supervise`, `nodes`, `report` and `requests`"""
     late: dict[str, int]
     """longest stage (or `wake_up_delay`: the thread was not scheduled in time) -> late ticks, whose messages
     were sent more than a period after their SYNC or never"""
