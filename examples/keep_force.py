@@ -1,8 +1,8 @@
 """Grip an object that relaxes with a constant force.
 
-`ForceControl` is a PI controller of the closing speed. Small deviations are ignored, so that it doesn't follow
-noise; the force's standard deviation is no measure of noise, as it contains the tolerances of parts, which don't
-change. It stops where the force isn't valid.
+`ForceControl` is a PI controller of the closing speed. Small deviations are ignored, so that it doesn't
+follow noise; the force's standard deviation is no measure of noise, as it contains the tolerances of parts,
+which don't change. It stops where the force isn't valid.
 """
 
 from __future__ import annotations

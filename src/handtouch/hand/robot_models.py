@@ -148,7 +148,7 @@ def _hand_problems(number: int, hand: HandTable) -> Iterator[Problem]:
         )
     if not hand.urdf:
         for key in _KEYS_REQUIRING_URDF:
-            if value := getattr(hand, key):
+            if key in hand.model_fields_set and (value := getattr(hand, key)):
                 yield Problem(f"{location}{key}", _value_text(value), "needs a URDF, and urdf is missing")
         return
     try:
