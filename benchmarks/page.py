@@ -89,11 +89,11 @@ def keep_run_time(folder: Path, name: str, entry: dict[str, Any]) -> None:
     all_bench = [row["minutes"] for program, row in known.items() if program.startswith("bench_")]
     note = (
         "Of the last full run of each program: wall time, processor time of all its processes, and the load "
-        f"average when it ended. `make bench` runs the {len(all_bench)} benchmarks listed here one after the "
-        f"other, in {sum(all_bench):.0f} minutes."
+        f"average when it ended. The benchmarks listed here take {sum(all_bench):.0f} minutes one after the "
+        "other."
     )
-    before = readme.read_text().partition(RUN_TIMES_HEAD)[0] if readme.exists() else ""
-    readme.write_text("\n".join([before + RUN_TIMES_HEAD, *textwrap.wrap(note, 110), "", *lines, ""]))
+    before = readme.read_text().partition(RUN_TIMES_HEAD)[0].rstrip() if readme.exists() else ""
+    readme.write_text("\n".join([f"{before}\n\n{RUN_TIMES_HEAD}", *textwrap.wrap(note, 110), "", *lines, ""]))
 
 
 def _note_run_time(folder: Path, name: str, process: int) -> None:
