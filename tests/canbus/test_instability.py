@@ -335,6 +335,19 @@ def test_changed_setting_is_repaired_and_named(
     assert [rig.state(n) for n in (1, 2)] == [OPERATIONAL] * 2, rig.status(1).reason
 
 
+def test_changes_that_are_minutes_apart_are_all_repaired(make_rig: Make) -> None:
+    """Also of a node that other faults interrupt meanwhile."""
+    rig = make_rig(1, device=EDS)
+    rig.boot()
+    for _ in range(5):
+        rig.node(1).write_object(0x1801, 2, 240)
+        assert any(e.new_state is NodeState.BOOTING for e in rig.run(3000))
+        assert rig.state(1) is OPERATIONAL
+        rig.run(30_000)
+        rig.node(1).write_object(0x1017, 0, 0)
+        rig.run(32_000)
+
+
 def test_changed_setting_is_repaired_three_times_then_reported(make_rig: Make) -> None:
     rig = make_rig(1, device=EDS)
     rig.boot()

@@ -43,9 +43,10 @@ from handtouch.canbus.nodes.transitions import (
     begin_boot,
     count_restart,
     enter,
-    forget_if_stable,
 )
 
+_REPAIR_MEMORY_NS = 60_000_000_000
+"""Time since the last repair after which the next one isn't one in a row."""
 _NO_HEARTBEAT_REASON = (
     "answers over SDO, but sends no heartbeat although its heartbeat time is set (0x1017): "
     "its firmware may hang; power-cycle it"
@@ -302,14 +303,15 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
 
 def _repair_settings(life: Lifecycle, difference: str, now_ns: int, timing: NodeTiming) -> Transition:
     """Configure a stale node again whose settings have changed, a few times."""
-    life = forget_if_stable(life, now_ns, timing)
+    if now_ns - life.repaired_ns > _REPAIR_MEMORY_NS:
+        life = replace(life, repairs=0)
     if life.repairs >= MAX_REPAIRS:
         reason = (
             f"no samples: {difference}, again after {MAX_REPAIRS} repairs; does another master or a "
             "configuration tool write it?"
         )
         return replace(enter(life, NodeState.STALE, now_ns, reason), due_ns=NEVER_NS), ()
-    life = replace(life, repairs=life.repairs + 1)
+    life = replace(life, repairs=life.repairs + 1, repaired_ns=now_ns)
     return begin_boot(life, now_ns, f"settings changed since its boot: {difference}; repaired", timing)
 
 

@@ -114,7 +114,8 @@ class Lifecycle:
     foreign_nmt_ns: int = 0
     checks: int = 0  # of its settings, since it was stale
     first_check_ns: int = -(1 << 62)  # time of the first of them
-    repairs: int = 0  # of changed settings
+    repairs: int = 0  # of changed settings, in close succession
+    repaired_ns: int = 0  # time of the last one
     boot_reason: str = ""  # cause of the present boot
     standby: bool = False  # not needed now: configured, but stopped instead of started
 

@@ -14,8 +14,6 @@ Transition = tuple[Lifecycle, tuple[NodeAction, ...]]
 
 NEVER_NS = 1 << 62
 STARTED = frozenset({NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE})
-_REPAIR_MEMORY_NS = 60_000_000_000
-"""Operation after which repairs of changed settings are counted from 0 again."""
 
 
 def enter(life: Lifecycle, state: NodeState, now_ns: int, reason: str) -> Lifecycle:
@@ -64,5 +62,4 @@ def forget_if_stable(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifecy
     operated_ns = now_ns - life.operational_ns if life.operational_ns else 0
     if operated_ns > timing.max_retry_ns:
         life = replace(life, restarts=0, boot_ups=0, reset_sent=False)
-    repairs = 0 if operated_ns > _REPAIR_MEMORY_NS else life.repairs
-    return replace(life, repairs=repairs, operational_ns=0)
+    return replace(life, operational_ns=0)
