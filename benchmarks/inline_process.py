@@ -16,8 +16,8 @@ class InlineProcess(ChildProcess):
 
     def __init__(self, deployment: Deployment) -> None:
         super().__init__("", "percept", lambda: b"")
-        self._worker = PerceptWorker(deployment)
-        self._waiting: list[bytes] = []
+        self.worker = PerceptWorker(deployment)
+        self.waiting: list[bytes] = []
 
     @property
     def pid(self) -> int | None:
@@ -34,10 +34,10 @@ class InlineProcess(ChildProcess):
 
     def send(self, message: bytes) -> bool:
         """Process a message at once."""
-        self._waiting += map(pack_message, self._worker.process_input(unpack_input(message)))
+        self.waiting += map(pack_message, self.worker.process_input(unpack_input(message)))
         return True
 
     def receive(self, now_ns: int, max_messages: int = 8) -> list[bytes]:  # noqa: ARG002
         """Return what the worker has sent."""
-        received, self._waiting = self._waiting[:max_messages], self._waiting[max_messages:]
+        received, self.waiting = self.waiting[:max_messages], self.waiting[max_messages:]
         return received

@@ -11,8 +11,10 @@ import sysconfig
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
 from hypothesis import HealthCheck, settings
 
 from tests.starter import Starter, find_port, own_endpoints
@@ -58,6 +60,17 @@ def endpoints() -> Iterator[dict[str, str]]:
     """ZeroMQ endpoints for a `[daemon]` table, private to this test."""
     with own_endpoints() as made:
         yield made
+
+
+@pytest.fixture
+def publisher(endpoints: dict[str, str]) -> Iterator[Any]:
+    """An XPUB socket in the place of a daemon's live stream; it reports every subscription."""
+    with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.SNDHWM, 0)
+        socket.setsockopt(zmq.XPUB_VERBOSE, 1)
+        socket.bind(endpoints["live"])
+        yield socket
 
 
 @pytest.fixture

@@ -13,19 +13,11 @@ begin_samples = 2
 end_samples = 2
 """
 EXACT_NODE = "gain_std = 0.0\nseries_std = 0.0\n"
-EXACT_SHEET = "".join(
-    f"{name} = 0.0\n"
-    for name in (
-        *(
-            "ohm_per_square_std",
-            "contact_ohm_std",
-            "alpha_std",
-            "anisotropy_std",
-            "gap_std_mm",
-            "size_std_mm",
-        ),
-    )
+SHEET_TOLERANCES = (
+    *("ohm_per_square_std", "contact_ohm_std", "alpha_std"),
+    *("anisotropy_std", "gap_std_mm", "size_std_mm"),
 )
+EXACT_SHEET = "".join(f"{name} = 0.0\n" for name in SHEET_TOLERANCES)
 
 
 def deployment_text(

@@ -11,7 +11,6 @@ from typing import Any, assert_type
 
 import numpy as np
 import pytest
-import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -236,16 +235,6 @@ def test_the_directions_of_a_contact_are_a_right_handed_frame(normal: tuple[floa
 
 
 # --- connection
-
-
-@pytest.fixture
-def publisher(endpoints: dict[str, str]) -> Iterator[Any]:
-    with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.SNDHWM, 0)
-        socket.setsockopt(zmq.XPUB_VERBOSE, 1)
-        socket.bind(endpoints["live"])
-        yield socket
 
 
 def _join(publisher: Any, count: int = 3) -> None:

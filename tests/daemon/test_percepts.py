@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from inline_process import InlineProcess
 
 from handtouch import wire
 from handtouch.config.tables import SceneRequest
@@ -19,11 +20,9 @@ from handtouch.core.scene import (
     Demand,
     RequestedOutputs,
 )
-from handtouch.daemon.child_process import ChildProcess
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.percept.messages import PerceptMessageError, pack_message, unpack_input, unpack_output
 from handtouch.percept.shape import pair_distance
-from handtouch.percept.worker import PerceptWorker
 from handtouch.view.message_lines import message_line
 from handtouch.wire import PERCEPT_KINDS, PadState
 
@@ -34,36 +33,20 @@ def _no_commands(hand: str, t_ns: int) -> None:
     """Return no joint commands."""
 
 
-class WorkerHere(ChildProcess):
-    """The worker of the percept process in this process, reached by the same messages."""
+class ObservedProcess(InlineProcess):
+    """The worker in this process; what is sent to it can be read, and refused."""
 
     def __init__(self, deployment: Any) -> None:
-        super().__init__("", "percept", lambda: b"")
-        self.worker = PerceptWorker(deployment)
-        self.waiting: list[bytes] = []
+        super().__init__(deployment)
         self.received: list[wire.PerceptInput] = []
         self.full = False
         """messages to it are dropped"""
 
-    @property
-    def pid(self) -> int | None:
-        return 1 if self.enabled else None
-
-    def start(self, now_ns: int) -> None:  # noqa: ARG002
-        self.enabled = True
-
-    def poll(self, now_ns: int) -> bool:  # noqa: ARG002
-        return False
-
     def send(self, message: bytes) -> bool:
-        if not self.full:
-            self.received.append(unpack_input(message))
-            self.waiting += map(pack_message, self.worker.process_input(self.received[-1]))
-        return not self.full
-
-    def receive(self, now_ns: int, max_messages: int = 8) -> list[bytes]:  # noqa: ARG002
-        received, self.waiting = self.waiting[:max_messages], self.waiting[max_messages:]
-        return received
+        if self.full:
+            return False
+        self.received.append(unpack_input(message))
+        return super().send(message)
 
 
 class Rig:
@@ -75,7 +58,7 @@ class Rig:
         self._bench = bench
         self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
         self.pipeline.node_state[:] = PadState.CLEAR
-        self.process = WorkerHere(bench.deployment)
+        self.process = ObservedProcess(bench.deployment)
         self.percepts = PerceptPublisher(
             bench.deployment,
             self.pipeline,

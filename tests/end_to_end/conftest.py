@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,6 +49,21 @@ duration_s = 0.9
 path = [[0.5, 0.3], [0.3, 0.8]]
 force_n = [2.0]
 """
+
+
+@contextlib.contextmanager
+def run_in_threads(*targets: Callable[[threading.Event], object]) -> Iterator[None]:
+    """Run functions side by side until the end of the block, which sets the event that each is given."""
+    stop = threading.Event()
+    threads = [threading.Thread(target=target, args=(stop,)) for target in targets]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
 
 
 class Rig:

@@ -13,7 +13,6 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-import zmq
 
 from handtouch import wire
 from handtouch.client import columns, connect
@@ -35,16 +34,6 @@ def programs(cpp: Path, javascript: Path) -> dict[str, list[str]]:
 def program(request: pytest.FixtureRequest, programs: dict[str, list[str]]) -> list[str]:
     """Command of one language."""
     return programs[request.param]
-
-
-@pytest.fixture
-def publisher(endpoints: dict[str, str]) -> Iterator[Any]:
-    with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.SNDHWM, 0)
-        socket.setsockopt(zmq.XPUB_VERBOSE, 1)
-        socket.bind(endpoints["live"])
-        yield socket
 
 
 Start = Callable[..., subprocess.Popen[str]]

@@ -23,6 +23,8 @@ from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.worlds import WORLDS
 from tests.deployments import deployment_text, pad_text
 
+from .conftest import run_in_threads
+
 PERIOD_MS, MAX_WAIT_S = 5.0, 90.0
 MAX_GROWTH_BYTES = 32 << 20
 SCENARIO = """
@@ -92,7 +94,6 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         daemon=f"sync_period_ms = {PERIOD_MS}\nsample_window_fraction = 0.9\nsupervise = false",
     )
     deployment = in_process_deployment(parse(text))
-    stop = threading.Event()
     folder: Path = tmp_path_factory.mktemp("percepts")
     hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), WORLDS["ideal"].draw(1))
     with (
@@ -103,18 +104,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     ):
         hand.start()
         made = Bench(daemon)
-        threads = [
-            threading.Thread(target=daemon.run, args=(stop,)),
-            threading.Thread(target=made.listen, args=(stop,)),
-        ]
-        for thread in threads:
-            thread.start()
-        try:
+        with run_in_threads(daemon.run, made.listen):
             yield made
-        finally:
-            stop.set()
-            for thread in threads:
-                thread.join()
 
 
 def _with_thicker_sheet(deployment: Deployment) -> Deployment:

@@ -28,6 +28,8 @@ from handtouch.simulate.worlds import WORLDS
 from tests.deployments import deployment_text, pad_text
 from tests.wire.schema_check import SchemaCheck
 
+from .conftest import run_in_threads
+
 PERIOD_MS = 5.0
 MAX_WAIT_S = 60.0
 """Upper limit of every wait."""
@@ -133,25 +135,14 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     deployment = in_process_deployment(parse(DEPLOYMENT + pads))
     settings = deployment.daemon.model_copy(update={"supervise": True})
     deployment = deployment.model_copy(update={"daemon": settings})
-    stop = threading.Event()
     hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), WORLDS["ideal"].draw(1))
     with hand, HandtouchDaemon.open(deployment, folder=folder) as daemon:
         for number, device in enumerate(hand.devices.values()):
             device.replace_device(1001 + number)
         hand.start()
         made = Bench(daemon, hand, folder / "calibrations.db")
-        threads = [
-            threading.Thread(target=daemon.run, args=(stop,)),
-            threading.Thread(target=made.listen, args=(stop,)),
-        ]
-        for thread in threads:
-            thread.start()
-        try:
+        with run_in_threads(daemon.run, made.listen):
             yield made
-        finally:
-            stop.set()
-            for thread in threads:
-                thread.join()
 
 
 def _errors_mm(contacts: list[wire.Contact], truth: list[GroundTruth]) -> list[float]:
@@ -255,20 +246,14 @@ def test_replaced_node_is_refused_if_configured(tmp_path: Path) -> None:
     deployment = in_process_deployment(parse(DEPLOYMENT + made_of))
     settings = deployment.daemon.model_copy(update={"supervise": True, "on_node_replaced": "refuse"})
     deployment = deployment.model_copy(update={"daemon": settings})
-    stop = threading.Event()
     hand = SimulatedHand.open(deployment, Scenario.parse(SCENARIO), WORLDS["ideal"].draw(1))
     with hand, HandtouchDaemon.open(deployment, folder=tmp_path) as daemon:
         next(iter(hand.devices.values())).replace_device(2002)
         hand.start()
         made = Bench(daemon, hand, tmp_path / "calibrations.db")
-        thread = threading.Thread(target=daemon.run, args=(stop,))
-        thread.start()
-        try:
+        with run_in_threads(daemon.run):
             made.wait("refused", lambda: _first_pad(daemon)["node_state"] == "faulted")
             pad = _first_pad(daemon)
-        finally:
-            stop.set()
-            thread.join()
     assert (pad["link"], pad["calibration_state"]) == ("swapped", "default")
     assert "1001" in pad["reason"]
     assert "2002" in pad["reason"]

@@ -29,6 +29,7 @@ from handtouch.simulate.worlds import (
     Uniform,
     World,
 )
+from tests.deployments import SHEET_TOLERANCES
 
 SEEDS = 400
 FloatArray = NDArray[np.float64]
@@ -236,16 +237,7 @@ def test_default_tolerances_of_a_deployment_are_those_of_the_default_world(
     for name in ("gain_std", "series_std"):
         default = config.Node.model_fields[name].default
         assert getattr(described.nodes["n"], name) == pytest.approx(default, rel=0.05)
-    for name in (
-        *(
-            "ohm_per_square_std",
-            "contact_ohm_std",
-            "alpha_std",
-            "anisotropy_std",
-            "gap_std_mm",
-            "size_std_mm",
-        ),
-    ):
+    for name in SHEET_TOLERANCES:
         default = config.Sheet.model_fields[name].default
         assert getattr(described.sheets["s"], name) == pytest.approx(default, rel=0.05)
 
