@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
 import socket
 import subprocess
+import tarfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -14,7 +17,9 @@ from typing import Any
 
 import pytest
 
+from handtouch.cli import main
 from handtouch.client import connect, keys, request
+from handtouch.record.recording import Recording
 
 from .conftest import START_S, Rig
 
@@ -185,3 +190,45 @@ def test_client_with_key_reconnects_when_the_daemon_restarts(reachable: Reachabl
         while after is not None and after.pid == before.pid:
             after = messages.recv(START_S)
         assert after is not None
+
+
+def test_a_support_archive_has_status_and_recording_and_no_secret(reachable: Reachable) -> None:
+    planted = "hunter2-Zx9"
+    reachable.config.write_text(f"# upload_token = {planted}\n{reachable.config.read_text()}")
+    reachable.start("run")
+    reachable.ask("pilot")
+    secrets = [planted, *(tomllib.loads(path.read_text())["secret_key"] for path in key_files(reachable))]
+    log = reachable.folder / "daemon.log"
+    log.write_text(f"started with password={planted}\nkey {secrets[1]} is loaded\nlast line\n")
+    contents: dict[str, bytes] = {}
+    while "recording.mcap" not in contents:  # a slow machine may receive nothing in time
+        archive = reachable.folder / "report.tar.gz"
+        archive.unlink(missing_ok=True)
+        done = reachable.run_command(
+            *("support", str(reachable.config), "--key", str(reachable.key("pilot")), "--seconds", "1"),
+            *("--log", str(log), "-o", str(archive)),
+        )
+        assert done.returncode in (0, 1), done.stderr
+        assert archive.stat().st_mode & 0o777 == 0o600
+        with tarfile.open(archive) as opened:
+            contents = {
+                Path(member.name).name: file.read()
+                for member in opened
+                if (file := opened.extractfile(member)) is not None
+            }
+    assert {"versions.json", "machine.txt", "deployment.toml", "doctor.json", "log-1.txt"} <= set(contents)
+    assert json.loads(contents["status.json"])["service"]["version"]
+    assert b"last line" in contents["log-1.txt"]
+    (reachable.folder / "recording.mcap").write_bytes(contents.pop("recording.mcap"))
+    topics = set()
+    for entry in Recording(reachable.folder / "recording.mcap"):
+        topics.add(entry.topic)
+        contents[entry.topic] = repr(entry.payload).encode()
+    assert "config" in topics
+    for name, content in contents.items():
+        assert not [secret for secret in secrets if secret.encode() in content], name
+    assert main(["support", "-o", str(archive)]) == 2  # never overwritten
+
+
+def key_files(reachable: Reachable) -> list[Path]:
+    return [reachable.keys / "server.key", reachable.key("reader"), reachable.key("pilot")]

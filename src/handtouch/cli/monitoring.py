@@ -1,13 +1,17 @@
-"""Arguments of the commands that show what a running daemon publishes: `watch`, `view`, `status`."""
+"""Arguments of the commands that show the state of a running daemon: `watch`, `view`, `status`, `support`."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from handtouch.cli.options import (
     LIVE_HELP,
     Subparsers,
     add_command,
+    add_config,
     add_endpoint,
     add_json,
+    add_key,
     add_percepts,
     integer,
     positive_number,
@@ -16,7 +20,7 @@ from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 
 
 def add(commands: Subparsers) -> None:
-    """Add `watch`, `view` and `status`."""
+    """Add `watch`, `view`, `status` and `support`."""
     _add_watch(commands)
     _add_view(commands)
 
@@ -28,6 +32,7 @@ def add(commands: Subparsers) -> None:
     )
     add_endpoint(status, CONTROL_ENDPOINT, "control endpoint")
     add_json(status)
+    _add_support(commands)
 
 
 def _add_watch(commands: Subparsers) -> None:
@@ -71,3 +76,37 @@ def _add_view(commands: Subparsers) -> None:
         "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
     )
     add_percepts(view)
+
+
+def _add_support(commands: Subparsers) -> None:
+    support = add_command(
+        commands,
+        "support",
+        "handtouch.cli.support_text:run",
+        "collect versions, deployment, status, logs and a short recording in one archive, without secrets",
+    )
+    add_config(support, "deployment file of the daemon, also for its endpoints", nargs="?")
+    support.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="new archive (default: handtouch-support-HOST-TIME.tar.gz in the current folder)",
+    )
+    support.add_argument(
+        "--seconds",
+        type=positive_number,
+        default=5.0,
+        metavar="S",
+        help="duration of the recording (default: 5)",
+    )
+    support.add_argument(
+        "--log",
+        dest="logs",
+        action="append",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="log file to add, where the journal doesn't have the daemon's log; repeatable",
+    )
+    add_key(support)
