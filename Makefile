@@ -57,10 +57,13 @@ examples: $(VENV)/.dev ## run examples/, each a control loop with a simulated gr
 
 # --- test
 
-.PHONY: test lint types unit coverage socketcan docs tables wiring
+.PHONY: test checks lint types unit coverage socketcan docs tables wiring
 test: ## run everything that CI runs
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan lint types docs
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan checks
 	@$(MAKE) --no-print-directory unit
+
+checks: ## run lint, types and docs beside the tests on SocketCAN, which need a processor in time
+	@nice -n 10 $(MAKE) --no-print-directory lint types docs
 
 lint: $(VENV)/.dev ## check style
 	$(BIN)/ruff check
