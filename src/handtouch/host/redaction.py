@@ -31,8 +31,8 @@ _PATTERNS = tuple((re.compile(pattern, re.DOTALL), by) for pattern, by in _RULES
 def redact(text: str, secrets: Iterable[str] = ()) -> tuple[str, int]:
     """Return the text without `secrets` and all that looks like one, and the number of replacements.
 
-    Looks like one: a value named secret, token, password or similar; credentials in a URL or an HTTP header, a
-    private key in PEM, a quoted CURVE key. Rather too much is removed than too little.
+    Looks like one: a value named secret, token, password or similar; credentials in a URL or an HTTP header;
+    a private key in PEM; a quoted CURVE key. Rather too much is removed than too little.
     """
     total = 0
     for secret in filter(None, secrets):
