@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import builtins
+import contextlib
 import inspect
+import json
 import os
+import pty
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -120,3 +127,139 @@ def test_an_unknown_command_or_choice_is_reported_with_the_closest(
         main(arguments)
     assert ended.value.code == 2
     assert f"did you mean '{closest}'?" in capsys.readouterr().err
+
+
+WITHOUT_DATA = {"demo", "run", "simulate", "view", "bridge", "keys revoke", "calibrations export"}
+ROOT = Path(__file__).parents[2]
+
+
+def test_every_command_that_prints_data_prints_json_and_documents_its_shape() -> None:
+    with_json = {name for name, parser in ALL_COMMANDS.items() if "--json" in parser.format_help()}
+    assert with_json == set(ALL_COMMANDS) - WITHOUT_DATA
+    rows = (ROOT / "docs/command_line.md").read_text().splitlines()
+    documented = [row.split("|")[1] for row in rows if row.startswith("| `")]
+    assert {name.strip("` ") for cell in documented for name in cell.split(",")} == with_json
+
+
+@pytest.mark.parametrize(
+    ("arguments", "keys"),
+    [
+        (["check", "config/utah_mit.toml"], {"file", "ok", "buses", "hands", "warnings"}),
+        (["check", "config/utah_mit.toml", "--bus", "can0=socketcan:vcan0"], {"file", "ok", "warnings"}),
+        (["check", "missing.toml"], {"file", "ok", "problems"}),
+        (["keys", "make", "{new}"], {"folder", "name", "public_key"}),
+    ],
+)
+def test_output_with_json_is_one_object_with_the_documented_keys(
+    arguments: list[str],
+    keys: set[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(ROOT)
+    main([text.format(new=tmp_path / "new") for text in arguments] + ["--json"])
+    assert keys <= json.loads(capsys.readouterr().out).keys()
+
+
+def test_check_uses_the_interface_given_for_a_bus(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["check", str(ROOT / "config/utah_mit.toml"), "--bus", "can0=socketcan:vcan7", "--json"])
+    assert json.loads(capsys.readouterr().out)["buses"][0]["channel"] == "vcan7"
+    assert main(["check", str(ROOT / "config/utah_mit.toml"), "--bus", "can9=socketcan:vcan7"]) == 2
+
+
+def test_every_command_writes_to_the_path_given_as_output() -> None:
+    writing = ("record", "export", "plot", "figures", "design", "calibrations export", "keys client")
+    for name in writing:
+        assert {"-o", "--output"} <= set(ALL_COMMANDS[name].format_help().replace(",", " ").split()), name
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["replay", "nope.mcap"],
+        ["replay", "nope.log", "config/utah_mit.toml"],
+        ["export", "nope.mcap"],
+        ["plot", "nope.mcap"],
+        ["calibrate", "right/palm_heel", "--config", "config/utah_mit.toml", "--from", "nope.jsonl"],
+    ],
+)
+def test_a_missing_file_is_named_without_an_error_number(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("nope.")
+    assert "Errno" not in error
+
+
+@pytest.mark.parametrize("command", [["design", "config/utah_mit.toml"], ["figures"]])
+def test_drawing_without_matplotlib_names_the_extra(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = builtins.__import__
+
+    def refuse(name: str, *rest: Any, **more: Any) -> Any:
+        if name.startswith("matplotlib"):
+            raise ImportError(f"No module named {name!r}")
+        return real(name, *rest, **more)
+
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    assert main([*command, "--output", str(tmp_path)]) == 2
+    assert "pip install 'handtouch[figures]'" in capsys.readouterr().err
+
+
+def test_completion_script_has_commands_options_and_paths() -> None:
+    command = [sys.executable, "-m", "handtouch", "--print-completion", "bash"]
+    script = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    tried = (
+        script
+        + '\ncomplete_words() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=(); _shtab_handtouch;'
+        ' echo "${COMPREPLY[@]}"; }\n'
+        "complete_words handtouch sna; complete_words handtouch calibrations ro; "
+        "complete_words handtouch replay --rep; complete_words handtouch check pyproj\n"
+    )
+    done = subprocess.run(
+        ["bash", "-c", tried], capture_output=True, text=True, timeout=60, cwd=ROOT, check=True
+    )
+    assert done.stdout.split() == ["snapshot", "rollback", "--report", "pyproject.toml"]
+
+
+def on_a_terminal(*arguments: str, **variables: str) -> str:
+    """Return what a command prints on a terminal."""
+    terminal, end = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "200", **variables}
+    command = [sys.executable, "-m", "handtouch", *arguments]
+    with subprocess.Popen(command, stdin=end, stdout=end, stderr=end, env=environment) as process:
+        os.close(end)
+        printed = b""
+        with contextlib.suppress(OSError):  # the terminal's other end is closed
+            while part := os.read(terminal, 65536):
+                printed += part
+        os.close(terminal)
+        process.wait()
+    return printed.decode()
+
+
+def test_colour_and_progress_are_for_terminals_and_colour_obeys_no_color() -> None:
+    scan = ("scan", "--bus", "can0=virtual:terminal-test", "--listen", "--seconds", "0.2")
+    colour, erased = re.compile(r"\x1b\[[0-9;]*3[0-7]m"), "\r\x1b[2K"
+    shown = on_a_terminal(*scan)
+    assert colour.search(shown)
+    assert erased in shown
+    assert not colour.search(on_a_terminal(*scan, NO_COLOR="1"))
+    command = [sys.executable, "-m", "handtouch", *scan]
+    piped = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert "\x1b" not in piped.stdout + piped.stderr
+
+
+def test_a_command_interrupted_before_its_result_exits_with_status_130(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object, **__: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("handtouch.cli.check_text.run", interrupted)
+    assert main(["check", "hand.toml"]) == 130

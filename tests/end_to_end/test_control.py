@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from handtouch import wire
+from handtouch.cli import main
 from handtouch.client import request
 from handtouch.config import load
 
@@ -271,3 +272,14 @@ def test_commands_report_a_missing_daemon(tmp_path: Path) -> None:
     for process in asking:  # side by side: each waits for an answer
         _, output = process.communicate(timeout=LONGEST_S)
         assert (process.returncode, "check that `handtouch run` is running" in output) == (1, True)
+
+
+def test_every_request_prints_json(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
+    requests = (
+        *(["status"], ["scene"], ["snapshot"], ["tare"], ["calibrate", "right/palm_heel"]),
+        *(["disable", "palm_heel"], ["enable", "palm_heel"], ["reload", "--dry-run"], ["log", "info"]),
+    )
+    for arguments in requests:
+        main([*arguments, "--json", "--endpoint", served.rig.endpoints["control"]])
+        printed = capsys.readouterr()
+        assert isinstance(json.loads(printed.out), dict), (arguments, printed.err)

@@ -15,9 +15,11 @@ import pytest
 import zmq
 
 from handtouch import config
+from handtouch.canbus.bus.port import BusError, Port
 from handtouch.cli import doctor_text
 from handtouch.client import keys
 from handtouch.config import shipped
+from handtouch.core.slab import Slab
 from handtouch.host.machine import Machine
 from handtouch.procedures import doctor
 from handtouch.procedures.doctor import HostCheck
@@ -187,8 +189,14 @@ def test_kernel_without_socketcan_is_one_failure_with_a_remedy(
 
 
 def test_multicast_group_without_a_route_is_detected() -> None:
-    (check,) = doctor.check_bus(bus("udp_multicast", "239.74.163.2", port=99_999_999), Machine())
-    assert (check.state, check.remedy) == ("fail", "ip route add 239.0.0.0/8 dev lo")
+    (check,) = doctor.check_bus(bus("udp_multicast", "ff02::1"), Machine())  # link-local, without its link
+    assert (check.state, "no route to ff02::1" in check.detail) == ("fail", True)
+    assert "ip -6 route add" in check.remedy
+
+
+def test_a_missing_multicast_route_is_the_reason_why_a_bus_cannot_be_opened() -> None:
+    with pytest.raises(BusError, match=r"no route to ff02::1.*; ip -6 route add"):
+        Port.open(bus("udp_multicast", "ff02::1"), Slab(1))
 
 
 def test_multicast_group_with_a_route_is_ok(network: list[str]) -> None:

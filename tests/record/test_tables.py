@@ -25,6 +25,14 @@ def tables(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_export_lists_its_tables_as_json(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(recorded), "--output", str(tmp_path), "--json"]) == 0
+    tables = json.loads(capsys.readouterr().out)["tables"]
+    assert {Path(table["file"]).name: table["rows"] for table in tables}["contacts.csv"] > 100
+
+
 def _rows(folder: Path, name: str) -> list[dict[str, str]]:
     with (folder / f"{name}.csv").open(newline="") as file:
         return list(csv.DictReader(file))
@@ -92,10 +100,10 @@ def test_component_names_of_a_vector_end_with_its_unit(name: str, length: int, p
     assert component_names(name, length) == parts
 
 
-def test_an_unreadable_or_empty_recording_is_exported_with_status_1(
+def test_a_missing_recording_is_wrong_usage_and_an_empty_one_a_failure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["export", str(tmp_path / "absent.mcap"), "-o", str(tmp_path)]) == 1
+    assert main(["export", str(tmp_path / "absent.mcap"), "-o", str(tmp_path)]) == 2
     empty = tmp_path / "empty.mcap"
     empty.write_bytes(b"")
     assert main(["export", str(empty), "-o", str(tmp_path / "made")]) == 1

@@ -24,22 +24,30 @@ from handtouch.cli import (
     recording,
     setup,
 )
-from handtouch.cli.options import EXIT_STATUS_HELP, LazyFunction, SuggestingParser
+from handtouch.cli.options import (
+    EXIT_STATUS_HELP,
+    LazyFunction,
+    PrintCompletion,
+    SuggestingParser,
+)
 
 COMMAND_GROUPS = (daemons, monitoring, recording, control, bridge, keys, setup, calibrations, node)
 """Modules with a function `add`, in the order of `--help`."""
 
+INTERRUPTED_STATUS = 130
+"""Exit status of a command that Ctrl-C ended before its result, as that of a shell."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; exit status 0 (success), 1 (failure) or 2 (wrong usage or invalid file)."""
+    """Run a command; exit status 0 (success), 1 (failure), 2 (wrong usage or file) or 130 (interrupted)."""
     # arrays are small: threads of the linear algebra library would only compete with the daemon's main thread
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options = vars(build_parser().parse_args(arguments))
     command: LazyFunction = options.pop("command")
     try:
         return command(**options)
-    except KeyboardInterrupt:
-        return 0
+    except KeyboardInterrupt:  # commands that run until Ctrl-C catch it themselves
+        return INTERRUPTED_STATUS
     except BrokenPipeError:  # the reader of our output has exited, as `| head` does
         sys.stderr.close()
         return 0
@@ -55,6 +63,13 @@ def build_parser() -> argparse.ArgumentParser:
         "doctor, scan, commission, then run; watch shows the contacts.",
     )
     parser.add_argument("--version", action="version", version=f"handtouch {__version__}")
+    parser.add_argument(
+        "--print-completion",
+        action=PrintCompletion,
+        default=argparse.SUPPRESS,
+        choices=("bash", "zsh", "tcsh"),
+        help="print the completion script of a shell (docs/command_line.md)",
+    )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for group in COMMAND_GROUPS:
         group.add(commands)

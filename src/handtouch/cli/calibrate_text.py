@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -12,6 +11,7 @@ from typing import Any
 
 from handtouch.calibration.store import StoreError
 from handtouch.cli import control_text
+from handtouch.cli.json_output import print_json
 from handtouch.config import ConfigError
 from handtouch.procedures import calibrate
 
@@ -41,6 +41,9 @@ def run(
     values = {option: value for option, value in values.items() if value is not None}
     if conflict := _find_conflict(guided, values, name, config, bool(weights) and from_file is not None):
         print(f"handtouch calibrate: {conflict}", file=sys.stderr)
+        return 2
+    if from_file is not None and not from_file.is_file():
+        print(f"{from_file}: no such file; --from reads readings that --log recorded", file=sys.stderr)
         return 2
     if guided and config is not None:
         guided_options = calibrate.CalibrateOptions(
@@ -94,4 +97,4 @@ def _run_guided(options: calibrate.CalibrateOptions, endpoints: calibrate.Daemon
 
 def _print_json(result: calibrate.CalibrationResult) -> None:
     record = calibrate.report.to_json(result.report, calibration_id=result.calibration_id or None)
-    print(json.dumps(record, indent=2))
+    print_json(record)

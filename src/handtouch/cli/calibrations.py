@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from handtouch.cli.options import Subparsers, add_command, add_command_group, add_json, integer
+from handtouch.cli.options import Subparsers, add_command, add_command_group, add_json, add_output, integer
 
 _TEXT = "handtouch.cli.calibrations_text"
 
@@ -59,6 +59,7 @@ def _add_diff(actions: Subparsers) -> argparse.ArgumentParser:
     parser.add_argument(
         "--to", dest="after", type=int, metavar="N", help="newer version (default: the newest)"
     )
+    add_json(parser)
     return parser
 
 
@@ -68,6 +69,7 @@ def _add_rollback(actions: Subparsers) -> argparse.ArgumentParser:
     )
     _add_sensor(parser)
     parser.add_argument("number", metavar="VERSION", type=int, help="version to restore")
+    add_json(parser)
     return parser
 
 
@@ -80,7 +82,7 @@ def _add_export(actions: Subparsers) -> argparse.ArgumentParser:
         help="serial number, or link that it was last on (default: all)",
     )
     parser.add_argument("--history", action="store_true", help="export every version, not only the newest")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
+    add_output(parser, "out", "file to write (default: standard output)", metavar="FILE")
     return parser
 
 
@@ -101,6 +103,7 @@ def _add_import(actions: Subparsers) -> argparse.ArgumentParser:
         action="store_true",
         help="allow the calibration of another sensor, which stays marked as such",
     )
+    add_json(parser)
     return parser
 
 

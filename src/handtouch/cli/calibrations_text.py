@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -13,6 +12,7 @@ from handtouch import config
 from handtouch.calibration import exchange
 from handtouch.calibration.calibration import Calibration, CalibrationVersion, differences
 from handtouch.calibration.store import Store, StoreError, damaged_files, store_path
+from handtouch.cli.json_output import print_json
 
 _APPLIED_NOTE = "a daemon that uses this store applies it within seconds; see `handtouch status`"
 
@@ -25,7 +25,7 @@ def run_list(store: Path | None, deployment: Path | None, as_json: bool) -> int:
         if as_json:
             sensors = [{"versions": one.number, "newest": _summary_fields(one)} for one in newest]
             record = {"store": str(opened.path), "sensors": sensors, "damaged": [*map(str, damaged)]}
-            print(json.dumps(record, indent=2))
+            print_json(record)
         else:
             print(f"{opened.path}: {len(newest)} sensors")
             for one in newest:
@@ -45,7 +45,7 @@ def run_show(
     def action(opened: Store) -> int:
         version = exchange.find_version(opened, sensor, number)
         if as_json:
-            print(json.dumps(version.to_json(), indent=2))
+            print_json(version.to_json())
         else:
             for old in opened.versions(version.serial):
                 print(f"{'>' if old == version else ' '} {_summary_line(old)}")
@@ -56,17 +56,26 @@ def run_show(
 
 
 def run_diff(
-    store: Path | None, deployment: Path | None, sensor: str, before: int | None, after: int | None
+    store: Path | None,
+    deployment: Path | None,
+    sensor: str,
+    before: int | None,
+    after: int | None,
+    as_json: bool,
 ) -> int:
     """Compare two versions; exit status 0 (equal), 1 (different), 2 (no such version)."""
 
     def action(opened: Store) -> int:
         new = exchange.find_version(opened, sensor, after)
         old = opened.get(new.serial, max(new.number - 1, 1) if before is None else before)
-        print(f"--- {_summary_line(old)}\n+++ {_summary_line(new)}")
         rows: list[tuple[str, Any, Any]] = list(differences(old.calibration, new.calibration))
         if old.config != new.config:
             rows.insert(0, ("config", old.config, new.config))
+        if as_json:
+            changes = [{"key": name, "before": one, "after": other} for name, one, other in rows]
+            print_json({"before": _summary_fields(old), "after": _summary_fields(new), "changes": changes})
+            return 1 if rows else 0
+        print(f"--- {_summary_line(old)}\n+++ {_summary_line(new)}")
         for name, one, other in rows:
             print(f"{name}\n  - {_format_value(one)}\n  + {_format_value(other)}")
         return 1 if rows else 0
@@ -74,11 +83,16 @@ def run_diff(
     return _run_with_store(store, deployment, action)
 
 
-def run_roll_back(store: Path | None, deployment: Path | None, sensor: str, number: int) -> int:
+def run_roll_back(
+    store: Path | None, deployment: Path | None, sensor: str, number: int, as_json: bool
+) -> int:
     """Write an older version again; exit status 0, or 2 (no such version)."""
 
     def action(opened: Store) -> int:
         made = exchange.roll_back(opened, sensor, number, datetime.now(UTC))
+        if as_json:
+            print_json(_summary_fields(made))
+            return 0
         print(f"serial {made.serial}: version {made.number} is a copy of version {number}; all are kept")
         print(_APPLIED_NOTE)
         return 0
@@ -110,14 +124,23 @@ def run_export(
 
 
 def run_import(
-    store: Path | None, deployment: Path | None, file: Path, serial: int | None, other_sensor: bool
+    store: Path | None,
+    deployment: Path | None,
+    file: Path,
+    serial: int | None,
+    other_sensor: bool,
+    as_json: bool,
 ) -> int:
     """Import exported calibrations; exit status 0, or 2 (no export, or another sensor's)."""
 
     def action(opened: Store) -> int:
-        for made in exchange.import_versions(
+        versions = exchange.import_versions(
             opened, file, serial, accept_mismatch=other_sensor, now=datetime.now(UTC)
-        ):
+        )
+        if as_json:
+            print_json([_summary_fields(made) for made in versions])
+            return 0
+        for made in versions:
             foreign = made.provenance.foreign
             print(f"serial {made.serial}: version {made.number}{f', {foreign}' if foreign else ''}")
         print(_APPLIED_NOTE)

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from handtouch import config
+from handtouch.cli.json_output import print_json
 from handtouch.procedures.check import find_warnings, load_deployment, summary
 
 
-def run(config_path: Path | None, as_json: bool, schema: bool) -> int:
+def run(config_path: Path | None, as_json: bool, schema: bool, buses: Sequence[str] = ()) -> int:
     """Print a deployment's summary and warnings; exit status 0, 1 (warnings), 2 (invalid file)."""
     if schema:
-        print(json.dumps(config.json_schema(), indent=2))
+        print_json(config.json_schema())
         return 0
     if config_path is None:
         print("handtouch check: give a deployment file, or --schema", file=sys.stderr)
         return 2
     try:
         deployment = load_deployment(config_path)
+        for text in buses:
+            deployment = config.with_bus(deployment, text)
     except config.ConfigError as error:
         _print_error(error, as_json)
         return 2
     warnings = list(find_warnings(deployment))
     if as_json:
         report = {"file": str(config_path), "ok": True, **summary(deployment), "warnings": warnings}
-        print(json.dumps(report, indent=2))
+        print_json(report)
     else:
         _print_summary(config_path, summary(deployment), warnings)
     return 1 if warnings else 0
@@ -41,7 +44,7 @@ def _print_error(error: config.ConfigError, as_json: bool) -> None:
         {"location": problem.location, "value": problem.value.removeprefix(" = "), "remedy": problem.remedy}
         for problem in error.problems
     ]
-    print(json.dumps({"file": error.file, "ok": False, "problems": problems}, indent=2))
+    print_json({"file": error.file, "ok": False, "problems": problems})
 
 
 def _print_summary(path: Path, facts: dict[str, Any], warnings: list[str]) -> None:

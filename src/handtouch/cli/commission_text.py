@@ -7,13 +7,16 @@ import logging
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from handtouch import config
 from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.nodes.spec import check_nodes
+from handtouch.cli.json_output import print_json
 from handtouch.procedures.commission import daemon_is_running, select_rows
 from handtouch.procedures.commission.outcome import PadOutcome
 from handtouch.procedures.commission.procedure import CommissioningProcedure
@@ -32,6 +35,7 @@ def run(
     dry_run: bool = False,
     assume_yes: bool = False,
     timeout_s: float = 60.0,
+    as_json: bool = False,
 ) -> int:
     """Commission the pads of a deployment that match `links`, all that are not done by default.
 
@@ -58,7 +62,11 @@ def run(
     record = CommissioningRecord(config_path, dry_run)
     saved = True
     try:
-        with open_sample_source(deployment) as source, open_dialogue() as dialogue:
+        with ExitStack() as stack:
+            if as_json:  # standard output is for the result alone
+                stack.enter_context(redirect_stdout(sys.stderr))
+            source = stack.enter_context(open_sample_source(deployment))
+            dialogue = stack.enter_context(open_dialogue())
             procedure = CommissioningProcedure(
                 deployment, source, dialogue, record.save, rows, assume_yes=assume_yes, timeout_s=timeout_s
             )
@@ -71,13 +79,46 @@ def run(
             except (OSError, ValueError, KeyError) as error:  # disk full; file edited meanwhile
                 dialogue.print_line(f"{config_path} can't be written: {error}", "bad")
                 saved = False
-            table = format_table(procedure)
+            text = "" if as_json else format_table(procedure) + _format_changes(record)
+            result = _as_json(procedure, record) if as_json else None
     except BusError as error:
         print(error, file=sys.stderr)
         return 1
-    print(table, end="")
-    print(_format_changes(record), end="")
+    if as_json:
+        print_json(result)
+    else:
+        print(text, end="")
     return 0 if saved and all(procedure.outcomes[row].ok for row in rows) else 1
+
+
+def _as_json(procedure: CommissioningProcedure, record: CommissioningRecord) -> dict[str, Any]:
+    """Return the outcome of each pad and of the file as JSON values."""
+    pads = []
+    for row in procedure.selected_rows:
+        outcome, node, rest = procedure.outcomes[row], procedure.node_of(row), procedure.rest_of(row)
+        known = outcome.slot is not None
+        pads.append(
+            {
+                "pad": outcome.name,
+                "ok": outcome.ok,
+                "result": outcome.result.value,
+                "bus": node.bus if known else None,
+                "node_id": node.node_id if known else None,
+                "serial": (node.serial or None) if known else None,
+                "electrodes": outcome.electrodes,
+                "noise_counts": float(np.max(rest.std)) if rest is not None and rest.samples else None,
+                "problems": outcome.problems,
+            }
+        )
+    changed = record.text != record.original
+    backup = record.backup if changed and not record.dry_run else None
+    return {
+        "file": record.path,
+        "changed": changed,
+        "dry_run": record.dry_run,
+        "backup": backup,
+        "pads": pads,
+    }
 
 
 def _format_changes(record: CommissioningRecord) -> str:

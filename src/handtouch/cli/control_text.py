@@ -7,7 +7,6 @@ pad was refused), 2 (an invalid endpoint or key file).
 from __future__ import annotations
 
 import getpass
-import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from handtouch import wire
+from handtouch.cli.json_output import print_json
 from handtouch.cli.scene_text import scene_lines
 from handtouch.client import request
 
@@ -103,7 +103,7 @@ class ControlTarget:
             print(error, file=sys.stderr)
             return 2
         if self.as_json:
-            print(json.dumps(to_json_lists(answer), indent=2))
+            print_json(to_json_lists(answer))
         else:
             for line in format_lines(answer):
                 print(line)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 from handtouch import config
+from handtouch.cli.json_output import print_json
 from handtouch.procedures.doctor import check_host
 
 
@@ -22,7 +21,7 @@ def run(config_path: Path | None, as_json: bool) -> int:
             return 2
     checks = list(check_host(deployment))
     if as_json:
-        print(json.dumps([asdict(check) for check in checks], indent=2))
+        print_json(checks)
     else:
         for check in checks:
             print(f"{check.state:<5} {check.subject}: {check.detail}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from handtouch.cli.options import Subparsers, add_command, add_command_group, add_json
+from handtouch.cli.options import Subparsers, add_command, add_command_group, add_json, add_output
 
 
 def add(commands: Subparsers) -> None:
@@ -26,6 +26,7 @@ def add(commands: Subparsers) -> None:
         help="folder to create; name it as [daemon] keys in the deployment file",
     )
     make.add_argument("--name", help="name of the daemon in its clients' key files (default: the host name)")
+    add_json(make)
 
     client = add_command(
         actions, "client", "handtouch.cli.keys_text:run_client", "create a client's key and authorise it"
@@ -38,13 +39,13 @@ def add(commands: Subparsers) -> None:
         default="read",
         help="read: subscribe; control: also send control requests and inputs (default: read)",
     )
-    client.add_argument(
-        "--out",
-        dest="file",
-        type=Path,
+    add_output(
+        client,
+        "file",
+        "key file to write, to be copied to the client's machine (default: NAME.key)",
         metavar="FILE",
-        help="key file to write, to be copied to the client's machine (default: NAME.key)",
     )
+    add_json(client)
 
     listed = add_command(actions, "list", "handtouch.cli.keys_text:run_list", "list the authorised clients")
     listed.add_argument("folder", metavar="FOLDER", type=Path, help="folder of the daemon's keys")

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
+from handtouch.cli.json_output import print_json
 from handtouch.client import keys
 
 
-def run_make(folder: Path, name: str | None) -> int:
+def run_make(folder: Path, name: str | None, as_json: bool = False) -> int:
     """Create a daemon's keys, named after the host by default; exit status 0, or 2 (failed)."""
     try:
         made = keys.make_server_keys(folder, name or platform.node())
     except keys.KeyFileError as error:
         return _print_error(error)
+    if as_json:
+        print_json({"folder": folder, "name": made.name, "public_key": made.public_key})
+        return 0
     print(
         f"created {folder}: keys of daemon {made.name}; public key {made.public_key}\n"
         f'name the folder in the deployment file: [daemon] keys = "{folder.name}"\n'
@@ -25,13 +27,16 @@ def run_make(folder: Path, name: str | None) -> int:
     return 0
 
 
-def run_client(folder: Path, name: str, rights: str, file: Path | None) -> int:
+def run_client(folder: Path, name: str, rights: str, file: Path | None, as_json: bool = False) -> int:
     """Create a client's keys; exit status 0, or 2 (failed)."""
     file = file or Path(f"{name}.key")
     try:
         keys.add_client(folder, name, rights, file)
     except keys.KeyFileError as error:
         return _print_error(error)
+    if as_json:
+        print_json({"file": file, "name": name, "rights": rights})
+        return 0
     print(
         f"created {file}: authorises {name} to {'read' if rights == 'read' else 'read and control'}\n"
         "move it to the client's machine, readable by its user only, and name it there: "
@@ -50,7 +55,7 @@ def run_list(folder: Path, as_json: bool) -> int:
         )
     clients, problems = keys.load_clients(folder)
     if as_json:
-        print(json.dumps({"clients": [asdict(c) for c in clients.values()], "problems": problems}, indent=2))
+        print_json({"clients": list(clients.values()), "problems": problems})
     else:
         for client in clients.values():
             print(f"{client.rights:<8} {client.public_key}  {client.name}")

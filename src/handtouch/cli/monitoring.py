@@ -50,7 +50,9 @@ def _add_watch(commands: Subparsers) -> None:
     style.add_argument(
         "--plain", dest="style", action="store_const", const="plain", help="print lines, also on a terminal"
     )
-    style.add_argument("--json", dest="style", action="store_const", const="json", help="print JSON lines")
+    style.add_argument(
+        "--json", dest="style", action="store_const", const="json", help="print JSON, a line per message"
+    )
     watch.add_argument(
         "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
     )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import sys
 from pathlib import Path
 from typing import Any
 
 from handtouch import config
+from handtouch.cli.json_output import print_json
 from handtouch.host import logs
 from handtouch.host.signals import stop_on_signals
 from handtouch.node import service
@@ -20,7 +20,7 @@ from handtouch.node.settings import NodeFile, json_schema, load
 def run_command(config_path: Path | None, *, schema: bool, measure_noise: bool, **options: Any) -> int:
     """Run the command; exit status 0, 1 (bus, ADC or state file), 2 (wrong usage or invalid file)."""
     if schema:
-        print(json.dumps(json_schema(), indent=2))
+        print_json(json_schema())
         return 0
     if config_path is None:
         print("handtouch node: give the file of the node, or --schema", file=sys.stderr)
@@ -63,7 +63,7 @@ def _print_noise(
         return 1
     pairs = list(zip(measured, positions, strict=True))
     if as_json:
-        print(json.dumps([_noise_map(noise, errors) for noise, errors in pairs], indent=2))
+        print_json([_noise_map(noise, errors) for noise, errors in pairs])
         return 0
     for noise, errors in pairs:
         print(f"pad {noise.pad.name}: {noise.samples} samples")
@@ -86,9 +86,9 @@ def _noise_map(noise: PadNoise, errors: list[tuple[str, float, float, float]]) -
         "pad": noise.pad.name,
         "samples": noise.samples,
         "channels": noise.pad.channels,
-        "mean_a": (1e-3 * noise.mean_ma).tolist(),
-        "std_a": (1e-3 * noise.std_ma).tolist(),
-        "std_counts": noise.std_counts.tolist(),
+        "mean_a": 1e-3 * noise.mean_ma,
+        "std_a": 1e-3 * noise.std_ma,
+        "std_counts": noise.std_counts,
         "position": [
             {"link": link, "force_n": force, "median_m": median, "worst_m": worst}
             for link, force, median, worst in errors

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
-EXIT_STATUS_HELP = "Exit status: 0 success; 1 failure, or a problem was found; 2 wrong usage or invalid file."
+EXIT_STATUS_HELP = (
+    "Exit status: 0 success; 1 failure, or a problem was found; 2 wrong usage, a file that is missing or "
+    "invalid, or a package that isn't installed; 130 interrupted before the end."
+)
 
 LIVE_HELP = "endpoint of the daemon's live stream, which drops what a slow subscriber can't take"
 
@@ -45,6 +48,29 @@ class SuggestingParser(argparse.ArgumentParser):
             if close := difflib.get_close_matches(found[2], choices, 1):
                 message = f"{found[1]}; did you mean {close[0]!r}?"
         super().error(message)
+
+
+class PrintCompletion(argparse.Action):
+    """Print the completion script of a shell for all commands, and exit."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, _namespace: Any, shell: Any, _option: Any = None
+    ) -> None:
+        import shtab  # only here, so that commands start quickly
+
+        _complete_paths(parser, shtab.FILE, shtab.DIRECTORY)
+        print(shtab.complete(parser, shell))
+        parser.exit()
+
+
+def _complete_paths(parser: argparse.ArgumentParser, files: Any, folders: Any) -> None:
+    """Mark the arguments of a parser and its commands that are completed with paths."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                _complete_paths(command, files, folders)
+        elif action.type is Path or action.metavar == "FILE":
+            action.complete = folders if action.metavar == "FOLDER" else files  # type: ignore[attr-defined]
 
 
 def add_command(commands: Subparsers, name: str, function: str, text: str) -> argparse.ArgumentParser:
@@ -100,9 +126,14 @@ def add_key(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_json(parser: argparse.ArgumentParser, text: str = "print JSON") -> None:
+def add_json(parser: argparse._ActionsContainer, text: str = "print JSON (docs/command_line.md)") -> None:
     """Add `--json` as `as_json`."""
     parser.add_argument("--json", dest="as_json", action="store_true", help=text)
+
+
+def add_output(parser: argparse.ArgumentParser, dest: str, text: str, **options: Any) -> None:
+    """Add `-o`, `--output`: the file or folder that a command writes."""
+    parser.add_argument("-o", "--output", dest=dest, type=Path, help=text, **options)
 
 
 def add_percepts(parser: argparse.ArgumentParser) -> None:

@@ -9,16 +9,19 @@ import sys
 import time
 from typing import Any
 
+from handtouch.cli.errors import file_error_text
+from handtouch.cli.json_output import print_json
+from handtouch.cli.progress import ProgressLine
 from handtouch.config import ConfigError
 from handtouch.host.signals import stop_on_signals
 from handtouch.record.capture import BYTES_PER_MB, Capture, RecordOptions
 
-_PROGRESS_PERIOD_S = 10.0
+NO_MESSAGE_TEXT = "no message received; is `handtouch run` running?"
 _MAX_SHOWN_MINUTES = 600
 
 
-def run(**options: Any) -> int:
-    """Record until Ctrl-C, or for the given time; `options` as of `record.capture.RecordOptions`.
+def run(*, as_json: bool, **options: Any) -> int:
+    """Record until Ctrl-C, or for the given time; other `options` as of `record.capture.RecordOptions`.
 
     Exit status 0; 1 if no message was received, messages were lost, the disk is full or the daemon rejects
     the key; 2 for wrong usage or file.
@@ -26,46 +29,38 @@ def run(**options: Any) -> int:
     try:
         capture = Capture.open(RecordOptions(**options))
     except (ConfigError, ValueError, OSError) as error:
-        print(error, file=sys.stderr)
+        print(file_error_text(error), file=sys.stderr)
         return 2
     stop = stop_on_signals()
-    progress = _ProgressLine(capture)
-    progress.print_line(f"recording {capture.endpoint} into {capture.files.folder or '.'}; stop with Ctrl-C")
-    with capture:
-        try:
-            capture.run(stop, progress.update)
-        except PermissionError as error:
-            progress.print_line(str(error))
-            return 1
-    return _print_summary(capture, progress)
+    with ProgressLine() as line:
+        line.print_line(f"recording {capture.endpoint} into {capture.files.folder or '.'}; stop with Ctrl-C")
+        with capture:
+            try:
+                capture.run(stop, _RecordingProgress(capture, line).update)
+            except PermissionError as error:
+                line.print_line(str(error))
+                return 1
+        return _print_summary(capture, line, as_json)
 
 
-class _ProgressLine:
-    """A status line, kept up to date on a terminal; elsewhere printed every ten seconds."""
+class _RecordingProgress:
+    """A progress line on a terminal; elsewhere a line when the daemon connects or disconnects."""
 
-    def __init__(self, capture: Capture) -> None:
-        self._capture = capture
-        self._terminal = sys.stderr.isatty()
-        self._started_s = self._printed_s = time.monotonic()
+    def __init__(self, capture: Capture, line: ProgressLine) -> None:
+        self._capture, self._line = capture, line
+        self._began_s = time.monotonic()
+        self._was_alive = True
 
     def update(self, alive: bool) -> None:
         """Show the progress; `alive`: the daemon has published lately."""
-        now_s = time.monotonic()
-        if not self._terminal and now_s - self._printed_s < _PROGRESS_PERIOD_S:
-            return
-        self._printed_s = now_s
-        line = _progress_text(self._capture, alive, now_s - self._started_s)
-        print(f"\r\x1b[2K{line}" if self._terminal else line, end="" if self._terminal else "\n",
-              file=sys.stderr, flush=True)  # fmt: skip
-
-    def print_line(self, text: str) -> None:
-        """Print a line of its own."""
-        print(f"\r\x1b[2K{text}" if self._terminal else text, file=sys.stderr, flush=True)
+        if alive != self._was_alive and not self._line.shown:
+            self._line.print_line("messages are received again" if alive else NO_MESSAGE_TEXT)
+        self._was_alive = alive
+        seconds = time.monotonic() - self._began_s
+        self._line.update(_progress_text(self._capture, seconds) if alive else NO_MESSAGE_TEXT)
 
 
-def _progress_text(capture: Capture, alive: bool, seconds: float) -> str:
-    if not alive:
-        return "no message from the daemon; is `handtouch run` running?"
+def _progress_text(capture: Capture, seconds: float) -> str:
     recorder = capture.recorder
     rate = recorder.size / max(seconds, 1.0)
     left = ""
@@ -79,13 +74,26 @@ def _progress_text(capture: Capture, alive: bool, seconds: float) -> str:
     )
 
 
-def _print_summary(capture: Capture, progress: _ProgressLine) -> int:
+def _print_summary(capture: Capture, progress: ProgressLine, as_json: bool) -> int:
     recorder, paths = capture.recorder, capture.files.paths
     summary = recorder.summary()
     progress.print_line(
         f"{summary['messages']} messages, {summary['ticks']} ticks, {summary['contacts']} contacts, "
         f"{recorder.size / BYTES_PER_MB:.1f} MB in {', '.join(map(str, paths)) or 'no file'}"
     )
+    if as_json:
+        counts = {"messages": sum(recorder.messages.values()), "ticks": recorder.messages["tick"]}
+        print_json(
+            {
+                "files": paths,
+                "bytes": recorder.size,
+                **counts,
+                "contacts": recorder.contacts,
+                "lost": dict(recorder.lost),
+                "malformed": recorder.malformed,
+                "end_reason": capture.end_reason,
+            }
+        )
     for topic, count in sorted(recorder.lost.items()):
         progress.print_line(f"{topic}: {count} messages lost; disk or machine are too slow")
     if recorder.malformed:
@@ -93,6 +101,6 @@ def _print_summary(capture: Capture, progress: _ProgressLine) -> int:
     if capture.end_reason:
         progress.print_line(capture.end_reason)
     elif not paths:
-        progress.print_line("no message received; is `handtouch run` running?")
+        progress.print_line(NO_MESSAGE_TEXT)
     complete = paths and not capture.end_reason and not recorder.lost and not recorder.malformed
     return 0 if complete else 1

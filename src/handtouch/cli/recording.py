@@ -5,14 +5,19 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from handtouch.cli.errors import file_error_text
+from handtouch.cli.json_output import print_json
 from handtouch.cli.options import (
     Subparsers,
     add_command,
     add_config,
+    add_json,
     add_key,
+    add_output,
     add_percepts,
     positive_number,
 )
+from handtouch.cli.progress import ProgressLine
 from handtouch.host.endpoints import COMPLETE_ENDPOINT
 
 
@@ -38,14 +43,14 @@ def _add_record(commands: Subparsers) -> None:
         nargs="?",
         help="deployment file of the daemon, for its endpoint; stored in the recording",
     )
-    record.add_argument(
-        "-o",
-        "--out",
-        type=Path,
+    add_output(
+        record,
+        "out",
+        "new .mcap file, or folder (default: the current folder)",
         default=Path(),
         metavar="PATH",
-        help="new .mcap file, or folder (default: the current folder)",
     )
+    add_json(record, "print a summary as JSON at the end")
     record.add_argument(
         "--endpoint",
         help="endpoint of the daemon's complete stream, which queues messages for slow subscribers "
@@ -109,9 +114,7 @@ def _add_replay(commands: Subparsers) -> None:
         metavar="FACTOR",
         help="1 as recorded, 2 twice as fast, max (default: max, with --publish 1)",
     )
-    replay.add_argument(
-        "--json", dest="as_json", action="store_true", help="print every contact message as a JSON line"
-    )
+    add_json(replay, "print every contact message as a line of JSON")
     replay.add_argument("--report", type=Path, metavar="FILE", help="write the comparison as JSON")
     replay.add_argument(
         "--publish", action="store_true", help="also publish the messages on the deployment's endpoints"
@@ -133,15 +136,10 @@ def _add_export(commands: Subparsers) -> None:
         default="csv",
         help="file format; parquet needs handtouch[export] (default: csv)",
     )
-    export.add_argument(
-        "-o",
-        "--out",
-        dest="folder",
-        type=Path,
-        default=Path("tables"),
-        metavar="FOLDER",
-        help="folder to write to (default: tables)",
+    add_output(
+        export, "folder", "folder to write to (default: tables)", default=Path("tables"), metavar="FOLDER"
     )
+    add_json(export)
 
 
 def _add_plot(commands: Subparsers) -> None:
@@ -152,15 +150,8 @@ def _add_plot(commands: Subparsers) -> None:
         "plot a recording: contacts over time and on pads, forces, health",
     )
     plot.add_argument("path", metavar="RECORDING", type=Path, help="MCAP recording")
-    plot.add_argument(
-        "-o",
-        "--out",
-        dest="folder",
-        type=Path,
-        default=Path("plots"),
-        metavar="FOLDER",
-        help="folder to write to (default: plots)",
-    )
+    add_output(plot, "folder", "folder to write to (default: plots)", default=Path("plots"), metavar="FOLDER")
+    add_json(plot)
     plot.add_argument(
         "--from",
         dest="from_s",
@@ -178,8 +169,8 @@ def _add_plot(commands: Subparsers) -> None:
     )
 
 
-def run_export(path: Path, folder: Path, format_: str) -> int:
-    """Export a recording; exit status 0, 1 (unreadable or empty), 2 (pyarrow is missing)."""
+def run_export(path: Path, folder: Path, format_: str, as_json: bool = False) -> int:
+    """Export a recording; exit status 0, 1 (empty, or tables not written), 2 (no recording, no pyarrow)."""
     from handtouch.record.export import export
     from handtouch.record.recording import Recording
 
@@ -191,12 +182,21 @@ def run_export(path: Path, folder: Path, format_: str) -> int:
             return 2
     try:
         recording = Recording(path)
-        counts = export(recording, folder, format_)
     except (OSError, ValueError) as error:
-        print(error, file=sys.stderr)
+        print(file_error_text(error), file=sys.stderr)
+        return 2
+    try:
+        with ProgressLine() as progress:
+            counts = export(recording, folder, format_, progress.update)
+    except (OSError, ValueError) as error:
+        print(file_error_text(error), file=sys.stderr)
         return 1
-    for name, rows in counts.items():
-        print(f"{folder / name}.{format_}: {rows} rows")
+    tables = {folder / f"{name}.{format_}": rows for name, rows in counts.items()}
+    if as_json:
+        print_json({"tables": [{"file": file, "rows": rows} for file, rows in tables.items()]})
+    else:
+        for file, rows in tables.items():
+            print(f"{file}: {rows} rows")
     if recording.truncation:
         print(f"{path}: {recording.truncation}; all before it is exported", file=sys.stderr)
     if recording.malformed_messages:
@@ -206,24 +206,34 @@ def run_export(path: Path, folder: Path, format_: str) -> int:
     return 0 if counts else 1
 
 
-def run_plot(path: Path, folder: Path, from_s: float = 0.0, to_s: float | None = None) -> int:
-    """Plot a recording; exit status 0, 1 (unreadable or empty), 2 (matplotlib is missing)."""
+def run_plot(
+    path: Path, folder: Path, from_s: float = 0.0, to_s: float | None = None, as_json: bool = False
+) -> int:
+    """Plot a recording; exit status 0, 1 (empty, or figures not written), 2 (no recording, no matplotlib)."""
     from handtouch.record.plot import draw, read_plot_data
     from handtouch.record.recording import Recording
 
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        print(f"{error}; pip install 'handtouch[figures]'", file=sys.stderr)
+        print(f"handtouch plot: {error}; pip install 'handtouch[figures]'", file=sys.stderr)
         return 2
     try:
         recording = Recording(path)
-        files = draw(read_plot_data(recording, from_s, to_s), folder)
     except (OSError, ValueError) as error:
-        print(error, file=sys.stderr)
+        print(file_error_text(error), file=sys.stderr)
+        return 2
+    try:
+        with ProgressLine() as progress:
+            progress.update(f"reading {path}")
+            files = draw(read_plot_data(recording, from_s, to_s), folder, progress.update)
+    except (OSError, ValueError) as error:
+        print(file_error_text(error), file=sys.stderr)
         return 1
-    for file in files:
-        print(file)
+    if as_json:
+        print_json({"files": files})
+    else:
+        print(*files, sep="\n")
     if recording.truncation:
         print(f"{path}: {recording.truncation}; all before it is plotted", file=sys.stderr)
     return 0

@@ -5,11 +5,10 @@ Public names: `run`, `speed_limiter`.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,9 @@ from typing import Any
 import zmq
 
 from handtouch import wire
+from handtouch.cli.errors import file_error_text
+from handtouch.cli.json_output import print_json_line, to_json
+from handtouch.cli.progress import ProgressLine
 from handtouch.client.keys import KeyFileError
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.authentication import Authenticator
@@ -42,17 +44,24 @@ def run(
 
     `speed`: factor over the recorded speed, 0 without delays; None: 0, or 1 if published.
 
-    Exit status 0; 1 for an unreadable file, no sample of the deployment, or contacts that differ although the
-    deployment is the recorded one; 2 for wrong usage or deployment file.
+    Exit status 0; 1 for no sample of the deployment, or contacts that differ although the
+    deployment is the recorded one; 2 for wrong usage, or a file that is missing or unreadable.
     """
-    on_contact = _print_json if as_json else _print_line
+    on_contact = print_json_line if as_json else _print_line
     if speed is None:
         speed = 1.0 if publish else 0.0
     try:
         deployment = load(config_path) if config_path else None
+        with path.open("rb"):  # a missing file is wrong usage
+            pass
+        recording = Recording(path) if is_recording(path) else None
+    except (OSError, ValueError) as error:  # ConfigError is a ValueError
+        print(file_error_text(error), file=sys.stderr)
+        return 2
+    try:
         with ExitStack() as stack:
-            if is_recording(path):
-                return _replay_recording(path, deployment, on_contact, publish, speed, report, stack)
+            if recording is not None:
+                return _replay_recording(recording, deployment, on_contact, publish, speed, report, stack)
             if deployment is None:
                 print(
                     f"{path}: a CAN log needs a deployment file: handtouch replay LOG CONFIG", file=sys.stderr
@@ -64,18 +73,19 @@ def run(
                 )
                 return 2
             publisher, pace = _open_publisher(deployment, publish, speed, stack)
-            summary = replay_log(path, deployment, on_contact, pace=pace, publisher=publisher)
+            with _progress_shown(pace) as shown:
+                summary = replay_log(path, deployment, on_contact, pace=shown, publisher=publisher)
             return _print_log_summary(summary, path, config_path)
     except (ConfigError, KeyFileError) as error:
         print(error, file=sys.stderr)
         return 2
     except (OSError, ValueError) as error:
-        print(error, file=sys.stderr)
+        print(file_error_text(error), file=sys.stderr)
         return 1
 
 
 def _replay_recording(
-    path: Path,
+    recording: Recording,
     deployment: Deployment | None,
     on_contact: Callable[[wire.Contact], None],
     publish: bool,
@@ -83,11 +93,13 @@ def _replay_recording(
     report: Path | None,
     stack: ExitStack,
 ) -> int:
-    recording = Recording(path)
     recorded = stack.enter_context(recorded_deployment(first_config(recording)))
     publisher, pace = _open_publisher(deployment or recorded, publish, speed, stack)
     began_s = time.monotonic()
-    result, comparison = replay_recording(recording, on_contact, deployment, pace=pace, publisher=publisher)
+    with _progress_shown(pace) as shown:
+        result, comparison = replay_recording(
+            recording, on_contact, deployment, pace=shown, publisher=publisher
+        )
     _print_result(recording, result, time.monotonic() - began_s)
     if comparison is not None:
         links = comparison.links()
@@ -102,7 +114,7 @@ def _replay_recording(
         details = {"equal": result.equal, "first_difference": None if first is None else asdict(first)}
         status = 0 if result.ticks and result.equal == result.compared else 1
     if report:
-        report.write_text(json.dumps(_report(recording, result) | details, indent=1) + "\n")
+        report.write_text(to_json(_report(recording, result) | details, indent=1) + "\n")
     return status
 
 
@@ -120,6 +132,24 @@ def speed_limiter(speed: float) -> Callable[[int], None]:
             time.sleep(ahead_s)
 
     return pace
+
+
+@contextmanager
+def _progress_shown(pace: Callable[[int], None]) -> Iterator[Callable[[int], None]]:
+    """Yield `pace` with a progress line, unless contacts are printed on the same terminal."""
+    with ProgressLine() as progress:
+        if not progress.shown or sys.stdout.isatty():
+            yield pace
+            return
+        begin_ns: int | None = None
+
+        def pace_and_show(t_ns: int) -> None:
+            nonlocal begin_ns
+            begin_ns = t_ns if begin_ns is None else begin_ns
+            progress.update(f"{(t_ns - begin_ns) * 1e-9:.0f} s replayed")
+            pace(t_ns)
+
+        yield pace_and_show
 
 
 def _open_publisher(
@@ -142,10 +172,6 @@ def _open_publisher(
         pace(t_ns)
 
     return publisher, serve
-
-
-def _print_json(contact: wire.Contact) -> None:
-    print(json.dumps(asdict(contact)))
 
 
 def _print_line(contact: wire.Contact) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -18,6 +17,8 @@ from handtouch import config
 from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, find_four_channels
 from handtouch.canbus.find.traffic import describe_identifier
+from handtouch.cli.json_output import to_json
+from handtouch.cli.progress import ProgressLine
 from handtouch.procedures.scan import (
     BusReport,
     NodeComparison,
@@ -69,25 +70,21 @@ def run_scan(
     except config.ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    console = Console(stderr=True)
     try:
-        if console.is_terminal:
-            with console.status("") as status:
-                reports = scan_buses(scanned, request, deployment, status.update)
-        else:
-            reports = scan_buses(scanned, request, deployment)
+        with ProgressLine() as progress:
+            reports = scan_buses(scanned, request, deployment, progress.update)
     except BusError as error:
         print(error, file=sys.stderr)
         return 1
     comparisons = compare_nodes(deployment, reports)
     ok = not any(comparison.problem for comparison in comparisons)
     ok = ok and not any(report.problems for report in reports)
-    write = to_json if as_json else to_text
+    write = scan_to_json if as_json else to_text
     print(write(reports, comparisons, deployment, ok), end="")
     return 0 if ok else 1
 
 
-def to_json(
+def scan_to_json(
     reports: Sequence[BusReport],
     comparisons: Sequence[NodeComparison],
     deployment: OptionalDeployment,
@@ -100,7 +97,7 @@ def to_json(
         "comparisons": [asdict(comparison) for comparison in comparisons],
         "fragment": fragment(nodes_without_pad(reports, comparisons, deployment), deployment),
     }
-    return json.dumps(report, indent=2) + "\n"
+    return to_json(report, indent=2) + "\n"
 
 
 def to_text(

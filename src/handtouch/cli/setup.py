@@ -10,6 +10,7 @@ from handtouch.cli.options import (
     add_command,
     add_config,
     add_json,
+    add_output,
     integer,
     positive_number,
 )
@@ -24,6 +25,7 @@ def add(commands: Subparsers) -> None:
         "check a deployment file: errors, bus load, warnings (exit status 1)",
     )
     add_config(check, nargs="?")
+    add_bus(check)
     add_json(check)
     check.add_argument(
         "--schema", action="store_true", help="print the JSON schema of deployment files instead"
@@ -49,13 +51,10 @@ def add(commands: Subparsers) -> None:
         "handtouch.cli.drawing_text:run_figures",
         "draw the theoretical figures of the paper that the sensor model comes from",
     )
-    figures.add_argument(
-        "--out",
-        type=Path,
-        default=Path("figures"),
-        metavar="FOLDER",
-        help="folder to write to (default: figures)",
+    add_output(
+        figures, "out", "folder to write to (default: figures)", default=Path("figures"), metavar="FOLDER"
     )
+    add_json(figures)
 
     design = add_command(
         commands,
@@ -64,14 +63,11 @@ def add(commands: Subparsers) -> None:
         "draw maps of a pad's expected position error from noise, for the design in a deployment file",
     )
     add_config(design)
-    design.add_argument("--link", help="pad to draw (default: the first)")
-    design.add_argument(
-        "--out",
-        type=Path,
-        default=Path("design"),
-        metavar="FOLDER",
-        help="folder to write to (default: design)",
+    design.add_argument("--link", metavar="LINK", help="pad to draw (default: the first)")
+    add_output(
+        design, "out", "folder to write to (default: design)", default=Path("design"), metavar="FOLDER"
     )
+    add_json(design)
 
 
 def _add_scan(commands: Subparsers) -> None:
@@ -166,7 +162,7 @@ def _add_conformance(commands: Subparsers) -> None:
         action="store_true",
         help="also prompt for a power cycle, a press and an error (keys: s skips a step, q quits)",
     )
-    output.add_argument("--json", dest="as_json", action="store_true", help="print JSON")
+    add_json(output)
     conformance.add_argument(
         "--report",
         dest="report_path",
@@ -212,3 +208,4 @@ def _add_commission(commands: Subparsers) -> None:
         metavar="S",
         help="time limit for a press or a key (default: 60)",
     )
+    add_json(commission)

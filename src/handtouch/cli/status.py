@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from handtouch.cli.json_output import print_json
 from handtouch.cli.scene_text import scene_lines
 from handtouch.client import CONTROL_ENDPOINT, request
 from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
@@ -42,7 +42,7 @@ def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bo
         print(error, file=sys.stderr)
         return 2
     if as_json:
-        print(json.dumps(answer, indent=2))
+        print_json(answer)
     else:
         print_status(answer, Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH_COLUMNS))
     return 0 if is_all_ok(answer) else 1

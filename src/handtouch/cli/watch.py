@@ -36,6 +36,8 @@ def run(
         with messages, display:
             show_messages(messages, display, lambda: time.monotonic() > end_s)
             has_received = messages.has_received
+    except KeyboardInterrupt:  # the usual end
+        return 0
     except PermissionError as error:
         print(error, file=sys.stderr)
         return 1

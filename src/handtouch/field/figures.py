@@ -36,10 +36,11 @@ PLUG_OHM = 200.0  # of contact under the banana plug, as assumed by the paper
 RESISTOR_OHM = 336.0
 
 
-def draw_figures(out_dir: Path) -> list[Path]:
+def draw_figures(out_dir: Path, on_progress: Callable[[str], None] = lambda _: None) -> list[Path]:
     """Write figure_2.png ... figure_7.png into `out_dir`, created if missing; return their paths.
 
-    Raises ImportError naming the extra where matplotlib isn't installed.
+    `on_progress` is called with a description of each figure before it is drawn. Raises
+    ImportError naming the extra where matplotlib isn't installed.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
     draw: dict[int, Callable[[], Figure]] = {
@@ -50,9 +51,10 @@ def draw_figures(out_dir: Path) -> list[Path]:
         6: _along_the_centre_line,
         7: _resistance_of_the_plane,
     }
-    paths = []
+    paths: list[Path] = []
     for number, make in draw.items():
         path = out_dir / f"figure_{number}.png"
+        on_progress(f"drawing {path} ({len(paths) + 1} of {len(draw)})")
         make().savefig(path, dpi=DPI)
         paths.append(path)
     return paths

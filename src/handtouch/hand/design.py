@@ -104,9 +104,9 @@ def error_summary(pad: PadDesign, force_n: float) -> tuple[float, float]:
 
 def draw_map(pad: PadDesign) -> Figure:
     """Draw the expected error over the unrolled pad, for a light and a firm touch."""
+    figure = new_figure(10.0, 4.6)
     from matplotlib.colors import LogNorm
 
-    figure = new_figure(10.0, 4.6)
     steps = np.linspace(_MAP_EDGE_FRACTION, 1 - _MAP_EDGE_FRACTION, _MAP_STEPS)
     x, y = np.meshgrid(steps * pad.network.a, steps * pad.network.b)
     u, v = pad.surface.from_rectangle(x, y)
@@ -211,16 +211,18 @@ def pad_design(deployment: config.Deployment, link: str | None = None) -> PadDes
     )
 
 
-def draw_design(pad: PadDesign, out: Path) -> list[Path]:
+def draw_design(pad: PadDesign, out: Path, on_progress: Callable[[str], None] = lambda _: None) -> list[Path]:
     """Write the drawings of a pad into the folder `out`, created if missing; return their paths.
 
-    Raises ImportError without matplotlib, OSError if `out` cannot be written.
+    `on_progress` is called with a description of each drawing before it is made. Raises ImportError naming
+    the extra without matplotlib, OSError if `out` cannot be written.
     """
     drawings: dict[str, Callable[[PadDesign], Figure]] = {"error": draw_map, "choices": draw_choices}
     out.mkdir(parents=True, exist_ok=True)
     paths = []
     for kind, draw in drawings.items():
         paths.append(out / f"{pad.name}_{kind}.png")
+        on_progress(f"drawing {paths[-1]} ({len(paths)} of {len(drawings)})")
         draw(pad).savefig(paths[-1], dpi=DPI)
     return paths
 

@@ -1,6 +1,6 @@
-"""Facts about this machine: kernel parameters and network interfaces.
+"""Facts about this machine: kernel parameters, network interfaces and routes.
 
-Public name: `Machine`.
+Public names: `Machine`, `check_multicast_route`, `NoRouteError`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,29 @@ from pathlib import Path
 from typing import Any
 
 _NET_ADMIN_BIT = 12
+_ANY_PORT = 9
+
+
+class NoRouteError(OSError):
+    """No route leads to a multicast group; `remedy` is the command that adds one."""
+
+    def __init__(self, group: str, error: OSError) -> None:
+        super().__init__(f"no route to {group}: {error}")
+        self.remedy = (
+            "ip -6 route add ff00::/8 dev lo table local"
+            if ":" in group
+            else "ip route add 239.0.0.0/8 dev lo"
+        )
+
+
+def check_multicast_route(group: str) -> None:
+    """Raise NoRouteError if the routing table has no route to a multicast address; nothing is sent."""
+    family = socket.AF_INET6 if ":" in group else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((group, _ANY_PORT))
+    except OSError as error:
+        raise NoRouteError(group, error) from error
 
 
 @dataclass(frozen=True)

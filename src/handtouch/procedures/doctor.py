@@ -23,9 +23,10 @@ import zmq
 from handtouch import config
 from handtouch.canbus.bus.receivers import RECEIVE_BUFFER_BYTES
 from handtouch.client import keys
+from handtouch.config.checks import UDP_MULTICAST_PORT
 from handtouch.core.compiled import Compilation
 from handtouch.host import realtime
-from handtouch.host.machine import Machine
+from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
 
 CheckState = Literal["ok", "warn", "fail"]
 _ENDPOINT_IN_USE_REMEDY = (
@@ -247,13 +248,11 @@ def _check_adapter(subject: str, bus: config.Bus, data: dict[str, Any], bring_up
 
 
 def _check_multicast(subject: str, bus: config.Bus) -> HostCheck:
-    group, port = str(bus.channel), bus.options.get("port", 43113)
-    family = socket.AF_INET6 if ":" in group else socket.AF_INET
+    group, port = str(bus.channel), bus.options.get("port", UDP_MULTICAST_PORT)
     try:
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((group, int(port)))  # sends nothing, only consults the routing table
-    except (OSError, OverflowError, ValueError) as error:
-        return HostCheck(subject, "fail", f"no route to {group}: {error}", "ip route add 239.0.0.0/8 dev lo")
+        check_multicast_route(group)
+    except NoRouteError as error:
+        return HostCheck(subject, "fail", str(error), error.remedy)
     return HostCheck(subject, "ok", f"{group} port {port} has a route")
 
 

@@ -6,6 +6,7 @@ Public name: `export`.
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -14,6 +15,7 @@ from handtouch.record.recording import Recording
 from handtouch.record.tables import Row, rows_of
 
 _ROW_GROUP_ROWS = 50_000
+_PROGRESS_ROWS = 1000
 
 
 class TableWriter(Protocol):
@@ -112,13 +114,21 @@ class _TableFolder:
         self._open_tables.close()
 
 
-def export(recording: Recording, folder: Path, format_: str = "csv") -> dict[str, int]:
+def export(
+    recording: Recording,
+    folder: Path,
+    format_: str = "csv",
+    on_progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, int]:
     """Write the tables of a recording into a folder; return their rows. "parquet" needs pyarrow.
 
-    Raises OSError, ImportError.
+    `on_progress` is called with a description of the work done, every `_PROGRESS_ROWS` rows. Raises OSError,
+    ImportError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _TableFolder(folder, format_) as tables:
-        for table, row in rows_of(recording):
+        for count, (table, row) in enumerate(rows_of(recording)):
+            if count % _PROGRESS_ROWS == 0:
+                on_progress(f"{count} rows written to {folder}")
             tables.write(table, row)
         return {name: writer.rows for name, writer in tables.tables.items()}

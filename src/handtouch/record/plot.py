@@ -133,8 +133,8 @@ def read_plot_data(recording: Recording, from_s: float = 0.0, to_s: float | None
     return data
 
 
-def draw(data: PlotData, folder: Path) -> list[Path]:
-    """Draw all figures into a folder; return the files."""
+def draw(data: PlotData, folder: Path, on_progress: Callable[[str], None] = lambda _: None) -> list[Path]:
+    """Draw all figures into a folder; return the files. `on_progress` is called before each figure."""
     import matplotlib
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -143,7 +143,8 @@ def draw(data: PlotData, folder: Path) -> list[Path]:
     if data.touched_pads:
         figures |= {"forces": _draw_forces, "pads": _draw_pads}
     with matplotlib.rc_context(_STYLE):
-        for name, make in figures.items():
+        for number, (name, make) in enumerate(figures.items(), 1):
+            on_progress(f"drawing {name} ({number} of {len(figures)})")
             figure = make(data)
             for suffix in ("pdf", "png"):
                 made.append(folder / f"{name}.{suffix}")

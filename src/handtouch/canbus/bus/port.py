@@ -34,6 +34,7 @@ from handtouch.canbus.bus.router import BusCounters, CanFrame, Router
 from handtouch.canbus.bus.sockets import DatagramReceiver, SocketcanReceiver
 from handtouch.config import Bus
 from handtouch.core.slab import Slab
+from handtouch.host.machine import NoRouteError, check_multicast_route
 
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})
 """Interfaces on which sent frames are received, and counted, again."""
@@ -212,6 +213,7 @@ def _open_receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
     if bus.interface == "socketcan":
         return SocketcanReceiver(opener, str(bus.channel)).open()
     if bus.interface == "udp_multicast":
+        check_multicast_route(str(bus.channel))
         return DatagramReceiver(opener).open()
     if bus.interface == "virtual":
         return InProcessReceiver(opener).open()
@@ -226,6 +228,8 @@ def _open_error(bus: Bus, error: Exception) -> BusError:
 
 
 def _open_remedy(bus: Bus, error: Exception) -> str:
+    if isinstance(error, NoRouteError):
+        return error.remedy
     if isinstance(error, NotImplementedError | ImportError):
         known = ", ".join(sorted(can.VALID_INTERFACES))
         return f"interface must be one of python-can's with its driver installed: {known}"
