@@ -129,7 +129,10 @@ def test_an_unknown_command_or_choice_is_reported_with_the_closest(
     assert f"did you mean '{closest}'?" in capsys.readouterr().err
 
 
-WITHOUT_DATA = {"demo", "run", "simulate", "view", "bridge", "keys revoke", "calibrations export"}
+WITHOUT_DATA = {
+    *("demo", "run", "simulate", "view", "bridge", "keys revoke"),
+    *("calibrations export", "support"),  # write files of JSON
+}
 ROOT = Path(__file__).parents[2]
 
 
@@ -169,7 +172,16 @@ def test_check_uses_the_interface_given_for_a_bus(capsys: pytest.CaptureFixture[
 
 
 def test_every_command_writes_to_the_path_given_as_output() -> None:
-    writing = ("record", "export", "plot", "figures", "design", "calibrations export", "keys client")
+    writing = (
+        "record",
+        "export",
+        "plot",
+        "figures",
+        "design",
+        "support",
+        "calibrations export",
+        "keys client",
+    )
     for name in writing:
         assert {"-o", "--output"} <= set(ALL_COMMANDS[name].format_help().replace(",", " ").split()), name
 

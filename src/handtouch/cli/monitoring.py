@@ -12,6 +12,7 @@ from handtouch.cli.options import (
     add_endpoint,
     add_json,
     add_key,
+    add_output,
     add_percepts,
     integer,
     positive_number,
@@ -88,12 +89,11 @@ def _add_support(commands: Subparsers) -> None:
         "collect versions, deployment, status, logs and a short recording in one archive, without secrets",
     )
     add_config(support, "deployment file of the daemon, also for its endpoints", nargs="?")
-    support.add_argument(
-        "-o",
-        "--out",
-        type=Path,
+    add_output(
+        support,
+        "out",
+        "new archive (default: handtouch-support-HOST-TIME.tar.gz in the current folder)",
         metavar="FILE",
-        help="new archive (default: handtouch-support-HOST-TIME.tar.gz in the current folder)",
     )
     support.add_argument(
         "--seconds",
