@@ -151,6 +151,14 @@ def test_responses_with_jitter_cost_time_but_no_node(seed: int, compares: bool) 
     assert bus.master().scan() == sorted(slave.address for slave in bus.slaves)
 
 
+def test_the_slowest_node_is_awaited_where_those_between_do_not_match() -> None:
+    """The gap between the fastest and the slowest is wider than any between two nodes that follow."""
+    slaves = [LssSlave(address(1 << bit), compares=False) for bit in (13, 8, 12, 0, 6, 7)]
+    master = Bus(slaves, (0.0005, 0.0035, 0.0065, 0.0095)).master()
+    assert master.scan() == sorted(slave.address for slave in slaves)
+    assert master.problems == []
+
+
 @pytest.mark.parametrize("compares", [True, False])
 @pytest.mark.parametrize("seed", [3, 14, 29, 41, 58])
 def test_nodes_missed_after_late_responses_are_a_problem(seed: int, compares: bool) -> None:

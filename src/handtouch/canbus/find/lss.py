@@ -266,15 +266,11 @@ class LssMaster:
             ):
                 continue
             first_ns = last_ns = self._clock()
-            widest_ns = 0
             for _ in range(_MAX_RESPONSES):  # of the slower ones
                 if self._exchange(None, self._response_timer.wait_s) is None:
                     break
-                now_ns = self._clock()
-                widest_ns, last_ns = max(widest_ns, now_ns - last_ns), now_ns
-            self._response_timer.record_round(
-                (first_ns - sent_ns) * 1e-9, (last_ns - sent_ns) * 1e-9, widest_ns * 1e-9
-            )
+                last_ns = self._clock()
+            self._response_timer.record_round((first_ns - sent_ns) * 1e-9, (last_ns - sent_ns) * 1e-9)
             return True
         return False
 
@@ -283,11 +279,12 @@ class LssMaster:
         sent_ns = self._clock()
         if self._request(request, cia305.IS_SLAVE, patience * self._response_timer.wait_s) is None:
             return False
-        self._response_timer.record_response((self._clock() - sent_ns) * 1e-9)
-        if self._response_timer.settle_s:
-            for _ in range(_MAX_RESPONSES):
-                if self._exchange(None, self._response_timer.settle_s) is None:
-                    break
+        response_s = (self._clock() - sent_ns) * 1e-9
+        self._response_timer.record_response(response_s)
+        settle_s = self._response_timer.settle_s(response_s)
+        for _ in range(_MAX_RESPONSES if settle_s else 0):
+            if self._exchange(None, settle_s) is None:
+                break
         return True
 
     def _select(self, address: LssAddress) -> int:
@@ -387,7 +384,7 @@ class _ResponseTimer:
 
     def __init__(self, min_wait_s: float) -> None:
         self.min_wait_s = min_wait_s
-        self._settle_s = 0.0
+        self._fastest_s = 0.0
         self._smoothed_s: float | None = None
         self._deviation_s = 0.0
         self._slowest_s = 0.0
@@ -400,17 +397,21 @@ class _ResponseTimer:
         estimate_s = self._smoothed_s + 4 * self._deviation_s
         return self._factor * min(max(estimate_s, 2 * self._slowest_s, self.min_wait_s), _MAX_WAIT_S)
 
-    @property
-    def settle_s(self) -> float:
-        """Time to wait for slower nodes after a response; 0 if all respond at once."""
-        return self.wait_s if self._factor > 1 else self._settle_s
+    def settle_s(self, response_s: float) -> float:
+        """Return the time to wait for slower nodes after a response; 0 if all respond at once.
 
-    def record_round(self, first_s: float, last_s: float, widest_s: float) -> None:
-        """Record a request to all nodes: first and last response, and the widest gap between responses."""
-        self.record_response(first_s)
-        self._slowest_s = last_s
-        several = last_s > first_s
-        self._settle_s = max(_MIN_SETTLE_S, 2 * widest_s) if several else 0.0
+        Which of the nodes respond isn't known, so the next one may be the slowest.
+        """
+        if self._factor > 1:
+            return self.wait_s
+        if self._slowest_s <= self._fastest_s:
+            return 0.0
+        return max(_MIN_SETTLE_S, 2 * self._slowest_s - response_s)
+
+    def record_round(self, fastest_s: float, slowest_s: float) -> None:
+        """Record the first and the last response time of a request to all nodes."""
+        self.record_response(fastest_s)
+        self._fastest_s, self._slowest_s = fastest_s, slowest_s
 
     def record_response(self, response_s: float) -> None:
         """Record a response time."""
