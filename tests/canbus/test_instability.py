@@ -363,14 +363,30 @@ def test_changed_setting_is_repaired_three_times_then_reported(make_rig: Make) -
     assert rig.state(1) is OPERATIONAL
 
 
-def test_settings_of_a_silent_but_correct_node_are_read_three_times_only(make_rig: Make) -> None:
+def test_settings_of_a_silent_but_correct_node_are_read_with_growing_delays(make_rig: Make) -> None:
     rig = make_rig(1, device=EDS)
     rig.boot()
     rig.node(1).send_data = False
     before = rig.node(1).sdo.requests
     rig.run(20_000)
-    assert rig.node(1).sdo.requests - before == 3 * 8
+    assert rig.node(1).sdo.requests - before == 6 * 8  # after 0.1, 0.5, 3.7, 8.7, 13.7 and 18.7 s
     assert rig.state(1) is STALE
+
+
+def test_a_change_is_repaired_however_often_the_node_was_stale_before(make_rig: Make) -> None:
+    rig = make_rig(2, device=EDS)
+    rig.boot()
+    for _ in range(6):  # as by a host that stalls
+        rig.node(1).send_data = False
+        rig.run(120)
+        assert rig.state(1) is STALE
+        rig.node(1).send_data = True
+        rig.run(20)
+        assert rig.state(1) is OPERATIONAL
+    rig.node(1).write_object(0x1801, 1, 0x80000281)
+    events = rig.run(6000)
+    assert any("0x1801:01, COB-ID of TPDO2, is 0x80000281 instead of 0x281" in e.reason for e in events)
+    assert rig.state(1) is OPERATIONAL
 
 
 def test_listener_reads_no_settings_of_a_stale_node(make_rig: Make) -> None:

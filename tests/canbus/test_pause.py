@@ -105,6 +105,27 @@ def test_one_late_pad_names_its_node(rig: Any) -> None:
     assert "heartbeat present; check transmission type and COB-ID of its TPDO" in event.reason
 
 
+@pytest.mark.parametrize("role", ["master", "listener"])
+def test_a_pad_that_stays_late_when_the_others_are_back_names_its_node(make_rig: Make, role: str) -> None:
+    rig = make_rig(3, role=role)
+    rig.plug_all()
+    if role == "listener":
+        for device in rig.devices.devices.values():
+            device.write_object(0x1017, 0, 100)
+            device.write_object(0x1801, 2, 1)
+            device.handle_nmt(1)
+    rig.start()
+    rig.run(500)
+    rig.wire.lose = {0x281, 0x282, 0x283}
+    rig.run(50)
+    assert all("as from every pad of bus can" in rig.status(n).reason for n in (1, 2, 3))
+    rig.wire.lose = {0x282}
+    events = rig.run(500)
+    assert "heartbeat present; " in rig.status(2).reason
+    assert "bus" not in rig.status(2).reason
+    assert not [e for e in events if e.slot != 1 and "heartbeat" in e.reason]
+
+
 def test_nodes_lost_together_name_the_bus_and_one_lost_alone_doesnt(rig: Any) -> None:
     rig.boot()
     rig.wire.cut = {1}

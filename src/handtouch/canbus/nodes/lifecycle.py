@@ -63,10 +63,8 @@ _TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF
 _SETTINGS_UNCHANGED = "its PDO and heartbeat settings are as configured; check its sampling and firmware"
 _STANDBY_REASON = "outside the scene: in standby until needed"
 
-MAX_CHECKS = 3
-"""Times that the settings of a stale node are read back."""
 _BUS_CAUSE_DELAY_NS = 1_000_000_000
-"""Time until the settings of a node are checked whose samples stayed away with those of others."""
+"""Time until the settings of a node are checked while those of others stay away, too."""
 MAX_REPAIRS = 3
 """Times that changed settings are repaired, before that is only reported."""
 _BOOT_STEPS = frozenset({NodeAction.IDENTIFY, NodeAction.READ_MAPPING, NodeAction.CONFIGURE})
@@ -102,8 +100,8 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
             return _on_sample_rate(life, samples_per_sync, now_ns, timing)
         case StandbyRequested(standby):
             return _on_standby_requested(life, standby, now_ns, timing)
-        case TimerExpired(bus_cause):
-            return _on_timer_expired(life, bus_cause, now_ns, timing)
+        case TimerExpired():
+            return _on_timer_expired(life, event, now_ns, timing)
         case LoopPaused(excused_ns):
             return _extend_timeouts(life, excused_ns), ()
         case BusRecovered():
@@ -244,8 +242,7 @@ def _on_step_done(life: Lifecycle, event: StepDone, now_ns: int, timing: NodeTim
         case NodeAction.ENTER_STANDBY if life.state is NodeState.STOPPED:
             return enter(life, NodeState.STOPPED, now_ns, _STANDBY_REASON), ()
         case NodeAction.CHECK_SETTINGS if life.state is NodeState.STALE:
-            reason = life.reason.replace(_TPDO_REMEDY, _SETTINGS_UNCHANGED)
-            return enter(life, NodeState.STALE, now_ns, reason), ()
+            return enter(life, NodeState.STALE, now_ns, _explain_silence(life, _SETTINGS_UNCHANGED)), ()
     return life, ()
 
 
@@ -279,7 +276,9 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
     if event.step is NodeAction.SET_TRANSMISSION and event.timed_out and life.state in STARTED:
         # its TPDO may be disabled now
         return begin_boot(life, now_ns, event.reason, timing)
-    if event.step is NodeAction.CHECK_SETTINGS and life.state is NodeState.STALE and not event.timed_out:
+    if event.step is NodeAction.CHECK_SETTINGS and life.state is NodeState.STALE:
+        if event.timed_out:
+            return enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY)), ()
         return _repair_settings(life, event.reason, now_ns, timing)
     if event.step is NodeAction.ENTER_STANDBY and life.state is NodeState.STOPPED:
         return enter(life, NodeState.STOPPED, now_ns, f"{_STANDBY_REASON}, but {event.reason}"), ()
@@ -303,6 +302,7 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
 
 def _repair_settings(life: Lifecycle, difference: str, now_ns: int, timing: NodeTiming) -> Transition:
     """Configure a stale node again whose settings have changed, a few times."""
+    life = replace(life, checks=0, check_ns=now_ns + timing.retry_delay_ns(3))
     if now_ns - life.repaired_ns > _REPAIR_MEMORY_NS:
         life = replace(life, repairs=0)
     if life.repairs >= MAX_REPAIRS:
@@ -352,32 +352,53 @@ def _on_samples_missing(
 ) -> Transition:
     if life.state is not NodeState.OPERATIONAL:
         return life, ()
-    heartbeat = "heartbeat present" if life.last_heartbeat_ns is not None else "no heartbeat either"
-    cause = bus_cause or f"{heartbeat}; {_TPDO_REMEDY}"
-    reason = f"no sample for {age_ns / 1e6:.0f} ms, {cause}"
-    return _enter_stale(life, now_ns, reason, bus_cause, timing), ()
+    return _enter_stale(life, now_ns, f"no sample for {age_ns / 1e6:.0f} ms", bus_cause, timing), ()
 
 
-def _enter_stale(life: Lifecycle, now_ns: int, reason: str, bus_cause: str, timing: NodeTiming) -> Lifecycle:
+def _enter_stale(life: Lifecycle, now_ns: int, silence: str, bus_cause: str, timing: NodeTiming) -> Lifecycle:
     """Enter STALE; the settings are checked soon, or later if the cause seems to be in the host or the bus.
 
-    The first check isn't postponed by single samples.
+    A check that is due isn't postponed by single samples.
     """
-    life = enter(life, NodeState.STALE, now_ns, reason)
-    if now_ns - life.first_check_ns > timing.max_retry_ns:
-        delay_ns = _BUS_CAUSE_DELAY_NS if bus_cause else timing.retry_delay_ns(1)
-        life = replace(life, first_check_ns=now_ns + delay_ns, checks=0)
-    return replace(life, due_ns=max(life.first_check_ns, now_ns))
+    life = replace(life, silence=silence, bus_cause=bus_cause)
+    life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY))
+    soon_ns = timing.retry_delay_ns(1)
+    if now_ns - life.check_ns > timing.max_retry_ns:
+        life = replace(life, check_ns=now_ns + (_BUS_CAUSE_DELAY_NS if bus_cause else soon_ns), checks=0)
+    due_ns = max(life.check_ns, now_ns)
+    return replace(life, due_ns=min(due_ns, now_ns + soon_ns) if bus_cause else due_ns)
 
 
-def _check_settings(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
-    """Have the settings of a stale node read back, a few times with growing delays."""
-    away = (cia301.STOPPED, cia301.PREOPERATIONAL)
-    if life.checks >= MAX_CHECKS or timing.role is BusRole.LISTENER or life.nmt_state in away:
+def _explain_silence(life: Lifecycle, remedy: str) -> str:
+    """Return the reason of a stale node; the remedy applies if the cause is the node's."""
+    if life.bus_cause:
+        return f"{life.silence}, {life.bus_cause}"
+    heartbeat = "heartbeat present" if life.last_heartbeat_ns is not None else "no heartbeat either"
+    return f"{life.silence}, {heartbeat}; {remedy}"
+
+
+def _on_stale_due(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTiming) -> Transition:
+    """Have the settings of a stale node read back, with growing delays.
+
+    A cause in the host or the bus holds only while samples of others are missing, too. Single samples after
+    its end may still be on their way, so the reason changes after the check, or for a listener after a delay.
+    """
+    soon_ns = now_ns + timing.retry_delay_ns(1)
+    listens = timing.role is BusRole.LISTENER
+    if life.bus_cause and bus_cause and (listens or now_ns < life.check_ns):
+        return replace(life, due_ns=soon_ns if listens else min(soon_ns, life.check_ns)), ()
+    was_common = bool(life.bus_cause)
+    life = replace(life, bus_cause=bus_cause if was_common else "")
+    if listens and was_common:
+        return replace(life, due_ns=soon_ns), ()
+    if listens:
+        life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY))
         return replace(life, due_ns=NEVER_NS), ()
+    if life.nmt_state in (cia301.STOPPED, cia301.PREOPERATIONAL):  # its heartbeats decide what follows
+        return replace(life, due_ns=now_ns + timing.max_retry_ns), ()
     checks = life.checks + 1
-    due_ns = now_ns + timing.retry_delay_ns(3 * checks)
-    return replace(life, checks=checks, due_ns=due_ns), (NodeAction.CHECK_SETTINGS,)
+    check_ns = now_ns + timing.retry_delay_ns(3 * checks)
+    return replace(life, checks=checks, check_ns=check_ns, due_ns=check_ns), (NodeAction.CHECK_SETTINGS,)
 
 
 def _on_standby_requested(life: Lifecycle, standby: bool, now_ns: int, timing: NodeTiming) -> Transition:
@@ -414,11 +435,11 @@ def _on_sample_rate(life: Lifecycle, samples_per_sync: int, now_ns: int, timing:
     return replace(life, babbling=True, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns), ()
 
 
-def _on_timer_expired(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTiming) -> Transition:
+def _on_timer_expired(life: Lifecycle, event: TimerExpired, now_ns: int, timing: NodeTiming) -> Transition:
     if life.last_heartbeat_ns is not None and is_supervised(life):
         quiet_ns = now_ns - life.last_heartbeat_ns
         if quiet_ns > timing.heartbeat_timeout_ns:
-            return _on_heartbeat_timeout(life, quiet_ns, bus_cause, now_ns, timing), ()
+            return _on_heartbeat_timeout(life, quiet_ns, event.bus_cause, now_ns, timing), ()
     if now_ns < life.due_ns:
         return life, ()
     if life.state is NodeState.ABSENT and timing.role is BusRole.LISTENER:
@@ -431,10 +452,9 @@ def _on_timer_expired(life: Lifecycle, bus_cause: str, now_ns: int, timing: Node
     if life.state is NodeState.FAULTED:
         return instability.on_fault_due(life, now_ns, timing)
     if life.state is NodeState.SETTLING:
-        cause = f", {bus_cause}" if bus_cause else f"; {_TPDO_REMEDY}"
-        return _enter_stale(life, now_ns, f"started, but no sample received{cause}", bus_cause, timing), ()
+        return _enter_stale(life, now_ns, "started, but no sample received", event.bus_cause, timing), ()
     if life.state is NodeState.STALE:
-        return _check_settings(life, now_ns, timing)
+        return _on_stale_due(life, event.sample_cause, now_ns, timing)
     return life, ()
 
 

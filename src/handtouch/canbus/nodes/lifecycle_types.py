@@ -112,8 +112,10 @@ class Lifecycle:
     reset_pending: bool = False  # its boot-up message hasn't arrived
     foreign_nmt: int | None = None  # last NMT command of another master, and its time
     foreign_nmt_ns: int = 0
-    checks: int = 0  # of its settings, since it was stale
-    first_check_ns: int = -(1 << 62)  # time of the first of them
+    silence: str = ""  # STALE: what is missing
+    bus_cause: str = ""  # STALE: its cause in the host or the bus, empty if it is the node's
+    checks: int = 0  # of its settings, in close succession
+    check_ns: int = -(1 << 62)  # time of the next one
     repairs: int = 0  # of changed settings, in close succession
     repaired_ns: int = 0  # time of the last one
     boot_reason: str = ""  # cause of the present boot
@@ -202,9 +204,14 @@ class SampleRate:
 
 @dataclass(frozen=True, slots=True)
 class TimerExpired:
-    """The time returned by `lifecycle.due_ns` has come; `bus_cause` as in `SamplesMissing`."""
+    """The time returned by `lifecycle.due_ns` has come.
+
+    Causes in the host or the bus, empty for none: `bus_cause` of missing heartbeats or first samples,
+    `sample_cause` of missing samples of a stale node.
+    """
 
     bus_cause: str = ""
+    sample_cause: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -326,7 +326,7 @@ class Master:
                 self._awaited_samples[slot] = int(arrival_ns[slot])
                 self._advance(self._by_slot[slot], SampleReceived(), now_ns)
         if self._sync_period_ns:
-            ages_ns = now_ns - np.maximum(arrival_ns, self.transmission_since_ns)
+            ages_ns = self._sample_ages_ns(now_ns)
             timeout_ns = np.maximum(STALE_PERIODS * self.sample_period_ns, _MIN_STALE_NS)
             stale = (self.states == NodeState.OPERATIONAL) & (ages_ns > timeout_ns)
             if stale.any():
@@ -335,6 +335,10 @@ class Master:
                     node = self._by_slot[slot]
                     cause = self._bus_causes.of_missing_samples(node, states, ages_ns, now_ns)
                     self._advance(node, SamplesMissing(int(ages_ns[slot]), cause), now_ns)
+
+    def _sample_ages_ns(self, now_ns: int) -> NDArray[np.int64]:
+        """Return the time (slots,) since the last sample, or since it is awaited."""
+        return now_ns - np.maximum(self._slab.arrival_ns, self.transmission_since_ns)
 
     def _check_recoveries(self, now_ns: int) -> None:
         """Restart the timeouts of a bus that was down: its nodes could not be heard."""
@@ -350,8 +354,9 @@ class Master:
         for node in self._nodes:
             due = due_ns(node.lifecycle, node.timing)
             if due is not None and due <= now_ns:
-                cause = self._bus_causes.of_timeout(node, now_ns)
-                self._advance(node, TimerExpired(cause), now_ns)
+                causes, ages_ns = self._bus_causes, self._sample_ages_ns(now_ns)
+                sample_cause = causes.of_missing_samples(node, self.states, ages_ns, now_ns)
+                self._advance(node, TimerExpired(causes.of_timeout(node, now_ns), sample_cause), now_ns)
                 due = due_ns(node.lifecycle, node.timing)
             if node.guarded and is_supervised(node.lifecycle):
                 self._send_guard_request(node, now_ns)
