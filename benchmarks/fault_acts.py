@@ -88,8 +88,8 @@ class Kind:
     """periods by which its samples are late; shortens the pause that makes it stale"""
     within_s: float = 1.0
     well_s: float = 2.0
-    rest_s: float = 0.0
-    """time until the node may have the next fault: an unstable one is stable after 5 s"""
+    unstable: bool = False
+    """the node doesn't stay operational: it has no other fault until it is stable again"""
     weight: float = 1.0
 
 

@@ -40,6 +40,7 @@ from handtouch.device import DeviceBus
 WELL = ("clear", "touched")
 HOLD_NS = S // 3  # a node has to stay well for so long
 GIVE_UP_S = 30.0
+STABLE_S = 5.5  # an unstable node is stable after 5 s of operation; until then a reboot may be its boot loop
 ALONE_AT_ONCE = 4
 
 
@@ -106,7 +107,8 @@ class Campaign:
             return
         if self._draining or len(self._alone) >= ALONE_AT_ONCE:
             self._draining = bool(self._alone)
-            if self._alone and not self._active:  # everything else is over
+            ready = not self._active and all(self._may_begin(n, now_ns) for n in self._links.values())
+            if self._alone and ready:  # everything else is over
                 self._begin(self._alone.pop(), None, now_ns)
             return
         if not self._coming:
@@ -235,7 +237,9 @@ class Campaign:
         self.done.append(fault)
         for node_id in fault.nodes:
             del self._busy[node_id]
-            self._free_ns[node_id] = now_ns + int(fault.kind.rest_s * S)
+            rebooted = self.health[node_id].reboots > fault.health[node_id].reboots
+            rest_s = STABLE_S if rebooted or fault.kind.unstable else 0.0
+            self._free_ns[node_id] = now_ns + int(rest_s * S)
         for t_ns in fault.disturbed_ns:
             paused = self.bench.cable.paused(fault.nodes[0], t_ns, fault.kind.lag)
             _once(fault, "paused" if paused else "disturbed")
