@@ -3,7 +3,7 @@
 A PDO's data is a little-endian word of 64 bits and a channel a bit field of one such word, so that samples of
 any width and mapping are stored as received and unpacked for the whole hand at once.
 
-Public names: `Slab`, `ChannelField`, `ChannelLayout`, `STANDARD_LAYOUT`, `MAX_PDOS`.
+Public names: `Slab`, `CountSlab`, `ChannelField`, `ChannelLayout`, `STANDARD_LAYOUT`, `MAX_PDOS`.
 """
 
 from __future__ import annotations
@@ -193,6 +193,27 @@ class Slab:
         self.fresh_count = int(np.count_nonzero(self.fresh))
         for parts in self._partial_samples.values():
             parts.begin_cycle(sync_ns)
+
+
+class CountSlab(Slab):
+    """A slab whose samples are counts of all pads at once, not PDOs; `limits` (size, 4, 2): the lowest and
+    highest count of each channel."""
+
+    def __init__(self, limits: NDArray[np.int64]) -> None:
+        super().__init__(len(limits))
+        low, high = limits[:, :, 0], limits[:, :, 1]
+        self._low_limits[:], self._high_limits[:] = np.where(low < 0, low + 1, -1), high
+
+    def store_counts(self, counts: NDArray[np.int64], arrival_ns: int) -> None:
+        """Store a sample (size, 4) of all pads."""
+        self._counts[:] = counts
+        self.arrival_ns.fill(arrival_ns)
+        self.fresh.fill(1)
+        self.fresh_count = self.size
+
+    def unpack_counts(self) -> NDArray[np.int64]:
+        """Return counts (size, 4); the array is reused by the next sample."""
+        return self._counts
 
 
 class _PartialSample:

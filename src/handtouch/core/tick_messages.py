@@ -156,9 +156,23 @@ class TickMessages:
         force[requested & columns.force_saturated[rows]] = ForceStatus.LOWER_BOUND
         force[requested & np.isnan(columns.contact_columns["force_n"][rows])] = ForceStatus.INVALID
 
+    def frame_columns(self) -> dict[str, NDArray[Any]]:
+        """Return the columns of all hand frames, (n, ...) with the rows of the model, in their types.
+
+        These are the values that `send_hand_frames` publishes; the optional columns aren't among them.
+        """
+        rows, layout = slice(0, self._model.size), wire.COLUMNS[wire.HandFrame]
+        self._update_statuses(rows)
+        return {name: array.astype(layout[name].dtype) for name, array in self._frame_sources(rows).items()}
+
     def _make_encoder(self, hand: str, rows: slice) -> HandFrameEncoder:
+        links = tuple(self._model.links[rows])
+        return HandFrameEncoder(self._session, hand, links, self._frame_sources(rows))
+
+    def _frame_sources(self, rows: slice) -> dict[str, NDArray[Any]]:
+        """Return the arrays that the columns of hand frames are copied from."""
         columns = self._tick.columns
-        sources: dict[str, NDArray[Any]] = {
+        return {
             "state": columns.state[rows],
             "contact_id": self._tick.contacts.id[rows],
             "sample_ns": columns.sample_ns[rows],
@@ -167,7 +181,6 @@ class TickMessages:
             "force_status": self._force_status[rows],
             **{name: columns.contact_columns[name][rows] for name in CONTACT_DTYPE.names or ()},
         }
-        return HandFrameEncoder(self._session, hand, tuple(self._model.links[rows]), sources)
 
     def _raw_message(self, hand: str, slab: Slab) -> wire.Raw:
         rows = self._model.rows_of_hand[hand]

@@ -1,8 +1,8 @@
 """History of a pad's sheet under load: ratio of apparent to true force over time.
 
-Public name: `SimulatedSheetHistory`. It integrates a `SheetLaw` between knots that are dense where the load
-changes and sparse elsewhere; the laws are exact under constant load, so an idle hour is a single step. It is
-integrated only as far as requested; results don't depend on the order of requests.
+Public names: `SimulatedSheetHistory`, `random_factor`. It integrates a `SheetLaw` between knots that are
+dense where the load changes and sparse elsewhere; the laws are exact under constant load, so an idle hour is
+a single step. It is integrated only as far as requested; results don't depend on the order of requests.
 """
 
 from __future__ import annotations
@@ -134,23 +134,38 @@ class SimulatedSheetHistory:
 
     def _random_factor(self, times_s: FloatArray, apparent_n: FloatArray) -> FloatArray:
         """Return the random part of the ratio: variation between presses, and contact noise."""
-        law = self._law
-        factor = np.ones(len(times_s))
-        if law.press_std and len(self._press_begins_s):
-            press = np.searchsorted(self._press_begins_s, self._scenario_time_s(times_s), side="right")
-            if np.isfinite(self._repeat_period_s):
-                press = press + (len(self._press_begins_s) + 1) * (times_s // self._repeat_period_s).astype(
-                    np.int64
-                )
-            factor *= np.exp(law.press_std * noise.standard_normal(self._noise_key, press))
-        if law.noise_std:
-            steps = times_s / law.noise_time_s
-            before = np.floor(steps)
-            part, first = steps - before, before.astype(np.int64)
-            low, high = (noise.standard_normal(self._noise_key + np.uint64(1), first + i) for i in (0, 1))
-            flicker = ((1 - part) * low + part * high) / np.hypot(part, 1 - part)
-            factor *= np.exp(law.noise_std / np.sqrt(np.maximum(apparent_n, 1e-3)) * flicker)
-        return factor
+        if not len(self._press_begins_s):
+            return random_factor(self._law, self._noise_key, times_s, apparent_n, None)
+        press = np.searchsorted(self._press_begins_s, self._scenario_time_s(times_s), side="right")
+        if np.isfinite(self._repeat_period_s):
+            press = press + (len(self._press_begins_s) + 1) * (times_s // self._repeat_period_s).astype(
+                np.int64
+            )
+        return random_factor(self._law, self._noise_key, times_s, apparent_n, press)
 
     def _scenario_time_s(self, times_s: FloatArray) -> FloatArray:
         return times_s % self._repeat_period_s if np.isfinite(self._repeat_period_s) else times_s
+
+
+def random_factor(
+    law: SheetLaw,
+    key: np.uint64 | NDArray[np.uint64],
+    times_s: FloatArray,
+    apparent_n: FloatArray,
+    press: NDArray[np.int64] | None,
+) -> FloatArray:
+    """Return the random part of apparent over true force (n,) at times and apparent forces (n,).
+
+    `key`: () or (n,), of each sheet. `press`: (n,), number of the press, for its variation; None: without it.
+    """
+    factor = np.ones(len(times_s))
+    if law.press_std and press is not None:
+        factor *= np.exp(law.press_std * noise.standard_normal(key, press))
+    if law.noise_std:
+        steps = times_s / law.noise_time_s
+        before = np.floor(steps)
+        part, first = steps - before, before.astype(np.int64)
+        low, high = (noise.standard_normal(key + np.uint64(1), first + i) for i in (0, 1))
+        flicker = ((1 - part) * low + part * high) / np.hypot(part, 1 - part)
+        factor *= np.exp(law.noise_std / np.sqrt(np.maximum(apparent_n, 1e-3)) * flicker)
+    return factor

@@ -32,12 +32,14 @@ from handtouch.simulate.worlds import DrawnWorld
 
 FloatArray = NDArray[np.float64]
 _QUANTISATION_VARIANCE = 1 / 12  # counts^2, by rounding
+_KEY_STEP = np.uint64(0xBF58476D1CE4E5B9)  # between the noise streams of equal hands
 
 
 class VirtualHand:
     """Pads of a deployment, or of one of its buses, with a stimulus in a world.
 
-    Rows are the pads in the order of the file; `pads` are (hand's name, pad). `faults` are added to those of
+    Rows are the pads in the order of the file; `pads` are (hand's name, pad), `virtual_pads` their models.
+    `faults` are added to those of
     the stimulus.
     """
 
@@ -52,25 +54,25 @@ class VirtualHand:
         self.pads = [(hand, pad) for hand, pad in deployment.pads if bus in (None, pad.bus)]
         self._stimulus = stimulus
         all_faults = (*stimulus.faults, *faults)
-        self._virtual_pads = [
+        self.virtual_pads = [
             VirtualPad.build(deployment, hand, pad, stimulus, world, all_faults) for hand, pad in self.pads
         ]
-        self._bank = SheetMapBank([row.circuit.maps for row in self._virtual_pads])
-        self._circuits = _HealthyCircuits(self._virtual_pads)
-        self._noise = np.array([row.noise_counts for row in self._virtual_pads])
-        self._keys = np.array([row.noise_keys for row in self._virtual_pads]).reshape(-1, 4)
-        self._gains = np.array([row.counts_per_ampere for row in self._virtual_pads])
-        limits = np.array([row.limits for row in self._virtual_pads])
+        self._bank = SheetMapBank([row.circuit.maps for row in self.virtual_pads])
+        self._circuits = _HealthyCircuits(self.virtual_pads)
+        self._noise = np.array([row.noise_counts for row in self.virtual_pads])
+        self._keys = np.array([row.noise_keys for row in self.virtual_pads]).reshape(-1, 4)
+        self._gains = np.array([row.counts_per_ampere for row in self.virtual_pads])
+        limits = np.array([row.limits for row in self.virtual_pads])
         self._low, self._high = limits[:, :, 0], limits[:, :, 1]
         self._sample_count = 0
-        self._drift = ElectronicsDrift(world, [(row.hand, row.pad.link) for row in self._virtual_pads])
+        self._drift = ElectronicsDrift(world, [(row.hand, row.pad.link) for row in self.virtual_pads])
         self._special_rows = [
-            number for number, row in enumerate(self._virtual_pads) if row.faults or row.replacement_gains
+            number for number, row in enumerate(self.virtual_pads) if row.faults or row.replacement_gains
         ]
         self._touch_pads = [
             [
                 (number, ContactPatch(radius_m) if radius_m else world.contact(row.sheet, index).patch)
-                for number, row in enumerate(self._virtual_pads)
+                for number, row in enumerate(self.virtual_pads)
                 if row.pad.link == link
             ]
             for index, (link, radius_m) in enumerate(stimulus.touch_links)
@@ -79,13 +81,9 @@ class VirtualHand:
     def sample(self, t_s: float) -> NDArray[np.int64]:
         """Return counts (pads, 4) of the channels x0, xa, y0, yb, `t_s` after the start of the scenario."""
         self._sample_count += 1
-        if history := self._virtual_pads[self._sample_count % len(self._virtual_pads)].history:
+        if history := self.virtual_pads[self._sample_count % len(self.virtual_pads)].history:
             history.extend_ahead(t_s)  # one pad per sample, to keep samples fast
-        counts = self._noise[:, None] * noise.standard_normal(self._keys, round(t_s * 1e9))
-        gains, times_s = self._gains, np.array([t_s])
-        if not self._drift.is_constant:
-            counts += self._drift.zero_counts(times_s)[0]
-            gains = gains * self._drift.gain_ratio(times_s)[0] * self._drift.supply_ratio(times_s)
+        counts, gains = self.untouched_counts(t_s)[0], self.counts_per_ampere(t_s)
         all_contacts = self._contacts_at(t_s)
         contact_counts = Counter(contact.row for contact in all_contacts)
         special = {*self._special_rows, *(row for row, number in contact_counts.items() if number > 1)}
@@ -93,18 +91,44 @@ class VirtualHand:
             currents, _ = self._currents(contacts, t_s)
             rows = [contact.row for contact in contacts]
             counts[rows] += currents * gains[rows]
-        readings = np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
+        readings = self.quantise(counts)
         for row in special:
             readings[row] = self.counts(row, [t_s])[0]
         return readings
 
+    def untouched_counts(self, t_s: float, hands: int = 1) -> FloatArray:
+        """Return zeros and noise (hands, pads, 4) [counts] at `t_s`, of hands that differ in noise only; the
+        first one is that of `sample`."""
+        keys = self._keys + (np.arange(hands, dtype=np.uint64) * _KEY_STEP)[:, None, None]
+        counts = self._noise[:, None] * noise.standard_normal(keys, round(t_s * 1e9))
+        if not self._drift.is_constant:
+            counts += self._drift.zero_counts(np.array([t_s]))
+        return np.asarray(counts)
+
+    def counts_per_ampere(self, t_s: float) -> FloatArray:
+        """Return the gains (pads, 4) of the channels at `t_s`, for currents at the nominal supply voltage."""
+        if self._drift.is_constant:
+            return self._gains
+        times_s = np.array([t_s])
+        return np.asarray(
+            self._gains * self._drift.gain_ratio(times_s)[0] * self._drift.supply_ratio(times_s)
+        )
+
+    def temperature_rise_k(self, t_s: float) -> float:
+        """Return the temperature at `t_s` relative to that at the start."""
+        return float(self._drift.temperature_rise_k(np.array([t_s]))[0])
+
+    def quantise(self, counts: FloatArray) -> NDArray[np.int64]:
+        """Return readings (..., pads, 4) of the converters."""
+        return np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
+
     def counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:
         """Return counts (n, 4) of one pad at times (n,), the same as those of `sample`."""
-        return self._virtual_pads[pad_row].counts(times_s)
+        return self.virtual_pads[pad_row].counts(times_s)
 
     def prepare(self) -> None:
         """Solve all sheets in advance, so that a live hand doesn't pause for it."""
-        for row in self._virtual_pads:
+        for row in self.virtual_pads:
             row.prepare()
 
     def switch_excitation(self, pad_row: int, t_s: float, on: bool) -> None:
@@ -112,7 +136,7 @@ class VirtualHand:
 
         It is on from the start.
         """
-        if history := self._virtual_pads[pad_row].history:
+        if history := self.virtual_pads[pad_row].history:
             history.switch_excitation(t_s, on)
 
     def truth(self, t_s: float, sync_ns: int = 0) -> list[GroundTruth]:
@@ -139,8 +163,20 @@ class VirtualHand:
         patch = np.array([(contact.patch.radius_m, *contact.patch.focus_m) for contact in contacts]).T
         force = np.array([contact.contact.force_n for contact in contacts])
         times_s = np.array([t_s])
-        pads = [self._virtual_pads[contact.row] for contact in contacts]
+        pads = [self.virtual_pads[contact.row] for contact in contacts]
         force = force * [1.0 if pad.is_ideal else pad.force_ratio(times_s)[0] for pad in pads]
+        return self.solve_contacts(rows, position, patch, force)
+
+    def solve_contacts(
+        self, rows: NDArray[np.intp], position: FloatArray, patch: FloatArray, force: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return currents (k, 4) [A] of contacts (k,), each alone on its pad, at the nominal supply voltage.
+
+        rows: (k,) of the pads. position: (2, k), fractions of the pad. patch: (3, k), radius and focus of a
+        `ContactPatch` [m]. force: (k,), apparent [N]. Second: the currents' derivatives (k, 4, 3) by x, y
+        [fractions] and total current.
+        """
+        pads = [self.virtual_pads[row] for row in rows.tolist()]
         equivalent_m, focus = self._patches_on_sheets(pads, position, patch)
         values, slopes = look_up_patches(self._bank, rows, position, focus)
         shares, log_ratio = values[:4].T, values[4] - np.log(equivalent_m)
@@ -165,7 +201,7 @@ class VirtualHand:
     def _truth(
         self, contact: _PadContact, currents: FloatArray, jacobian: FloatArray, sync_ns: int
     ) -> GroundTruth:
-        row, applied = self._virtual_pads[contact.row], contact.contact
+        row, applied = self.virtual_pads[contact.row], contact.contact
         shape = row.shape
         s_m, phi = applied.x * shape.length_m, applied.y * shape.arc
         parallel_m = float(shape.radius(s_m))

@@ -1,6 +1,7 @@
 """Convert the contact points of a grasp to patches on the pads: discs with position, force and radius.
 
-Public names: `ContactPatches` (discs and resultants of all pads), `contact_patches`, `clip_to_pad`. A soft
+Public names: `ContactPatches` (discs and resultants of all pads), `contact_patches`; of one pad:
+`project_points`, `pad_discs`, `clip_to_pad`. A soft
 skin spreads a point's force over a disc, by Hertz's law for two round bodies. Two convex bodies with
 several contact points also touch between them: the points move towards their centre of force until their
 second moment is that of a uniform load. Overlapping discs are merged, preserving their moments of force.
@@ -25,6 +26,7 @@ _SKIN_MODULUS_PA = 1.0e6  # effective modulus of a rubber skin on a hard object
 _MIN_RADIUS_M, _MAX_RADIUS_M = 0.5e-3, 5e-3
 _MIN_FORCE_N = 1e-4
 _MAX_OVERHANG_M = 0.5e-3  # points that far beyond the edge of a pad press on the edge
+_MAX_HEIGHT_M = 5e-3  # of a contact point above or below the surface: penetration, and pads out of place
 _UNIFORM_LOAD_RATIO = 3**-0.5  # a uniform line or rectangle has a third of the second moment of its ends
 
 
@@ -54,9 +56,7 @@ def contact_patches(grasp: GraspRecord) -> ContactPatches:
     """Return the contact patches of a grasp."""
     n, p = len(grasp.times_s), len(grasp.pads)
     sensed = [_sensed_points(grasp, row) for row in range(p)]
-    equalised = [_equalise_load(*it[1:]) for it in sensed]
-    merged = [_merge_overlapping(grasp.pads[row], *points) for row, points in enumerate(equalised)]
-    discs = [clip_to_pad(grasp.pads[row], *points) for row, points in enumerate(merged)]
+    discs = [pad_discs(grasp.pads[row], *points[1:]) for row, points in enumerate(sensed)]
     depth = max((int(np.bincount(steps).max()) for steps, *_ in discs if len(steps)), default=1)
     patches = ContactPatches(
         np.full((n, p, depth, 2), 0.5),
@@ -84,13 +84,36 @@ def _sensed_points(
     steps = grasp.step_index[indices]
     rotation = grasp.link_rotation[steps, row]
     on_link = np.einsum("kji,kj->ki", rotation, grasp.point_m[indices] - grasp.link_m[steps, row])
-    foot = pad.shape.project((on_link - pad.translation_m) @ pad.rotation)
-    force_vector = np.einsum("kji,kj->ki", rotation, grasp.force_n[indices]) @ pad.rotation
-    force = -np.einsum("ki,ki->k", force_vector, foot.normal)
+    force = np.einsum("kji,kj->ki", rotation, grasp.force_n[indices])
+    on, position, normal_n, radius = project_points(pad, on_link, force, grasp.grasped_object.curvature)
+    return indices[on], steps[on], position, normal_n, radius
+
+
+def project_points(
+    pad: MujocoPad, on_link_m: FloatArray, force_n: FloatArray, curvature: FloatArray | float
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return the contact points (k,) that a pad senses: indices, positions, normal forces, radii.
+
+    on_link_m, force_n: (n, 3), points and forces on the link, in its frame. curvature: (n,) or (), mean
+    curvature of the other body [1/m].
+    """
+    foot = pad.shape.project((on_link_m - pad.translation_m) @ pad.rotation)
+    force = -np.einsum("ki,ki->k", force_n @ pad.rotation, foot.normal)
     rim = 0.5 + _MAX_OVERHANG_M / _side_lengths_m(pad, 0.5)
-    on = (np.abs(foot.fraction - 0.5) <= rim).all(axis=1) & (force > _MIN_FORCE_N)
+    near = np.abs(foot.height_m) <= _MAX_HEIGHT_M
+    on = np.flatnonzero((np.abs(foot.fraction - 0.5) <= rim).all(axis=1) & near & (force > _MIN_FORCE_N))
     position = np.clip(foot.fraction[on], 0.0, 1.0)
-    return indices[on], steps[on], position, force[on], _hertz_radius_m(grasp, pad, position, force[on])
+    curvatures = np.broadcast_to(curvature, len(force_n))[on]
+    return on, position, force[on], _hertz_radius_m(pad, position, force[on], curvatures)
+
+
+def pad_discs(
+    pad: MujocoPad, steps: IntArray, position: FloatArray, force: FloatArray, radius: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return discs (d,) of contact points (k,) on a pad, both in the order of steps: steps, positions,
+    forces, radii."""
+    equalised = _equalise_load(steps, position, force, radius)
+    return clip_to_pad(pad, *_merge_overlapping(pad, *equalised))
 
 
 def _equalise_load(
@@ -106,7 +129,7 @@ def _equalise_load(
 
 
 def _hertz_radius_m(
-    grasp: GraspRecord, pad: MujocoPad, position: FloatArray, force_n: FloatArray
+    pad: MujocoPad, position: FloatArray, force_n: FloatArray, other_curvature: FloatArray
 ) -> FloatArray:
     """Return radii (k,) of discs: a^3 = 3 F R / 4 E, where 1 / R is the sum of both mean curvatures."""
     curvature = np.zeros(len(force_n))
@@ -114,7 +137,7 @@ def _hertz_radius_m(
         curvature = 0.5 / pad.shape.radius(position[:, 0] * pad.shape.length_m)
         if pad.shape.sphere_from_rad is not None:
             curvature = np.full(len(force_n), 1 / pad.shape.start_radius_m)
-    total_curvature = np.maximum(curvature + grasp.grasped_object.curvature, 1.0)
+    total_curvature = np.maximum(curvature + other_curvature, 1.0)
     cube = 3 * force_n / (4 * _SKIN_MODULUS_PA * total_curvature)
     return np.asarray(np.clip(np.cbrt(cube), _MIN_RADIUS_M, _MAX_RADIUS_M))
 

@@ -1,0 +1,119 @@
+"""Contact points on the links of a hand in a MuJoCo simulation.
+
+Public names: `LinkPoints` (points on the links), `ContactReader` (reads them from MuJoCo's data).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+_Columns = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class LinkPoints:
+    """Contact points (k,) on the links of pads, of several environments, in their order."""
+
+    environment: IntArray
+    """(k,)."""
+    pad: IntArray
+    """(k,), row of a pad on the link; a point on a link with several pads is a row for each."""
+    point_m: FloatArray
+    """(k, 3), in the link's frame."""
+    force_n: FloatArray
+    """(k, 3), force on the link, in its frame."""
+    curvature: FloatArray
+    """(k,), mean curvature of the other body [1/m]."""
+
+    def every(self, step: int, first: int) -> LinkPoints:
+        """Return the contacts of every `step`-th environment from `first` on, numbered from 0."""
+        rows = self.environment % step == first
+        return LinkPoints(
+            self.environment[rows] // step,
+            *(column[rows] for column in (self.pad, self.point_m, self.force_n, self.curvature)),
+        )
+
+
+class ContactReader:
+    """Reads the contacts of the pads of a deployment from data of a model.
+
+    A pad senses contacts of the geom `pad LINK`, or of all geoms of its link's body if there is none.
+    `bodies` are names of bodies by link, where they differ. Raises ValueError for a link without a body.
+    """
+
+    def __init__(self, pads: Sequence[config.Pad], model: Any, bodies: Mapping[str, str]) -> None:
+        self._model, self.time_step_s = model, float(model.opt.timestep)
+        links = [pad.mount.link or pad.link for pad in pads]
+        self._bodies = np.array([_body_id(model, bodies.get(link, link), link) for link in links])
+        self._senses = np.zeros((len(pads), model.ngeom), np.bool_)
+        for row, pad in enumerate(pads):
+            geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"pad {pad.link}")
+            self._senses[row] = (
+                np.arange(model.ngeom) == geom if geom >= 0 else model.geom_bodyid == self._bodies[row]
+            )
+        self._curvature = np.array([_curvature(model, geom) for geom in range(model.ngeom)])
+
+    def read(self, states: Sequence[Any]) -> LinkPoints:
+        """Return the contacts of environments with the data `states`, after a step or mj_forward."""
+        found = [self._read_one(number, data) for number, data in enumerate(states)]
+        columns = [np.concatenate(column) for column in zip(*found, strict=True)]
+        return LinkPoints(*columns)
+
+    def _read_one(self, environment: int, data: Any) -> _Columns:
+        contacts = data.contact
+        geoms = contacts.geom.reshape(-1, 2)
+        side, pad, number = np.nonzero(self._senses[:, geoms.T].transpose(1, 0, 2))
+        pressed = contacts.efc_address[number] >= 0
+        side, pad, number = side[pressed], pad[pressed], number[pressed]
+        k = len(pad)
+        if not k:
+            none = np.zeros(0, np.intp)
+            return none, none, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        forces = np.empty((k, 6))
+        for row, contact in enumerate(number.tolist()):
+            mujoco.mj_contactForce(self._model, data, contact, forces[row])
+        # rows of a contact's frame: its normal, from the first geom to the second, and two tangents
+        on_second = np.einsum("ki,kij->kj", forces[:, :3], contacts.frame[number].reshape(k, 3, 3))
+        on_link = np.where(side[:, None] == 1, on_second, -on_second)
+        bodies = self._bodies[pad]
+        rotation = data.xmat[bodies].reshape(k, 3, 3)
+        return (
+            np.full(k, environment),
+            pad,
+            np.einsum("kji,kj->ki", rotation, contacts.pos[number] - data.xpos[bodies]),
+            np.einsum("kji,kj->ki", rotation, on_link),
+            self._curvature[geoms[number, 1 - side]],
+        )
+
+
+def _body_id(model: Any, name: str, link: str) -> int:
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    if number < 0:
+        known = ", ".join(model.body(body).name for body in range(1, model.nbody))
+        raise ValueError(
+            f'the model has no body "{name}" for link {link}: state it in bodies={{"{link}": ...}}; '
+            f"its bodies: {known}"
+        )
+    return int(number)
+
+
+def _curvature(model: Any, geom: int) -> float:
+    """Return the mean curvature [1/m] of a geom's side; 0 for flat ones and meshes."""
+    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return float(1 / size[0])
+    if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
+        return float(0.5 / size[0])
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return float(np.mean(1 / size))
+    return 0.0

@@ -1,0 +1,256 @@
+"""Touch of a hand in a MuJoCo simulation: the arrays that the daemon would publish, without a bus or daemon.
+
+Public names: `TactileSensor`, `TactileReading`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config, wire
+from handtouch.config.channels import order_by_electrode, resolve_channels
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.core.slab import CountSlab
+from handtouch.simulate.tactile.mujoco_contacts import ContactReader, LinkPoints
+from handtouch.simulate.tactile.simulated_pads import SimulatedPads
+from handtouch.simulate.worlds import WORLDS, World
+from handtouch.wire import PadState
+
+_HANDS_PER_PIPELINE = 16
+"""Environments that share a tick: enough to spread the cost of a call, and few enough for the caches"""
+_START_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class TactileReading:
+    """One sample of all pads: arrays (..., pads, ...), with a first axis for several environments.
+
+    All but `counts` are columns of the hand frame as published, described in docs/wire.md; NaN is unknown.
+    """
+
+    counts: NDArray[np.int64]
+    """(p, 4), counts of the electrodes x0, xa, y0, yb, as in `raw`"""
+    state: NDArray[np.uint8]
+    """(p,), `handtouch.wire.PadState`"""
+    contact_id: NDArray[np.uint32]
+    """(p,), 0 without contact"""
+    sample_ns: NDArray[np.int64]
+    """(p,), time of the sample"""
+    total_current_a: NDArray[np.float32]
+    """(p,)"""
+    position_m: NDArray[np.float32]
+    """(p, 3), in the link's frame"""
+    normal: NDArray[np.float32]
+    """(p, 3), outward"""
+    covariance_m2: NDArray[np.float32]
+    """(p, 3, 3), of `position_m`"""
+    pad_m: NDArray[np.float32]
+    """(p, 2), arc lengths on the pad"""
+    position_status: NDArray[np.uint8]
+    """(p,), `handtouch.wire.PositionStatus`"""
+    force_n: NDArray[np.float32]
+    """(p,), normal force"""
+    force_std_n: NDArray[np.float32]
+    """(p,)"""
+    force_status: NDArray[np.uint8]
+    """(p,), `handtouch.wire.ForceStatus`"""
+    residual: NDArray[np.float32]
+    """(p,)"""
+    residual_std: NDArray[np.float32]
+    """(p,)"""
+
+    @property
+    def touched(self) -> NDArray[np.bool_]:
+        """Pads (p,) in contact."""
+        return np.not_equal(self.contact_id, 0)
+
+    def environment(self, number: int) -> Self:
+        """Return the reading of one of several environments."""
+        return type(self)(*(getattr(self, field.name)[number] for field in fields(self)))
+
+
+class TactileSensor:
+    """Pads of a deployment on the links of a MuJoCo model, in one or several environments.
+
+    `world` is a name of `handtouch.simulate.worlds.WORLDS` or a `World`; `seed` draws from it what the
+    deployment doesn't know, such as gains and mounts. With several seeds, environment k has the world of seed
+    k modulo their number; environments of one seed differ in noise and history. Call `read` once per
+    `period_s`, the deployment's SYNC period unless stated otherwise. `bodies`: names of the model's bodies by
+    link, where they differ; a geom named `pad LINK` replaces the body's geoms as what the pad senses.
+
+    For `settling_s` before the first reading nothing touches, so that the zeros of the channels are known.
+
+    `links` are the names of the pads, "hand/link", in the order of the arrays. Raises ValueError for an
+    unknown world or seed, or a link without a body.
+    """
+
+    def __init__(
+        self,
+        deployment: config.Deployment,
+        model: Any,
+        world: str | World = "default",
+        seed: int | Sequence[int] = 1,
+        *,
+        environments: int = 1,
+        period_s: float | None = None,
+        bodies: Mapping[str, str] | None = None,
+        settling_s: float = 0.5,
+    ) -> None:
+        if environments < 1:
+            raise ValueError(f"environments = {environments}: must be 1 or more")
+        seeds = [seed] if isinstance(seed, int) else list(seed)
+        self.links = deployment.pad_names
+        self.environments = environments
+        self.period_s = 1e-3 * deployment.daemon.sync_period_ms if period_s is None else period_s
+        self._period_ns = round(1e9 * self.period_s)
+        pads = [entry.pad for entry in deployment.pads]
+        self._reader = ContactReader(pads, model, bodies or {})
+        drawn = [_world_named(world).draw(number) for number in seeds[:environments]]
+        self._members = [np.arange(first, environments, len(drawn)) for first in range(len(drawn))]
+        self._hands = [
+            SimulatedPads(deployment, one, len(members), self.period_s)
+            for one, members in zip(drawn, self._members, strict=True)
+        ]
+        self._cores = _pipelines(deployment, environments, self._period_ns)
+        self._samples = 0
+        self._restarted: set[int] = set()
+        untouched = LinkPoints(*(np.zeros(0, np.intp),) * 2, *(np.zeros((0, 3)),) * 2, np.zeros(0))
+        for _ in range(round(settling_s / self.period_s)):
+            self._process(self._sample(untouched))
+
+    @property
+    def steps(self) -> int:
+        """Number of MuJoCo's steps per reading."""
+        return max(round(self.period_s / self._reader.time_step_s), 1)
+
+    def read(self, data: Any) -> TactileReading:
+        """Return the reading at the contacts of an environment's MjData, or of a sequence of them.
+
+        Call it after `mj_step`; contacts and poses are those of the begin of that step. Raises ValueError for
+        another number of environments.
+        """
+        several = isinstance(data, Sequence)
+        states = list(data) if several else [data]
+        if len(states) != self.environments:
+            raise ValueError(f"{len(states)} MjData for a sensor of {self.environments} environments")
+        counts = self._sample(self._reader.read(states))
+        reading = self._process(counts)
+        return reading if several else reading.environment(0)
+
+    def reset(self, environments: Sequence[int] | None = None) -> None:
+        """Begin a new episode in some environments, by default in all: sheets are fresh, and contacts end.
+
+        In the next reading their pads are `PadState.STARTING`, untouched; zeros remain known.
+        """
+        chosen = range(self.environments) if environments is None else environments
+        for number in chosen:
+            self._hands[number % len(self._hands)].reset(number // len(self._hands))
+        self._restarted.update(chosen)
+
+    def _sample(self, contacts: LinkPoints) -> NDArray[np.int64]:
+        """Return counts (environments, pads, 4) at the next sample."""
+        self._samples += 1
+        t_s = self._samples * self.period_s
+        counts = np.empty((self.environments, len(self.links), 4), np.int64)
+        seeds = len(self._hands)
+        for first, (hands, members) in enumerate(zip(self._hands, self._members, strict=True)):
+            counts[members] = hands.sample(t_s, contacts if seeds == 1 else contacts.every(seeds, first))
+        return counts
+
+    def _process(self, counts: NDArray[np.int64]) -> TactileReading:
+        sync_ns = _START_NS + self._samples * self._period_ns
+        pads = len(self.links)
+        parts = []
+        for number, core in enumerate(self._cores):
+            first = number * _HANDS_PER_PIPELINE
+            present = counts[first : first + core.model.size // pads]
+            core.node_state[:] = PadState.CLEAR
+            for environment in self._restarted:
+                if first <= environment < first + len(present):
+                    row = (environment - first) * pads
+                    core.node_state[row : row + pads] = PadState.STARTING
+            core.begin_cycle(sync_ns, sync_ns)
+            core.slab.store_counts(present.reshape(-1, 4), sync_ns + 1)
+            core.tick_if_due(sync_ns + core.cycle.window_ns)
+            parts.append(core.messages.frame_columns())
+        self._restarted.clear()
+        columns = {
+            name: np.concatenate([part[name] for part in parts]).reshape(
+                self.environments, pads, *parts[0][name].shape[1:]
+            )
+            for name in parts[0]
+        }
+        columns["covariance_m2"] = columns["covariance_m2"].reshape(self.environments, pads, 3, 3)
+        return TactileReading(counts=counts, **columns)
+
+
+class _CountPipeline(Pipeline):
+    """A pipeline that is given counts."""
+
+    slab: CountSlab
+
+
+class _NoSink:
+    """Nothing subscribes: readings are taken from the arrays."""
+
+    def has_subscriber(self, topic: str) -> bool:  # noqa: ARG002
+        return False
+
+    def send(self, message: wire.OutgoingMessage) -> None:
+        """Ignore a message."""
+
+
+def _pipelines(deployment: config.Deployment, environments: int, period_ns: int) -> list[_CountPipeline]:
+    """Return pipelines for the environments, whose hands are copies of the deployment's."""
+    models: dict[int, PadModel] = {}
+    made = []
+    for first in range(0, environments, _HANDS_PER_PIPELINE):
+        count = min(_HANDS_PER_PIPELINE, environments - first)
+        if count not in models:
+            models[count] = PadModel(_repeated(deployment, count))
+        model = models[count]
+        core = _CountPipeline(model, period_ns, deployment.daemon.sample_window_fraction, _NoSink())
+        core.slab = CountSlab(np.tile(_channel_limits(deployment), (count, 1, 1)))
+        made.append(core)
+    return made
+
+
+def _repeated(deployment: config.Deployment, count: int) -> config.Deployment:
+    """Return a deployment with copies of its hands."""
+    hands = tuple(
+        hand.model_copy(update={"name": f"{hand.name}.{number}"})
+        for number in range(count)
+        for hand in deployment.hands
+    )
+    return deployment.model_copy(update={"hands": hands})
+
+
+def _channel_limits(deployment: config.Deployment) -> NDArray[np.int64]:
+    """Return the limits (pads, 4, 2) of the channels x0, xa, y0, yb."""
+    nodes = deployment.nodes
+    return np.array(
+        [
+            [
+                channel.limits
+                for channel in order_by_electrode(
+                    resolve_channels(nodes[pad.node].channels, nodes[pad.node].eds), pad.electrodes
+                )
+            ]
+            for _, pad in deployment.pads
+        ],
+        np.int64,
+    )
+
+
+def _world_named(world: str | World) -> World:
+    if isinstance(world, World):
+        return world
+    if world not in WORLDS:
+        raise ValueError(f'there is no world "{world}"; known: {", ".join(WORLDS)}')
+    return WORLDS[world]

@@ -1,0 +1,191 @@
+"""Counts of the pads of equal hands in several environments, from contact points on their links.
+
+Public name: `SimulatedPads`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.simulate.contact_patch import ContactPatch
+from handtouch.simulate.grasp.mujoco_scene import MujocoPad
+from handtouch.simulate.grasp.patches import pad_discs, project_points
+from handtouch.simulate.stimulus import AppliedContact
+from handtouch.simulate.tactile.live_sheet import LiveSheets
+from handtouch.simulate.tactile.mujoco_contacts import LinkPoints
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.worlds import DrawnWorld
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+class SimulatedPads:
+    """Pads of a deployment in a world, on `count` equal hands that differ in noise and history.
+
+    Times are seconds since the start and increase from one sample to the next, by `period_s`.
+    """
+
+    def __init__(self, deployment: config.Deployment, world: DrawnWorld, count: int, period_s: float) -> None:
+        self._count = count
+        self._hand = VirtualHand(deployment, _NoStimulus(), world)
+        self._pads = [
+            MujocoPad(entry.pad.link, -1, row.rotation, row.translation, row.shape)
+            for entry, row in zip(deployment.pads, self._hand.virtual_pads, strict=True)
+        ]
+        streams = np.arange(count, dtype=np.uint64) * np.uint64(2)
+        self._sheets = [
+            LiveSheets(row.sheet_law, row.noise_keys[0] + np.uint64(7) + streams, period_s)
+            if row.sheet_law
+            else None
+            for row in self._hand.virtual_pads
+        ]
+
+    def reset(self, hand: int) -> None:
+        """Give a hand fresh sheets."""
+        for sheets in self._sheets:
+            if sheets:
+                sheets.reset(hand)
+
+    def sample(self, t_s: float, contacts: LinkPoints) -> NDArray[np.int64]:
+        """Return counts (hands, pads, 4) of the electrodes x0, xa, y0, yb; `contacts` at the sample's time,
+        whose environments are the hands."""
+        counts = self._hand.untouched_counts(t_s, self._count)
+        hand, pad, currents = self._currents(t_s, self._discs(contacts))
+        counts[hand, pad] += currents * self._hand.counts_per_ampere(t_s)[pad]
+        return self._hand.quantise(counts)
+
+    def _discs(self, contacts: LinkPoints) -> _Discs:
+        """Return the discs that contact points make on the pads."""
+        found = [
+            (np.full(len(hand), pad), hand, *rest)
+            for pad in np.unique(contacts.pad).tolist()
+            for hand, *rest in [self._discs_on_pad(pad, contacts)]
+        ]
+        if not found:
+            none = np.zeros(0, np.intp)
+            return _Discs(none, none, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+        return _Discs(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+    def _discs_on_pad(
+        self, row: int, contacts: LinkPoints
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        pad, rows = self._pads[row], np.flatnonzero(contacts.pad == row)
+        on, *points = project_points(
+            pad, contacts.point_m[rows], contacts.force_n[rows], contacts.curvature[rows]
+        )
+        hands = contacts.environment[rows[on]]
+        order = np.argsort(hands, kind="stable")
+        return pad_discs(pad, hands[order], *(column[order] for column in points))
+
+    def _currents(self, t_s: float, discs: _Discs) -> tuple[IntArray, IntArray, FloatArray]:
+        """Return hands, pads (k,) and currents (k, 4) [A], at the nominal voltage, of the touched pads."""
+        force_n = discs.force_n * self._force_ratio(t_s, discs)
+        _, inverse, number = np.unique(discs.key, return_inverse=True, return_counts=True)
+        alone = number[inverse] == 1
+        patch = np.stack([discs.radius_m[alone], *np.zeros((2, alone.sum()))])
+        hands, pads = [discs.hand[alone]], [discs.pad[alone]]
+        position = discs.position[alone].T
+        found = [self._hand.solve_contacts(pads[0], position, patch, force_n[alone])[0]]
+        for pad in np.unique(discs.pad[~alone]).tolist():
+            rows = np.flatnonzero(~alone & (discs.pad == pad))
+            touched, stimulus = _several_discs(discs, force_n, rows)
+            circuit = self._hand.virtual_pads[pad].circuit
+            none = np.ones(len(touched))
+            found.append(circuit.currents(np.arange(len(touched), dtype=np.float64), stimulus, (), none))
+            hands.append(touched)
+            pads.append(np.full(len(touched), pad))
+        return np.concatenate(hands), np.concatenate(pads), np.concatenate(found)
+
+    def _force_ratio(self, t_s: float, discs: _Discs) -> FloatArray:
+        """Return apparent over true force of the discs (k,), and let the sheets' histories go on."""
+        warmer_k, ratio = self._hand.temperature_rise_k(t_s), np.ones(len(discs.pad))
+        for pad, sheets in enumerate(self._sheets):
+            if sheets:
+                rows = np.flatnonzero(discs.pad == pad)
+                hands, disc = np.unique(discs.hand[rows], return_inverse=True)
+                total_n: FloatArray = np.zeros(len(hands))
+                np.add.at(total_n, disc, discs.force_n[rows])
+                apparent_n = sheets.apparent_force_n(t_s, hands, total_n, warmer_k)
+                ratio[rows] = (apparent_n / total_n)[disc]
+        return ratio
+
+
+@dataclass(frozen=True)
+class _Discs:
+    """Discs (k,) on the pads of all hands."""
+
+    pad: IntArray
+    hand: IntArray
+    position: FloatArray
+    """(k, 2), fractions of the pad."""
+    force_n: FloatArray
+    radius_m: FloatArray
+
+    @property
+    def key(self) -> IntArray:
+        """Number (k,) of hand and pad."""
+        return np.asarray(self.hand << 16 | self.pad)
+
+
+def _several_discs(discs: _Discs, force_n: FloatArray, rows: IntArray) -> tuple[IntArray, _Snapshots]:
+    """Return the hands (n,) with several discs on a pad, and these as contacts at the times 0 to n - 1."""
+    hands, column, number = np.unique(discs.hand[rows], return_inverse=True, return_counts=True)
+    order = np.argsort(column, kind="stable")
+    lane = np.empty(len(rows), np.intp)
+    lane[order] = np.arange(len(rows)) - np.repeat(np.cumsum(number) - number, number)
+    shape = int(number.max()), len(hands)
+    position, force, radius = np.full((shape[0], 2, shape[1]), 0.5), np.zeros(shape), np.full(shape, 1e-3)
+    position[lane, :, column] = discs.position[rows]
+    force[lane, column], radius[lane, column] = force_n[rows], discs.radius_m[rows]
+    patches = np.stack([radius, np.zeros(shape), np.zeros(shape)], axis=1)
+    return hands, _Snapshots(position, force, patches)
+
+
+@dataclass(frozen=True)
+class _Snapshots:
+    """Contacts on a pad, a `PadStimulus` at whole times: those of hands, one after the other."""
+
+    position: FloatArray
+    force_n: FloatArray
+    patches: FloatArray
+
+    @property
+    def max_contacts(self) -> int:
+        return len(self.force_n)
+
+    @property
+    def event_times_s(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+
+    def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        at = times_s.astype(np.intp)
+        return self.position[:, :, at], self.force_n[:, at], self.patches[:, :, at]
+
+
+class _NoStimulus:
+    """A stimulus without contacts: those of a running simulation are given to each sample."""
+
+    faults = ()
+    node_faults = ()
+    node_replacements = ()
+    repeat = False
+    duration_s = np.inf
+    touch_links: Sequence[tuple[str, float | None]] = ()
+
+    def contacts_at(self, t_s: float) -> list[AppliedContact]:  # noqa: ARG002
+        return []
+
+    def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> _Snapshots:  # noqa: ARG002
+        return _Snapshots(np.zeros((0, 2, 0)), np.zeros((0, 0)), np.zeros((0, 3, 0)))
+
+    def joint_trajectory(self, robot: object) -> None:
+        """Return None: the simulation has the joints."""
+
+    def check_links(self, links: Iterable[str], file: str = "") -> None:
+        """Accept any links."""
