@@ -6,6 +6,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 ONLY ?= *
+UPGRADE ?= --upgrade
 ARGS ?=
 # tests start hundreds of processes; without bytecode each of them would compile the source
 unexport PYTHONDONTWRITEBYTECODE
@@ -21,14 +22,20 @@ $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or later found; give make PYTHON=/path/to/python3"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { echo "python3 -m venv failed; on Debian: apt-get install python3-venv"; exit 1; }
 
-$(VENV)/.run: pyproject.toml requirements.lock | $(BIN)/python
+# exactly the locked files of packages, by their hashes; then handtouch itself, built by the locked build tools
+LOCKED := $(PIP) install --no-compile --require-hashes --no-deps
+HANDTOUCH := $(PIP) install --no-compile --no-deps --no-build-isolation -e .
+
+$(VENV)/.run: pyproject.toml locks/run.lock locks/build.lock | $(BIN)/python
 	@echo "installing handtouch into $(VENV) ..."
-	@$(PIP) install --no-compile -c requirements.lock -e .
+	@$(LOCKED) -r locks/run.lock -r locks/build.lock
+	@$(HANDTOUCH)
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml requirements.lock | $(BIN)/python
+$(VENV)/.dev: pyproject.toml locks/dev.lock | $(BIN)/python
 	@echo "installing handtouch and its tools into $(VENV) ..."
-	@$(PIP) install --no-compile -c requirements.lock -e '.[dev]'
+	@$(LOCKED) -r locks/dev.lock
+	@$(HANDTOUCH)
 	@touch $(VENV)/.run $(VENV)/.view $@
 
 # sources that Cython compiles; a run without a compiler is slower, and says so
@@ -36,9 +43,9 @@ CORE := $(wildcard src/handtouch/core/stages/*.py src/handtouch/core/stages/*.px
 $(VENV)/.core: $(CORE) | $(VENV)/.dev
 	@$(BIN)/python -m handtouch.core.build && touch $@ || test "$(CI)" != true
 
-$(VENV)/.view: pyproject.toml requirements.lock | $(VENV)/.run
+$(VENV)/.view: locks/view.lock | $(VENV)/.run
 	@echo "installing packages for joints and meshes in the view ..."
-	@$(PIP) install --no-compile -c requirements.lock -e '.[view]'
+	@$(LOCKED) -r locks/view.lock
 	@touch $@
 
 .PHONY: install dev
@@ -112,18 +119,22 @@ format: $(VENV)/.dev ## format the source
 	$(BIN)/ruff check --fix-only
 	$(BIN)/ruff format
 
-lock: $(BIN)/python ## update the pinned versions of all packages
+lock: $(BIN)/python ## update the pinned versions and hashes of all packages in locks/; UPGRADE= keeps versions
 	@$(PIP) install uv
-	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra dev --extra dist --no-header --no-annotate \
-		--no-emit-index-url --no-emit-find-links --output-file requirements.lock pyproject.toml
+	@cd locks && lock() { name=$$1; shift; $(abspath $(BIN))/uv pip compile --quiet --universal --python-version 3.11 \
+		--generate-hashes --no-header --no-annotate --no-emit-index-url --no-emit-find-links --output-file $$name.lock "$$@"; }; \
+	lock dev $(UPGRADE) --extra dev --group ../pyproject.toml:build ../pyproject.toml && \
+	lock run -c dev.lock ../pyproject.toml && lock view -c dev.lock --extra view ../pyproject.toml && \
+	lock build -c dev.lock --group ../pyproject.toml:build && \
+	lock dist $(UPGRADE) -c dev.lock --group ../pyproject.toml:dist
 
 schema: $(VENV)/.run ## write config/*.schema.json from the models of the deployment's and the node's file
 	$(BIN)/handtouch check --schema >config/handtouch.schema.json
 	$(BIN)/handtouch node --schema >config/touch_node.schema.json
 
 # for any Linux with glibc 2.17 or later on these machines; ziglang has a C compiler for both
-dist: $(VENV)/.dev ## build the source archive and wheels for x86_64 and aarch64
-	@$(PIP) install --no-compile -c requirements.lock -e '.[dist]'
+dist: $(BIN)/python ## build the source archive and wheels for x86_64 and aarch64
+	@$(LOCKED) -r locks/dist.lock
 	rm -rf dist build
 	$(BIN)/python -m build --no-isolation --sdist
 	for machine in x86_64 aarch64; do \

@@ -6,14 +6,16 @@
 #   services/install.sh uninstall   everything but /etc/handtouch
 #
 # The program is installed in a virtual environment, PREFIX/lib/handtouch, with the link PREFIX/bin/handtouch. Running the
-# script again updates it; existing files in SYSCONFDIR/handtouch are kept.
+# script again updates it; existing files in SYSCONFDIR/handtouch are kept. Packages it depends on are exactly the files
+# that the lock names by their hashes.
 #
 #   PREFIX      /usr/local      prefix of program and units
 #   SYSCONFDIR  /etc            folder of the deployments
 #   DESTDIR     (empty)         prepended to both, to stage an image or a package
-#   WHEEL       (this source)   handtouch wheel to install
+#   WHEEL       (this source)   handtouch wheel to install; from source, a C compiler makes it fast
+#   LOCK        locks/run.lock  packages to install; empty if they come from elsewhere
 #   PYTHON      python3         interpreter, 3.11 or later
-#   PIP_ARGS    (empty)         further arguments of pip install, e.g. --no-index --find-links /media/wheels
+#   PIP_ARGS    (empty)         further arguments of pip, e.g. --no-index --find-links /media/wheels
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -21,6 +23,7 @@ PREFIX=${PREFIX:-/usr/local}
 SYSCONFDIR=${SYSCONFDIR:-/etc}
 DESTDIR=${DESTDIR:-}
 WHEEL=${WHEEL:-$here/..}
+LOCK=${LOCK-$here/../locks/run.lock}
 PYTHON=${PYTHON:-python3}
 
 venv=$PREFIX/lib/handtouch
@@ -31,10 +34,9 @@ install_program() {
   "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
     { echo "install.sh: $PYTHON is older than 3.11; set PYTHON to a later one" >&2; exit 1; }
   "$PYTHON" -m venv "$DESTDIR$venv"
-  # shellcheck disable=SC2086  # PIP_ARGS is a list of words
-  pip_install() { "$DESTDIR$venv/bin/python" -m pip install --quiet --disable-pip-version-check ${PIP_ARGS:-} "$@"; }
-  pip_install --constraint "$here/../requirements.lock" "$WHEEL"
-  pip_install --no-deps --force-reinstall "$WHEEL" # the same version again, changed
+  [ -z "$LOCK" ] || run_pip "$DESTDIR$venv" install --require-hashes --no-deps -r "$LOCK"
+  if [ -d "$WHEEL" ]; then build_wheel; fi
+  run_pip "$DESTDIR$venv" install --no-deps --force-reinstall "$WHEEL" # also the same version again, changed
   if [ -n "$DESTDIR" ]; then # scripts name the environment by its path at the time
     for script in "$DESTDIR$venv"/bin/*; do
       [ -L "$script" ] || sed -i "s|$DESTDIR$venv|$venv|g" "$script"
@@ -42,6 +44,22 @@ install_program() {
   fi
   mkdir -p "$DESTDIR$PREFIX/bin"
   ln -sf "../lib/handtouch/bin/handtouch" "$DESTDIR$PREFIX/bin/handtouch"
+}
+
+build_wheel() { # from the source in WHEEL, with the locked build tools
+  work=$(mktemp -d)
+  trap 'rm -rf "$work"' EXIT
+  "$PYTHON" -m venv "$work/venv"
+  run_pip "$work/venv" install --require-hashes --no-deps -r "$here/../locks/build.lock"
+  run_pip "$work/venv" wheel --no-deps --no-build-isolation --wheel-dir "$work" "$WHEEL"
+  WHEEL=$(echo "$work"/*.whl)
+}
+
+run_pip() { # VENV COMMAND [ARGUMENT...]
+  python=$1/bin/python command=$2
+  shift 2
+  # shellcheck disable=SC2086  # PIP_ARGS is a list of words
+  "$python" -m pip "$command" --quiet --disable-pip-version-check ${PIP_ARGS:-} "$@"
 }
 
 install_services() {

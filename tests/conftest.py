@@ -155,7 +155,8 @@ class Installation:
             "SYSCONFDIR": str(self.root / "etc"),
             "WHEEL": str(wheel),
             "PYTHON": sys.executable,
-            "PIP_ARGS": "--no-deps --no-index",
+            "LOCK": "",  # the packages of the tests, see `environment`
+            "PIP_ARGS": "--no-index",
             **variables,
         }
         script = [str(ROOT / "services/install.sh"), *arguments]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import fnmatch
 import os
+import re
 import shlex
 import shutil
 import subprocess
 import sys
 import time
+import zipfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ import pytest
 import yaml
 
 from handtouch.cli import build_parser
+from handtouch.core.compiled import STAGES
 
 from .conftest import ROOT, Installation
 
@@ -25,8 +28,10 @@ SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 
 
 def stages() -> list[list[tuple[str, str]]]:
-    """Return the instructions of the Dockerfile by stage, from the first FROM on."""
+    """Return the instructions of the Dockerfile by stage, from the first FROM on, with ARG inserted."""
     text = (ROOT / "docker/Dockerfile").read_text().replace("\\\n", " ")
+    for name, value in re.findall(r"^ARG (\w+)=(\S+)", text, re.MULTILINE):
+        text = text.replace(f"${{{name}}}", value)
     found: list[list[tuple[str, str]]] = []
     for line in text.splitlines():
         name, _, rest = line.strip().partition(" ")
@@ -64,9 +69,10 @@ def test_every_copied_file_exists_and_reaches_the_build() -> None:
     assert ignored("tests")
 
 
-def test_the_image_is_slim_and_not_run_by_root() -> None:
+def test_the_image_is_slim_pinned_by_digest_and_not_run_by_root() -> None:
     build, final = stages()
-    assert all(stage[0][1].split()[0].endswith("-slim") for stage in (build, final))
+    for stage in (build, final):
+        assert re.match(r"python:3\.\d+\.\d+-slim-\w+@sha256:[0-9a-f]{64}( |$)", stage[0][1])
     users = [rest for name, rest in final if name == "USER"]
     assert users
     assert int(users[-1].split(":")[0]) > 0
@@ -75,21 +81,60 @@ def test_the_image_is_slim_and_not_run_by_root() -> None:
     )
 
 
+def copy_context(stage: list[tuple[str, str]], root: Path, workdir: str, wheel: Path | None) -> None:
+    """Replay the COPY instructions of a stage in a folder instead of /."""
+    for name, rest in stage:
+        *sources, target = rest.split()
+        if name != "COPY":
+            continue
+        folder = root / workdir / target.lstrip("/")
+        for source in sources:
+            if source.startswith("--from"):
+                assert wheel is not None
+                folder.mkdir(parents=True, exist_ok=True)
+                shutil.copy(wheel, folder)
+                break
+            if (ROOT / source).is_dir():
+                shutil.copytree(ROOT / source, folder, ignore=lambda at, names: [
+                    item for item in names if ignored(str((Path(at) / item).relative_to(ROOT)))
+                ])  # fmt: skip
+            else:
+                place = folder / Path(source).name if target.endswith(("/", ".")) else folder
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(ROOT / source, place)
+
+
+def test_the_build_stage_makes_a_compiled_wheel(tmp_path: Path) -> None:
+    build, _ = stages()
+    (workdir,) = [rest.lstrip("/") for name, rest in build if name == "WORKDIR"]
+    copy_context(build, tmp_path, workdir, None)
+    folder = "src/handtouch/core/stages/_compiled"
+    assert not (tmp_path / workdir / folder).exists()  # compiled for the host's C library
+    if (ROOT / folder).exists():  # saves half a minute of the compiler
+        shutil.copytree(ROOT / folder, tmp_path / workdir / folder)
+    installs, script = [rest for name, rest in build if name == "RUN" and "pip" in rest]
+    assert "--require-hashes" in installs
+    assert script.startswith("HANDTOUCH_REQUIRE_COMPILED=1 python -m pip wheel ")
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["sh", "-ec", script.replace("/wheels", f"{tmp_path}/wheels")],
+        cwd=tmp_path / workdir, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = (tmp_path / "wheels").iterdir()
+    with zipfile.ZipFile(wheel) as opened:
+        compiled = [name for name in opened.namelist() if "/_compiled/" in name]
+    assert len(compiled) == len(STAGES)
+
+
 def test_image_installs_like_a_controller(wheel: Path, tmp_path: Path) -> None:
     """Replay COPY and RUN in a folder instead of /."""
     _, final = stages()
     (run,) = [rest for name, rest in final if name == "RUN"]
-    for name, rest in final:
-        words = rest.split()
-        if name == "COPY":
-            sources = [wheel] if words[0].startswith("--from") else [ROOT / word for word in words[:-1]]
-            for source in sources:
-                place = tmp_path / words[-1].lstrip("/")
-                place = place / source.name if words[-1].endswith(("/", "wheels")) else place
-                place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(source, place)
+    copy_context(final, tmp_path, "", wheel)
     assert "services/install.sh program" in run
-    offline = run.replace("PIP_ARGS=--no-cache-dir", "PIP_ARGS='--no-cache-dir --no-deps --no-index'")
+    assert (tmp_path / "install/locks/run.lock").exists()
+    offline = run.replace("PIP_ARGS=--no-cache-dir", "LOCK= PIP_ARGS='--no-cache-dir --no-index'")
     assert offline != run
     environment = {**os.environ, "PREFIX": f"{tmp_path}/usr", "PYTHON": sys.executable}
     script = offline.replace("/install", f"{tmp_path}/install").replace(
@@ -106,9 +151,10 @@ def test_every_command_is_one_of_handtouch() -> None:
     parser = build_parser()
     default = next(rest for name, rest in stages()[-1] if name == "CMD")
     commands = [yaml.safe_load(default), *(service["command"] for service in SERVICES.values())]
-    health = SERVICES["daemon"]["healthcheck"]["test"]
-    assert health[:2] == ["CMD", "handtouch"]
-    for words in [*commands, health[2:]]:
+    (image,) = [rest.partition("CMD ")[2] for name, rest in stages()[-1] if name == "HEALTHCHECK"]
+    checks = [["CMD", *yaml.safe_load(image)], SERVICES["daemon"]["healthcheck"]["test"]]
+    assert [words[:2] for words in checks] == [["CMD", "handtouch"]] * 2
+    for words in [*commands, *(check[2:] for check in checks)]:
         parser.parse_args(words)  # leaves with SystemExit if it isn't
 
 

@@ -9,8 +9,10 @@ import tarfile
 import time
 import tomllib
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -18,15 +20,26 @@ import handtouch
 
 from .conftest import ROOT, Installation
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+TABLES = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = TABLES["project"]
 
 
-def pins() -> dict[str, list[str]]:
-    """Versions in requirements.lock by package."""
-    found: dict[str, list[str]] = {}
-    for line in (ROOT / "requirements.lock").read_text().splitlines():
-        requirement = Requirement(line)
-        found.setdefault(canonicalize_name(requirement.name), []).append(str(requirement.specifier)[2:])
+LOCKS = sorted(path.stem for path in (ROOT / "locks").glob("*.lock"))
+
+
+def locked(name: str) -> Iterator[tuple[Requirement, list[str]]]:
+    """Yield the requirements of a lock, and the algorithms of their hashes."""
+    text = (ROOT / f"locks/{name}.lock").read_text().replace("\\\n", " ")
+    for line in text.splitlines():
+        requirement, *hashes = line.split(" --hash=")
+        yield Requirement(requirement), [item.partition(":")[0] for item in hashes]
+
+
+def pins(name: str) -> dict[str, set[str]]:
+    """Return the versions in a lock by package."""
+    found: dict[str, set[str]] = {}
+    for requirement, _ in locked(name):
+        found.setdefault(canonicalize_name(requirement.name), set()).add(str(requirement.specifier))
     return found
 
 
@@ -36,7 +49,7 @@ def test_source_archive_is_complete(archives: Path) -> None:
         names = {name.partition("/")[2] for name in opened.getnames()}
     assert {
         "pyproject.toml",
-        "requirements.lock",
+        "locks/run.lock",
         "Makefile",
         "README.md",
         "LICENSE",
@@ -75,19 +88,39 @@ def test_clients_in_other_languages_have_the_version_of_the_package() -> None:
     assert package["version"] == project[1] == handtouch.__version__
 
 
-def test_every_requirement_is_pinned() -> None:
-    extras = [item for extra in PROJECT["optional-dependencies"].values() for item in extra]
-    pinned = pins()
-    for text in [*PROJECT["dependencies"], *extras]:
-        requirement = Requirement(text)
-        name = canonicalize_name(requirement.name)
-        if name != "handtouch":
-            assert name in pinned, f"{name} is not in requirements.lock: run `make lock`"
-            assert all(requirement.specifier.contains(version) for version in pinned[name]), name
+@pytest.mark.parametrize("name", LOCKS)
+def test_every_file_of_a_lock_has_a_hash_and_no_index(name: str) -> None:
+    for requirement, hashes in locked(name):
+        assert re.fullmatch(r"==[^,*]+", str(requirement.specifier)), requirement
+        assert hashes, requirement
+        assert set(hashes) == {"sha256"}, requirement
+    assert "://" not in (ROOT / f"locks/{name}.lock").read_text()
 
 
-def test_lock_names_no_package_index() -> None:
-    assert not re.search(r"://|^-", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
+def test_every_requirement_is_locked() -> None:
+    extras, groups = PROJECT["optional-dependencies"], TABLES["dependency-groups"]
+    for name, required in {
+        "run": PROJECT["dependencies"],
+        "view": [*PROJECT["dependencies"], *extras["urdf"]],
+        "dev": [*PROJECT["dependencies"], *groups["build"], *(i for items in extras.values() for i in items)],
+        "build": [*groups["build"], *TABLES["build-system"]["requires"]],
+        "dist": [*groups["build"], *(item for item in groups["dist"] if isinstance(item, str))],
+    }.items():
+        versions = pins(name)
+        for text in required:
+            requirement = Requirement(text)
+            package = canonicalize_name(requirement.name)
+            if package != "handtouch":
+                assert package in versions, f"{package} is not in locks/{name}.lock: run `make lock`"
+                for version in versions[package]:
+                    assert requirement.specifier.contains(version[2:]), f"{package} in locks/{name}.lock"
+
+
+def test_locks_agree_on_versions() -> None:
+    tested = pins("dev")
+    for name in set(LOCKS) - {"dev"}:
+        for package, versions in pins(name).items():
+            assert versions <= tested.get(package, versions), f"{package} in locks/{name}.lock"
 
 
 def test_installed_program_prints_help_quickly(installation: Installation) -> None:
