@@ -133,12 +133,13 @@ schema: $(VENV)/.run ## write config/*.schema.json from the models of the deploy
 	$(BIN)/handtouch node --schema >config/touch_node.schema.json
 
 # for any Linux with glibc 2.17 or later on these machines; ziglang has a C compiler for both
-dist: $(BIN)/python ## build the source archive and wheels for x86_64 and aarch64
+dist: $(VENV)/.dev ## build the source archive, wheels for x86_64 and aarch64, and a bill of materials (SBOM)
 	@$(LOCKED) -r locks/dist.lock
 	rm -rf dist build
 	$(BIN)/python -m build --no-isolation --sdist
 	for machine in x86_64 aarch64; do \
 		HANDTOUCH_WHEEL_MACHINE=$$machine $(BIN)/python -m build --no-isolation --wheel || exit 1; done
+	$(BIN)/python -m release.sbom run >dist/handtouch.cdx.json
 
 clean: ## remove build results and .venv
 	rm -rf $(VENV) dist build .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis
