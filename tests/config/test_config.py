@@ -195,15 +195,16 @@ ERRORS = {
     ),
     "bus that is not there": (
         ('bus = "can0"', 'bus = "can1"'),
-        THUMB + 'bus = "can1": no [[bus]] of that name; known: can0',
+        THUMB + 'bus = "can1": no [[bus]] of that name; did you mean "can0"? known: can0',
     ),
     "sheet that is not there": (
         ('sheet = "firm"', 'sheet = "frim"'),
-        THUMB + 'sheet = "frim": no [sheet.NAME] of that name; known: firm',
+        THUMB + 'sheet = "frim": no [sheet.NAME] of that name; did you mean "firm"? known: firm',
     ),
     "unknown interface": (
         ('interface = "socketcan"', 'interface = "socketcann"'),
-        'hand.toml: [[bus]] 1 "can0": interface = "socketcann": python-can knows canalystii',
+        'hand.toml: [[bus]] 1 "can0": interface = "socketcann": did you mean "socketcan"? '
+        "python-can knows canalystii",
     ),
     "no multicast address": (
         ('interface = "socketcan"', 'interface = "udp_multicast"'),
@@ -296,7 +297,53 @@ ERRORS = {
         ("[[bus]]", '[daemon]\nlive = "tcp://localhost:5582"\n[[bus]]'),
         '[daemon]: complete = "tcp://127.0.0.1:5582": is also the endpoint of live',
     ),
-    "no TOML": (("[touch]", "[touch"), "hand.toml: TOML: Expected ']'"),
+    "surface in metres": (
+        ("radius_mm = 12.0, length_mm = 30.0", "radius_mm = 0.012, length_mm = 30.0"),
+        THUMB + "surface.radius_mm = 0.012: less than 0.5 mm; lengths are in millimetres: write 12 if",
+    ),
+    "gap in metres": (("gap_mm = 0.8", "gap_mm = 0.0008"), THUMB + "gap_mm = 0.0008: less than 0.02 mm"),
+    "mount in metres": (
+        ("[1.0, 2.0, 3.0]", "[0.015, 0.0, -0.0115]"),
+        THUMB + "mount.position_mm = [0.015, 0.0, -0.0115]: less than 0.2 mm; lengths are in millimetres: "
+        "write [15, 0, -11.5] if it is in metres",
+    ),
+    "mount in radians": (
+        ("[1.0, 2.0, 3.0]", "[1.0, 2.0, 3.0], rpy_deg = [0.0, -1.5708, 3.1416]"),
+        THUMB + "mount.rpy_deg = [0.0, -1.5708, 3.1416]: a multiple of 45 degrees if it is in radians; "
+        "angles are in degrees: write [0, -90, 180]",
+    ),
+    "arc in radians": (
+        ("arc_deg = 150.0", "arc_deg = 2.3562"),
+        THUMB
+        + "surface.arc_deg = 2.3562: a multiple of 45 degrees if it is in radians; angles are in degrees"
+        ": write 135",
+    ),
+    "contact radius in metres": (
+        ("contact_radius_mm = 2.5", "contact_radius_mm = 0.0025"),
+        "[sheet.firm]: contact_radius_mm = 0.0025: less than 0.05 mm; lengths are in "
+        "millimetres: write 2.5 if",
+    ),
+    "key twice": (
+        ("node_id = 5\n", "node_id = 5\nserial = 7\nnode_id = 6\n"),
+        'hand.toml: line 31 `node_id = 6`: the key "node_id" is given twice in [[hand.pad]], '
+        "first on line 29 "
+        "`node_id = 5`; delete one of them",
+    ),
+    "list twice": (
+        ("gap_mm = 0.8\n", "gap_mm = 0.8\nseries_ohm = [1.0,\n1.0, 1.0, 1.0]\nseries_ohm = [\n]\n"),
+        'the key "series_ohm" is given twice in [[hand.pad]], first on line 34',
+    ),
+    "key twice in an inline table": (
+        ("radius_mm = 12.0", "radius_mm = 12.0, radius_mm = 13.0"),
+        '`surface = { kind = "cylinder", radius_mm = 12.0, radius_m...`: the key "radius_mm" '
+        "is given twice in {",
+    ),
+    "table twice": (
+        ("[[hand]]", "[touch]\nbegin_samples = 3\n[[hand]]"),
+        "hand.toml: line 23 [touch]: this table is given twice, first on line 19; keep one",
+    ),
+    "byte order mark": (("\n[[bus]]", "\ufeff\n[[bus]]"), "line 1: its first character is a byte order mark"),
+    "no TOML": (("[touch]", "[touch"), "hand.toml: TOML, line 19, column 7 `[touch`: Expected ']'"),
 }
 
 
@@ -384,6 +431,27 @@ def test_binary_file_raises_config_error(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match="not UTF-8 text"):
         config.load(tmp_path / "a.toml")
+
+
+def test_text_in_another_encoding_is_named_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_bytes(("# für die Hand" + SMALL).encode("latin-1"))
+    with pytest.raises(
+        ConfigError, match=r"line 1 `# für die Hand`: byte 0xFC isn't UTF-8; it is 'ü' in Latin-1"
+    ):
+        config.load(tmp_path / "a.toml")
+    (tmp_path / "a.toml").write_bytes(SMALL.encode("utf-16"))
+    with pytest.raises(ConfigError, match="is UTF-16; save it as UTF-8"):
+        config.load(tmp_path / "a.toml")
+    (tmp_path / "a.toml").write_bytes(SMALL.encode("utf-8-sig"))
+    with pytest.raises(ConfigError, match="without BOM"):
+        config.load(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize(
+    "rpy_deg", [[0.0, 12.5, 0.0], [0.0, 2.29, 0.0], [180.0, -90.0, 0.0], [0.0, 1.5, 3.0]]
+)
+def test_small_and_large_angles_in_degrees_are_accepted(rpy_deg: list[float]) -> None:
+    config.parse(SMALL.replace("[1.0, 2.0, 3.0]", f"[0.0, 0.0, 0.0], rpy_deg = {rpy_deg}"))
 
 
 def test_eds_path_is_relative_to_the_deployment(tmp_path: Path) -> None:
@@ -535,7 +603,7 @@ def test_with_bus_replaces_interface_and_options(
         ("can0=socketcan", "must be NAME=INTERFACE:CHANNEL"),
         ("can0=socketcan:can0,fd", "must be NAME=INTERFACE:CHANNEL"),
         ("can7=socketcan:can0", "NAME = can7: the deployment has no bus of that name; known: can0"),
-        ("can0=socketcann:can0", 'interface = "socketcann": python-can knows'),
+        ("can0=socketcann:can0", 'interface = "socketcann": did you mean "socketcan"? python-can knows'),
         ("can0=udp_multicast:10.0.0.1", 'channel = "10.0.0.1": must be a multicast address'),
     ],
 )
@@ -603,7 +671,7 @@ def deployments(draw: st.DrawFn) -> dict[str, Any]:
             "node": "four",
             "sheet": "firm",
             "surface": draw(surfaces()),
-            "gap_mm": draw(st.floats(0.001, 0.01)),
+            "gap_mm": draw(st.floats(0.02, 0.03)),
             "series_ohm": draw(st.lists(st.floats(0.0, 1e4), min_size=4, max_size=4)),
             "mount": {"rpy_deg": draw(st.lists(st.floats(-180, 180), min_size=3, max_size=3))},
         }

@@ -35,6 +35,7 @@ from handtouch.config.tables import (
     Sheet,
     Touch,
 )
+from handtouch.config.toml_text import parse_toml, read_text
 
 __all__ = [
     "Behaviour",
@@ -68,22 +69,12 @@ def load(path: Path | str) -> Deployment:
     Raises ConfigError with every error, also for a file that can't be read or isn't TOML.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ConfigError(
-            str(path), (Problem("the file", "", f"{reason}; give the path of a deployment file"),)
-        ) from error
-    return parse(text, str(path), path.parent)
+    return parse(read_text(path, "a deployment file"), str(path), path.parent)
 
 
 def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) -> Deployment:
     """Check the text of a deployment file; its paths are relative to `folder` (default: current folder)."""
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(file, (Problem("TOML", "", f"{error}; correct the syntax there"),)) from error
+    raw = parse_toml(text, file)
     try:
         deployment = Deployment.model_validate(raw)
     except ValidationError as error:

@@ -5,6 +5,7 @@ Public names: `problems_in`, `problems_in_buses`, `UDP_MULTICAST_PORT`.
 
 from __future__ import annotations
 
+import difflib
 import ipaddress
 import json
 import re
@@ -20,6 +21,7 @@ from handtouch.config.tables import (
     Pad,
     Touch,
 )
+from handtouch.config.units import pad_unit_problems, unit_problems
 
 UDP_MULTICAST_PORT = 43113
 """python-can's default port of a udp_multicast bus."""
@@ -34,6 +36,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
     yield from _check_touch("[touch]: ", deployment.touch)
     yield from _check_names("[[hand]]", "name", [hand.name for hand in deployment.hands])
     yield from _check_scene(deployment)
+    yield from unit_problems(deployment)
     taken: dict[tuple[str, int], str] = {}
     owners: dict[int, str] = {}
     for hand in deployment.hands:
@@ -42,7 +45,8 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
             name = f"{hand.name}/{pad.link}"
             location = f'[[hand.pad]] {number} "{name}": '
             yield from _check_references(location, pad, deployment)
-            yield from _check_shape(location, pad)
+            in_wrong_unit = list(pad_unit_problems(location, pad))
+            yield from in_wrong_unit or _check_shape(location, pad)
             if len(set(pad.electrodes)) < 4:
                 yield Problem(
                     f"{location}electrodes",
@@ -171,8 +175,9 @@ def _check_buses(buses: Iterable[Bus]) -> Iterator[Problem]:
     for number, bus in enumerate(buses, 1):
         location = f'[[bus]] {number} "{bus.name}": '
         if bus.interface not in VALID_INTERFACES:
-            known = ", ".join(sorted(VALID_INTERFACES))
-            yield Problem(f"{location}interface", _format_value(bus.interface), f"python-can knows {known}")
+            known = sorted(VALID_INTERFACES)
+            remedy = f"{_suggestion(bus.interface, known)}python-can knows {', '.join(known)}"
+            yield Problem(f"{location}interface", _format_value(bus.interface), remedy)
         if bus.interface == "udp_multicast" and not _is_multicast(str(bus.channel)):
             yield Problem(
                 f"{location}channel",
@@ -252,7 +257,11 @@ def _check_references(location: str, pad: Pad, deployment: Deployment) -> Iterat
         value = getattr(pad, key)
         if value not in names:
             there = f"known: {', '.join(names)}" if names else "none is defined"
-            yield Problem(f"{location}{key}", _format_value(value), f"no {header} of that name; {there}")
+            yield Problem(
+                f"{location}{key}",
+                _format_value(value),
+                f"no {header} of that name; {_suggestion(value, names)}{there}",
+            )
 
 
 def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
@@ -277,6 +286,11 @@ def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
             _format_value(pad.gap_mm),
             "touching electrodes share their currents, so series_ohm needs a gap above 0",
         )
+
+
+def _suggestion(value: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(value, known, 1)
+    return f'did you mean "{close[0]}"? ' if close else ""
 
 
 def _format_value(value: object) -> str:

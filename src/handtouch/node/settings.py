@@ -6,7 +6,6 @@ Public names: `load`, `json_schema`, `NodeFile`, `TouchNode` and its tables.
 from __future__ import annotations
 
 import os
-import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from pydantic import Field, ValidationError, model_validator
 from handtouch.config.base import Table
 from handtouch.config.problems import ConfigError, Problem, Tables, problems_of
 from handtouch.config.tables import Name, NodeId, Positive
+from handtouch.config.toml_text import parse_toml, read_text
 
 Channel = Annotated[str, Field(pattern=r"^(voltage|current)\d+(-(voltage|current)\d+)?$")]
 FourChannels = Annotated[tuple[Channel, Channel, Channel, Channel], Field(strict=False)]
@@ -187,14 +187,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _read(path: Path, model: type[_Model], tables: Tables) -> _Model:
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        problem = Problem("the file", "", f"{reason}; give the path of an existing file")
-        raise ConfigError(str(path), (problem,)) from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(str(path), (Problem("TOML", "", f"{error}; correct the syntax there"),)) from error
+    raw = parse_toml(read_text(path, "an existing file"), str(path))
     try:
         return model.model_validate(raw)
     except ValidationError as error:

@@ -5,7 +5,6 @@ Public name: `Scenario`. Mistakes are reported like those in a deployment file.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Self
@@ -15,6 +14,7 @@ from pydantic import Field, ValidationError
 from handtouch.config import Deployment
 from handtouch.config.base import Table
 from handtouch.config.problems import ConfigError, Problem, problems_of
+from handtouch.config.toml_text import parse_toml, read_text
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import FAULTS, INFLUENCES, AnyFault, Fault
@@ -49,21 +49,12 @@ class Scenario(Table):
     @classmethod
     def load(cls, path: Path | str) -> Self:
         """Read and check a scenario file. Raises ConfigError naming every mistake."""
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
-            problem = Problem("the file", "", f"{reason}; give the path of a scenario file")
-            raise ConfigError(str(path), (problem,)) from error
-        return cls.parse(text, str(path))
+        return cls.parse(read_text(Path(path), "a scenario file"), str(path))
 
     @classmethod
     def parse(cls, text: str, file: str = "scenario.toml") -> Self:
         """Check the text of a scenario file. Raises ConfigError naming every mistake."""
-        try:
-            raw = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigError(file, (Problem("TOML", "", f"{error}; correct the syntax there"),)) from error
+        raw = parse_toml(text, file)
         try:
             scenario = cls.model_validate(raw)
         except ValidationError as error:
