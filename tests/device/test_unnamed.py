@@ -6,9 +6,11 @@ import struct
 from typing import Any
 
 import pytest
+from canopen.objectdictionary import import_od
 
 from handtouch.canbus.cia301 import LSS_REQUEST, LSS_RESPONSE
 from handtouch.canbus.find.lss import LssMaster
+from handtouch.config import shipped
 
 
 class _Exchange:
@@ -46,6 +48,13 @@ def test_without_an_id_it_responds_to_lss_only(bench: Any, master: LssMaster) ->
     assert bench.take() == bench.nmt(1, 0) == bench.sync() == bench.run(500) == []
     (address,) = master.scan()
     assert (address.product_code, address.revision, address.serial) == (0x401, 0x10000, 77)
+
+
+def test_the_shipped_eds_states_that_its_node_supports_lss(bench: Any, master: LssMaster) -> None:
+    eds = shipped.path("handtouch-node.eds")
+    bench.bus.add_unconfigured(eds=str(eds), serial=77).plug()
+    assert len(master.scan()) == 1
+    assert import_od(str(eds)).device_information.LSS_supported
 
 
 def test_it_boots_with_the_assigned_id_and_measures(
