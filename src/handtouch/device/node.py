@@ -14,6 +14,7 @@ from canopen.nmt import COMMAND_TO_STATE, NMT_STATES
 from handtouch.canbus import cia301
 from handtouch.config import eds
 from handtouch.device import inputs
+from handtouch.device.error_control import HEARTBEAT_TIME, ErrorControl
 from handtouch.device.faults import FaultSwitches
 from handtouch.device.object_values import Address, ObjectValues
 from handtouch.device.pdo import DeviceTpdo
@@ -26,8 +27,6 @@ NMT_COMMANDS = (cia301.START_NODE, cia301.STOP_NODE, cia301.ENTER_PREOPERATIONAL
 _NO_CHANGE, _STOPS = 1, 2
 """0x1029: an error doesn't change the NMT state, or stops the node."""
 _ERROR_REGISTER, _EMCY_COB_ID = (cia301.ERROR_REGISTER, 0), (cia301.EMCY_COB_ID, 0)
-_GUARD_TIME, _LIFE_TIME_FACTOR = (cia301.GUARD_TIME, 0), (cia301.LIFE_TIME_FACTOR, 0)
-_HEARTBEAT_TIME = (cia301.HEARTBEAT_TIME, 0)
 _LIFE_GUARD_ERROR = 0x8130
 _HISTORY_LENGTH = 8
 _MAX_BACKLOG_NS = 100_000_000  # of a babbling node, after a pause of the program
@@ -69,10 +68,8 @@ class Device(FaultSwitches):
         self._counts_sample = -1
         self._noise = random.Random(node_id)
         # jobs of an earlier generation are void
-        self._power_generation = self._heartbeat_generation = 0
-        self._babble_generation = self._guard_generation = self._boot_loop_generation = 0
+        self._power_generation = self._babble_generation = self._boot_loop_generation = 0
         self._latched_error: tuple[int, int, bytes] | None = None
-        self._toggle_bit = 0
         self._channels = {address: channel for channel, address in enumerate(spec.channels)}
         dictionary = spec.load_dictionary(node_id)
         self._objects = ObjectValues(dictionary, self._measured_value, self._check_write, self._handle_write)
@@ -85,6 +82,7 @@ class Device(FaultSwitches):
         self._excitation = spec.find_excitation(self._objects)
         self._excited_sample: int | None = -inputs.SETTLE_SAMPLES - 1
         self.sdo = DeviceSdoServer(node_id, self._objects, self._send)
+        self._error_control = ErrorControl(bus, self._objects, self._send_state, self._leave_unguarded)
         self._tpdos = [
             DeviceTpdo(
                 default,
@@ -125,6 +123,7 @@ class Device(FaultSwitches):
         with self._bus.lock:
             self._power_generation += 1
             self.plugged = self._is_bus_off = False
+            self._error_control.stop()
             self.refresh()
 
     def reboot(self) -> None:
@@ -322,20 +321,9 @@ class Device(FaultSwitches):
             self.sdo.handle_request(data)
 
     def handle_guard_request(self, now_ns: int) -> None:
-        """Respond to a guarding request with state and toggle bit, and restart the life time."""
-        is_guarded = _GUARD_TIME in self._objects and not self._objects.get_integer(*_HEARTBEAT_TIME)
-        if not is_guarded or not self.plugged or self._is_bus_off:
-            return
-        if self.send_heartbeat:
-            state = self._nmt_state if self.heartbeat_state is None else self.heartbeat_state
-            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((self._toggle_bit | state,)))
-        self._toggle_bit ^= 0x80
-        life_ms = self._objects.get_integer(*_GUARD_TIME) * self._objects.get_integer(*_LIFE_TIME_FACTOR)
-        self._guard_generation += 1
-        if life_ms:
-            self._bus.schedule(
-                now_ns + life_ms * 1_000_000, partial(self._handle_guard_timeout, self._guard_generation)
-            )
+        """Respond to a guarding request, if it is guarded."""
+        if self.plugged and not self._is_bus_off:
+            self._error_control.handle_guard_request(now_ns)
 
     def transmit(self, message: can.Message, is_data: bool = False) -> None:
         """Send a frame through the line, which may be faulty."""
@@ -370,15 +358,26 @@ class Device(FaultSwitches):
         """Initialise as in CiA 301: defaults, boot-up message, pre-operational."""
         self._objects.reset(application=power)
         self.sdo.reset()
-        self._toggle_bit = 0
-        self._guard_generation += 1
+        self._error_control.stop()
         self.plugged = True
         self._load_objects()
         self._send(cia301.NMT_ERROR_CONTROL + self.node_id, b"\0")
         self._enter_nmt_state(cia301.PREOPERATIONAL)
-        self._start_heartbeat(self._objects.get_integer(*_HEARTBEAT_TIME))
+        self._error_control.start_heartbeat()
         if self._latched_error is not None:
             self.send_emergency(*self._latched_error)
+
+    def _send_state(self, toggle_bit: int) -> None:
+        """Send a heartbeat or a guarding response."""
+        if self.send_heartbeat:
+            state = self._nmt_state if self.heartbeat_state is None else self.heartbeat_state
+            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((toggle_bit | state,)))
+
+    def _leave_unguarded(self) -> None:
+        """Report an expired life time, and leave operational."""
+        self.send_emergency(_LIFE_GUARD_ERROR, 0x11)
+        if self._nmt_state == cia301.OPERATIONAL:
+            self._enter_nmt_state(cia301.PREOPERATIONAL)
 
     def _add_to_history(self, entry: int) -> None:
         """Put an error first in the pre-defined error field, 0x1003."""
@@ -429,8 +428,8 @@ class Device(FaultSwitches):
             tpdo.check_write(index, sub, value)
 
     def _handle_write(self, index: int, sub: int, value: int) -> None:
-        if (index, sub) == _HEARTBEAT_TIME:
-            self._start_heartbeat(value)
+        if (index, sub) == HEARTBEAT_TIME:
+            self._error_control.start_heartbeat()
         elif (index, sub) == self._excitation:
             self._set_excitation(bool(value))
         for tpdo in self._tpdos:
@@ -438,31 +437,6 @@ class Device(FaultSwitches):
         self.refresh()
 
     # Scheduled jobs.
-
-    def _start_heartbeat(self, period_ms: int) -> None:
-        self._heartbeat_generation += 1
-        if period_ms:
-            period_ns = period_ms * 1_000_000
-            self._bus.schedule(
-                self._bus.now_ns + period_ns,
-                partial(self._emit_heartbeat, self._heartbeat_generation, period_ns),
-            )
-
-    def _emit_heartbeat(self, generation: int, period_ns: int, due_ns: int, now_ns: int) -> int | None:
-        if generation != self._heartbeat_generation or not self.plugged:
-            return None
-        if self.send_heartbeat:
-            state = self._nmt_state if self.heartbeat_state is None else self.heartbeat_state
-            self._send(cia301.NMT_ERROR_CONTROL + self.node_id, bytes((state,)))
-        return due_ns + period_ns * (1 + (now_ns - due_ns) // period_ns)
-
-    def _handle_guard_timeout(self, generation: int, *_: int) -> None:
-        """Report an expired life time, and leave operational."""
-        if generation != self._guard_generation or not self.plugged:
-            return
-        self.send_emergency(_LIFE_GUARD_ERROR, 0x11)
-        if self._nmt_state == cia301.OPERATIONAL:
-            self._enter_nmt_state(cia301.PREOPERATIONAL)
 
     def _reboot_repeatedly(self, generation: int, period_ns: int, _due_ns: int, now_ns: int) -> int | None:
         if generation != self._boot_loop_generation:
