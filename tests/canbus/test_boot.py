@@ -318,6 +318,22 @@ def test_timeout_after_invalid_responses_names_the_last_one(response: str, recei
         node.sdo.read(0x1017, 0, "heartbeat time")
 
 
+def test_late_responses_to_earlier_requests_are_reported_as_late() -> None:
+    node = Node(identity(7))
+    assert node.sdo.read(0x1018, 1, "vendor id")
+
+    def late(_id: int, _data: bytes) -> bool:
+        node.transport.deliver_response(bytes.fromhex("4318100107000000"))
+        return True
+
+    node.intercept(late)
+    with pytest.raises(
+        BootStepError, match="attempts, but a late one to an earlier request, 0x1018:01;"
+    ) as e:
+        node.sdo.read(0x1018, 2, "product code")
+    assert e.value.timed_out
+
+
 def test_garbled_response_is_an_error_not_a_value() -> None:
     node = Node({})
 

@@ -383,8 +383,12 @@ def test_a_change_is_repaired_however_often_the_node_was_stale_before(make_rig: 
         rig.node(1).send_data = True
         rig.run(20)
         assert rig.state(1) is OPERATIONAL
+    rig.node(1).send_data = False
+    rig.run(4000)  # the delay until the next check has grown
+    rig.node(1).send_data = True
+    rig.run(20)
     rig.node(1).write_object(0x1801, 1, 0x80000281)
-    events = rig.run(6000)
+    events = rig.run(600)
     assert any("0x1801:01, COB-ID of TPDO2, is 0x80000281 instead of 0x281" in e.reason for e in events)
     assert rig.state(1) is OPERATIONAL
 

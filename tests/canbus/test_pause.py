@@ -53,8 +53,10 @@ def test_node_that_was_unplugged_during_a_pause_is_lost_in_time_after_it(rig: An
     events = rig.run(500)
     assert [(event.slot, event.new_state) for event in events] == [
         (1, NodeState.STALE),
+        (1, NodeState.STALE),
         (1, NodeState.ABSENT),
     ]
+    assert "its settings can't be read: reading" in events[1].reason
     assert "bus can" not in events[-1].reason
 
 
@@ -100,9 +102,10 @@ def test_pads_that_are_late_together_name_the_bus(rig: Any) -> None:
 def test_one_late_pad_names_its_node(rig: Any) -> None:
     rig.boot()
     rig.wire.lose = {0x282}
-    (event,) = rig.run(100)
-    assert event.slot == 1
-    assert "heartbeat present; check transmission type and COB-ID of its TPDO" in event.reason
+    before, after = rig.run(200)
+    assert before.slot == after.slot == 1
+    assert "heartbeat present; its PDO and heartbeat settings are being checked" in before.reason
+    assert "heartbeat present; its PDO and heartbeat settings are as configured" in after.reason
 
 
 @pytest.mark.parametrize("role", ["master", "listener"])

@@ -22,10 +22,11 @@ def explain_pad_state(
     `node_reason` is the master's explanation of the node state, `counts` (4,) the newest sample, `railed`
     (4,) which channels are at the end of their range.
     """
-    if state <= PadState.TOUCHED or (state == PadState.STARTING and node == NodeState.OPERATIONAL):
+    is_fine = state <= PadState.TOUCHED
+    if node == NodeState.OPERATIONAL and (is_fine or state == PadState.STARTING):
         return ""
-    if node not in (NodeState.OPERATIONAL, NodeState.STALE):
-        return node_reason
+    if is_fine or node not in (NodeState.OPERATIONAL, NodeState.STALE):
+        return node_reason  # also of a pad whose state is that of the last tick
     if state == PadState.FAULTED:
         channels = dict(zip(ELECTRODES, counts.tolist(), strict=True))
         if at_end := [name for name, at in zip(ELECTRODES, railed.tolist(), strict=True) if at]:

@@ -60,6 +60,7 @@ _BABBLING_REASON = (
     "power-cycle or unplug it"
 )
 _TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF)"
+_CHECK_PENDING = "its PDO and heartbeat settings are being checked"
 _SETTINGS_UNCHANGED = "its PDO and heartbeat settings are as configured; check its sampling and firmware"
 _STANDBY_REASON = "outside the scene: in standby until needed"
 
@@ -278,7 +279,8 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
         return begin_boot(life, now_ns, event.reason, timing)
     if event.step is NodeAction.CHECK_SETTINGS and life.state is NodeState.STALE:
         if event.timed_out:
-            return enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY)), ()
+            reason = _explain_silence(life, f"its settings can't be read: {event.reason}")
+            return enter(life, NodeState.STALE, now_ns, reason), ()
         return _repair_settings(life, event.reason, now_ns, timing)
     if event.step is NodeAction.ENTER_STANDBY and life.state is NodeState.STOPPED:
         return enter(life, NodeState.STOPPED, now_ns, f"{_STANDBY_REASON}, but {event.reason}"), ()
@@ -361,10 +363,13 @@ def _enter_stale(life: Lifecycle, now_ns: int, silence: str, bus_cause: str, tim
     A check that is due isn't postponed by single samples.
     """
     life = replace(life, silence=silence, bus_cause=bus_cause)
-    life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY))
+    remedy = _TPDO_REMEDY if timing.role is BusRole.LISTENER else _CHECK_PENDING
+    life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, remedy))
     soon_ns = timing.retry_delay_ns(1)
     if now_ns - life.check_ns > timing.max_retry_ns:
         life = replace(life, check_ns=now_ns + (_BUS_CAUSE_DELAY_NS if bus_cause else soon_ns), checks=0)
+    elif not bus_cause:
+        life = replace(life, check_ns=min(life.check_ns, now_ns + timing.retry_delay_ns(3)))
     due_ns = max(life.check_ns, now_ns)
     return replace(life, due_ns=min(due_ns, now_ns + soon_ns) if bus_cause else due_ns)
 
@@ -395,6 +400,7 @@ def _on_stale_due(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTimi
         life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY))
         return replace(life, due_ns=NEVER_NS), ()
     if life.nmt_state in (cia301.STOPPED, cia301.PREOPERATIONAL):  # its heartbeats decide what follows
+        life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY))
         return replace(life, due_ns=now_ns + timing.max_retry_ns), ()
     checks = life.checks + 1
     check_ns = now_ns + timing.retry_delay_ns(3 * checks)

@@ -116,12 +116,13 @@ class SdoTransport:
         self._responded = False
         self._dropped: bytes | None = None
         self._object = bytes(3)
+        self._requested: set[bytes] = set()
 
     def deliver_response(self, data: bytes) -> None:
         """Pass on a response, from the receiving thread, while `awaiting_response`.
 
         A response for another object is dropped: it is late, or answers a probe or another master; so is one
-        of another length than 8 bytes. The latest one dropped is in the reason of a timeout.
+        of another length than 8 bytes. The reason of a timeout has the latest one dropped.
         """
         is_invalid = len(data) != cia301.SDO_BYTES
         if is_invalid or (
@@ -145,6 +146,7 @@ class SdoTransport:
         Raises BootStepError, or BootStepCancelled if `is_cancelled` is true before an attempt.
         """
         self._object = index.to_bytes(2, "little") + bytes((sub,))
+        self._requested.add(self._object)
         timeout: SdoCommunicationError | None = None
         self._dropped = None
         for _ in range(MAX_SDO_ATTEMPTS):
@@ -169,12 +171,21 @@ class SdoTransport:
             finally:
                 self.awaiting_response = False
         limit = f"within {self._timeout_s * 1e3:.0f} ms in {MAX_SDO_ATTEMPTS} attempts"
-        cause = (
-            f"no answer {limit}; is its SDO server running, the bus overloaded?"
-            if self._dropped is None
-            else f"no valid SDO response {limit}; received: {self._dropped.hex(' ') or 'no data'}"
-        )
+        cause = self._explain_silence(limit)
         raise BootStepError(f"{description}: {cause}", timed_out=True) from timeout
+
+    def _explain_silence(self, limit: str) -> str:
+        """Return why a request has no answer, by the latest response dropped meanwhile."""
+        dropped = self._dropped
+        if dropped is None:
+            return f"no answer {limit}; is its SDO server running, the bus overloaded?"
+        if len(dropped) == cia301.SDO_BYTES and dropped[1:4] in self._requested:
+            index, sub = int.from_bytes(dropped[1:3], "little"), dropped[3]
+            return (
+                f"no answer {limit}, but a late one to an earlier request, 0x{index:04X}:{sub:02X}; "
+                "is the node, the bus or this host overloaded?"
+            )
+        return f"no valid SDO response {limit}; received: {dropped.hex(' ') or 'no data'}"
 
 
 def _never_cancelled() -> bool:
