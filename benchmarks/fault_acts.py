@@ -90,6 +90,8 @@ class Kind:
     well_s: float = 2.0
     unstable: bool = False
     """the node doesn't stay operational: it has no other fault until it is stable again"""
+    repaired: bool = False
+    """changed settings, which are repaired a few times in a row only"""
     weight: float = 1.0
 
 

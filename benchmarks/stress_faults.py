@@ -41,6 +41,7 @@ WELL = ("clear", "touched")
 HOLD_NS = S // 3  # a node has to stay well for so long
 GIVE_UP_S = 30.0
 STABLE_S = 5.5  # an unstable node is stable after 5 s of operation; until then a reboot may be its boot loop
+REPAIR_MEMORY_S = 60.0  # three repairs, each within this time of the one before, are the last
 ALONE_AT_ONCE = 4
 
 
@@ -65,6 +66,7 @@ class Campaign:
         self._active: list[Fault] = []
         self._busy: dict[int, Fault] = {}
         self._free_ns: dict[int, int] = {}
+        self._repaired_ns: dict[int, int] = {}
         self._started = 0
         self._next_ns = 0
 
@@ -124,7 +126,12 @@ class Campaign:
             self._begin(self._coming.popleft(), None, now_ns)
         else:
             free = [n for n in self._links.values() if self._may_begin(n, now_ns)]
+            if kind.repaired:
+                since_ns = now_ns - int(REPAIR_MEMORY_S * S)
+                free = [n for n in free if self._repaired_ns.get(n, 0) < since_ns]
             if not free:
+                if kind.repaired:
+                    self._coming.rotate(-1)
                 return
             self._begin(self._coming.popleft(), self._chance.choice(free), now_ns)
         self._next_ns = max(
@@ -240,6 +247,8 @@ class Campaign:
             rebooted = self.health[node_id].reboots > fault.health[node_id].reboots
             rest_s = STABLE_S if rebooted or fault.kind.unstable else 0.0
             self._free_ns[node_id] = now_ns + int(rest_s * S)
+            if fault.kind.repaired:
+                self._repaired_ns[node_id] = now_ns
         for t_ns in fault.disturbed_ns:
             paused = self.bench.cable.paused(fault.nodes[0], t_ns, fault.kind.lag)
             _once(fault, "paused" if paused else "disturbed")
