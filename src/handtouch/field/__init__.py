@@ -10,6 +10,8 @@ from handtouch.field.contact_law import (
 from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.model import ForwardModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
+from handtouch.field.outline import Outline
+from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.rectangle import Location, Rectangle
 from handtouch.field.residual import PointTest, point_test, resolvable_separation
 from handtouch.field.sandwich import Sandwich, SandwichEstimate
@@ -26,6 +28,7 @@ from handtouch.field.surface import (
 
 __all__ = [
     "AnisotropicSurface",
+    "BoundaryElectrode",
     "ConeSurface",
     "ContactLaw",
     "CylinderSurface",
@@ -36,6 +39,8 @@ __all__ = [
     "ForwardModel",
     "Location",
     "LocatorBank",
+    "Outline",
+    "OutlineNetwork",
     "PlaneSurface",
     "PointEstimate",
     "PointTest",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field.model import FloatArray, ForwardModel, channel_noise
+from handtouch.field.model import FloatArray, ForwardModel, channel_noise, mirrored_inside
 
 BoolArray = NDArray[np.bool_]
 
@@ -144,6 +144,7 @@ class _LikelihoodFit:
         self, model: ForwardModel, currents: FloatArray, noise: FloatArray, noise_unit: FloatArray
     ) -> None:
         self.model, self.currents, self.noise_unit = model, currents, noise_unit
+        self.mirrored_inside = mirrored_inside(model)
         self.weight = 1 / noise
         self.data = currents * self.weight
         self.sides = np.array([[model.a], [model.b]])
@@ -152,8 +153,10 @@ class _LikelihoodFit:
     def initial_positions(self) -> FloatArray:
         """Return a start from the currents alone, shape (2, n): the most likely of a grid of points."""
         side = (np.arange(_GUESS_GRID) + 0.5) / _GUESS_GRID
-        x, y = (place.ravel() for place in np.meshgrid(side, side))
+        x, y = self.move_inside(np.stack([place.ravel() for place in np.meshgrid(side, side)]))
         table = self.model.fractions(self.model.a * x, self.model.b * y).T
+        on_pad = np.isfinite(table).all(axis=1)
+        x, y, table = x[on_pad], y[on_pad], table[on_pad]
         begin = np.empty((2, self.data.shape[1]))
         for first in range(0, self.data.shape[1], _GUESS_BATCH):
             some = slice(first, first + _GUESS_BATCH)
@@ -162,6 +165,13 @@ class _LikelihoodFit:
             best = np.argmax(np.maximum(along, 0.0) ** 2 / norm, axis=0)
             begin[:, some] = x[best], y[best]
         return begin
+
+    def move_inside(self, point: FloatArray) -> FloatArray:
+        """Return points (2, n), where off the pad replaced by nearby points on it."""
+        point = np.clip(point, _MIN_EDGE_DISTANCE, 1 - _MIN_EDGE_DISTANCE)
+        if self.mirrored_inside is None:
+            return point
+        return np.asarray(np.stack(self.mirrored_inside(*(point * self.sides))) / self.sides)
 
     def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> _WhitenedModel:
         """Evaluate the model at `point`, shape (2, n), for the elements `index`."""
@@ -201,9 +211,9 @@ class _LikelihoodFit:
 
     def maximise(self, begin: FloatArray, unit: FloatArray) -> PointEstimate:
         """Iterate every element to its maximum; converged elements are left alone."""
-        point = np.clip(begin, _MIN_EDGE_DISTANCE, 1 - _MIN_EDGE_DISTANCE)
         known = np.isfinite(self.data).all(0) & np.isfinite(self.weight).all(0)
-        point = np.where(known, np.where(np.isfinite(point), point, 0.5), np.nan)
+        point = self.move_inside(np.where(np.isfinite(begin), begin, 0.5))
+        point = np.where(known, point, np.nan)
         best = self.linearise(point, slice(None))
         converged = np.zeros(point.shape[1], dtype=np.bool_)
         damping = np.ones(point.shape[1])
@@ -214,7 +224,7 @@ class _LikelihoodFit:
                 break
             here, at = point[:, active], best.select(active)
             step, decrement = self.gauss_newton_step(at, here)
-            trial = np.clip(here + damping[active] * step, _MIN_EDGE_DISTANCE, 1 - _MIN_EDGE_DISTANCE)
+            trial = self.move_inside(here + damping[active] * step)
             new = self.linearise(trial, active)
             accept = (new.cost <= at.cost) & (new.total > 0) | (at.total <= 0)
             point[:, active[accept]] = trial[:, accept]
@@ -236,8 +246,9 @@ class _LikelihoodFit:
     ) -> NDArray[np.intp]:
         """Move points out of corners, in place, to where currents carry information; return their indices.
 
-        Near a corner the two far currents vanish with the square of its distance r, so that all r up to
-        sqrt(noise) sides are equally likely, and only the direction from the corner is known.
+        Of rectangles only. Near a corner the two far currents vanish with the square of its distance r, so
+        that all r up to sqrt(noise) sides are equally likely, and only the direction from the corner is
+        known.
         """
         noise = self.noise_unit / np.sqrt((self.weight * self.weight).mean(0))
         radius = np.minimum(
@@ -245,7 +256,7 @@ class _LikelihoodFit:
         )  # in shorter sides; NaN for no contact
         far = point > 0.5
         offset = np.where(far, 1 - point, point) * self.aspect
-        index = np.flatnonzero(np.hypot(*offset) < radius)
+        index = np.flatnonzero(np.hypot(*offset) < (radius if self.mirrored_inside is None else 0.0))
         if index.size:
             corner = np.where(far, 1.0, 0.0)[:, index]
             inward = np.where(far, -1.0, 1.0)[:, index] * radius[index] / self.aspect
@@ -262,7 +273,7 @@ class _LikelihoodFit:
     def centre_invalid_points(self, point: FloatArray, at: _WhitenedModel) -> NDArray[np.intp]:
         """Move points without a positive total to the centre, in place; return their indices."""
         index = np.flatnonzero(at.total <= 0)
-        point[:, index] = 0.5
+        point[:, index] = self.move_inside(np.full((2, index.size), 0.5))
         return index
 
     def build_estimate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -48,6 +49,13 @@ def spreading_radius(model: ForwardModel, x: FloatArray, y: FloatArray) -> Float
     """
     radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
     return np.asarray(radius(x, y), dtype=np.float64)
+
+
+def mirrored_inside(
+    model: ForwardModel,
+) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None:
+    """Return the function that moves points off the pad onto it; None for a rectangle, which needs none."""
+    return getattr(model, "mirrored_inside", None)
 
 
 def channel_noise(noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:

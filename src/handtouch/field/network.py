@@ -4,8 +4,7 @@ Public names: `ElectrodeNetwork`, `Electrode`.
 
 By reciprocity the current that a point contact sends to grounded electrode i is the potential phi_i there
 when electrode i alone is at 1 and the bare boundary insulates; `_electrodes` computes those potentials to
-rounding error. Resistors R mix the currents: (1 + G R / sheet) I = phi, G the conductance matrix for one ohm
-per square.
+rounding error, `_series_resistors` adds the resistors.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy.typing as npt
 
 from handtouch.field._disc import CirclePoints, DiscMap
 from handtouch.field._electrodes import ElectrodePotentials
-from handtouch.field.estimate import PointEstimate, estimate
+from handtouch.field._series_resistors import GroundedElectrodes
 from handtouch.field.rectangle import Location, Rectangle
 
 FloatArray = npt.NDArray[np.float64]
@@ -47,7 +46,7 @@ class Electrode:
     stop: float
 
 
-class ElectrodeNetwork:
+class ElectrodeNetwork(GroundedElectrodes):
     """A resistive rectangle [0, a] x [0, b] with any electrodes on its boundary; a `ForwardModel`.
 
     The usual case is four electrodes that leave `gap` bare from each corner along each side: one number, or
@@ -92,13 +91,6 @@ class ElectrodeNetwork:
         network._build(a, b, list(electrodes), sheet_ohm_per_square, series)
         return network
 
-    def with_series_ohm(self, series_ohm: Sequence[float]) -> ElectrodeNetwork:
-        """Return the same pad with other series resistors; costs microseconds."""
-        network = self.__class__.__new__(self.__class__)
-        network.__dict__.update(self.__dict__)
-        network._set_series_resistors(series_ohm)
-        return network
-
     @property
     def a(self) -> float:
         """Length along x, from side x0 to xa."""
@@ -127,17 +119,6 @@ class ElectrodeNetwork:
             return np.asarray(self._potentials.potentials(self._to_disc(x, y))[self._ring_position])
 
     @np.errstate(all="ignore")
-    def fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Return the measured fractions of the contact's current, resistors included; (m, ...), summing to
-        1.
-        """
-        return self._mixed(self.ideal_fractions(x, y))
-
-    def currents(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Return `fractions`, by its other name."""
-        return self.fractions(x, y)
-
-    @np.errstate(all="ignore")
     def fractions_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return `fractions` (m, ...) and derivatives by (x, y) (m, 2, ...), unbounded at electrodes'
         ends.
@@ -156,31 +137,6 @@ class ElectrodeNetwork:
         with np.errstate(all="ignore"):
             radius = self._disc.radius(defects) * np.exp(self._potentials.log_spread(defects))
             return np.asarray(radius * self._unit)
-
-    @np.errstate(all="ignore")
-    def series_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Return the resistance [ohm] that resistors add between a contact and ground: sum of phi_i V_i."""
-        ideal = self.ideal_fractions(x, y)
-        return np.asarray(np.einsum("i...,ij,j...->...", ideal, self._voltage_per_current, ideal))
-
-    @property
-    def series_quadratic_form(self) -> FloatArray:
-        """Matrix Q (m, m) of the form f @ Q @ f [ohm] that gives `series_resistance` from measured fractions
-        f.
-
-        Raises ValueError where an electrode floats: its voltage doesn't follow from the currents.
-        """
-        if self._unmix is None:
-            raise ValueError(
-                "series_ohm: the voltage of a floating electrode does not follow from the currents"
-            )
-        return np.asarray(self._unmix.T * np.asarray(self.series_ohm))
-
-    @property
-    def series_sensitivity(self) -> FloatArray:
-        """Matrix S (m, m): the logarithm of resistor j changes the measured fractions f by S[:, j] f[j]."""
-        drop = np.asarray(self.series_ohm) / self.sheet_ohm_per_square
-        return -self._mix @ self.conductance * np.where(np.isfinite(drop), drop, 0.0)
 
     @np.errstate(all="ignore")
     def locate(self, currents: npt.ArrayLike) -> Location:
@@ -206,14 +162,6 @@ class ElectrodeNetwork:
         expected = self.ideal_fractions(x, y)
         residual = measured[:2].sum(axis=0) - (self._side_sums[:2] @ expected).sum(axis=0)
         return Location(*(v.reshape(shape)[()] for v in (x, y, total, residual)))
-
-    def estimate(
-        self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None
-    ) -> PointEstimate:
-        """Return the maximum-likelihood contact from all noisy currents (m, ...); see
-        `handtouch.field.estimate`.
-        """
-        return estimate(self, currents, noise, start)
 
     @np.errstate(all="ignore")
     def _build(
@@ -244,31 +192,7 @@ class ElectrodeNetwork:
         self._potentials = ElectrodePotentials(stops, starts, self._disc.defects(*ends[0].mean(axis=0)))
         sums = np.array([[float(e.side == side) for e in self.electrodes] for side in SIDES])
         self._side_sums = sums if sums.any(axis=1).all() else None
-        self._set_series_resistors(series_ohm)
-
-    @np.errstate(all="ignore")
-    def _set_series_resistors(self, series_ohm: Sequence[float]) -> None:
-        """Compute the resistors' matrices: currents from phi and back, and voltages per ampere from phi."""
-        resistance = np.asarray(series_ohm, np.float64)
-        count = len(self.electrodes)
-        if resistance.shape != (count,) or not (resistance >= 0).all():
-            raise ValueError(f"series_ohm must be {count} resistances of at least 0, got {series_ohm}")
-        self.series_ohm = tuple(float(r) for r in resistance)
-        self._mix: FloatArray = np.eye(count)
-        self._unmix: FloatArray | None = np.eye(count)
-        self._voltage_per_current: FloatArray = np.zeros((count, count))
-        if not resistance.any():
-            return
-        if not np.isfinite(resistance).any():
-            raise ValueError("series_ohm: at least one electrode must be connected to ground")
-        # unknowns: the current of a connected electrode, the voltage over `sheet` of a floating one
-        connected = np.isfinite(resistance)
-        drop = np.where(connected, resistance, self.sheet_ohm_per_square)
-        system = np.diag(connected.astype(float)) + self.conductance * (drop / self.sheet_ohm_per_square)
-        solution = np.asarray(np.linalg.inv(system), np.float64)
-        self._mix = solution * connected[:, None]
-        self._unmix = system if connected.all() else None
-        self._voltage_per_current = drop[:, None] * solution
+        self._set_series_resistors(series_ohm, len(self.electrodes))
 
     def _to_disc(self, x: npt.ArrayLike, y: npt.ArrayLike) -> ComplexArray:
         """Return defects (4, ...), NaN off the pad."""
@@ -277,9 +201,6 @@ class ElectrodeNetwork:
         with np.errstate(all="ignore"):
             x, y = (np.where(on_pad, coordinate, np.nan) / self._unit for coordinate in (x, y))
             return self._disc.defects(x, y)
-
-    def _mixed(self, ideal: FloatArray) -> FloatArray:
-        return np.asarray(np.tensordot(self._mix, ideal, axes=1)) if any(self.series_ohm) else ideal
 
     def _ideal_with_jacobian(self, defects: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Return potentials (m, ...) and their derivatives (m, 2, ...) by coordinates in `_unit`."""
