@@ -11,6 +11,8 @@ from typing import Any
 from handtouch import __version__
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parent))
+from key_figures import draw_all
 from page import outdated
 
 project = "handtouch"
@@ -60,5 +62,6 @@ def mark_outdated(app: Any, page: str, source: list[str]) -> None:  # noqa: ARG0
 
 def setup(app: Any) -> None:
     """Sphinx calls it."""
+    app.connect("builder-inited", lambda app: draw_all(Path(app.srcdir) / "_figures"))
     app.connect("source-read", mark_outdated)
     app.connect("autodoc-process-docstring", as_text)

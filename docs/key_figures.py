@@ -1,0 +1,192 @@
+"""Plots of docs/key_figures.md, drawn from the recorded results of the benchmarks whenever the site is built.
+
+`python docs/key_figures.py FOLDER` draws them without the site. Needs matplotlib.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+RESULTS = Path(__file__).parent / "benchmarks"
+WORLDS = ("ideal", "default", "harsh")
+BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"  # distinct with colour blindness
+STYLE = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "svg.hashsalt": "handtouch",
+    "figure.facecolor": "white",
+}
+SIZE_INCH = (5.6, 3.6)
+
+
+def draw_all(folder: Path) -> None:
+    """Write one SVG per figure into `folder`, created if missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figures: dict[str, Callable[[Axes], None]] = {
+        "position": draw_position,
+        "coverage": draw_coverage,
+        "latency": draw_latency,
+        "tick": draw_tick,
+        "bus": draw_bus,
+        "methods": draw_methods,
+        "slip": draw_slip,
+        "diagnosis": draw_diagnosis,
+        "swap": draw_swap,
+    }
+    with matplotlib.rc_context(STYLE):
+        for name, draw in figures.items():
+            figure = Figure(figsize=SIZE_INCH, layout="constrained")
+            draw(figure.add_subplot())
+            figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+
+
+def load(name: str) -> Any:
+    """Return the recorded results of a benchmark."""
+    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def draw_position(axes: Axes) -> None:
+    """Rms error of valid positions by world."""
+    results = load("worlds")
+    for shift, colour, state in ((-0.2, BLUE, "as configured"), (0.2, ORANGE, "calibrated")):
+        errors = [1e3 * results[f"{world}, {state}, position"]["rms_error"] for world in WORLDS]
+        bars = axes.bar([n + shift for n in range(len(WORLDS))], errors, 0.38, color=colour, label=state)
+        axes.bar_label(bars, fmt="%.2g", padding=2)
+    axes.set(xticks=range(len(WORLDS)), xticklabels=WORLDS, ylabel="rms position error, mm")
+    axes.margins(y=0.15)
+    axes.legend(frameon=False)
+
+
+def draw_coverage(axes: Axes) -> None:
+    """Share of true values within the stated 95 % regions by world."""
+    results = load("worlds")
+    for shift, colour, quantity in ((-0.2, BLUE, "position"), (0.2, ORANGE, "force")):
+        found = [results[f"{world}, as configured, {quantity}"]["coverage"]["0.95"] for world in WORLDS]
+        shares = [100 * share["count"] / share["total"] for share in found]
+        bars = axes.bar([n + shift for n in range(len(WORLDS))], shares, 0.38, color=colour, label=quantity)
+        axes.bar_label(bars, fmt="%.0f", padding=2)
+    axes.axhline(95, color=GREY, linewidth=1, linestyle="--")
+    axes.set(xticks=range(len(WORLDS)), xticklabels=WORLDS, ylabel="within the stated 95 % region, %")
+    axes.set_ylim(0, 119)
+    axes.legend(frameon=False, ncols=2, loc="upper center")
+
+
+def draw_latency(axes: Axes) -> None:
+    """Latency from the last CAN frame to the subscriber, median and 99th percentile."""
+    turns: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    for turn in load("latency")["udp_multicast"]["turns"]:
+        if turn["contacts"] == "sliding":
+            turns[turn["who"]].append((1e-3 * turn["p50_us"], 1e-3 * turn["p99_us"]))
+    names = {
+        "daemon": "handtouch",
+        "floor": "bare loop",
+        "daemon, realtime_priority = 40, busy_poll_us = 1000": "handtouch,\nreal-time",
+        "floor with that priority": "bare loop,\nreal-time",
+    }
+    for shift, colour, label, column in ((-0.2, BLUE, "median", 0), (0.2, ORANGE, "99th percentile", 1)):
+        values = [median(turn[column] for turn in turns[who]) for who in names]
+        bars = axes.bar([n + shift for n in range(len(names))], values, 0.38, color=colour, label=label)
+        axes.bar_label(bars, fmt="%.2f", padding=2)
+    axes.set(xticks=range(len(names)), xticklabels=names.values(), ylabel="last CAN frame to subscriber, ms")
+    axes.margins(y=0.15)
+    axes.legend(frameon=False)
+
+
+def draw_tick(axes: Axes) -> None:
+    """Time to compute all pads once, by touched pads."""
+    rows = [row for row in load("tick")["rows"] if row["state"] == "hot" and row["touched"] == row["pads"]]
+    for colour, contacts in ((BLUE, "static"), (ORANGE, "sliding")):
+        points = sorted((row["pads"], row["tick"]) for row in rows if row["contacts"] == contacts)
+        axes.plot(*zip(*points, strict=True), "o-", color=colour, label=f"{contacts} contacts on all pads")
+    axes.set(xscale="log", yscale="log", xlabel="pads", ylabel="one tick of all pads, us")
+    axes.set_xticks(sorted({row["pads"] for row in rows}), sorted({row["pads"] for row in rows}))
+    axes.minorticks_off()
+    axes.legend(frameon=False)
+
+
+def draw_bus(axes: Axes) -> None:
+    """Load of the CAN bus of 15 pads, by sampling."""
+    loads: dict[str, list[float]] = defaultdict(list)
+    for row in load("idle")["loads"]:
+        loads[row["scene"]].append(100 * row["bus_load"])
+    axes.barh(list(loads), [max(values) for values in loads.values()], color=GREY, label="most")
+    bars = axes.barh(
+        list(loads), [min(values) for values in loads.values()], color=BLUE, label="all untouched"
+    )
+    axes.bar_label(bars, fmt="%.0f %%", padding=3)
+    axes.set(xlabel="load of a 1 Mbit/s bus, 15 pads at 200 Hz, %")
+    axes.set_yticks(range(len(loads)), [name.replace(", ", ",\n") for name in loads])
+    axes.invert_yaxis()
+    axes.legend(frameon=False, loc="lower right")
+
+
+def draw_methods(axes: Axes) -> None:
+    """Run time against error of ways to locate a contact on an ideal pad."""
+    kinds = {"paper": (GREY, "the paper's"), "instead": (ORANGE, "common alternatives"), "handtouch": (BLUE, "exact"),
+             "core": (GREEN, "in the daemon")}  # fmt: skip
+    rows = [row for row in load("methods")["rows"] if row["case"] == "ideal pad"]
+    for kind, (colour, label) in kinds.items():
+        points = [(row["us_per_contact"]["15"], row["rms_mm"]) for row in rows if row["kind"] == kind]
+        axes.plot(*zip(*points, strict=True), "o", color=colour, label=label)
+    axes.set(
+        xscale="log", yscale="log", xlabel="us per contact, 15 at once", ylabel="rms error without noise, mm"
+    )
+    axes.axhline(
+        load("methods")["floors_mm"]["ideal pad"]["noise of the channels"], color=GREY, linestyle="--"
+    )
+    axes.text(0.99, 0.86, "noise of the channels", transform=axes.transAxes, ha="right", color=GREY)
+    axes.legend(frameon=False, loc="lower right", fontsize=8)
+
+
+def draw_slip(axes: Axes) -> None:
+    """Detection latency of slips by speed, with the bound of a test that knows the speed."""
+    rows = [row for row in load("slip")["latency"] if (row["sheet"], row["hz"]) == ("ideal", 200.0)]
+    for colour, force_n in ((BLUE, 0.5), (ORANGE, 2.0), (GREEN, 5.0)):
+        of_force = sorted((row["mm_per_s"], row) for row in rows if row["force_n"] == force_n)
+        found = [(speed, row["median_ms"]) for speed, row in of_force if row["median_ms"] is not None]
+        axes.plot(*zip(*found, strict=True), "o-", color=colour, label=f"{force_n:g} N")
+        bounds = [(speed, row["bound_ms"]) for speed, row in of_force if row["bound_ms"] is not None]
+        axes.plot(*zip(*bounds, strict=True), ":", color=colour)
+    axes.set(xscale="log", yscale="log", xlabel="speed, mm/s", ylabel="median detection latency, ms")
+    axes.legend(frameon=False, title="dotted: knows the speed")
+
+
+def draw_diagnosis(axes: Axes) -> None:
+    """Share of episodes with a fault that are diagnosed correctly."""
+    rows = [row for row in load("diagnose")["tables"]["By fault"] if row["named, %"] != ""]
+    bars = axes.barh([row["fault played"] for row in rows], [row["named, %"] for row in rows], color=BLUE)
+    axes.bar_label(bars, fmt="%.0f", padding=3)
+    axes.set(xlabel="episodes with the correct diagnosis, %", xlim=(0, 112))
+    axes.invert_yaxis()
+
+
+def draw_swap(axes: Axes) -> None:
+    """Position error of a replaced node by contacts since."""
+    by_pad: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
+    for row in load("swap")["rows"]:
+        by_pad[row["pad"]].append(
+            (row["contacts since"], row["position error, rms mm"], row["with the true gains, rms mm"])
+        )
+    for colour, (pad, rows) in zip((BLUE, ORANGE, GREEN), by_pad.items(), strict=False):
+        contacts, errors, known = zip(*sorted(rows), strict=True)
+        axes.plot(contacts, errors, "o-", color=colour, label=f"pad {pad}")
+        axes.plot(contacts, known, ":", color=colour)
+    axes.set(xlabel="contacts since the replacement", ylabel="rms position error, mm", yscale="log")
+    axes.set_yticks([0.02, 0.05, 0.1, 0.2, 0.4], [0.02, 0.05, 0.1, 0.2, 0.4])
+    axes.minorticks_off()
+    axes.legend(frameon=False, title="dotted: gains known")
+
+
+if __name__ == "__main__":
+    draw_all(Path(sys.argv[1]))
