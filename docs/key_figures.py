@@ -110,7 +110,8 @@ def draw_tick(axes: Axes) -> None:
         points = sorted((row["pads"], row["tick"]) for row in rows if row["contacts"] == contacts)
         axes.plot(*zip(*points, strict=True), "o-", color=colour, label=f"{contacts} contacts on all pads")
     axes.set(xscale="log", yscale="log", xlabel="pads", ylabel="one tick of all pads, us")
-    axes.set_xticks(sorted({row["pads"] for row in rows}), sorted({row["pads"] for row in rows}))
+    sizes = sorted({row["pads"] for row in rows})
+    axes.set_xticks(sizes, [f"{size}" for size in sizes])
     axes.minorticks_off()
     axes.legend(frameon=False)
 
@@ -183,7 +184,7 @@ def draw_swap(axes: Axes) -> None:
         axes.plot(contacts, errors, "o-", color=colour, label=f"pad {pad}")
         axes.plot(contacts, known, ":", color=colour)
     axes.set(xlabel="contacts since the replacement", ylabel="rms position error, mm", yscale="log")
-    axes.set_yticks([0.02, 0.05, 0.1, 0.2, 0.4], [0.02, 0.05, 0.1, 0.2, 0.4])
+    axes.set_yticks([0.02, 0.05, 0.1, 0.2, 0.4], ["0.02", "0.05", "0.1", "0.2", "0.4"])
     axes.minorticks_off()
     axes.legend(frameon=False, title="dotted: gains known")
 
