@@ -134,8 +134,12 @@ def draw_bus(axes: Axes) -> None:
 
 def draw_methods(axes: Axes) -> None:
     """Run time against error of ways to locate a contact on an ideal pad."""
-    kinds = {"paper": (GREY, "the paper's"), "instead": (ORANGE, "common alternatives"), "handtouch": (BLUE, "exact"),
-             "core": (GREEN, "in the daemon")}  # fmt: skip
+    kinds = {
+        "paper": (GREY, "the paper's"),
+        "instead": (ORANGE, "common alternatives"),
+        "handtouch": (BLUE, "handtouch.field"),
+        "core": (GREEN, "in the daemon"),
+    }
     rows = [row for row in load("methods")["rows"] if row["case"] == "ideal pad"]
     for kind, (colour, label) in kinds.items():
         points = [(row["us_per_contact"]["15"], row["rms_mm"]) for row in rows if row["kind"] == kind]
