@@ -365,7 +365,9 @@ def measure(folder: Path, asked: Any) -> dict[str, Any]:
 def machine() -> str:
     """Return a description of the machine."""
     where = os.environ.get("VCAN_RUN", "host")
-    return f"{where}, {platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+    priority = "" if os.sched_getscheduler(0) == os.SCHED_OTHER else ", real-time priority"
+    python = f"Python {platform.python_version()}{priority}"
+    return f"{where}, {platform.machine()}, {os.cpu_count()} processors, {python}"
 
 
 def main() -> int:
