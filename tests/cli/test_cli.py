@@ -130,7 +130,7 @@ def test_an_unknown_command_or_choice_is_reported_with_the_closest(
 
 
 WITHOUT_DATA = {
-    *("demo", "run", "simulate", "view", "bridge", "keys revoke"),
+    *("demo", "run", "simulate", "view", "bridge ros2", "bridge zenoh", "keys revoke"),
     *("calibrations export", "support"),  # write files of JSON
 }
 ROOT = Path(__file__).parents[2]

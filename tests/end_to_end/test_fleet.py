@@ -233,7 +233,7 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_tracks_restarts(
             robot.start("run")
             # before there is anybody to connect to
             robot.start_command(
-                *("bridge", str(robot.config), "--prefix", f"lab/robot{number}", "--control"),
+                *("bridge", "zenoh", str(robot.config), "--prefix", f"lab/robot{number}", "--control"),
                 *("--connect", listen[number - 1]),
             )
         for robot in robots:
@@ -284,7 +284,7 @@ def test_control_is_not_forwarded_unless_enabled(rig: Rig, free_port: int) -> No
     listen = f"tcp/127.0.0.1:{free_port}"
     remote = Remote(rig.command()[:-3], listen)
     try:
-        rig.start_command("bridge", str(rig.config), "--prefix", "lab", "--connect", listen)
+        rig.start_command("bridge", "zenoh", str(rig.config), "--prefix", "lab", "--connect", listen)
         remote.next("sample", "lab/hand/service")
         assert remote.get("lab/hand/control", msgpack.packb({"v": 1, "command": "status"})) == {}
     finally:
@@ -308,7 +308,7 @@ def test_control_is_not_forwarded_unless_enabled(rig: Rig, free_port: int) -> No
 )
 def test_wrong_options_of_a_bridge_are_rejected_with_the_remedy(arguments: list[str], error: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "handtouch", "bridge", *arguments],
+        [sys.executable, "-m", "handtouch", "bridge", "zenoh", *arguments],
         capture_output=True,
         text=True,
         timeout=START_S,

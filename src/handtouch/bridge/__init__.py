@@ -1,4 +1,4 @@
-"""Bridge of daemons' topics to a Zenoh network, for fleets and for Zenoh clients.
+"""Bridges of daemons' topics: to a Zenoh network, for fleets and Zenoh clients; to ROS 2 (`ros2`).
 
-A subscriber in a process of its own: what happens on the network never delays a tick.
+Each is a subscriber in a process of its own: what happens on the network never delays a tick.
 """

@@ -1,6 +1,7 @@
 """Options of the bridge, and the daemons that they name.
 
-Public names: `BridgeOptions`, `BridgedDaemon`, `BridgeError`, `bridged_daemons`, `is_key_part`.
+Public names: `BridgeOptions`, `BridgedDaemon`, `BridgeError`, `bridged_daemons`, `connect_endpoint`,
+`is_key_part`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class BridgedDaemon:
 
 @dataclass(frozen=True)
 class BridgeOptions:
-    """Options of `handtouch bridge`."""
+    """Options of `handtouch bridge zenoh`."""
 
     configs: Sequence[Path] = ()
     endpoints: Sequence[str] = ()
@@ -81,12 +82,15 @@ def _daemon_of_config(path: Path) -> BridgedDaemon:
             f"{path}: the file's name can't be one on the network; use --endpoint NAME=ENDPOINT"
         )
     return BridgedDaemon(
-        name, _connect_endpoint(path, settings.complete), _connect_endpoint(path, settings.control)
+        name, connect_endpoint(path, settings.complete), connect_endpoint(path, settings.control)
     )
 
 
-def _connect_endpoint(path: Path, endpoint: str) -> str:
-    """Return the endpoint to connect to, of one that a daemon on this machine binds."""
+def connect_endpoint(path: Path, endpoint: str) -> str:
+    """Return the endpoint to connect to, of one that a daemon on this machine binds.
+
+    Raises BridgeError for a free port.
+    """
     if endpoint.endswith(":*"):
         raise BridgeError(f"{path}: {endpoint} is any free port; give it a number, or use --endpoint")
     return to_connect(endpoint)

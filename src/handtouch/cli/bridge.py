@@ -3,16 +3,47 @@
 from __future__ import annotations
 
 import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from handtouch.cli.options import Subparsers, add_command
+from handtouch.cli.options import Subparsers, add_command, add_command_group, add_config
 
 
 def add(commands: Subparsers) -> None:
-    """Add `bridge`."""
+    """Add `bridge` with its subcommands."""
+    text = "forward the topics of daemons to a ROS 2 or Zenoh network"
+    bridges = add_command_group(commands, "bridge", text, text[0].upper() + text[1:] + ".")
+    _add_ros2(bridges)
+    _add_zenoh(bridges)
+
+
+def _add_ros2(bridges: Subparsers) -> None:
+    ros2 = add_command(
+        bridges,
+        "ros2",
+        "handtouch.cli.bridge:run_ros2",
+        "publish contacts, wrenches, markers and diagnostics in ROS 2, and forward its joint states",
+    )
+    add_config(ros2, "deployment file of a daemon on this machine")
+    ros2.add_argument("--namespace", default="handtouch", help="of the topics (default: handtouch)")
+    ros2.add_argument(
+        "--frame-prefix", default="", metavar="PREFIX", help="put before the names of links in frame_id"
+    )
+    ros2.add_argument("--domain", type=int, metavar="ID", help="DDS domain (default: ROS_DOMAIN_ID, or 0)")
+    ros2.add_argument(
+        "--joint-states",
+        default="/joint_states",
+        metavar="TOPIC",
+        help="topic of joint states to forward to the daemon; empty for none (default: /joint_states)",
+    )
+    ros2.add_argument("--key", metavar="FILE", help="client key, for a daemon that requires one")
+
+
+def _add_zenoh(bridges: Subparsers) -> None:
     bridge = add_command(
-        commands, "bridge", "handtouch.cli.bridge:run", "forward the topics of daemons over a Zenoh network"
+        bridges, "zenoh", "handtouch.cli.bridge:run_zenoh", "forward the topics of daemons over Zenoh"
     )
     bridge.add_argument(
         "configs", metavar="CONFIG", type=Path, nargs="*", help="deployment files of daemons on this machine"
@@ -58,13 +89,33 @@ def add(commands: Subparsers) -> None:
     )
 
 
-def run(**options: Any) -> int:
-    """Run the bridge until SIGINT or SIGTERM.
+def run_zenoh(**options: Any) -> int:
+    """Run the Zenoh bridge until SIGINT or SIGTERM.
 
     Exit status 0; 1 if a daemon rejects the key; 2 for wrong usage or deployment file.
     """
-    from handtouch.bridge.options import BridgeError, BridgeOptions
+    from handtouch.bridge.options import BridgeOptions
     from handtouch.bridge.runner import run_bridge
+
+    return _run(lambda stop: run_bridge(BridgeOptions(**options), stop))
+
+
+def run_ros2(**options: Any) -> int:
+    """Run the ROS 2 bridge until SIGINT or SIGTERM; exit status as `run_zenoh`."""
+    from handtouch.bridge.ros2.runner import RosOptions, run_ros_bridge
+
+    def relay(stop: threading.Event) -> list[PermissionError]:
+        try:
+            run_ros_bridge(RosOptions(**options), stop)
+        except PermissionError as error:
+            return [error]
+        return []
+
+    return _run(relay)
+
+
+def _run(relay: Callable[[threading.Event], list[PermissionError]]) -> int:
+    from handtouch.bridge.options import BridgeError
     from handtouch.config import ConfigError
     from handtouch.host import logs
     from handtouch.host.signals import stop_on_signals
@@ -72,7 +123,7 @@ def run(**options: Any) -> int:
     stop = stop_on_signals()
     logging_session = logs.start_logging()
     try:
-        errors = run_bridge(BridgeOptions(**options), stop)
+        errors = relay(stop)
     except (BridgeError, ConfigError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -1,0 +1,244 @@
+"""The daemon's messages as ROS 2 messages.
+
+Public names: `Stamper`, `contact_message`, `wrench_message`, `palm_wrench`, `contact_markers`,
+`removed_markers`, `pad_status`, `bus_status`, `daemon_status`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from handtouch import wire
+from handtouch.bridge.ros2 import messages as ros
+from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
+
+_EVENTS = {"begin": 0, "update": 1, "end": 2}
+_POSITION_STATUS = {status.text: int(status) for status in PositionStatus}
+_FORCE_STATUS = {status.text: int(status) for status in ForceStatus}
+_FRAME_STATUS = {status.text: int(status) for status in FrameStatus}
+
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of diagnostic_msgs/DiagnosticStatus"""
+_PAD_LEVELS = {"clear": OK, "touched": OK, "starting": WARN, "off": OK, "stale": STALE}
+"""Any other state is an error"""
+_BUS_LEVELS = {"active": OK, "warning": WARN, "passive": WARN}
+
+_ARROW, _SPHERE, _DELETE = 0, 2, 2
+_MARKER_NAMESPACES = ("contact", "force", "ellipse")
+_POINT_SIZE_M, _SHAFT_M, _HEAD_M, _MIN_ARROW_M, _ARROW_M_PER_N = 3e-3, 1.5e-3, 3e-3, 5e-3, 1e-2
+_ELLIPSE_SIGMA = math.sqrt(5.991)
+"""Half axes of the ellipse that contains 95 % of a normal distribution in two dimensions"""
+_MIN_AXIS_M = 1e-4
+_VALID_COLOR, _UNRELIABLE_COLOR = (0.1, 0.8, 0.3), (0.95, 0.6, 0.1)
+
+
+class Stamper:
+    """ROS time and frames; `wall_offset_ns` is that of the daemon's `service`, None before the first."""
+
+    def __init__(self, frame_prefix: str = "") -> None:
+        self.wall_offset_ns: int | None = None
+        self._prefix = frame_prefix
+
+    def time(self, t_ns: int) -> ros.Time:
+        """Return a time of the daemon's clock as ROS time."""
+        return ros.Time.from_ns(t_ns + (self.wall_offset_ns or 0))
+
+    def header(self, t_ns: int, link: str) -> ros.Header:
+        """Return a header with a link's frame; without one if `link` is empty."""
+        return ros.Header(self.time(t_ns), self._prefix + link if link else "")
+
+    def monotonic_ns(self, stamp: ros.Time) -> int | None:
+        """Return a ROS time on the daemon's clock; None for 0, which means unknown, or before `service`."""
+        wall_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        return wall_ns - self.wall_offset_ns if wall_ns and self.wall_offset_ns is not None else None
+
+
+def contact_message(contact: wire.Contact, stamper: Stamper) -> ros.RosContact:
+    """Return a contact; what is unknown is NaN."""
+    return ros.RosContact(
+        header=stamper.header(contact.t_ns, contact.frame),
+        event=_EVENTS[contact.event],
+        id=contact.id,
+        hand=contact.hand,
+        link=contact.link,
+        begin=stamper.time(contact.begin_ns),
+        duration_s=contact.duration_s,
+        age_s=contact.age_s,
+        position_status=_POSITION_STATUS[contact.position_status],
+        position_m=ros.Point(*_numbers(contact.position_m, 3)),
+        normal=ros.Vector3(*_numbers(contact.normal, 3)),
+        covariance_m2=_numbers(contact.covariance_m2, 9),
+        pad_m=_numbers(contact.pad_m, 2),
+        force_status=_FORCE_STATUS[contact.force_status],
+        force_n=_number(contact.force_n),
+        force_std_n=_number(contact.force_std_n),
+        peak_force_n=_number(contact.peak_force_n),
+        uncompensated_force_n=_number(contact.uncompensated_force_n),
+        total_current_a=contact.total_current_a,
+        residual=_number(contact.residual),
+        residual_std=_number(contact.residual_std),
+        begin_threshold_n=contact.begin_threshold_n,
+        end_threshold_n=contact.end_threshold_n,
+        calibration_id=contact.calibration_id,
+        end_reason=contact.end_reason,
+        group=contact.group,
+        palm_status=_FRAME_STATUS[contact.palm_status],
+        palm_position_m=ros.Point(*_numbers(contact.palm_position_m, 3)),
+        palm_normal=ros.Vector3(*_numbers(contact.palm_normal, 3)),
+        palm_covariance_m2=_numbers(contact.palm_covariance_m2, 9),
+        base_status=_FRAME_STATUS[contact.base_status],
+        base_position_m=ros.Point(*_numbers(contact.base_position_m, 3)),
+        base_normal=ros.Vector3(*_numbers(contact.base_normal, 3)),
+        base_covariance_m2=_numbers(contact.base_covariance_m2, 9),
+        joints_age_s=_number(contact.joints_age_s),
+        diagnoses=list(contact.diagnoses),
+        fresh=contact.fresh,
+    )
+
+
+def wrench_message(contact: wire.Contact, stamper: Stamper) -> ros.WrenchStamped | None:
+    """Return the wrench on the link, about its frame's origin; zero at the end of a contact, None where force
+    or position is unknown."""
+    header = stamper.header(contact.t_ns, contact.frame)
+    if contact.event == "end":
+        return ros.WrenchStamped(header, ros.RosWrench())
+    if contact.force_n is None or contact.position_m is None or contact.normal is None:
+        return None
+    wrench = _wrench(contact.position_m, contact.normal, contact.force_n)
+    return ros.WrenchStamped(header, _wrench_message(wrench))
+
+
+def palm_wrench(
+    contacts: Iterable[wire.Contact], t_ns: int, palm_link: str, stamper: Stamper
+) -> ros.WrenchStamped | None:
+    """Return the sum of the wrenches of all active contacts of a hand, about its palm's origin; None where
+    the force or the palm position of any is unknown."""
+    total = np.zeros(6)
+    for contact in contacts:
+        if contact.force_n is None or contact.palm_position_m is None or contact.palm_normal is None:
+            return None
+        total += _wrench(contact.palm_position_m, contact.palm_normal, contact.force_n)
+    return ros.WrenchStamped(stamper.header(t_ns, palm_link), _wrench_message(total))
+
+
+def contact_markers(contact: wire.Contact, number: int, stamper: Stamper) -> list[ros.Marker]:
+    """Return the markers of an active contact with a position: point, force, and ellipse of 95 %.
+
+    `number` is that of the pad on its hand.
+    """
+    if contact.position_m is None or contact.normal is None:
+        return removed_markers(contact.frame, contact.t_ns, number, stamper)
+    header = stamper.header(contact.t_ns, contact.frame)
+    position, normal = np.array(contact.position_m), np.array(contact.normal)
+    at, color = ros.Point(*contact.position_m), _color(contact)
+    length_m = _MIN_ARROW_M + _ARROW_M_PER_N * (contact.force_n or 0.0)
+    size = ros.Vector3(*[_POINT_SIZE_M] * 3)
+    markers = [
+        ros.Marker(header, "contact", number, _SPHERE, pose=ros.Pose(at), scale=size, color=color),
+        ros.Marker(
+            *(header, "force", number, _ARROW),
+            scale=ros.Vector3(_SHAFT_M, _HEAD_M, 0.0),
+            color=color,
+            points=[ros.Point(*(position + length_m * normal).tolist()), at],
+        ),
+    ]
+    if contact.covariance_m2 is None:
+        markers.append(ros.Marker(header, "ellipse", number, action=_DELETE))
+    else:
+        markers.append(_ellipse(header, number, at, np.reshape(contact.covariance_m2, (3, 3)), color))
+    for marker in markers:
+        marker.frame_locked = True  # links move on between two messages
+    return markers
+
+
+def removed_markers(link: str, t_ns: int, number: int, stamper: Stamper) -> list[ros.Marker]:
+    """Return messages that remove the markers of a pad."""
+    header = stamper.header(t_ns, link)
+    return [ros.Marker(header, name, number, action=_DELETE) for name in _MARKER_NAMESPACES]
+
+
+def pad_status(health: wire.Health) -> ros.DiagnosticStatus:
+    """Return the status of a pad and its node."""
+    level = _PAD_LEVELS.get(health.state, ERROR)
+    if level == OK and (health.diagnoses or health.calibration_state in ("quarantined", "manual_required")):
+        level = WARN
+    found = ", ".join(str(diagnosis.get("kind", "")) for diagnosis in health.diagnoses)
+    values = {
+        name: getattr(health, name)
+        for name in (
+            *("state", "node_state", "bus", "node_id", "sampling", "rate_hz", "samples", "missed_samples"),
+            *("age_s", "reboots", "heartbeats_missed", "error_register", "calibration_state"),
+            "calibration_id",
+        )
+    }
+    text = "; ".join(filter(None, (health.state, health.reason, found)))
+    name = f"handtouch: {health.hand}/{health.link}"
+    serial = "" if health.serial is None else str(health.serial)
+    return _status(level, name, text, serial, {**values, "diagnoses": found})
+
+
+def bus_status(name: str, bus: Mapping[str, Any]) -> ros.DiagnosticStatus:
+    """Return the status of a bus, from `buses` of a `service` message."""
+    state = str(bus["state"])
+    values = {key: bus[key] for key in ("load", "lost_hz", "frames", "error_frames", "overflow")}
+    text = "; ".join(filter(None, (state, str(bus["problem"]))))
+    return _status(_BUS_LEVELS.get(state, ERROR), f"handtouch: bus {name}", text, name, values)
+
+
+def daemon_status(service: wire.Service | None) -> ros.DiagnosticStatus:
+    """Return the status of the daemon; None: it is disconnected."""
+    if service is None:
+        return _status(ERROR, "handtouch: daemon", "disconnected", "", {})
+    values = {
+        name: getattr(service, name) for name in ("version", "uptime_s", "rate_hz", "ticks", "overruns")
+    }
+    level, text = (OK, "running") if service.core_compiled else (WARN, "running; its core is uncompiled")
+    return _status(level, "handtouch: daemon", text, "", values)
+
+
+def _status(
+    level: int, name: str, message: str, hardware_id: str, values: Mapping[str, Any]
+) -> ros.DiagnosticStatus:
+    pairs = [ros.KeyValue(key, "" if value is None else str(value)) for key, value in values.items()]
+    return ros.DiagnosticStatus(level, name, message, hardware_id, pairs)
+
+
+def _wrench(position: Sequence[float], normal: Sequence[float], force_n: float) -> Any:
+    """Return force and torque (6,) of a force against the outward normal."""
+    force = -force_n * np.array(normal)
+    return np.concatenate([force, np.cross(position, force)])
+
+
+def _wrench_message(values: Any) -> ros.RosWrench:
+    numbers = values.tolist()
+    return ros.RosWrench(ros.Vector3(*numbers[:3]), ros.Vector3(*numbers[3:]))
+
+
+def _ellipse(header: ros.Header, number: int, at: ros.Point, covariance: Any, color: Any) -> ros.Marker:
+    variance, axes = np.linalg.eigh(covariance)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    lengths = np.maximum(2 * _ELLIPSE_SIGMA * np.sqrt(np.maximum(variance, 0.0)), _MIN_AXIS_M)
+    pose = ros.Pose(at, ros.Quaternion(*Rotation.from_matrix(axes).as_quat().tolist()))
+    shade = ros.ColorRGBA(color.r, color.g, color.b, 0.35)
+    return ros.Marker(
+        header, "ellipse", number, _SPHERE, pose=pose, scale=ros.Vector3(*lengths.tolist()), color=shade
+    )
+
+
+def _color(contact: wire.Contact) -> ros.ColorRGBA:
+    is_valid = contact.position_status == contact.force_status == "valid"
+    return ros.ColorRGBA(*(_VALID_COLOR if is_valid else _UNRELIABLE_COLOR), 1.0)
+
+
+def _numbers(values: Sequence[float] | None, count: int) -> list[float]:
+    return [math.nan] * count if values is None else list(values)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,0 +1,91 @@
+"""DDS participant with ROS 2's names, qualities of service and type hashes.
+
+Public names: `RosNetwork`, `Quality`, `RosNetworkError`, `ros_name`.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import Enum
+from typing import Any
+
+from cyclonedds.core import DDSException, Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from handtouch.bridge.ros2.type_hash import type_hash
+
+_BLOCKING_S = 0.1
+"""Longest that a reliable subscriber which doesn't keep up may delay a message"""
+
+
+class RosNetworkError(RuntimeError):
+    """No DDS participant can be opened; the text contains the remedy."""
+
+
+class Quality(Enum):
+    """Quality of service of a topic."""
+
+    SENSOR_DATA = "best effort, volatile, depth 5: ROS 2's profile for sensor data"
+    STATE = "reliable, transient local, depth 1: late subscribers receive the last message"
+
+    @property
+    def qos(self) -> Qos:
+        """Policies of DDS."""
+        # ROS 2 encodes messages by the first version of XCDR
+        encoding = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
+        if self is Quality.SENSOR_DATA:
+            return Qos(encoding, Policy.Reliability.BestEffort, Policy.History.KeepLast(5))
+        return Qos(
+            encoding,
+            Policy.Reliability.Reliable(duration(seconds=_BLOCKING_S)),
+            Policy.Durability.TransientLocal,
+            Policy.History.KeepLast(1),
+        )
+
+
+class RosNetwork:
+    """Participant of a domain; topics are below `namespace`, absolute ones (with a slash in front) not.
+
+    Raises RosNetworkError.
+    """
+
+    def __init__(self, domain: int, namespace: str = "") -> None:
+        try:
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            raise RosNetworkError(
+                f"can't open DDS domain {domain}: {error}; check the network interface, and CYCLONEDDS_URI "
+                "if it is set"
+            ) from error
+        self._namespace = namespace.strip("/")
+
+    def writer(self, name: str, kind: type[IdlStruct], quality: Quality) -> DataWriter[Any]:
+        """Return a writer of a topic."""
+        qos = quality.qos + Qos(_type_hash_policy(kind))
+        return DataWriter(self._participant, self._topic(name, kind), qos=qos)
+
+    def reader(self, name: str, kind: type[IdlStruct], quality: Quality) -> DataReader[Any]:
+        """Return a reader of a topic."""
+        qos = quality.qos + Qos(_type_hash_policy(kind))
+        return DataReader(self._participant, self._topic(name, kind), qos=qos)
+
+    def _topic(self, name: str, kind: type[IdlStruct]) -> Topic[Any]:
+        full = (
+            name if name.startswith("/") else f"/{self._namespace}/{name}" if self._namespace else f"/{name}"
+        )
+        return Topic(self._participant, f"rt{full}", kind)
+
+
+def ros_name(text: str) -> str:
+    """Return a text as a part of a ROS name: letters, digits and single underscores, no digit in front."""
+    name = re.sub(r"_+", "_", re.sub(r"[^0-9A-Za-z]", "_", text)).rstrip("_") or "_"
+    return f"_{name}" if name[0].isdigit() else name
+
+
+def _type_hash_policy(kind: type[IdlStruct]) -> Policy.Userdata:
+    return Policy.Userdata(f"typehash={type_hash(kind)};".encode())

@@ -1,0 +1,241 @@
+"""Relay from one daemon to ROS 2, and of joint states to the daemon.
+
+Public names: `RosRelay`, `JointStateRelay`, `TOPICS`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from handtouch import wire
+from handtouch.bridge.ros2 import conversion
+from handtouch.bridge.ros2 import messages as ros
+from handtouch.bridge.ros2.conversion import Stamper
+from handtouch.bridge.ros2.network import Quality, RosNetwork, ros_name
+from handtouch.client.robot import Robot
+
+TOPICS = ("contact/*/*", "hand/*", "health/*/*", "service")
+"""Topics of the daemon that are relayed"""
+_DIAGNOSTICS_PERIOD_NS = 1_000_000_000
+_MARKER_PERIOD_NS = 33_000_000
+_MAX_JOINT_STATES_PER_POLL = 32
+_log = logging.getLogger("handtouch.bridge")
+
+
+class RosRelay:
+    """Relay of a daemon's messages; `palm_links`: frame of the palm by hand, absent where unknown."""
+
+    def __init__(self, network: RosNetwork, stamper: Stamper, palm_links: Mapping[str, str]) -> None:
+        self._network, self._stamper = network, stamper
+        self._palm_links = palm_links
+        self._hands: dict[str, _HandRelay] = {}
+        self._diagnostics = network.writer("/diagnostics", ros.DiagnosticArray, Quality.STATE)
+        self._statuses: dict[str, ros.DiagnosticStatus] = {}
+        self._sent_ns = 0  # time of the last diagnostics
+        self._newest_ns = 0
+        self._waiting: list[wire.Message] = []  # until the daemon's wall clock is known
+        self._session: int | None = None
+
+    def relay(self, message: wire.Message) -> None:
+        """Relay one message of the daemon."""
+        if isinstance(message, wire.Service):
+            self._stamper.wall_offset_ns = message.wall_offset_ns
+            self._update_service(message)
+        elif self._stamper.wall_offset_ns is None:
+            self._waiting.append(message)
+            return
+        for earlier in self._waiting:
+            self._relay_now(earlier)
+        self._waiting.clear()
+        self._relay_now(message)
+
+    def _relay_now(self, message: wire.Message) -> None:
+        match message:
+            case wire.Contact():
+                self._hand(message.hand).add_contact(message)
+            case wire.HandFrame():
+                self._hand(message.hand).end_tick(message)
+            case wire.Health():
+                self._update_status(conversion.pad_status(message))
+        if not isinstance(message, wire.Contact):  # the time of an end or a retained one isn't of the newest
+            self._newest_ns = max(self._newest_ns, message.t_ns)
+            if self._newest_ns - self._sent_ns >= _DIAGNOSTICS_PERIOD_NS:
+                self._send_diagnostics()
+
+    def _update_service(self, service: wire.Service) -> None:
+        if service.session != self._session:
+            self._session, self._newest_ns, self._sent_ns = service.session, 0, 0
+            self._statuses.clear()
+            _log.info("daemon %s connected, hands: %s", service.version, ", ".join(service.hands))
+        for hand in service.hands:
+            self._hand(hand).links = tuple(service.hands[hand])
+        self._update_status(conversion.daemon_status(service))
+        for name, bus in service.buses.items():
+            self._update_status(conversion.bus_status(name, bus))
+
+    def end_session(self) -> None:
+        """Publish that the daemon is disconnected, and the end of its contacts; nothing if it is known."""
+        if self._session is None:
+            return
+        _log.warning("daemon disconnected")
+        self._session = None
+        for hand in self._hands.values():
+            hand.end_all(self._newest_ns)
+        self._statuses = {"handtouch: daemon": conversion.daemon_status(None)}
+        self._send_diagnostics()
+
+    def _update_status(self, status: ros.DiagnosticStatus) -> None:
+        """Keep a status, and send all at once if its level or text changed."""
+        before = self._statuses.get(status.name)
+        self._statuses[status.name] = status
+        changed = before is not None and (before.level, before.message) != (status.level, status.message)
+        if changed and self._newest_ns:
+            self._send_diagnostics()
+
+    def _send_diagnostics(self) -> None:
+        self._sent_ns = self._newest_ns
+        header = self._stamper.header(self._newest_ns, "")
+        self._diagnostics.write(ros.DiagnosticArray(header, list(self._statuses.values())))
+
+    def _hand(self, name: str) -> _HandRelay:
+        if name not in self._hands:
+            palm = self._palm_links.get(name, "")
+            self._hands[name] = _HandRelay(name, palm, self._network, self._stamper)
+        return self._hands[name]
+
+
+class _HandRelay:
+    """Topics of one hand."""
+
+    def __init__(self, name: str, palm_link: str, network: RosNetwork, stamper: Stamper) -> None:
+        self.links: tuple[str, ...] = ()
+        self._name, self._palm_link, self._stamper, self._network = name, palm_link, stamper, network
+        self._root = ros_name(name)
+        self._contacts = network.writer(f"{self._root}/contacts", ros.ContactArray, Quality.SENSOR_DATA)
+        self._markers = network.writer(f"{self._root}/markers", ros.MarkerArray, Quality.STATE)
+        self._wrenches: dict[str, Any] = {}
+        self._tick_contacts: list[wire.Contact] = []
+        self._active: dict[str, wire.Contact] = {}
+        self._shown: dict[str, str] = {}  # link with markers -> its frame
+        self._marked_ns = 0
+
+    def add_contact(self, contact: wire.Contact) -> None:
+        """Add a contact of the present tick."""
+        self._tick_contacts.append(contact)
+        if contact.event == "end":
+            self._active.pop(contact.link, None)
+        else:
+            self._active[contact.link] = contact
+        if (wrench := conversion.wrench_message(contact, self._stamper)) is not None:
+            self._writer_of(contact.link).write(wrench)
+
+    def end_tick(self, frame: wire.HandFrame) -> None:
+        """Publish the contacts of the tick whose frame this is, which follows them."""
+        contacts, self._tick_contacts = self._tick_contacts, []
+        self.links = frame.links
+        header = self._stamper.header(frame.t_ns, self._palm_link)
+        converted = [conversion.contact_message(contact, self._stamper) for contact in contacts]
+        self._contacts.write(ros.ContactArray(header, frame.session, frame.tick, self._name, converted))
+        if contacts:
+            self._send_palm_wrench(frame.t_ns)
+        if abs(frame.t_ns - self._marked_ns) >= _MARKER_PERIOD_NS:
+            self._send_markers(frame.t_ns)
+
+    def end_all(self, t_ns: int) -> None:
+        """Publish the end of everything that is shown: the daemon is disconnected."""
+        for link, contact in self._active.items():
+            header = self._stamper.header(t_ns, contact.frame)
+            self._writer_of(link).write(ros.WrenchStamped(header, ros.RosWrench()))
+        self._active.clear()
+        self._tick_contacts.clear()
+        self._send_palm_wrench(t_ns)
+        self._send_markers(t_ns)
+
+    def _send_palm_wrench(self, t_ns: int) -> None:
+        if not self._palm_link:
+            return
+        wrench = conversion.palm_wrench(self._active.values(), t_ns, self._palm_link, self._stamper)
+        if wrench is not None:
+            self._writer_of("").write(wrench)
+
+    def _send_markers(self, t_ns: int) -> None:
+        self._marked_ns = t_ns
+        if not (self._active or self._shown):
+            return
+        markers: list[ros.Marker] = []
+        for link, frame in self._shown.items():
+            if link not in self._active:
+                markers += conversion.removed_markers(frame, t_ns, self._number(link), self._stamper)
+        for link, contact in self._active.items():
+            markers += conversion.contact_markers(contact, self._number(link), self._stamper)
+        self._shown = {link: contact.frame for link, contact in self._active.items()}
+        self._markers.write(ros.MarkerArray(markers))
+
+    def _number(self, link: str) -> int:
+        return self.links.index(link) if link in self.links else len(self.links)
+
+    def _writer_of(self, link: str) -> Any:
+        """Return the writer of a link's wrench; of the palm's for an empty name."""
+        if link not in self._wrenches:
+            parts = [self._root, ros_name(link), "wrench"] if link else [self._root, "wrench"]
+            self._wrenches[link] = self._network.writer(
+                "/".join(parts), ros.WrenchStamped, Quality.SENSOR_DATA
+            )
+        return self._wrenches[link]
+
+
+class JointStateRelay:
+    """Forwards joint states from ROS 2 to the daemon, to each hand those with any of its joints.
+
+    `joints`: names of joints by hand.
+    """
+
+    def __init__(
+        self,
+        network: RosNetwork,
+        topic: str,
+        robot: Robot,
+        stamper: Stamper,
+        joints: Mapping[str, Sequence[str]],
+    ) -> None:
+        self._reader = network.reader(topic, ros.RosJointState, Quality.SENSOR_DATA)
+        self._robot, self._stamper = robot, stamper
+        self._joints = {hand: set(names) for hand, names in joints.items()}
+        self._refused = False
+
+    def run(self, stop: threading.Event, poll_s: float) -> None:
+        """Forward joint states until `stop`."""
+        while not stop.is_set():
+            if not self.forward_waiting():
+                stop.wait(poll_s)
+
+    def forward_waiting(self) -> int:
+        """Forward the joint states that have arrived; return their number."""
+        states = self._reader.take(_MAX_JOINT_STATES_PER_POLL)
+        valid = [state for state in states if isinstance(state, ros.RosJointState)]
+        for state in valid:
+            self._forward(state)
+        return len(valid)
+
+    def _forward(self, state: ros.RosJointState) -> None:
+        if not state.name or len(state.position) != len(state.name):
+            return  # velocities or efforts only
+        positions = dict(zip(state.name, state.position, strict=True))
+        velocities = dict(zip(state.name, state.velocity, strict=False))
+        t_ns = self._stamper.monotonic_ns(state.header.stamp)
+        for hand, names in self._joints.items():
+            chosen = {name: value for name, value in positions.items() if name in names}
+            if not chosen:
+                continue
+            known = {name: velocities[name] for name in chosen if name in velocities}
+            try:
+                self._robot.send_joints(
+                    hand, chosen, t_ns=t_ns, velocity_rad_s=known if known.keys() == chosen.keys() else None
+                )
+            except (ValueError, PermissionError) as error:
+                if not self._refused:
+                    _log.warning("joint states of hand %s aren't forwarded: %s", hand, error)
+                self._refused = True

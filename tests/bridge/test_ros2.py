@@ -1,0 +1,166 @@
+"""Messages of the ROS 2 bridge: definitions, encoding and content, as ROS tools decode them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cyclonedds.idl import IdlStruct
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
+
+from handtouch import wire
+from handtouch.bridge.ros2 import messages as ros
+from handtouch.bridge.ros2.conversion import (
+    Stamper,
+    contact_markers,
+    contact_message,
+    palm_wrench,
+    wrench_message,
+)
+from handtouch.bridge.ros2.messages import MESSAGE_TYPES
+from handtouch.bridge.ros2.network import ros_name
+from handtouch.bridge.ros2.type_hash import ros_type_name, type_hash
+from tests.client.hand_messages import make_contact
+
+PACKAGE = Path(__file__).parents[2] / "clients" / "ros2" / "handtouch_msgs"
+WALL_OFFSET_NS = 1_700_000_000_000_000_123
+NOT_ON_ROS = {"v", "session", "seq", "t_ns", "retained", "frame", "begin_ns"}
+"""Fields of `contact` that are in the headers, in `begin`, or about the transport"""
+
+
+def typestore(release: Stores) -> Any:
+    """Types of a ROS 2 release, with those of the repository's `.msg` files."""
+    store = get_typestore(release)
+    for path in sorted((PACKAGE / "msg").glob("*.msg")):
+        store.register(get_types_from_msg(path.read_text(), f"handtouch_msgs/msg/{path.stem}"))
+    return store
+
+
+@pytest.fixture(scope="module", params=[Stores.ROS2_HUMBLE, Stores.ROS2_KILTED], ids=["humble", "kilted"])
+def store(request: pytest.FixtureRequest) -> Any:
+    return typestore(request.param)
+
+
+def make_stamper() -> Stamper:
+    stamper = Stamper("robot1/")
+    stamper.wall_offset_ns = WALL_OFFSET_NS
+    return stamper
+
+
+LOCATED = replace(
+    make_contact("index_tip", "update", 7, seq=2_000_000_000),
+    position_m=(0.01, 0.02, 0.03),
+    normal=(0.0, 0.6, 0.8),
+    covariance_m2=(4e-8, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 0.0),
+    pad_m=(0.011, 0.022),
+    position_status="valid",
+    force_n=2.5,
+    palm_status="valid",
+    palm_position_m=(0.1, 0.0, 0.0),
+    palm_normal=(0.0, 0.0, 1.0),
+    palm_covariance_m2=(1e-6,) * 9,
+    group=3,
+    diagnoses=("gum", "drift"),
+)
+
+
+@pytest.mark.parametrize("kind", MESSAGE_TYPES, ids=ros_type_name)
+def test_definitions_hash_as_in_ros(kind: type[IdlStruct], store: Any) -> None:
+    """The same RIHS01 hash means the same names, types and order of all fields."""
+    assert type_hash(kind) == store.hash_rihs01(ros_type_name(kind))
+
+
+def test_constants_of_the_msg_file_are_the_codes_of_the_wire(store: Any) -> None:
+    constants = {name: value for name, _, value in store.fielddefs["handtouch_msgs/msg/Contact"][0]}
+    for prefix, codes in (
+        ("POSITION", wire.PositionStatus),
+        ("FORCE", wire.ForceStatus),
+        ("FRAME", wire.FrameStatus),
+    ):
+        assert {f"{prefix}_{code.name}": code.value for code in codes} == {
+            name: value for name, value in constants.items() if name.startswith(f"{prefix}_")
+        }
+
+
+def test_every_field_of_a_contact_is_decoded_by_ros(store: Any) -> None:
+    stamper = make_stamper()
+    array = ros.ContactArray(
+        stamper.header(LOCATED.t_ns, "palm"), 2**53 - 1, 9, "right", [contact_message(LOCATED, stamper)]
+    )
+    decoded = store.deserialize_cdr(array.serialize(), "handtouch_msgs/msg/ContactArray")
+    assert (decoded.session, decoded.tick, decoded.header.frame_id) == (2**53 - 1, 9, "robot1/palm")
+    (contact,) = decoded.contacts
+    stamp = contact.header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == LOCATED.t_ns + WALL_OFFSET_NS
+    assert contact.header.frame_id == "robot1/index_tip"
+    assert (contact.event, contact.position_status, contact.palm_status) == (1, 1, 1)
+    for field in fields(wire.Contact):
+        if field.name in NOT_ON_ROS or field.name in ("event", "position_status", "force_status"):
+            continue
+        sent, received = getattr(LOCATED, field.name), getattr(contact, field.name)
+        if field.name.endswith("_status"):
+            assert received == wire.FrameStatus[sent.upper()]
+        elif hasattr(received, "x"):
+            expected = [math.nan] * 3 if sent is None else sent
+            np.testing.assert_array_equal([received.x, received.y, received.z], expected)
+        elif sent is None:
+            assert np.isnan(received).all(), field.name
+        else:
+            assert np.array_equal(np.asarray(received), np.asarray(sent)), field.name
+
+
+def test_a_wrench_is_the_force_on_the_link_about_its_origin(store: Any) -> None:
+    message = wrench_message(LOCATED, make_stamper())
+    assert message is not None
+    decoded = store.deserialize_cdr(message.serialize(), "geometry_msgs/msg/WrenchStamped")
+    force, torque = decoded.wrench.force, decoded.wrench.torque
+    assert [force.x, force.y, force.z] == pytest.approx([0.0, -1.5, -2.0])
+    expected = np.cross(LOCATED.position_m or (), [0.0, -1.5, -2.0])
+    assert [torque.x, torque.y, torque.z] == pytest.approx(expected.tolist())
+
+
+def test_wrenches_are_zero_at_the_end_and_absent_where_unknown() -> None:
+    stamper = make_stamper()
+    ended = wrench_message(replace(LOCATED, event="end"), stamper)
+    assert ended is not None
+    assert ended.wrench == ros.RosWrench()
+    assert wrench_message(replace(LOCATED, force_n=None), stamper) is None
+    assert palm_wrench([LOCATED, make_contact("thumb_tip", "update", 8)], 1, "palm", stamper) is None
+    total = palm_wrench([LOCATED, LOCATED], 1, "palm", stamper)
+    assert total is not None
+    assert total.wrench.force.z == -5.0
+    assert total.wrench.torque.y == pytest.approx(0.5)
+    nothing = palm_wrench([], 1, "palm", stamper)
+    assert nothing is not None
+    assert nothing.wrench == ros.RosWrench()
+
+
+def test_the_ellipse_has_the_axes_of_the_covariance(store: Any) -> None:
+    turned = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
+    covariance = turned @ np.diag([4e-8, 1e-8, 0.0]) @ turned.T
+    values: Any = tuple(covariance.ravel().tolist())
+    contact = replace(LOCATED, covariance_m2=values)
+    array = ros.MarkerArray(contact_markers(contact, 4, make_stamper()))
+    decoded = store.deserialize_cdr(array.serialize(), "visualization_msgs/msg/MarkerArray")
+    assert [(marker.ns, marker.id, marker.action) for marker in decoded.markers] == [
+        *(("contact", 4, 0), ("force", 4, 0), ("ellipse", 4, 0))
+    ]
+    ellipse = decoded.markers[2]
+    pose = ellipse.pose.orientation
+    axes = Rotation.from_quat([pose.x, pose.y, pose.z, pose.w]).as_matrix()
+    half = np.array([ellipse.scale.x, ellipse.scale.y, ellipse.scale.z]) / 2
+    long = axes[:, half.argmax()]
+    assert abs(long @ turned[:, 0]) == pytest.approx(1.0)
+    assert sorted(half)[1:] == pytest.approx([math.sqrt(5.991 * 1e-8), math.sqrt(5.991 * 4e-8)], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [("index_tip", "index_tip"), ("3rd finger", "_3rd_finger"), ("a--b__c", "a_b_c")]
+)
+def test_names_fit_the_rules_of_ros(text: str, name: str) -> None:
+    assert ros_name(text) == name
