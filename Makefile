@@ -141,5 +141,11 @@ dist: $(VENV)/.dev ## build the source archive, wheels for x86_64 and aarch64, a
 		HANDTOUCH_WHEEL_MACHINE=$$machine $(BIN)/python -m build --no-isolation --wheel || exit 1; done
 	$(BIN)/python -m release.sbom run >dist/handtouch.cdx.json
 
+.PHONY: deb
+deb: ## build the Debian package of the services in build/, for this machine's Python; needs debhelper
+	rm -rf build/deb && mkdir -p build/deb
+	git archive --prefix=handtouch/ HEAD | tar -x -C build/deb
+	cd build/deb/handtouch && PATH=/usr/sbin:/usr/bin:/sbin:/bin dpkg-buildpackage -us -uc -b
+
 clean: ## remove build results and .venv
 	rm -rf $(VENV) dist build .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -63,11 +63,12 @@ run_pip() { # VENV COMMAND [ARGUMENT...]
 }
 
 install_services() {
-  mkdir -p "$DESTDIR$units" "$DESTDIR$PREFIX/lib/sysctl.d" "$DESTDIR$settings"
+  mkdir -p "$DESTDIR$units" "$DESTDIR$PREFIX/lib/sysctl.d" "$DESTDIR$PREFIX/lib/udev/rules.d" "$DESTDIR$settings"
   for unit in handtouch@.service handtouch-can@.service handtouch-node@.service; do
     sed -e "s|@VENV@|$venv|g" -e "s|@SYSCONFDIR@|$SYSCONFDIR|g" "$here/$unit" >"$DESTDIR$units/$unit"
   done
   cp "$here/sysctl.conf" "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf"
+  cp "$here/60-handtouch-can.rules" "$DESTDIR$PREFIX/lib/udev/rules.d/"
   cp "$here/../config/handtouch.schema.json" "$here/../config/touch_node.schema.json" "$DESTDIR$settings/"
   keep "$here/../config/utah_mit.toml" hand.toml
   keep "$here/../config/touch_node.toml" node.toml
@@ -82,7 +83,8 @@ keep() { # copy a file that the owner edits, unless it is there
 uninstall() {
   rm -rf "$DESTDIR$venv"
   rm -f "$DESTDIR$PREFIX/bin/handtouch" "$DESTDIR$units/handtouch@.service" "$DESTDIR$units/handtouch-can@.service" \
-    "$DESTDIR$units/handtouch-node@.service" "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf"
+    "$DESTDIR$units/handtouch-node@.service" "$DESTDIR$PREFIX/lib/sysctl.d/60-handtouch.conf" \
+    "$DESTDIR$PREFIX/lib/udev/rules.d/60-handtouch-can.rules"
 }
 
 reload() {

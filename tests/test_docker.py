@@ -121,8 +121,8 @@ def test_the_build_stage_makes_a_compiled_wheel(tmp_path: Path) -> None:
         cwd=tmp_path / workdir, env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,) = (tmp_path / "wheels").iterdir()
-    with zipfile.ZipFile(wheel) as opened:
+    (made,) = (tmp_path / "wheels").iterdir()
+    with zipfile.ZipFile(made) as opened:
         compiled = [name for name in opened.namelist() if "/_compiled/" in name]
     assert len(compiled) == len(STAGES)
 

@@ -76,7 +76,10 @@ def test_version_is_the_same_everywhere(wheel: Path) -> None:
     changes = (ROOT / "CHANGELOG.md").read_text()
     newest = re.search(r"^## (\S+)", changes, re.MULTILINE)
     assert newest is not None
-    assert {PROJECT["version"], newest[1], wheel.name.split("-")[1]} == {handtouch.__version__}
+    debian = re.match(r"handtouch \(([^)]+)\)", (ROOT / "debian/changelog").read_text())
+    assert debian is not None
+    versions = {PROJECT["version"], newest[1], wheel.name.split("-")[1], debian[1]}
+    assert versions == {handtouch.__version__}
 
 
 def test_clients_in_other_languages_have_the_version_of_the_package() -> None:

@@ -11,6 +11,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -126,9 +127,33 @@ def test_wrong_deployment_exits_with_status_2(installation: Installation) -> Non
     assert "missing.toml: the file: No such file" in done.stderr
 
 
-def test_service_notifies_ready_and_watchdog_and_stops(
+def with_families(families: list[str], command: list[str]) -> list[str]:
+    """Return a command that runs another one with the socket families of a sandbox only."""
+    program = """if True:
+        import ctypes, errno, os, platform, struct, sys
+        allowed, command = [int(word) for word in sys.argv[1].split(",")], sys.argv[2:]
+        socket_call = {"x86_64": 41, "aarch64": 198}[platform.machine()]
+        load, equal, end = 0x20, 0x15, 0x06
+        allow, refuse = 0x7FFF0000, 0x00050000 | errno.EAFNOSUPPORT
+        steps = [(load, 0, 0, 0), (equal, 0, len(allowed) + 2, socket_call), (load, 0, 0, 16)]
+        steps += [(equal, len(allowed) - i, 0, family) for i, family in enumerate(allowed)]
+        steps += [(end, 0, 0, refuse), (end, 0, 0, allow)]
+        code = b"".join(struct.pack("HBBI", *step) for step in steps)
+        class Filter(ctypes.Structure):
+            _fields_ = [("length", ctypes.c_ushort), ("code", ctypes.c_char_p)]
+        libc = ctypes.CDLL(None, use_errno=True)
+        assert libc.prctl(38, 1, 0, 0, 0) == 0  # no new privileges
+        assert libc.prctl(22, 2, ctypes.byref(Filter(len(steps), code)), 0, 0) == 0, ctypes.get_errno()
+        os.execv(command[0], command)
+    """
+    numbers = ",".join(str(int(getattr(socket, family))) for family in families)
+    return [sys.executable, "-c", program, numbers, *command]
+
+
+def test_service_in_its_sandbox_notifies_ready_and_watchdog_and_stops(
     installation: Installation, network: list[str], tmp_path: Path, free_port: int
 ) -> None:
+    families = unit(installation, UNITS[0])["Service"]["RestrictAddressFamilies"].split()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(0.5)
@@ -138,7 +163,7 @@ def test_service_notifies_ready_and_watchdog_and_stops(
             "WATCHDOG_USEC": "2000000",
         }
         run = command(installation, "hand", f"--bus can0=udp_multicast:239.74.163.2:{free_port}")
-        with subprocess.Popen([*network, *run], env=environment) as daemon:
+        with subprocess.Popen([*network, *with_families(families, run)], env=environment) as daemon:
             try:
                 received = ""
                 deadline = time.monotonic() + 60
@@ -181,7 +206,13 @@ def test_uninstalling_keeps_settings(tmp_path: Path, wheel: Path) -> None:
     assert left == ["etc/handtouch/hand.toml", "usr/lib/systemd/system/other.service"]
 
 
-@pytest.mark.parametrize("script", ["services/install.sh", ".ci/run"])
+SCRIPTS = [
+    *("services/install.sh", ".ci/run"),
+    *(f"debian/handtouch.{name}" for name in ("postinst", "prerm", "postrm")),
+]
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_shell_scripts_are_valid(script: str) -> None:
     if not (ROOT / script).exists():
         pytest.skip("not in the source archive")
