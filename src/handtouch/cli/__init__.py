@@ -59,9 +59,9 @@ def build_parser() -> argparse.ArgumentParser:
         prog="handtouch",
         epilog=EXIT_STATUS_HELP,
         description="Middleware for tactile sensors of a robot hand: reads CANopen sensor nodes and "
-        "publishes contacts (position, force, uncertainty) over ZeroMQ. First look: demo. On a robot: describe "
-        "its hands, nodes and buses in a deployment file (TOML, such as config/utah_mit.toml), then check, "
-        "doctor, scan, commission and run; watch shows the contacts.",
+        "publishes contacts (position, force, uncertainty) over ZeroMQ. First look: demo. On a robot: "
+        "describe its hands, nodes and buses in a deployment file (TOML, such as config/utah_mit.toml), then "
+        "check, doctor, scan, commission and run; watch shows the contacts.",
     )
     parser.add_argument("--version", action="version", version=f"handtouch {__version__}")
     parser.add_argument(
