@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from bench_latency import PORT, descriptors, in_own_network, machine, on_loopback, resident_mb
 from hostile_clients import HOSTILE, burner, cpu_seconds, hostile_client
-from page import made_by, options, output_folder
+from page import made_by, options, output_folder, progress
 
 from handtouch.client import connect, request
 from handtouch.config import load
@@ -32,6 +32,7 @@ from handtouch.config import load
 WELL_BEHAVED = 35
 READERS_PER_PROCESS = 7
 JOINING_S, LEAVING_S = 5.0, 10.0
+PATIENCE_S = 300.0  # of a request for `status`, on a machine with other load
 SAMPLES_OF_MEMORY = 50
 MAX_RATIO = 1.1
 MAX_GROWTH_MB = 5.0
@@ -87,28 +88,33 @@ def run_reader(endpoint: str, measure: Event, results: Any, stop: Event) -> None
 
 def phase(
     endpoints: dict[str, str],
-    pid: int,
+    own: list[int],
     seconds: float,
     others: list[tuple[Callable[..., None], tuple[Any, ...]]],
 ) -> dict[str, Any]:
-    """Measure the daemon and well-behaved clients beside other processes."""
+    """Measure the daemon and well-behaved clients beside other processes; `own`: daemon and nodes."""
+    pid = own[0]
     results: multiprocessing.Queue[tuple[list[float], int]] = multiprocessing.Queue()
     measure = multiprocessing.Event()
     count = WELL_BEHAVED // READERS_PER_PROCESS
     late_s: list[float] = []
     lost = 0
     readers = [(run_reader, (endpoints["live"], measure, results))] * count
-    with running(readers) as (_, stop_readers), running(others) as (pids, _):
+    with running(readers) as (reader_pids, stop_readers), running(others) as (pids, _):
         time.sleep(JOINING_S)
         measure.set()
-        before = request("status", endpoint=endpoints["control"], timeout_s=60)["service"]
+        before = request("status", endpoint=endpoints["control"], timeout_s=PATIENCE_S)["service"]
         used_s = [cpu_seconds(other) for other in pids]
         memory_mb, begin_s = [], time.monotonic()
+        busy_s = outside_seconds([*own, *reader_pids, *pids])
         while (passed_s := time.monotonic() - begin_s) < seconds:
             memory_mb.append((passed_s, resident_mb(pid)))
+            if len(memory_mb) % (SAMPLES_OF_MEMORY // 5) == 1:
+                progress(f"{passed_s:.0f} of {seconds:.0f} s, {memory_mb[-1][1]:.0f} MB")
             time.sleep(seconds / SAMPLES_OF_MEMORY)
+        busy_s = outside_seconds([*own, *reader_pids, *pids]) - busy_s
         asked_s = time.monotonic()
-        after = request("status", endpoint=endpoints["control"], timeout_s=60)["service"]
+        after = request("status", endpoint=endpoints["control"], timeout_s=PATIENCE_S)["service"]
         answered_s = time.monotonic() - asked_s
         took_s = (after["t_ns"] - before["t_ns"]) * 1e-9
         shares = [(cpu_seconds(p) - used) / took_s for p, used in zip(pids, used_s, strict=True)]
@@ -131,8 +137,16 @@ def phase(
         "rejected": {cause: n for cause, n in rejected.items() if n},
         "memory_mb": memory_mb,
         "shares": shares,
+        "outside": busy_s / seconds,
         "late": {part: n - before["loop"]["late"].get(part, 0) for part, n in after["loop"]["late"].items()},
     }
+
+
+def outside_seconds(pids: list[int]) -> float:
+    """Return the CPU time that all processes of the machine but these have used."""
+    user, nice, system = map(int, Path("/proc/stat").read_text().split()[1:4])
+    total_s = (user + nice + system) / os.sysconf("SC_CLK_TCK")
+    return total_s - sum(cpu_seconds(pid) for pid in [*pids, os.getpid()])
 
 
 def over_tcp(config: Path) -> Path:
@@ -162,14 +176,14 @@ def measure(config: Path, seconds: float) -> dict[str, Any]:
         kinds = [kind for kind, (count, _) in HOSTILE.items() for _ in range(count)]
         hostile = phase(
             endpoints,
-            daemon.pid,
+            [daemon.pid, nodes.pid],
             seconds,
             [(run_hostile, (kind, endpoints, seed)) for seed, kind in enumerate(kinds)],
         )
         time.sleep(LEAVING_S)
         left = {"memory_mb": resident_mb(daemon.pid), "descriptors": descriptors(daemon.pid)}
         burners = [(burner, (share,)) for share in hostile["shares"]]
-        control = phase(endpoints, daemon.pid, seconds, burners)
+        control = phase(endpoints, [daemon.pid, nodes.pid], seconds, burners)
     finally:
         for process in (daemon, nodes):
             process.terminate()
@@ -222,7 +236,9 @@ are disconnected; 3 request `status`, `snapshot` and `tare` with 100 requests un
 send random bytes to all endpoints, with 200 connections open each. Then the same subscribers beside processes
 that use as much CPU as each hostile client did and don't connect (processors: {used}).
 Latency is from SYNC to the message in the subscriber.
-{machine()}; load average when it ended {os.getloadavg()[0]:.1f}.
+{machine()}; load average when it ended {os.getloadavg()[0]:.1f}. Processes that don't belong to the test used
+{results["hostile"]["outside"]:.2f} processors beside the hostile clients,
+{results["control"]["outside"]:.2f} beside the burners: the two can be compared only where these agree.
 
 {HEAD}
 {chr(10).join(rows)}

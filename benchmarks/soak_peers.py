@@ -13,8 +13,6 @@ import contextlib
 import errno
 import itertools
 import json
-import os
-import platform
 import random
 import re
 import signal
@@ -22,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -32,7 +30,8 @@ import can
 import numpy as np
 from bench_receive_path import VCAN
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
+from page import made_by, options, output_folder, progress
+from peer_verdicts import Starvation, Verdicts
 
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
@@ -58,43 +57,6 @@ WORKER_POLL_S = 0.0001
 ACTS = ("nmt", "sync", "sdo", "flood", "emcy", "short", "pause", "down", "nothing")
 COMMANDS = (cia301.STOP_NODE, cia301.ENTER_PREOPERATIONAL, cia301.RESET_COMMUNICATION, cia301.RESET_NODE)
 GUEST_PERIOD_MS, GUEST_HEARTBEAT_TIMEOUT_MS = 50, 1000
-ACCUSED = ("absent", "faulted")
-NO_PROCESSOR = re.compile("as from every pad of bus|no sample for three SYNC|no answer within|no SYNC on bus")
-"""Reasons that the guest's one processor causes: simulated nodes that don't get it are late all together."""
-
-
-class Verdicts:
-    """Counts acts and node events, and keeps what must not happen."""
-
-    def __init__(self, one_processor: bool) -> None:
-        self.one_processor = one_processor
-        self.starved: Counter[str] = Counter()  # events of nodes without processor time, by act
-        self.acts: Counter[str] = Counter()
-        self.left: Counter[str] = Counter()  # nodes that left OPERATIONAL, by act
-        self.broken: list[str] = []
-
-    def judge(self, act: str, node: str, old: str, new: str, reason: str) -> None:
-        """Judge a node's event during an act or its recovery."""
-        if old == "operational" != new:
-            self.left[act] += 1
-        if self.one_processor and NO_PROCESSOR.search(reason):
-            self.starved[act] += 1
-            return
-        blamed = act == "down" and (new == "absent" or old == "absent") and "bus can" in reason
-        if (new in ACCUSED and not blamed) or (act not in ("nmt", "down") and new != "operational"):
-            self.broken.append(f"{act}: {node}: {old} -> {new}: {reason}")
-
-    def figures(self, length: str, seconds: float) -> dict[str, Any]:
-        """Return the figures of a run."""
-        return {
-            "length": length,
-            "seconds": round(seconds),
-            "acts": dict(self.acts),
-            "left_operational": dict(self.left),
-            "starved": dict(self.starved),
-            "broken": self.broken[:20],
-            "machine": f"{os.environ.get('VCAN_RUN', 'host')}, {platform.machine()}, {os.cpu_count()} cores",
-        }
 
 
 class InjectedBus:
@@ -250,7 +212,7 @@ def injected(hours: float) -> dict[str, Any]:
     """Run the acts for so many hours of the injected clock."""
     master_module.ThreadPoolExecutor = CountedWorkers  # type: ignore[attr-defined]
     sdo.SDO_TIMEOUT_S = 0.05  # of real time, while the injected clock stands still
-    hand, verdicts, generator = InjectedHand(), Verdicts(one_processor=False), random.Random(1)
+    hand, verdicts, generator = InjectedHand(), Verdicts(), random.Random(1)
     list(hand.run(2.0))
     assert hand.is_operational, hand.master.status()
     began_s, end_ns = time.monotonic(), hand.now_ns + round(hours * 3600 * SECOND)
@@ -258,6 +220,10 @@ def injected(hours: float) -> dict[str, Any]:
         if hand.now_ns >= end_ns:
             break
         verdicts.acts[act] += 1
+        if act == ACTS[0]:
+            progress(
+                f"{(hand.now_ns - end_ns) / 3600e9 + hours:.2f} of {hours:g} h, {len(verdicts.broken)} broken"
+            )
         events = itertools.chain(_act_injected(hand, act, generator), hand.run(RECOVERY_S))
         for event in events:
             old, new = event.old_state.name.lower(), event.new_state.name.lower()
@@ -312,7 +278,7 @@ def _down(hand: InjectedHand, seconds: float) -> Iterator[NodeEvent]:
 
 def socketcan(minutes: float) -> dict[str, Any]:
     """Run the acts on vcan0 for so many minutes, against the daemon's own process."""
-    verdicts, generator = Verdicts(one_processor=True), random.Random(1)
+    verdicts, generator = Verdicts(), random.Random(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         config = _guest_deployment(folder)
@@ -353,25 +319,32 @@ def _run_guest(
     pads = _wait_operational(endpoint, 120.0)
     ids = [pad["node_id"] for pad in pads]
     states = {pad["link"]: pad["node_state"] for pad in pads}
+    starvation = Starvation(ids, GUEST_PERIOD_MS * 1e-3)
+    starvation.start()
     began_s = time.monotonic()
     with (
+        contextlib.closing(starvation),
         connect("health/*/*", endpoint=f"ipc://{folder}/live", queue=100_000) as health,
         can.Bus(interface="socketcan", channel="vcan0") as other,
     ):
         for act in itertools.cycle(ACTS):
-            if time.monotonic() - began_s > 60 * minutes:
+            passed_s = time.monotonic() - began_s
+            if passed_s > 60 * minutes:
                 break
+            progress(f"{passed_s / 60:.1f} of {minutes:g} min, {len(verdicts.broken)} broken; {act}")
             verdicts.acts[act] += 1
             _act_guest(act, daemon, other, ids, generator)
             time.sleep(3.0)
             try:
                 _wait_operational(endpoint, 60.0)
             except TimeoutError as error:
-                verdicts.broken.append(f"{act}: {error}")
+                verdicts.record(act, str(error), starvation.was_recent(time.time()))
+            since_boot_s = time.time() - time.monotonic()
             while (message := health.recv(0.1)) is not None:
                 old, states[message.link] = states[message.link], message.node_state
                 if old != message.node_state:
-                    verdicts.judge(act, message.link, old, message.node_state, message.reason)
+                    starved = starvation.was_recent(since_boot_s + message.t_ns * 1e-9)
+                    verdicts.judge(act, message.link, old, message.node_state, message.reason, starved)
     return verdicts.figures(f"{minutes:g} min, vcan0", time.monotonic() - began_s)
 
 
@@ -446,8 +419,8 @@ def report(name: str, figures: dict[str, Any], out: Path) -> None:
         "0.6 or 2 s (`pause`), an interface that is down for up to 5 s (`down`). Nodes may leave",
         "OPERATIONAL only by `nmt` and `down`; a promise is broken by a node that is lost or faulted,",
         "that leaves it for another reason, or that doesn't return. In the guest all processes share one",
-        "processor: events of simulated nodes that are late for want of it, known by a reason that names",
-        "host or bus, are counted apart.",
+        "processor: an event is counted apart (`no processor`) if most nodes sent nothing in the two seconds",
+        "before, by the kernel's stamps of their frames, and its reason names host, bus or silence.",
         f"{made_by()}.",
         "",
         "| length | duration, s | acts | left OPERATIONAL | no processor | broken promises | machine |",
