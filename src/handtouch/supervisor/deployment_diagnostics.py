@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from handtouch.calibration.calibration import Gains
 from handtouch.config import Deployment
 from handtouch.supervisor import diagnose
 from handtouch.supervisor.ipc import FloatArray, SampleBlock
@@ -26,11 +27,13 @@ class DeploymentDiagnostics:
         self._hands: list[tuple[slice, diagnose.HandDiagnostics]] = []
         self._models: dict[int, diagnose.DiagnosisModel] = {}
         self._default_ampere_per_count: dict[int, FloatArray] = {}
+        self._stated_gain_covariance: dict[int, FloatArray] = {}
         first = 0
         for hand in deployment.hands:
             rows = slice(first, first + len(hand.pads))
             model = diagnose.DiagnosisModel.from_deployment(deployment, hand.name)
             self._models[first], self._default_ampere_per_count[first] = model, model.ampere_per_count.copy()
+            self._stated_gain_covariance[first] = model.gain_covariance.copy()
             self._hands.append((rows, diagnose.HandDiagnostics(model)))
             first = rows.stop
         self._pending: list[SampleBlock] = []
@@ -63,11 +66,18 @@ class DeploymentDiagnostics:
         rows, hand = self._hand_of(pad)
         hand.set_offsets(pad - rows.start, offset_counts)
 
-    def set_gains(self, pad: int, gains: ArrayLike) -> None:
-        """Set the gains (4,) of a pad and discard its contacts so far."""
+    def set_gains(self, pad: int, gains: Gains) -> None:
+        """Set the gains of a pad, with their covariance, and discard its contacts so far.
+
+        A covariance wider than what the deployment states, as before any contact, is no information.
+        """
         rows, hand = self._hand_of(pad)
         row, model = pad - rows.start, self._models[rows.start]
-        model.ampere_per_count[row] = self._default_ampere_per_count[rows.start][row] * np.asarray(gains)
+        model.ampere_per_count[row] = self._default_ampere_per_count[rows.start][row] * np.asarray(
+            gains.factors
+        )
+        stated, known = self._stated_gain_covariance[rows.start][row], np.array(gains.covariance)
+        model.gain_covariance[row] = known if 0 < np.trace(known) < np.trace(stated) else stated
         hand.reset_contacts(row)
 
     def _hand_of(self, pad: int) -> tuple[slice, diagnose.HandDiagnostics]:

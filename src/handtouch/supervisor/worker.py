@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from handtouch.calibration.auto_calibration import AutoCalibrator, CalibrationState
 from handtouch.calibration.calibration import (
     CalibrationVersion,
-    ChannelValues,
     Gains,
     Provenance,
     age_s,
@@ -62,8 +61,8 @@ class Diagnostics(Protocol):
     def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
         """Set the stored offsets (4,) of a pad."""
 
-    def set_gains(self, pad: int, gains: ChannelValues) -> None:
-        """Set the gains (4,) of a pad and discard its contacts so far."""
+    def set_gains(self, pad: int, gains: Gains) -> None:
+        """Set the gains of a pad, with their covariance, and discard its contacts so far."""
 
 
 @dataclass
@@ -175,7 +174,7 @@ class SupervisorWorker:
             )
             self._store_schedule.reset_pad(pad)
             if self._diagnostics is not None:
-                self._diagnostics.set_gains(pad, row.calibrator.gains.factors)
+                self._diagnostics.set_gains(pad, row.calibrator.gains)
             name = f"{row.mounting_point.hand}/{row.mounting_point.link}"
             _log.info(
                 "%s: node with serial %d: calibration %s%s", name, serial, row.calibrator.calibration_state,
@@ -207,7 +206,7 @@ class SupervisorWorker:
             else:
                 row.calibrator.revert_to_default()
             if self._diagnostics is not None:
-                self._diagnostics.set_gains(pad, row.calibrator.gains.factors)
+                self._diagnostics.set_gains(pad, row.calibrator.gains)
             messages.append(self._restore_calibration(pad, version, now))
             _log.info(
                 "%s/%s: calibration %s stored by another process: applied",
@@ -230,7 +229,7 @@ class SupervisorWorker:
             row.calibrator.accept_measured_law()
         if self._diagnostics is not None:
             if "gains" in given:
-                self._diagnostics.set_gains(update.pad, update.gains)
+                self._diagnostics.set_gains(update.pad, row.calibrator.gains)
             if update.offset_counts is not None:
                 self._diagnostics.set_offsets(update.pad, update.offset_counts)
         if {"gains", "law"} & {*given}:
@@ -267,7 +266,7 @@ class SupervisorWorker:
                 name = version.calibration_id if version else f"{row.calibrator.serial}-learning"
                 messages.append(_calibration_update(pad, row.calibrator.serial, name, row.calibrator.gains))
                 if self._diagnostics is not None:
-                    self._diagnostics.set_gains(pad, row.calibrator.gains.factors)
+                    self._diagnostics.set_gains(pad, row.calibrator.gains)
 
     def _store_gains(self, row: _PadEntry, now: datetime) -> CalibrationVersion | None:
         estimate, serial = row.calibrator.estimate, row.calibrator.serial

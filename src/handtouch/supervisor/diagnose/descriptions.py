@@ -155,6 +155,8 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
         force_valid = True
     elif hypothesis.kind == FaultKind.GAIN_STEP:
         cause = f"the gain of channel {names[0]} is about {hypothesis.factor:.2f} times the former one"
+        others = {h.electrodes[0]: h.factor for h in fault.alternatives if h.electrodes != names}
+        cause += "".join(f", or that of {name} {factor:.2f} times" for name, factor in others.items())
         remedy = "touch the pad all over, so that it calibrates itself; if it persists, replace the node"
         values["factor"] = hypothesis.factor
     else:
@@ -165,6 +167,8 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
             f"the sheet is torn at the corner of {names[0]} and {names[1]}: about {mm[0]:.0f} mm along x and "
             f"{mm[1]:.0f} mm along y no longer conduct"
         )
+        corners = dict.fromkeys(h.electrodes for h in fault.alternatives if h.electrodes != names)
+        cause += "".join(f"; or at that of {' and '.join(corner)}" for corner in corners)
         remedy = "replace the sheet; until then don't rely on positions near that corner"
         values.update(along_x_mm=mm[0], along_y_mm=mm[1])
     published = Diagnosis(

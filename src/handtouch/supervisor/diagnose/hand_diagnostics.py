@@ -6,18 +6,14 @@ Public: `HandDiagnostics`. `channel_faults` checks single samples, `static_load`
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field.network import ElectrodeNetwork
 from handtouch.supervisor.diagnose.channel_faults import ChannelFaultDetector
-from handtouch.supervisor.diagnose.contact_faults import (
-    ContactCurrents,
-    ContactFaultDetector,
-    HypothesisTables,
-)
+from handtouch.supervisor.diagnose.contact_faults import ContactFaultDetector
 from handtouch.supervisor.diagnose.descriptions import (
     describe_channel_faults,
     describe_contact_fault,
@@ -30,6 +26,7 @@ from handtouch.supervisor.diagnose.features import (
     approximate_position,
     extract_features,
 )
+from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, HypothesisTables
 from handtouch.supervisor.diagnose.model import (
     DiagnosisModel,
     FloatArray,
@@ -48,14 +45,14 @@ class HandDiagnostics:
     """Detectors and active diagnoses of all pads of a hand; `process_block` takes block after block.
 
     offset_counts: (n, 4), stored readings of the untouched channels; those of the model if left out.
-    tables: of hypotheses, by network, shared by diagnostics of one model.
+    tables: of hypotheses, by design, shared by diagnostics of one model.
     """
 
     def __init__(
         self,
         model: DiagnosisModel,
         offset_counts: ArrayLike | None = None,
-        tables: dict[ElectrodeNetwork, HypothesisTables] | None = None,
+        tables: dict[Hashable, HypothesisTables] | None = None,
     ) -> None:
         self._model = model
         offsets = model.offset_counts if offset_counts is None else offset_counts
@@ -88,7 +85,7 @@ class HandDiagnostics:
     def reset_contacts(self, pad: int) -> None:
         """Discard the contacts of a pad, whose calibration or node was replaced."""
         if pad in self._contact_detectors:
-            self._contact_detectors[pad].reset()
+            self._contact_detectors[pad].reset(self._model.gain_covariance[pad])
 
     def process_block(self, block: HandSamples) -> list[PadDiagnosis]:
         """Process a block; return the diagnoses that began, changed or ended.
@@ -138,10 +135,17 @@ class HandDiagnostics:
     def _contact_detector(self, pad: int) -> ContactFaultDetector:
         """Return the detector of a pad, made on first use: tables take a quarter of a second per design."""
         if pad not in self._contact_detectors:
-            network = self._model.networks[pad]
-            if network not in self._tables:
-                self._tables[network] = HypothesisTables(network, self._model.surfaces[pad])
-            self._contact_detectors[pad] = ContactFaultDetector(self._tables[network])
+            design = self._model.designs[pad]
+            if design not in self._tables:
+                self._tables[design] = HypothesisTables(
+                    self._model.networks[pad],
+                    self._model.surfaces[pad],
+                    self._model.parts[pad](),
+                    self._model.sheets[pad].anisotropy_std,
+                )
+            self._contact_detectors[pad] = ContactFaultDetector(
+                self._tables[design], self._model.gain_covariance[pad]
+            )
         return self._contact_detectors[pad]
 
     def _collect_diagnoses(self) -> dict[tuple[int, FaultKind], PadDiagnosis]:

@@ -5,8 +5,9 @@ Electrodes and channels are always in the order x0, xa, y0, yb.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from handtouch import config
 from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
-from handtouch.hand import electrode_network, pad_surface
+from handtouch.hand import electrode_network, networks_with_other_parts, pad_surface
 from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
 
@@ -64,20 +65,25 @@ class PadDiagnosis:
 class DiagnosisModel:
     """Parameters of the n pads of a hand, from deployment file and calibration.
 
-    networks, surfaces, sheets: of each pad. drive_v: (n,). ampere_per_count, offset_counts: (n, 4) as
-    calibrated; offsets are the stored ones, not a running baseline. noise_counts: (n,) of a reading.
-    limits: (n, 4, 2) lowest and highest count.
+    networks, surfaces, sheets: of each pad; parts: networks in each of which one part of the pad differs by
+    one standard deviation, made when called. drive_v: (n,). ampere_per_count, offset_counts: (n, 4) as
+    calibrated; offsets are the stored ones, not a running baseline. gain_covariance: (n, 4, 4) of the
+    logarithms of the gains, as stated or calibrated. noise_counts: (n,) of a reading. limits: (n, 4, 2)
+    lowest and highest count. designs: equal for pads of which all this is equal, calibration aside.
     """
 
     links: tuple[str, ...]
     networks: Sequence[ElectrodeNetwork]
     surfaces: Sequence[Surface]
     sheets: Sequence[config.Sheet]
+    parts: Sequence[Callable[[], Sequence[ElectrodeNetwork]]]
     drive_v: FloatArray
     ampere_per_count: FloatArray
     noise_counts: FloatArray
     limits: FloatArray
+    designs: Sequence[Hashable]
     offset_counts: FloatArray
+    gain_covariance: FloatArray
 
     @classmethod
     def from_deployment(cls, deployment: config.Deployment, hand: str) -> DiagnosisModel:
@@ -92,21 +98,29 @@ class DiagnosisModel:
                 factor = node.channel_scale[pad.electrodes.index(name)]
                 scale[row, k] = node.full_scale_ma * 1e-3 / full * factor
                 limits[row, k] = channel.limits
-        by_design: dict[object, ElectrodeNetwork] = {}  # pads of one design share one network and its tables
-        networks = []
-        for pad in pads:
-            design = (pad.surface, pad.gap_mm, pad.series_ohm, pad.sheet)
+        by_design: dict[Hashable, ElectrodeNetwork] = {}  # pads of one design share one network
+        networks, designs = [], []
+        for pad, node in zip(pads, nodes, strict=True):
+            sheet = deployment.sheets[pad.sheet]
+            design = (pad.surface, pad.gap_mm, pad.series_ohm, sheet, node.gain_std, node.series_std)
+            designs.append(design)
             if design not in by_design:
-                by_design[design] = electrode_network(pad, deployment.sheets[pad.sheet])
+                by_design[design] = electrode_network(pad, sheet)
             networks.append(by_design[design])
         return cls(
             links=tuple(pad.link for pad in pads),
             networks=networks,
             surfaces=[pad_surface(pad) for pad in pads],
             sheets=[deployment.sheets[pad.sheet] for pad in pads],
+            parts=[
+                partial(networks_with_other_parts, pad, node, deployment.sheets[pad.sheet])
+                for pad, node in zip(pads, nodes, strict=True)
+            ],
             drive_v=np.array([node.drive_v for node in nodes]),
             ampere_per_count=scale,
             noise_counts=np.array([node.noise_counts for node in nodes]),
             limits=limits,
+            designs=designs,
             offset_counts=np.zeros((len(pads), 4)),
+            gain_covariance=np.stack([node.gain_std**2 * np.eye(4) for node in nodes]),
         )

@@ -1,0 +1,276 @@
+"""Pads with and without a fault, tabulated: how well each explains the currents of a contact.
+
+Public: `Hypothesis`, `HypothesisTables`, `ContactCurrents`. A contact has three unknowns (position and total)
+and four currents. The one number left over is the contact's score under a hypothesis.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.config.channels import ELECTRODES
+from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.surface import Surface
+from handtouch.supervisor.diagnose.model import FloatArray
+from handtouch.supervisor.diagnose.sheet_changes import CORNERS, SheetChanges
+from handtouch.wire.faults import FaultKind
+
+_GAIN_TOLERANCE_STD = 0.02
+"""Of a channel's gain, as noise of log likelihood ratios, which raise suspicions only."""
+_SEARCH_TOLERANCE = 0.02  # of each current, in the search of the first node
+_NODES_PER_SIDE = 25
+_NODE_FRACTIONS = np.linspace(0.02, 0.98, _NODES_PER_SIDE)
+_MODEL_ERROR_FRACTION = 1e-3  # of the total: what the model neglects
+_TORN_MODEL_ERROR_FRACTION = 5e-3  # of the total: few sizes of cuts, coarse grids
+_SCORE_MODEL_ERROR_FRACTION = 3e-3  # of the total, for scores: the same for all hypotheses
+_NON_POINT_PROBABILITIES = np.array(
+    [0.03, 0.5]
+)  # of all contacts: usually, and while two objects are handled
+_MIN_LOG_LIKELIHOOD, _MAX_SQUARED_MISFIT = -1e3, 1e6
+_LOG_NON_POINT_SPREAD = np.log(40.0)  # log ratio of the scatter of contacts that are no points
+_CUT_FRACTIONS = (
+    0.2,
+    0.35,
+    0.5,
+    0.65,
+    0.8,
+    0.92,
+)  # of a side; the short side of a fingertip may be cut off whole
+_GAIN_STEP_FACTORS = np.exp(np.append(np.arange(-19.5, -1), np.arange(1.5, 20)) * 0.07)
+
+
+class Hypothesis(NamedTuple):
+    """Possible fault: kind, electrodes; factor of a gain, or fractions of the sides that a cut removes."""
+
+    kind: FaultKind
+    electrodes: tuple[str, ...]
+    factor: float = 1.0
+    cut: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ContactCurrents:
+    """Currents (4,) and noise (4,) [A] of a contact; position (2,) as fractions of the pad, nominal fit."""
+
+    sample_ns: int
+    currents: FloatArray
+    noise: FloatArray
+    position: FloatArray
+
+
+class Scores(NamedTuple):
+    """Misfits of k contacts under one hypothesis, in standard deviations.
+
+    scores (k,): along the direction that no position and total explains. slopes (k, t): their change by one
+    standard deviation of each tolerance of the sheet and its electrodes, then by the log gain of each
+    channel. rest (k,): squared misfit along the other directions, where no position fits.
+    """
+
+    scores: FloatArray
+    slopes: FloatArray
+    rest: FloatArray
+
+
+class HypothesisTables:
+    """Current shares under each hypothesis, for one design of pad.
+
+    parts: networks in each of which one part differs by one standard deviation. unevenness_std: amplitude of
+    the waves of the logarithm of the sheet's resistance.
+    """
+
+    def __init__(
+        self,
+        network: ElectrodeNetwork,
+        surface: Surface,
+        parts: Sequence[ElectrodeNetwork] = (),
+        unevenness_std: float = 0.0,
+    ) -> None:
+        self.hypotheses: list[Hypothesis] = []
+        x, y = _nodes(network)
+        nominal = network.fractions(x, y).T
+        series = np.array(network.series_ohm)
+        orders, factors = [np.arange(4)], [np.ones(4)]
+        for order, names in _swap_permutations():
+            self.hypotheses.append(Hypothesis(FaultKind.SWAPPED_CABLES, names))
+            orders.append(order)
+            factors.append(np.ones(4))
+        for channel, factor in itertools.product(range(4), _GAIN_STEP_FACTORS):
+            self.hypotheses.append(Hypothesis(FaultKind.GAIN_STEP, (ELECTRODES[channel],), float(factor)))
+            orders.append(np.arange(4))
+            factors.append(np.where(np.arange(4) == channel, 1 / factor, 1.0))
+        self._orders, self._factors = np.array(orders).T, np.array(factors).T
+        self._nominal = _FractionTable(nominal[None])
+        others = []
+        for channel in range(4):
+            floating = network.with_series_ohm(np.where(np.arange(4) == channel, np.inf, series).tolist())
+            self.hypotheses.append(Hypothesis(FaultKind.DEAD_ELECTRODE, (ELECTRODES[channel],)))
+            others.append(floating.fractions(x, y).T)
+        if series.any():
+            for i, j in itertools.combinations(range(4), 2):
+                merged = nominal.copy()
+                merged[:, [i, j]] = nominal[:, [i, j]].mean(axis=1, keepdims=True)
+                self.hypotheses.append(
+                    Hypothesis(FaultKind.SHORTED_ELECTRODE, (ELECTRODES[i], ELECTRODES[j]))
+                )
+                others.append(merged)
+        self._electrode_faults, torn_ones = _FractionTable(np.stack(others)), []
+        sheet = SheetChanges(network, surface, _NODE_FRACTIONS)
+        cuts = list(itertools.product(CORNERS, _CUT_FRACTIONS, _CUT_FRACTIONS))
+        changes = sheet.by_cuts((CORNERS[corner], p, q) for corner, p, q in cuts)
+        for (corner, p, q), (change, beyond) in zip(cuts, changes, strict=True):
+            self.hypotheses.append(Hypothesis(FaultKind.TORN_CORNER, corner, 1.0, (p, q)))
+            torn = nominal + change.reshape(-1, 4)
+            torn[beyond.ravel()] = 0.0
+            torn_ones.append(torn)
+        self._torn = _FractionTable(np.stack(torn_ones))
+        self.hypotheses.append(Hypothesis(FaultKind.UNEXPLAINED, ()))
+        self.kinds = np.array([h.kind for h in self.hypotheses])
+        tolerances = [part.fractions(*_nodes(part)).T - nominal for part in parts]
+        if unevenness_std > 0:
+            tolerances += [change.reshape(-1, 4) for change in sheet.by_waves(unevenness_std)]
+        self._tolerances = np.array([*tolerances, *(nominal * channel for channel in np.eye(4))])
+
+    def log_likelihood_ratios(self, contact: ContactCurrents, left_out: NDArray[np.bool_]) -> FloatArray:
+        """Return log likelihood ratios (2, hypotheses) to a nominal pad with few contacts that are no points,
+        and to one with many; channels (4,) with a known fault are left out."""
+        data = contact.currents
+        total = max(float(data.sum()), 1e-30)
+        sigma = np.sqrt(
+            contact.noise**2 + (_GAIN_TOLERANCE_STD * data) ** 2 + (_MODEL_ERROR_FRACTION * total) ** 2
+        )
+        sigma = np.where(left_out, 1e6 * total, sigma)
+        rescaled = data[self._orders] * self._factors, sigma[self._orders] * self._factors
+        level, volume = self._nominal.fit(*rescaled)
+        level = level + np.log(self._factors).sum(axis=0)
+        torn_sigma = np.hypot(sigma, _TORN_MODEL_ERROR_FRACTION * total)
+        torn = self._torn.fit(data[:, None], torn_sigma[:, None])[0] - np.log(torn_sigma / sigma).sum()
+        others = self._electrode_faults.fit(data[:, None], sigma[:, None])[0]
+        level = np.concatenate([level, others, torn]) - volume[0]
+        level = np.append(level, -_LOG_NON_POINT_SPREAD)
+        few, many = (
+            np.logaddexp(np.log1p(-part) + level, np.log(part) - _LOG_NON_POINT_SPREAD)
+            for part in _NON_POINT_PROBABILITIES
+        )
+        return np.stack([few[1:] - few[0], few[1:] - many[0]])
+
+    def score(self, index: int | None, currents: FloatArray, noise: FloatArray) -> Scores:
+        """Return the scores of contacts (4, k) with their noise under a hypothesis; None: no fault."""
+        table, pad = self._nominal, 0
+        permuted, others = self._orders.shape[1] - 1, self._electrode_faults.pads
+        if index is not None and index < permuted:
+            order, factor = self._orders[:, index + 1], self._factors[:, index + 1, None]
+            currents, noise = currents[order] * factor, noise[order] * factor
+        elif index is not None and index < permuted + others:
+            table, pad = self._electrode_faults, index - permuted
+        elif index is not None:
+            table, pad = self._torn, index - permuted - others
+        sigma = np.hypot(noise, _SCORE_MODEL_ERROR_FRACTION * currents.sum(axis=0))
+        return table.score(pad, currents, sigma, self._tolerances)
+
+
+def _nodes(network: ElectrodeNetwork) -> tuple[FloatArray, FloatArray]:
+    x, y = np.meshgrid(_NODE_FRACTIONS * network.a, _NODE_FRACTIONS * network.b, indexing="ij")
+    return x.ravel(), y.ravel()
+
+
+class _FractionTable:
+    """Fractions (t, P, 4) of t pads on the grid, and their slopes."""
+
+    def __init__(self, fractions: FloatArray) -> None:
+        self._fractions = fractions
+        cube = fractions.reshape(len(fractions), _NODES_PER_SIDE, _NODES_PER_SIDE, 4)
+        self._slopes = np.stack([v.reshape(fractions.shape) for v in np.gradient(cube, axis=(1, 2))])
+        self._coarse = (
+            np.arange(_NODES_PER_SIDE**2).reshape(_NODES_PER_SIDE, _NODES_PER_SIDE)[::2, ::2].ravel()
+        )
+        self._coarse_fractions = np.ascontiguousarray(fractions[:, self._coarse])
+        self._coarse_squares = self._coarse_fractions**2
+
+    def fit(self, data: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods, up to a constant, of point contacts anywhere, and their volume terms.
+
+        Of data (4, k) with standard deviations sigma: (k,) for one pad, (t,) for t pads and k = 1. The
+        nearest node of a coarse grid, then two Gauss-Newton steps.
+        """
+        table, node = self._nearest_nodes(data, sigma)
+        _, _, misfit, gram, undetermined = self._refine(table, node, data, sigma)
+        volume = np.where(undetermined, _MIN_LOG_LIKELIHOOD, -0.5 * np.linalg.slogdet(gram)[1])
+        return np.asarray(volume - 0.5 * (misfit**2).sum(axis=0)), np.asarray(volume)
+
+    def score(self, pad: int, data: FloatArray, sigma: FloatArray, tolerances: FloatArray) -> Scores:
+        """Return the scores of data (4, k) with standard deviations on one pad; tolerances (t, P, 4)."""
+        node = self._nearest_nodes(data, np.hypot(sigma, _SEARCH_TOLERANCE * data), pad)[1]
+        table = np.full(data.shape[1], pad)
+        node, jacobian, misfit, _, undetermined = self._refine(table, node, data, sigma)
+        null = np.linalg.svd(jacobian.transpose(2, 1, 0), full_matrices=True)[0][:, :, 3]
+        flat = node[0] * _NODES_PER_SIDE + node[1]
+        total = np.maximum(data.sum(axis=0), 1e-30)
+        slopes = np.einsum("ck,tkc->kt", null.T * total / sigma, tolerances[:, flat])
+        scores = np.einsum("kc,ck->k", null, misfit)
+        rest = np.maximum((misfit**2).sum(axis=0) - scores**2, 0.0)
+        return Scores(scores, slopes, np.where(undetermined, _MAX_SQUARED_MISFIT, rest))
+
+    @property
+    def pads(self) -> int:
+        """Number of pads."""
+        return len(self._fractions)
+
+    def _nearest_nodes(
+        self, data: FloatArray, sigma: FloatArray, pad: int | None = None
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return tables (j,) and best nodes (2, j) of the coarse grid for each table and contact."""
+        one = slice(None) if pad is None else slice(pad, pad + 1)
+        weight = 1 / sigma**2
+        along = self._coarse_fractions[one] @ (weight * data)  # (t, P, k)
+        norm = self._coarse_squares[one] @ weight
+        best = np.argmax(np.maximum(along, 0) * along / (norm + 1e-300), axis=1)
+        node = np.stack(np.divmod(self._coarse[best.ravel()], _NODES_PER_SIDE))
+        return np.indices(best.shape)[0].ravel(), node
+
+    def _refine(
+        self, table: NDArray[np.intp], node: NDArray[np.intp], data: FloatArray, sigma: FloatArray
+    ) -> tuple[NDArray[np.intp], FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Return nodes, Jacobian, misfit, its Gram matrix and where undetermined, after Gauss-Newton."""
+        for reach in (2, 1):  # not beyond the next node
+            jacobian, misfit = self._linearise(table, node, data, sigma)
+            gram = np.einsum("pck,qck->kpq", jacobian, jacobian)
+            size = np.trace(gram, axis1=1, axis2=2)
+            undetermined = size <= 0  # no node collects such currents
+            gram += np.eye(3) * np.where(undetermined, 1.0, 1e-9 * size)[:, None, None]
+            step = np.linalg.solve(gram, np.einsum("pck,ck->kp", jacobian, misfit)[:, :, None])[:, :, 0]
+            step[:, 1:] = np.clip(step[:, 1:], -reach, reach)
+            if reach > 1:
+                moved = np.clip(node + np.rint(step[:, 1:].T).astype(np.intp), 0, _NODES_PER_SIDE - 1)
+                there = (
+                    self._fractions[table, moved[0] * _NODES_PER_SIDE + moved[1], 0] > 0
+                )  # and not cut off
+                node = np.where(there, moved, node)
+        misfit = misfit - np.einsum("kp,pck->ck", step, jacobian)
+        return node, jacobian, misfit, gram, undetermined
+
+    def _linearise(
+        self, table: NDArray[np.intp], node: NDArray[np.intp], data: FloatArray, sigma: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return whitened Jacobian (3, 4, k) by log total and position, and misfit, at nodes (2, k)."""
+        flat = node[0] * _NODES_PER_SIDE + node[1]
+        f = self._fractions[table, flat].T
+        slopes = self._slopes[:, table, flat].transpose(0, 2, 1)
+        total = np.maximum((f * data / sigma**2).sum(0) / ((f / sigma) ** 2).sum(0).clip(1e-300), 1e-12)
+        return np.stack([f, slopes[0], slopes[1]]) * total / sigma, (data - total * f) / sigma
+
+
+def _swap_permutations() -> list[tuple[NDArray[np.intp], tuple[str, ...]]]:
+    """Return permutations up to mirroring: the four swaps of neighbours, and both pairs at once."""
+    pairs = [(0, 2), (0, 3), (1, 2), (1, 3)]
+    found = []
+    for i, j in pairs:
+        order = np.arange(4)
+        order[[i, j]] = j, i
+        found.append((order, (ELECTRODES[i], ELECTRODES[j])))
+    return [*found, (np.array([2, 3, 0, 1]), ELECTRODES)]
