@@ -26,6 +26,7 @@ _ARC_ITERATIONS = 6  # of the search for the direction from a corner
 _MIN_CORNER_ANGLE_RAD = 0.02  # of an estimate near a corner from its sides
 _GUESS_BATCH = 8192  # contacts at once, to bound memory
 _GUESS_GRID = 9  # points per side of the search for a start
+_OUTLINE_GRID_OFFSET = 0.4681  # of a grid cell: keeps the points off edges in simple ratios
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,8 @@ class _LikelihoodFit:
 
     def initial_positions(self) -> FloatArray:
         """Return a start from the currents alone, shape (2, n): the most likely of a grid of points."""
-        side = (np.arange(_GUESS_GRID) + 0.5) / _GUESS_GRID
+        offset = 0.5 if self.mirrored_inside is None else _OUTLINE_GRID_OFFSET
+        side = (np.arange(_GUESS_GRID) + offset) / _GUESS_GRID
         x, y = self.move_inside(np.stack([place.ravel() for place in np.meshgrid(side, side)]))
         table = self.model.fractions(self.model.a * x, self.model.b * y).T
         on_pad = np.isfinite(table).all(axis=1)

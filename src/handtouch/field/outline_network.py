@@ -22,7 +22,6 @@ from handtouch.field._mixed_problem import MixedProblem
 from handtouch.field._series_resistors import GroundedElectrodes
 from handtouch.field.outline import MIN_CLEARANCE, ComplexArray, FloatArray, Outline
 
-_TOLERANCE = 1e-7  # of the densities; of potentials some 1e-11
 _SMOOTH_ANGLE_RAD = 1e-9
 _MAX_IMAGE_DISTANCE = 0.5  # of the larger extent: of a point from its mirror image
 _MIN_IMAGE_CLEARANCE = 0.5  # of a mirror image from the boundary, in distances of its source
@@ -60,9 +59,9 @@ class OutlineNetwork(GroundedElectrodes):
     outline: touches both axes from above and from the right (`Outline.at_origin`). electrodes: their order is
     that of the channels; bare stretches insulate. series_ohm: resistors from the electrodes to ground, none
     unless given; infinity leaves one floating. resistivity_ratio: rho_x / rho_y of an anisotropic sheet,
-    whose `sheet_ohm_per_square` is then sqrt(rho_x rho_y) / w.
+    whose `sheet_ohm_per_square` is then sqrt(rho_x rho_y) / w. tolerance: of the boundary's densities.
 
-    Fractions and conductance are accurate to some 1e-11, with re-entrant corners, too, derivatives to 1e-9
+    Fractions and conductance are accurate to some 1e-10, with re-entrant corners, too, derivatives to 1e-8
     from 1 % of the pad inwards. Arguments broadcast; points off the pad or NaN give NaN. Building takes the
     cube of `unknowns`: a second or two for 1,500.
 
@@ -78,6 +77,7 @@ class OutlineNetwork(GroundedElectrodes):
         sheet_ohm_per_square: float,
         series_ohm: Sequence[float] | None = None,
         resistivity_ratio: float = 1.0,
+        tolerance: float = 1e-7,
     ) -> None:
         x0, y0, x1, y1 = outline.bounds
         if max(abs(x0), abs(y0)) > _ORIGIN_ROUNDING * max(x1 - x0, y1 - y0):
@@ -85,6 +85,7 @@ class OutlineNetwork(GroundedElectrodes):
         for name, value in (
             ("sheet_ohm_per_square", sheet_ohm_per_square),
             ("resistivity_ratio", resistivity_ratio),
+            ("tolerance", tolerance),
         ):
             if not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
@@ -98,7 +99,7 @@ class OutlineNetwork(GroundedElectrodes):
         self._solved = outline.stretched(self._stretch / self._unit, 1 / self._unit)
         self._pieces = _pieces(outline, self.electrodes)
         panels = [p for stretch in _stretches(self._solved, self._pieces) for p in initial_panels(stretch)]
-        self._problem = MixedProblem(panels, len(self.electrodes), _TOLERANCE)
+        self._problem = MixedProblem(panels, len(self.electrodes), tolerance)
         none = (0.0,) * len(self.electrodes)
         self._set_series_resistors(none if series_ohm is None else series_ohm, len(self.electrodes))
 

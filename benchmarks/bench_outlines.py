@@ -1,0 +1,294 @@
+"""Measure pads of any outline: error against run time, finite elements, information against electrodes.
+
+Prints its tables and writes docs/benchmarks/outlines.md, outlines.json and outlines.png.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+from page import made_by, options, output_folder, progress, table
+from skfem import ElementTriP2, ElementTriP3, ElementTriP4
+
+from handtouch.field import BoundaryElectrode, ElectrodeNetwork, Outline, OutlineNetwork
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+FloatArray = NDArray[np.float64]
+Pad = Callable[[float], OutlineNetwork]
+Row = dict[str, Any]
+
+ROOT = Path(__file__).parent.parent
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
+REFERENCE_TOLERANCE = 3e-10
+INSET = 0.01  # of the larger extent: least distance of points from the boundary
+POINTS = 400
+NOISE = 0.01  # of the total, on each channel
+INFORMATION_MARGIN = 0.1  # of the extent
+GAP_SHARE = 0.1  # of the pitch of the electrodes
+
+
+def equal_electrodes(
+    outline: Outline, count: int, share: float, first: float = 0.0
+) -> list[BoundaryElectrode]:
+    """Electrodes of one length at one pitch; `share` of it bare."""
+    perimeter = outline.perimeter()
+    pitch = perimeter / count
+    starts = [(first + k * pitch) % perimeter for k in range(count)]
+    return [BoundaryElectrode(s, (s + pitch * (1 - share)) % perimeter) for s in starts]
+
+
+def shapes() -> dict[str, Pad]:
+    """Return the pads, built at a tolerance."""
+    corners = [(z.real, z.imag) for z in 1 + np.exp(1j * np.pi / 3 * np.arange(6))]
+    l_shape = Outline([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)])
+    holed = Outline([(0, 0), (2, 0), (2, 1), (0, 1)], holes=[Outline.circle(0.2).moved(0.8, 0.25)])
+    outlines = {
+        "disc, 3": (Outline.circle(1.0), 3, 0.5),
+        "disc, 4": (Outline.circle(1.0), 4, 0.5),
+        "disc, 8": (Outline.circle(1.0), 8, 0.5),
+        "disc, 16": (Outline.circle(1.0), 16, 0.5),
+        "hexagon, 3": (Outline(corners).at_origin(), 3, 0.5),
+        "ellipse 2:1, 5": (Outline.ellipse(2.0, 1.0), 5, 0.2),
+        "stadium, 6": (Outline([(0, 0), (1, 0), (1, 1), (0, 1)], [0, 1, 0, 1]).at_origin(), 6, 0.2),
+        "L, 5": (l_shape, 5, 0.2),
+        "L, 16": (l_shape, 16, 0.3),
+        "round hole, 4": (holed, 4, 0.2),
+        "strip 10:1, 6": (Outline([(0, 0), (10, 0), (10, 1), (0, 1)]), 6, 0.2),
+    }
+
+    def make(name: str) -> Pad:
+        outline, count, share = outlines[name]
+        first = 0.0 if name.startswith(("disc", "hexagon")) else 0.137 * outline.perimeter()
+        electrodes = equal_electrodes(outline, count, share, first)
+        return lambda tolerance: OutlineNetwork(outline, electrodes, 1000.0, tolerance=tolerance)
+
+    return {name: make(name) for name in outlines}
+
+
+def inner_points(pad: OutlineNetwork, inset: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Random points, at least `inset` of the larger extent from the boundary."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0, pad.a, 20 * count), rng.uniform(0, pad.b, 20 * count)
+    ring = inset * max(pad.a, pad.b) * np.exp(2j * np.pi * np.arange(32) / 32)
+    inside = pad.outline.contains(x[:, None] + ring.real, y[:, None] + ring.imag).all(axis=1)
+    return x[inside][:count], y[inside][:count]
+
+
+def timed(make: Pad, tolerance: float) -> tuple[OutlineNetwork, float]:
+    """Return a pad and the processor time of building it."""
+    start = time.process_time()
+    pad = make(tolerance)
+    return pad, time.process_time() - start
+
+
+def convergence(quick: bool) -> list[Row]:
+    """Errors at each tolerance against the same solved to a smaller one."""
+    rows = []
+    for name, make in shapes().items():
+        if quick and name not in ("disc, 3", "L, 5"):
+            continue
+        reference = make(REFERENCE_TOLERANCE)
+        x, y = inner_points(reference, INSET, POINTS)
+        fractions, jacobian = reference.fractions_with_jacobian(x, y)
+        radius = reference.spreading_radius(x, y)
+        for tolerance in TOLERANCES:
+            pad, seconds = timed(make, tolerance)
+            ours = pad.fractions_with_jacobian(x, y)
+            rows.append(
+                {
+                    "outline, electrodes": name,
+                    "tolerance": tolerance,
+                    "unknowns": pad.unknowns,
+                    "build, CPU s": seconds,
+                    "conductance": float(np.abs(pad.conductance - reference.conductance).max()),
+                    "fractions": float(np.abs(ours[0] - fractions).max()),
+                    "gradients, per larger extent": float(
+                        np.abs(ours[1] - jacobian).max() * max(pad.a, pad.b)
+                    ),
+                    "spreading radius, relative": float(
+                        np.abs(pad.spreading_radius(x, y) / radius - 1).max()
+                    ),
+                }
+            )
+        progress(name)
+    return rows
+
+
+def closed_forms() -> list[Row]:
+    """Errors at the default tolerance against solutions known otherwise."""
+    rows = []
+    for name, make in shapes().items():
+        if not name.startswith(("disc", "hexagon")):
+            continue
+        conductance = make(1e-7).conductance
+        count = len(conductance)
+        expected = np.sort(2 * np.sin(np.pi * np.arange(count) / count))
+        error = np.abs(np.linalg.eigvalsh((conductance + conductance.T) / 2) - expected).max()
+        rows.append(
+            {"pad": name, "known": "eigenvalues 2 sin(pi k / m) of the conductance", "error": float(error)}
+        )
+    for gap in (0.2, 0.05, 0.01):
+        exact, a = ElectrodeNetwork(1.5, 1.0, gap, 1000.0), 1.5
+        ends = [(2 * a + 1 + gap, 2 * a + 2 - gap), (a + gap, a + 1 - gap), (gap, a - gap)]
+        electrodes = [BoundaryElectrode(*pair) for pair in [*ends, (a + 1 + gap, 2 * a + 1 - gap)]]
+        pad = OutlineNetwork(Outline([(0, 0), (a, 0), (a, 1), (0, 1)]), electrodes, 1000.0)
+        x, y = inner_points(pad, INSET, POINTS)
+        (f, j), (f0, j0) = pad.fractions_with_jacobian(x, y), exact.fractions_with_jacobian(x, y)
+        errors = {
+            "conductance": pad.conductance - exact.conductance,
+            "fractions": f - f0,
+            "gradients": j - j0,
+            "spreading radius": pad.spreading_radius(x, y) / exact.spreading_radius(x, y) - 1,
+        }
+        for known, error in errors.items():
+            rows.append(
+                {
+                    "pad": f"rectangle 1.5:1, gaps {100 * gap:g} %",
+                    "known": f"{known} of the theta-function solution",
+                    "error": float(np.abs(error).max()),
+                }
+            )
+    return rows
+
+
+def elements(quick: bool) -> list[Row]:
+    """An L with a square hole against the finite elements of the tests, refined."""
+    spec = importlib.util.spec_from_file_location("fem", ROOT / "tests" / "field" / "test_outline_fem.py")
+    assert spec is not None
+    assert spec.loader is not None
+    fem = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(fem)
+    outline, pad = fem.pad_with_hole()
+    fractions = pad.fractions(*fem.POINTS)
+    rows = []
+    cases = [(2, ElementTriP2(), 8), (3, ElementTriP3(), 16), (4, ElementTriP4(), 20)]
+    for order, element, levels in cases[: 1 if quick else 3]:
+        start = time.process_time()
+        found = fem.solve_elements(outline, fem.ENDS, levels, element)
+        rows.append(
+            {
+                "order of elements": order,
+                "halvings at singular points": levels,
+                "unknowns": int(found.unknowns),
+                "CPU s": time.process_time() - start,
+                "conductance": float(np.abs(found.conductance - pad.conductance).max()),
+                "fractions": float(np.abs(found.fractions - fractions).max()),
+            }
+        )
+        progress(f"elements of order {order}")
+    return rows
+
+
+def information(quick: bool) -> list[Row]:
+    """Cramer-Rao bound of the position against the number of electrodes."""
+    rows = []
+    square = Outline([(0, 0), (1, 0), (1, 1), (0, 1)])
+    for count in (3, 4, 8) if quick else range(3, 17):
+        row: Row = {"electrodes": count}
+        for name, outline in (("disc", Outline.circle(0.5)), ("square", square)):
+            # from the middle of a gap at a corner on: with four, one electrode on each side of the square
+            electrodes = equal_electrodes(
+                outline, count, GAP_SHARE, GAP_SHARE / 2 * outline.perimeter() / count
+            )
+            pad = OutlineNetwork(outline, electrodes, 1000.0)
+            x, y = inner_points(pad, INFORMATION_MARGIN, POINTS)
+            fractions, jacobian = pad.fractions_with_jacobian(x, y)
+            columns = np.moveaxis(np.concatenate([jacobian, fractions[:, None]], axis=1), (0, 1), (-2, -1))
+            covariance = NOISE**2 * np.linalg.inv(np.swapaxes(columns, -1, -2) @ columns)
+            error = 100 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+            bits = -0.5 * np.log2(np.linalg.det(covariance[:, :2, :2]))
+            row |= {
+                f"{name}: median, %": float(np.median(error)),
+                f"{name}: worst, %": float(error.max()),
+                f"{name}: mean information, bits": float(bits.mean()),
+            }
+        rows.append(row)
+    reference = rows[1]
+    for row in rows:
+        for name in ("disc", "square"):
+            key = f"{name}: mean information, bits"
+            row[f"{name}: bits over 4 electrodes"] = row[key] - reference[key]
+    for row in rows:
+        for name in ("disc", "square"):
+            del row[f"{name}: mean information, bits"]
+    progress("information")
+    return rows
+
+
+def draw(path: Path, accuracy: list[Row], bound: list[Row]) -> None:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2))
+    for name in dict.fromkeys(row["outline, electrodes"] for row in accuracy):
+        mine = [row for row in accuracy if row["outline, electrodes"] == name]
+        errors = [max(row["fractions"], 1e-15) for row in mine]
+        left.loglog([row["build, CPU s"] for row in mine], errors, "o-", label=name, markersize=3)
+    left.set(xlabel="time to build, CPU s", ylabel="largest error of a fraction")
+    left.legend(fontsize=7)
+    counts = [row["electrodes"] for row in bound]
+    for name in ("disc", "square"):
+        for kind, style in (("median", "o-"), ("worst", "s--")):
+            values = [row[f"{name}: {kind}, %"] for row in bound]
+            right.plot(counts, values, style, label=f"{name}, {kind}", markersize=3)
+    right.set(xlabel="electrodes", ylabel="Cramer-Rao bound of the position, % of the extent", yscale="log")
+    right.legend(fontsize=8)
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=90)
+
+
+def main() -> None:
+    quick = options(__doc__).parse_args().quick
+    known, accuracy = closed_forms(), convergence(quick)
+    mesh, bound = elements(quick), information(quick)
+    page = [
+        "# Pads of any outline",
+        "",
+        f"{made_by()}.",
+        "",
+        "Times are processor times of a shared machine, to be read as orders of magnitude.",
+        "",
+        "![Error against time to build; bound against electrodes](outlines.png)",
+        "",
+        *table(
+            "Closed forms", "Largest error at the default tolerance, from 1 % of the extent inwards.", known
+        ),
+        *table(
+            "Error against run time",
+            f"Largest difference from the same pad at a tolerance of {REFERENCE_TOLERANCE:g}, {POINTS} points "
+            "from 1 % of the larger extent inwards. The default tolerance is 1e-7.",
+            accuracy,
+        ),
+        *table(
+            "Finite elements",
+            "An L with a square hole and five electrodes, one over the re-entrant corner: largest difference of "
+            "scikit-fem's solution from that of the boundary integral equation.",
+            mesh,
+        ),
+        *table(
+            "Information against electrodes",
+            f"Cramer-Rao bound of the root of var x + var y, % of the extent, noise of {100 * NOISE:g} % of the "
+            f"total on every channel, {100 * INFORMATION_MARGIN:g} % of the extent left out at the boundary; "
+            f"equal electrodes, {100 * GAP_SHARE:g} % of the pitch bare. Bits: mean gain in -log2 of the area "
+            "of the uncertainty over four electrodes.",
+            bound,
+        ),
+    ]
+    folder = output_folder(quick)
+    (folder / "outlines.md").write_text("\n".join(page))
+    data = {"closed_forms": known, "accuracy": accuracy, "elements": mesh, "information": bound}
+    (folder / "outlines.json").write_text(json.dumps(data, indent=1) + "\n")
+    draw(folder / "outlines.png", accuracy, bound)
+
+
+if __name__ == "__main__":
+    main()
