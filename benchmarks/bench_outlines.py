@@ -264,22 +264,22 @@ def main() -> None:
         ),
         *table(
             "Error against run time",
-            f"Largest difference from the same pad at a tolerance of {REFERENCE_TOLERANCE:g}, {POINTS} points "
-            "from 1 % of the larger extent inwards. The default tolerance is 1e-7.",
+            f"Largest difference from the same pad at a tolerance of {REFERENCE_TOLERANCE:g}, {POINTS} "
+            "points from 1 % of the larger extent inwards. The default tolerance is 1e-7.",
             accuracy,
         ),
         *table(
             "Finite elements",
-            "An L with a square hole and five electrodes, one over the re-entrant corner: largest difference of "
-            "scikit-fem's solution from that of the boundary integral equation.",
+            "An L with a square hole and five electrodes, one over the re-entrant corner: largest difference "
+            "of scikit-fem's solution from that of the boundary integral equation.",
             mesh,
         ),
         *table(
             "Information against electrodes",
-            f"Cramer-Rao bound of the root of var x + var y, % of the extent, noise of {100 * NOISE:g} % of the "
-            f"total on every channel, {100 * INFORMATION_MARGIN:g} % of the extent left out at the boundary; "
-            f"equal electrodes, {100 * GAP_SHARE:g} % of the pitch bare. Bits: mean gain in -log2 of the area "
-            "of the uncertainty over four electrodes.",
+            f"Cramer-Rao bound of the root of var x + var y, % of the extent, noise of {100 * NOISE:g} % of "
+            f"the total on every channel, {100 * INFORMATION_MARGIN:g} % of the extent left out at the "
+            f"boundary; equal electrodes, {100 * GAP_SHARE:g} % of the pitch bare. Bits: mean gain in -log2 of the "
+            "area of the uncertainty over four electrodes.",
             bound,
         ),
     ]
