@@ -278,8 +278,8 @@ def main() -> None:
             "Information against electrodes",
             f"Cramer-Rao bound of the root of var x + var y, % of the extent, noise of {100 * NOISE:g} % of "
             f"the total on every channel, {100 * INFORMATION_MARGIN:g} % of the extent left out at the "
-            f"boundary; equal electrodes, {100 * GAP_SHARE:g} % of the pitch bare. Bits: mean gain in -log2 of the "
-            "area of the uncertainty over four electrodes.",
+            f"boundary; equal electrodes, {100 * GAP_SHARE:g} % of the pitch bare. Bits: mean gain in -log2 "
+            "of the area of the uncertainty over four electrodes.",
             bound,
         ),
     ]
