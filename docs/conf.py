@@ -8,12 +8,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+
 from handtouch import __version__
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 sys.path.insert(0, str(Path(__file__).parent))
 from key_figures import draw_all
 from page import outdated
+
+MAX_NUMBER_CHARACTERS = 24
+"""of a cell such as "93.8 (92.8-94.8)" or "12 of 300, 4 %"."""
 
 project = "handtouch"
 author = "the handtouch authors"
@@ -60,8 +65,17 @@ def mark_outdated(app: Any, page: str, source: list[str]) -> None:  # noqa: ARG0
         source[0] = f"{title}\n\n:::{{note}}\nOlder than the code: {reason}\n:::\n{rest}"
 
 
+def mark_numbers(app: Any, doctree: nodes.document) -> None:  # noqa: ARG001
+    """Give short cells that begin with a number the class `number`, which keeps them on one line."""
+    for cell in doctree.findall(nodes.entry):
+        text = cell.astext().strip()
+        if len(text) <= MAX_NUMBER_CHARACTERS and re.match(r"[<>~+\-\u2212]?\s?\d", text):
+            cell["classes"].append("number")
+
+
 def setup(app: Any) -> None:
     """Sphinx calls it."""
     app.connect("builder-inited", lambda app: draw_all(Path(app.srcdir) / "_figures"))
     app.connect("source-read", mark_outdated)
+    app.connect("doctree-read", mark_numbers)
     app.connect("autodoc-process-docstring", as_text)
