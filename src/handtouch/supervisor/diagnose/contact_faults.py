@@ -60,6 +60,8 @@ _TOLERANCE_WIDENING = 1.2
 _MIN_UNEXPLAINED_SHARE, _MAX_EXPLAINED_SHARE = 0.65, 0.35
 """Share of contacts that are no points, at which they are unexplained, and at which that ends."""
 _SIMILAR_KINDS = {FaultKind.GAIN_STEP, FaultKind.TORN_CORNER}
+_MIN_CONTACTS_SIMILAR = 12
+"""Contacts of a fault of free size: fewer fit one of the sizes now and then."""
 _KINDS_WITH_ALTERNATIVES = (*_SIMILAR_KINDS, FaultKind.SWAPPED_CABLES)
 """Kinds that are diagnosed while it is open which electrodes are concerned."""
 
@@ -184,7 +186,9 @@ class ContactFaultDetector:
         hypotheses = [self._tables.hypotheses[index] for index in suspects]
         best = int(margins.argmax())
         found = hypotheses[best]
-        if margins[best] < MIN_EVIDENCE_NATS:
+        if margins[best] < MIN_EVIDENCE_NATS or (
+            found.kind in _SIMILAR_KINDS and count < _MIN_CONTACTS_SIMILAR
+        ):
             return None
         same = np.array([h.kind == found.kind for h in hypotheses])
         near = margins > margins[best] - MIN_SEPARATION_NATS
