@@ -169,7 +169,8 @@ def run(name: str, units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                     trust[word.pad] = word.calibration_state
                 elif isinstance(word, CalibrationUpdate):
                     model.set_gains_and_law(word.pad, word.gains, word.calibration_id)
-                    deviation[word.pad] = np.sqrt(np.diag(np.reshape(word.covariance, (4, 4))).max())
+                    covariance = np.reshape(word.covariance or (0.0,) * 16, (4, 4))
+                    deviation[word.pad] = np.sqrt(np.diag(covariance).max())
             if number in counts:
                 taken[number] = errors_mm(model, readings, places), list(trust), deviation.copy()
             if number < max(counts):

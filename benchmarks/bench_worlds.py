@@ -30,8 +30,9 @@ from scores import Estimates, EstimateScore, concatenate, draw_calibration, slic
 from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel, networks_of
-from handtouch.hand import networks_with_other_parts
+from handtouch.hand import models_with_other_parts, part_stds
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import (
@@ -84,7 +85,8 @@ def learnt_gains(hand: VirtualHand, deployment: Deployment, model: PadModel, num
     times_s = (REST_S + np.array(numbers)[:, None] * STEP_S + held).ravel()
     for row, (network, (_, pad)) in enumerate(zip(networks_of(deployment), deployment.pads, strict=True)):
         node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
-        calibrator = AutoCalibrator(network, networks_with_other_parts(pad, node, sheet))
+        others = models_with_other_parts(network, pad, node, sheet)
+        calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet))
         calibrator.assign_node(row + 1, None, None, "", 0)
         readings = hand.counts(row, times_s).reshape(len(numbers), LEARNT_SAMPLES, 4).mean(axis=1)
         noise_a = model.noise_a[row] / np.sqrt(LEARNT_SAMPLES)
@@ -95,11 +97,13 @@ def learnt_gains(hand: VirtualHand, deployment: Deployment, model: PadModel, num
             )
             update = calibrator.add_contact(contact)
             if update.apply:
-                gains = calibrator.gains
-                learnt = gains.factors, gains.covariance
+                learnt = calibrator.gains
         if calibrator.calibration_state == "calibrated":
-            model.set_gains_and_law(row, learnt[0], f"{row + 1}-1")
-            model.set_uncertainty(row, learnt[1], False)
+            covariance = tuple(np.ravel(learnt.covariance).tolist())
+            calibration = ActiveCalibration(
+                f"{row + 1}-1", learnt.factors, gain_covariance=covariance, parts=learnt.parts
+            )
+            model.set_calibration(row, calibration)
 
 
 def play(task: tuple[str, int, int, int]) -> dict[str, Estimates]:

@@ -7,11 +7,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from handtouch.calibration.calibration import LearnedParts, matrix
 from handtouch.config import Deployment, parse
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import electrode_network
+from handtouch.hand import electrode_network, part_stds
 from tests.core.conftest import DEPLOYMENT, TOLERANT_DEPLOYMENT
 
 FloatArray = NDArray[np.float64]
@@ -75,13 +77,48 @@ def test_tables_of_tolerances_agree_with_networks_of_other_parts(
         tabulated = values[..., number] * table.end_vectors[number][:, None, None]
         assert np.quantile(np.abs(tabulated - exact) / np.abs(exact).max(), 0.98) < 1e-3
     exact = change(*(other_network(deployment, row, 0.0, step) for step in (1e-3, -1e-3))) / 2e-3
-    assert np.abs(np.moveaxis(values[..., 8:], -1, 0) - exact).max() < 1e-4 * np.abs(exact).max()
+    assert np.abs(np.moveaxis(values[..., 8:12], -1, 0) - exact).max() < 1e-4 * np.abs(exact).max()
     if row == RESISTED:
         fractions = model.networks[row].fractions(x * model.networks[row].a, y * model.networks[row].b)
         for number, one in enumerate(np.eye(4)):
             exact = change(*(other_network(deployment, row, log_series=step * one) for step in (1e-3, -1e-3)))
             tabulated = table.series_vectors[number][:, None, None] * fractions[number]
             assert np.abs(tabulated - exact / 2e-3).max() < 1e-4 * np.abs(exact / 2e-3).max()
+
+
+def test_learned_parts_replace_the_stated_tolerances(deployment: Deployment) -> None:
+    """With gaps and aspect known as they are, positions are right; the touch error widens regions."""
+    rng, learned = np.random.default_rng(8), PadModel(deployment)
+    _, pad = deployment.pads[0]
+    stds = part_stds(pad, deployment.nodes[pad.node], deployment.sheets[pad.sheet])
+    offsets = np.zeros(len(stds))
+    offsets[:8], offsets[8] = 0.5 * rng.normal(0, 1, 8), 1.5
+    gaps_m, aspect = 1e-3 * stds[0] * offsets[:8].reshape(4, 2), stds[8] * offsets[8]
+    true = [other_network(deployment, 0, gaps_m, aspect), *learned.networks[1:]]
+    at = np.full((3, 2), [0.25, 0.4])
+    x, y = (at * sides(learned.networks)).T
+    exact = learned.placement.to_link_frame(np.arange(3), x, y, np.zeros((3, 2, 2))).position_m[0]
+    stated_error = np.linalg.norm(solve(learned, at, true)[1][0] - exact)
+    variance, covariance = {}, matrix(1e-12 * np.eye(4 + len(stds)))
+    for touch_error in (0.0, 3e-3):
+        known = LearnedParts(stds, tuple(offsets.tolist()), covariance, touch_error)
+        learned.set_calibration(0, ActiveCalibration("1-1", gain_covariance=(0.0,) * 16, parts=known))
+        covariances, positions, _ = solve(learned, at, true)
+        variance[touch_error] = np.trace(covariances[0])
+        assert np.linalg.norm(positions[0] - exact) < 0.2 * stated_error
+    assert variance[3e-3] > 9 * variance[0.0]
+
+
+def test_deployments_state_uneven_sheets_and_elongated_contacts(
+    deployment: Deployment, model: PadModel
+) -> None:
+    """Both widen the region of a contact beside the middle of a pad."""
+    at = np.full((3, 2), [0.35, 0.6])
+    without = np.trace(solve(model, at)[0], axis1=1, axis2=2)
+    for update in ({"unevenness_std": 0.05}, {"contact_elongation_std": 1.0}):
+        sheets = {"s": deployment.sheets["s"].model_copy(update=update)}
+        wider = PadModel(deployment.model_copy(update={"sheets": sheets}))
+        assert (np.trace(solve(wider, at)[0], axis1=1, axis2=2) > 1.1 * without).all(), update
 
 
 def test_regions_hold_for_parts_within_their_tolerances(deployment: Deployment, model: PadModel) -> None:

@@ -94,7 +94,7 @@ def test_contacts_calibrate_a_replaced_node(bench: Bench, swapped: Swapped) -> N
         assert assessment(messages, pad).diagnoses == ()
         last = calibrations(messages, pad)[-1]
         off = np.log(last.gains) - np.log(bench.gains[pad])
-        deviation = np.sqrt(np.diag(np.reshape(last.covariance, (4, 4))))
+        deviation = np.sqrt(np.diag(np.reshape(last.covariance or (), (4, 4))))
         assert np.abs(off).max() < 0.01
         assert (np.abs(off) < 4 * deviation).all()
     with Store(path) as store:
@@ -239,7 +239,7 @@ def test_measured_law_ends_quarantine_of_a_pad_without_observable_gains(bench: B
     (applied,) = calibrations(messages, 2)
     assert applied.law is not None
     assert applied.law.alpha == 1.4
-    assert np.diag(np.reshape(applied.covariance, (4, 4))) == pytest.approx([0.05**2 * 0.75] * 4)
+    assert np.diag(np.reshape(applied.covariance or (), (4, 4))) == pytest.approx([0.05**2 * 0.75] * 4)
     assert assessment(messages, 2).calibration_state == "calibrated"
 
 
@@ -253,6 +253,7 @@ def test_calibration_taken_over_from_another_node_is_applied_and_reported(
     worker = make_worker(bench, tmp_path / "c.db")
     messages = worker.process_message(bench.introduce([11, 12, 13], [1, None, None]), NOW)
     (applied,) = calibrations(messages, 0)
+    assert applied.covariance is not None
     assert applied.covariance[0] > 0.04**2 * 0.75
     (diagnosis,) = assessment(messages, 0).diagnoses
     assert assessment(messages, 0).calibration_state == "default"

@@ -19,6 +19,7 @@ from handtouch.calibration.calibration import (
     MAX_GAIN,
     MIN_GAIN,
     Gains,
+    LearnedParts,
     channel_values,
     matrix,
 )
@@ -29,7 +30,7 @@ from handtouch.calibration.gains import (
     GainStatus,
 )
 from handtouch.calibration.stationary_contacts import StationaryContact
-from handtouch.field.model import ForwardModel
+from handtouch.field.model import ForwardModel, FractionModel
 from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
 
@@ -43,6 +44,8 @@ _MIN_CONTACTS_TO_STORE_AGAIN = 4 * BATCH_CONTACTS
 _MAX_CALIBRATED_LOG_GAIN_STD = 0.02
 """Standard deviation of the least certain log gain of a calibrated node. In this direction gains hardly
 change a position: by 0.3 to 0.5 % of the pad's length, rms, from 1:1 to 2:1."""
+_MODEL_ERROR, _MODEL_ERROR_WITHOUT_PARTS = 1e-4, 5e-4
+"""Standard deviation of the fractions by what neither gains nor parts with tolerances explain."""
 _MANUAL_REMEDY = "measure them with `handtouch calibrate`"
 
 
@@ -68,7 +71,7 @@ class GainUpdate:
 
 
 def new_gain_estimator(
-    model: ForwardModel, attempt: int = 0, own: Gains | None = None, parts: Sequence[ForwardModel] = ()
+    model: ForwardModel, attempt: int = 0, own: Gains | None = None, parts: Sequence[FractionModel] = ()
 ) -> GainEstimator:
     """Return the estimator of a pad's gains, about gains of its `own` or the deployment's.
 
@@ -78,9 +81,12 @@ def new_gain_estimator(
     return GainEstimator(
         model,
         tolerance=_INITIAL_LOG_GAIN_STDS[attempt],
+        model_error=_MODEL_ERROR if parts else _MODEL_ERROR_WITHOUT_PARTS,
         required_std=_MAX_CALIBRATED_LOG_GAIN_STD,
         start=own.factors if own else None,
         covariance=own.covariance if own else None,
+        part_offsets=own.parts.offsets if own and own.parts else None,
+        joint_covariance=own.parts.covariance if own and own.parts else None,
         parts=parts,
     )
 
@@ -88,11 +94,14 @@ def new_gain_estimator(
 class AutoCalibrator:
     """Calibration state and gain estimate of the node at one pad.
 
-    model: the pad's. parts: models in each of which one of its parts differs by one standard deviation.
+    model: the pad's. parts: models in each of which one of its parts differs by one standard deviation, and
+    these, part_stds.
     """
 
-    def __init__(self, model: ForwardModel, parts: Sequence[ForwardModel] = ()) -> None:
-        self._model, self._parts = model, parts
+    def __init__(
+        self, model: ForwardModel, parts: Sequence[FractionModel] = (), part_stds: Sequence[float] = ()
+    ) -> None:
+        self._model, self._parts, self.part_stds = model, parts, tuple(part_stds)
         self.serial: int | None = None
         self.calibration_state = CalibrationState.DEFAULT
         self.can_learn = False
@@ -176,8 +185,13 @@ class AutoCalibrator:
 
     @property
     def gains(self) -> Gains:
-        """Return the gains estimated by contacts and stored values."""
-        return Gains(channel_values(self._mean_gain * self.estimate.gains), matrix(self.estimate.covariance))
+        """Return the gains estimated by contacts and stored values, with the pad's parts."""
+        found, parts = self.estimate, None
+        if self.part_stds:
+            offsets = tuple(found.part_offsets.tolist())
+            parts = LearnedParts(self.part_stds, offsets, matrix(found.joint_covariance), found.touch_error)
+        factors = channel_values(self._mean_gain * found.gains)
+        return Gains(factors, matrix(found.covariance), parts)
 
     @property
     def progress(self) -> str:

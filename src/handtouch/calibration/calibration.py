@@ -1,6 +1,7 @@
 """Calibration of one node beyond the deployment file, and its provenance; to JSON and back.
 
-Public: `Calibration` of `Gains`, `Offsets`, `LawParameters` and `StoredSheetState`; `Provenance`;
+Public: `Calibration` of `Gains` (with `LearnedParts`), `Offsets`, `LawParameters` and `StoredSheetState`;
+`Provenance`;
 `CalibrationVersion`, one entry of the store; `check_match`, which binds a version to a node, `MismatchError`;
 `differences`; `aged_gains`; `channel_values` and `matrix`, which convert arrays.
 """
@@ -42,7 +43,7 @@ class MismatchError(ValueError):
 
 def _check_covariance(values: Matrix) -> Matrix:
     size = len(values)
-    if size not in (3, 4) or any(len(row) != size for row in values):
+    if size < 3 or any(len(row) != size for row in values):
         raise ValueError(f"must be a square matrix, has rows of {[len(row) for row in values]}")
     array = np.array(values)
     scale = float(np.abs(array).max())
@@ -58,11 +59,38 @@ Covariance4 = Annotated[Matrix, Field(min_length=4, max_length=4), AfterValidato
 
 
 @dataclass(frozen=True, config=_RECORD)
+class LearnedParts:
+    """Parts of a pad that were learned with its gains: gaps, sides, waves of the sheet, resistors.
+
+    stated_stds: (p,) of the deployment that they were learned under, as `part_stds` of `hand`; 0 for parts
+    that don't matter. offsets: (p,) in these. covariance: (4 + p, 4 + p) of log gains, then of the offsets.
+    touch_error: standard deviation of the fractions of a touch, another one each time.
+    """
+
+    stated_stds: tuple[float, ...]
+    offsets: tuple[float, ...]
+    covariance: Annotated[Matrix, AfterValidator(_check_covariance)]
+    touch_error: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        count = len(self.offsets)
+        if len(self.stated_stds) != count or len(self.covariance) != 4 + count:
+            raise ValueError(
+                f"offsets: has {count} parts, stated_stds {len(self.stated_stds)}, covariance "
+                f"{len(self.covariance)} rows: must be as many, and 4 more"
+            )
+
+
+@dataclass(frozen=True, config=_RECORD)
 class Gains:
-    """Factors that correct the currents of channels x0, xa, y0, yb; covariance (4, 4) of their logarithms."""
+    """Factors that correct the currents of channels x0, xa, y0, yb; covariance (4, 4) of their logarithms.
+
+    parts: of the pad, where they were learned with the gains.
+    """
 
     factors: tuple[Positive, Positive, Positive, Positive]
     covariance: Covariance4
+    parts: LearnedParts | None = None
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -225,8 +253,14 @@ def age_s(version: CalibrationVersion, now: datetime) -> float:
     return max(0.0, (now - written).total_seconds())
 
 
-def aged_gains(version: CalibrationVersion, now: datetime) -> Gains | None:
-    """Return the gains of a version, with the uncertainty of drift since, and of another node's gains."""
+def aged_gains(
+    version: CalibrationVersion, now: datetime, stated_stds: tuple[float, ...] | None = None
+) -> Gains | None:
+    """Return the gains of a version, with the uncertainty of drift since, and of another node's gains.
+
+    With the parts of its pad, unless they are another node's or were learned under other tolerances than
+    `stated_stds`.
+    """
     gains = version.calibration.gains
     if gains is None:
         return None
@@ -234,11 +268,14 @@ def aged_gains(version: CalibrationVersion, now: datetime) -> Gains | None:
     if version.provenance.foreign:
         drift += _NODE_TO_NODE_LOG_GAIN_STD**2
     # a random walk of four gains that leaves their product unchanged
-    covariance = tuple(
-        tuple(value + drift * ((i == j) - 0.25) for j, value in enumerate(row))
-        for i, row in enumerate(gains.covariance)
-    )
-    return Gains(gains.factors, covariance)
+    walk, covariance, parts = drift * (np.eye(4) - 0.25), np.array(gains.covariance), None
+    if gains.parts is not None and not version.provenance.foreign and gains.parts.stated_stds == stated_stds:
+        joint = np.array(gains.parts.covariance)
+        joint[:4, :4] += walk
+        parts = LearnedParts(
+            gains.parts.stated_stds, gains.parts.offsets, matrix(joint), gains.parts.touch_error
+        )
+    return Gains(gains.factors, matrix(covariance + walk), parts)
 
 
 def channel_values(values: ArrayLike) -> ChannelValues:

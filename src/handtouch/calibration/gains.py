@@ -20,6 +20,7 @@ mixture of two normal distributions of the score, whose shares are estimated too
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -29,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch.field.estimate import estimate
-from handtouch.field.model import FloatArray, ForwardModel, channel_noise
+from handtouch.field.model import FloatArray, ForwardModel, FractionModel, channel_noise
 
 BATCH_CONTACTS = 32
 MAX_SHAPE_DEVIATION = 20.0
@@ -46,6 +47,7 @@ _CELLS_PER_SIDE = 10  # a side
 _MEMORY_CONTACTS = 128.0  # contacts over which the share of points is estimated
 _MIN_OUTLIER_VARIANCE = 25.0  # variance of the scores of contacts that are no points, at least
 _MIN_INFORMATION_FRACTION = 0.2  # of a batch's information, however unlikely its contacts
+_MEDIAN_SQUARED_SCORE = 0.4549  # of a standard normal number
 _DAY_NS = 86_400e9
 
 # orthonormal directions of four log gains that sum to zero
@@ -67,6 +69,10 @@ class GainEstimate:
 
     gains: (4,), factors that correct the currents; their product is 1, a common factor is not observable.
     covariance: (4, 4), of the logarithms of the gains; singular, as they sum to zero. Widened by the misfit.
+    touch_error: standard deviation of the fractions of a touch, another one each time, that explains the
+        scores beyond noise; patches that aren't round have one.
+    part_offsets: (p,) of the other parts, in their standard deviations as stated.
+    joint_covariance: (4 + p, 4 + p) of the logarithms of the gains and of these.
     contacts: number used. effective_contacts: number that counts, once those at one position and those that
         are no points are discounted. point_fraction: share of them that are points.
     misfit: root mean square score of recent points, near 1 where model and noise are right.
@@ -75,6 +81,9 @@ class GainEstimate:
 
     gains: FloatArray
     covariance: FloatArray
+    part_offsets: FloatArray
+    joint_covariance: FloatArray
+    touch_error: float
     contacts: int
     effective_contacts: float
     point_fraction: float
@@ -98,8 +107,10 @@ class GainEstimator:
         the pad, so a cell never adds more information than this allows, however often it is touched.
     required_std: of the least certain log gain, at which the gains count as estimated; for other parts as
         stated, as no number of contacts separates them from gains.
-    start: initial gains (4,), their covariance (4, 4) of logarithms as `covariance`, both as stored.
-    parts: models in each of which one part, such as a gap, differs by one standard deviation.
+    start: initial gains (4,), their covariance (4, 4) of logarithms as `covariance`, both as stored; with the
+        `part_offsets` (p,) and the `joint_covariance` (4 + p, 4 + p), if these were stored.
+    parts: models in each of which one part, such as a gap, differs by one standard deviation; `model` itself
+        for those without a tolerance.
 
     Raises ValueError for a model with other channels, or a parameter out of range.
     """
@@ -114,7 +125,9 @@ class GainEstimator:
         required_std: float = 5e-3,
         start: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
-        parts: Sequence[ForwardModel] = (),
+        part_offsets: ArrayLike | None = None,
+        joint_covariance: ArrayLike | None = None,
+        parts: Sequence[FractionModel] = (),
     ) -> None:
         for name, value, least in (
             ("tolerance", tolerance, 1e-9),
@@ -130,7 +143,13 @@ class GainEstimator:
         self._log_gains = np.zeros(4) if start is None else _normalised_logs(start)
         self._parts, self._part_offsets = tuple(parts), np.zeros(len(parts))
         self._information: FloatArray = np.diag([tolerance**-2] * 3 + [1.0] * len(parts))
-        if covariance is not None:
+        self._basis = np.eye(4 + len(parts))[:, 1:]
+        self._basis[:4, :3] = _BASIS
+        if joint_covariance is not None and part_offsets is not None:
+            self._part_offsets = np.array(part_offsets, dtype=np.float64)
+            known = self._basis.T @ np.asarray(joint_covariance, dtype=np.float64) @ self._basis
+            self._information = _inverse(known + 1e-18 * np.eye(len(known)))
+        elif covariance is not None:
             known = _BASIS.T @ np.asarray(covariance, dtype=np.float64) @ _BASIS
             self._information[:3, :3] = _inverse(known + 1e-18 * np.eye(3))
         # the positions behind given gains are unknown: each cell starts with half of the information it can
@@ -139,6 +158,7 @@ class GainEstimator:
         self._cell_information = np.full((_CELLS_PER_SIDE, _CELLS_PER_SIDE), already)
         self._mixture = _OutlierMixture()
         self._pending: list[FloatArray] = []
+        self._touch_variance = 0.0
         self._contacts, self._effective_contacts = 0, 0.0
         self._misfit_sums = np.array([1.0, 0.0])  # weighted sum of squares, and of weights
         self._last_ns: int | None = None
@@ -179,12 +199,16 @@ class GainEstimator:
         misfit = float(np.sqrt(squares / counted)) if counted > 0 else float("nan")
         # scores wider than by noise: model errors of the points widen the covariance of the gains too
         widening = max(1.0, np.nan_to_num(misfit) ** 2)
-        covariance = _BASIS @ _inverse(self._information)[:3, :3] @ _BASIS.T * widening
+        joint = self._basis @ _inverse(self._information) @ self._basis.T
+        joint *= widening
         with_parts_as_stated = _BASIS @ _inverse(self._information[:3, :3]) @ _BASIS.T * widening
         status, reason = self._assess(float(np.sqrt(np.diag(with_parts_as_stated).max())))
         return GainEstimate(
             np.exp(self._log_gains),
-            covariance,
+            joint[:4, :4],
+            self._part_offsets.copy(),
+            joint,
+            math.sqrt(self._touch_variance),
             self._contacts,
             self._effective_contacts,
             1 - self._mixture.outlier_fraction,
@@ -242,6 +266,7 @@ class GainEstimator:
     def _process_batch(self, currents: FloatArray, sigma: FloatArray) -> None:
         """Process a batch (4, n): iterate around the former gains, then keep its information."""
         known, known_parts, positions = self._log_gains, self._part_offsets, None
+        known_variance, contacts = self._touch_variance, min(self._contacts, _MEMORY_CONTACTS)
         for _ in range(_MAX_BATCH_ITERATIONS):
             gains = np.exp(self._log_gains)[:, None]
             view = _ContactLinearisation.linearise(
@@ -249,13 +274,18 @@ class GainEstimator:
             )
             positions = view.positions
             share, cells = self._information_shares(view)
-            spread = np.sqrt(1 + (self._model_error * view.score_sensitivity) ** 2)
+            error2 = self._model_error**2 + self._touch_variance
+            spread = np.sqrt(1 + error2 * view.score_sensitivity**2)
             mixture = replace(self._mixture)
             prior = np.concatenate([_BASIS.T @ (known - self._log_gains), known_parts])
             found = mixture.solve(view, share, spread, self._information, prior)
             information = self._information + (view.score_slope * found.precision) @ view.score_slope.T
             # the step of the gains is from the present ones; scores are linear in the parts' offsets
             self._log_gains = self._log_gains + _BASIS @ found.step[:3]
+            touch_variance = _touch_variance(found.squared_scores * spread**2, view.score_sensitivity)
+            self._touch_variance = (contacts * known_variance + len(share) * touch_variance) / (
+                contacts + len(share)
+            )
             step = np.concatenate([found.step[:3], found.step[3:] - self._part_offsets])
             self._part_offsets = found.step[3:]
             if step @ information @ step < _CONVERGED_STEP_SIGMA**2:
@@ -273,7 +303,8 @@ class GainEstimator:
         """Return the share of each contact's information (n,) given earlier ones nearby, and the updated
         cells.
 
-        Independent information i of a cell and a common error m give 1 / (1 / i + m^2) together.
+        Independent information i of a cell and a common error m give 1 / (1 / i + m^2) together. Errors of
+        each touch reduce its own.
         """
         cells, error = self._cell_information.copy(), self._model_error**2
         at = (
@@ -281,12 +312,24 @@ class GainEstimator:
             .clip(0, _CELLS_PER_SIDE - 1)
             .astype(int)
         )
+        own = view.score_sensitivity**2
+        kept = 1 / (1 + self._touch_variance * own)
         share = np.zeros(at.shape[1])
         for k, (i, j) in enumerate(at.T):
-            before, own = cells[i, j], view.score_sensitivity[k] ** 2
-            cells[i, j] += own
-            share[k] = 1 / ((1 + before * error) * (1 + cells[i, j] * error))
+            before = cells[i, j]
+            cells[i, j] += kept[k] * own[k]
+            share[k] = kept[k] / ((1 + before * error) * (1 + cells[i, j] * error))
         return share, cells
+
+
+def _touch_variance(squared_scores: FloatArray, sensitivity: FloatArray) -> float:
+    """Return the variance of the fractions that explains the scores (n,) beyond noise.
+
+    From the median of the more sensitive half, which a minority that are no points doesn't change.
+    """
+    sensitive = sensitivity >= np.median(sensitivity)
+    excess = squared_scores[sensitive] / _MEDIAN_SQUARED_SCORE - 1
+    return max(0.0, float(np.median(excess / sensitivity[sensitive] ** 2)))
 
 
 def gain_deviation(model: ForwardModel, contacts: int = 400) -> float:
@@ -400,7 +443,7 @@ class _ContactLinearisation:
     def linearise(
         cls,
         model: ForwardModel,
-        parts: Sequence[ForwardModel],
+        parts: Sequence[FractionModel],
         currents: FloatArray,
         sigma: FloatArray,
         start: FloatArray | None,
@@ -412,8 +455,11 @@ class _ContactLinearisation:
         total = np.where(known, found.total, 1.0)
         null, slope = _score_slopes(model, x, y, sigma, total)
         if parts:
-            changes = [part.fractions(x * (part.a / model.a), y * (part.b / model.b)) for part in parts]
-            by_part = np.stack(changes) - model.fractions(x, y)
+            nominal = model.fractions(x, y)
+            by_part = np.zeros((len(parts), *nominal.shape))
+            for change, part in zip(by_part, parts, strict=True):
+                if part is not model:
+                    change += part.fractions(x * (part.a / model.a), y * (part.b / model.b)) - nominal
             slope = np.concatenate([slope, -np.einsum("nc,pcn->pn", null, by_part * total / sigma)])
         score = np.einsum("nc,cn->n", null, currents / sigma)
         sharpness = total * np.linalg.norm(null.T / sigma, axis=0)

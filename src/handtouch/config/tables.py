@@ -250,6 +250,11 @@ class Sheet(Table):
     alpha: float = Field(gt=0, le=5, description="exponent of pressure in the contact law")
     contact_radius_mm: Positive = Field(description="radius assumed for a contact")
     contact_radius_std_mm: NonNegative = Field(description="error of that radius (1 sigma)")
+    contact_elongation_std: Annotated[float, Field(ge=0, le=2)] = Field(
+        0.0,
+        description="logarithm of a contact's length over its width, in any direction (1 sigma); default: "
+        "round",
+    )
     ohm_per_square_std: Annotated[float, Field(ge=0, le=1)] = Field(
         0.1, description="relative error of ohm_per_square (1 sigma); default: that of printed carbon"
     )
@@ -263,6 +268,11 @@ class Sheet(Table):
     gap_std_mm: NonNegative = Field(
         0.12,
         description="error of a pad's gap_mm, each end of an electrode (1 sigma); default: that of +-0.2",
+    )
+    unevenness_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.0,
+        description="relative amplitude of each of the five longest waves of the sheet resistance over a pad "
+        "(1 sigma); a film of +-10 % has about 0.04",
     )
     size_std_mm: NonNegative = Field(
         0.06, description="error of a pad's length and width (1 sigma); default: that of +-0.1"

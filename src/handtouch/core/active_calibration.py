@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from handtouch.calibration.calibration import LawParameters
+from handtouch.calibration.calibration import LawParameters, LearnedParts
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,14 +15,16 @@ class ActiveCalibration:
     """Calibration of a pad, and what is known about its quality.
 
     gains: of the electrodes x0, xa, y0, yb. law: None, the deployment's. gain_covariance: (16,) of log gains;
-    None, as the deployment states. quarantined: no force is published. diagnoses: names of those responsible
-    for `quarantined` or `position_unreliable`.
+    None, as the deployment states. parts: learned with the gains; None, as the deployment states.
+    quarantined: no force is published. diagnoses: names of those responsible for `quarantined` or
+    `position_unreliable`.
     """
 
     calibration_id: str
     gains: tuple[float, ...] = (1.0,) * 4
     law: LawParameters | None = None
     gain_covariance: tuple[float, ...] | None = None
+    parts: LearnedParts | None = None
     quarantined: bool = False
     position_unreliable: bool = False
     diagnoses: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from handtouch.core.pad_tables import SEARCH_POINTS, stack_table, view_bytes, vi
 from handtouch.core.stages.locate import Fit
 from handtouch.core.stages.place import Placement
 from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, ContactSolver
-from handtouch.core.stages.tolerances import Whitening
+from handtouch.core.stages.tolerances import PartKnowledge, Whitening, part_count
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def make_solver(
     """
     n = currents.shape[1]
     raw, beside, gain = _work(3 * (n + 1)), _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
-    whitening = Whitening(_work(n * n), _work(3 * n), _work(n), n)
+    whitening = Whitening(_work(n * n), _work(n), _work(10 * n), _work(part_count(n) * n), _work(n), n)
     fit = Fit(
         _work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, beside, _work(n), gain, whitening
     )
@@ -49,6 +49,9 @@ def make_solver(
         _work(3 * n),
         view_floats(currents),
         view_floats(model.weight),
+        PartKnowledge(
+            view_floats(model.part_axes), view_floats(model.part_offsets), view_floats(model.touch_errors)
+        ),
         view_floats(model.gain_covariance),
         view_floats(offset_std_a),
         view_bytes(force_requested),

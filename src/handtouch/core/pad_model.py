@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
-from handtouch.calibration.calibration import Calibration, LawParameters, matrix
+from handtouch.calibration.calibration import Calibration, LawParameters, LearnedParts, matrix
 from handtouch.config import Deployment
 from handtouch.config.channels import (
     ELECTRODES,
@@ -25,7 +25,7 @@ from handtouch.core.pad_tables import ForwardTable, SurfacePatches, view_floats
 from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
-from handtouch.core.stages.tolerances import PadTolerances
+from handtouch.core.stages.tolerances import PadTolerances, part_count
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
 from handtouch.field.network import ElectrodeNetwork
@@ -40,7 +40,12 @@ FloatArray = NDArray[np.float64]
 _NODE_TOLERANCES = {"gain_std", "series_std"}
 _SHEET_TOLERANCES = {
     *("ohm_per_square_std", "contact_ohm_std", "alpha_std", "anisotropy_std", "gap_std_mm", "size_std_mm"),
+    *("unevenness_std", "contact_elongation_std"),
 }
+
+
+PART_COUNT = part_count(4)
+_LOCAL_UNEVENNESS = 1.5  # standard deviation of ln of the local sheet resistance, per wave's: a sum of five
 
 
 class PadModel:
@@ -51,7 +56,8 @@ class PadModel:
     y0, yb includes `gains` (n, 4); `noise_counts` (n,) and `noise_a` (n, 4) are standard deviations of a
     channel. The counts of untouched pads are state of the tick: see `Baseline`.
 
-    `gain_covariance` (n, 4, 4) is that of log gains; `quarantined` (n,): no force is published;
+    `gain_covariance` (n, 4, 4) is that of log gains; `part_axes` (n, 4 + p, 4 + p), `part_offsets` (n, p) and
+    `touch_errors` (n,): see `PartKnowledge`; `quarantined` (n,): no force is published;
     `position_unreliable` (n,).
 
     A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
@@ -96,6 +102,11 @@ class PadModel:
         self.gains = np.ones((self.size, 4))
         self._stated_gain_covariance = np.stack([node.gain_std**2 * np.eye(4) for node in nodes])
         self.gain_covariance = self._stated_gain_covariance.copy()
+        self.touch_errors = np.zeros(self.size)
+        self.part_offsets = np.zeros((self.size, PART_COUNT))
+        self.part_axes = np.zeros((self.size, 4 + PART_COUNT, 4 + PART_COUNT))
+        for pad in range(self.size):
+            self._set_parts(pad, None)
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
         self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
         self.begin_threshold_n = np.array([touch.begin_threshold_n for touch in touches])
@@ -162,6 +173,7 @@ class PadModel:
         self.mean_ampere_per_count[pad] = self.ampere_per_count[pad].mean()
         stated, covariance = self._stated_gain_covariance[pad], calibration.gain_covariance
         self.gain_covariance[pad] = stated if covariance is None else np.reshape(covariance, (4, 4))
+        self._set_parts(pad, calibration.parts)
         self.quarantined[pad] = calibration.quarantined
         self.position_unreliable[pad] = calibration.position_unreliable
 
@@ -176,6 +188,16 @@ class PadModel:
         self.set_calibration(
             pad, replace(self.calibrations[pad], calibration_id=calibration_id, gains=values, law=law)
         )
+
+    def _set_parts(self, pad: int, parts: LearnedParts | None) -> None:
+        """Apply what is known of the parts of a pad, None: as the deployment states, and of its gains."""
+        if parts is not None:
+            self.part_axes[pad] = _triangle(np.array(parts.covariance))
+            self.part_offsets[pad], self.touch_errors[pad] = parts.offsets, parts.touch_error
+        else:
+            self.part_axes[pad] = np.eye(4 + PART_COUNT)
+            self.part_axes[pad, :4, :4] = _triangle(self.gain_covariance[pad])
+            self.part_offsets[pad] = self.touch_errors[pad] = 0.0
 
     @property
     def calibration_ids(self) -> list[str]:
@@ -335,6 +357,13 @@ class PadModel:
         return self._law.current(force_n, self._drive_v, self._sheet_ohm, *self._centre_spreading)
 
 
+def _triangle(covariance: FloatArray) -> FloatArray:
+    """Return the upper triangle R with R' R = covariance, which may be singular."""
+    variances, directions = np.linalg.eigh(covariance)
+    root = np.sqrt(np.maximum(variances, 0.0))[:, None] * directions.T
+    return np.asarray(np.linalg.qr(root, mode="r"))
+
+
 def _behaviour_of_sheet(sheet: config.Sheet) -> SheetBehaviour | None:
     return sheet_behaviour_of(sheet.behaviour) if sheet.behaviour else None
 
@@ -370,7 +399,8 @@ def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
 
 def law_of(sheet: config.Sheet) -> LawParameters:
     """Return the contact law of a deployment's sheet, with its tolerances."""
-    covariance = np.diag(np.square([sheet.contact_ohm_std, sheet.alpha_std, sheet.ohm_per_square_std]))
+    local_std = math.hypot(sheet.ohm_per_square_std, _LOCAL_UNEVENNESS * sheet.unevenness_std)
+    covariance = np.diag(np.square([sheet.contact_ohm_std, sheet.alpha_std, local_std]))
     return LawParameters(sheet.contact_ohm_mm2, sheet.alpha, sheet.ohm_per_square, matrix(covariance))
 
 

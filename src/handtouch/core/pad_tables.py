@@ -24,13 +24,15 @@ from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.model import spreading_radius
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.surface import Surface
+from handtouch.field.uneven_sheet import unevenness_slopes
 
 FloatArray = NDArray[np.float64]
 
 _STENCIL = 7  # nodes that a slope is computed from
 _FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB
-CELLS_PER_TOLERANCE_CELL = 3  # tables of tolerances have 0.5 MB
+CELLS_PER_TOLERANCE_CELL = 3  # tables of tolerances have 1.8 MB
 _TOLERANCE_STEP = 3e-5  # of differences, in sides
+_PATCH_STEP = 0.02  # of second differences: currents of a patch vary no faster
 _EDGE_CELL, _ELECTRODE_END_CELL = 0.003, 0.008
 """Distances from an edge and from an electrode's end below which cells shrink no further, in sides."""
 SEARCH_POINTS = 9
@@ -84,8 +86,9 @@ class ForwardTable:
     of the nodes and their derivatives by cell. search_fractions: (81, n), search_cells: (2, 9), see
     `ModelTable`.
 
-    tolerance_nodes: (37, 37, 4, 3 n), on every third node: fields of the 2 n ends of electrodes, and
-    derivatives of the fractions by the logarithm of a / b, see `PadTolerances`. end_vectors: (2 n, n),
+    tolerance_nodes: (37, 37, 4, 10 n), on every third node: fields of the 2 n ends of electrodes, and
+    derivatives of the fractions by the logarithm of a / b, by waves of the sheet resistance, and second ones
+    by x x and x y, see `PadTolerances`. end_vectors: (2 n, n),
     derivatives of the fractions by the bare length at each end, two of each electrode, per its field.
     series_vectors: (n, n), by the logarithm of each resistor, per its electrode's fraction.
     """
@@ -195,10 +198,10 @@ class _Axis:
 def _tabulate_tolerances(
     network: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return nodes of the fields of a network's ends and of the derivatives by its aspect, and the vectors of
-    its ends.
+    """Return nodes of the fields of a network's ends and of the derivatives by its aspect and by waves of its
+    sheet's resistance, and the vectors of its ends.
 
-    By differences to networks that are slightly different.
+    By differences to networks that are slightly different, but for the waves.
     """
     s, t = np.meshgrid(_inside(nodes_x[:, 0]) / network.a, _inside(nodes_y[:, 0]) / network.b)
     nominal = network.fractions(s * network.a, t * network.b)
@@ -229,7 +232,23 @@ def _tabulate_tolerances(
         for electrode in network.electrodes
     ]
     by_aspect = slope(stretch, longer, _TOLERANCE_STEP)
-    return hermite_table(np.stack([*fields, *by_aspect], axis=-1)), np.array(vectors)
+    by_waves = unevenness_slopes(network, s * network.a, t * network.b)
+    columns = np.concatenate(
+        [fields, by_aspect, by_waves.reshape(-1, *s.shape), *_second_derivatives(network, s, t)]
+    )
+    return hermite_table(np.moveaxis(columns, 0, -1)), np.array(vectors)
+
+
+def _second_derivatives(
+    network: ElectrodeNetwork, s: FloatArray, t: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives (n, y, x) of the fractions by x x and by x y, at fractions s, t of the sides."""
+    half = _PATCH_STEP * network.a
+    x = np.clip(s * network.a, 1.01 * half, network.a - 1.01 * half)
+    y = np.clip(t, _PATCH_STEP, 1 - _PATCH_STEP) * network.b
+    more, less = (network.fractions_with_jacobian(x + step, y)[1] for step in (half, -half))
+    by_x, by_y = np.moveaxis((more - less) / (2 * half), 1, 0)
+    return by_x, by_y
 
 
 def _axis_along(electrode: Electrode) -> int:

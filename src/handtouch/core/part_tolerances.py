@@ -5,14 +5,19 @@ Public names: `stage_tolerances`.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable, view_floats
 from handtouch.core.stages.tolerances import PadTolerances
 from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.surface import Surface
 from handtouch.hand.pads import log_aspect_std, pad_surface, relative_size_stds
 
+FloatArray = NDArray[np.float64]
 _M_PER_MM = 1e-3
 
 
@@ -30,12 +35,15 @@ def stage_tolerances(
     end_stds = sheet.gap_std_mm * _M_PER_MM / np.array(_metres_per_unit(pad, network))
     end_vectors = np.ascontiguousarray(end_stds[:, None] * table.end_vectors)
     has_series = any(pad.series_ohm)
+    elongations = _elongations(sheet, surface, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
+    is_elongated = bool(elongations.any())
     return PadTolerances(
         view_floats(table.tolerance_nodes),
         len(table.tolerance_nodes) - 1,
         1 / CELLS_PER_TOLERANCE_CELL,
         view_floats(end_vectors),
         aspect_std,
+        sheet.unevenness_std,
         view_floats(table.series_vectors),
         node.series_std,
         sheet.ohm_per_square_std,
@@ -43,8 +51,22 @@ def stage_tolerances(
         surface.extent_m[0] / 2,
         size_x,
         size_y,
-        not (end_vectors.any() or aspect_std or has_series),
+        view_floats(elongations),
+        is_elongated,
+        not (end_vectors.any() or aspect_std or sheet.unevenness_std or has_series or is_elongated),
     )
+
+
+def _elongations(sheet: config.Sheet, surface: Surface, x: FloatArray) -> FloatArray:
+    """Return half the standard deviation of the difference of variances of a contact's current, at x (k,).
+
+    Along the rectangle's axes, in squares of its unit, of elliptical patches of pressure in all directions.
+    """
+    area_m2 = (sheet.contact_radius_mm**2 + sheet.contact_radius_std_mm**2) * _M_PER_MM**2
+    difference_m2 = area_m2 / 4 * 2 * math.sinh(sheet.contact_elongation_std)
+    inside = np.clip(x, 1e-6 * surface.a, (1 - 1e-6) * surface.a)
+    along_x, along_y = surface.scales(inside, np.full(len(x), surface.b / 2))
+    return np.ascontiguousarray(difference_m2 / (2 * math.sqrt(2)) / (along_x * along_y))
 
 
 def _metres_per_unit(pad: config.Pad, network: ElectrodeNetwork) -> list[float]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.calibration.calibration import LawParameters, channel_values
+from handtouch.calibration.calibration import LawParameters, LearnedParts, channel_values
 from handtouch.canbus.nodes.master import (
     Master,
     NodeEvent,
@@ -101,6 +101,7 @@ class SupervisorClient:
         self._degrading_kinds: list[tuple[str, ...]] = [()] * pipeline.model.size
         """of each pad, kinds of the diagnoses that invalidate force or position"""
         self._log_gain_covariance: list[NDArray[np.float64] | None] = [None] * pipeline.model.size
+        self._parts: list[LearnedParts | None] = [None] * pipeline.model.size
         """of each pad; None: as the deployment states"""
         self._block_buffer = BlockBuffer(pipeline.model.size)
         self._serials: list[int | None] = [None] * pipeline.model.size
@@ -167,7 +168,7 @@ class SupervisorClient:
         replaced, or automatic calibration estimates better gains.
         """
         if "gains" in parts:
-            self._log_gain_covariance[pad] = _MANUAL_LOG_GAIN_COVARIANCE
+            self._log_gain_covariance[pad], self._parts[pad] = _MANUAL_LOG_GAIN_COVARIANCE, None
             self._update_uncertainty(pad, self._pipeline.calibrations[pad].quarantined)
         self._manual_parts[pad] = self._manual_parts.get(pad, set()) | set(parts)
         self._send_manual_calibration(pad, offset_counts)
@@ -271,6 +272,7 @@ class SupervisorClient:
             calibration_id=calibration.calibration_id,
             gains=(x0, xa, y0, yb),
             covariance=tuple(covariance.ravel().tolist()),
+            parts=self._parts[pad],
             offset_counts=channel_values(offset_counts) if offset_counts is not None else None,
             law=ContactLawMessage(**asdict(law)) if law is not None and "law" in given else None,
         )
@@ -282,7 +284,7 @@ class SupervisorClient:
         """Discard the calibration of a pad whose node was replaced, until the new node is calibrated."""
         pipeline = self._pipeline
         default = ActiveCalibration(pipeline.model.default_calibration_ids[pad])
-        self._log_gain_covariance[pad] = _UNKNOWN_LOG_GAIN_COVARIANCE
+        self._log_gain_covariance[pad], self._parts[pad] = _UNKNOWN_LOG_GAIN_COVARIANCE, None
         self._manual_parts.pop(pad, None)
         self._unconfirmed_calibrations.pop(pad, None)
         self._position_unreliable[pad], self._degrading_kinds[pad] = False, (FaultKind.NODE_REPLACED.value,)
@@ -306,6 +308,7 @@ class SupervisorClient:
             replace(
                 calibration,
                 gain_covariance=None if covariance is None else tuple(covariance.ravel().tolist()),
+                parts=None if unreliable else self._parts[pad],
                 quarantined=quarantined,
                 position_unreliable=unreliable,
                 diagnoses=self._degrading_kinds[pad],
@@ -346,7 +349,9 @@ class SupervisorClient:
             self._manual_parts.pop(pad, None)
         before = pipeline.calibrations[pad]
         law = before.law if message.law is None else LawParameters(**message.law.model_dump())
-        self._log_gain_covariance[pad] = np.reshape(message.covariance, (4, 4))
+        self._log_gain_covariance[pad], self._parts[pad] = None, message.parts
+        if message.covariance is not None:
+            self._log_gain_covariance[pad] = np.reshape(message.covariance, (4, 4))
         calibration = replace(before, calibration_id=message.calibration_id, gains=message.gains, law=law)
         self._set_calibration(pad, calibration, before.quarantined)
         if offsets is not None:

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 
-@runtime_checkable
-class ForwardModel(Protocol):
+class FractionModel(Protocol):
     """Maps a point contact at (x, y) of a pad 0 <= x <= a, 0 <= y <= b to the fractions its channels
     measure.
 
@@ -37,6 +36,11 @@ class ForwardModel(Protocol):
         NaN, in its own element only, for a point that is NaN or off the pad.
         """
         ...
+
+
+@runtime_checkable
+class ForwardModel(FractionModel, Protocol):
+    """A `FractionModel` with derivatives."""
 
     def fractions_with_jacobian(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return `fractions` and their derivatives by (x, y), shape (channels, 2, ...)."""

@@ -1,22 +1,24 @@
 """Hands: pads on links, robot descriptions (URDF), kinematics, joint states and contact groups.
 
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `networks_with_other_parts`,
-`PadGeometry`, `LinkContacts`.
+Public names: `pad_surface`, `mount_transform`, `electrode_network`, `models_with_other_parts`,
+`part_stds`, `PadGeometry`, `LinkContacts`.
 """
 
 from handtouch.hand.pad_geometry import LinkContacts, PadGeometry
 from handtouch.hand.pads import (
     electrode_network,
+    models_with_other_parts,
     mount_transform,
-    networks_with_other_parts,
     pad_surface,
+    part_stds,
 )
 
 __all__ = [
     "LinkContacts",
     "PadGeometry",
     "electrode_network",
+    "models_with_other_parts",
     "mount_transform",
-    "networks_with_other_parts",
     "pad_surface",
+    "part_stds",
 ]

@@ -1,6 +1,6 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `networks_with_other_parts`,
+Public names: `pad_surface`, `mount_transform`, `electrode_network`, `models_with_other_parts`, `part_stds`,
 `relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
 """
 
@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
+from handtouch.field.model import FractionModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.surface import Surface
+from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
 _M_PER_MM = 1e-3
 
@@ -84,20 +86,33 @@ def electrode_network(
     )
 
 
-def networks_with_other_parts(
-    pad: config.Pad, node: config.Node, sheet: config.Sheet
-) -> tuple[ElectrodeNetwork, ...]:
-    """Return networks in each of which one part of the pad differs by one standard deviation; gains aside."""
-    networks = []
-    if gap_std_m := sheet.gap_std_mm * _M_PER_MM:
-        networks += [electrode_network(pad, sheet, gap_std_m * end) for end in np.eye(8).reshape(8, 4, 2)]
-    if aspect_std := log_aspect_std(pad, sheet):
-        networks.append(electrode_network(pad, sheet, log_aspect=aspect_std))
-    if any(pad.series_ohm):
-        nominal, ohm = electrode_network(pad, sheet), np.array(pad.series_ohm)
-        changes = [node.series_std * one for one in np.eye(4)] + [np.full(4, -sheet.ohm_per_square_std)]
-        networks += [nominal.with_series_ohm(ohm * np.exp(change)) for change in changes]
-    return tuple(networks)
+def models_with_other_parts(
+    nominal: ElectrodeNetwork, pad: config.Pad, node: config.Node, sheet: config.Sheet
+) -> tuple[FractionModel, ...]:
+    """Return models in each of which one part of the pad differs by one standard deviation; gains aside.
+
+    In the order of `part_stds`; `nominal` itself, the pad's network, for parts without a tolerance.
+    """
+    stds, ohm = part_stds(pad, node, sheet), np.array(pad.series_ohm)
+    models: list[FractionModel] = []
+    gap_std_m = sheet.gap_std_mm * _M_PER_MM
+    models += [electrode_network(pad, sheet, gap_std_m * end) for end in np.eye(8).reshape(8, 4, 2)]
+    models.append(electrode_network(pad, sheet, log_aspect=log_aspect_std(pad, sheet)))
+    models += [UnevenSheet(nominal, wave, sheet.unevenness_std) for wave in range(len(UNEVEN_WAVES))]
+    changes = [node.series_std * one for one in np.eye(4)] + [np.full(4, -sheet.ohm_per_square_std)]
+    models += [nominal.with_series_ohm(ohm * np.exp(change)) for change in changes]
+    return tuple(model if std else nominal for model, std in zip(models, stds, strict=True))
+
+
+def part_stds(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[float, ...]:
+    """Return the standard deviations of a pad's parts; 0 for those that don't matter.
+
+    Gaps [mm] at both ends of each electrode; logarithms of the ratio of the sides, of the waves of the sheet
+    resistance (`UNEVEN_WAVES`), of each series resistor, and of the sheet resistance beside these.
+    """
+    resistors = (*(node.series_std,) * 4, sheet.ohm_per_square_std) if any(pad.series_ohm) else (0.0,) * 5
+    waves = (sheet.unevenness_std,) * len(UNEVEN_WAVES)
+    return (*(sheet.gap_std_mm,) * 8, log_aspect_std(pad, sheet), *waves, *resistors)
 
 
 def relative_size_stds(pad: config.Pad, sheet: config.Sheet) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from handtouch.calibration.auto_calibration import CalibrationState
-from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN
+from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LearnedParts
 from handtouch.config import Deployment, Table
 from handtouch.wire.diagnosis import Diagnosis
 
@@ -165,7 +165,8 @@ class ContactLawMessage(Table):
 class CalibrationUpdate(Table):
     """Calibration to apply to a pad, as long as its node has this serial number.
 
-    covariance: (4, 4) of log gains, row by row. If known: offset_counts and their standard deviations, per
+    covariance: (4, 4) of log gains, row by row; None, as the deployment states. parts: of the pad, learned
+    with the gains; None, as the deployment states. If known: offset_counts and their standard deviations, per
     channel; contact law; back_n, back_std_n: back force [N] of its sheet.
     """
 
@@ -174,7 +175,8 @@ class CalibrationUpdate(Table):
     serial: Serial
     calibration_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
     gains: tuple[GainFactor, GainFactor, GainFactor, GainFactor]
-    covariance: Annotated[tuple[float, ...], Field(min_length=16, max_length=16)]
+    covariance: Annotated[tuple[float, ...], Field(min_length=16, max_length=16)] | None = None
+    parts: LearnedParts | None = None
     offset_counts: FourFloats | None = None
     offset_std: FourFloats | None = None
     law: ContactLawMessage | None = None

@@ -29,8 +29,9 @@ from handtouch.calibration.calibration import (
 from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_back_force
+from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import electrode_network, networks_with_other_parts
+from handtouch.hand import electrode_network, models_with_other_parts, part_stds
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
     MAX_TEXT,
@@ -92,7 +93,7 @@ class SupervisorWorker:
     ) -> None:
         deployment = start.deployment
         entries = deployment.pads
-        models: dict[object, tuple[ElectrodeNetwork, tuple[ElectrodeNetwork, ...]]] = {}
+        models: dict[object, tuple[ElectrodeNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}
         self._pads = []
         noise = start.noise_counts[:, None] * start.ampere_per_count
         for number, (hand, pad) in enumerate(entries):
@@ -101,8 +102,9 @@ class SupervisorWorker:
                 deployment.sheets[pad.sheet],
             )
             if design not in models:
-                others = networks_with_other_parts(pad, deployment.nodes[pad.node], sheet)
-                models[design] = electrode_network(pad, sheet), others
+                network, node = electrode_network(pad, sheet), deployment.nodes[pad.node]
+                others = models_with_other_parts(network, pad, node, sheet)
+                models[design] = network, others, part_stds(pad, node, sheet)
             mounting_point = MountingPoint(hand, pad.link, start.default_calibration_ids[number])
             self._pads.append(
                 _PadEntry(
@@ -167,7 +169,7 @@ class SupervisorWorker:
             version = None
             if not obstacle:
                 version, row.rejection_reason = self._store.newest_applicable(serial, row.mounting_point, now)
-            own = aged_gains(version, now) if version else None
+            own = aged_gains(version, now, row.calibrator.part_stds) if version else None
             row.version_number, row.foreign_source = 0, version.provenance.foreign if version else ""
             row.calibrator.assign_node(
                 serial, last, own, obstacle, self._latest_sync_ns, foreign=bool(row.foreign_source)
@@ -199,7 +201,7 @@ class SupervisorWorker:
             if version is None or version.number == row.version_number:
                 continue
             row.foreign_source = version.provenance.foreign
-            if own := aged_gains(version, now):
+            if own := aged_gains(version, now, row.calibrator.part_stds):
                 row.calibrator.apply_gains(own, foreign=bool(row.foreign_source))
             elif version.calibration.law and row.calibrator.force_unreliable:
                 row.calibrator.accept_measured_law()
@@ -224,7 +226,8 @@ class SupervisorWorker:
             return
         if "gains" in given:
             row.foreign_source = ""
-            row.calibrator.apply_gains(Gains(update.gains, matrix(np.reshape(update.covariance, (4, 4)))))
+            covariance = np.reshape(update.covariance or (0.0,) * 16, (4, 4))
+            row.calibrator.apply_gains(Gains(update.gains, matrix(covariance), update.parts))
         if "law" in given:
             row.calibrator.accept_measured_law()
         if self._diagnostics is not None:
@@ -319,11 +322,10 @@ class SupervisorWorker:
         row.version_number = version.number
         self._set_diagnostic_offsets(pad, version)
         gains = row.calibrator.gains
-        if not known.gains and row.calibrator.calibration_state is CalibrationState.DEFAULT:
-            # gains as in the deployment file, whose uncertainty is unknown
-            gains = Gains((1.0,) * 4, matrix(np.zeros((4, 4))))
         update = _calibration_update(pad, version.serial, version.calibration_id, gains)
         found: dict[str, Any] = {}
+        if not known.gains and row.calibrator.calibration_state is CalibrationState.DEFAULT:
+            found = {"gains": (1.0,) * 4, "covariance": None, "parts": None}  # as in the deployment file
         if known.offsets:
             found["offset_counts"] = known.offsets.counts
             found["offset_std"] = channel_values(np.sqrt(known.offsets.variance))
@@ -407,7 +409,12 @@ def _shorten(diagnosis: Diagnosis) -> Diagnosis:
 def _calibration_update(pad: int, serial: int, name: str, gains: Gains) -> CalibrationUpdate:
     covariance = tuple(value for row in gains.covariance for value in row)
     return CalibrationUpdate(
-        pad=pad, serial=serial, calibration_id=name, gains=gains.factors, covariance=covariance
+        pad=pad,
+        serial=serial,
+        calibration_id=name,
+        gains=gains.factors,
+        covariance=covariance,
+        parts=gains.parts,
     )
 
 

@@ -23,18 +23,18 @@ cdef class Fit:
     cdef public double var_x, var_y, cov_xy, cov_x_total, cov_y_total, var_total
     cdef public bint found
 
-@cython.locals(i=Py_ssize_t, tracked=bint, settled=bint, variance=double)
+@cython.locals(i=Py_ssize_t, first=Py_ssize_t, tracked=bint, settled=bint, variance=double)
 cdef void locate(
-    ModelTable table, Fit fit, tolerances.PadTolerances pad, double[::1] gain_covariance, Py_ssize_t first,
-    double s, double t) noexcept
-@cython.locals(n=Py_ssize_t)
+    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known, Py_ssize_t number,
+    double[::1] gain_covariance, double s, double t) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t)
 cdef void _whiten(
-    ModelTable table, Fit fit, tolerances.PadTolerances pad, double[::1] gain_covariance,
-    Py_ssize_t first) noexcept
+    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known,
+    Py_ssize_t number) noexcept
 @cython.locals(_=Py_ssize_t)
 cdef void _refine(
-    ModelTable table, Fit fit, tolerances.PadTolerances pad, double[::1] gain_covariance,
-    Py_ssize_t first) noexcept
+    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known,
+    Py_ssize_t number) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _whiten_column(ModelTable table, Fit fit, Py_ssize_t first, double[::1] out) noexcept
 cdef double _clamp(ModelTable table, double s) noexcept

@@ -111,14 +111,15 @@ def locate(
     table: ModelTable,
     fit: Fit,
     pad: tolerances.PadTolerances,
+    known: tolerances.PartKnowledge,
+    number: int,
     gain_covariance: memoryview[float],
-    first: int,
     s: float,
     t: float,
 ) -> None:
     """Find the most likely contact for the readings in `fit`; (s, t): last position in cells, NaN if new.
 
-    gain_covariance: of log gains, (n n,) from index `first` on. `fit.found` is False where no contact
+    number: of the pad. gain_covariance: of log gains, (pads n n,). `fit.found` is False where no contact
     explains the currents better than none.
     """
     fit.sum = 0.0
@@ -127,20 +128,21 @@ def locate(
     tracked, settled = s == s and t == t, False
     if tracked:
         fit.s, fit.t = s, t
-        _whiten(table, fit, pad, gain_covariance, first)
+        _whiten(table, fit, pad, known, number)
         settled = _maximise(table, fit, True)
     if settled:
-        _refine(table, fit, pad, gain_covariance, first)
+        _refine(table, fit, pad, known, number)
         variance = max(fit.var_x / (table.side_x * table.side_x), fit.var_y / (table.side_y * table.side_y))
         settled = fit.cost <= _MAX_TRACKED_COST and variance <= _MAX_TRACKED_VARIANCE
     if not settled:
+        first = number * table.electrodes * table.electrodes
         tolerances.whiten_by_gains(fit.whitening, gain_covariance, first, fit.readings)
         tolerances.apply_whitening(fit.whitening, fit.readings, 0, fit.data)
         fit.whitened_s = fit.whitened_t = _INFINITY
         if not tracked:
             fit.s = fit.t = 0.5 * table.cells
         _search(table, fit, tracked)
-        _refine(table, fit, pad, gain_covariance, first)
+        _refine(table, fit, pad, known, number)
     fit.found = fit.total > 0.0
     if fit.found:
         _move_out_of_corner(table, fit)
@@ -150,26 +152,36 @@ def locate(
 
 
 def _whiten(
-    table: ModelTable, fit: Fit, pad: tolerances.PadTolerances, gain_covariance: memoryview[float], first: int
+    table: ModelTable,
+    fit: Fit,
+    pad: tolerances.PadTolerances,
+    known: tolerances.PartKnowledge,
+    number: int,
 ) -> None:
     """Whiten for noise and tolerances at (s, t)."""
     n = table.electrodes
     tables.read_table(table.values, 0, table.cells, n + 1, fit.s, fit.t, fit.raw)
     total = max(fit.sum, 0.0)
-    tolerances.whiten(fit.whitening, pad, gain_covariance, first, fit.raw, fit.weight, total, fit.s, fit.t)
-    tolerances.apply_whitening(fit.whitening, fit.readings, 0, fit.data)
+    tolerances.whiten(fit.whitening, pad, known, number, fit.raw, fit.weight, total, fit.s, fit.t)
+    for i in range(n):
+        fit.scaled[i] = fit.readings[i] - fit.whitening.shift[i]
+    tolerances.apply_whitening(fit.whitening, fit.scaled, 0, fit.data)
     fit.whitened_s, fit.whitened_t = fit.s, fit.t
 
 
 def _refine(
-    table: ModelTable, fit: Fit, pad: tolerances.PadTolerances, gain_covariance: memoryview[float], first: int
+    table: ModelTable,
+    fit: Fit,
+    pad: tolerances.PadTolerances,
+    known: tolerances.PartKnowledge,
+    number: int,
 ) -> None:
     """Maximise again while the position is far from that of the tolerances; compute the covariance."""
     for _ in range(_MAX_WHITENINGS):
         away = max(abs(fit.s - fit.whitened_s), abs(fit.t - fit.whitened_t))
         if away <= _MAX_WHITENING_CELLS or not fit.total > 0.0:
             break
-        _whiten(table, fit, pad, gain_covariance, first)
+        _whiten(table, fit, pad, known, number)
         _maximise(table, fit, False)
     _compute_covariance(table, fit)
 

@@ -10,6 +10,7 @@ cdef class ContactSolver:
     cdef list tables, pad_tolerances, laws, surfaces
     cdef force.StackTable stack
     cdef locate.Fit fit
+    cdef tolerances.PartKnowledge known
     cdef place.Placement placement
     cdef force.ForceResult result
     cdef Py_ssize_t electrodes

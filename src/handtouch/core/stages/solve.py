@@ -41,7 +41,8 @@ _MAX_EXTENT_SIDES = 0.5
 class ContactSolver:
     """Solves contacts of the pads of a model; arrays are flat, with a row a pad.
 
-    currents, weight: (pads n,) currents [A] and 1 / noise [1/A]. gain_covariance: (pads n n,) of log gains.
+    currents, weight: (pads n,) currents [A] and 1 / noise [1/A]. known: of gains and parts.
+    gain_covariance: (pads n n,) of log gains.
     offset_std: (pads,) of the sum of the currents, from the
     baseline [A]; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
     force is to be estimated. values: (pads VALUE_COUNT,), the result; NaN for a new contact, else the search
@@ -61,6 +62,7 @@ class ContactSolver:
         work: memoryview[float],
         currents: memoryview[float],
         weight: memoryview[float],
+        known: tolerances.PartKnowledge,
         gain_covariance: memoryview[float],
         offset_std: memoryview[float],
         force_requested: memoryview[int],
@@ -75,7 +77,7 @@ class ContactSolver:
             work[:electrodes], work[electrodes : 2 * electrodes], work[2 * electrodes : 3 * electrodes],
         )  # fmt: skip
         self.currents, self.weight = currents, weight
-        self.gain_covariance = gain_covariance
+        self.known, self.gain_covariance = known, gain_covariance
         self.offset_std, self.force_requested = offset_std, force_requested
         self.values = values
 
@@ -99,8 +101,9 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
         table,
         fit,
         solver.pad_tolerances[pad],
+        solver.known,
+        pad,
         solver.gain_covariance,
-        pad * n * n,
         values[row + _CELLS],
         values[row + _CELLS + 1],
     )
@@ -140,7 +143,7 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
         )
     tolerances.transpose_whitening(fit.whitening, fit.data, fit.weight, solver.by_total)
     for i in range(2):
-        pair += fit.readings[i] / fit.weight[i]
+        pair += (fit.readings[i] - fit.whitening.shift[i]) / fit.weight[i]
         modelled += fit.raw[i]
     slope_x = (fit.raw[n + 1] + fit.raw[n + 2]) / fit.scale_x
     slope_y = (fit.raw[2 * n + 2] + fit.raw[2 * n + 3]) / fit.scale_y

@@ -2,22 +2,33 @@ cimport cython
 from libc cimport math
 from handtouch.core.stages cimport tables
 
+cdef Py_ssize_t _WAVES
+
 cdef class PadTolerances:
     cdef double[::1] values, end_vectors, series_vectors
     cdef Py_ssize_t cells
-    cdef double cell_ratio, aspect_std, series_std, sheet_std, middle_u_m, size_x, size_y
-    cdef bint has_series, is_shape_exact
+    cdef double cell_ratio, aspect_std, wave_std, series_std, sheet_std, middle_u_m, size_x, size_y
+    cdef double[::1] elongations
+    cdef bint has_series, is_elongated, is_shape_exact
+
+cdef class PartKnowledge:
+    cdef double[::1] axes, offsets, touch_errors
 
 cdef class Whitening:
-    cdef double[::1] matrix, fields, vector
+    cdef double[::1] matrix, shift, fields, changes, vector
     cdef Py_ssize_t electrodes
+
+cpdef Py_ssize_t part_count(Py_ssize_t electrodes) noexcept
 
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]')
 cdef void whiten_by_gains(
     Whitening whitening, double[::1] gain_covariance, Py_ssize_t first, double[::1] readings) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]', vector='double[::1]')
+@cython.locals(
+    n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, parts=Py_ssize_t, size=Py_ssize_t, varied=Py_ssize_t,
+    row=Py_ssize_t, matrix='double[::1]', vector='double[::1]', changes='double[::1]', axes='double[::1]',
+    offsets='double[::1]')
 cdef void whiten(
-    Whitening whitening, PadTolerances pad, double[::1] gain_covariance, Py_ssize_t first,
+    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
     double[::1] fractions, double[::1] weight, double total, double s, double t) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void apply_whitening(
@@ -25,10 +36,15 @@ cdef void apply_whitening(
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void transpose_whitening(
     Whitening whitening, double[::1] values, double[::1] weight, double[::1] out) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, vector='double[::1]', fields='double[::1]')
-cdef void _add_shape(
+@cython.locals(
+    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, first=Py_ssize_t, columns=Py_ssize_t, changes='double[::1]', fields='double[::1]')
+cdef void _compute_changes(
     Whitening whitening, PadTolerances pad, double[::1] fractions, double[::1] weight, double total,
     double s, double t) noexcept
+@cython.locals(
+    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, cell=Py_ssize_t, vector='double[::1]', fields='double[::1]')
+cdef void _add_elongation(
+    Whitening whitening, PadTolerances pad, double[::1] weight, double total, double s) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]', vector='double[::1]')
 cdef void _add_square(Whitening whitening) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t)

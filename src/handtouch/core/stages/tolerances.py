@@ -3,7 +3,7 @@
 Every tolerance changes the fractions along one vector: a gain by its own fraction; the end of an electrode
 by a constant vector times a field on the pad (Hadamard: of the potentials, only the strength of their
 singularity at that end differs); a series resistor by a constant vector times its fraction; the ratio of the
-pad's sides by a vector of fields.
+pad's sides and each wave of its sheet's resistance by a vector of fields.
 """
 
 from __future__ import annotations
@@ -12,17 +12,21 @@ import math
 
 from handtouch.core.stages import tables
 
+_WAVES = 5  # of the sheet resistance
+
 
 class PadTolerances:
     """Tolerances of one pad of n electrodes, as standard deviations.
 
     values: nodes as `tables.read_values` needs them, over the pad in `cells` cells, each as many of the
-    forward model's as 1 / `cell_ratio`; columns are the fields of the 2 n ends of electrodes, then the
-    derivatives of the n fractions by the logarithm of the ratio of the sides. end_vectors: (2 n n,) changes
-    of fractions by one standard deviation of each end, per its field. aspect_std: of that logarithm.
-    series_vectors: (n n,) changes by the logarithm of each resistor, per its electrode's fraction;
-    series_std, sheet_std: of the logarithms of resistors and sheet resistance. middle_u_m: arc length from
-    the electrode x0 to the pad's middle; size_x, size_y: relative standard deviations of its sides.
+    forward model's as 1 / `cell_ratio`; columns are the fields of the 2 n ends of electrodes, then
+    derivatives of the n fractions by the logarithm of the ratio of the sides, by each wave of the sheet
+    resistance, by x x and by x y. end_vectors: (2 n n,) changes of fractions by one standard deviation of
+    each end, per its field. aspect_std, wave_std: of that logarithm, and of a wave. series_vectors: (n n,)
+    changes by the logarithm of each resistor, per its electrode's fraction; series_std, sheet_std: of the
+    logarithms of resistors and sheet resistance. middle_u_m: arc length from the electrode x0 to the pad's
+    middle; size_x, size_y: relative standard deviations of its sides. elongations: (cells + 1,) along x,
+    standard deviation of what an elongated contact multiplies derivatives by x x and x y with.
     """
 
     def __init__(
@@ -32,6 +36,7 @@ class PadTolerances:
         cell_ratio: float,
         end_vectors: memoryview[float],
         aspect_std: float,
+        wave_std: float,
         series_vectors: memoryview[float],
         series_std: float,
         sheet_std: float,
@@ -39,29 +44,59 @@ class PadTolerances:
         middle_u_m: float,
         size_x: float,
         size_y: float,
+        elongations: memoryview[float],
+        is_elongated: bool,
         is_shape_exact: bool,
     ) -> None:
         self.values = values
         self.cells = cells
         self.cell_ratio = cell_ratio
         self.end_vectors = end_vectors
-        self.aspect_std = aspect_std
+        self.aspect_std, self.wave_std = aspect_std, wave_std
         self.series_vectors = series_vectors
         self.series_std, self.sheet_std, self.has_series = series_std, sheet_std, has_series
         self.middle_u_m, self.size_x, self.size_y = middle_u_m, size_x, size_y
+        self.elongations, self.is_elongated = elongations, is_elongated
         self.is_shape_exact = is_shape_exact  # none but gains have a tolerance
+
+
+class PartKnowledge:
+    """What is known of the log gains of all pads, and of their parts in standard deviations as stated.
+
+    A pad has n log gains, then p = `part_count(n)` parts. axes: (pads (n + p)^2,), rows of an upper triangle
+    whose product with its transpose is their covariance. offsets: (pads p,) most likely values of the parts.
+    touch_errors: (pads,) standard deviation of the fractions of a touch, another one each time.
+    """
+
+    def __init__(
+        self, axes: memoryview[float], offsets: memoryview[float], touch_errors: memoryview[float]
+    ) -> None:
+        self.axes, self.offsets, self.touch_errors = axes, offsets, touch_errors
 
 
 class Whitening:
     """Whitening of currents over noise: `matrix` (n n,) is lower triangular; its product with currents that
-    noise and tolerances vary is uncorrelated, of variance 1. `fields` (3 n,), `vector` (n,): working memory.
+    noise and tolerances vary is uncorrelated, of variance 1. `shift` (n,): what the offsets of the parts add
+    to the currents over noise. `fields` (10 n,), `changes` (p n,), `vector` (n,): working memory.
     """
 
     def __init__(
-        self, matrix: memoryview[float], fields: memoryview[float], vector: memoryview[float], electrodes: int
+        self,
+        matrix: memoryview[float],
+        shift: memoryview[float],
+        fields: memoryview[float],
+        changes: memoryview[float],
+        vector: memoryview[float],
+        electrodes: int,
     ) -> None:
-        self.matrix, self.fields, self.vector = matrix, fields, vector
+        self.matrix, self.shift = matrix, shift
+        self.fields, self.changes, self.vector = fields, changes, vector
         self.electrodes = electrodes
+
+
+def part_count(electrodes: int) -> int:
+    """Return the number of parts: ends of electrodes, ratio of the sides, waves, resistors and sheet."""
+    return 3 * electrodes + 2 + _WAVES
 
 
 def whiten_by_gains(
@@ -73,6 +108,7 @@ def whiten_by_gains(
     """
     n, matrix = whitening.electrodes, whitening.matrix
     for i in range(n):
+        whitening.shift[i] = 0.0
         for j in range(n):
             matrix[i * n + j] = 0.0
         variance = gain_covariance[first + i * n + i] * readings[i] * readings[i]
@@ -82,27 +118,48 @@ def whiten_by_gains(
 def whiten(
     whitening: Whitening,
     pad: PadTolerances,
-    gain_covariance: memoryview[float],
-    first: int,
+    known: PartKnowledge,
+    number: int,
     fractions: memoryview[float],
     weight: memoryview[float],
     total: float,
     s: float,
     t: float,
 ) -> None:
-    """Set the whitening for a contact at (s, t), in cells of the forward model, with a total current.
+    """Set whitening and shift for a contact at (s, t), in cells of the forward model, with a total current.
 
-    fractions: (n,) there. weight: (n,) 1 / noise.
+    number: of the pad. fractions: (n,) there. weight: (n,) 1 / noise.
     """
-    n, matrix, vector = whitening.electrodes, whitening.matrix, whitening.vector
+    n, matrix, vector, changes = whitening.electrodes, whitening.matrix, whitening.vector, whitening.changes
+    parts = part_count(n)
+    size, axes, offsets = n + parts, known.axes, known.offsets
     for i in range(n):
-        vector[i] = total * fractions[i] * weight[i]
-    for i in range(n):
-        for j in range(i + 1):
-            matrix[i * n + j] = gain_covariance[first + i * n + j] * vector[i] * vector[j]
-        matrix[i * n + i] += 1.0
+        whitening.shift[i] = 0.0
+        for j in range(n):
+            matrix[i * n + j] = 0.0
+        error = known.touch_errors[number] * total * weight[i]
+        matrix[i * n + i] = 1.0 + error * error
+    varied = 0
     if not pad.is_shape_exact:
-        _add_shape(whitening, pad, fractions, weight, total, s, t)
+        _compute_changes(whitening, pad, fractions, weight, total, s, t)
+        varied = parts if pad.has_series else parts - n - 1
+    for k in range(n + varied):
+        row = (number * size + k) * size
+        for i in range(n):
+            vector[i] = axes[row + i] * total * fractions[i] * weight[i] if i >= k else 0.0
+        for j in range(max(k - n, 0), varied):
+            step = axes[row + n + j]
+            if step != 0.0:
+                for i in range(n):
+                    vector[i] += step * changes[j * n + i]
+        _add_square(whitening)
+    if pad.is_elongated:
+        _add_elongation(whitening, pad, weight, total, s * pad.cell_ratio)
+    for j in range(varied):
+        step = offsets[number * parts + j]
+        if step != 0.0:
+            for i in range(n):
+                whitening.shift[i] += step * changes[j * n + i]
     _invert_root(matrix, n)
 
 
@@ -131,7 +188,7 @@ def transpose_whitening(
         out[i] = row * weight[i]
 
 
-def _add_shape(
+def _compute_changes(
     whitening: Whitening,
     pad: PadTolerances,
     fractions: memoryview[float],
@@ -140,28 +197,44 @@ def _add_shape(
     s: float,
     t: float,
 ) -> None:
-    """Add the covariance by ends of electrodes, ratio of the sides, and resistors."""
-    n, vector, fields = whitening.electrodes, whitening.vector, whitening.fields
-    tables.read_values(pad.values, pad.cells, 3 * n, s * pad.cell_ratio, t * pad.cell_ratio, fields)
-    for k in range(2 * n):
-        for i in range(n):
-            vector[i] = pad.end_vectors[k * n + i] * total * fields[k] * weight[i]
-        _add_square(whitening)
+    """Compute the changes of the currents over noise by one standard deviation of each part."""
+    n, changes, fields = whitening.electrodes, whitening.changes, whitening.fields
+    columns, ratio = (5 + _WAVES) * n, pad.cell_ratio
+    tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, fields)
     for i in range(n):
-        vector[i] = pad.aspect_std * total * fields[2 * n + i] * weight[i]
-    _add_square(whitening)
-    if not pad.has_series:
-        return
-    for k in range(n):
+        scale = total * weight[i]
+        for k in range(2 * n):
+            changes[k * n + i] = pad.end_vectors[k * n + i] * fields[k] * scale
+        changes[2 * n * n + i] = pad.aspect_std * fields[2 * n + i] * scale
+        for k in range(_WAVES):
+            changes[(2 * n + 1 + k) * n + i] = pad.wave_std * fields[(3 + k) * n + i] * scale
+        if pad.has_series:
+            first = (2 * n + 1 + _WAVES) * n + i
+            together = 0.0
+            for k in range(n):
+                change = pad.series_vectors[k * n + i] * fractions[k]
+                changes[first + k * n] = pad.series_std * change * scale
+                together += change
+            # a larger sheet resistance is a smaller one of every resistor
+            changes[first + n * n] = -pad.sheet_std * together * scale
+
+
+def _add_elongation(
+    whitening: Whitening, pad: PadTolerances, weight: memoryview[float], total: float, s: float
+) -> None:
+    """Add the covariance by patches that aren't round, at s cells; `fields` are those there.
+
+    Current that spreads with variances v + d along one direction and v - d at right angles to it adds d times
+    the second derivative along that direction, as potentials are harmonic; the direction is unknown.
+    """
+    n, vector, fields = whitening.electrodes, whitening.vector, whitening.fields
+    cell = min(int(s), pad.cells - 1)
+    beyond = s - cell
+    std = (1.0 - beyond) * pad.elongations[cell] + beyond * pad.elongations[cell + 1]
+    for k in range(2):
         for i in range(n):
-            vector[i] = pad.series_vectors[k * n + i] * pad.series_std * total * fractions[k] * weight[i]
+            vector[i] = std * fields[(3 + _WAVES + k) * n + i] * total * weight[i]
         _add_square(whitening)
-    for i in range(n):  # a larger sheet resistance is a smaller one of every resistor
-        together = 0.0
-        for k in range(n):
-            together += pad.series_vectors[k * n + i] * fractions[k]
-        vector[i] = pad.sheet_std * together * total * weight[i]
-    _add_square(whitening)
 
 
 def _add_square(whitening: Whitening) -> None:

@@ -226,6 +226,8 @@ class DrawnWorld:
             "contact_ohm_std": law.contact_ohm_ratio.std,
             "alpha_std": law.alpha_offset.std,
             "anisotropy_std": parts.anisotropy_ratio.std,
+            "unevenness_std": parts.unevenness.std,
+            "contact_elongation_std": float(np.log(self.world.contacts.elongation.mean)),
             "gap_std_mm": parts.gap_offset_mm.std,
             "size_std_mm": max(parts.length_offset_mm.std, parts.width_offset_mm.std),
         }
