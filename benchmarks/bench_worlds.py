@@ -78,6 +78,16 @@ def drawn_world(name: str, number: int) -> DrawnWorld:
     return replace(world, mounts=MountSpread()).draw(Family.REPORTING.seed(number))
 
 
+def with_stated_radius(deployment: Deployment, drawn: DrawnWorld) -> Deployment:
+    """Return the deployment with the spread of contact radii in this world as its builder states it."""
+    spread = drawn.world.contacts.radius_sigma.std
+    sheets = {
+        name: sheet.model_copy(update={"contact_radius_std_mm": spread * sheet.contact_radius_std_mm})
+        for name, sheet in deployment.sheets.items()
+    }
+    return deployment.model_copy(update={"sheets": sheets})
+
+
 def learnt_gains(hand: VirtualHand, deployment: Deployment, model: PadModel, numbers: range) -> None:
     """Calibrate the model's gains by touches of these numbers, as the supervisor does."""
     period_s = deployment.daemon.sync_period_ms * 1e-3
@@ -111,7 +121,7 @@ def play(task: tuple[str, int, int, int]) -> dict[str, Estimates]:
     name, number, touches, learnt = task
     drawn = drawn_world(name, number)
     deployment = drawn.describe(load(shipped.path("utah_mit.toml")))
-    model = PadModel(deployment)
+    model = PadModel(with_stated_radius(deployment, drawn))
     stimulus = Scenario(touch=draw_touches(model.links, WARM_UP + touches + learnt, drawn.seed))
     hand = VirtualHand(deployment, stimulus, drawn)
     numbers = range(WARM_UP, WARM_UP + touches)
@@ -242,7 +252,8 @@ HEAD = """\
 with few hidden quantities; 15 pads each, of four surfaces; seeds of the reporting family. {touches} touches
 of each pad, {low:g} to {high:g} N (log-uniform), anywhere from 2 % of a side inside the edges; one sample of
 each, 0.32 s after it began. 12 touches come first, as evidence for the compensation of sheets. Deployment
-files describe sheets as their builder would. Pads are mounted as stated; for mounts and joints see
+files describe sheets as their builder would, and state the standard deviations of the parts and contacts of
+their world (also of uneven sheets and elongated contacts, which the model of a contact doesn't have). Pads are mounted as stated; for mounts and joints see
 [grasp](grasp.md). *Calibrated*: with the gains of automatic calibration after {learnt} other touches of each
 pad, where it reached that state.
 
