@@ -253,9 +253,9 @@ with few hidden quantities; 15 pads each, of four surfaces; seeds of the reporti
 of each pad, {low:g} to {high:g} N (log-uniform), anywhere from 2 % of a side inside the edges; one sample of
 each, 0.32 s after it began. 12 touches come first, as evidence for the compensation of sheets. Deployment
 files describe sheets as their builder would, and state the standard deviations of the parts and contacts of
-their world (also of uneven sheets and elongated contacts, which the model of a contact doesn't have). Pads are mounted as stated; for mounts and joints see
-[grasp](grasp.md). *Calibrated*: with the gains of automatic calibration after {learnt} other touches of each
-pad, where it reached that state.
+their world, also those of uneven sheets and elongated contacts. Pads are mounted as stated; for mounts and
+joints see [grasp](grasp.md). *Calibrated*: with the gains and parts that automatic calibration learned from
+{learnt} other touches of each pad, where it reached that state.
 
 * Shares are in % of valid estimates, with 95 % intervals (Clopper and Pearson); those of *valid* are of all
   touches, also missed ones. Touches of one pad share its parts: the intervals are of touches on these pads.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from handtouch.calibration.gains import (
     BATCH_CONTACTS,
+    MAX_TOUCH_ERROR,
     GainEstimator,
     GainStatus,
     fisher_covariance,
@@ -274,8 +275,8 @@ def test_invalid_parameters_are_refused_by_name(options: dict[str, Any], message
 
 
 def test_gains_of_pads_with_other_gaps_are_within_their_covariance() -> None:
-    """Squared errors in units of the covariance are 3 on average, one for each direction of the gains; where
-    gaps aren't parameters, they are many times more."""
+    """Squared errors in units of the covariance are 3 on average, one for each direction of the gains, 11
+    with the gaps; where gaps aren't parameters, they are many times more."""
     nominal, generator = ElectrodeNetwork(30.0, 24.0, 0.8, 1.0), np.random.default_rng(8)
 
     def with_gaps(more: FloatArray) -> ElectrodeNetwork:
@@ -287,16 +288,37 @@ def test_gains_of_pads_with_other_gaps_are_within_their_covariance() -> None:
 
     parts = [with_gaps(0.1 * one) for one in np.eye(8)]
     distances: dict[bool, list[float]] = {False: [], True: []}
+    joint = []
     for number in range(12):
-        readings = contacts(with_gaps(0.1 * generator.normal(size=8)), 64, 1e-4, seed=number)
+        gaps = generator.normal(size=8)
+        readings = contacts(with_gaps(0.1 * gaps), 64, 1e-4, seed=number)
         for known in (False, True):
             estimator = plain(nominal, parts=parts if known else ())
             estimator.add_contacts(readings, 1e-4, 0)
             found = estimator.estimate
             error = np.log(found.gains) - TRUTH
             distances[known].append(float(error @ np.linalg.pinv(found.covariance, rcond=1e-6) @ error))
+        error = np.concatenate([error, found.part_offsets - gaps])
+        joint.append(error @ np.linalg.pinv(found.joint_covariance, rcond=1e-9) @ error)
     assert 1.5 < np.mean(distances[True]) < 4.5
     assert np.mean(distances[False]) > 30
+    assert 7 < np.mean(joint) < 15
+
+
+def test_errors_of_each_touch_are_estimated_and_widen_the_covariance() -> None:
+    """As of patches that aren't round: their scores are no outliers; gains stay within the covariance."""
+    readings, rng = contacts(SQUARE, 256, 1e-4), np.random.default_rng(5)
+    disturbed = readings + 1.5e-3 * readings.sum(axis=0) * rng.normal(size=readings.shape)
+    found = {}
+    for name, currents in (("points", readings), ("patches", disturbed)):
+        estimator = plain()
+        estimator.add_contacts(currents, 1e-4, 0)
+        found[name] = estimator.estimate
+        error = np.log(found[name].gains) - TRUTH
+        assert error @ np.linalg.pinv(found[name].covariance, rcond=1e-6) @ error < 16
+    assert found["points"].touch_error < 1e-4
+    assert 0.8e-3 < found["patches"].touch_error <= MAX_TOUCH_ERROR
+    assert found["patches"].point_fraction > 0.8
 
 
 def test_invalid_calls_are_refused() -> None:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import k0
 
 from handtouch import config
+from handtouch.field import ElectrodeNetwork
+from handtouch.field.uneven_sheet import UNEVEN_WAVES, unevenness_slopes
 from handtouch.simulate.pad_circuit import contact_layer_ohm
 from handtouch.simulate.pad_geometry import simulated_surface
 from handtouch.simulate.scenario import Scenario
@@ -123,6 +125,18 @@ def test_a_sheet_of_uniformly_higher_resistance_keeps_its_shares() -> None:
     plain = solve_sheet(SHAPE, NO_GAPS)
     np.testing.assert_allclose(maps.table, plain.table, atol=1e-9)
     np.testing.assert_allclose(maps.conductance, plain.conductance * math.exp(-0.2), rtol=2e-3)
+
+
+def test_first_order_theory_of_uneven_sheets_agrees_with_finite_elements() -> None:
+    """The slopes of the shares by each wave, which tolerances of uneven sheets are made of."""
+    network = ElectrodeNetwork(A, B, 1e-3 * A, 1.0)
+    inner = TABLE_NODES[INNER]
+    slopes = unevenness_slopes(network, *np.meshgrid(A * inner, B * inner, indexing="ij"))
+    for wave in (1, 2, 3):
+        amplitudes = tuple(0.02 * np.eye(5)[wave])
+        maps = uneven_sheet_maps(SHAPE, NO_GAPS, Unevenness(UNEVEN_WAVES, amplitudes))
+        change = (maps.table[:4] - solve_sheet(SHAPE, NO_GAPS).table[:4])[:, INNER][:, :, INNER] / 0.02
+        assert np.abs(slopes[wave] - change).max() < 0.02 * np.abs(change).max()
 
 
 def test_counts_of_an_uneven_pad_follow_its_local_resistance(deployment: config.Deployment) -> None:

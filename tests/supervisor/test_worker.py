@@ -18,6 +18,7 @@ from handtouch.calibration.calibration import (
     Calibration,
     Gains,
     LawParameters,
+    Offsets,
     Provenance,
     matrix,
 )
@@ -241,6 +242,21 @@ def test_measured_law_ends_quarantine_of_a_pad_without_observable_gains(bench: B
     assert applied.law.alpha == 1.4
     assert np.diag(np.reshape(applied.covariance or (), (4, 4))) == pytest.approx([0.05**2 * 0.75] * 4)
     assert assessment(messages, 2).calibration_state == "calibrated"
+
+
+def test_a_stored_calibration_without_gains_leaves_their_stated_tolerances(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """Gains as in the deployment file are no exact ones."""
+    offsets = Offsets((1.0,) * 4, (0.1,) * 4)
+    with Store(tmp_path / "c.db") as store:
+        store.write(11, "nominal-square", Calibration(offsets=offsets), Provenance("offsets"), NOW)
+    messages = make_worker(bench, tmp_path / "c.db").process_message(
+        bench.introduce([11, 12, 13], [None, None, None]), NOW
+    )
+    (applied,) = calibrations(messages, 0)
+    assert applied.offset_counts == offsets.counts
+    assert (applied.gains, applied.covariance, applied.parts) == ((1.0,) * 4, None, None)
 
 
 def test_calibration_taken_over_from_another_node_is_applied_and_reported(

@@ -35,6 +35,9 @@ from handtouch.field.model import FloatArray, ForwardModel, FractionModel, chann
 BATCH_CONTACTS = 32
 MAX_SHAPE_DEVIATION = 20.0
 """Standard deviation of a log gain after 400 contacts, per noise, above which a shape is refused."""
+MAX_TOUCH_ERROR = 2e-3
+"""Standard deviation of the fractions of a touch that is still a point; larger errors of most contacts are
+those of other gains or objects."""
 
 _MAX_BATCH_ITERATIONS = 8
 _CONVERGED_STEP_SIGMA = 0.02  # standard deviations of the gains: a smaller step ends a batch
@@ -329,7 +332,8 @@ def _touch_variance(squared_scores: FloatArray, sensitivity: FloatArray) -> floa
     """
     sensitive = sensitivity >= np.median(sensitivity)
     excess = squared_scores[sensitive] / _MEDIAN_SQUARED_SCORE - 1
-    return max(0.0, float(np.median(excess / sensitivity[sensitive] ** 2)))
+    variance = float(np.median(excess / sensitivity[sensitive] ** 2))
+    return min(max(variance, 0.0), MAX_TOUCH_ERROR**2)
 
 
 def gain_deviation(model: ForwardModel, contacts: int = 400) -> float:
