@@ -61,7 +61,7 @@ class PadTolerances:
 
 
 class PartKnowledge:
-    """What is known of the log gains of all pads, and of their parts in standard deviations as stated.
+    """Knowledge of the log gains of all pads, and of their parts in standard deviations as stated.
 
     A pad has n log gains, then p = `part_count(n)` parts. axes: (pads (n + p)^2,), rows of an upper triangle
     whose product with its transpose is their covariance. offsets: (pads p,) most likely values of the parts.
