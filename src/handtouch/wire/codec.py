@@ -213,7 +213,8 @@ def _describe(value: Any) -> str:
 
 
 def _is_array(origin: Any) -> bool:
-    return getattr(origin, "__name__", "") == "ndarray"  # numpy is imported only by payloads that use it
+    """Return True for numpy's array or its alias (numpy 2.5), without importing numpy."""
+    return getattr(origin, "__name__", "") in ("ndarray", "NDArray")
 
 
 def _checker(hint: Any) -> Callable[[Any], Any]:

@@ -79,8 +79,8 @@ def input_fields(kind: type[Any]) -> tuple[FieldDeclaration, ...]:
 
 
 def is_array(hint: Any) -> bool:
-    """Return True for the type of a numpy array, without importing numpy."""
-    return getattr(typing.get_origin(hint), "__name__", "") == "ndarray"
+    """Return True for the type of a numpy array, without importing numpy (2.5 has an alias)."""
+    return getattr(typing.get_origin(hint), "__name__", "") in ("ndarray", "NDArray")
 
 
 def _declaration(name: str, hint: Any, is_optional: bool, meanings: dict[str, str]) -> FieldDeclaration:
