@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.config.channels import ELECTRODES
+from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.supervisor.diagnose.model import FloatArray
@@ -88,7 +89,7 @@ class HypothesisTables:
         self,
         network: ElectrodeNetwork,
         surface: Surface,
-        parts: Sequence[ElectrodeNetwork] = (),
+        parts: Sequence[FractionModel] = (),
         unevenness_std: float = 0.0,
     ) -> None:
         self.hypotheses: list[Hypothesis] = []
@@ -131,7 +132,8 @@ class HypothesisTables:
         self._torn = _FractionTable(np.stack(torn_ones))
         self.hypotheses.append(Hypothesis(FaultKind.UNEXPLAINED, ()))
         self.kinds = np.array([h.kind for h in self.hypotheses])
-        tolerances = [part.fractions(*_nodes(part)).T - nominal for part in parts]
+        varied = (part for part in parts if part is not network)
+        tolerances = [part.fractions(*_nodes(part)).T - nominal for part in varied]
         if unevenness_std > 0:
             tolerances += [change.reshape(-1, 4) for change in sheet.by_waves(unevenness_std)]
         self._tolerances = np.array([*tolerances, *(nominal * channel for channel in np.eye(4))])
@@ -174,7 +176,7 @@ class HypothesisTables:
         return table.score(pad, currents, sigma, self._tolerances)
 
 
-def _nodes(network: ElectrodeNetwork) -> tuple[FloatArray, FloatArray]:
+def _nodes(network: FractionModel) -> tuple[FloatArray, FloatArray]:
     x, y = np.meshgrid(_NODE_FRACTIONS * network.a, _NODE_FRACTIONS * network.b, indexing="ij")
     return x.ravel(), y.ravel()
 

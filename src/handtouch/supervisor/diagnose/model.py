@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
+from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
-from handtouch.hand import electrode_network, networks_with_other_parts, pad_surface
+from handtouch.hand import electrode_network, models_with_other_parts, pad_surface
 from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
 
@@ -76,7 +77,7 @@ class DiagnosisModel:
     networks: Sequence[ElectrodeNetwork]
     surfaces: Sequence[Surface]
     sheets: Sequence[config.Sheet]
-    parts: Sequence[Callable[[], Sequence[ElectrodeNetwork]]]
+    parts: Sequence[Callable[[], Sequence[FractionModel]]]
     drive_v: FloatArray
     ampere_per_count: FloatArray
     noise_counts: FloatArray
@@ -113,8 +114,8 @@ class DiagnosisModel:
             surfaces=[pad_surface(pad) for pad in pads],
             sheets=[deployment.sheets[pad.sheet] for pad in pads],
             parts=[
-                partial(networks_with_other_parts, pad, node, deployment.sheets[pad.sheet])
-                for pad, node in zip(pads, nodes, strict=True)
+                partial(models_with_other_parts, network, pad, node, deployment.sheets[pad.sheet])
+                for network, pad, node in zip(networks, pads, nodes, strict=True)
             ],
             drive_v=np.array([node.drive_v for node in nodes]),
             ampere_per_count=scale,
