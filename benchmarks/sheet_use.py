@@ -17,6 +17,7 @@ from scores import Estimates, bin_labels
 
 from handtouch.config import Behaviour
 from handtouch.core.sheet_force import ForceReliability, SheetForceCompensation, sheet_behaviour_of
+from handtouch.core.state import TickState
 from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
 from handtouch.simulate.worlds import DrawnWorld, SheetKind
 
@@ -97,15 +98,18 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
     behaviours = [
         sheet_behaviour_of(some.behaviour) if some.behaviour else None for some in sheets for _ in some.laws
     ]
-    compensation = SheetForceCompensation(behaviours, round(DT_S * 1e9))
+    held = TickState.empty(len(laws))
+    compensation = SheetForceCompensation(behaviours, round(DT_S * 1e9), held)
+    is_modelled = np.array([behaviour is not None for behaviour in behaviours])
     gains = np.concatenate([some.gains for some in sheets])
     kind = np.repeat([some.name for some in sheets], [len(some.laws) for some in sheets])
-    pads, use = np.arange(len(laws)), Use(len(laws), rng)
+    use = Use(len(laws), rng)
     compared, press = np.zeros(len(laws), np.bool_), np.ones(len(laws))
     press_std = np.array([law.press_std for law in laws])
     noise_std = np.array([law.noise_std for law in laws])
     touching, none, t_ns, gone_s = np.zeros(len(laws), np.bool_), np.zeros(len(laws)), 10**9, 0.0
-    compensation.compensate_forces(none, none, touching, t_ns)
+    held.uncompensated_force_n[:] = held.uncompensated_std_n[:] = 0.0
+    compensation.compensate_forces(t_ns)
     rows: list[dict[str, Any]] = []
     for long_s, is_work in use.spells(hours):
         for dt_s in [DT_S] * round(long_s / DT_S) if is_work else [long_s]:
@@ -128,8 +132,8 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
                 compensation.begin_contacts(began)
                 compared[began] = False
             touching = now
-            pressed = compensation.compensate_forces(apparent, none, touching, t_ns)
-            is_modelled = np.isin(pads, pressed)
+            held.touching[:], held.uncompensated_force_n[:] = touching, apparent
+            compensation.compensate_forces(t_ns)
             due = np.flatnonzero(touching & ~compared & (load > 0) & (use.age_s >= use.sample_s))
             compared[due] = True
             for pad in due.tolist():

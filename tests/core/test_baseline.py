@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch.core.baseline import Baseline
+from handtouch.core.state import TickState
 
 FloatArray = NDArray[np.float64]
 BEGIN, END, SLOW_S = 80.0, 40.0, 20.0
@@ -23,7 +24,8 @@ class Rig:
 
     def __init__(self, pads: int = 4, period_ns: int = 5_000_000, noise: float = 0.0) -> None:
         full = np.full(pads, 1.0)
-        self.baseline = Baseline(full, BEGIN * full, END * full, SLOW_S * full, [slice(0, pads)])
+        self.state = TickState.empty(pads)
+        self.baseline = Baseline(full, BEGIN * full, END * full, SLOW_S * full, [slice(0, pads)], self.state)
         self.pads, self.period_ns, self.noise = pads, period_ns, noise
         self.t_ns = SECOND_NS
         self.touching = np.zeros(pads, np.bool_)
@@ -42,12 +44,15 @@ class Rig:
             total = excess.sum(axis=1)
             began = ~self.touching & (total > BEGIN)
             self.touching = np.where(self.touching, total >= END, total > BEGIN)
-            if began.any():
-                self.baseline.begin_contacts(np.flatnonzero(began))
+            self.state.held[began] = True
+            for block in (self.state.block_sum, self.state.block_squares, self.state.block_count):
+                block[began] = 0.0
             free = ~self.touching & (total <= BEGIN)
             if sampled < 1:
                 free &= self._rng.random(self.pads) < sampled
-            self.baseline.add_samples(excess, free)
+            self.state.block_sum[free] += excess[free]
+            self.state.block_squares[free] += np.square(excess[free])
+            self.state.block_count[free] += 1
             self.baseline.update_baseline(self.t_ns, self.touching)
 
     def total(self, pad: int = 0) -> float:
@@ -159,7 +164,7 @@ def test_a_stored_baseline_survives_a_start_while_touched() -> None:
     rig.baseline.set_offset(0, [5.0] * 4, [0.5] * 4)
     rig.run(5.0, lambda _: only(0, 60.0))
     assert rig.touching[0]
-    assert not rig.baseline.unknown_in_contact[0]
+    assert rig.baseline.known[0]
     assert rig.baseline.expected_counts[0] == pytest.approx(5.0)
 
 
@@ -177,10 +182,10 @@ def test_the_stored_variance_decides_whether_a_first_reading_is_drift() -> None:
 def test_without_a_stored_baseline_a_pad_touched_at_the_start_is_unknown_until_released() -> None:
     rig = Rig()
     rig.run(2.0, lambda _: only(1, 60.0, others=4.0))
-    assert rig.baseline.unknown_in_contact.tolist() == [False, True, False, False]
+    assert rig.baseline.known.tolist() == [True, False, True, True]
     rig.run(1.0, lambda _: 4.0)
     rig.run(1.0, lambda _: only(1, 60.0, others=4.0))
-    assert not rig.baseline.unknown_in_contact.any()
+    assert rig.baseline.known.all()
     assert rig.baseline.expected_counts[1] == pytest.approx(4.0, abs=0.3)
 
 

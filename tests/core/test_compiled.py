@@ -40,8 +40,9 @@ def copied(tmp_path: Path) -> Path:
 
 
 @needs_compiled
-def test_compiled_and_interpreted_stages_give_the_same_bits() -> None:
-    program = str(Path(__file__).with_name("solve_many.py"))
+@pytest.mark.parametrize("name", ["solve_many.py", "detect_many.py"])
+def test_compiled_and_interpreted_stages_give_the_same_bits(name: str) -> None:
+    program = str(Path(__file__).with_name(name))
     compiled, interpreted = run(program, "1000"), run(program, "1000", HANDTOUCH_UNCOMPILED="1")
     kinds, digests = zip(*(out.stdout.split() for out in (compiled, interpreted)), strict=True)
     assert kinds == ("compiled", "interpreted")

@@ -6,73 +6,86 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.core.contacts import ContactChanges, ContactDetector
+from handtouch.core.contacts import ContactChanges, ContactDetector, DetectionSettings
 from handtouch.core.cycle import Cycle
+from handtouch.core.slab import Slab
+from handtouch.core.state import TickState
 
-BEGIN, END = 2.0, 1.0
-
-
-def _contacts(pads: int = 1, begin: int = 2, end: int = 3) -> ContactDetector:
-    return ContactDetector(np.full(pads, BEGIN), np.full(pads, END), np.full(pads, begin), np.full(pads, end))
+BEGIN, END = 20.0, 10.0
 
 
-def _step(
-    contacts: ContactDetector, level: float, t_ns: int = 0, sampled: bool = True, trusted: bool = True
-) -> ContactChanges:
-    one = np.ones(1, dtype=np.bool_)
-    return contacts.detect_contacts(np.array([level]), one & sampled, one & trusted, np.array([t_ns]))
+class Detector:
+    """Contacts of one pad with a baseline of 0 and 1 A per count."""
+
+    def __init__(self, begin: int = 2, end: int = 3) -> None:
+        one, self._state, self._slab = np.ones(1), TickState.empty(1), Slab(1)
+        self._state.max_sample_period_ns[:] = 10
+        self._cycle, self._up = Cycle(10, 0.6), np.zeros(1, np.uint8)
+        counts = (np.array([number]) for number in (begin, end, 10))
+        settings = DetectionSettings(np.ones((1, 4)), one, one, BEGIN * one, END * one, *counts)
+        self.contacts = ContactDetector(settings, np.zeros((1, 4)), self._state)
+
+    def step(self, level: float, sampled: bool = True, trusted: bool = True) -> ContactChanges:
+        """Run a cycle of 10 ns; a pad that isn't trusted is at the end of its range."""
+        self._cycle.begin_cycle(self._cycle.sync_ns + 10)
+        self._slab.begin_cycle(self._cycle.sync_ns)
+        counts = np.array([level, 0, 0, 0] if trusted else [32767] * 4, dtype="<i2")
+        if sampled or not trusted:
+            self._slab.write_pdo(0, counts.tobytes(), self._cycle.sync_ns + 1)
+        self._slab.unpack_counts()
+        return self.contacts.detect_contacts(self._slab, self._up, self._cycle)
 
 
 def test_a_contact_begins_after_the_debounce_with_the_time_of_its_first_sample() -> None:
-    contacts = _contacts(begin=3)
-    began = [len(_step(contacts, 3.0, t).began) for t in (10, 20, 30, 40)]
+    detector = Detector(begin=3)
+    began = [len(detector.step(30).began) for _ in range(4)]
     assert began == [0, 0, 1, 0]
-    assert contacts.begin_ns[0] == 10
+    assert detector.contacts.begin_ns[0] == 10
 
 
 def test_a_single_outlier_neither_begins_nor_ends_a_contact() -> None:
-    contacts = _contacts(begin=2, end=2)
-    levels = [3.0, 0.0, 3.0, 3.0, 0.0, 3.0, 0.0]
-    changes = [_step(contacts, level) for level in levels]
+    detector = Detector(begin=2, end=2)
+    levels = [30, 0, 30, 30, 0, 30, 0]
+    changes = [detector.step(level) for level in levels]
     assert [len(c.began) for c in changes] == [0, 0, 0, 1, 0, 0, 0]
     assert not any(len(c.ended) for c in changes)
 
 
 def test_between_the_thresholds_nothing_changes() -> None:
-    contacts = _contacts(begin=1, end=1)
-    assert not len(_step(contacts, 1.5).began)
-    assert len(_step(contacts, 3.0).began)
-    assert not len(_step(contacts, 1.5).ended)
-    assert len(_step(contacts, 0.5).ended)
+    detector = Detector(begin=1, end=1)
+    assert not len(detector.step(15).began)
+    assert len(detector.step(30).began)
+    assert not len(detector.step(15).ended)
+    assert len(detector.step(5).ended)
 
 
 def test_a_pad_without_a_sample_keeps_its_state() -> None:
-    contacts = _contacts(begin=2)
-    _step(contacts, 3.0)
-    assert not len(_step(contacts, 3.0, sampled=False).began)
-    assert len(_step(contacts, 3.0).began)
+    detector = Detector(begin=2)
+    detector.step(30)
+    assert not len(detector.step(30, sampled=False).began)
+    assert len(detector.step(30).began)
 
 
 def test_a_contact_on_an_untrusted_pad_ends_at_once_and_needs_a_new_debounce() -> None:
-    contacts = _contacts(begin=2)
-    _step(contacts, 3.0)
-    _step(contacts, 3.0)
-    assert len(_step(contacts, 3.0, sampled=False, trusted=False).ended)
-    assert not len(_step(contacts, 3.0).began)
-    assert len(_step(contacts, 3.0).began)
+    detector = Detector(begin=2)
+    detector.step(30)
+    detector.step(30)
+    assert len(detector.step(30, trusted=False).ended)
+    assert not len(detector.step(30).began)
+    assert len(detector.step(30).began)
 
 
-@given(st.lists(st.tuples(st.floats(0, 3), st.booleans(), st.booleans()), max_size=60))
-def test_begins_and_ends_alternate_and_no_id_is_used_twice(steps: list[tuple[float, bool, bool]]) -> None:
-    contacts = _contacts(begin=2, end=2)
+@given(st.lists(st.tuples(st.integers(0, 30), st.booleans(), st.booleans()), max_size=60))
+def test_begins_and_ends_alternate_and_no_id_is_used_twice(steps: list[tuple[int, bool, bool]]) -> None:
+    detector = Detector(begin=2, end=2)
     events: list[tuple[str, int]] = []
-    for t_ns, (level, sampled, trusted) in enumerate(steps):
-        changes = _step(contacts, level, t_ns, sampled, trusted)
+    for level, sampled, trusted in steps:
+        changes = detector.step(level, sampled, trusted)
         if len(changes.began):
-            events.append(("begin", int(contacts.id[0])))
+            events.append(("begin", int(detector.contacts.id[0])))
         if len(changes.ended):
-            events.append(("end", int(contacts.id[0])))
-            contacts.clear_ended(changes.ended)
+            events.append(("end", int(detector.contacts.id[0])))
+            detector.contacts.id[changes.ended] = 0
     assert [event for event, _ in events] == ["begin", "end"] * (len(events) // 2) + ["begin"] * (
         len(events) % 2
     )

@@ -32,6 +32,9 @@ def test_a_contact_of_non_finite_numbers_is_readable(bench: Any, event: wire.Con
             column = getattr(columns, name)
             column[:] = rng.choice(ODD, column.shape) if rng.random() < 0.5 else rng.normal(size=column.shape)
         pipeline.tick.contacts.peak_force_n[:] = rng.choice(ODD, pipeline.model.size)
+        state = pipeline.state
+        state.contact_id[:], state.solved[:], state.known[:] = 1, True, True
+        pipeline.tick.refresh()
         pad = int(rng.integers(pipeline.model.size))
         sent = pipeline.messages._contact_message(pad, event, 10**9, 10**9)
         read = wire.decode(wire.encode(sent))

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch import sheet
@@ -16,6 +19,7 @@ from handtouch.core.sheet_force import (
     SheetForceCompensation,
     sheet_behaviour_of,
 )
+from handtouch.core.state import TickState
 
 FloatArray = NDArray[np.float64]
 PERIOD_NS, DT_S = 100_000_000, 0.1
@@ -28,10 +32,16 @@ class Rig:
     def __init__(
         self, pads: int, model: sheet.SheetModel, behaviour: object = LIKE_S1, seed: int = 1
     ) -> None:
-        self.compensation = SheetForceCompensation([behaviour] * pads, PERIOD_NS)  # type: ignore[list-item]
+        self.tick_state = TickState.empty(pads)
+        self.compensation = SheetForceCompensation([behaviour] * pads, PERIOD_NS, self.tick_state)  # type: ignore[list-item]
         self._state, self._step = model.initial_state(pads, seed), model.discretise(DT_S)
         self.t_ns, self.touching = 10**9, np.zeros(pads, np.bool_)
-        self.compensation.compensate_forces(np.zeros(pads), np.zeros(pads), self.touching, self.t_ns)
+        self.compensate(np.zeros(pads))
+
+    def compensate(self, apparent: FloatArray) -> None:
+        self.tick_state.touching[:] = self.touching
+        self.tick_state.uncompensated_force_n[:], self.tick_state.uncompensated_std_n[:] = apparent, 0.0
+        self.compensation.compensate_forces(self.t_ns)
 
     def run(self, seconds: float, load_n: FloatArray) -> None:
         for _ in range(round(seconds / DT_S)):
@@ -41,7 +51,7 @@ class Rig:
             self.compensation.begin_contacts(np.flatnonzero(touching & ~self.touching))
             self.touching = touching
             self.apparent = apparent
-            self.compensation.compensate_forces(apparent, 0.0 * apparent, touching, self.t_ns)
+            self.compensate(apparent)
 
     def cycle(self, times: int, load_n: FloatArray) -> None:
         for _ in range(times):
@@ -209,16 +219,39 @@ def test_a_late_or_implausible_reference_is_ignored(force: float, late_ns: int) 
 
 def test_sheets_of_two_behaviours_and_none_are_independent() -> None:
     s2 = sheet_behaviour_of(Behaviour(preset="S2", hysteresis_width=0.1))
-    compensation = SheetForceCompensation([LIKE_S1, None, s2, LIKE_S1], PERIOD_NS)
-    raw, touching = np.array([1.0, 1.0, 1.0, 0.0]), np.array([True, True, True, False])
+    state = TickState.empty(4)
+    compensation = SheetForceCompensation([LIKE_S1, None, s2, LIKE_S1], PERIOD_NS, state)
+    state.uncompensated_force_n[:3], state.uncompensated_std_n[:], state.touching[:3] = 1.0, 0.1, True
     for t_ns in range(10**9, 2 * 10**9, PERIOD_NS):
-        pressed = compensation.compensate_forces(raw, 0.1 * raw, touching, t_ns)
-    assert pressed.tolist() == [0, 2]
-    assert np.isfinite(compensation.std_n[pressed]).all()
+        compensation.compensate_forces(t_ns)
+    assert np.isfinite(compensation.std_n).tolist() == [True, False, True, True]
+    assert (compensation.force_n[[0, 2]] > 0).all()
     assert compensation.state[1] == ForceReliability.RELIABLE
     again = compensation.with_behaviours([LIKE_S1, None, s2, LIKE_S1], [LIKE_S1, None, LIKE_S1, LIKE_S1])
     assert again.touched_s[0] == compensation.touched_s[0] > 0
     assert again.state[2] == ForceReliability.UNRELIABLE
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(-0.5, 8.0), st.booleans(), st.integers(1, 3)), min_size=1, max_size=40),
+    st.sampled_from(["S1", "S2"]),
+    st.sampled_from([0.0, 0.1]),
+)
+def test_loads_are_those_of_the_inverse_model(
+    steps: list[tuple[float, bool, int]], preset: Literal["S1", "S2"], hysteresis_width: float
+) -> None:
+    behaviour = sheet_behaviour_of(
+        Behaviour(preset=preset, hysteresis_width=hysteresis_width, gain_std=0.0, back_force_std_n=0.0)
+    )
+    inverse = sheet.SheetCompensator(behaviour.model, 1, behaviour.uncertainty, update_period_s=DT_S)
+    rig = Rig(1, calm(sheet.S1), behaviour)
+    for apparent, touching, periods in steps:
+        rig.t_ns += periods * PERIOD_NS
+        rig.touching[:] = touching
+        rig.compensate(np.array([apparent]))
+        expected = inverse.compensate(np.array([apparent * touching]), periods * DT_S)
+        np.testing.assert_allclose(rig.compensation.force_n, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_the_keys_of_a_behaviour_change_its_preset() -> None:

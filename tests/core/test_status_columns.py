@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,6 +40,8 @@ class _Driver:
         self._bench = bench
         self.touched = [self.counts(pad, 1e-3) for pad in range(3)]
         self.sync_ns = 10**9
+        for _ in range(30):  # until the baselines are known
+            self.run_cycle()
 
     def counts(self, pad: int, current_a: float) -> bytes:
         """Return the sample of a contact with a total current."""
@@ -63,7 +67,8 @@ def _nothing(driver: _Driver) -> None:
 
 
 def _unreliable_position(driver: _Driver) -> None:
-    driver.pipeline.model.position_unreliable[ROUND] = True
+    calibration = driver.pipeline.calibrations[ROUND]
+    driver.pipeline.set_calibration(ROUND, replace(calibration, position_unreliable=True))
 
 
 def _saturated(driver: _Driver) -> None:
@@ -71,8 +76,7 @@ def _saturated(driver: _Driver) -> None:
 
 
 def _unknown_baseline(driver: _Driver) -> None:
-    baseline = driver.pipeline.tick.baseline
-    baseline.touching[PLANE], baseline.known[PLANE] = True, False
+    driver.pipeline.tick.baseline.known[PLANE] = False
 
 
 def _position_only(driver: _Driver) -> None:
@@ -92,7 +96,7 @@ def _position_only(driver: _Driver) -> None:
 )
 def test_codes_in_the_hand_frame_are_the_statuses_of_the_contacts(
     bench: Any,
-    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
     change: Any,
     link: str,
     position: PositionStatus,
@@ -101,7 +105,7 @@ def test_codes_in_the_hand_frame_are_the_statuses_of_the_contacts(
     driver = _Driver(bench)
     for _ in range(4):
         driver.run_cycle(PLANE, ROUND, RESISTED)
-    monkeypatch.setattr(bench.model, "position_unreliable", bench.model.position_unreliable.copy())
+    request.addfinalizer(partial(bench.model.set_calibration, ROUND, bench.model.calibrations[ROUND]))
     change(driver)
     frame, contacts = driver.run_cycle(PLANE, ROUND, RESISTED)
     values = columns(frame)
@@ -124,3 +128,15 @@ def test_a_pad_without_a_contact_has_no_status(bench: Any) -> None:
     for _ in range(4):
         frame, _ = driver.run_cycle()
     assert not any(np.count_nonzero(columns(frame)[name]) for name in ("position_status", "force_status"))
+
+
+def test_the_force_is_unreliable_from_begin_to_end_of_a_contact_older_than_the_baseline(bench: Any) -> None:
+    """A pad touched since the start: its zero was never measured."""
+    driver = _Driver(bench)
+    driver.pipeline.tick.reset_pad(PLANE)  # its node was replaced
+    statuses = []
+    for number in range(60):
+        driver.run_cycle(*[PLANE] * (number < 50))
+        statuses += [m.force_status for m in driver.sent.messages if isinstance(m, wire.Contact)]
+    assert len(statuses) > 49
+    assert set(statuses) == {"unreliable"}

@@ -2,8 +2,9 @@
 
 Public name: `Baseline`.
 
-Ticks only collect samples (`add_samples`); a tenth of a second of them is then processed at once
-(`update_baseline`), with its duration, so that tick rate and missing samples make no difference. Rules:
+Ticks only collect samples (`stages.detect`, the `block_...` arrays of the state); a tenth of a second of them
+is then processed at once (`update_baseline`), with its duration, so that tick rate and missing samples make
+no difference. Rules:
 * An untouched pad's baseline is tracked with a time constant, up to a maximum rate: a slower rise is drift.
 * A touched pad's baseline is held, after release too, until the pad reads nearly its baseline again: leakage
   or creep neither triggers another contact nor becomes the baseline.
@@ -84,7 +85,6 @@ class Baseline:
         for row, pads in enumerate(hands):
             self._hand_membership[row, pads] = 1.0
         self._sum, self._squares, self._count = held.block_sum, held.block_squares, held.block_count
-        self._buffer = np.zeros((n, 4))
         self._blocks, self._block_begin_ns = held.blocks, held.block_begin_ns
         self._drift_until_ns = held.drift_until_ns  # time of each pad's last offset update
         self._anchor, self._anchored_s = held.drift_anchor, held.drift_anchored_s
@@ -130,30 +130,9 @@ class Baseline:
         self._update_expected()
 
     @property
-    def unknown_in_contact(self) -> BoolArray:
-        """Pads (n,) touched since the start, so that their baseline was never measured."""
-        return np.asarray(self.touching & ~self.known)
-
-    @property
     def noise_counts(self) -> FloatArray:
         """Standard deviation of each channel (n, 4), measured while untouched."""
         return np.asarray(np.sqrt(self.noise_squared))
-
-    def add_samples(self, excess: FloatArray, free: BoolArray) -> None:
-        """Add the samples of a tick: counts less `expected_counts` (n, 4), of the pads that are `free` (n,):
-        untouched, with a new sample that can be trusted."""
-        if np.count_nonzero(free) == free.size:
-            masked = excess
-        else:
-            masked = np.multiply(excess, free[:, None], out=self._buffer)
-        self._sum += masked
-        self._squares += np.multiply(masked, masked, out=self._buffer)
-        self._count += free
-
-    def begin_contacts(self, began: IntArray) -> None:
-        """Hold the baselines of these pads; the samples collected last may be the contact's approach."""
-        self.held[began] = True
-        self._discard_samples(began)
 
     def update_baseline(self, sync_ns: int, touching: BoolArray) -> bool:
         """Process the samples collected, once a block is complete; return True if it was. `touching` (n,):

@@ -21,7 +21,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-STAGES = ("tables", "tolerances", "locate", "force", "place", "solve", "slip", "receive")
+STAGES = (
+    *("tables", "tolerances", "locate", "force", "place", "solve", "slip", "receive", "detect", "sheets"),
+    "publish",
+)
 """Modules of `handtouch.core.stages`, lowest first."""
 DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"
 """Environment variable that makes Python run the sources, for debugging."""

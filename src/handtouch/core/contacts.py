@@ -1,4 +1,7 @@
-"""Contact detection: two thresholds and a debounce turn samples into begin, update and end."""
+"""Contact detection: two thresholds and a debounce turn samples into begin, update and end.
+
+Public names: `ContactDetector`, `DetectionSettings`, `ContactChanges`.
+"""
 
 from __future__ import annotations
 
@@ -7,111 +10,107 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.cycle import Cycle
+from handtouch.core.memory import view_memory
+from handtouch.core.slab import Slab
+from handtouch.core.stages.detect import ContactDetection
 from handtouch.core.state import TickState
 
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 FloatArray = NDArray[np.float64]
 
+NO_LIMIT_NS = np.iinfo(np.int64).max
+_MAX_SILENT_PERIODS = 3
+
+
+class DetectionSettings(NamedTuple):
+    """Settings of n pads, read in place in every tick."""
+
+    ampere_per_count: FloatArray
+    """(n, 4)"""
+    mean_ampere_per_count: FloatArray
+    """(n,)"""
+    noise_counts: FloatArray
+    """(n,) of a channel"""
+    begin_threshold_a: FloatArray
+    """(n,) a contact begins above it"""
+    end_threshold_a: FloatArray
+    """(n,) a contact ends below it"""
+    begin_samples: NDArray[np.int64]
+    """(n,) successive samples"""
+    end_samples: NDArray[np.int64]
+    max_gap_periods: NDArray[np.int64]
+    """(n,) a contact ends after so many missing samples"""
+
 
 class ContactChanges(NamedTuple):
-    """Pads whose contact began or ended in one tick, and those with a new sample of a contact."""
+    """Pads whose contact began or ended in one tick, continues with a new sample (`updated`) or without the
+    expected one (`silent`), and those whose contact is to be solved."""
 
     began: IntArray
     ended: IntArray
-    measured: IntArray
+    updated: IntArray
+    silent: IntArray
+    solved: IntArray
 
 
 _NO_PADS: IntArray = np.zeros(0, dtype=np.intp)
 
 
 class ContactDetector:
-    """Contacts of n pads, at most one each, as columns; they begin above `begin` and end below `end` (n,).
+    """Contacts of n pads, at most one each, in a tick's state.
 
     `touching` (n,) bool; `id` (n,) uint32, 0 without contact; `begin_ns` (n,) time of the first sample above
-    the begin threshold; `peak_force_n` (n,) greatest valid force of the contact [N], updated by the tick.
+    the begin threshold; `peak_force_n` (n,) greatest valid force of the contact [N]; `currents` (n, 4)
+    [A], and of contacts that are to be solved `offset_std_a` (n,) of their sum, from the baseline.
+
+    expected_counts: (n, 4) of untouched pads, read in place.
     """
 
-    def __init__(
-        self,
-        begin: FloatArray,
-        end: FloatArray,
-        begin_samples: NDArray[np.int64],
-        end_samples: NDArray[np.int64],
-        state: TickState | None = None,
-    ) -> None:
-        held = TickState.empty(len(begin)) if state is None else state
-        self.touching, self.id, self.begin_ns = held.touching, held.contact_id, held.begin_ns
-        self.peak_force_n, self._next_id = held.peak_force_n, held.next_contact_id
-        self._first_sample_ns = held.first_sample_ns
-        self._contradicting_samples = held.contradicting_samples  # successive, against `touching`
-        self.set_settings(begin, end, begin_samples, end_samples)
+    def __init__(self, settings: DetectionSettings, expected_counts: FloatArray, state: TickState) -> None:
+        self.touching, self.id, self.begin_ns = state.touching, state.contact_id, state.begin_ns
+        self.peak_force_n, self._next_id = state.peak_force_n, state.next_contact_id
+        self.currents, self.offset_std_a = np.zeros(expected_counts.shape), np.zeros(state.pads)
+        self._state, self._expected_counts = state, expected_counts
+        self._rows = np.zeros((len(ContactChanges._fields), state.pads), dtype=np.intp)
+        self._lists = list(self._rows)
+        self.set_settings(settings)
+
+    def set_settings(self, settings: DetectionSettings) -> None:
+        """Change the settings; they apply to present contacts too."""
+        arrays = {name: view_memory(array) for name, array in settings._asdict().items()}
+        arrays["expected_counts"] = view_memory(self._expected_counts)
+        arrays["currents"], arrays["excess"] = view_memory(self.currents), view_memory(np.zeros(4))
+        arrays["offset_std_a"] = view_memory(self.offset_std_a)
+        self._stage = ContactDetection(
+            self._state.pads, self._state.memory() | arrays, view_memory(self._rows)
+        )
 
     def detect_contacts(
-        self, level: FloatArray, sampled: BoolArray, trusted: BoolArray, sample_ns: NDArray[np.int64]
+        self, slab: Slab, node_state: NDArray[np.uint8], cycle: Cycle, until_ns: int = NO_LIMIT_NS
     ) -> ContactChanges:
-        """Process one tick: the `level` of all pads, which of them were `sampled` and when, which to trust.
+        """Process the samples in a slab that arrived before `until_ns`, of pads whose `node_state` (n,) is 0.
 
-        A contact on an untrusted pad ends at once; a pad without a sample keeps its state.
+        A contact on a pad without valid samples ends at once; one that misses a sample keeps its state.
         """
-        touching = self.touching
-        above = level > self._threshold
-        against = above != touching
-        lost = touching > trusted
-        began = ended = _NO_PADS
-        if self._debouncing or np.count_nonzero(against) or np.count_nonzero(lost):
-            against &= sampled
-            against &= trusted
-            began, ended = self._debounce(against, sampled | ~trusted, lost, sample_ns)
-            above = level > self._threshold
-        # a sample below the threshold has no position: the last one holds until the debounce decides
-        return ContactChanges(began, ended, (touching & sampled & above).nonzero()[0])
+        stage = self._stage
+        stage.detect_contacts(
+            *(slab.memory, node_state.data, cycle.sync_ns, cycle.previous_sync_ns),
+            *(cycle.period_ns // 2, until_ns),
+        )
+        counts = stage.began, stage.ended, stage.updated, stage.silent, stage.solved
+        return ContactChanges(
+            *[pads[:k].copy() if k else _NO_PADS for pads, k in zip(self._lists, counts, strict=True)]
+        )
 
-    def set_settings(
-        self,
-        begin: FloatArray,
-        end: FloatArray,
-        begin_samples: NDArray[np.int64],
-        end_samples: NDArray[np.int64],
-    ) -> None:
-        """Set thresholds and debounce counts; they apply to present contacts too. Call it also after the
-        state was loaded."""
-        self._begin_threshold, self._end_threshold = begin, np.nextafter(end, -np.inf)
-        # the one that applies now
-        self._threshold = np.where(self.touching, self._end_threshold, begin)
-        self._required_samples = np.stack([begin_samples, end_samples])
-        self._debouncing = bool(self._contradicting_samples.any())
+    def is_fresh(self, pad: int) -> bool:
+        """Return True if the pad sent its last expected sample."""
+        held = self._state
+        limit_ns = 0 if held.synchronous[pad] else _MAX_SILENT_PERIODS * held.max_sample_period_ns[pad]
+        return bool(held.silent_ns[pad] <= limit_ns)
 
     @property
     def begun_count(self) -> int:
         """Number of contacts begun so far."""
         return int(self._next_id[0]) - 1
-
-    def clear_ended(self, ended: IntArray) -> None:
-        """Clear the ids of ended contacts, after their last message was built."""
-        if len(ended):
-            self.id[ended] = 0
-
-    def _debounce(
-        self, against: BoolArray, known: BoolArray, lost: BoolArray, sample_ns: NDArray[np.int64]
-    ) -> tuple[IntArray, IntArray]:
-        np.copyto(self._first_sample_ns, sample_ns, where=against & (self._contradicting_samples == 0))
-        self._contradicting_samples[against] += 1
-        self._contradicting_samples[~against & known] = 0
-        flips = against & (
-            self._contradicting_samples
-            >= np.where(self.touching, self._required_samples[1], self._required_samples[0])
-        )
-        began = np.flatnonzero(flips & ~self.touching)
-        ended = np.flatnonzero(flips & self.touching | lost)
-        self._contradicting_samples[began] = self._contradicting_samples[ended] = 0
-        self._debouncing = bool(self._contradicting_samples.any())
-        self.touching[began] = True
-        self.touching[ended] = False
-        self._threshold[began] = self._end_threshold[began]
-        self._threshold[ended] = self._begin_threshold[ended]
-        self.id[began] = np.arange(self._next_id[0], self._next_id[0] + len(began))
-        self._next_id[0] += len(began)
-        self.begin_ns[began] = self._first_sample_ns[began]
-        self.peak_force_n[began] = np.nan
-        return began, ended

@@ -18,6 +18,8 @@ import numpy.typing as npt
 
 from handtouch import sheet
 from handtouch.config import Behaviour
+from handtouch.core.memory import view_memory
+from handtouch.core.stages.sheets import SheetInterval, SheetStage
 from handtouch.core.state import SHEET_ELEMENTS, SHEET_PLAYS, TickState
 
 FloatArray = npt.NDArray[np.float64]
@@ -102,9 +104,12 @@ class SheetForceCompensation:
         self._new_contacts = held.new_contact  # since then
         self._relative_std = held.relative_std  # standard deviation over force
         self._period_ns = period_ns
-        self._apparent, self._gain = np.zeros(n), np.ones(n)
+        self._gain = np.ones(n)
+        self._results = np.zeros((4, n))
         self._reset()
-        self.groups = _make_groups(behaviours, held)
+        self.groups = _make_groups(behaviours, held, self._results)
+        self._stage = self._make_stage()
+        self._periods = -1  # of the groups' steps
 
     def with_behaviours(
         self, before: Sequence[SheetBehaviour | None], behaviours: Sequence[SheetBehaviour | None]
@@ -196,33 +201,30 @@ class SheetForceCompensation:
         self._begin_s[began] = self.touched_s[began]
         self._new_contacts[began] = True
 
-    def compensate_forces(
-        self, uncompensated_n: FloatArray, uncompensated_std_n: FloatArray, touching: BoolArray, sync_ns: int
-    ) -> IntArray:
-        """Advance all sheets to `sync_ns` and compensate the forces of touched pads with a model; return
-        these pads (k,).
+    def compensate_forces(self, sync_ns: int) -> None:
+        """Advance all sheets to `sync_ns`, and compensate the forces of touched pads with a model.
 
-        uncompensated_n, uncompensated_std_n: (n,) of the contact law [N]; untouched pads count as 0.
+        They are those of the contact law in the state, `uncompensated_force_n` and `uncompensated_std_n`
+        [N]; untouched pads count as 0.
         """
-        dt_s = self._interval_s(sync_ns)
-        apparent = self._apparent
-        apparent.fill(0.0)
-        np.copyto(apparent, uncompensated_n, where=touching)
+        stage = self._stage
+        periods = stage.elapsed_periods(sync_ns)
+        if periods != self._periods:
+            self._periods = periods
+            for group in self.groups:
+                group.set_interval(periods * self._period_ns * 1e-9)
         for group in self.groups:
-            load = group.compensator.compensate(apparent[group.rows], dt_s)
-            self.force_n[group.rows] = load
-        self._waited_s[0] += dt_s
-        pressed: IntArray = (touching & self.modelled).nonzero()[0]
-        if not len(pressed):
-            self._waited_s[0] = 0.0
-            return pressed
-        self._last_touch_ns[pressed] = self._updated_ns
-        force = self.force_n.take(pressed) * self._gain.take(pressed)
-        if self._waited_s[0] >= UPDATE_PERIOD_S or np.count_nonzero(self._new_contacts):
-            self._update_uncertainty(pressed, force, uncompensated_std_n, touching)
-        self.force_n[pressed] = force
-        self.std_n[pressed] = force * self._relative_std.take(pressed)
-        return pressed
+            if stage.compensate_sheets(group.step):
+                group.compensator.update_back_force()
+        stage.find_pressed(periods * self._period_ns * 1e-9)
+        if stage.due:
+            self._update_uncertainty()
+        if stage.pressed:
+            stage.store_forces()
+
+    def store_forces(self) -> None:
+        """Replace the forces of touched pads in the contacts' values by compensated ones."""
+        self._stage.store_forces()
 
     def update_gains(
         self, reference: ForceReference, sample_ns: npt.NDArray[np.int64], touching: BoolArray
@@ -260,10 +262,26 @@ class SheetForceCompensation:
         self._confirmed[pads] = True
         return len(pads)
 
-    def _update_uncertainty(
-        self, pressed: IntArray, force: FloatArray, uncompensated_std_n: FloatArray, touching: BoolArray
-    ) -> None:
+    def _make_stage(self) -> SheetStage:
+        rows = [pad for group in self.groups for pad in group.pads.tolist()]
+        pads = np.array(rows + [0] * (len(self._gain) - len(rows)), dtype=np.int64)
+        return SheetStage(
+            self._held.memory(),
+            view_memory(pads),
+            len(rows),
+            view_memory(self._gain),
+            view_memory(self._results),
+            SHEET_ELEMENTS,
+            SHEET_PLAYS,
+            self._period_ns,
+            UPDATE_PERIOD_S,
+        )
+
+    def _update_uncertainty(self) -> None:
         """Update standard deviations and reliability of touched pads; periodically and at contact begin."""
+        touching, uncompensated_std_n = self._held.touching, self._held.uncompensated_std_n
+        pressed = np.flatnonzero(touching & self.modelled)
+        force = self.force_n[pressed]
         self.touched_s += self._waited_s * touching
         self._waited_s[0] = 0.0
         self._new_contacts[:] = False
@@ -280,30 +298,48 @@ class SheetForceCompensation:
         sane = std < _MAX_FORCE_STD_FRACTION * force  # False for what isn't finite
         self.state[pressed] = np.where(sane, known, ForceReliability.INVALID)
 
-    def _interval_s(self, sync_ns: int) -> float:
-        """Return the whole periods since the last tick (equal intervals are cheapest), keeping the rest."""
-        elapsed_ns = sync_ns - int(self._updated_ns[0])
-        if elapsed_ns > 10**9 * _HOUR_S or elapsed_ns < 0:
-            self._updated_ns[0] = sync_ns
-            return 0.0
-        periods = (elapsed_ns + self._period_ns // 2) // self._period_ns
-        self._updated_ns[0] += periods * self._period_ns
-        return periods * self._period_ns * 1e-9
-
 
 class _BehaviourGroup:
-    """Pads of equal sheet behaviour; `state`: of their sheets."""
+    """Pads of equal sheet behaviour, the group `number`; `state`: of their sheets, from row `first` on."""
 
-    def __init__(self, behaviour: SheetBehaviour, pads: IntArray, state: sheet.CompensatorState) -> None:
-        self.pads = pads
+    def __init__(
+        self,
+        number: int,
+        first: int,
+        behaviour: SheetBehaviour,
+        pads: IntArray,
+        state: sheet.CompensatorState,
+        results: FloatArray,
+    ) -> None:
+        self.pads, self._number, self._first = pads, number, first
         whole = len(pads) == pads[-1] - pads[0] + 1
         self.rows: slice | IntArray = slice(int(pads[0]), int(pads[-1]) + 1) if whole else pads
         self._forget_time_s = behaviour.forget_time_s
         self.compensator = sheet.SheetCompensator(
             behaviour.model, len(pads), behaviour.uncertainty, update_period_s=UPDATE_PERIOD_S, state=state
         )
+        self.compensator.last_step = results[:, first : first + len(pads)]
+        self.set_interval(0.0)
         if behaviour.back_force_std_n:
             self.compensator.set_back_force(0.0, behaviour.back_force_std_n)
+
+    def set_interval(self, dt_s: float) -> None:
+        """Set the interval of the next steps."""
+        model = self.compensator.model
+        creep, hysteresis = model.creep.discretise(dt_s), model.hysteresis.inverse
+        self.step = SheetInterval(
+            self._number,
+            self._first,
+            self._first + len(self.pads),
+            dt_s,
+            float(model.creep.total),
+            float(hysteresis.base),
+            view_memory(creep.inverse_lines.copy()),
+            view_memory(creep.transition.copy()),
+            view_memory(np.array(hysteresis.widths_n, dtype=np.float64)),
+            view_memory(np.array(hysteresis.weights, dtype=np.float64)),
+            len(creep.inverse_lines),
+        )
 
     def decay_back_force(self, rows: IntArray, pause_s: FloatArray) -> None:
         """Update back forces of rows after a pause. An undetected press may have wiped them, more probably
@@ -318,7 +354,9 @@ class _BehaviourGroup:
         back[rows] *= kept
 
 
-def _make_groups(behaviours: Sequence[SheetBehaviour | None], held: TickState) -> list[_BehaviourGroup]:
+def _make_groups(
+    behaviours: Sequence[SheetBehaviour | None], held: TickState, results: FloatArray
+) -> list[_BehaviourGroup]:
     """Return the pads by sheet behaviour, with fresh sheets in consecutive rows of the state."""
     groups, first = [], 0
     for number, kind in enumerate(dict.fromkeys(b for b in behaviours if b is not None)):
@@ -339,7 +377,7 @@ def _make_groups(behaviours: Sequence[SheetBehaviour | None], held: TickState) -
         for part in vars(state).values():
             part[:] = 0
         state.powered[:] = True
-        groups.append(_BehaviourGroup(kind, pads, state))
+        groups.append(_BehaviourGroup(number, rows.start, kind, pads, state, results))
     return groups
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.config.channels import integer_limits
+from handtouch.core.memory import view_memory
 from handtouch.core.stages import receive
 
 MAX_PDOS = 4
 """Most PDOs that the four channels of a pad may be spread over."""
 PDO_BYTES = 8
-_WORD_BITS = 8 * PDO_BYTES
 _SAMPLE_BYTES = MAX_PDOS * PDO_BYTES
 
 
@@ -73,39 +73,32 @@ class Slab:
         self._arrival_ns, self._repeat_counts = self.arrival_ns.data, self.repeat_counts.data
         self._fresh = bytearray(size)
         self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
-        self._is_fresh = self.fresh.view(np.bool_)
-        self._standard_counts = np.frombuffer(self._bytes, dtype="<i2").reshape(size, _SAMPLE_BYTES // 2)[
-            :, :4
-        ]
-        self._has_standard_layout = np.ones(size, dtype=np.bool_)
-        self._all_standard = True
         self._single = bytearray(size)  # 1 where a sample is one PDO
         self._partial_samples: dict[int, _PartialSample] = {}  # of pads with several PDOs
-        self._word_indices = np.zeros((size, 4), dtype=np.intp)
-        self._left_shifts = np.zeros((size, 4), dtype=np.int64)
-        self._right_shifts = np.zeros((size, 4), dtype=np.int64)
-        self._unsigned_masks: NDArray[np.int64] | None = None  # applied after the shifts
+        self._fields = np.zeros((size, 4, receive.FIELD_WORDS), dtype=np.int64)
         self._counts_per_unit = np.zeros((size, 4))  # of REAL32 fields, 0 for integers
         self._is_real: NDArray[np.bool_] | None = None
         self._low_limits = np.zeros((size, 4), dtype=np.int64)
         self._high_limits = np.zeros((size, 4), dtype=np.int64)
         self._counts = np.zeros((size, 4), dtype=np.int64)
-        self._memory = receive.SampleMemory(
+        self.memory = receive.SampleMemory(
             self._words.data,
             self._arrival_ns,
             self._repeat_counts,
             memoryview(self._fresh),
             memoryview(self._single),
+            *(view_memory(a) for a in (self._counts, self._fields, self._low_limits, self._high_limits)),
         )
+        """the same memory as the stages take it"""
         for slot in range(size):
             self.set_layout(slot, STANDARD_LAYOUT)
 
     def set_layout(self, slot: int, layout: ChannelLayout) -> None:
         """Set the channel fields of a slot, STANDARD_LAYOUT by default; its present sample is discarded."""
         for channel, field in enumerate(layout):
-            self._word_indices[slot, channel] = slot * MAX_PDOS + field.pdo
-            self._left_shifts[slot, channel] = _WORD_BITS - field.first_bit - field.bits
-            self._right_shifts[slot, channel] = _WORD_BITS - field.bits
+            sign = 1 << field.bits - 1 if field.signed else 0
+            word = slot * MAX_PDOS + field.pdo
+            self._fields[slot, channel] = word, field.first_bit, (1 << field.bits) - 1, sign
             self._counts_per_unit[slot, channel] = field.counts_per_unit or 0.0
             low, high = field.limits
             # an amplifier at its limit gives either of the two lowest counts; a current of zero is no limit
@@ -113,16 +106,12 @@ class Slab:
             self._high_limits[slot, channel] = high
         pdos = frozenset(field.pdo for field in layout)
         self._single[slot] = pdos == {0}
-        self._has_standard_layout[slot] = layout == STANDARD_LAYOUT
-        self._all_standard = bool(self._has_standard_layout.all())
         self._partial_samples.pop(slot, None)
         if not self._single[slot]:
             self._partial_samples[slot] = _PartialSample(pdos)
         self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = bytes(_SAMPLE_BYTES)
         is_real = self._counts_per_unit > 0
         self._is_real = is_real if is_real.any() else None
-        unsigned = self._low_limits == -1
-        self._unsigned_masks = np.where(unsigned, self._high_limits, -1) if unsigned.any() else None
 
     def write_pdo(self, slot: int, data: bytes | bytearray, arrival_ns: int, pdo: int = 0) -> None:
         """Store a PDO of a slot, at most 8 bytes; `pdo` as numbered by the slot's layout.
@@ -151,24 +140,16 @@ class Slab:
 
         Return that frame's number, and the bytes stored; see `handtouch.core.stages.receive`.
         """
-        end = receive.store_samples(self._memory, batch, routes, first, count)
-        self.fresh_count += self._memory.new_fresh
-        return end, self._memory.stored_bytes
+        end = receive.store_samples(self.memory, batch, routes, first, count)
+        self.fresh_count += self.memory.new_fresh
+        return end, self.memory.stored_bytes
 
     def unpack_counts(self) -> NDArray[np.int64]:
         """Return counts (size, 4) of the electrodes x0, xa, y0, yb; the array is reused by the next call."""
-        counts = self._counts
-        if self._all_standard:
-            np.copyto(counts, self._standard_counts)
-            return counts
-        np.take(self._words, self._word_indices, out=counts, mode="clip")
-        np.left_shift(counts, self._left_shifts, out=counts)
-        np.right_shift(counts, self._right_shifts, out=counts)
-        if self._unsigned_masks is not None:
-            np.bitwise_and(counts, self._unsigned_masks, out=counts)
+        receive.unpack_counts(self.memory)
         if self._is_real is not None:
-            self._convert_real(counts, self._is_real)
-        return counts
+            self._convert_real(self._counts, self._is_real)
+        return self._counts
 
     def _convert_real(self, counts: NDArray[np.int64], is_real: NDArray[np.bool_]) -> None:
         """Convert the bits of REAL32 fields to counts; NaN becomes the lower limit, which is saturated."""
@@ -189,8 +170,7 @@ class Slab:
 
     def begin_cycle(self, sync_ns: int) -> None:
         """Begin a cycle at a SYNC: samples that arrived since then are fresh, even if before this call."""
-        np.greater_equal(self.arrival_ns, sync_ns, out=self._is_fresh)
-        self.fresh_count = int(np.count_nonzero(self.fresh))
+        self.fresh_count = receive.begin_cycle(self.memory, sync_ns)
         for parts in self._partial_samples.values():
             parts.begin_cycle(sync_ns)
 

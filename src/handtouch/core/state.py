@@ -19,20 +19,19 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.memory import view_memory
 from handtouch.core.stages.slip import SLIP_COUNT
 from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.wire import PadState
 
 VERSION = 1
 """Of what the fields mean; their names, types and shapes are in the hash of the layout."""
-PUBLISHED_VALUES = 21
 PALM_VALUES = 31
 SHEET_ELEMENTS = SHEET_PLAYS = 8
 _ALIGNMENT = 64
 _MAX_PAUSE_NS = 3600 * 10**9
 _NEVER_SAMPLED_NS = 1 << 60
 
-Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -102,11 +101,8 @@ class TickState:
     """contacts that were solved since they began and their outputs were requested"""
     values: Annotated[FloatArray, Stored("<f8", _PADS, VALUE_COUNT, fill=math.nan)]
     """values of the contact's last solved sample, see `stages.solve.VALUE_SLICES`"""
-    published: Annotated[Float32Array, Stored("<f4", _PADS, PUBLISHED_VALUES, fill=math.nan)]
-    """columns of the hand frame that are written per contact"""
     uncompensated_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
     uncompensated_std_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
-    force_saturated: Annotated[BoolArray, Stored("?", _PADS)]
 
     # requested outputs
     position_requested: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
@@ -215,6 +211,10 @@ class TickState:
         """Return version and hash of the declared fields."""
         text = "\n".join(f"{name} {stored.dtype.str} {stored.shape}" for name, stored in _stored_fields())
         return f"{VERSION}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+
+    def memory(self) -> dict[str, memoryview[Any]]:
+        """Return the memory of the arrays by name, flat, as the stages take it."""
+        return {name: view_memory(getattr(self, name)) for name, _ in _stored_fields()}
 
     def save(self) -> bytes:
         """Return the bytes of all arrays."""

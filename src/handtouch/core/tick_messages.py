@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.core.contact_solver import MAX_SQUARED_MISFIT
+from handtouch.core.contact_solver import VALUE_SLICES
 from handtouch.core.hand_frame import HandFrameEncoder
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
@@ -28,7 +28,15 @@ END_REASONS: dict[PadState, EndReason] = {
 }
 """End reason of a contact by the state of its pad; "released" for any other."""
 _STOPPED: EndReason = "stopped"
-_WITH_STD = (ForceStatus.VALID, ForceStatus.UNRELIABLE)
+_WITH_STD = (int(ForceStatus.VALID), int(ForceStatus.UNRELIABLE))
+_POSITION_NAMES = tuple(status.text for status in PositionStatus)
+_FORCE_NAMES = tuple(status.text for status in ForceStatus)
+_PAD_M, _POSITION, _NORMAL, _COVARIANCE = (
+    VALUE_SLICES[name] for name in ("pad_m", "position_m", "normal", "covariance_m2")
+)
+_FORCE, _FORCE_STD, _RESIDUAL, _RESIDUAL_STD = (
+    VALUE_SLICES[name].start for name in ("force_n", "force_std_n", "residual", "residual_std")
+)
 
 
 class MessageSink(Protocol):
@@ -60,8 +68,6 @@ class TickMessages:
         self._session = session
         self._state = tick.state
         self._end_reason: EndReason = ""  # of all contacts, when the daemon stops
-        self._position_status = np.zeros(model.size, dtype=np.uint8)
-        self._force_status = np.zeros(model.size, dtype=np.uint8)
         self._encoders = {hand: self._make_encoder(hand, rows) for hand, rows in model.rows_of_hand.items()}
         self._hand_topics = [(hand, f"hand/{hand}", f"raw/{hand}") for hand in model.rows_of_hand]
         self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
@@ -81,7 +87,7 @@ class TickMessages:
             for pad in rows.tolist():
                 if sink.has_subscriber(self._topics[pad]):
                     sink.send(self._contact_message(pad, event, result.sync_ns, now_ns))
-        self._tick.contacts.clear_ended(result.ended)
+        self._tick.clear_ended(result.ended)
         self._transforms.discard(result.ended)
 
     def replace_model(self, model: PadModel) -> None:
@@ -95,7 +101,6 @@ class TickMessages:
         none = np.zeros(0, dtype=np.intp)
         self.send_contacts(TickResult(now_ns, none, none, touching, none), now_ns, sink)
         self._tick.contacts.touching[:] = False
-        self._state.published[:] = np.nan
         self._tick.columns.state[:] = PadState.STARTING
 
     def send_hand_frames(self, slab: Slab, tick_number: int, sync_ns: int, sink: MessageSink) -> None:
@@ -127,7 +132,6 @@ class TickMessages:
     def _hand_frame(self, hand: str, retained: bool = False) -> wire.EncodedMessage:
         rows = self._model.rows_of_hand[hand]
         optional = self._transforms.hand_columns(rows)
-        self._update_statuses(rows)
         seq, tick_number, sync_ns = self._frame_numbers()
         return self._encoders[hand].encode(seq, sync_ns, tick_number, retained, optional)
 
@@ -136,33 +140,12 @@ class TickMessages:
         held = self._state
         return int(held.frame_seq[0]), int(held.frame_tick[0]), int(held.frame_sync_ns[0])
 
-    def _update_statuses(self, rows: slice) -> None:
-        """Write the status columns of a hand's pads; the encoder copies them."""
-        tick, columns = self._tick, self._tick.columns
-        position, force = self._position_status[rows], self._force_status[rows]
-        position[:], force[:] = PositionStatus.NOT_COMPUTED, ForceStatus.NOT_COMPUTED
-        touching = tick.contacts.touching[rows]
-        if not np.count_nonzero(touching):
-            return
-        located = touching & np.isfinite(columns.contact_columns["position_m"][rows, 0])
-        solved = touching & tick.state.solved[rows]
-        position[solved & tick.state.position_requested[rows]] = PositionStatus.INVALID
-        position[located] = PositionStatus.VALID
-        no_point = columns.squared_misfit[rows] > MAX_SQUARED_MISFIT
-        position[located & (no_point | self._model.position_unreliable[rows])] = PositionStatus.UNRELIABLE
-        requested = solved & tick.state.force_requested[rows]
-        force[requested] = ForceStatus.VALID
-        force[requested & tick.is_force_unreliable(rows)] = ForceStatus.UNRELIABLE
-        force[requested & columns.force_saturated[rows]] = ForceStatus.LOWER_BOUND
-        force[requested & np.isnan(columns.contact_columns["force_n"][rows])] = ForceStatus.INVALID
-
     def frame_columns(self) -> dict[str, NDArray[Any]]:
         """Return the columns of all hand frames, (n, ...) with the rows of the model, in their types.
 
         These are the values that `send_hand_frames` publishes; the optional columns aren't among them.
         """
         rows, layout = slice(0, self._model.size), wire.COLUMNS[wire.HandFrame]
-        self._update_statuses(rows)
         return {name: array.astype(layout[name].dtype) for name, array in self._frame_sources(rows).items()}
 
     def _make_encoder(self, hand: str, rows: slice) -> HandFrameEncoder:
@@ -177,8 +160,8 @@ class TickMessages:
             "contact_id": self._tick.contacts.id[rows],
             "sample_ns": columns.sample_ns[rows],
             "total_current_a": columns.total_current_a[rows],
-            "position_status": self._position_status[rows],
-            "force_status": self._force_status[rows],
+            "position_status": columns.position_status[rows],
+            "force_status": columns.force_status[rows],
             **{name: columns.contact_columns[name][rows] for name in CONTACT_DTYPE.names or ()},
         }
 
@@ -205,17 +188,14 @@ class TickMessages:
         model, columns, contacts = self._model, self._tick.columns, self._tick.contacts
         sample_ns = int(columns.sample_ns[pad])
         begin_ns = int(contacts.begin_ns[pad])
-        position, normal, on_pad = (
-            column[pad].tolist() for column in (columns.position_m, columns.normal, columns.pad_m)
-        )
+        values = columns.values[pad].tolist()
+        position, normal, on_pad = values[_POSITION], values[_NORMAL], values[_PAD_M]
         located = all(map(math.isfinite, (*position, *normal, *on_pad)))
-        covariance = columns.covariance_m2[pad].ravel().tolist()
+        covariance = values[_COVARIANCE]
         bounded = located and all(map(math.isfinite, covariance))  # at a corner it may be unbounded
-        force_n = _finite_or_none(columns.force_n[pad])
-        force_status = self._force_status_of(pad, force_n)
+        force_status = int(columns.force_status[pad])
         t_ns = sample_ns if event != "end" else sync_ns
         modelled = self._tick.sheet_force.modelled[pad]
-        state = PadState(int(columns.state[pad]))
         return wire.Contact(
             v=wire.SCHEMA_VERSION,
             session=self._session,
@@ -233,42 +213,29 @@ class TickMessages:
             normal=tuple(normal) if located else None,
             covariance_m2=tuple(covariance) if bounded else None,
             pad_m=tuple(on_pad) if located else None,
-            position_status=self._position_status_of(pad, located).text,
-            force_n=force_n,
-            force_std_n=_finite_or_none(columns.force_std_n[pad]) if force_status in _WITH_STD else None,
+            position_status=_POSITION_NAMES[columns.position_status[pad]],
+            force_n=_finite_or_none(values[_FORCE]),
+            force_std_n=_finite_or_none(values[_FORCE_STD]) if force_status in _WITH_STD else None,
             peak_force_n=_finite_or_none(contacts.peak_force_n[pad]),
-            force_status=force_status.text,
+            force_status=_FORCE_NAMES[force_status],
             total_current_a=float(columns.total_current_a[pad]),
-            residual=_finite_or_none(columns.residual[pad]),
-            residual_std=_finite_or_none(columns.residual_std[pad]),
+            residual=_finite_or_none(values[_RESIDUAL]),
+            residual_std=_finite_or_none(values[_RESIDUAL_STD]),
             begin_threshold_n=float(model.begin_threshold_n[pad]),
             end_threshold_n=float(model.end_threshold_n[pad]),
             calibration_id=model.calibrations[pad].calibration_id,
-            end_reason=self._end_reason or END_REASONS.get(state, "released") if event == "end" else "",
+            end_reason=self._end_reason_of(pad) if event == "end" else "",
             retained=retained,
             uncompensated_force_n=_finite_or_none(columns.uncompensated_force_n[pad]) if modelled else None,
             diagnoses=model.calibrations[pad].diagnoses,
-            fresh=self._tick.is_fresh(pad),
+            fresh=contacts.is_fresh(pad),
             **self._transforms.contact_fields(pad),
         )
 
-    def _position_status_of(self, pad: int, located: bool) -> PositionStatus:
-        if located:
-            no_point = self._tick.columns.squared_misfit[pad] > MAX_SQUARED_MISFIT
-            unreliable = no_point or self._model.position_unreliable[pad]
-            return PositionStatus.UNRELIABLE if unreliable else PositionStatus.VALID
-        failed = self._state.position_requested[pad] and self._state.solved[pad]
-        return PositionStatus.INVALID if failed else PositionStatus.NOT_COMPUTED
-
-    def _force_status_of(self, pad: int, force_n: float | None) -> ForceStatus:
-        if not (self._state.force_requested[pad] and self._state.solved[pad]):
-            return ForceStatus.NOT_COMPUTED
-        if force_n is None:
-            return ForceStatus.INVALID
-        if self._tick.columns.force_saturated[pad]:
-            return ForceStatus.LOWER_BOUND
-        return ForceStatus.UNRELIABLE if self._tick.is_force_unreliable(pad) else ForceStatus.VALID
+    def _end_reason_of(self, pad: int) -> EndReason:
+        state = PadState(int(self._tick.columns.state[pad]))
+        return self._end_reason or END_REASONS.get(state, "released")
 
 
-def _finite_or_none(value: np.float64) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None

@@ -115,7 +115,8 @@ class SheetCompensator:
             (swelling.preload_n_per_k * warmth_k) ** 2,
         )
         """Variances proportional to the square of the effective load, to the effective load, and constant."""
-        self._last_result = tuple(np.zeros(pads) for _ in range(4))
+        self.last_step = np.zeros((4, pads))
+        """Of the last step: load, load before hysteresis, effective load, and reading [N]."""
         self._set_interval(0.0)
 
     @property
@@ -131,14 +132,14 @@ class SheetCompensator:
             checked = np.asarray(value, np.float64)
             if not ((checked >= 0) & np.isfinite(checked)).all():
                 raise ValueError(f"{name} must be at least 0 and finite, got {checked}")
-        self._update_back_force()
+        self.update_back_force()
         self.back_n[:] = back_n
         self.back_std_n[:] = std_n
         self._state.load_is_old[0] = True
 
     def reset_pads(self, pads: npt.NDArray[np.intp]) -> None:
         """Reset some pads to fresh sheets."""
-        self._update_back_force()
+        self.update_back_force()
         state = self._adaptation
         deviations = self.back_std_n, self._press_n
         rows = (state.back_n, state.peak_n, state.current_flow_s, *deviations, *self._plays, *self._elements)
@@ -147,7 +148,7 @@ class SheetCompensator:
 
     def set_powered(self, powered: npt.ArrayLike) -> None:
         """Switch the potential, (n,) or (); without it the back force decays."""
-        self._update_back_force()
+        self.update_back_force()
         self._powered[:] = powered
 
     def set_temperature_rise(self, warmer_k: float) -> None:
@@ -170,7 +171,7 @@ class SheetCompensator:
     def std_n(self, pads: npt.NDArray[np.intp] | slice = slice(None)) -> FloatArray:
         """Return the standard deviation of the last load [N], of all pads or some. Without a response it is
         that of a load anywhere below the threshold of response."""
-        load, before, effective, reading = (column[pads] for column in self._last_result)
+        load, before, effective, reading = self.last_step[:, pads]
         press, flicker, fixed = self._irreducible_variance
         variance = np.square(math.sqrt(press) * effective + self._press_n[pads]) + flicker * effective
         variance += np.square(self.back_std_n[pads])
@@ -198,7 +199,7 @@ class SheetCompensator:
         load = self._inverse_hysteresis.apply_to(self._plays, before) if len(self._plays) else before
         if self._temperature_rise_k:
             load = np.maximum(load - swelling.preload_n_per_k * self._temperature_rise_k, 0.0) * flows
-        self._last_result = (load, before, effective, reading)
+        self.last_step[:] = load, before, effective, reading
         return load
 
     def _set_interval(self, dt_s: float) -> None:
@@ -226,10 +227,11 @@ class SheetCompensator:
         self._flow_s += self._dt_s * flows
         self._state.waited_s[0] += self._dt_s
         if self._state.waited_s[0] >= self._update_period_s:
-            self._update_back_force()
+            self.update_back_force()
         return load
 
-    def _update_back_force(self) -> None:
+    def update_back_force(self) -> None:
+        """Update the back force from the loads since its last update."""
         state, flow = self._adaptation, self._flow_s
         step = self.model.adaptation.discretise(flow)
         remaining = step.remaining_fraction(state)

@@ -97,30 +97,34 @@ class Creep:
 
 
 class CreepStep:
-    """Creep over one interval; n steps of dt under a constant load equal one of n dt."""
+    """Creep over one interval; n steps of dt under a constant load equal one of n dt.
+
+    `transition` (modes, 1 + modes): elements after it from load and elements, unless they exceed the load.
+    `inverse_lines` (1 + modes, 1 + modes): the greatest of them is the load, from reading and elements.
+    """
 
     def __init__(self, creep: Creep, dt_s: float) -> None:
         decay = np.exp(-dt_s / np.array(creep.times_s))
         modes, weights = len(decay), np.array(creep.weights)
         self._reading = np.append(creep.instant, weights)
         # An element moves to decay * state + (1 - decay) * load, or to the load where that is less.
-        self._transition = np.column_stack([-np.expm1(-dt_s / np.array(creep.times_s)), np.diag(decay)])
+        self.transition = np.column_stack([-np.expm1(-dt_s / np.array(creep.times_s)), np.diag(decay)])
         # Elements keep their order, the fastest nearest to the load. If the first k exceed the load they
         # follow it immediately, and reading = slope_k load + sum over the others of weight decay state: one
         # straight line for each k. The reading is the least of them, so the load is the largest solution.
         others = np.triu(np.ones((modes + 1, modes))) * (weights * decay)
         slope = creep.total - others.sum(1)
-        self._inverse_lines = np.column_stack([np.ones(modes + 1), -others]) / slope[:, None]
+        self.inverse_lines = np.column_stack([np.ones(modes + 1), -others]) / slope[:, None]
 
     def forward(self, state: FloatArray, load_n: FloatArray) -> FloatArray:
         """Return the reading (n,) at the end of an interval under load (n,) >= 0; update `state` in place."""
         state[0] = load_n
-        np.minimum(self._transition @ state, state[0], out=state[1:])
+        np.minimum(self.transition @ state, state[0], out=state[1:])
         return np.asarray(self._reading @ state)
 
     def inverse(self, state: FloatArray, reading_n: FloatArray) -> FloatArray:
         """Return the load (n,) of a reading; exact. Update `state` in place."""
         state[0] = reading_n
-        load = np.maximum.reduce(self._inverse_lines @ state, out=state[0])
-        np.minimum(self._transition @ state, load, out=state[1:])
+        load = np.maximum.reduce(self.inverse_lines @ state, out=state[0])
+        np.minimum(self.transition @ state, load, out=state[1:])
         return np.array(load)

@@ -1,11 +1,11 @@
 cimport cython
 
 cdef long long _STAMP_KIND, _LOW_HALF
-cdef Py_ssize_t _HEADER, _FRAME, _CONTROL, _ROUTE
+cdef Py_ssize_t _HEADER, _FRAME, _CONTROL, _ROUTE, _FIELD
 cdef Py_ssize_t _CONTROL_SIZE, _MESSAGE_SIZE, _STAMP_BYTES, _FRAME_BYTES, _IDENTIFIERS, _WORDS_OF_SLOT
 
 cdef class SampleMemory:
-    cdef long long[::1] words, arrival_ns, repeat_counts
+    cdef long long[::1] words, arrival_ns, repeat_counts, counts, fields, low_limits, high_limits
     cdef unsigned char[::1] fresh, single
     cdef readonly Py_ssize_t new_fresh, stored_bytes
 
@@ -19,3 +19,7 @@ cpdef Py_ssize_t store_samples(
     SampleMemory memory, FrameBatch batch, long long[::1] routes, Py_ssize_t first, Py_ssize_t count)
 @cython.locals(header=Py_ssize_t, control=Py_ssize_t, arrival_ns='long long')
 cpdef long long frame_arrival_ns(FrameBatch batch, Py_ssize_t i)
+@cython.locals(slot=Py_ssize_t, count=Py_ssize_t)
+cpdef Py_ssize_t begin_cycle(SampleMemory memory, long long sync_ns)
+@cython.locals(i=Py_ssize_t, field=Py_ssize_t, count='long long')
+cpdef unpack_counts(SampleMemory memory)

@@ -1,8 +1,8 @@
 """Samples of a batch of CAN frames, stored in the slab's memory.
 
-Public names: `SampleMemory`, `FrameBatch`, `store_samples`, `frame_arrival_ns`, `HEADER_WORDS`,
-`FRAME_WORDS`, `CONTROL_WORDS`, `ROUTE_WORDS`. Memory is read in words of 64 bits; the layouts are those of
-Linux on 64-bit little-endian processors.
+Public names: `SampleMemory`, `FrameBatch`, `store_samples`, `frame_arrival_ns`, `begin_cycle`,
+`unpack_counts`, `HEADER_WORDS`, `FRAME_WORDS`, `CONTROL_WORDS`, `ROUTE_WORDS`, `FIELD_WORDS`. Memory is read
+in words of 64 bits; the layouts are those of Linux on 64-bit little-endian processors.
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ _HEADER, _FRAME, _CONTROL, _ROUTE = 8, 9, 4, 2
 HEADER_WORDS, FRAME_WORDS, CONTROL_WORDS, ROUTE_WORDS = _HEADER, _FRAME, _CONTROL, _ROUTE
 """Words of a `struct mmsghdr`, of the longest frame (`struct canfd_frame`), of a control message with a
 `struct timespec`, and of a route."""
+_FIELD = 4
+FIELD_WORDS = _FIELD
+"""Words that describe a channel's field."""
 _CONTROL_SIZE, _MESSAGE_SIZE = 5, 7  # words of a `struct mmsghdr`
 _STAMP_BYTES = 32
 _STAMP_KIND = 35 << 32 | 1  # SCM_TIMESTAMPNS of SOL_SOCKET
@@ -25,6 +28,9 @@ class SampleMemory:
 
     words: (slots 4,) PDOs. arrival_ns, repeat_counts: (slots,). fresh: (slots,). single: (slots,), 1 where a
     sample is one PDO. `new_fresh` and `stored_bytes` are those of the last call of `store_samples`.
+    counts: (slots 4,), written by `unpack_counts`; of each, low_limits and high_limits, at which a channel is
+    saturated, and fields (slots 4 FIELD_WORDS,): index of its word, first bit, mask of its bits, and the
+    value of its sign bit, 0 without sign.
     """
 
     def __init__(
@@ -34,7 +40,13 @@ class SampleMemory:
         repeat_counts: memoryview[int],
         fresh: memoryview[int],
         single: memoryview[int],
+        counts: memoryview[int],
+        fields: memoryview[int],
+        low_limits: memoryview[int],
+        high_limits: memoryview[int],
     ) -> None:
+        self.counts, self.fields = counts, fields
+        self.low_limits, self.high_limits = low_limits, high_limits
         self.words, self.arrival_ns, self.repeat_counts = words, arrival_ns, repeat_counts
         self.fresh, self.single = fresh, single
         self.new_fresh = self.stored_bytes = 0
@@ -81,6 +93,25 @@ def store_samples(
             memory.new_fresh += 1
         memory.stored_bytes += size
     return count
+
+
+def begin_cycle(memory: SampleMemory, sync_ns: int) -> int:
+    """Mark the samples that arrived since a SYNC as fresh; return their number."""
+    count = 0
+    for slot in range(len(memory.arrival_ns)):
+        memory.fresh[slot] = 1 if memory.arrival_ns[slot] >= sync_ns else 0
+        count += memory.fresh[slot]
+    return count
+
+
+def unpack_counts(memory: SampleMemory) -> None:
+    """Unpack all channels; of a REAL32 field, its bits as an integer."""
+    for i in range(len(memory.counts)):
+        field = _FIELD * i
+        count = memory.words[memory.fields[field]] >> memory.fields[field + 1] & memory.fields[field + 2]
+        if count & memory.fields[field + 3]:
+            count -= 2 * memory.fields[field + 3]
+        memory.counts[i] = count
 
 
 def frame_arrival_ns(batch: FrameBatch, i: int) -> int:

@@ -1,0 +1,22 @@
+"""Memory of arrays as the stages take it: flat memoryviews, which Python reads as its own numbers.
+
+Public name: `view_memory`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def view_memory(array: NDArray[Any]) -> memoryview[Any]:
+    """Return the memory of an array of numbers or truth values, flat.
+
+    Raises ValueError for an array that isn't contiguous, as a copy would be other memory.
+    """
+    if not array.flags.c_contiguous:
+        raise ValueError(f"an array of shape {array.shape} isn't contiguous")
+    memory: memoryview[Any] = (array.view(np.uint8) if array.dtype == np.bool_ else array).reshape(-1).data
+    return memory

@@ -1,0 +1,48 @@
+cimport cython
+from handtouch.core.stages.receive cimport SampleMemory
+
+cdef Py_ssize_t _VALUES, _CHANNELS, _CLEAR, _TOUCHED, _STALE, _FAULTED, _MAX_SILENT
+cdef double _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION, _NAN
+
+cdef class ContactDetection:
+    cdef Py_ssize_t pads
+    cdef readonly Py_ssize_t began, ended, updated, silent, solved
+    cdef long long[::1] rows
+    cdef double[::1] expected_counts, currents, ampere_per_count, noise_counts
+    cdef double[::1] begin_threshold_a, end_threshold_a, mean_ampere_per_count, offset_std, offset_std_a
+    cdef long long[::1] begin_samples, end_samples, max_gap_periods
+    cdef long long[::1] ticks, sample_ns, arrival_ns, sample_counts, missed_sample_counts, silent_ns
+    cdef long long[::1] max_sample_period_ns
+    cdef unsigned char[::1] pad_state, synchronous, touching, is_solved, position_requested, held
+    cdef double[::1] total_current_a, peak_force_n, values
+    cdef unsigned int[::1] contact_id
+    cdef long long[::1] next_contact_id, begin_ns, first_sample_ns, contradicting_samples
+    cdef long long[::1] update_interval_ticks
+    cdef double[::1] block_sum, block_squares, block_count, excess
+    cdef bint sampled, implausible, trusted, stale
+    @cython.locals(pad=Py_ssize_t)
+    cpdef detect_contacts(
+        self, SampleMemory memory, const unsigned char[::1] node_state, long long sync_ns,
+        long long previous_sync_ns, long long half_period_ns, long long until_ns)
+
+@cython.locals(arrival_ns='long long', here=bint, in_time=bint)
+cdef void _take_sample(
+    ContactDetection stage, SampleMemory memory, Py_ssize_t pad, bint operational, long long sync_ns,
+    long long previous_sync_ns, long long until_ns) noexcept
+@cython.locals(railed=bint, sources=bint, total=double, magnitude=double, low=double, high=double,
+               excess=double, least=double, c=Py_ssize_t, i=Py_ssize_t, count='long long')
+cdef void _check_sample(ContactDetection stage, SampleMemory memory, Py_ssize_t pad) noexcept
+@cython.locals(period_ns='long long')
+cdef void _check_silence(
+    ContactDetection stage, Py_ssize_t pad, long long cycle_ns, long long half_period_ns) noexcept
+@cython.locals(level=double, touching=bint, above=bint, required='long long')
+cdef void _detect_contact(ContactDetection stage, Py_ssize_t pad) noexcept
+@cython.locals(begin_a=double, end_a=double)
+cdef bint _is_above(ContactDetection stage, Py_ssize_t pad, double level, bint touching) noexcept
+@cython.locals(i=Py_ssize_t)
+cdef void _begin_contact(ContactDetection stage, Py_ssize_t pad) noexcept
+cdef void _end_contact(ContactDetection stage, Py_ssize_t pad) noexcept
+@cython.locals(due=bint)
+cdef void _select(ContactDetection stage, Py_ssize_t pad, bint continued, bint above) noexcept
+@cython.locals(free=bint, c=Py_ssize_t, excess=double)
+cdef void _count_sample(ContactDetection stage, Py_ssize_t pad) noexcept

@@ -1,0 +1,252 @@
+"""Samples of a tick to contacts: currents, validity, two thresholds and a debounce; one pass over the pads.
+
+Public name: `ContactDetection`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from handtouch.core.stages.receive import SampleMemory
+from handtouch.core.stages.solve import VALUE_COUNT
+
+_VALUES = VALUE_COUNT
+_CHANNELS = 4
+_CLEAR, _TOUCHED, _STALE, _FAULTED = 0, 1, 2, 4  # PadState
+_MAX_SILENT = 3  # periods
+_MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION = 10.0, 0.02  # of a channel's noise, and of all channels
+_NAN = float("nan")
+
+
+class ContactDetection:
+    """Detection of contacts on n pads of four channels, at most one each.
+
+    arrays: flat memory of the arrays of `TickState` by their names; of the model: ampere_per_count (n 4),
+    mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,), begin_samples,
+    end_samples and max_gap_periods (n,); expected_counts (n 4) of untouched pads. Written for the solver:
+    currents (n 4,) and offset_std_a (n,), the standard deviation of their sums from the baseline [A].
+
+    rows: (5 n,): pads whose contact began, ended, has a new sample and didn't begin, misses one, or is to be
+    solved, `began`, `ended`, `updated`, `silent` and `solved` of them, n from one list to the next.
+    """
+
+    def __init__(self, pads: int, arrays: Mapping[str, Any], rows: memoryview[int]) -> None:
+        self.pads, self.rows = pads, rows
+        self.began = self.ended = self.updated = self.silent = self.solved = 0
+        # model
+        self.expected_counts, self.currents = arrays["expected_counts"], arrays["currents"]
+        self.ampere_per_count, self.noise_counts = arrays["ampere_per_count"], arrays["noise_counts"]
+        self.mean_ampere_per_count = arrays["mean_ampere_per_count"]
+        self.offset_std, self.offset_std_a = arrays["offset_std"], arrays["offset_std_a"]
+        self.begin_threshold_a = arrays["begin_threshold_a"]
+        self.end_threshold_a = arrays["end_threshold_a"]
+        self.begin_samples, self.end_samples = arrays["begin_samples"], arrays["end_samples"]
+        self.max_gap_periods = arrays["max_gap_periods"]
+        # samples
+        self.ticks = arrays["ticks"]
+        self.pad_state, self.sample_ns = arrays["pad_state"], arrays["sample_ns"]
+        self.arrival_ns, self.sample_counts = arrays["arrival_ns"], arrays["sample_counts"]
+        self.missed_sample_counts, self.silent_ns = arrays["missed_sample_counts"], arrays["silent_ns"]
+        self.synchronous = arrays["synchronous"]
+        self.max_sample_period_ns = arrays["max_sample_period_ns"]
+        self.total_current_a = arrays["total_current_a"]
+        # contacts
+        self.touching, self.contact_id = arrays["touching"], arrays["contact_id"]
+        self.next_contact_id, self.begin_ns = arrays["next_contact_id"], arrays["begin_ns"]
+        self.first_sample_ns = arrays["first_sample_ns"]
+        self.contradicting_samples = arrays["contradicting_samples"]
+        self.peak_force_n, self.is_solved = arrays["peak_force_n"], arrays["solved"]
+        self.values = arrays["values"]
+        self.position_requested = arrays["position_requested"]
+        self.update_interval_ticks = arrays["update_interval_ticks"]
+        # baseline
+        self.held, self.block_sum = arrays["held"], arrays["block_sum"]
+        self.block_squares, self.block_count = arrays["block_squares"], arrays["block_count"]
+        # of one pad
+        self.sampled = self.implausible = self.trusted = self.stale = False
+        self.excess = arrays["excess"]
+
+    def detect_contacts(
+        self,
+        memory: SampleMemory,
+        node_state: memoryview[int],
+        sync_ns: int,
+        previous_sync_ns: int,
+        half_period_ns: int,
+        until_ns: int,
+    ) -> None:
+        """Process the samples that arrived before `until_ns`. node_state: (n,), 0 where the node is up."""
+        self.began = self.ended = self.updated = self.silent = self.solved = 0
+        self.ticks[0] += 1
+        for pad in range(self.pads):
+            _take_sample(self, memory, pad, node_state[pad] == 0, sync_ns, previous_sync_ns, until_ns)
+            _check_sample(self, memory, pad)
+            _check_silence(self, pad, sync_ns - previous_sync_ns, half_period_ns)
+            if node_state[pad] != 0:
+                self.trusted = False
+            _detect_contact(self, pad)
+            if node_state[pad] != 0:
+                self.pad_state[pad] = node_state[pad]
+            elif self.stale:
+                self.pad_state[pad] = _STALE
+            elif self.implausible:
+                self.pad_state[pad] = _FAULTED
+            else:
+                self.pad_state[pad] = _TOUCHED if self.touching[pad] else _CLEAR
+            if self.sampled:
+                _count_sample(self, pad)
+
+
+def _take_sample(
+    stage: ContactDetection,
+    memory: SampleMemory,
+    pad: int,
+    operational: bool,
+    sync_ns: int,
+    previous_sync_ns: int,
+    until_ns: int,
+) -> None:
+    """Note a pad's new sample and its time: its SYNC, or its arrival where it is event-driven."""
+    arrival_ns = memory.arrival_ns[pad]
+    here = arrival_ns < until_ns
+    stage.sampled = here and operational and arrival_ns != stage.arrival_ns[pad]
+    if here:
+        stage.arrival_ns[pad] = arrival_ns
+    in_time = here and memory.fresh[pad] != 0
+    if stage.sampled:
+        stage.sample_ns[pad] = sync_ns if in_time else previous_sync_ns
+        if not stage.synchronous[pad]:
+            stage.sample_ns[pad] = arrival_ns
+    if not in_time and operational and stage.synchronous[pad] and stage.pad_state[pad] <= _TOUCHED:
+        stage.missed_sample_counts[pad] += 1
+
+
+def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> None:
+    """Compute a pad's currents. Its sample is implausible with a channel at the end of its range, or sourcing
+    current.
+
+    A sheet only sinks current. If all channels source, by no more than begins a contact, the baseline is
+    wrong, not the pad: it was learned during a light touch.
+    """
+    railed, total, magnitude = False, 0.0, 0.0
+    low = high = 0.0
+    for c in range(_CHANNELS):
+        i = pad * _CHANNELS + c
+        count = memory.counts[i]
+        if count <= memory.low_limits[i] or count >= memory.high_limits[i]:
+            railed = True
+        excess = count - stage.expected_counts[i]
+        stage.excess[c] = excess
+        stage.currents[i] = excess * stage.ampere_per_count[i]
+        total += stage.currents[i]
+        magnitude += abs(excess)
+        if c == 0 or excess < low:
+            low = excess
+        if c == 0 or excess > high:
+            high = excess
+    least = _MAX_NEGATIVE_SIGMA * stage.noise_counts[pad]
+    sources = low < -(_MAX_NEGATIVE_FRACTION * magnitude + least)
+    if sources:
+        sources = high > least or -total > stage.begin_threshold_a[pad]
+    stage.implausible = railed or sources
+    stage.trusted = not stage.implausible
+    if stage.sampled:
+        stage.total_current_a[pad] = total
+
+
+def _check_silence(stage: ContactDetection, pad: int, cycle_ns: int, half_period_ns: int) -> None:
+    """Add the cycle to the silence of a pad without a sample: it is stale after three periods."""
+    stage.stale = False
+    if stage.sampled:
+        stage.silent_ns[pad] = 0
+        return
+    period_ns = stage.max_sample_period_ns[pad]
+    stage.silent_ns[pad] += max(0, min(cycle_ns, period_ns))
+    # times of SYNCs vary
+    stage.stale = stage.silent_ns[pad] > _MAX_SILENT * period_ns - half_period_ns
+    if stage.silent_ns[pad] > stage.max_gap_periods[pad] * period_ns + half_period_ns:
+        stage.trusted = False
+
+
+def _detect_contact(stage: ContactDetection, pad: int) -> None:
+    """Begin, continue or end a pad's contact; one on a pad that isn't trusted ends at once."""
+    level, touching = stage.total_current_a[pad], stage.touching[pad] != 0
+    above = _is_above(stage, pad, level, touching)
+    if touching and not stage.trusted:
+        _end_contact(stage, pad)
+    elif stage.sampled and stage.trusted and above != touching:
+        if stage.contradicting_samples[pad] == 0:
+            stage.first_sample_ns[pad] = stage.sample_ns[pad]
+        stage.contradicting_samples[pad] += 1
+        required = stage.end_samples[pad] if touching else stage.begin_samples[pad]
+        if stage.contradicting_samples[pad] >= required and touching:
+            _end_contact(stage, pad)
+        elif stage.contradicting_samples[pad] >= required:
+            _begin_contact(stage, pad)
+    elif stage.sampled or not stage.trusted:
+        stage.contradicting_samples[pad] = 0
+    if stage.touching[pad]:
+        _select(stage, pad, touching, _is_above(stage, pad, level, True))
+
+
+def _is_above(stage: ContactDetection, pad: int, level: float, touching: bool) -> bool:
+    """Return True if a current is above the threshold that applies."""
+    begin_a: float = stage.begin_threshold_a[pad]
+    end_a: float = stage.end_threshold_a[pad]
+    return level >= end_a if touching else level > begin_a
+
+
+def _begin_contact(stage: ContactDetection, pad: int) -> None:
+    """Begin a contact. The samples that its baseline collected last may be its approach."""
+    stage.touching[pad] = stage.held[pad] = 1
+    stage.contact_id[pad] = stage.next_contact_id[0] & 0xFFFFFFFF
+    stage.next_contact_id[0] += 1
+    stage.begin_ns[pad] = stage.first_sample_ns[pad]
+    stage.contradicting_samples[pad] = stage.is_solved[pad] = 0
+    stage.peak_force_n[pad] = _NAN
+    for i in range(pad * _VALUES, (pad + 1) * _VALUES):
+        stage.values[i] = _NAN  # not a starting point: it is of the contact before
+    for i in range(pad * _CHANNELS, (pad + 1) * _CHANNELS):
+        stage.block_sum[i] = stage.block_squares[i] = 0.0
+    stage.block_count[pad] = 0.0
+    stage.rows[stage.began] = pad
+    stage.began += 1
+
+
+def _end_contact(stage: ContactDetection, pad: int) -> None:
+    stage.touching[pad] = stage.contradicting_samples[pad] = 0
+    stage.rows[stage.pads + stage.ended] = pad
+    stage.ended += 1
+
+
+def _select(stage: ContactDetection, pad: int, continued: bool, above: bool) -> None:
+    """List a pad's contact if it is to be updated or solved, or its sample is missing.
+
+    A sample below the threshold has no position: the last one holds until the debounce decides.
+    """
+    due = stage.ticks[0] % stage.update_interval_ticks[pad] == 0
+    if not stage.sampled:
+        if due and stage.synchronous[pad]:
+            stage.rows[3 * stage.pads + stage.silent] = pad
+            stage.silent += 1
+    elif above and (due or not continued):
+        if continued:
+            stage.rows[2 * stage.pads + stage.updated] = pad
+            stage.updated += 1
+        if stage.position_requested[pad]:
+            stage.offset_std_a[pad] = stage.offset_std[pad] * stage.mean_ampere_per_count[pad]
+            stage.rows[4 * stage.pads + stage.solved] = pad
+            stage.solved += 1
+
+
+def _count_sample(stage: ContactDetection, pad: int) -> None:
+    """Count a sample, and collect that of an untouched pad for its baseline, unless a contact may begin."""
+    stage.sample_counts[pad] += 1
+    free = stage.trusted and not stage.touching[pad]
+    if free and stage.total_current_a[pad] <= stage.begin_threshold_a[pad]:
+        for c in range(_CHANNELS):
+            excess = stage.excess[c]
+            stage.block_sum[pad * _CHANNELS + c] += excess
+            stage.block_squares[pad * _CHANNELS + c] += excess * excess
+        stage.block_count[pad] += 1.0
