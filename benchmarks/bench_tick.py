@@ -116,6 +116,8 @@ def measure(ticks: int) -> list[Row]:
             for state, pause_s in (("hot", 0.0), ("cold", PAUSE_S)):
                 spent = Driver(model, touched, SPEEDS.get(kind, 0.0)).measure(ticks, pause_s)
                 rows.append({"pads": pads, "touched": touched, "contacts": kind, "state": state, **spent})
+                times = ", ".join(f"{name} {us:.1f} us" for name, us in spent.items())
+                print(f"{pads} pads, {touched} touched, {kind}, {state}: {times}", flush=True)
     return rows
 
 
@@ -129,8 +131,8 @@ def line(rows: list[Row], row: Row) -> str:
     cold = pick(rows, "cold", row["pads"], row["touched"], row["contacts"])
     each = f"{whole(row) / row['touched']:.1f}" if row["touched"] else ""
     columns = [row["pads"], row["touched"], row["contacts"]]
-    columns += [f"{row[part]:.0f}" for part in ("floor", "tick", "prepare")] + [each]
-    columns += [f"{cold[part]:.0f}" for part in ("floor", "tick", "prepare")]
+    columns += [f"{row[part]:.1f}" for part in ("floor", "tick", "prepare")] + [each]
+    columns += [f"{cold[part]:.1f}" for part in ("floor", "tick", "prepare")]
     return "| " + " | ".join(map(str, columns)) + " |"
 
 
