@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.config import shipped
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.simulate.faults import FAULTS
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
@@ -121,7 +122,8 @@ def detector(series_ohm: float = 0.0) -> ContactFaultDetector:
     """Detector of the first pad, with the tolerances that its deployment states."""
     made, network = model(), model().networks[0].with_series_ohm([series_ohm] * 4)
     if network not in _TABLES:
-        parts = [part.with_series_ohm([series_ohm] * 4) for part in made.parts[0]()]
+        networks = (part for part in made.parts[0]() if isinstance(part, ElectrodeNetwork))
+        parts = [part.with_series_ohm([series_ohm] * 4) for part in networks]
         _TABLES[network] = HypothesisTables(network, made.surfaces[0], parts, made.sheets[0].anisotropy_std)
     return ContactFaultDetector(_TABLES[network], made.gain_covariance[0])
 
