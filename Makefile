@@ -69,7 +69,7 @@ test: ## run everything that CI runs
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan checks
 	@$(MAKE) --no-print-directory unit
 
-checks: ## run lint, types and docs beside the tests on SocketCAN, which need a processor in time
+checks: $(VENV)/.dev ## run lint, types and docs beside the tests on SocketCAN, which need a processor in time
 	@nice -n 10 $(MAKE) --no-print-directory lint types docs
 
 lint: $(VENV)/.dev ## check style
