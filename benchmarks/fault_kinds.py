@@ -198,7 +198,7 @@ KINDS = (
          lasts_s=(0.3, 2.0), weight=2.0,
          reported=matches(r"identity mismatch: serial number is (\d+) .* configured is (\d+)")),
     Kind("two nodes with its id", "faulted: duplicate node id, or identity mismatch", twin, no_twin,
-         lasts_s=(2.0, 6.0), within_s=5.0, well_s=9.0,
+         lasts_s=(4.5, 7.0), within_s=5.0, well_s=9.0,
          reported=matches("duplicate node id|identity mismatch: serial number")),
     Kind("reboot, SDO abort at a step", "faulted: refused", fail_at_step(ABORT), heal_sdo,
          lasts_s=(0.5, 0.5), reported=_REFUSED, weight=3.0),

@@ -183,9 +183,11 @@ def test_unplugged_node_is_stale_then_lost_then_operational_again(rig: Any, foun
     else:
         rig.wire.cut.add(2)
     events = rig.run(600)
-    assert [e.new_state for e in events] == [NodeState.STALE, ABSENT]
-    assert "no heartbeat for 35" in events[1].reason
-    stale, lost = ((e.event_ns - (rig.t_ns - 600_000_000)) // 1_000_000 for e in events)
+    assert [e.new_state for e in events] == [NodeState.STALE, NodeState.STALE, ABSENT]
+    assert "are being checked" in events[0].reason
+    assert "can't be read" in events[1].reason
+    assert "no heartbeat for 35" in events[2].reason
+    stale, _, lost = ((e.event_ns - (rig.t_ns - 600_000_000)) // 1_000_000 for e in events)
     assert 15 <= stale <= 21
     assert 250 <= lost <= 352
     assert [rig.state(n) for n in (1, 3)] == [OPERATIONAL] * 2
