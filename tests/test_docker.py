@@ -23,6 +23,8 @@ from handtouch.core.compiled import STAGES
 
 from .conftest import ROOT, Installation
 
+pytestmark = pytest.mark.timeout(900)  # the first of these tests waits for a wheel, which compiles
+
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker/compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 

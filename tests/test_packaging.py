@@ -20,6 +20,8 @@ import handtouch
 
 from .conftest import ROOT, Installation
 
+pytestmark = pytest.mark.timeout(900)  # the first of these tests waits for a wheel, which compiles
+
 TABLES = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = TABLES["project"]
 
