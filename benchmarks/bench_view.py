@@ -219,18 +219,6 @@ def browser_packages(folder: Path) -> Path | None:
     return folder
 
 
-_FORMATS = (
-    *(
-        ("to_reader", ".2f"),
-        ("latency_ms", ".2f"),
-        ("ticks_hz", ".0f"),
-        ("view", ".1%"),
-        ("update_ms", ".1f"),
-    ),
-    *(("updates_hz", ".1f"), ("frames_hz", ".1f"), ("kilobytes_s", ".0f")),
-)
-
-
 def page_of(results: dict[str, Any]) -> str:
     """Return the page of results."""
     rows = results["rows"]

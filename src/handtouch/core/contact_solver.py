@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pad_tables import SEARCH_POINTS, stack_table, view_bytes, view_floats
+from handtouch.core.pad_tables import SEARCH_POINTS, stack_table
 from handtouch.core.stages.locate import Fit
 from handtouch.core.stages.place import Placement
 from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, ContactSolver
@@ -47,20 +48,20 @@ def make_solver(
         Placement(_work(15)),
         n,
         _work(3 * n),
-        view_floats(currents),
-        view_floats(model.weight),
+        view_memory(currents),
+        view_memory(model.weight),
         PartKnowledge(
-            view_floats(model.part_axes), view_floats(model.part_offsets), view_floats(model.touch_errors)
+            view_memory(model.part_axes), view_memory(model.part_offsets), view_memory(model.touch_errors)
         ),
-        view_floats(model.gain_covariance),
-        view_floats(offset_std_a),
-        view_bytes(force_requested),
-        view_floats(values),
+        view_memory(model.gain_covariance),
+        view_memory(offset_std_a),
+        view_memory(force_requested),
+        view_memory(values),
     )
 
 
 def _work(size: int) -> memoryview[float]:
-    return view_floats(np.zeros(size))
+    return view_memory(np.zeros(size))
 
 
 __all__ = ["MAX_SQUARED_MISFIT", "VALUE_COUNT", "VALUE_SLICES", "ContactSolver", "make_solver"]

@@ -21,7 +21,8 @@ from handtouch.config.channels import (
     resolve_channels,
 )
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.pad_tables import ForwardTable, SurfacePatches, view_floats
+from handtouch.core.memory import view_memory
+from handtouch.core.pad_tables import ForwardTable, SurfacePatches
 from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
@@ -335,7 +336,7 @@ class PadModel:
     def stage_laws(self) -> list[PadLaw]:
         """Return the contact laws as the stages take them; they follow later changes."""
         return [
-            PadLaw(view_floats(parameters), view_floats(form), bool(has_series))
+            PadLaw(view_memory(parameters), view_memory(np.ascontiguousarray(form)), bool(has_series))
             for parameters, form, has_series in zip(
                 self.law_parameters, self._series_form, self._has_series, strict=True
             )

@@ -12,11 +12,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.memory import view_memory
 from handtouch.core.stages.force import StackTable
 from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.place import PadSurface
@@ -44,16 +44,6 @@ _MAX_SURFACE_ERROR = 1e-7
 """Of a pad's size, between the nodes."""
 _STACK_INTERVALS = 2048
 _MIN_LOG_FACTOR, _MAX_LOG_FACTOR = -16.0, 32.0
-
-
-def view_floats(array: FloatArray) -> memoryview[float]:
-    """Return the memory of a contiguous float64 array, flat, as the stages take it."""
-    return cast("memoryview[float]", array.reshape(-1).data)
-
-
-def view_bytes(array: NDArray[np.uint8] | NDArray[np.bool_]) -> memoryview[int]:
-    """Return the memory of a contiguous array of bytes or truth values, flat, as the stages take it."""
-    return array.reshape(-1).view(np.uint8).data
 
 
 def hermite_table(values: FloatArray) -> FloatArray:
@@ -143,13 +133,13 @@ class ForwardTable:
     def pad_table(self) -> ModelTable:
         """Return it as the stages take it."""
         return ModelTable(
-            view_floats(self.nodes),
+            view_memory(self.nodes),
             len(self.nodes) - 1,
             self.electrodes,
-            view_floats(self.nodes_x),
-            view_floats(self.nodes_y),
-            view_floats(self.search_fractions),
-            view_floats(self.search_cells),
+            view_memory(self.nodes_x),
+            view_memory(self.nodes_y),
+            view_memory(self.search_fractions),
+            view_memory(self.search_cells),
             SEARCH_POINTS,
         )
 
@@ -302,7 +292,7 @@ class SurfacePatches:
         """Return it as the stages take it."""
         cells = self.nodes.shape[1] - 1
         return PadSurface(
-            view_floats(self.nodes), 0, cells, self.nodes[0].size, view_floats(self.ends), self.side_x
+            view_memory(self.nodes), 0, cells, self.nodes[0].size, view_memory(self.ends), self.side_x
         )
 
 
@@ -329,4 +319,4 @@ def stack_table() -> StackTable:
     slope = by_factor * np.exp(knots) * width
     chord, left, right = np.diff(level), slope[:-1], slope[1:]
     pieces = np.stack([left + right - 2 * chord, 3 * chord - 2 * left - right, left, level[:-1]], axis=1)
-    return StackTable(view_floats(np.ascontiguousarray(pieces)), _STACK_INTERVALS, _MIN_LOG_FACTOR, width)
+    return StackTable(view_memory(np.ascontiguousarray(pieces)), _STACK_INTERVALS, _MIN_LOG_FACTOR, width)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable, view_floats
+from handtouch.core.memory import view_memory
+from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages.tolerances import PadTolerances
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
@@ -38,20 +39,20 @@ def stage_tolerances(
     elongations = _elongations(sheet, surface, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
     is_elongated = bool(elongations.any())
     return PadTolerances(
-        view_floats(table.tolerance_nodes),
+        view_memory(table.tolerance_nodes),
         len(table.tolerance_nodes) - 1,
         1 / CELLS_PER_TOLERANCE_CELL,
-        view_floats(end_vectors),
+        view_memory(end_vectors),
         aspect_std,
         sheet.unevenness_std,
-        view_floats(table.series_vectors),
+        view_memory(table.series_vectors),
         node.series_std,
         sheet.ohm_per_square_std,
         has_series,
         surface.extent_m[0] / 2,
         size_x,
         size_y,
-        view_floats(elongations),
+        view_memory(elongations),
         is_elongated,
         not (end_vectors.any() or aspect_std or sheet.unevenness_std or has_series or is_elongated),
     )

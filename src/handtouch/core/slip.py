@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.pad_tables import view_floats
+from handtouch.core.memory import view_memory
 from handtouch.core.stages.slip import SLIP_PARAMETERS, SLIP_SLICES, SLIP_WORK, SlipStage
 from handtouch.core.state import TickState
 
@@ -95,13 +95,13 @@ class SlipDetector:
         self.any_requested = False
         self.samples_per_false_alarm = max(false_alarm_s / period_s, 2.0)
         self._stage = SlipStage(
-            view_floats((grip or GripModel()).parameters(period_s, self.samples_per_false_alarm)),
-            view_floats(np.zeros(SLIP_WORK)),
-            view_floats(self.state),
+            view_memory((grip or GripModel()).parameters(period_s, self.samples_per_false_alarm)),
+            view_memory(np.zeros(SLIP_WORK)),
+            view_memory(self.state),
             self.contact_id.data,
             self.sample_ns.data,
-            view_floats(values),
-            view_floats(total_a),
+            view_memory(values),
+            view_memory(total_a),
             times.data,
             ids.data,
         )

@@ -190,10 +190,6 @@ class TickProcessor:
         self.discard_solutions(changed)
         self.refresh()
 
-    def position_noise_covariance(self, pads: IntArray) -> FloatArray:
-        """Return the covariance (k, 2, 2) of arc lengths on pads (k,) that is independent in each sample."""
-        return self.columns.pad_noise_m2[pads][:, [[0, 1], [1, 2]]]
-
     def solve_all(self) -> None:
         """Compute position and force of every touched pad, requested or not; the state's owner undoes it."""
         everything = np.ones(self.model.size, dtype=np.bool_)
