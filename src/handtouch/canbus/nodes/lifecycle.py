@@ -134,8 +134,6 @@ def is_supervised(life: Lifecycle) -> bool:
 
 
 def _on_heartbeat(life: Lifecycle, nmt: int, now_ns: int, timing: NodeTiming) -> Transition:
-    if life.last_heartbeat_ns is not None or timing.role is BusRole.LISTENER:
-        life = replace(life, last_heartbeat_ns=max(now_ns, life.last_heartbeat_ns or 0))
     just_stopped = nmt == cia301.STOPPED != life.nmt_state
     left_stopped = life.nmt_state == cia301.STOPPED != nmt
     legal = nmt in cia301.NMT_NAMES
@@ -143,8 +141,12 @@ def _on_heartbeat(life: Lifecycle, nmt: int, now_ns: int, timing: NodeTiming) ->
         f"heartbeat: node is {cia301.NMT_NAMES[nmt]}" if legal else f"heartbeat with illegal NMT state {nmt}"
     )
     boot_reason = _with_loss_reason(life, report)
-    before = life
-    life = replace(life, nmt_state=nmt, last_frame_ns=now_ns, heartbeat_required=False)
+    before, heartbeat_ns = life, life.last_heartbeat_ns
+    if heartbeat_ns is not None or timing.role is BusRole.LISTENER:
+        heartbeat_ns = max(now_ns, heartbeat_ns or 0)
+    life = replace(
+        life, nmt_state=nmt, last_frame_ns=now_ns, last_heartbeat_ns=heartbeat_ns, heartbeat_required=False
+    )
     if not legal and timing.role is BusRole.MASTER:
         return instability.on_illegal_state(before, life, now_ns, timing)
     if life.state is NodeState.ABSENT or (life.state in _IN_BOOT and just_stopped):
@@ -162,7 +164,8 @@ def _on_heartbeat(life: Lifecycle, nmt: int, now_ns: int, timing: NodeTiming) ->
     if life.state in STARTED and settled:
         if nmt != cia301.OPERATIONAL:
             return instability.on_departure(life, now_ns, timing)
-        life = replace(life, confirmed=True)
+        if not life.confirmed:
+            life = replace(life, confirmed=True)
     return life, ()
 
 
