@@ -34,6 +34,10 @@ READERS_PER_PROCESS = 7
 JOINING_S, LEAVING_S = 5.0, 10.0
 PATIENCE_S = 300.0  # of a request for `status`, on a machine with other load
 SAMPLES_OF_MEMORY = 50
+ORDINARY_NICE = 10
+"""Of hostile clients and burners above daemon, nodes and well-behaved ones: as far as `handtouch@.service` puts
+the daemon before ordinary processes. Without it, a flood on the same processors takes what the scheduler gives
+to any busy process, whatever the daemon does"""
 MAX_RATIO = 1.1
 MAX_GROWTH_MB = 5.0
 """Growth after a third of the time; until then the queues of stalled subscribers fill"""
@@ -79,7 +83,13 @@ def running(targets: list[tuple[Callable[..., None], tuple[Any, ...]]]) -> Itera
 
 
 def run_hostile(kind: str, endpoints: dict[str, str], seed: int, stop: Event) -> None:
+    os.nice(ORDINARY_NICE)
     hostile_client(kind, endpoints, stop, seed)
+
+
+def run_burner(share: float, stop: Event) -> None:
+    os.nice(ORDINARY_NICE)
+    burner(share, stop)
 
 
 def run_reader(endpoint: str, measure: Event, results: Any, stop: Event) -> None:
@@ -182,7 +192,7 @@ def measure(config: Path, seconds: float) -> dict[str, Any]:
         )
         time.sleep(LEAVING_S)
         left = {"memory_mb": resident_mb(daemon.pid), "descriptors": descriptors(daemon.pid)}
-        burners = [(burner, (share,)) for share in hostile["shares"]]
+        burners = [(run_burner, (share,)) for share in hostile["shares"]]
         control = phase(endpoints, [daemon.pid, nodes.pid], seconds, burners)
     finally:
         for process in (daemon, nodes):
@@ -235,6 +245,8 @@ to prefixes without topic, and connect again when they
 are disconnected; 3 request `status`, `snapshot` and `tare` with 100 requests under way each; 2 connect and
 send random bytes to all endpoints, with 200 connections open each. Then the same subscribers beside processes
 that use as much CPU as each hostile client did and don't connect (processors: {used}).
+Hostile clients and burners run {ORDINARY_NICE} nice levels below the others, as far as `handtouch@.service` puts the daemon
+before ordinary processes.
 Latency is from SYNC to the message in the subscriber.
 {machine()}; load average when it ended {os.getloadavg()[0]:.1f}. Processes that don't belong to the test used
 {results["hostile"]["outside"]:.2f} processors beside the hostile clients,

@@ -1,6 +1,6 @@
 """Connections of clients to the daemon's endpoints: which one a message came over, and how to close one.
 
-Public names: `connection_of`, `client_key_of`, `close_connection`.
+Public names: `connection_of`, `client_key_of`, `close_connection`, `block_connection`.
 """
 
 from __future__ import annotations
@@ -40,10 +40,7 @@ def close_connection(descriptor: int, endpoint: str) -> bool:
     and then the end. Meanwhile the descriptor may be another's: what isn't a connection to this endpoint is
     left alone, and another client of this endpoint reconnects within milliseconds.
     """
-    with (
-        contextlib.suppress(OSError),
-        socket.fromfd(descriptor, socket.AF_INET, socket.SOCK_STREAM) as connection,
-    ):
+    with contextlib.suppress(OSError), _open_duplicate(descriptor) as connection:
         address = connection.getsockname()
         if _is_of_endpoint(address, endpoint):
             if isinstance(address, tuple):
@@ -51,6 +48,24 @@ def close_connection(descriptor: int, endpoint: str) -> bool:
             connection.shutdown(socket.SHUT_RD)
             return True
     return False
+
+
+def block_connection(descriptor: int, endpoint: str) -> bool:
+    """Drop whatever a TCP connection to an endpoint receives from now on; return False if there is none.
+
+    Its client hears nothing, so it doesn't connect again at once, as it would to a closed connection. The
+    kernel gives the connection up when the client has acknowledged nothing for 10 s.
+    """
+    with contextlib.suppress(OSError), _open_duplicate(descriptor) as connection:
+        address = connection.getsockname()
+        if isinstance(address, tuple) and _is_of_endpoint(address, endpoint):
+            _drop_packets(connection)
+            return True
+    return False
+
+
+def _open_duplicate(descriptor: int) -> socket.socket:
+    return socket.fromfd(descriptor, socket.AF_INET, socket.SOCK_STREAM)
 
 
 def _drop_packets(connection: socket.socket) -> None:

@@ -6,7 +6,7 @@ Public names: `Publisher`, `RetainedMessages`.
 from __future__ import annotations
 
 import logging
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 
 import zmq
@@ -14,7 +14,7 @@ import zmq
 from handtouch import wire
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.cause_counter import CauseCounter
-from handtouch.daemon.connections import close_connection, connection_of
+from handtouch.daemon.connections import block_connection, close_connection, connection_of
 from handtouch.daemon.endpoints import bind_endpoint, is_readable
 from handtouch.daemon.subscriptions import SUBSCRIPTION_CAUSES, SubscriptionLimits, SubscriptionTable
 
@@ -27,6 +27,10 @@ _QUEUED_SUBSCRIPTIONS = 4
 """Subscriptions that ZeroMQ takes from a connection at a time, within a call of the hot thread"""
 _RECEIVE_BUFFER_BYTES = 2048
 """Kernel's buffer of a connection for subscriptions: what a closed connection leaves to be read"""
+_MAX_BLOCKED = 64
+"""Connections that are blocked for a flood of subscriptions within `_BLOCKED_NS`; others are closed"""
+_BLOCKED_NS = 10_000_000_000
+"""Longest time for which a blocked connection holds a descriptor"""
 _MAX_RETAINED_PER_POLL = 16
 """Retained messages sent per poll, so that many late subscribers don't delay a tick."""
 _REFRESH_PERIOD_NS = 20_000_000
@@ -66,6 +70,7 @@ class Publisher:
         self._table = SubscriptionTable(topics, sockets)
         self._limits = SubscriptionLimits(len(self._table.topics))
         self._refusals = CauseCounter(_log, "subscription refused", SUBSCRIPTION_CAUSES)
+        self._blocked_ns: deque[int] = deque()
         self._refreshed_ns: int | None = None
         self._new_prefixes: dict[tuple[str, bytes], None] = {}  # since the last refresh
         self._pending_retained: dict[tuple[str, str], None] = {}  # (stream, topic), in order of subscription
@@ -189,8 +194,20 @@ class Publisher:
             self._new_prefixes[stream, prefix] = None
         else:
             self._refusals.add("unknown_topic", f"{prefix!r:.80}", now_ns)
-        if not self._limits.allow(connection, known, now_ns) and close_connection(connection, endpoint):
+        if not self._limits.allow(connection, known, now_ns) and self._cut_off(connection, endpoint, now_ns):
             self._refusals.add("subscription_flood", f"{stream}, last prefix {prefix!r:.80}", now_ns)
+
+    def _cut_off(self, connection: int, endpoint: str, now_ns: int) -> bool:
+        """Block or close the connection of a flood; return False if it is closed already.
+
+        A client whose connection is closed would be back within milliseconds, and the flood would go on.
+        """
+        while self._blocked_ns and now_ns - self._blocked_ns[0] > _BLOCKED_NS:
+            self._blocked_ns.popleft()
+        if len(self._blocked_ns) < _MAX_BLOCKED and block_connection(connection, endpoint):
+            self._blocked_ns.append(now_ns)
+            return True
+        return close_connection(connection, endpoint)
 
     def _refresh(self) -> None:
         """Evaluate the changes of subscriptions, and note what late subscribers are to receive."""

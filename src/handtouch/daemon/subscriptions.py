@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 SUBSCRIPTION_CAUSES = {
     "unknown_topic": "subscription to a prefix of no topic of this deployment; docs/wire.md lists them",
-    "subscription_flood": "connection closed because of too many subscriptions; subscribe to a common "
+    "subscription_flood": "connection cut off because of too many subscriptions; subscribe to a common "
     "prefix, such as contact/, and keep it",
 }
 """Causes of refused subscriptions: name of the counter -> description and remedy."""
