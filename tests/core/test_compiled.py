@@ -59,6 +59,27 @@ def test_stages_compiled_from_other_sources_are_refused(copied: Path) -> None:
     assert "of other sources" in " ".join(reason)
 
 
+@pytest.mark.parametrize(
+    ("edited", "other"),
+    [
+        ("solve.py", {"solve"}),
+        ("locate.py", {"locate"}),
+        ("tables.pxd", {"tables", "tolerances", "locate", "place", "solve"}),
+        ("receive.pxd", {"receive", "detect"}),
+    ],
+)
+def test_an_edit_makes_those_modules_old_that_are_compiled_from_it(
+    copied: Path, edited: str, other: set[str]
+) -> None:
+    hashes = "from handtouch.core.compiled import STAGES, source_hash; \
+print(*(f'{stage}-{source_hash(stage)}' for stage in STAGES))"
+    before = set(run("-c", hashes, source=copied).stdout.split())
+    with (copied / "handtouch/core/stages" / edited).open("a") as file:
+        file.write("# edited\n")
+    after = set(run("-c", hashes, source=copied).stdout.split())
+    assert {name.split("-")[0] for name in after - before} == other
+
+
 def test_modules_for_another_machine_are_never_of_this_one(copied: Path) -> None:
     other = "x86_64" if platform.machine() == "aarch64" else "aarch64"
     build = f"from pathlib import Path; from handtouch.core.build import build_stages; \

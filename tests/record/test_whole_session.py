@@ -235,6 +235,11 @@ def test_everything_happened_in_the_session(entries: list[RecordedMessage]) -> N
     assert ends >= {"released", "lost", "stopped"}
 
 
+def test_a_reload_publishes_the_configuration_once(entries: list[RecordedMessage]) -> None:
+    changes = [e.payload["seq"] for e in entries if e.topic == "config" and not e.payload["retained"]]
+    assert len(changes) == len(set(changes)) > 0
+
+
 @pytest.mark.parametrize("start", [0, 2])
 def test_a_replay_repeats_every_message_bit_for_bit(entries: list[RecordedMessage], start: int) -> None:
     """From the first state, and from any later one."""

@@ -62,6 +62,8 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as work:
         for name, file in zip(compiled.STAGES, files, strict=True):
+            if file.exists():
+                continue
             generated, built = Path(work) / f"{name}.c", Path(work) / f"{name}.so"
             options = [f"-X{key}={value}" for key, value in _DIRECTIVES.items()]
             source_file = f"handtouch/core/stages/{name}.py"

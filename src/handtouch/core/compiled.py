@@ -3,14 +3,15 @@
 Public names: `STAGES`, `source_hash`, `compiled_file`, `this_platform`, `CompiledFinder`, `Compilation`.
 
 The modules of `handtouch.core.stages` are plain Python that Cython compiles as it stands. A compiled module
-carries the hash of all their sources in its file's name; one of other sources isn't loaded, and Python runs
-the source instead, with the same results to the last bit and some fifty times slower.
+carries the hash of its sources in its file's name; one of other sources isn't loaded, and Python runs all
+stages from their sources instead, with the same results to the last bit and some fifty times slower.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import sysconfig
 from collections.abc import Sequence
 from functools import cache
@@ -30,6 +31,7 @@ DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"
 """Environment variable that makes Python run the sources, for debugging."""
 _PACKAGE = "handtouch.core.stages"
 _FOLDER = Path(__file__).parent / "stages"
+_CIMPORT = re.compile(rf"^from {_PACKAGE}(?:\.(\w+) cimport .*| cimport (.*))$", re.MULTILINE)
 
 
 class Compilation(NamedTuple):
@@ -52,12 +54,18 @@ class Compilation(NamedTuple):
 
 
 @cache
-def source_hash() -> str:
-    """Return the hash of the sources of all stages, and of how they are compiled."""
+def source_hash(stage: str) -> str:
+    """Return the hash of what a stage is compiled from: source, declarations that it uses, and options."""
+    declarations, waiting = {stage}, [stage]
+    while waiting:
+        text = (_FOLDER / f"{waiting.pop()}.pxd").read_text()
+        used = {name for found in _CIMPORT.findall(text) for name in re.findall(r"\w+", found[0] or found[1])}
+        waiting += used - declarations
+        declarations |= used
     digest = hashlib.sha256((_FOLDER.parent / "build.py").read_bytes())
-    for name in STAGES:
-        for ending in (".py", ".pxd"):
-            digest.update((_FOLDER / f"{name}{ending}").read_bytes())
+    digest.update((_FOLDER / f"{stage}.py").read_bytes())
+    for name in sorted(declarations):
+        digest.update((_FOLDER / f"{name}.pxd").read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -72,7 +80,7 @@ def compiled_file(stage: str, platform: str = "") -> Path:
     `platform` : this machine's by default
     """
     platform = platform or this_platform()
-    return _FOLDER / "_compiled" / f"{stage}-{source_hash()}-{platform}.abi3.so"
+    return _FOLDER / "_compiled" / f"{stage}-{source_hash(stage)}-{platform}.abi3.so"
 
 
 class CompiledFinder(MetaPathFinder):

@@ -65,7 +65,6 @@ class TickJournal:
         message = self._config_message(now_ns, retained=False)
         if message is not None and self._sink.has_subscriber("config"):
             self._sink.send(message)
-            self._sink.send(message)
 
     def publish_first_state(self, now_ns: int) -> None:
         """Publish config and state before a tick, if the messages `tick` begin with this one."""
