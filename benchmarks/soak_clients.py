@@ -35,9 +35,9 @@ JOINING_S, LEAVING_S = 5.0, 10.0
 PATIENCE_S = 300.0  # of a request for `status`, on a machine with other load
 SAMPLES_OF_MEMORY = 50
 ORDINARY_NICE = 10
-"""Of hostile clients and burners above daemon, nodes and well-behaved ones: as far as `handtouch@.service` puts
-the daemon before ordinary processes. Without it, a flood on the same processors takes what the scheduler gives
-to any busy process, whatever the daemon does"""
+"""Nice levels of hostile clients and burners below the others, as `handtouch@.service` puts the daemon before
+ordinary processes. Without them, a flood on the same processors takes what the scheduler gives to any busy
+process, whatever the daemon does"""
 MAX_RATIO = 1.1
 MAX_GROWTH_MB = 5.0
 """Growth after a third of the time; until then the queues of stalled subscribers fill"""
@@ -245,8 +245,8 @@ to prefixes without topic, and connect again when they
 are disconnected; 3 request `status`, `snapshot` and `tare` with 100 requests under way each; 2 connect and
 send random bytes to all endpoints, with 200 connections open each. Then the same subscribers beside processes
 that use as much CPU as each hostile client did and don't connect (processors: {used}).
-Hostile clients and burners run {ORDINARY_NICE} nice levels below the others, as far as `handtouch@.service` puts the daemon
-before ordinary processes.
+Hostile clients and burners run {ORDINARY_NICE} nice levels below the others, as `handtouch@.service`
+puts the daemon before ordinary processes.
 Latency is from SYNC to the message in the subscriber.
 {machine()}; load average when it ended {os.getloadavg()[0]:.1f}. Processes that don't belong to the test used
 {results["hostile"]["outside"]:.2f} processors beside the hostile clients,
