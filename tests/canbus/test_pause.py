@@ -139,6 +139,31 @@ def test_nodes_lost_together_name_the_bus_and_one_lost_alone_doesnt(rig: Any) ->
     assert all("as from every node of bus can; check this bus's cable" in event.reason for event in lost)
 
 
+@pytest.mark.parametrize("role", ["master", "listener"])
+def test_a_node_that_stays_lost_when_the_others_are_back_names_its_own_connection(
+    make_rig: Make, role: str
+) -> None:
+    rig = make_rig(3, role=role)
+    rig.plug_all()
+    if role == "listener":
+        for device in rig.devices.devices.values():
+            device.write_object(0x1017, 0, 100)
+            device.write_object(0x1801, 2, 1)
+            device.handle_nmt(1)
+    rig.start()
+    rig.run(500)
+    rig.wire.cut = {1, 2, 3}
+    rig.run(600)
+    assert all("as from every node of bus can" in rig.status(n).reason for n in (1, 2, 3))
+    rig.wire.cut = {2}
+    rig.run(5000)
+    assert rig.state(1) is rig.state(3) is NodeState.OPERATIONAL
+    assert rig.state(2) is NodeState.ABSENT
+    assert "lost: no heartbeat for" in rig.status(2).reason
+    assert "check its power, cable, node id" in rig.status(2).reason
+    assert "as from" not in rig.status(2).reason
+
+
 def test_a_short_pause_of_the_loop_is_not_the_cause_of_a_long_silence(rig: Any) -> None:
     rig.boot()
     rig.wire.cut = {1, 2, 3}

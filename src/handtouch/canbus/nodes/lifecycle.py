@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import assert_never
 
 from handtouch.canbus import cia301
-from handtouch.canbus.nodes import instability
+from handtouch.canbus.nodes import instability, silence
 from handtouch.canbus.nodes.lifecycle_types import (
     CONNECTION_REMEDY,
     BootUpReceived,
@@ -47,10 +47,6 @@ from handtouch.canbus.nodes.transitions import (
 
 _REPAIR_MEMORY_NS = 60_000_000_000
 """Time since the last repair after which the next one isn't one in a row."""
-_NO_HEARTBEAT_REASON = (
-    "answers over SDO, but sends no heartbeat although its heartbeat time is set (0x1017): "
-    "its firmware may hang; power-cycle it"
-)
 _DUPLICATE_ID_REASON = (
     "duplicate node id: heartbeats come twice as often as configured; unplug one node and give it "
     "another id (`handtouch scan` lists the serial numbers)"
@@ -59,13 +55,9 @@ _BABBLING_REASON = (
     "babbling: it sends {} samples per SYNC, or another device sends with its COB-ID; "
     "power-cycle or unplug it"
 )
-_TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF)"
-_CHECK_PENDING = "its PDO and heartbeat settings are being checked"
 _SETTINGS_UNCHANGED = "its PDO and heartbeat settings are as configured; check its sampling and firmware"
 _STANDBY_REASON = "outside the scene: in standby until needed"
 
-_BUS_CAUSE_DELAY_NS = 1_000_000_000
-"""Time until the settings of a node are checked while those of others stay away, too."""
 MAX_REPAIRS = 3
 """Times that changed settings are repaired, before that is only reported."""
 _BOOT_STEPS = frozenset({NodeAction.IDENTIFY, NodeAction.READ_MAPPING, NodeAction.CONFIGURE})
@@ -94,7 +86,7 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
         case SampleReceived():
             return _on_sample(life, now_ns, timing)
         case SamplesMissing(age_ns, bus_cause):
-            return _on_samples_missing(life, age_ns, bus_cause, now_ns, timing)
+            return silence.on_samples_missing(life, age_ns, bus_cause, now_ns, timing)
         case HeartbeatRate(doubled):
             return _on_heartbeat_rate(life, doubled, now_ns, timing)
         case SampleRate(samples_per_sync):
@@ -246,7 +238,9 @@ def _on_step_done(life: Lifecycle, event: StepDone, now_ns: int, timing: NodeTim
         case NodeAction.ENTER_STANDBY if life.state is NodeState.STOPPED:
             return enter(life, NodeState.STOPPED, now_ns, _STANDBY_REASON), ()
         case NodeAction.CHECK_SETTINGS if life.state is NodeState.STALE:
-            return enter(life, NodeState.STALE, now_ns, _explain_silence(life, _SETTINGS_UNCHANGED)), ()
+            return enter(
+                life, NodeState.STALE, now_ns, silence.explain_silence(life, _SETTINGS_UNCHANGED)
+            ), ()
     return life, ()
 
 
@@ -282,7 +276,7 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
         return begin_boot(life, now_ns, event.reason, timing)
     if event.step is NodeAction.CHECK_SETTINGS and life.state is NodeState.STALE:
         if event.timed_out:
-            reason = _explain_silence(life, f"its settings can't be read: {event.reason}")
+            reason = silence.explain_silence(life, f"its settings can't be read: {event.reason}")
             return enter(life, NodeState.STALE, now_ns, reason), ()
         return _repair_settings(life, event.reason, now_ns, timing)
     if event.step is NodeAction.ENTER_STANDBY and life.state is NodeState.STOPPED:
@@ -352,64 +346,6 @@ def _restart_timeouts(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifec
     return life
 
 
-def _on_samples_missing(
-    life: Lifecycle, age_ns: int, bus_cause: str, now_ns: int, timing: NodeTiming
-) -> Transition:
-    if life.state is not NodeState.OPERATIONAL:
-        return life, ()
-    return _enter_stale(life, now_ns, f"no sample for {age_ns / 1e6:.0f} ms", bus_cause, timing), ()
-
-
-def _enter_stale(life: Lifecycle, now_ns: int, silence: str, bus_cause: str, timing: NodeTiming) -> Lifecycle:
-    """Enter STALE; the settings are checked soon, or later if the cause seems to be in the host or the bus.
-
-    A check that is due isn't postponed by single samples.
-    """
-    life = replace(life, silence=silence, bus_cause=bus_cause)
-    remedy = _TPDO_REMEDY if timing.role is BusRole.LISTENER else _CHECK_PENDING
-    life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, remedy))
-    soon_ns = timing.retry_delay_ns(1)
-    if now_ns - life.check_ns > timing.max_retry_ns:
-        life = replace(life, check_ns=now_ns + (_BUS_CAUSE_DELAY_NS if bus_cause else soon_ns), checks=0)
-    elif not bus_cause:
-        life = replace(life, check_ns=min(life.check_ns, now_ns + timing.retry_delay_ns(3)))
-    due_ns = max(life.check_ns, now_ns)
-    return replace(life, due_ns=min(due_ns, now_ns + soon_ns) if bus_cause else due_ns)
-
-
-def _explain_silence(life: Lifecycle, remedy: str) -> str:
-    """Return the reason of a stale node; the remedy applies if the cause is the node's."""
-    if life.bus_cause:
-        return f"{life.silence}, {life.bus_cause}"
-    heartbeat = "heartbeat present" if life.last_heartbeat_ns is not None else "no heartbeat either"
-    return f"{life.silence}, {heartbeat}; {remedy}"
-
-
-def _on_stale_due(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTiming) -> Transition:
-    """Have the settings of a stale node read back, with growing delays.
-
-    A cause in the host or the bus holds only while samples of others are missing, too. Single samples after
-    its end may still be on their way, so the reason changes after the check, or for a listener after a delay.
-    """
-    soon_ns = now_ns + timing.retry_delay_ns(1)
-    listens = timing.role is BusRole.LISTENER
-    if life.bus_cause and bus_cause and (listens or now_ns < life.check_ns):
-        return replace(life, due_ns=soon_ns if listens else min(soon_ns, life.check_ns)), ()
-    was_common = bool(life.bus_cause)
-    life = replace(life, bus_cause=bus_cause if was_common else "")
-    if listens and was_common:
-        return replace(life, due_ns=soon_ns), ()
-    if listens:
-        life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY))
-        return replace(life, due_ns=NEVER_NS), ()
-    if life.nmt_state in (cia301.STOPPED, cia301.PREOPERATIONAL):  # its heartbeats decide what follows
-        life = enter(life, NodeState.STALE, now_ns, _explain_silence(life, _TPDO_REMEDY))
-        return replace(life, due_ns=now_ns + timing.max_retry_ns), ()
-    checks = life.checks + 1
-    check_ns = now_ns + timing.retry_delay_ns(3 * checks)
-    return replace(life, checks=checks, check_ns=check_ns, due_ns=check_ns), (NodeAction.CHECK_SETTINGS,)
-
-
 def _on_standby_requested(life: Lifecycle, standby: bool, now_ns: int, timing: NodeTiming) -> Transition:
     if timing.role is not BusRole.MASTER:  # only the NMT master stops nodes
         return life, ()
@@ -448,12 +384,14 @@ def _on_timer_expired(life: Lifecycle, event: TimerExpired, now_ns: int, timing:
     if life.last_heartbeat_ns is not None and is_supervised(life):
         quiet_ns = now_ns - life.last_heartbeat_ns
         if quiet_ns > timing.heartbeat_timeout_ns:
-            return _on_heartbeat_timeout(life, quiet_ns, event.bus_cause, now_ns, timing), ()
+            return silence.on_heartbeat_timeout(life, quiet_ns, event.bus_cause, now_ns, timing), ()
     if now_ns < life.due_ns:
         return life, ()
     if life.state is NodeState.ABSENT and timing.role is BusRole.LISTENER:
-        return replace(life, due_ns=NEVER_NS), ()
+        life = silence.review_loss(life, event.bus_cause, now_ns)
+        return replace(life, due_ns=now_ns + silence.BUS_CAUSE_DELAY_NS if life.bus_cause else NEVER_NS), ()
     if life.state is NodeState.ABSENT:
+        life = silence.review_loss(life, event.bus_cause, now_ns)
         probes = life.unanswered_probes + 1
         return replace(life, unanswered_probes=probes, due_ns=now_ns + timing.retry_delay_ns(probes)), (
             NodeAction.PROBE,
@@ -461,35 +399,9 @@ def _on_timer_expired(life: Lifecycle, event: TimerExpired, now_ns: int, timing:
     if life.state is NodeState.FAULTED:
         return instability.on_fault_due(life, now_ns, timing)
     if life.state is NodeState.SETTLING:
-        return _enter_stale(life, now_ns, "started, but no sample received", event.bus_cause, timing), ()
+        return silence.enter_stale(
+            life, now_ns, "started, but no sample received", event.bus_cause, timing
+        ), ()
     if life.state is NodeState.STALE:
-        return _on_stale_due(life, event.sample_cause, now_ns, timing)
+        return silence.on_stale_due(life, event.sample_cause, now_ns, timing)
     return life, ()
-
-
-def _on_heartbeat_timeout(
-    life: Lifecycle, quiet_ns: int, bus_cause: str, now_ns: int, timing: NodeTiming
-) -> Lifecycle:
-    """Return the lifecycle of a node whose heartbeat has timed out."""
-    if life.heartbeat_required and timing.role is not BusRole.LISTENER and not bus_cause:
-        # present, since it was just configured: retried with growing delays
-        failures = life.failures + 1
-        life = enter(life, NodeState.FAULTED, now_ns, _NO_HEARTBEAT_REASON)
-        return replace(
-            life, last_heartbeat_ns=None, failures=failures, due_ns=now_ns + timing.retry_delay_ns(failures)
-        )
-    cause = f", {bus_cause}" if bus_cause else f"; {CONNECTION_REMEDY}"
-    reason = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms{cause}"
-    life = replace(enter(life, NodeState.ABSENT, now_ns, reason), last_heartbeat_ns=None, nmt_state=None)
-    return replace(
-        life,
-        heartbeat_required=True,
-        failures=0,
-        restarts=0,
-        boot_ups=0,
-        operational_ns=0,
-        fault=None,
-        reset_sent=False,
-        reset_pending=False,
-        due_ns=now_ns + timing.retry_delay_ns(0),
-    )

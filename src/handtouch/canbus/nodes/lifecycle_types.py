@@ -112,8 +112,9 @@ class Lifecycle:
     reset_pending: bool = False  # its boot-up message hasn't arrived
     foreign_nmt: int | None = None  # last NMT command of another master, and its time
     foreign_nmt_ns: int = 0
-    silence: str = ""  # STALE: what is missing
-    bus_cause: str = ""  # STALE: its cause in the host or the bus, empty if it is the node's
+    silence: str = ""  # STALE, ABSENT: what is missing
+    bus_cause: str = ""  # STALE, ABSENT: its cause in the host or the bus, empty if it is the node's
+    alone_ns: int | None = None  # ABSENT: since when others of its bus are heard again, after a common cause
     checks: int = 0  # of its settings, in close succession
     check_ns: int = -(1 << 62)  # time of the next one
     repairs: int = 0  # of changed settings, in close succession

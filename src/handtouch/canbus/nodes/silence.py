@@ -1,0 +1,134 @@
+"""Silence of a node: samples that stay away, a loss, and whose cause it is.
+
+Public names: `on_samples_missing`, `enter_stale`, `explain_silence`, `on_stale_due`, `on_heartbeat_timeout`,
+`review_loss`, `BUS_CAUSE_DELAY_NS`. Pure functions, as in `lifecycle`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from handtouch.canbus import cia301
+from handtouch.canbus.nodes.lifecycle_types import (
+    CONNECTION_REMEDY,
+    BusRole,
+    Lifecycle,
+    NodeAction,
+    NodeState,
+    NodeTiming,
+)
+from handtouch.canbus.nodes.transitions import NEVER_NS, Transition, enter
+
+_NO_HEARTBEAT_REASON = (
+    "answers over SDO, but sends no heartbeat although its heartbeat time is set (0x1017): "
+    "its firmware may hang; power-cycle it"
+)
+_TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF)"
+_CHECK_PENDING = "its PDO and heartbeat settings are being checked"
+
+BUS_CAUSE_DELAY_NS = 1_000_000_000
+"""Time until the cause is sought in a node whose silence began together with that of others"""
+
+
+def on_samples_missing(
+    life: Lifecycle, age_ns: int, bus_cause: str, now_ns: int, timing: NodeTiming
+) -> Transition:
+    """Handle samples that stay away from an operational node."""
+    if life.state is not NodeState.OPERATIONAL:
+        return life, ()
+    return enter_stale(life, now_ns, f"no sample for {age_ns / 1e6:.0f} ms", bus_cause, timing), ()
+
+
+def enter_stale(life: Lifecycle, now_ns: int, silence: str, bus_cause: str, timing: NodeTiming) -> Lifecycle:
+    """Enter STALE; the settings are checked soon, or later if the cause seems to be in the host or the bus.
+
+    A check that is due isn't postponed by single samples.
+    """
+    life = replace(life, silence=silence, bus_cause=bus_cause)
+    remedy = _TPDO_REMEDY if timing.role is BusRole.LISTENER else _CHECK_PENDING
+    life = enter(life, NodeState.STALE, now_ns, explain_silence(life, remedy))
+    soon_ns = timing.retry_delay_ns(1)
+    if now_ns - life.check_ns > timing.max_retry_ns:
+        life = replace(life, check_ns=now_ns + (BUS_CAUSE_DELAY_NS if bus_cause else soon_ns), checks=0)
+    elif not bus_cause:
+        life = replace(life, check_ns=min(life.check_ns, now_ns + timing.retry_delay_ns(3)))
+    due_ns = max(life.check_ns, now_ns)
+    return replace(life, due_ns=min(due_ns, now_ns + soon_ns) if bus_cause else due_ns)
+
+
+def explain_silence(life: Lifecycle, remedy: str) -> str:
+    """Return the reason of a stale node; the remedy applies if the cause is the node's."""
+    if life.bus_cause:
+        return f"{life.silence}, {life.bus_cause}"
+    heartbeat = "heartbeat present" if life.last_heartbeat_ns is not None else "no heartbeat either"
+    return f"{life.silence}, {heartbeat}; {remedy}"
+
+
+def on_stale_due(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTiming) -> Transition:
+    """Have the settings of a stale node read back, with growing delays.
+
+    A cause in the host or the bus holds only while samples of others are missing, too. Single samples after
+    its end may still be on their way, so the reason changes after the check, or for a listener after a delay.
+    """
+    soon_ns = now_ns + timing.retry_delay_ns(1)
+    listens = timing.role is BusRole.LISTENER
+    if life.bus_cause and bus_cause and (listens or now_ns < life.check_ns):
+        return replace(life, due_ns=soon_ns if listens else min(soon_ns, life.check_ns)), ()
+    was_common = bool(life.bus_cause)
+    life = replace(life, bus_cause=bus_cause if was_common else "")
+    if listens and was_common:
+        return replace(life, due_ns=soon_ns), ()
+    if listens:
+        life = enter(life, NodeState.STALE, now_ns, explain_silence(life, _TPDO_REMEDY))
+        return replace(life, due_ns=NEVER_NS), ()
+    if life.nmt_state in (cia301.STOPPED, cia301.PREOPERATIONAL):  # its heartbeats decide what follows
+        life = enter(life, NodeState.STALE, now_ns, explain_silence(life, _TPDO_REMEDY))
+        return replace(life, due_ns=now_ns + timing.max_retry_ns), ()
+    checks = life.checks + 1
+    check_ns = now_ns + timing.retry_delay_ns(3 * checks)
+    return replace(life, checks=checks, check_ns=check_ns, due_ns=check_ns), (NodeAction.CHECK_SETTINGS,)
+
+
+def on_heartbeat_timeout(
+    life: Lifecycle, quiet_ns: int, bus_cause: str, now_ns: int, timing: NodeTiming
+) -> Lifecycle:
+    """Return the lifecycle of a node whose heartbeat has timed out."""
+    if life.heartbeat_required and timing.role is not BusRole.LISTENER and not bus_cause:
+        # present, since it was just configured: retried with growing delays
+        failures = life.failures + 1
+        life = enter(life, NodeState.FAULTED, now_ns, _NO_HEARTBEAT_REASON)
+        return replace(
+            life, last_heartbeat_ns=None, failures=failures, due_ns=now_ns + timing.retry_delay_ns(failures)
+        )
+    silence = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms"
+    cause = f", {bus_cause}" if bus_cause else f"; {CONNECTION_REMEDY}"
+    life = enter(life, NodeState.ABSENT, now_ns, silence + cause)
+    return replace(
+        life,
+        silence=silence,
+        bus_cause=bus_cause,
+        alone_ns=None,
+        last_heartbeat_ns=None,
+        nmt_state=None,
+        heartbeat_required=True,
+        failures=0,
+        restarts=0,
+        boot_ups=0,
+        operational_ns=0,
+        fault=None,
+        reset_sent=False,
+        reset_pending=False,
+        due_ns=now_ns + timing.retry_delay_ns(0),
+    )
+
+
+def review_loss(life: Lifecycle, bus_cause: str, now_ns: int) -> Lifecycle:
+    """Name the node's own connection as the cause when the others of its bus have been back for a while."""
+    if bus_cause or not life.bus_cause:
+        return replace(life, alone_ns=None)
+    if life.alone_ns is None:
+        return replace(life, alone_ns=now_ns)
+    if now_ns - life.alone_ns < BUS_CAUSE_DELAY_NS:
+        return life
+    life = enter(life, NodeState.ABSENT, now_ns, f"{life.silence}; {CONNECTION_REMEDY}")
+    return replace(life, bus_cause="")
