@@ -1,6 +1,6 @@
-"""Measure the sheet models: agreement with the paper's experiments, power laws as modes, cost.
+"""Measure the sheet models: agreement with the paper's experiments, power laws as modes.
 
-For errors of compensation on the sheets of the worlds see bench_supervise.
+For errors of compensation on the sheets of the worlds see bench_supervise, for its cost bench_tick.
 
 Prints its tables and writes docs/benchmarks/sheet.md, sheet.json and sheet.png.
 """
@@ -11,10 +11,7 @@ import json
 import os
 import platform
 import statistics
-import time
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +30,6 @@ from handtouch.sheet import (
     Creep,
     Fluctuation,
     ParameterUncertainty,
-    PrandtlIshlinskii,
-    SheetCompensator,
     SheetModel,
     SheetModelState,
 )
@@ -53,8 +48,6 @@ S1_RUNS, S2_RUNS = (
     (2075,) * 4,
     (3434, 3433, 3433),
 )  # 8300 and 10 300 cycles, a night without potential between
-PADS, DT_S, BATCH, BATCHES = 60, 1e-3, 200, 60
-FULL_N, LOOP = 5.0, 0.1
 INK, FAINT, ACCENT = "#1a1a1a", "#8a8a8a", "#1f6fb4"
 
 
@@ -177,46 +170,6 @@ def prony() -> Rows:
     ]
 
 
-# Cost
-
-
-def costs(batches: int) -> Rows:
-    rng = np.random.default_rng(1)
-    load = rng.uniform(0.5, 5, PADS) * (rng.random(PADS) < 0.5)
-    looped = replace(S1, hysteresis=PrandtlIshlinskii.from_width(LOOP, FULL_N))
-    power = replace(looped, creep=Creep.power_law(0.05))
-    rows: Rows = []
-    for name, model in (
-        ("S1", S1),
-        ("S1 + hysteresis of 6 plays", looped),
-        ("S1 + hysteresis + power-law creep, 7 modes", power),
-    ):
-        exact, held = SheetCompensator(model, PADS), SheetCompensator(model, PADS, update_period_s=0.1)
-        step, state = model.discretise(DT_S), model.initial_state(PADS)
-        rows.append(
-            {
-                "model": name,
-                "forward": timed(partial(step.forward, state, load), batches),
-                "inverse, exact": timed(partial(exact.compensate, load, DT_S), batches),
-                "inverse, updated every 0.1 s": timed(partial(held.compensate, load, DT_S), batches),
-                "std of 60": timed(held.std_n, batches),
-                "std of 8": timed(partial(held.std_n, np.arange(8)), batches),
-            }
-        )
-    return rows
-
-
-def timed(call: Callable[[], object], batches: int) -> str:
-    """Return median and least processor time over batches, in us."""
-    found = []
-    for _ in range(batches):
-        start = time.process_time()
-        for _ in range(BATCH):
-            call()
-        found.append(1e6 * (time.process_time() - start) / BATCH)
-    return f"{statistics.median(found):.1f} ({min(found):.1f})"
-
-
 # The figure
 
 
@@ -311,26 +264,20 @@ def table(title: str, note: str, rows: Rows) -> list[str]:
 
 def main() -> None:
     quick = options(__doc__).parse_args().quick
-    batches = 2 if quick else BATCHES
     machine = (
         f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
     )
     tables = {
         "Observations of the paper": (
             "Without fluctuation, except in the row of 5 %. *set*: a parameter is that number; *fitted*: a "
-            "parameter was chosen to give it; *chosen*: a rule of the "
-            "model was; *follows*: nothing was chosen for it. The paper gives no decay "
-            "times and no split into runs: these are ours.",
+            "parameter was chosen to give it; *chosen*: a rule of the model was; *follows*: nothing was "
+            "chosen for it. The paper gives neither decay times nor the division into runs: these are "
+            "assumptions.",
             experiments(),
         ),
         "Power law as a sum of exponentials": (
             "Greatest relative error of t^p from 1 ms to 1 h, by number of modes.",
             prony(),
-        ),
-        "Cost of a step of 60 pads": (
-            f"Half of them touched, {DT_S:g} s; processor time in us, median of {batches} batches (least). "
-            "Aim: 10 us for a tick's part, on an idle machine.",
-            costs(batches),
         ),
     }
     page = ["# Sheet behaviour", "", f"{made_by()}; {machine}.", ""]
