@@ -18,6 +18,7 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.host.build import build_info
+from handtouch.record.foxglove import FoxgloveConverter
 from handtouch.record.mcap_file import RecordingFile
 from handtouch.record.recorder import MessageRecorder, RotationLimits
 from handtouch.wire import PadState
@@ -162,9 +163,14 @@ class RecordingSession:
     ) -> None:
         self.paths: list[Path] = []
         self.lose: Callable[[bytes], bool] = lambda _: False
-        self.recorder = MessageRecorder(self._open, limits or RotationLimits())
+        self.send: Callable[[list[bytes]], object] = lambda _: None
+        self.recorder = MessageRecorder(self._open, limits or RotationLimits(), FoxgloveConverter)
         self._folder = folder
         self.hand = make_hand(self.take)
+        self.start()
+
+    def start(self) -> None:
+        """Record the messages at the daemon's start."""
         self.take(service(1, self.hand.t_ns))
         deployment = self.hand.deployment
         self.hand.pipeline.journal.publish_config(
@@ -175,6 +181,7 @@ class RecordingSession:
         """Record a message of the daemon."""
         if not parts or not self.lose(parts[0]):
             self.recorder.add_message(parts, self.hand.t_ns if hasattr(self, "hand") else 0)
+            self.send(parts)
 
     def send_retained(self) -> None:
         """Record the retained messages, as after a new subscription."""

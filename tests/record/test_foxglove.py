@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import zmq
 from numpy.typing import NDArray
+from websockets.sync.client import ClientConnection
+from websockets.sync.client import connect as open_websocket
+from websockets.typing import Subprotocol
 
 from handtouch import config
+from handtouch.client import connect
 from handtouch.config import shipped
 from handtouch.hand.urdf import read_urdf
 from handtouch.record.foxglove import (
     FRAMES_TOPIC,
     HAND_TOPIC,
+    LOG_TOPIC,
     SCENE_TOPIC,
     FoxgloveConverter,
 )
 from handtouch.record.link_frames import quaternion
+from handtouch.record.schemas import SceneMessage
+from handtouch.view import foxglove as live
+
+from .conftest import WALL_NS, RecordingSession
+from .foxglove_messages import decode
 
 DEPLOYMENT = config.load(shipped.path("utah_mit.toml"))
 LINKS = [pad.link for pad in DEPLOYMENT.hands[0].pads]
@@ -36,12 +55,17 @@ def configured(urdf: bytes | None = None) -> FoxgloveConverter:
     return made
 
 
-def frames(made: list[Any]) -> dict[str, dict[str, Any]]:
+def fields(message: SceneMessage) -> dict[str, Any]:
+    """Return the fields of a message."""
+    return decode(message.format.schema_name, message.format.schema, message.data)
+
+
+def frames(made: list[SceneMessage]) -> dict[str, dict[str, Any]]:
     return {
         one["child_frame_id"]: one
         for message in made
         if message.topic == FRAMES_TOPIC
-        for one in json.loads(message.data)["transforms"]
+        for one in fields(message)["transforms"]
     }
 
 
@@ -83,13 +107,13 @@ def test_bodies_and_contacts_are_in_frames_of_links() -> None:
     foxglove = configured()
     made = foxglove.convert("service", {"hands": {"right": LINKS}}, 10 * SECOND_NS)
     at = frames(made)
-    (body,) = [json.loads(message.data) for message in made if message.topic == HAND_TOPIC]
+    (body,) = [fields(message) for message in made if message.topic == HAND_TOPIC]
     assert {entity["frame_id"] for entity in body["entities"]} <= set(at)
     assert any(entity[kind] for entity in body["entities"] for kind in ("cubes", "cylinders"))
     contact = {"event": "begin", "id": 1, "hand": "right", "link": "index_distal", "frame": "index_distal"}
     contact |= {"position_m": [0.01, 0, 0.01], "normal": [0, 0, 1], "force_n": 1.0, "force_status": "valid"}
     scene = foxglove.convert("contact/right/index_distal", contact, 10 * SECOND_NS)
-    (entity,) = next(json.loads(m.data) for m in scene if m.topic == SCENE_TOPIC)["entities"]
+    (entity,) = next(fields(m) for m in scene if m.topic == SCENE_TOPIC)["entities"]
     assert entity["frame_id"] in at
 
 
@@ -116,3 +140,87 @@ def test_a_quaternion_equals_its_matrix() -> None:
         frame = {"rotation": dict(zip("xyzw", quaternion(turn), strict=True))}
         frame["translation"] = dict.fromkeys("xyz", 0.0)
         assert np.allclose(matrix(frame)[:3, :3], turn)
+
+
+class FoxgloveClient:
+    """A client of Foxglove's WebSocket that subscribes to every channel."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        self._channels: dict[int, dict[str, Any]] = {}
+
+    def messages(self, timeout_s: float) -> Iterator[tuple[str, int, dict[str, Any]]]:
+        """Yield topic, time [ns] and fields of the messages until there is none for `timeout_s`."""
+        while True:
+            try:
+                received = self._socket.recv(timeout=timeout_s)
+            except TimeoutError:
+                return
+            if isinstance(received, str):
+                self._subscribe(json.loads(received))
+            elif received[0] == 1:
+                number, t_ns = struct.unpack_from("<IQ", received, 1)
+                channel, data = self._channels[number], received[13:]
+                if channel["encoding"] == "json":
+                    yield channel["topic"], t_ns, json.loads(data)
+                    continue
+                schema = base64.b64decode(channel["schema"] + "===")
+                yield channel["topic"], t_ns, decode(channel["schemaName"], schema, data)
+
+    def _subscribe(self, message: dict[str, Any]) -> None:
+        channels = message.get("channels", []) if message["op"] == "advertise" else []
+        self._channels |= {channel["id"]: channel for channel in channels}
+        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+
+def test_a_client_of_foxglove_receives_scene_frames_log_and_values(
+    make_hand: Callable[..., Any], tmp_path: Path
+) -> None:
+    endpoint, stop = f"ipc://{tmp_path}/live", threading.Event()
+    session = RecordingSession(make_hand, tmp_path)
+    needed = {SCENE_TOPIC, FRAMES_TOPIC, LOG_TOPIC, "contact/h/plane", "service"}
+    received: dict[str, dict[str, Any]] = {}
+    with ExitStack() as opened:
+        publisher = opened.enter_context(opened.enter_context(zmq.Context()).socket(zmq.XPUB))
+        publisher.bind(endpoint)
+        messages = opened.enter_context(connect(*live.PATTERNS, endpoint=endpoint, key=""))
+        for _ in live.PATTERNS:
+            publisher.recv()  # is subscribed
+        server = opened.enter_context(live.FoxgloveServer("127.0.0.1", 0))
+        thread = threading.Thread(target=live.serve, args=(messages, server, stop, float("inf")))
+        thread.start()
+        opened.callback(thread.join)
+        opened.callback(stop.set)
+        protocol = Subprotocol("foxglove.sdk.v1")
+        client = FoxgloveClient(opened.enter_context(open_websocket(server.url, subprotocols=[protocol])))
+        session.send = publisher.send_multipart
+        while not needed <= received.keys():  # a channel appears with its first message, which is lost
+            session.start()
+            session.hand.stroke(40)
+            for topic, t_ns, message in client.messages(0.05):
+                received[topic] = message
+                assert t_ns > WALL_NS
+    assert {one["child_frame_id"] for one in received[FRAMES_TOPIC]["transforms"]} == {"plane", "round"}
+    assert received[LOG_TOPIC]["message"].startswith("contact ")
+    assert received["contact/h/plane"]["link"] == "plane"
+    assert all(entity["frame_id"] in ("plane", "round") for entity in received[SCENE_TOPIC]["entities"])
+
+
+def test_a_port_in_use_and_a_missing_package_are_reported_with_a_remedy(tmp_path: Path) -> None:
+    def run(port: int, **environment: str) -> str:
+        command = [sys.executable, "-m", "handtouch", "view", "--foxglove", "--key", "", "--port", str(port)]
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}
+        )
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        return done.stderr
+
+    with live.FoxgloveServer("127.0.0.1", 0) as server:
+        port = int(server.url.split(":")[2])
+        assert f"127.0.0.1:{port}" in (text := run(port))
+        assert "--port 0" in text
+    (tmp_path / "foxglove.py").write_text("raise ImportError('not here')")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    assert "handtouch[foxglove]" in run(0, PYTHONPATH=path)

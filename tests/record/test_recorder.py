@@ -16,9 +16,10 @@ from mcap.reader import make_reader
 from handtouch import wire
 from handtouch.record.recorder import MessageRecorder, RotationLimits
 from handtouch.record.recording import Recording
-from handtouch.record.schemas import FOXGLOVE_SCHEMAS, schema_of
+from handtouch.record.schemas import MessageFormat, schema_of
 
 from .conftest import SESSION, WALL_NS, RecordingSession, health, service
+from .foxglove_messages import decode
 
 SECOND_NS = 1_000_000_000
 
@@ -46,10 +47,12 @@ class TopicFile:
     def __init__(self) -> None:
         self.written: list[tuple[str, int]] = []
 
-    def write(self, topic: str, data: bytes, t_ns: int, seq: int = 0, foxglove: str = "") -> None:
+    def write(
+        self, topic: str, data: bytes, t_ns: int, seq: int = 0, form: MessageFormat | None = None
+    ) -> None:
         assert data
         assert seq >= 0
-        if not foxglove:
+        if form is None:
             self.written.append((topic, t_ns))
 
     def flush(self) -> None:
@@ -161,19 +164,21 @@ def test_every_channel_has_a_schema_for_foxglove(recorded: Path) -> None:
             channel.topic: (summary.schemas[channel.schema_id], channel.message_encoding)
             for channel in summary.channels.values()
         }
-        for schema, _ in schemas.values():
-            assert schema.encoding == "jsonschema"
-            assert json.loads(schema.data)["type"] == "object"
-        assert {schema.name for schema, _ in schemas.values()} >= set(FOXGLOVE_SCHEMAS)
+        for topic, (schema, encoding) in schemas.items():
+            if topic.startswith("/"):
+                assert (schema.encoding, encoding) == ("protobuf", "protobuf")
+            else:
+                assert schema.encoding == "jsonschema"
+                assert json.loads(schema.data)["type"] == "object"
+        names = {schema.name for schema, _ in schemas.values()}
+        assert names >= {"foxglove.SceneUpdate", "foxglove.FrameTransforms", "foxglove.Log"}
         assert schemas["contact/h/plane"][1] == "json"
         assert schemas["tick"][1] == "msgpack"
         made = [
-            (s.name, json.loads(m.data))
+            (s.name, decode(s.name, s.data, m.data))
             for s, c, m in make_reader(file).iter_messages()
             if s and c.topic[0] == "/"
         ]
-    for name, message in made:
-        assert message.keys() == FOXGLOVE_SCHEMAS[name]["properties"].keys()
     lines = [message["message"] for name, message in made if name == "foxglove.Log"]
     assert any("begin" in text for text in lines)
     assert "lost: its heartbeat timed out" in lines

@@ -64,6 +64,11 @@ def _add_view(commands: Subparsers) -> None:
     view = add_command(
         commands, "view", "handtouch.cli.view:run", "serve a live 3D view of a running daemon's hands"
     )
+    view.add_argument(
+        "--foxglove",
+        action="store_true",
+        help="serve Foxglove (scene, frames, log, values to plot) over its WebSocket, instead of a page",
+    )
     add_endpoint(view, LIVE_ENDPOINT, LIVE_HELP)
     view.add_argument(
         "--host", default="127.0.0.1", help="address that the page is served at (default: 127.0.0.1)"
@@ -71,10 +76,11 @@ def _add_view(commands: Subparsers) -> None:
     view.add_argument(
         "--port",
         type=integer(0, 65535, "a port, 0 to 65535"),
-        default=5588,
-        help="TCP port of the page, 0 for any free one (default: 5588)",
+        help="TCP port of the page, 0 for any free one (default: 5588; 8765 for Foxglove)",
     )
-    view.add_argument("--open", dest="show", action="store_true", help="open the page in a browser")
+    view.add_argument(
+        "--open", dest="show", action="store_true", help="open the page, or Foxglove, in a browser"
+    )
     view.add_argument(
         "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
     )

@@ -1,8 +1,9 @@
-"""`handtouch view`: serve the page in the browser and print its URL."""
+"""`handtouch view`: serve the page in the browser, or Foxglove, and print the URL."""
 
 from __future__ import annotations
 
 import sys
+import threading
 import time
 import webbrowser
 
@@ -18,16 +19,21 @@ def run(
     endpoint: str,
     key: str | None,
     host: str,
-    port: int,
+    port: int | None,
     show: bool = False,
     seconds: float = 0.0,
     percepts: bool = False,
+    foxglove: bool = False,
 ) -> int:
-    """Serve the page until Ctrl-C, or for `seconds`; `show` opens it in this machine's browser.
+    """Serve the page, or Foxglove, until Ctrl-C, or for `seconds`; `show` opens it in this machine's browser.
 
-    Exit status 0, 1 when the daemon rejects this client, 2 for an unusable endpoint, key or port.
+    Exit status 0, 1 when the daemon rejects this client, 2 for an unusable endpoint, key or port, or without
+    the extra.
     """
     stop = stop_on_signals()
+    if foxglove:
+        return _serve_foxglove(endpoint, key, host, port, show, seconds, percepts, stop)
+    port = page.PORT if port is None else port
     model = PageModel(percepts)
     server = PageServer(model.values, host, port)
     try:
@@ -55,8 +61,52 @@ def run(
     return 0
 
 
+def _serve_foxglove(
+    endpoint: str,
+    key: str | None,
+    host: str,
+    port: int | None,
+    show: bool,
+    seconds: float,
+    percepts: bool,
+    stop: threading.Event,
+) -> int:
+    try:
+        from handtouch.view import foxglove
+    except ImportError as error:
+        print(f"Foxglove's package is missing ({error}): pip install 'handtouch[foxglove]'", file=sys.stderr)
+        return 2
+    patterns = (*foxglove.PATTERNS, *[page.PERCEPT_PATTERN] * percepts)
+    port = foxglove.PORT if port is None else port
+    try:
+        messages = connect(*patterns, endpoint=endpoint, key=key, queue=foxglove.QUEUE_MESSAGES)
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
+    with messages:
+        try:
+            server = foxglove.FoxgloveServer(host, port)
+        except RuntimeError as error:
+            print(_bind_error_text(host, port, error), file=sys.stderr)
+            return 2
+        with server:
+            print(
+                f"handtouch view: {server.url} shows {endpoint} in {server.app_url}; Ctrl-C to stop",
+                flush=True,
+            )
+            if show:
+                webbrowser.open(server.app_url)
+            end_s = time.monotonic() + seconds if seconds else float("inf")
+            try:
+                foxglove.serve(messages, server, stop, end_s)
+            except PermissionError as error:
+                print(error, file=sys.stderr)
+                return 1
+    return 0
+
+
 def _bind_error_text(host: str, port: int, error: Exception) -> str:
     return (
-        f"can't serve the page at {host}:{port}: {getattr(error, 'strerror', None) or error}; if another "
+        f"can't serve at {host}:{port}: {getattr(error, 'strerror', None) or error}; if another "
         "view uses the port, take a free one with `handtouch view --port 0`"
     )

@@ -20,7 +20,7 @@ from handtouch.client import SERVICE_TIMEOUT_S, Subscriber
 from handtouch.config import load
 from handtouch.host.endpoints import COMPLETE_ENDPOINT, to_connect
 from handtouch.record.mcap_file import RecordingFile
-from handtouch.record.recorder import MessageRecorder, RotationLimits
+from handtouch.record.recorder import MessageRecorder, NoScenes, RotationLimits, SceneConverter
 
 PATTERNS = (
     "config",  # before the state, which is read with it
@@ -111,7 +111,7 @@ class Capture:
     def __init__(self, options: RecordOptions, endpoint: str, source: Subscriber[Any]) -> None:
         self.endpoint = endpoint
         self.files = RecordingFiles(options, endpoint)
-        self.recorder = MessageRecorder(self.files.open_next, _rotation_limits(options))
+        self.recorder = MessageRecorder(self.files.open_next, _rotation_limits(options), _scene_converter())
         self.end_reason = ""
         self._options, self._source = options, source
 
@@ -172,6 +172,15 @@ class Capture:
                     f"less than {options.keep_free_mb:g} MB are free in {self.files.folder}: recording ended"
                 )
         return ""
+
+
+def _scene_converter() -> Callable[[], SceneConverter]:
+    """Return the maker of Foxglove's messages, or one that makes none if the extra isn't installed."""
+    try:
+        from handtouch.record.foxglove import FoxgloveConverter
+    except ImportError:
+        return NoScenes
+    return FoxgloveConverter
 
 
 def _rotation_limits(options: RecordOptions) -> RotationLimits:

@@ -1,16 +1,40 @@
 """Conversion to Foxglove's 3-D scenes and logs: contacts on their links, frames, and events.
 
-Public name: `FoxgloveConverter`.
+Public name: `FoxgloveConverter`. Needs the extra `foxglove`: Foxglove's own messages, encoders and schemas.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any, Protocol
+
+from foxglove import Schema
+from foxglove.messages import (
+    ArrowPrimitive,
+    Color,
+    CubePrimitive,
+    CylinderPrimitive,
+    Duration,
+    FrameTransform,
+    FrameTransforms,
+    KeyValuePair,
+    Log,
+    LogLevel,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SceneEntityDeletion,
+    SceneUpdate,
+    SpherePrimitive,
+    TextPrimitive,
+    Timestamp,
+    Vector3,
+)
 
 from handtouch.hand import urdf
 from handtouch.record.link_frames import LinkFrames, LinkTransform, quaternion
+from handtouch.record.schemas import MessageFormat, SceneMessage
 
 SCENE_TOPIC, LOG_TOPIC, FRAMES_TOPIC, HAND_TOPIC = (
     "/handtouch/scene",
@@ -22,19 +46,16 @@ _SCENE_PERIOD_NS = 33_000_000
 _FRAMES_PERIOD_NS = 1_000_000_000
 _HAND_PERIOD_NS = 5_000_000_000
 _ARROW_M_PER_N = 0.01
-_INFO, _WARNING = 2, 3
-_COLOR_OF_STATUS = {"valid": (0.1, 0.6, 0.9, 0.9), "lower_bound": (0.9, 0.2, 0.1, 0.9)}
-_DEFAULT_COLOR = (0.6, 0.6, 0.6, 0.9)
-_BODY_COLOR = dict(zip("rgba", (0.36, 0.4, 0.46, 1.0), strict=True))
-_IDENTITY_ROTATION = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-
-
-class FoxgloveMessage(NamedTuple):
-    """A message for Foxglove: topic, name of the schema, JSON."""
-
-    topic: str
-    schema: str
-    data: bytes
+_CONTACT_LIFETIME = Duration(sec=1)
+"""Contacts of a daemon that ended without a message disappear."""
+_COLOR_OF_STATUS = {
+    "valid": Color(r=0.1, g=0.6, b=0.9, a=0.9),
+    "lower_bound": Color(r=0.9, g=0.2, b=0.1, a=0.9),
+}
+_DEFAULT_COLOR = Color(r=0.6, g=0.6, b=0.6, a=0.9)
+_TEXT_COLOR = Color(r=1.0, g=1.0, b=1.0, a=1.0)
+_BODY_COLOR = Color(r=0.36, g=0.4, b=0.46, a=1.0)
+_NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 class FoxgloveConverter:
@@ -51,14 +72,14 @@ class FoxgloveConverter:
         self._links_known = False
         self._pad_states: dict[str, tuple[str, str]] = {}
 
-    def convert(self, topic: str, payload: dict[str, Any], t_ns: int) -> list[FoxgloveMessage]:
+    def convert(self, topic: str, payload: dict[str, Any], t_ns: int) -> list[SceneMessage]:
         """Return the messages to add after one recorded at `t_ns` [ns since 1970]."""
         prefix, _, name = topic.partition("/")
         made = []
         if prefix == "contact":
             if payload["event"] != "update":
                 self._scene_wall_ns = 0  # no delay
-                made.append(_log_message(t_ns, _INFO, name, _contact_text(payload)))
+                made.append(_log_message(t_ns, LogLevel.Info, name, _contact_text(payload)))
             if payload["event"] == "end":
                 self._contacts.pop(name, None)
             else:
@@ -66,8 +87,9 @@ class FoxgloveConverter:
         elif prefix == "health":
             state = payload["state"].replace("touched", "clear"), payload["reason"]
             if self._pad_states.get(name) not in (None, state):
+                level = LogLevel.Warning if payload["reason"] else LogLevel.Info
                 text = f"{payload['state']}: {payload['reason']}".removesuffix(": ")
-                made.append(_log_message(t_ns, _WARNING if payload["reason"] else _INFO, name, text))
+                made.append(_log_message(t_ns, level, name, text))
             self._pad_states[name] = state
         elif prefix == "service":
             self._links.set_links(payload["hands"])
@@ -86,119 +108,131 @@ class FoxgloveConverter:
             self._hand_wall_ns = t_ns
             entities = [_body_entity(frame, shapes, t_ns) for frame, shapes in self._links.bodies()]
             if entities:
-                made.append(
-                    FoxgloveMessage(
-                        HAND_TOPIC, "foxglove.SceneUpdate", _json({"deletions": [], "entities": entities})
-                    )
-                )
+                made.append(_encoded(HAND_TOPIC, SceneUpdate(entities=entities)))
         if t_ns - self._scene_wall_ns >= _SCENE_PERIOD_NS and (self._contacts or self._shown_contacts):
             self._scene_wall_ns = t_ns
-            made.append(FoxgloveMessage(SCENE_TOPIC, "foxglove.SceneUpdate", _json(self._scene_update(t_ns))))
+            made.append(_encoded(SCENE_TOPIC, self._scene_update(t_ns)))
         return made
 
-    def _scene_update(self, t_ns: int) -> dict[str, Any]:
+    def _scene_update(self, t_ns: int) -> SceneUpdate:
         entities = [
             _contact_entity(name, self._links.frame_name(contact["hand"], contact["frame"]), contact, t_ns)
             for name, contact in self._contacts.items()
         ]
-        shown = {entity["id"] for entity in entities}
-        deleted = [
-            {"timestamp": _time(t_ns), "type": 0, "id": old} for old in sorted(self._shown_contacts - shown)
+        deletions = [
+            SceneEntityDeletion(timestamp=_time(t_ns), id=name)
+            for name in sorted(self._shown_contacts - self._contacts.keys())
         ]
-        self._shown_contacts = shown
-        return {"deletions": deleted, "entities": entities}
+        self._shown_contacts = set(self._contacts)
+        return SceneUpdate(deletions=deletions, entities=entities)
 
 
-def _frame_transforms(t_ns: int, frames: Iterable[LinkTransform]) -> FoxgloveMessage:
+class EncodableMessage(Protocol):
+    """A message of `foxglove.messages`."""
+
+    @staticmethod
+    def get_schema() -> Schema: ...
+
+    def encode(self) -> bytes: ...
+
+
+def _encoded(topic: str, message: EncodableMessage) -> SceneMessage:
+    return SceneMessage(topic, _format_of(type(message)), message.encode())
+
+
+@cache
+def _format_of(kind: type[EncodableMessage]) -> MessageFormat:
+    schema = kind.get_schema()
+    return MessageFormat("protobuf", schema.name, schema.encoding, schema.data)
+
+
+def _frame_transforms(t_ns: int, frames: Iterable[LinkTransform]) -> SceneMessage:
     transforms = [
-        {
-            "timestamp": _time(t_ns),
-            "parent_frame_id": frame.parent,
-            "child_frame_id": frame.child,
-            "translation": _vector(frame.translation_m),
-            "rotation": dict(zip("xyzw", frame.rotation, strict=True)),
-        }
+        FrameTransform(
+            timestamp=_time(t_ns),
+            parent_frame_id=frame.parent,
+            child_frame_id=frame.child,
+            translation=_vector(frame.translation_m),
+            rotation=_rotation(frame.rotation),
+        )
         for frame in frames
     ]
-    return FoxgloveMessage(FRAMES_TOPIC, "foxglove.FrameTransforms", _json({"transforms": transforms}))
+    return _encoded(FRAMES_TOPIC, FrameTransforms(transforms=transforms))
 
 
-def _empty_entity(frame: str, name: str, t_ns: int, **metadata: str) -> dict[str, Any]:
-    """Return an entity without primitives."""
-    return {
-        "timestamp": _time(t_ns),
-        "frame_id": frame,
-        "id": name,
-        "lifetime": {"sec": 0, "nsec": 0},
-        "frame_locked": True,
-        "metadata": [{"key": key, "value": value} for key, value in metadata.items()],
-        **{kind: [] for kind in ("arrows", "cubes", "spheres", "cylinders", "lines", "triangles")},
-        "texts": [],
-        "models": [],
-    }
-
-
-def _body_entity(frame: str, shapes: list[urdf.BodyShape], t_ns: int) -> dict[str, Any]:
+def _body_entity(frame: str, shapes: list[urdf.BodyShape], t_ns: int) -> SceneEntity:
     """Return a link's bodies; without meshes."""
-    made = _empty_entity(frame, f"body of {frame}", t_ns)
+    cubes, spheres, cylinders = [], [], []
     for shape in shapes:
-        turn = dict(zip("xyzw", quaternion(shape.rotation), strict=True))
-        pose = {"position": _vector(shape.translation_m.tolist()), "orientation": turn}
-        if shape.kind == "box":
-            made["cubes"].append({"pose": pose, "size": _vector(shape.size_m), "color": _BODY_COLOR})
-            continue
         if shape.kind == "mesh":
             continue
+        pose = _pose(shape.translation_m.tolist(), quaternion(shape.rotation))
+        if shape.kind == "box":
+            cubes.append(CubePrimitive(pose=pose, size=_vector(shape.size_m), color=_BODY_COLOR))
+            continue
         wide = 2 * shape.size_m[0]
-        ball = {"size": _vector((wide, wide, wide)), "color": _BODY_COLOR}
+        ball_size = _vector((wide, wide, wide))
         if shape.kind == "sphere":
-            made["spheres"].append({"pose": pose, **ball})
+            spheres.append(SpherePrimitive(pose=pose, size=ball_size, color=_BODY_COLOR))
             continue
         long = shape.size_m[1]
-        ends = {"bottom_scale": 1.0, "top_scale": 1.0}
-        made["cylinders"].append(
-            {"pose": pose, "size": _vector((wide, wide, long)), **ends, "color": _BODY_COLOR}
+        size = _vector((wide, wide, long))
+        cylinders.append(
+            CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=_BODY_COLOR)
         )
         for sign in (-0.5, 0.5) if shape.kind == "capsule" else ():
             end = shape.translation_m + sign * long * shape.rotation[:, 2]
-            made["spheres"].append(
-                {"pose": {"position": _vector(end.tolist()), "orientation": _IDENTITY_ROTATION}, **ball}
-            )
-    return made
+            spheres.append(SpherePrimitive(pose=_pose(end.tolist()), size=ball_size, color=_BODY_COLOR))
+    return SceneEntity(
+        timestamp=_time(t_ns),
+        frame_id=frame,
+        id=f"body of {frame}",
+        frame_locked=True,
+        cubes=cubes,
+        spheres=spheres,
+        cylinders=cylinders,
+    )
 
 
-def _contact_entity(name: str, frame: str, contact: dict[str, Any], t_ns: int) -> dict[str, Any]:
+def _contact_entity(name: str, frame: str, contact: dict[str, Any], t_ns: int) -> SceneEntity:
     position, normal, force_n = contact["position_m"], contact["normal"], contact["force_n"]
-    about = {key: str(contact[key]) for key in ("hand", "link", "force_status")}
-    made = _empty_entity(frame, name, t_ns, **about)
-    if position is None or normal is None:
-        return made
-    color = dict(zip("rgba", _COLOR_OF_STATUS.get(contact["force_status"], _DEFAULT_COLOR), strict=True))
-    flat = {"position": _vector(position), "orientation": _IDENTITY_ROTATION}
-    made["spheres"] = [{"pose": flat, "size": _vector((0.003, 0.003, 0.003)), "color": color}]
-    if force_n is not None:
-        pose = {"position": _vector(position), "orientation": _rotation_from_x(normal)}
-        made["arrows"] = [
-            {
-                "pose": pose,
-                "shaft_length": force_n * _ARROW_M_PER_N,
-                "shaft_diameter": 0.001,
-                "head_length": 0.002,
-                "head_diameter": 0.002,
-                "color": color,
-            }
-        ]
-        made["texts"] = [
-            {
-                "pose": flat,
-                "billboard": True,
-                "font_size": 12.0,
-                "scale_invariant": True,
-                "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
-                "text": f"{contact['link']} {force_n:.2f} N",
-            }
-        ]
-    return made
+    spheres, arrows, texts = [], [], []
+    if position is not None and normal is not None:
+        color = _COLOR_OF_STATUS.get(contact["force_status"], _DEFAULT_COLOR)
+        size = _vector((0.003, 0.003, 0.003))
+        spheres.append(SpherePrimitive(pose=_pose(position), size=size, color=color))
+        if force_n is not None:
+            arrows.append(
+                ArrowPrimitive(
+                    pose=_pose(position, _rotation_from_x(normal)),
+                    shaft_length=force_n * _ARROW_M_PER_N,
+                    shaft_diameter=0.001,
+                    head_length=0.002,
+                    head_diameter=0.002,
+                    color=color,
+                )
+            )
+            texts.append(
+                TextPrimitive(
+                    pose=_pose(position),
+                    billboard=True,
+                    font_size=12.0,
+                    scale_invariant=True,
+                    color=_TEXT_COLOR,
+                    text=f"{contact['link']} {force_n:.2f} N",
+                )
+            )
+    return SceneEntity(
+        timestamp=_time(t_ns),
+        frame_id=frame,
+        id=name,
+        lifetime=_CONTACT_LIFETIME,
+        frame_locked=True,
+        metadata=[KeyValuePair(key=key, value=str(contact[key])) for key in ("hand", "link", "force_status")],
+        spheres=spheres,
+        arrows=arrows,
+        texts=texts,
+    )
 
 
 def _contact_text(contact: dict[str, Any]) -> str:
@@ -209,27 +243,32 @@ def _contact_text(contact: dict[str, Any]) -> str:
     return f"{text} ({contact['end_reason']}) after {contact['duration_s']:.2f} s{peak}"
 
 
-def _log_message(t_ns: int, level: int, name: str, text: str) -> FoxgloveMessage:
-    log = {"timestamp": _time(t_ns), "level": level, "message": text, "name": name, "file": "", "line": 0}
-    return FoxgloveMessage(LOG_TOPIC, "foxglove.Log", _json(log))
+def _log_message(t_ns: int, level: LogLevel, name: str, text: str) -> SceneMessage:
+    return _encoded(LOG_TOPIC, Log(timestamp=_time(t_ns), level=level, message=text, name=name))
 
 
-def _json(value: Any) -> bytes:
-    return json.dumps(value, separators=(",", ":")).encode()
+def _time(t_ns: int) -> Timestamp:
+    return Timestamp(t_ns // 1_000_000_000, t_ns % 1_000_000_000)
 
 
-def _time(t_ns: int) -> dict[str, int]:
-    return {"sec": t_ns // 1_000_000_000, "nsec": t_ns % 1_000_000_000}
+def _vector(xyz: Iterable[float]) -> Vector3:
+    x, y, z = xyz
+    return Vector3(x=x, y=y, z=z)
 
 
-def _vector(xyz: Any) -> dict[str, float]:
-    return dict(zip("xyz", xyz, strict=True))
+def _rotation(xyzw: Iterable[float]) -> Quaternion:
+    x, y, z, w = xyzw
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
-def _rotation_from_x(normal: Any) -> dict[str, float]:
-    """Return the rotation of the x axis, the direction of arrows, to a unit vector."""
+def _pose(position: Iterable[float], xyzw: Iterable[float] = _NO_ROTATION) -> Pose:
+    return Pose(position=_vector(position), orientation=_rotation(xyzw))
+
+
+def _rotation_from_x(normal: Iterable[float]) -> tuple[float, float, float, float]:
+    """Return the rotation (x, y, z, w) of the x axis, the direction of arrows, to a unit vector."""
     x, y, z = normal
     if x < -1 + 1e-9:
-        return {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0}
+        return 0.0, 0.0, 1.0, 0.0
     scale = (2 * (1 + x)) ** 0.5
-    return {"x": 0.0, "y": -z / scale, "z": y / scale, "w": scale / 2}
+    return 0.0, -z / scale, y / scale, scale / 2

@@ -5,18 +5,16 @@ Public name: `RecordingFile`.
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import IO, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
-from handtouch import __version__, wire
-from handtouch.record.schemas import ENCODING, FOXGLOVE_SCHEMAS, schema_of
+from handtouch import __version__
+from handtouch.record.schemas import MessageFormat, wire_format
 
 _CHUNK_BYTES = 512 * 1024
-_PAYLOAD_OF_PREFIX = {topic.prefix: topic.payload for topic in wire.TOPICS}
 
 
 class RecordingFile:
@@ -40,11 +38,13 @@ class RecordingFile:
         """Size of the file in bytes."""
         return self._stream.tell()
 
-    def write(self, topic: str, data: bytes, t_ns: int, seq: int = 0, foxglove: str = "") -> None:
-        """Add a wire message, encoded as in ENCODING, or one of a Foxglove schema, as JSON."""
+    def write(
+        self, topic: str, data: bytes, t_ns: int, seq: int = 0, form: MessageFormat | None = None
+    ) -> None:
+        """Add a message; without `form` a wire message, encoded as in ENCODING."""
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._register(topic, foxglove)
+            channel = self._register(topic, form or wire_format(topic.split("/")[0]))
         self.messages += 1
         self._writer.add_message(channel, t_ns, data, t_ns, seq & 0xFFFFFFFF)
 
@@ -67,15 +67,11 @@ class RecordingFile:
         """Truncate after the last complete record and close; raises nothing."""
         self._stream.truncate()
 
-    def _register(self, topic: str, foxglove: str) -> int:
-        prefix = topic.split("/")[0]
-        name = foxglove or f"handtouch.{_PAYLOAD_OF_PREFIX[prefix].__name__}"
+    def _register(self, topic: str, form: MessageFormat) -> int:
+        name = form.schema_name
         if name not in self._schemas:
-            schema = FOXGLOVE_SCHEMAS[foxglove] if foxglove else schema_of(_PAYLOAD_OF_PREFIX[prefix])
-            data = json.dumps(schema, separators=(",", ":")).encode()
-            self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
-        encoding = "json" if foxglove else ENCODING[prefix]
-        self._channels[topic] = self._writer.register_channel(topic, encoding, self._schemas[name])
+            self._schemas[name] = self._writer.register_schema(name, form.schema_encoding, form.schema)
+        self._channels[topic] = self._writer.register_channel(topic, form.encoding, self._schemas[name])
         return self._channels[topic]
 
 

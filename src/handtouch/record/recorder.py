@@ -1,6 +1,7 @@
 """Content of recordings: every message in order, losses counted, each file complete in itself.
 
-Public names: `MessageRecorder`, `RotationLimits`, `MessageFile`. Free of sockets and clocks.
+Public names: `MessageRecorder`, `RotationLimits`, `MessageFile`, `SceneConverter`, `NoScenes`. Free of
+sockets and clocks.
 """
 
 from __future__ import annotations
@@ -12,8 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from handtouch import wire
-from handtouch.record.foxglove import FoxgloveConverter
-from handtouch.record.schemas import ENCODING
+from handtouch.record.schemas import ENCODING, MessageFormat, SceneMessage
 from handtouch.wire.codec import check_fields, unpack
 
 _FLUSH_PERIOD_NS = 1_000_000_000
@@ -25,16 +25,32 @@ _MAX_WAITING_MESSAGES = 100_000
 
 
 class MessageFile(Protocol):
-    """Output of messages: `RecordingFile`."""
+    """Output of messages: `RecordingFile`, or Foxglove's live server."""
 
     @property
     def size(self) -> int: ...
 
-    def write(self, topic: str, data: bytes, t_ns: int, seq: int = 0, foxglove: str = "") -> None: ...
+    def write(
+        self, topic: str, data: bytes, t_ns: int, seq: int = 0, form: MessageFormat | None = None
+    ) -> None: ...
 
     def flush(self) -> None: ...
 
     def finish(self, summary: dict[str, str]) -> None: ...
+
+
+class SceneConverter(Protocol):
+    """Maker of scenes and logs from the messages of a session: `FoxgloveConverter`."""
+
+    def convert(self, topic: str, payload: dict[str, Any], t_ns: int) -> list[SceneMessage]: ...
+
+
+class NoScenes:
+    """A `SceneConverter` that makes nothing."""
+
+    def convert(self, topic: str, payload: dict[str, Any], t_ns: int) -> list[SceneMessage]:  # noqa: ARG002
+        """Return no message."""
+        return []
 
 
 @dataclass(frozen=True)
@@ -48,12 +64,18 @@ class RotationLimits:
 class MessageRecorder:
     """Recorder of messages in the order of arrival; times are ns since 1970 UTC, except `now_ns`, monotonic.
 
-    `open_file` opens the next file, when the time of its first message is known. `state_requested`: subscribe
+    `open_file` opens the next file, when the time of its first message is known; `make_converter` makes the
+    converter of a session. `state_requested`: subscribe
     to `state` again, to get the daemon's retained state. `lost` counts messages missing in sequences, by
     topic; `malformed` those that violate the wire contract. Exceptions of files are passed on.
     """
 
-    def __init__(self, open_file: Callable[[int], MessageFile], limits: RotationLimits) -> None:
+    def __init__(
+        self,
+        open_file: Callable[[int], MessageFile],
+        limits: RotationLimits,
+        make_converter: Callable[[], SceneConverter] = NoScenes,
+    ) -> None:
         self.lost: Counter[str] = Counter()
         self.malformed = 0
         self.messages: Counter[str] = Counter()
@@ -63,7 +85,7 @@ class MessageRecorder:
         self.state_requested = False
         self.file: MessageFile | None = None
         self._open_file, self._limits = open_file, limits
-        self._foxglove = FoxgloveConverter()
+        self._make_converter, self._converter = make_converter, make_converter()
         self._session: int | None = None
         self._wall_offset_ns: int | None = None
         self._waiting: list[tuple[str, bytes, dict[str, Any]]] = []
@@ -137,7 +159,7 @@ class MessageRecorder:
         self._seq.clear()
         self._repeated.clear()
         self._waiting.clear()
-        self._foxglove = FoxgloveConverter()
+        self._converter = self._make_converter()
         self._needs_state = True
 
     def _is_new(self, topic: str, payload: dict[str, Any]) -> bool:
@@ -181,16 +203,18 @@ class MessageRecorder:
         self.contacts += prefix == "contact" and payload.get("event") == "begin"
         self._write(topic, data, t_ns, payload["seq"])
         try:
-            shown = self._foxglove.convert(topic, payload, t_ns)
+            shown = self._converter.convert(topic, payload, t_ns)
         except (KeyError, TypeError, ValueError, AttributeError):  # an unexpected type
             self.malformed += 1
             return
         for made in shown:
-            self._write(made.topic, made.data, t_ns, foxglove=made.schema)
+            self._write(made.topic, made.data, t_ns, form=made.format)
 
-    def _write(self, topic: str, data: bytes, t_ns: int, seq: int = 0, foxglove: str = "") -> None:
+    def _write(
+        self, topic: str, data: bytes, t_ns: int, seq: int = 0, form: MessageFormat | None = None
+    ) -> None:
         assert self.file is not None
-        self.file.write(topic, data, max(0, t_ns), seq, foxglove)
+        self.file.write(topic, data, max(0, t_ns), seq, form)
 
     def _is_full(self, now_ns: int) -> bool:
         assert self.file is not None

@@ -1,6 +1,6 @@
-"""Schemas of recorded channels: JSON schemas of the wire's payloads, and Foxglove's.
+"""Formats of recorded channels, and JSON schemas of the wire's payloads.
 
-Public names: `schema_of`, `FOXGLOVE_SCHEMAS`, `ENCODING`.
+Public names: `MessageFormat`, `SceneMessage`, `wire_format`, `schema_of`, `ENCODING`.
 
 Payloads with binary columns are stored as received, in msgpack; the others as JSON, which Foxglove plots and
 lists without conversion. Both have JSON schemas; in those of msgpack, a "string" with `contentEncoding`
@@ -9,10 +9,12 @@ lists without conversion. Both have JSON schemas; in those of msgpack, a "string
 
 from __future__ import annotations
 
+import json
 import types
 import typing
 from dataclasses import fields
-from typing import Any, Union
+from functools import cache
+from typing import Any, NamedTuple, Union
 
 from handtouch import wire
 
@@ -28,6 +30,34 @@ ENCODING = {
     for topic in wire.TOPICS
 }
 """Prefix of a topic -> encoding of its messages."""
+
+_PAYLOAD_OF_PREFIX = {topic.prefix: topic.payload for topic in wire.TOPICS}
+
+
+class MessageFormat(NamedTuple):
+    """Encoding of the messages of a channel, and their schema."""
+
+    encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+
+
+class SceneMessage(NamedTuple):
+    """A message made from the wire's for Foxglove's scenes and logs."""
+
+    topic: str
+    format: MessageFormat
+    data: bytes
+
+
+@cache
+def wire_format(prefix: str) -> MessageFormat:
+    """Return the format in which messages of a topic's prefix are stored. Raises KeyError."""
+    payload = _PAYLOAD_OF_PREFIX[prefix]
+    schema = json.dumps(schema_of(payload), separators=(",", ":")).encode()
+    return MessageFormat(ENCODING[prefix], f"handtouch.{payload.__name__}", "jsonschema", schema)
+
 
 _SCALAR_SCHEMAS: dict[Any, dict[str, Any]] = {
     int: {"type": "integer"},
@@ -72,91 +102,3 @@ def _schema_of_type(hint: Any) -> dict[str, Any]:
     if origin is typing.Literal:
         return {"type": "string", "enum": list(arguments)}
     return dict(_SCALAR_SCHEMAS[hint])
-
-
-def _object(title: str = "", **properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties} | ({"title": title} if title else {})
-
-
-def _list(items: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "array", "items": items}
-
-
-_NUMBER, _TEXT, _BOOLEAN = _SCALAR_SCHEMAS[float], _SCALAR_SCHEMAS[str], _SCALAR_SCHEMAS[bool]
-_TIME = _object("time", sec={"type": "integer", "minimum": 0}, nsec={"type": "integer", "minimum": 0})
-_DURATION = _object("duration", sec={"type": "integer"}, nsec={"type": "integer", "minimum": 0})
-_VECTOR = _object("foxglove.Vector3", x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _object("foxglove.Quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _object("foxglove.Pose", position=_VECTOR, orientation=_QUATERNION)
-_COLOR = _object("foxglove.Color", r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
-_ARROW = _object(
-    "foxglove.ArrowPrimitive",
-    pose=_POSE,
-    shaft_length=_NUMBER,
-    shaft_diameter=_NUMBER,
-    head_length=_NUMBER,
-    head_diameter=_NUMBER,
-    color=_COLOR,
-)
-_SPHERE = _object("foxglove.SpherePrimitive", pose=_POSE, size=_VECTOR, color=_COLOR)
-_CUBE = _object("foxglove.CubePrimitive", pose=_POSE, size=_VECTOR, color=_COLOR)
-_CYLINDER = _object(
-    "foxglove.CylinderPrimitive",
-    pose=_POSE,
-    size=_VECTOR,
-    bottom_scale=_NUMBER,
-    top_scale=_NUMBER,
-    color=_COLOR,
-)
-_TEXT_PRIMITIVE = _object(
-    "foxglove.TextPrimitive",
-    pose=_POSE,
-    billboard=_BOOLEAN,
-    font_size=_NUMBER,
-    scale_invariant=_BOOLEAN,
-    color=_COLOR,
-    text=_TEXT,
-)
-_ENTITY = _object(
-    "foxglove.SceneEntity",
-    timestamp=_TIME,
-    frame_id=_TEXT,
-    id=_TEXT,
-    lifetime=_DURATION,
-    frame_locked=_BOOLEAN,
-    metadata=_list(_object("foxglove.KeyValuePair", key=_TEXT, value=_TEXT)),
-    arrows=_list(_ARROW),
-    cubes=_list(_CUBE),
-    spheres=_list(_SPHERE),
-    cylinders=_list(_CYLINDER),
-    lines=_list(_object()),
-    triangles=_list(_object()),
-    texts=_list(_TEXT_PRIMITIVE),
-    models=_list(_object()),
-)
-_DELETION = _object("foxglove.SceneEntityDeletion", timestamp=_TIME, type={"type": "integer"}, id=_TEXT)
-_TRANSFORM = _object(
-    "foxglove.FrameTransform",
-    timestamp=_TIME,
-    parent_frame_id=_TEXT,
-    child_frame_id=_TEXT,
-    translation=_VECTOR,
-    rotation=_QUATERNION,
-)
-
-FOXGLOVE_SCHEMAS = {
-    "foxglove.SceneUpdate": _object(
-        "foxglove.SceneUpdate", deletions=_list(_DELETION), entities=_list(_ENTITY)
-    ),
-    "foxglove.FrameTransforms": _object("foxglove.FrameTransforms", transforms=_list(_TRANSFORM)),
-    "foxglove.Log": _object(
-        "foxglove.Log",
-        timestamp=_TIME,
-        level={"type": "integer"},
-        message=_TEXT,
-        name=_TEXT,
-        file=_TEXT,
-        line={"type": "integer", "minimum": 0},
-    ),
-}
-"""Name -> JSON schema with the public fields of Foxglove's schemas."""
