@@ -25,6 +25,19 @@ def test_benchmarks_draw_worlds_of_the_reporting_family_only(path: Path) -> None
             assert re.match(r"Family\.REPORTING\.seed\(", ast.unparse(node.args[0])), ast.unparse(node)
 
 
+def test_the_index_has_a_row_for_every_page_and_none_else() -> None:
+    folder = ROOT / "docs" / "benchmarks"
+    rows = re.findall(r"^\| (\[.*\.md\)) \|", (folder / "README.md").read_text(), re.MULTILINE)
+    linked = [name for row in rows for name in re.findall(r"\((\w+\.md)\)", row)]
+    assert sorted(linked) == sorted(path.name for path in folder.glob("*.md") if path.name != "README.md")
+
+
+def test_every_benchmark_writes_the_page_of_its_name() -> None:
+    for path in (ROOT / "docs" / "benchmarks").glob("*.md"):
+        for kind, name, *_ in page.STAMP.findall(path.read_text()):
+            assert path.stem in (name, f"{kind}_{name}")
+
+
 @pytest.fixture
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A benchmark that measures one module, in a tree of its own."""
