@@ -108,9 +108,12 @@ def write_page(
         lines += ["", "Where figures as found differ from the check's:", "", *notes]
     if others := before.get("other_settings", ()):
         lines += ["", "## As found, in other settings", ""]
-        lines += [f"With the estimators of commit `{before['commit']}`; shares in %.", ""]
-        lines += ["| quantity | setting | share |", "|" + " --- |" * 3]
-        lines += [f"| {row['quantity']} | {row['setting']} | {Figure(*row['share'])} |" for row in others]
+        lines += [
+            f"With the estimators of commit `{before['commit']}`; shares in %, rms errors in % of 5 N.",
+            "",
+        ]
+        lines += ["| quantity | setting | found |", "|" + " --- |" * 3]
+        lines += [f"| {row['quantity']} | {row['setting']} | {Figure(*row['found'])} |" for row in others]
     (folder / "claims.md").write_text("\n".join([*lines, ""]))
     record = {claim.title: asdict(figure) for claim, figure in rows}
     (folder / "claims.json").write_text(json.dumps(record, indent=1).replace("NaN", "null") + "\n")
