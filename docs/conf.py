@@ -15,8 +15,10 @@ from handtouch import __version__
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 sys.path.insert(0, str(Path(__file__).parent))
 from key_figures import draw_all
+from notebook_page import render_notebook
 from page import outdated
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_NUMBER_CHARACTERS = 24
 """of a cell such as "93.8 (92.8-94.8)" or "12 of 300, 4 %"."""
 
@@ -65,6 +67,16 @@ def mark_outdated(app: Any, page: str, source: list[str]) -> None:  # noqa: ARG0
         source[0] = f"{title}\n\n:::{{note}}\nOlder than the code: {reason}\n:::\n{rest}"
 
 
+def insert_notebooks(app: Any, page: str, source: list[str]) -> None:  # noqa: ARG001
+    """Replace each `<!-- notebook: NAME -->` by the notebook, executed unless that follows the name."""
+
+    def insert(mark: re.Match[str]) -> str:
+        figures = Path(app.srcdir) / "_figures"
+        return render_notebook(EXAMPLES / f"{mark[1]}.ipynb", figures, execute=mark[2] is None)
+
+    source[0] = re.sub(r"<!-- notebook: (\w+)(, not executed)? -->", insert, source[0])
+
+
 def mark_numbers(app: Any, doctree: nodes.document) -> None:  # noqa: ARG001
     """Give short cells that begin with a number the class `number`, which keeps them on one line."""
     for cell in doctree.findall(nodes.entry):
@@ -77,5 +89,6 @@ def setup(app: Any) -> None:
     """Sphinx calls it."""
     app.connect("builder-inited", lambda app: draw_all(Path(app.srcdir) / "_figures"))
     app.connect("source-read", mark_outdated)
+    app.connect("source-read", insert_notebooks)
     app.connect("doctree-read", mark_numbers)
     app.connect("autodoc-process-docstring", as_text)

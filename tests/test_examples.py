@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -109,6 +110,23 @@ def test_the_notebook_logs_and_plots(programs: Any, endpoints: Any, tmp_path: Pa
     figure = tmp_path / "contacts.png"
     assert programs("run_all").log(endpoints.live, figure, 1.0).wait(60) == 0
     assert figure.stat().st_size > 10_000
+
+
+def test_the_notebook_of_one_pad_shows_what_it_states(programs: Any) -> None:
+    pytest.importorskip("matplotlib").use("agg")
+    names: dict[str, Any] = {}
+    exec(programs("run_all").cells(EXAMPLES / "one_pad.ipynb"), names)
+    names["plt"].close("all")
+    assert (names["contact"].x, names["contact"].y) == pytest.approx((0.008, 0.012), rel=1e-12)
+    assert 1860 < names["inside"] < 1940  # binomial, 4 sigma
+    assert names["back"].force_n == pytest.approx(names["force_n"], rel=1e-6)
+
+
+@pytest.mark.parametrize("notebook", sorted(EXAMPLES.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebooks_are_kept_without_outputs(notebook: Path) -> None:
+    code = [cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"]
+    assert code
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
 
 
 # --- the gripper itself
