@@ -210,8 +210,10 @@ def test_contacts_are_drawn_at_their_positions_and_the_page_survives_restarts(
     rig.processes.pop("run").wait()
     browser.wait("document.getElementById('trouble').textContent.includes('daemon disconnected')")
     assert browser.evaluate("Object.values(handtouch.state.contacts).every((contact) => !contact)")
+    browser.wait("document.getElementById('up').textContent.startsWith('last known: ')")
     rig.start("run")
     browser.wait(f"document.getElementById('trouble').hidden && {touched}")
+    browser.wait("!document.getElementById('up').textContent.includes('known')")
     assert "daemon restarted" in browser.evaluate("JSON.stringify(handtouch.state.messages)")
 
     rig.end("simulate")

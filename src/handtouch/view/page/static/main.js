@@ -40,7 +40,7 @@ function applyChanges(changes) {
     } else if (["alive", "service", "messages", "percepts_enabled"].includes(key)) state[key] = value;
   }
   if ("alive" in changes || "service" in changes || changes.scene) drawService(state);
-  if (changes.scene || Object.keys(changes).some((key) => key.startsWith("pad/"))) drawNodes(state);
+  if (changes.scene || "alive" in changes || Object.keys(changes).some((key) => key.startsWith("pad/"))) drawNodes(state);
   if (changes.scene || Object.keys(changes).some((key) => key.startsWith("percepts/"))) drawPercepts(state);
   if (changes.messages) drawMessages(state);
   dirty = true;
@@ -48,6 +48,10 @@ function applyChanges(changes) {
 
 // Where drawing is slow, as in software, it takes at most half of the time: the processor is shared with controllers.
 let drawnAt = 0, pausedUntil = 0;
+
+function redraw() {
+  dirty = true;
+}
 
 function draw(now) {
   requestAnimationFrame(draw);
@@ -71,6 +75,7 @@ function connect() {
   changes.onopen = () => {
     state.connected = true;
     drawService(state);
+    drawNodes(state);
   };
   changes.onmessage = (message) => {
     counts.updates += 1;
@@ -79,6 +84,8 @@ function connect() {
   changes.onerror = () => { // the browser reconnects by itself, unless the response was no event stream
     state.connected = false;
     drawService(state);
+    drawNodes(state);
+    redraw();
     if (changes.readyState === EventSource.CLOSED) setTimeout(connect, 1000);
   };
 }
@@ -96,7 +103,6 @@ function reportRates() {
 window.handtouch = { state, counts, hand, pads, tooltip }; // for the console and for tests
 drawLegend();
 drawService(state);
-const redraw = () => { dirty = true; };
 controlHand(byId("hand"), hand, tooltip, state, redraw);
 controlPads(byId("pads"), pads, hand, tooltip, state, redraw);
 controlChips(byId("nodes"), hand, tooltip, state, redraw);

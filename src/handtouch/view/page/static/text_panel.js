@@ -57,8 +57,8 @@ export function drawService({ connected, alive, service, scene }) {
   }));
 }
 
-// Every pad with its status; count, sign, colour and words follow from the same status.
-export function drawNodes({ scene, pads }) {
+// Every pad with its status; count, sign, colour and words follow from the same status, the last known one without a daemon.
+export function drawNodes({ connected, alive, scene, pads }) {
   if (!scene) return;
   const counts = new Map();
   for (const { key } of scene.pads) {
@@ -66,7 +66,7 @@ export function drawNodes({ scene, pads }) {
     counts.set(status, (counts.get(status) ?? 0) + 1);
   }
   const others = [...counts].filter(([status]) => status !== "ok").map(([status, count]) => `${count} ${status}`);
-  set("up", [`${counts.get("ok") ?? 0} of ${scene.pads.length} ok`, ...others].join(" · "));
+  set("up", (connected && alive ? "" : "last known: ") + [`${counts.get("ok") ?? 0} of ${scene.pads.length} ok`, ...others].join(" · "));
   const list = byId("nodes"), chips = new Map([...list.children].map((chip) => [chip.dataset.key, chip]));
   const shown = scene.pads.map((pad) => chips.get(pad.key) ?? newChip(pad));
   if (shown.length !== chips.size || shown.some((chip) => !chip.isConnected)) list.replaceChildren(...shown);
