@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, replace
 
 import pytest
@@ -202,6 +203,14 @@ def test_json_lines_contain_every_message_completely(capsys: pytest.CaptureFixtu
 
     LineDisplay(as_json=True).show_message(CONTACT)
     assert json.loads(capsys.readouterr().out)["force_n"] == 1.234
+
+
+def test_json_lines_have_null_for_numbers_that_json_lacks(capsys: pytest.CaptureFixture[str]) -> None:
+    import json
+
+    LineDisplay(as_json=True).show_message(replace(CONTACT, residual=math.inf))
+    line = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert line["residual"] is None
 
 
 def _hand(pads: int, touched: int) -> HandView:

@@ -11,8 +11,8 @@ from typing import Any
 
 from handtouch.calibration.store import StoreError
 from handtouch.cli import control_text
-from handtouch.cli.json_output import print_json
 from handtouch.config import ConfigError
+from handtouch.host.json_output import print_json
 from handtouch.procedures import calibrate
 
 

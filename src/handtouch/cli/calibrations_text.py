@@ -12,7 +12,7 @@ from handtouch import config
 from handtouch.calibration import exchange
 from handtouch.calibration.calibration import Calibration, CalibrationVersion, differences
 from handtouch.calibration.store import Store, StoreError, damaged_files, store_path
-from handtouch.cli.json_output import print_json
+from handtouch.host.json_output import print_json
 
 _APPLIED_NOTE = "a daemon that uses this store applies it within seconds; see `handtouch status`"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from handtouch import config
-from handtouch.cli.json_output import print_json
+from handtouch.host.json_output import print_json
 from handtouch.procedures.check import find_warnings, load_deployment, summary
 
 

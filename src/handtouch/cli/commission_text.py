@@ -16,7 +16,7 @@ import numpy as np
 from handtouch import config
 from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.nodes.spec import check_nodes
-from handtouch.cli.json_output import print_json
+from handtouch.host.json_output import print_json
 from handtouch.procedures.commission import daemon_is_running, select_rows
 from handtouch.procedures.commission.outcome import PadOutcome
 from handtouch.procedures.commission.procedure import CommissioningProcedure
@@ -60,7 +60,7 @@ def run(
         print(error, file=sys.stderr)
         return 2
     record = CommissioningRecord(config_path, dry_run)
-    saved = True
+    saved, interrupted = True, False
     try:
         with ExitStack() as stack:
             if as_json:  # standard output is for the result alone
@@ -76,6 +76,7 @@ def run(
                 procedure.run()
             except KeyboardInterrupt:
                 dialogue.print_line("Interrupted; results so far are kept.")
+                interrupted = True
             except (OSError, ValueError, KeyError) as error:  # disk full; file edited meanwhile
                 dialogue.print_line(f"{config_path} can't be written: {error}", "bad")
                 saved = False
@@ -88,6 +89,8 @@ def run(
         print_json(result)
     else:
         print(text, end="")
+    if interrupted:
+        raise KeyboardInterrupt
     return 0 if saved and all(procedure.outcomes[row].ok for row in rows) else 1
 
 

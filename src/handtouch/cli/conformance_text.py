@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 import time
@@ -17,6 +16,7 @@ from rich.text import Text
 from handtouch import __version__, config
 from handtouch.canbus.bus.port import BusError, Port
 from handtouch.core.slab import Slab
+from handtouch.host.json_output import to_json
 from handtouch.procedures.commission import daemon_is_running
 from handtouch.procedures.conformance import (
     BusInUseError,
@@ -87,13 +87,13 @@ def run(
         return 1
     except KeyboardInterrupt:
         print("interrupted; the node was set back", file=sys.stderr)
-        return 1
+        raise
     if not reports:
         print("no node responds; check power, bit rate and termination", file=sys.stderr)
         return 1
-    print(to_json(reports) if as_json else to_text(reports, terminal=sys.stdout.isatty()), end="")
+    print(reports_json(reports) if as_json else to_text(reports, terminal=sys.stdout.isatty()), end="")
     if report_path is not None:
-        text = to_json(reports) if report_path.suffix == ".json" else to_text(reports, terminal=False)
+        text = reports_json(reports) if report_path.suffix == ".json" else to_text(reports, terminal=False)
         try:
             report_path.write_text(text, encoding="utf-8")
         except OSError as error:
@@ -102,14 +102,14 @@ def run(
     return 0 if all(report.ok for report in reports) else 1
 
 
-def to_json(reports: Sequence[NodeReport]) -> str:
+def reports_json(reports: Sequence[NodeReport]) -> str:
     """Format reports as one JSON object: `ok`, `version`, `nodes`."""
     report = {
         "ok": all(report.ok for report in reports),
         "version": __version__,
         "nodes": [report.to_map() for report in reports],
     }
-    return json.dumps(report, indent=2) + "\n"
+    return to_json(report, indent=2) + "\n"
 
 
 def to_text(reports: Sequence[NodeReport], *, terminal: bool) -> str:

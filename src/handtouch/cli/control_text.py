@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from handtouch import wire
-from handtouch.cli.json_output import print_json
 from handtouch.cli.scene_text import scene_lines
 from handtouch.client import request
+from handtouch.host.json_output import print_json
 
 _SHORT_TIMEOUT_S, _LONG_TIMEOUT_S = 3.0, 60.0
 Reply = Mapping[str, Any]

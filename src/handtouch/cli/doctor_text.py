@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from handtouch import config
-from handtouch.cli.json_output import print_json
+from handtouch.host.json_output import print_json
 from handtouch.procedures.doctor import check_host
 
 

@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from handtouch.cli.json_output import print_json
 from handtouch.cli.progress import ProgressLine
+from handtouch.host.json_output import print_json
 
 
 def run_figures(out: Path, as_json: bool = False) -> int:

@@ -6,8 +6,8 @@ import platform
 import sys
 from pathlib import Path
 
-from handtouch.cli.json_output import print_json
 from handtouch.client import keys
+from handtouch.host.json_output import print_json
 
 
 def run_make(folder: Path, name: str | None, as_json: bool = False) -> int:

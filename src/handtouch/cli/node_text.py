@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from handtouch import config
-from handtouch.cli.json_output import print_json
 from handtouch.host import logs
+from handtouch.host.json_output import print_json
 from handtouch.host.signals import stop_on_signals
 from handtouch.node import service
 from handtouch.node.adc_fault import AdcError

@@ -10,9 +10,9 @@ import time
 from typing import Any
 
 from handtouch.cli.errors import file_error_text
-from handtouch.cli.json_output import print_json
 from handtouch.cli.progress import ProgressLine
 from handtouch.config import ConfigError
+from handtouch.host.json_output import print_json
 from handtouch.host.signals import stop_on_signals
 from handtouch.record.capture import BYTES_PER_MB, Capture, RecordOptions
 

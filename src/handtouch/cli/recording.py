@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 from handtouch.cli.errors import file_error_text
-from handtouch.cli.json_output import print_json
 from handtouch.cli.options import (
     Subparsers,
     add_command,
@@ -19,6 +18,7 @@ from handtouch.cli.options import (
 )
 from handtouch.cli.progress import ProgressLine
 from handtouch.host.endpoints import COMPLETE_ENDPOINT
+from handtouch.host.json_output import print_json
 
 
 def add(commands: Subparsers) -> None:

@@ -17,12 +17,12 @@ import zmq
 
 from handtouch import wire
 from handtouch.cli.errors import file_error_text
-from handtouch.cli.json_output import print_json_line, to_json
 from handtouch.cli.progress import ProgressLine
 from handtouch.client.keys import KeyFileError
 from handtouch.config import ConfigError, Deployment, load
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.publisher import Publisher
+from handtouch.host.json_output import print_json_line, to_json
 from handtouch.record.comparison import LinkComparison
 from handtouch.record.exact_replay import ReplayResult, recorded_deployment
 from handtouch.record.recording import Recording, is_recording

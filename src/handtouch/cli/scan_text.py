@@ -17,8 +17,8 @@ from handtouch import config
 from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, find_four_channels
 from handtouch.canbus.find.traffic import describe_identifier
-from handtouch.cli.json_output import to_json
 from handtouch.cli.progress import ProgressLine
+from handtouch.host.json_output import to_json
 from handtouch.procedures.scan import (
     BusReport,
     NodeComparison,

@@ -9,9 +9,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from handtouch.cli.json_output import print_json
 from handtouch.cli.scene_text import scene_lines
 from handtouch.client import CONTROL_ENDPOINT, request
+from handtouch.host.json_output import print_json
 from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
 
 _PIPE_WIDTH_COLUMNS = 200

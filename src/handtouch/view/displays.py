@@ -5,16 +5,15 @@ Public names: `Display`, `LiveDisplay`, `LineDisplay`, `show_messages`.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 from handtouch import wire
 from handtouch.client import Subscriber
+from handtouch.host.json_output import print_json_line
 from handtouch.view.message_lines import DISCONNECTED_TEXT, active_errors, message_line
 
 _FRAMES_PER_S = 15
@@ -69,7 +68,7 @@ class LineDisplay:
 
     def show_message(self, message: wire.Message) -> None:
         if self._as_json:
-            print(json.dumps(_to_json(asdict(message))), flush=True)
+            print_json_line(message)
             return
         if self._has_changed(message):
             print(message_line(message), flush=True)
@@ -134,12 +133,3 @@ def show_messages(messages: Subscriber[wire.Message], display: Display, done: Ca
         if time.monotonic() >= next_frame_s:
             display.refresh(messages.alive)
             next_frame_s = time.monotonic() + 1 / _FRAMES_PER_S
-
-
-def _to_json(value: Any) -> Any:
-    """Convert a value for JSON: columns of bytes as hexadecimal."""
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, dict):
-        return {key: _to_json(item) for key, item in value.items()}
-    return value

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from handtouch.cli import main
-from handtouch.cli.conformance_text import to_json, to_text
+from handtouch.cli.conformance_text import reports_json, to_text
 from handtouch.device import DeviceBus
 from handtouch.procedures.conformance import CATALOGUE, NodeReport, Verdict
 
@@ -43,7 +43,7 @@ def test_checks_that_were_not_made_are_grouped_by_their_reason(
 
 def test_json_has_every_check_of_every_node(line: Any, check: Callable[..., NodeReport]) -> None:
     line.add()
-    report = json.loads(to_json([check(), check()]))
+    report = json.loads(reports_json([check(), check()]))
     assert report["ok"] is True
     assert [[entry["check"] for entry in node["checks"]] for node in report["nodes"]] == [list(CATALOGUE)] * 2
     assert {entry["verdict"] for node in report["nodes"] for entry in node["checks"]} == {

@@ -121,7 +121,8 @@ def run_guided(
         try:
             return _run_procedure(job, procedure, served, dialogue, recorder, clock)
         except KeyboardInterrupt:
-            raise CalibrationError("Interrupted; nothing was changed but the zero.") from None
+            dialogue.print_line("Interrupted; nothing was changed but the zero.")
+            raise
 
 
 class _CalibrationJob:
