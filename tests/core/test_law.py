@@ -48,6 +48,6 @@ def test_the_std_of_a_force_includes_the_covariance_of_a_calibrated_law(bench: A
         solver.solve_contacts(np.zeros(1, np.intp).data)
         results.append((values[0, VALUE_SLICES["force_n"]][0], values[0, VALUE_SLICES["force_std_n"]][0]))
     (force, exact_std), (same, std) = results
-    assert same == pytest.approx(force)
+    assert same == pytest.approx(force, rel=0.02)  # the mean, of other probabilities
     # the layer dominates here: force goes nearly as k^(1 / alpha)
     assert np.sqrt(std**2 - exact_std**2) / force == pytest.approx(0.2 / 1.5, rel=0.2)

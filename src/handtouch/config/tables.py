@@ -255,6 +255,11 @@ class Sheet(Table):
         description="logarithm of a contact's length over its width, in any direction (1 sigma); default: "
         "round",
     )
+    max_force_n: Positive | None = Field(
+        None,
+        description="greatest force of a contact; forces near the maximum current of the sheet, which hardly "
+        "differ in current, are taken as equally likely up to it; default: unknown, they are lower bounds",
+    )
     ohm_per_square_std: Annotated[float, Field(ge=0, le=1)] = Field(
         0.1, description="relative error of ohm_per_square (1 sigma); default: that of printed carbon"
     )

@@ -25,10 +25,11 @@ from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches
 from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
-from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
+from handtouch.core.stages.force import LAW_PARAMETERS, MIN_RADIUS_RATIO, RADIUS_NODES, PadLaw
 from handtouch.core.stages.tolerances import PadTolerances, part_count
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
+from handtouch.field.contact_stack import stack_factor
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import (
     PadGeometry,
@@ -41,7 +42,7 @@ FloatArray = NDArray[np.float64]
 _NODE_TOLERANCES = {"gain_std", "series_std"}
 _SHEET_TOLERANCES = {
     *("ohm_per_square_std", "contact_ohm_std", "alpha_std", "anisotropy_std", "gap_std_mm", "size_std_mm"),
-    *("unevenness_std", "contact_elongation_std"),
+    *("unevenness_std", "contact_elongation_std", "max_force_n"),
 }
 
 
@@ -326,7 +327,13 @@ class PadModel:
             self._drive_v[pad],
             math.log(reference),
         )
-        self.law_parameters[pad, 7:] = (axes * np.sqrt(np.maximum(variances, 0.0))).T.ravel()
+        self.law_parameters[pad, 7:16] = (axes * np.sqrt(np.maximum(variances, 0.0))).T.ravel()
+        greatest_n = self._parts[pad][2].max_force_n
+        if greatest_n:
+            ratio = np.maximum(1 + np.array(RADIUS_NODES) * radius_std / radius, MIN_RADIUS_RATIO)
+            # specific resistances go as area^alpha
+            x = radius * np.sqrt(self._sheet_ohm[pad] / law.resistivity(greatest_n)) * ratio ** (1 - alpha)
+            self.law_parameters[pad, 16:] = stack_factor(x)
 
     def stage_tolerances(self) -> list[PadTolerances]:
         """Return the tolerances of the pads' parts as the stages take them."""

@@ -30,7 +30,7 @@ UPDATE_PERIOD_S = 0.1
 _MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
 _MIN_FORCE_N = 1e-6
 _MIN_UNTOUCHED_PROBABILITY = 0.3  # that no undetected press occurred in a pause, however long
-_MAX_FORCE_STD_FRACTION = 0.5  # of the force: above it, the force is invalid
+_MAX_FORCE_STD_FRACTION = 1.0  # of the force: above it, the force is invalid
 _HOUR_S = 3600.0
 _LOG_GAIN_STD_PER_HOUR = 0.05
 _MAX_LOG_GAIN_RATE_PER_S = 0.02
@@ -279,7 +279,7 @@ class SheetForceCompensation:
 
     def _update_uncertainty(self) -> None:
         """Update standard deviations and reliability of touched pads; periodically and at contact begin."""
-        touching, uncompensated_std_n = self._held.touching, self._held.uncompensated_std_n
+        touching, apparent_n = self._held.touching, self._held.uncompensated_force_n
         pressed = np.flatnonzero(touching & self.modelled)
         force = self.force_n[pressed]
         self.touched_s += self._waited_s * touching
@@ -287,7 +287,9 @@ class SheetForceCompensation:
         self._new_contacts[:] = False
         for group in self.groups:
             self.std_n[group.rows] = group.compensator.std_n()
-        variance = np.square(self.std_n[pressed]) + np.square(uncompensated_std_n[pressed])
+        with np.errstate(all="ignore"):
+            relative = self._held.uncompensated_std_n[pressed] / apparent_n[pressed]
+        variance = np.square(self.std_n[pressed]) + np.square(relative * force)
         held_s = self.touched_s[pressed] - self._begin_s[pressed]
         wander = self._slow_creep[pressed] * np.log1p(held_s / _MIN_CONTACT_AGE_S)
         variance += np.square(force) * (np.square(self.log_gain_std[pressed]) + np.square(wander))

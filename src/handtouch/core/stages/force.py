@@ -1,8 +1,10 @@
 """Force: from a contact's total current through the contact law, with its standard deviation.
 
-The same law as `handtouch.field.contact_law`, which is the reference. The standard deviation is by quadrature
-over contact radius and law, not by slopes: on soft sheets that by the radius passes through zero, and towards
-the maximum current of the sheet forces grow without bound.
+The same law as `handtouch.field.contact_law`, which is the reference for contacts far from edges whose
+parameters are exact. The force is the mean of its probability given the current: all forces up to the
+greatest of a contact are equally likely before (by their logarithm), and the stack factor that the current
+leaves is normal about that of each force and radius, with the variance of noise, law and distance from the
+edge at that force. So it holds near the maximum current of the sheet, where forces hardly differ in current.
 """
 
 from __future__ import annotations
@@ -22,16 +24,22 @@ _LOG_LAYER, _ALPHA, _LOG_RADIUS, _RADIUS_STD, _LOG_SHEET, _DRIVE, _LOG_REFERENCE
     6,
     7,
 )
-LAW_PARAMETERS = 16
-_MIN_ALPHA = 0.1
+_MIN_FACTORS = 16
+LAW_PARAMETERS = 21
+RADIUS_NODES = (0.0, 1.3556261799742657, -1.3556261799742657, 2.8569700138728056, -2.8569700138728056)
+"""Errors of the radius, in standard deviations, that the quadrature evaluates (Gauss and Hermite)."""
+MIN_RADIUS_RATIO = 0.25
+"""Least radius of these, relative to the stated one."""
+_NEAR_NODE, _FAR_NODE, _MIN_RADIUS_RATIO = RADIUS_NODES[1], RADIUS_NODES[3], MIN_RADIUS_RATIO
+_MIDDLE_WEIGHT, _NEAR_WEIGHT, _FAR_WEIGHT = 0.5333333333333333, 0.22207592200561263, 0.011257411327720693
 _BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_CURRENT_FRACTION
 _MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
 _MIN_CURRENT_A = 1e-200
 _TWO_PI, _LOG_PI, _INFINITY = 2.0 * math.pi, math.log(math.pi), math.inf
 _NAN = float("nan")
-# Gauss-Hermite quadrature of five nodes; the middle one is the reported force itself
-_NEAR_NODE, _FAR_NODE = 1.3556261799742657, 2.8569700138728056
-_NEAR_WEIGHT, _FAR_WEIGHT = 0.22207592200561263, 0.011257411327720693
+_STEP_SIGMA, _MAX_SIGMA, _MAX_NODES = 0.7, 3.5, 48  # of the quadrature over the stack factor
+_MIN_RELATIVE_VARIANCE = 1e-18
+_UNLIMITED_SIGMA = 3.0
 
 
 class StackTable:
@@ -52,9 +60,10 @@ class PadLaw:
 
     parameters: (LAW_PARAMETERS,) ln of specific resistance times reference pressure^alpha; alpha; ln of the
     contact radius [m] and its standard deviation; ln of the sheet resistance; drive voltage; ln of the
-    reference pressure; and three axes of the calibrated law's covariance, one standard deviation each of (ln
-    specific resistance, alpha, ln sheet resistance). series: (n n,) quadratic form of the series resistors
-    [ohm]; has_series: any isn't 0.
+    reference pressure; three axes of the calibrated law's covariance, one standard deviation each of (ln
+    specific resistance, alpha, ln sheet resistance); and the stack factors of the greatest force, at the
+    radii of RADIUS_NODES, 0 where it is unknown. series: (n n,) quadratic form of the series resistors [ohm];
+    has_series: any isn't 0.
     """
 
     def __init__(self, parameters: memoryview[float], series: memoryview[float], has_series: bool) -> None:
@@ -64,11 +73,21 @@ class PadLaw:
 
 
 class ForceResult:
-    """Force of one contact [N]; `std_n` is infinite where `status` is LOWER_BOUND."""
+    """Force of one contact [N]; `std_n` is infinite where `status` is LOWER_BOUND.
+
+    The rest is working memory. `whole`, `resistors`, `log_spreading_m`, `gradient2`, `variance`: of the
+    contact, see `estimate_force`; `log_radius_m` assumed for it. Of the force that leaves a stack factor:
+    `log_force`, its derivative `slope` by the factor, the factor's standard deviation `std`, and the
+    difference `excess` of what the current leaves from it. `weights`, `mean`, `square`: integrals of the
+    probability, of the force relative to that of `log_unit`, and of its square.
+    """
 
     def __init__(self) -> None:
         self.force_n = self.std_n = _NAN
         self.status = _NOT_ESTIMATED
+        self.whole = self.resistors = self.log_spreading_m = self.gradient2 = self.variance = 0.0
+        self.log_radius_m = self.log_force = self.slope = self.std = self.excess = 0.0
+        self.weights = self.mean = self.square = self.log_unit = 0.0
 
 
 def estimate_force(
@@ -78,62 +97,127 @@ def estimate_force(
     total_a: float,
     total_std_a: float,
     log_spreading_m: float,
+    gradient2: float,
     position_variance: float,
     series_ohm: float,
 ) -> None:
     """Estimate the force for a total current.
 
-    total_std_a: of noise and baseline. log_spreading_m: ln of the spreading radius;
-    position_variance: what the position's uncertainty, with that of the total, makes of the stack factor's
-    variance beyond noise of the total.
+    total_std_a: of noise and baseline. log_spreading_m: ln of the spreading radius; gradient2: square of its
+    gradient [1/m^2]. position_variance: what the position's uncertainty, with that of the total, makes of
+    the stack factor's variance beyond noise of the total.
     """
     result.force_n = result.std_n = _NAN
     result.status = _NOT_ESTIMATED
     if not total_a > _BOUND_SIGMA * total_std_a:
         return
     p = law.parameters
-    alpha, radius_std = p[_ALPHA], p[_RADIUS_STD]
-    per_sheet = _TWO_PI * math.exp(-p[_LOG_SHEET])
-    resistors = per_sheet * series_ohm
-    spread = max(log_spreading_m - p[_LOG_RADIUS], _MIN_LOG_SPREADING_RATIO)
-    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
     whole = whole_factor(law, total_a)
-    factor = whole - resistors - spread
     noise = whole * total_std_a / total_a
-    variance = noise * noise + position_variance
-    margin = _BOUND_SIGMA * math.sqrt(variance + radius_std * radius_std)
-    if factor - margin <= least:
-        margin /= max(1.0 - _BOUND_SIGMA * total_std_a / total_a, 0.1)  # the factor is inverse to the current
-        result.force_n = _force_at(
-            stack, p[_LOG_LAYER], alpha, p[_LOG_RADIUS], p[_LOG_SHEET], max(factor + margin, least)
-        )
-        result.std_n = _INFINITY
-        result.status = _LOWER_BOUND
-        return
-    force = _force_at(stack, p[_LOG_LAYER], alpha, p[_LOG_RADIUS], p[_LOG_SHEET], factor)
-    slope = force / alpha * _log_x2_slope(stack, factor)
-    square = slope * slope * variance
-    if radius_std > 0.0:
-        near, far = _NEAR_NODE * radius_std, _FAR_NODE * radius_std
-        square += _NEAR_WEIGHT * (
-            _squared_change(stack, law, force, near, log_spreading_m, whole, resistors)
-            + _squared_change(stack, law, force, -near, log_spreading_m, whole, resistors)
-        )
-        square += _FAR_WEIGHT * (
-            _squared_change(stack, law, force, far, log_spreading_m, whole, resistors)
-            + _squared_change(stack, law, force, -far, log_spreading_m, whole, resistors)
-        )
+    result.whole, result.resistors = whole, _TWO_PI * math.exp(-p[_LOG_SHEET]) * series_ohm
+    result.log_spreading_m, result.gradient2 = log_spreading_m, gradient2
+    result.variance = max(noise * noise + position_variance, 0.0)
+    result.log_radius_m = p[_LOG_RADIUS]
+    spread = max(log_spreading_m - p[_LOG_RADIUS], _MIN_LOG_SPREADING_RATIO)
+    limit = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + result.resistors)
+    least = max(p[_MIN_FACTORS], limit)
+    _evaluate_factor(stack, law, result, least)
+    by_radius = (-1.0 + (2.0 - 2.0 * p[_ALPHA]) / (result.slope * p[_ALPHA])) * p[_RADIUS_STD]
+    std = math.sqrt(result.std * result.std + by_radius * by_radius)
+    # without a greatest force, those from the limit on are equally likely, and have no mean
+    reach = -_BOUND_SIGMA if p[_MIN_FACTORS] > limit else _UNLIMITED_SIGMA
+    result.status = _LOWER_BOUND
+    if result.excess > reach * std:
+        result.log_unit = result.log_force
+        result.weights = result.mean = result.square = 0.0
+        _integrate(stack, law, result, 0.0, _MIDDLE_WEIGHT, least)
+        if p[_RADIUS_STD] > 0.0:
+            _integrate(stack, law, result, _NEAR_NODE, _NEAR_WEIGHT, max(p[_MIN_FACTORS + 1], limit))
+            _integrate(stack, law, result, -_NEAR_NODE, _NEAR_WEIGHT, max(p[_MIN_FACTORS + 2], limit))
+            _integrate(stack, law, result, _FAR_NODE, _FAR_WEIGHT, max(p[_MIN_FACTORS + 3], limit))
+            _integrate(stack, law, result, -_FAR_NODE, _FAR_WEIGHT, max(p[_MIN_FACTORS + 4], limit))
+        if result.weights > 0.0:
+            mean = result.mean / result.weights
+            variance = result.square / result.weights - mean * mean
+            unit = math.exp(min(300.0, result.log_unit))
+            result.force_n = unit * mean
+            result.std_n = unit * math.sqrt(max(variance, _MIN_RELATIVE_VARIANCE * mean * mean))
+            result.status = _VALID
+    if result.status == _LOWER_BOUND:
+        result.log_radius_m = p[_LOG_RADIUS]
+        _evaluate_factor(stack, law, result, max(least + result.excess + _BOUND_SIGMA * std, least))
+        result.force_n, result.std_n = math.exp(min(300.0, result.log_force)), _INFINITY
+
+
+def _integrate(
+    stack: StackTable, law: PadLaw, result: ForceResult, radius_sigma: float, share: float, least: float
+) -> None:
+    """Add the integrals over the stack factor, from the least one up, at a radius of this probability.
+
+    Trapezoids: steps are in proportion to the factor's standard deviation.
+    """
+    p = law.parameters
+    ratio = max(1.0 + radius_sigma * p[_RADIUS_STD], _MIN_RADIUS_RATIO)
+    result.log_radius_m = p[_LOG_RADIUS] + math.log(ratio)
+    factor, step_before = _lowest_factor(stack, law, result, least), 0.0
+    for _ in range(_MAX_NODES):
+        _evaluate_factor(stack, law, result, factor)
+        sigma = result.excess / result.std
+        step = _STEP_SIGMA * result.std
+        weight = 0.5 * (step_before + step) * share * math.exp(-0.5 * sigma * sigma)
+        weight *= -result.slope / result.std
+        force = math.exp(result.log_force - result.log_unit)
+        result.weights += weight
+        result.mean += weight * force
+        result.square += weight * force * force
+        if sigma < -_MAX_SIGMA:
+            break
+        step_before = step
+        factor += step
+
+
+def _lowest_factor(stack: StackTable, law: PadLaw, result: ForceResult, least: float) -> float:
+    """Return the stack factor from which on the quadrature has to begin."""
+    factor = least
+    for _ in range(2):  # the spreading depends on it near edges
+        _evaluate_factor(stack, law, result, factor)
+        factor = max(factor + result.excess, least)
+    _evaluate_factor(stack, law, result, factor)
+    factor = max(least, factor / (1.0 + _MAX_SIGMA * result.std / factor))
+    _evaluate_factor(stack, law, result, factor)
+    missing = _MAX_SIGMA * result.std - result.excess
+    return max(least, factor - missing) if missing > 0.0 else factor
+
+
+def _evaluate_factor(stack: StackTable, law: PadLaw, result: ForceResult, factor: float) -> None:
+    """Compute the force that leaves a stack factor, and how far the current is from it.
+
+    The sheet's resistance from the contact to the electrodes: that of a small contact is ln(R / A), less what
+    the current's density inside it adapts to the gradient of the potential, (A grad ln R)^2 / 4 times
+    I2(x) / I0(x) = 1 - 2 / (x^2 factor); a contact that hangs over the edge is between that of one moved
+    inside and that of its current at its centre. The mean of the two limits, and their variance.
+    """
+    p = law.parameters
+    alpha, log_radius_m = p[_ALPHA], result.log_radius_m
+    log_x2, slope = _log_x2(stack, factor), _log_x2_slope(stack, factor)
+    log_specific = p[_LOG_SHEET] + 2.0 * log_radius_m - log_x2  # ln of ohm m^2
+    log_pressure = (p[_LOG_LAYER] - log_specific) / alpha
+    by_log_x2 = 1.0 / slope
+    ratio = result.log_spreading_m - log_radius_m
+    adaptation = max(1.0 - 2.0 * math.exp(-min(log_x2, 700.0)) / factor, 0.0)
+    steepness = min(result.gradient2 * math.exp(2.0 * log_radius_m), 1.0)
+    high = max(ratio, _MIN_LOG_SPREADING_RATIO)
+    low = max(ratio, 0.0) - 0.25 * steepness * adaptation
+    spread = 0.5 * (high + low)
+    result.log_force = _LOG_PI + 2.0 * log_radius_m + log_pressure
+    result.slope = slope / alpha
+    result.excess = result.whole - result.resistors - spread - factor
+    variance = result.variance + 0.25 * (high - low) * (high - low)
+    by_sheet, by_alpha = factor + spread + by_log_x2, by_log_x2 * (log_pressure - p[_LOG_REFERENCE])
     for k in range(_AXES, _AXES + 9, 3):
-        if p[k] != 0.0 or p[k + 1] != 0.0 or p[k + 2] != 0.0:
-            square += _NEAR_WEIGHT * (
-                _squared_change_along(stack, law, force, k, _NEAR_NODE, spread, whole, resistors)
-                + _squared_change_along(stack, law, force, k, -_NEAR_NODE, spread, whole, resistors)
-            )
-            square += _FAR_WEIGHT * (
-                _squared_change_along(stack, law, force, k, _FAR_NODE, spread, whole, resistors)
-                + _squared_change_along(stack, law, force, k, -_FAR_NODE, spread, whole, resistors)
-            )
-    result.force_n, result.std_n, result.status = force, math.sqrt(square), _VALID
+        change = by_alpha * p[k + 1] - by_log_x2 * p[k] + by_sheet * p[k + 2]
+        variance += change * change
+    result.std = math.sqrt(max(variance, _MIN_RELATIVE_VARIANCE * factor * factor))
 
 
 def whole_factor(law: PadLaw, total_a: float) -> float:
@@ -154,57 +238,6 @@ def series_resistance(law: PadLaw, currents: memoryview[float], first: int, elec
             row += law.series[i * electrodes + j] * currents[first + j]
         form += currents[first + i] * row
     return form / (total * total) if total > 0.0 else 0.0
-
-
-def _squared_change(
-    stack: StackTable,
-    law: PadLaw,
-    force: float,
-    log_ratio: float,
-    log_spreading_m: float,
-    whole: float,
-    resistors: float,
-) -> float:
-    """Return the squared change of the force with a radius larger by the factor exp(log_ratio)."""
-    p = law.parameters
-    log_radius_m = p[_LOG_RADIUS] + log_ratio
-    spread = max(log_spreading_m - log_radius_m, _MIN_LOG_SPREADING_RATIO)
-    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
-    factor = max(whole - resistors - spread, least)
-    change = _force_at(stack, p[_LOG_LAYER], p[_ALPHA], log_radius_m, p[_LOG_SHEET], factor) - force
-    return change * change
-
-
-def _squared_change_along(
-    stack: StackTable,
-    law: PadLaw,
-    force: float,
-    axis: int,
-    sigma: float,
-    spread: float,
-    whole: float,
-    resistors: float,
-) -> float:
-    """Return the squared change of the force with a law that differs by `sigma` along an axis of its
-    covariance."""
-    p = law.parameters
-    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + resistors)
-    # a larger sheet resistance makes the factor smaller
-    log_sheet_change = sigma * p[axis + 2]
-    factor = max((whole - resistors) * math.exp(-log_sheet_change) - spread, least)
-    alpha = max(p[_ALPHA] + sigma * p[axis + 1], _MIN_ALPHA)
-    log_layer = p[_LOG_LAYER] + sigma * p[axis] + (alpha - p[_ALPHA]) * p[_LOG_REFERENCE]
-    log_sheet = p[_LOG_SHEET] + log_sheet_change
-    change = _force_at(stack, log_layer, alpha, p[_LOG_RADIUS], log_sheet, factor) - force
-    return change * change
-
-
-def _force_at(
-    stack: StackTable, log_layer: float, alpha: float, log_radius_m: float, log_sheet: float, factor: float
-) -> float:
-    """Return the force [N] at a stack factor: pressure from the layer's resistance, times the area."""
-    log_resistance = _log_x2(stack, factor) - log_sheet - 2.0 * log_radius_m  # minus ln of ohm m^2
-    return math.exp(min(700.0, _LOG_PI + 2.0 * log_radius_m + (log_resistance + log_layer) / alpha))
 
 
 def _log_x2(stack: StackTable, factor: float) -> float:

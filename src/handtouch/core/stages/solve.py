@@ -222,6 +222,7 @@ def _estimate_force(solver: ContactSolver, pad: int) -> None:
         fit.total,
         math.sqrt(fit.var_total),
         log_spreading_m,
+        (slope_x * slope_x + slope_y * slope_y) / (solver.placement.scale_m * solver.placement.scale_m),
         variance,
         force.series_resistance(law, solver.currents, pad * n, n),
     )

@@ -1,0 +1,106 @@
+"""Forces of single contacts hold with their stated probability: near edges and near the sheet's maximum
+current."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch.config import parse
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.pad_model import PadModel
+from handtouch.field.contact_law import ContactLaw, ForceEstimateStatus
+from tests.core.conftest import TOLERANT_DEPLOYMENT
+
+FloatArray = NDArray[np.float64]
+GREATEST_N = 15.0
+
+
+def solve(model: PadModel, currents: FloatArray) -> tuple[float, float, int]:
+    """Return force, standard deviation and status of a contact with these currents (4,) on the first pad."""
+    every = np.zeros((model.size, 4))
+    every[0] = currents
+    values = np.full((model.size, VALUE_COUNT), np.nan)
+    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+    solver.solve_contacts(np.zeros(1, np.intp).data)
+    force, std, status = (
+        values[0, VALUE_SLICES[name]][0] for name in ("force_n", "force_std_n", "force_status")
+    )
+    return float(force), float(std), int(status)
+
+
+def patch_factor(distance: float, x: float, alpha: float) -> float:
+    """Return 2 pi V / (rho I) of a disc of radius 1 next to a straight grounded edge, cut off by it.
+
+    By collocation on a square grid, with image charges: neither eq. 11 nor an expansion. The whole force acts
+    on what is left of the disc; x is that of the whole disc.
+    """
+    cells = 26
+    axis = (np.arange(cells) + 0.5) * 2 / cells - 1
+    across, away = (grid.ravel() for grid in np.meshgrid(axis, axis + distance))
+    inside = (across**2 + (away - distance) ** 2 < 1) & (away > 0)
+    place = (across + 1j * away)[inside]
+    cell = np.pi / np.count_nonzero(across**2 + (away - distance) ** 2 < 1)
+    apart = np.abs(place[:, None] - place)
+    # mean of ln r over a square about its middle
+    np.fill_diagonal(apart, np.sqrt(cell) * np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))
+    green = np.log(np.abs(place[:, None] - place.conj()) / apart)
+    pressed = x**2 * (np.pi / (cell * len(place))) ** alpha
+    density = np.linalg.solve(np.eye(len(place)) * 2 * np.pi / pressed + cell * green, np.ones(len(place)))
+    return float(1 / (cell * density.sum()))
+
+
+@pytest.mark.parametrize("distance", [0.4, 0.7, 1.0, 1.5])
+@pytest.mark.parametrize("force_n", [1.0, 3.0])
+def test_a_force_next_to_an_electrode_covers_that_of_a_cut_off_patch(
+    bench: Any, distance: float, force_n: float
+) -> None:
+    model, sheet = bench.model, bench.deployment.sheets["s"]
+    radius_m, network = 1e-3 * sheet.contact_radius_mm, model.networks[0]
+    pressure = force_n / (np.pi * radius_m**2) / (1e3 * sheet.reference_kpa)
+    x = radius_m * np.sqrt(sheet.ohm_per_square / (1e-6 * sheet.contact_ohm_mm2) * pressure**sheet.alpha)
+    total = 5.0 * 2 * np.pi / sheet.ohm_per_square / patch_factor(distance, x, sheet.alpha)
+    fractions = network.fractions(distance * radius_m, network.b / 2)
+    found, std, status = solve(model, total * fractions)
+    assert status == ForceEstimateStatus.VALID
+    assert abs(found - force_n) < 1.96 * std
+    assert std < 0.75 * force_n
+
+
+def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability() -> None:
+    text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
+    model, rng = PadModel(parse(text)), np.random.default_rng(4)
+    sheet, network = parse(text).sheets["s"], model.networks[0]
+    fractions = network.fractions(network.a / 2, network.b / 2)
+    spreading_m = float(network.spreading_radius(network.a / 2, network.b / 2))
+    inside, forces = [], np.exp(rng.uniform(np.log(0.5), np.log(GREATEST_N), 600))
+    for force_n in forces.tolist():
+        law = ContactLaw(
+            1e-6 * sheet.contact_ohm_mm2 * np.exp(sheet.contact_ohm_std * rng.normal()),
+            sheet.alpha + sheet.alpha_std * rng.normal(),
+            1e-3 * (sheet.contact_radius_mm + sheet.contact_radius_std_mm * rng.normal()),
+            reference_pa=1e3 * sheet.reference_kpa,
+        )
+        sheet_ohm = sheet.ohm_per_square * np.exp(sheet.ohm_per_square_std * rng.normal())
+        found, std, status = solve(
+            model, float(law.current(force_n, 5.0, sheet_ohm, spreading_m)) * fractions
+        )
+        inside.append((status == ForceEstimateStatus.VALID, abs(found - force_n) < 1.96 * std))
+    valid, held = np.array(inside).T
+    strong = forces > 5
+    assert valid.mean() > 0.97
+    assert 0.92 < held[valid].mean() < 0.99
+    assert 0.90 < held[valid & strong].mean() <= 1.0
+
+
+def test_without_a_greatest_force_those_at_the_sheets_limit_are_lower_bounds(bench: Any) -> None:
+    model = bench.model
+    fractions = model.networks[0].fractions(model.networks[0].a / 2, model.networks[0].b / 2)
+    law = ContactLaw(2e-2, 1.5, 2.5e-3)
+    spreading_m = float(model.networks[0].spreading_radius(model.networks[0].a / 2, model.networks[0].b / 2))
+    found, std, status = solve(model, float(law.current(30.0, 5.0, 2400.0, spreading_m)) * fractions)
+    assert (status, std) == (ForceEstimateStatus.LOWER_BOUND, np.inf)
+    assert found < 30.0
