@@ -20,6 +20,7 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,9 @@ FIRST_SEED = 2000
 """Of the use that is played; thresholds were tuned on seeds below 1100."""
 SETTLED_S = 15.0
 """Time from the naming of a fault to the end of its episode, without a wrong diagnosis."""
+Detected = tuple[str, str, float, float]
+"""A diagnosis: link, kind, time [s], stated confidence."""
+CONFIDENCES = (0.0, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 _TABLES: dict[Any, Any] = {}
 _MODELS: dict[tuple[str, int], DiagnosisModel] = {}
 
@@ -56,14 +60,14 @@ def play(task: tuple[str, str, int]) -> dict[str, Any]:
         _MODELS[key] = DiagnosisModel.from_deployment(it.deployment, "right")
     diagnosis = HandDiagnostics(_MODELS[key], tables=_TABLES)
     truth = FAULTY[name].value if name in FAULTY else NOTHING
-    detected: list[tuple[str, str, float]] = []
+    detected: list[Detected] = []
     t_s, named_s = 0.0, None
     for block in it.blocks():
         t_s = float(block.sample_ns.max()) * 1e-9
         for fault in diagnosis.process_block(block):
             if not fault.is_fault or fault.until_ns is not None:
                 continue
-            detected.append((fault.link, fault.kind.value, t_s))
+            detected.append((fault.link, fault.kind.value, t_s, fault.published.confidence))
             if is_right(it, truth, detected[-1]) and named_s is None:
                 named_s = t_s
         named = [one for one in detected if one[1] != FaultKind.UNEXPLAINED]
@@ -77,9 +81,9 @@ def play(task: tuple[str, str, int]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def is_right(it: Episode, truth: str, found: tuple[str, str, float]) -> bool:
+def is_right(it: Episode, truth: str, found: Detected) -> bool:
     """Return whether a diagnosis names the played fault on its pad, after it began."""
-    link, kind, at_s = found
+    link, kind, at_s, _ = found
     return kind == truth and link == it.link and at_s >= it.begin_s
 
 
@@ -113,7 +117,7 @@ def events(results: Sequence[dict[str, Any]]) -> EventScore:
     for number, r in enumerate(results):
         if r["truth"] != NOTHING:
             truth.append(((number, r["link"], r["truth"]), r["begin_s"]))
-        for link, kind, at_s in r["detected"]:
+        for link, kind, at_s, _ in r["detected"]:
             if kind != FaultKind.UNEXPLAINED:
                 detected.append(((number, link, kind), at_s))
     return score_events(truth, detected, hours=sum(r["hours"] for r in results), late_s=LENGTH_S)
@@ -121,17 +125,17 @@ def events(results: Sequence[dict[str, Any]]) -> EventScore:
 
 def last_diagnosis(r: dict[str, Any]) -> str:
     """Return the last diagnosis of the pad with the fault; of any pad if there is no fault."""
-    kinds = [kind for link, kind, _ in r["detected"] if r["truth"] == NOTHING or link == r["link"]]
+    kinds = [kind for link, kind, *_ in r["detected"] if r["truth"] == NOTHING or link == r["link"]]
     return kinds[-1] if kinds else NOTHING
 
 
 def row(results: Sequence[dict[str, Any]], **names: str) -> dict[str, Any]:
     """Return a row of events, with the share of episodes that were left unexplained."""
-    doubt = [any(kind == FaultKind.UNEXPLAINED for _, kind, _ in r["detected"]) for r in results]
+    doubt = [any(kind == FaultKind.UNEXPLAINED for _, kind, *_ in r["detected"]) for r in results]
     wrong = Counter(
         kind
         for r in results
-        for kind in {kind for _, kind, _ in r["detected"]} - {r["truth"], FaultKind.UNEXPLAINED.value}
+        for kind in {kind for _, kind, *_ in r["detected"]} - {r["truth"], FaultKind.UNEXPLAINED.value}
     )
     score = events(results)
     return {
@@ -141,6 +145,27 @@ def row(results: Sequence[dict[str, Any]], **names: str) -> dict[str, Any]:
         "unexplained, %": str(Share.of_mask(np.array(doubt))),
         "false alarms": ", ".join(f"{kind} {count}" for kind, count in wrong.most_common(3)),
     }
+
+
+def reliability(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return how often named faults were right, by stated confidence: one row for each world and bin."""
+    rows = []
+    for world in WORLDS:
+        stated = np.array([
+            (confidence, kind == r["truth"] and link == r["link"] and at_s >= r["begin_s"])
+            for r in chosen(results, world, NAMES)
+            for link, kind, at_s, confidence in r["detected"]
+            if kind != FaultKind.UNEXPLAINED
+        ]).reshape(-1, 2)  # fmt: skip
+        for low, high in pairwise(CONFIDENCES):
+            here = stated[(stated[:, 0] > low) & (stated[:, 0] <= high)]
+            if len(here):
+                rows.append({
+                    "world": world, "stated": f"{low:g} to {high:g}", "diagnoses": len(here),
+                    "mean stated, %": 100 * here[:, 0].mean(),
+                    "right, %": str(Share.of_mask(here[:, 1] > 0)),
+                })  # fmt: skip
+    return rows
 
 
 def chosen(results: Sequence[dict[str, Any]], world: str, names: Sequence[str]) -> list[dict[str, Any]]:
@@ -224,6 +249,11 @@ def main() -> None:
             f"World {world}": ("", [row(chosen(results, world, (name,)), played=name) for name in NAMES])
             for world in WORLDS
         },
+        "Reliability of the stated confidence": (
+            "Every diagnosis of a fault that began or changed, `unexplained` aside; right: the kind that was "
+            "played, on its pad, after it began.",
+            reliability(results),
+        ),
         "Cost": ("15 pads at 200 Hz, all in use; tables are made in the first round.", cost()),
     }
     page = [line for title, (note, rows) in tables.items() for line in table(title, note, rows)]

@@ -124,7 +124,7 @@ def detector(series_ohm: float = 0.0) -> ContactFaultDetector:
     if network not in _TABLES:
         networks = (part for part in made.parts[0]() if isinstance(part, ElectrodeNetwork))
         parts = [part.with_series_ohm([series_ohm] * 4) for part in networks]
-        _TABLES[network] = HypothesisTables(network, made.surfaces[0], parts, made.sheets[0].anisotropy_std)
+        _TABLES[network] = HypothesisTables(network, made.surfaces[0], parts)
     return ContactFaultDetector(_TABLES[network], made.gain_covariance[0])
 
 

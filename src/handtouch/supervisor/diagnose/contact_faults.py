@@ -35,8 +35,12 @@ from handtouch.wire.faults import FaultKind
 
 SUSPICION_NATS = 20.0
 """Sum at which a fault is suspected."""
+_RIVAL_FRACTION = 0.5
+"""Of that sum, at which another fault is compared with a suspected one."""
 MIN_EVIDENCE_NATS = 14.0
 """Margin of a fault over a pad without one, by joint evidence."""
+_MIN_EVIDENCE_SIMILAR_NATS = 18.0
+"""The same for gain steps and torn corners, whose sizes are free."""
 MIN_SEPARATION_NATS = 6.0
 """Margin over faults of other kinds; far from the corner, a torn corner looks like a gain step."""
 CLEAR_NATS = 8.0
@@ -44,8 +48,10 @@ CLEAR_NATS = 8.0
 _MAX_SUM_NATS = 4 * SUSPICION_NATS
 _NATS_PER_LOGIT = 4.0
 """Of evidence, for the stated confidence: what the model neglects is common to many contacts."""
-_WINDOWS = (64, 40, 20)
+_WINDOWS = (64, 52, 44, 36, 28, 20, 12)
 """Contacts that are explained jointly, and last ones of them among which the fault may have begun."""
+_MIN_CONTACTS_TO_END, _MAX_CONTACTS_TO_END = 20, 40
+"""Recent contacts by which a diagnosis ends."""
 _MAX_BEGINS = 3
 """Begins of the most likely suspicions, from which contacts are explained jointly, too."""
 _MIN_CONTACTS, _MAX_STEP_CONTACTS = 6, 6
@@ -153,14 +159,9 @@ class ContactFaultDetector:
         if self._fault is not None and self._has_ended(self._fault):
             self.reset()
             return
-        suspects = self._suspects(suspected & ~self._last_resort)
-        begins = dict.fromkeys(self._since_ns[suspects].tolist())
-        since = [sum(one.contact.sample_ns >= begin for one in self._contacts) for begin in begins]
-        counts = {min(count, len(self._contacts)) for count in (*_WINDOWS, *since[:_MAX_BEGINS])}
-        found = [
-            self._compare(suspects, count) for count in sorted(counts) if suspects and count >= _MIN_CONTACTS
-        ]
-        best = max((fault for fault in found if fault), key=lambda fault: fault.nats, default=None)
+        candidates = self._min_sums >= _RIVAL_FRACTION * self._suspicion_nats
+        suspects = self._suspects(candidates & ~self._last_resort)
+        best = self._compare(suspects) if suspects else None
         if best is None and self._fault is None and suspected[self._last_resort].any():
             best = self._unexplained(suspects)
         if best is not None and (best.rival is None or self._fault is None):
@@ -179,16 +180,22 @@ class ContactFaultDetector:
                 suspects.append(index)
         return suspects[:_MAX_SUSPECTS]
 
-    def _compare(self, suspects: Sequence[int], count: int) -> ContactFault | None:
-        """Return the fault that explains the last contacts best; None if none does by far."""
-        nats = self._explain([None, *suspects], count).nats
-        margins = nats[1:] - nats[0]
+    def _compare(self, suspects: Sequence[int]) -> ContactFault | None:
+        """Return the fault that explains the contacts best, each with its likeliest begin; None if none does
+        by far."""
         hypotheses = [self._tables.hypotheses[index] for index in suspects]
+        similar = np.array([h.kind in _SIMILAR_KINDS for h in hypotheses])
+        counts = np.array(self._counts_since_begin(suspects))
+        nats = np.stack([self._explain([None, *suspects], count).nats for count in counts.tolist()])
+        every = np.where(
+            similar & (counts < _MIN_CONTACTS_SIMILAR)[:, None], -np.inf, nats[:, 1:] - nats[:, :1]
+        )
+        margins = every.max(axis=0)
         best = int(margins.argmax())
+        if margins[best] < MIN_EVIDENCE_NATS:
+            return None
         found = hypotheses[best]
-        if margins[best] < MIN_EVIDENCE_NATS or (
-            found.kind in _SIMILAR_KINDS and count < _MIN_CONTACTS_SIMILAR
-        ):
+        if found.kind in _SIMILAR_KINDS and margins[best] < _MIN_EVIDENCE_SIMILAR_NATS:
             return None
         same = np.array([h.kind == found.kind for h in hypotheses])
         near = margins > margins[best] - MIN_SEPARATION_NATS
@@ -206,9 +213,16 @@ class ContactFaultDetector:
             float(margins[best]),
             float(1 / (1 + np.exp(logits).sum())),
             int(self._since_ns[suspects[best]]),
-            count,
+            int(counts[every[:, best].argmax()]),
             rivals[0] if rivals else None,
         )
+
+    def _counts_since_begin(self, suspects: Sequence[int]) -> list[int]:
+        """Return numbers of last contacts among which a fault may have begun."""
+        begins = dict.fromkeys(self._since_ns[suspects].tolist())
+        since = [sum(one.contact.sample_ns >= begin for one in self._contacts) for begin in begins]
+        counts = {min(count, len(self._contacts)) for count in (*_WINDOWS, *since[:_MAX_BEGINS])}
+        return sorted(max(count, _MIN_CONTACTS) for count in counts)
 
     def _unexplained(self, suspects: Sequence[int]) -> ContactFault | None:
         """Return the diagnosis that contacts are no points, with or without a fault that is known."""
@@ -221,8 +235,8 @@ class ContactFaultDetector:
 
     def _has_ended(self, fault: ContactFault) -> bool:
         """Return whether recent contacts contradict a fault, or none in memory supports it any more."""
-        recent = min(self._contacts_since_fault, _WINDOWS[1])
-        if recent < _WINDOWS[2]:
+        recent = min(self._contacts_since_fault, _MAX_CONTACTS_TO_END)
+        if recent < _MIN_CONTACTS_TO_END:
             return False
         if fault.hypothesis.kind == FaultKind.UNEXPLAINED:
             return bool(self._explain([None], recent, before=False).non_point_share[0] < _MAX_EXPLAINED_SHARE)

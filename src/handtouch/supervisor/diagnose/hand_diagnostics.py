@@ -141,7 +141,6 @@ class HandDiagnostics:
                     self._model.networks[pad],
                     self._model.surfaces[pad],
                     self._model.parts[pad](),
-                    self._model.sheets[pad].anisotropy_std,
                 )
             self._contact_detectors[pad] = ContactFaultDetector(
                 self._tables[design], self._model.gain_covariance[pad]

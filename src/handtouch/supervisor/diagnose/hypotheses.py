@@ -43,6 +43,8 @@ _CUT_FRACTIONS = (
     0.8,
     0.92,
 )  # of a side; the short side of a fingertip may be cut off whole
+_CUT_STEP_STD = 0.5
+"""Standard deviation of a cut's sizes about those of a hypothesis, in steps between these."""
 _GAIN_STEP_FACTORS = np.exp(np.append(np.arange(-19.5, -1), np.arange(1.5, 20)) * 0.07)
 
 
@@ -69,8 +71,9 @@ class Scores(NamedTuple):
     """Misfits of k contacts under one hypothesis, in standard deviations.
 
     scores (k,): along the direction that no position and total explains. slopes (k, t): their change by one
-    standard deviation of each tolerance of the sheet and its electrodes, then by the log gain of each
-    channel. rest (k,): squared misfit along the other directions, where no position fits.
+    standard deviation of each tolerance of the sheet and its electrodes, of both sizes of a cut, which are 0
+    for other hypotheses, then by the log gain of each channel. rest (k,): squared misfit along the
+    other directions, where no position fits.
     """
 
     scores: FloatArray
@@ -81,16 +84,11 @@ class Scores(NamedTuple):
 class HypothesisTables:
     """Current shares under each hypothesis, for one design of pad.
 
-    parts: networks in each of which one part differs by one standard deviation. unevenness_std: amplitude of
-    the waves of the logarithm of the sheet's resistance.
+    parts: networks in each of which one part differs by one standard deviation.
     """
 
     def __init__(
-        self,
-        network: ElectrodeNetwork,
-        surface: Surface,
-        parts: Sequence[FractionModel] = (),
-        unevenness_std: float = 0.0,
+        self, network: ElectrodeNetwork, surface: Surface, parts: Sequence[FractionModel] = ()
     ) -> None:
         self.hypotheses: list[Hypothesis] = []
         x, y = _nodes(network)
@@ -134,9 +132,8 @@ class HypothesisTables:
         self.kinds = np.array([h.kind for h in self.hypotheses])
         varied = (part for part in parts if part is not network)
         tolerances = [part.fractions(*_nodes(part)).T - nominal for part in varied]
-        if unevenness_std > 0:
-            tolerances += [change.reshape(-1, 4) for change in sheet.by_waves(unevenness_std)]
-        self._tolerances = np.array([*tolerances, *(nominal * channel for channel in np.eye(4))])
+        no_cut = np.zeros((2, *nominal.shape))
+        self._tolerances = np.array([*tolerances, *no_cut, *(nominal * channel for channel in np.eye(4))])
 
     def log_likelihood_ratios(self, contact: ContactCurrents, left_out: NDArray[np.bool_]) -> FloatArray:
         """Return log likelihood ratios (2, hypotheses) to a nominal pad with few contacts that are no points,
@@ -163,7 +160,7 @@ class HypothesisTables:
 
     def score(self, index: int | None, currents: FloatArray, noise: FloatArray) -> Scores:
         """Return the scores of contacts (4, k) with their noise under a hypothesis; None: no fault."""
-        table, pad = self._nominal, 0
+        table, pad, tolerances = self._nominal, 0, self._tolerances
         permuted, others = self._orders.shape[1] - 1, self._electrode_faults.pads
         if index is not None and index < permuted:
             order, factor = self._orders[:, index + 1], self._factors[:, index + 1, None]
@@ -172,8 +169,10 @@ class HypothesisTables:
             table, pad = self._electrode_faults, index - permuted
         elif index is not None:
             table, pad = self._torn, index - permuted - others
+            tolerances = tolerances.copy()
+            tolerances[-6:-4] = _CUT_STEP_STD * self._torn.changes_by_cut(pad)
         sigma = np.hypot(noise, _SCORE_MODEL_ERROR_FRACTION * currents.sum(axis=0))
-        return table.score(pad, currents, sigma, self._tolerances)
+        return table.score(pad, currents, sigma, tolerances)
 
 
 def _nodes(network: FractionModel) -> tuple[FloatArray, FloatArray]:
@@ -222,6 +221,20 @@ class _FractionTable:
     def pads(self) -> int:
         """Number of pads."""
         return len(self._fractions)
+
+    def changes_by_cut(self, pad: int) -> FloatArray:
+        """Return changes (2, P, 4) by one step more of each size of a cut; 0 where either is cut off."""
+        steps, along, changes = (
+            len(_CUT_FRACTIONS),
+            divmod(pad % len(_CUT_FRACTIONS) ** 2, len(_CUT_FRACTIONS)),
+            [],
+        )
+        for at, stride in zip(along, (steps, 1), strict=True):
+            first, last = max(at - 1, 0) - at, min(at + 1, steps - 1) - at
+            less, more = self._fractions[pad + first * stride], self._fractions[pad + last * stride]
+            there = (less.sum(axis=1) > 0) & (more.sum(axis=1) > 0)
+            changes.append((more - less) * there[:, None] / (last - first))
+        return np.array(changes)
 
     def _nearest_nodes(
         self, data: FloatArray, sigma: FloatArray, pad: int | None = None

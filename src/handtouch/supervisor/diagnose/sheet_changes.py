@@ -1,13 +1,12 @@
-"""Changes of the electrodes' current shares by cuts and by unevenness of the sheet: finite differences.
+"""Changes of the electrodes' current shares by cuts of the sheet: finite differences.
 
-Public: `SheetChanges`. The even and the changed sheet are solved on one coarse grid of the rectangle; only
+Public: `SheetChanges`. The whole and the cut sheet are solved on one coarse grid of the rectangle; only
 their difference is used, in which most of the grid's error cancels. Resistors to ground are neglected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from handtouch.supervisor.diagnose.model import FloatArray
 _CELLS_PER_SIDE = 40  # a side
 _CUT_CONDUCTIVITY = 1e-9  # beyond the cut, relative
 _MIRRORED_ELECTRODES = np.array([0, 1, 3, 2, -1])  # electrodes with y reversed
-_WAVES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))  # half periods along x and y
 CORNERS = {("x0", "y0"): (0, 0), ("x0", "yb"): (0, 1), ("xa", "y0"): (1, 0), ("xa", "yb"): (1, 1)}
 
 
@@ -65,12 +63,6 @@ class SheetChanges:
             self._shares(lambda x, y: np.where(_is_cut_off(x, y, cut), _CUT_CONDUCTIVITY, 1.0)) - self._even
         )
 
-    def by_waves(self, amplitude: float) -> Iterator[FloatArray]:
-        """Yield the change (k, k, 4) by each of the smoothest waves of the logarithm of the resistance."""
-        for m, n in _WAVES:
-            wave = partial(_wave_conductivity, amplitude=amplitude, m=m, n=n)
-            yield self._sample(self._shares(wave) - self._even)
-
     def _sample(self, change: FloatArray) -> FloatArray:
         nodes = self._nodes
         return np.asarray(RegularGridInterpolator((nodes, nodes), np.moveaxis(change, 0, -1))(self._grid))
@@ -100,10 +92,6 @@ class SheetChanges:
         potentials = np.zeros((n * n, 4))
         potentials[held], potentials[~held] = fixed, free
         return potentials.T.reshape(4, n, n)
-
-
-def _wave_conductivity(x: FloatArray, y: FloatArray, amplitude: float, m: int, n: int) -> FloatArray:
-    return np.asarray(np.exp(-amplitude * np.cos(m * np.pi * x) * np.cos(n * np.pi * y)))
 
 
 def _is_cut_off(x: FloatArray, y: FloatArray, cut: tuple[tuple[int, int], float, float]) -> NDArray[np.bool_]:

@@ -93,7 +93,7 @@ class StaticLoad:
     """total within the first minute"""
     classified_age_s: float = 0.0
     channel: int = 0
-    """channel of the highest reading, when last classified"""
+    """channel of the highest reading, when the others' were least"""
     scatter: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_BLOCKS))
     """variance of the current fractions in each quiet block"""
     last_press_ns: int = 0
@@ -237,8 +237,6 @@ class StaticLoadDetector:
             load.kind = cause
         elif load.kind is None and age_s > 300:
             load.kind = FaultKind.UNEXPLAINED
-        if features["one channel"]:
-            load.channel = int(np.abs(load.level_counts).argmax())
         if load.kind in _CAUSES:
             load.probability = float(share[_CAUSES.index(load.kind)])
 
@@ -248,7 +246,11 @@ class StaticLoadDetector:
         times, floors = np.array(load.ages_s), np.array(load.floors_counts)
         sizes = np.abs(floors).sum(axis=1)
         # when the sheet's rests of other presses were least
-        others = float((sizes - np.abs(floors).max(axis=1))[sizes > 0.5 * size].min(initial=size))
+        rests = np.where(sizes > 0.5 * size, sizes - np.abs(floors).max(axis=1), np.inf)
+        others = float(rests.min(initial=size))
+        one_channel = others <= 3 + 0.02 * size
+        if one_channel:
+            load.channel = int(np.abs(floors[rests.argmin()]).argmax())
         totals = sizes
         late = times > max(age_s - 30.0, 2.0)
         times, floors, totals = times[late], floors[late], totals[late]
@@ -268,7 +270,7 @@ class StaticLoadDetector:
         load.evidence.update(counts=size, slope_per_s=slope)
         steady = age_s >= 14.0
         features: dict[str, bool | None] = {
-            "one channel": others <= 3 + 0.02 * size,
+            "one channel": one_channel,
             "negative": bool(level.min() < -(4 + 0.03 * size)),
             "abrupt": abrupt,
             "decays": slope < -0.008 if steady else None,
