@@ -55,6 +55,7 @@ def make_percept_message(percept: PerceptEstimate, hand: str, link: str) -> wire
         evidence=dict(percept.evidence),
         reason=percept.reason,
         retained=False,
+        experimental=percept.kind in wire.EXPERIMENTAL_PERCEPTS,
     )
 
 
@@ -80,6 +81,7 @@ def make_request_message(request: ActionRequest, hand: str, link: str) -> wire.P
         retained=False,
         question=question.name,
         expires_ns=request.expires_ns,
+        experimental="action_request" in wire.EXPERIMENTAL_PERCEPTS,
     )
 
 

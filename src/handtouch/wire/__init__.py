@@ -19,6 +19,7 @@ from handtouch.wire.codec import (
 )
 from handtouch.wire.columns import Column
 from handtouch.wire.contact import (
+    EXPERIMENTAL_PERCEPTS,
     PERCEPT_KINDS,
     Contact,
     ContactEvent,
@@ -52,6 +53,7 @@ from handtouch.wire.topics import (
 
 __all__ = [
     "COLUMNS",
+    "EXPERIMENTAL_PERCEPTS",
     "HEALTH",
     "INTERNAL_TOPICS",
     "JOINTS",

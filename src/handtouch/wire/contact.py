@@ -24,9 +24,11 @@ ContactEvent = Literal["begin", "update", "end"]
 
 PerceptKind = Literal["motion", "stiffness", "shape", "texture", "action_request"]
 PERCEPT_KINDS = ("motion", "stiffness", "shape", "texture")
+"""Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
 ACTION_REQUEST = "action_request"
 """Kind of percept that requests an action of the robot"""
-"""Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
+EXPERIMENTAL_PERCEPTS = frozenset({"stiffness", "texture", ACTION_REQUEST})
+"""Kinds of percepts of which too little is known in the world `default` to rely on them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,3 +233,5 @@ class Percept:
     """of an action request only: the question that it would answer"""
     expires_ns: int = 0
     """of an action request only: it is void from then on"""
+    experimental: bool = False
+    """don't rely on it: such estimates are rare or unproven in the world `default`"""

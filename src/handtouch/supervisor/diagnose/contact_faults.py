@@ -35,8 +35,6 @@ from handtouch.wire.faults import FaultKind
 
 SUSPICION_NATS = 20.0
 """Sum at which a fault is suspected."""
-_RIVAL_FRACTION = 0.5
-"""Of that sum, at which another fault is compared with a suspected one."""
 MIN_EVIDENCE_NATS = 14.0
 """Margin of a fault over a pad without one, by joint evidence."""
 _MIN_EVIDENCE_SIMILAR_NATS = 18.0
@@ -159,8 +157,7 @@ class ContactFaultDetector:
         if self._fault is not None and self._has_ended(self._fault):
             self.reset()
             return
-        candidates = self._min_sums >= _RIVAL_FRACTION * self._suspicion_nats
-        suspects = self._suspects(candidates & ~self._last_resort)
+        suspects = self._suspects(suspected & ~self._last_resort)
         best = self._compare(suspects) if suspects else None
         if best is None and self._fault is None and suspected[self._last_resort].any():
             best = self._unexplained(suspects)
