@@ -9,6 +9,7 @@ import numpy as np
 
 from handtouch.config import parse
 from handtouch.core.cycle import Cycle
+from handtouch.core.encoders import ContactMessageEncoder
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import STANDARD_LAYOUT, ChannelField, Slab
 from handtouch.core.stages import detect
@@ -29,6 +30,7 @@ def main(count: int) -> None:
     model = PadModel(parse(TOLERANT_DEPLOYMENT + BEHAVIOUR))
     slab, cycle, tick = Slab(model.size), Cycle(PERIOD_NS, 0.6), TickProcessor(model, PERIOD_NS)
     slab.set_layout(1, (ChannelField(0, 0, 16, signed=False), *STANDARD_LAYOUT[1:]))
+    encoder = ContactMessageEncoder(model, tick, session=7)
     digest, t_ns, node_state = hashlib.sha256(), 10**9, np.zeros(model.size, np.uint8)
     tick.state.synchronous[2] = False
     for number in range(count):
@@ -47,7 +49,9 @@ def main(count: int) -> None:
         tick.run_tick(slab, node_state, cycle, until_ns)
         tick.prepare_next_tick()
         digest.update(tick.state.save())
-        digest.update(tick.columns.contact_columns.tobytes() + tick.columns.force_status.tobytes())
+        digest.update(tick.columns.published_values.tobytes() + tick.columns.force_status.tobytes())
+        for pad in range(model.size):
+            digest.update(encoder.encode(pad, "update", t_ns, t_ns, "", False).payload)
     assert tick.contacts.begun_count > count // 100
     print("compiled" if detect.__file__.endswith(".so") else "interpreted", digest.hexdigest())
 

@@ -1,18 +1,25 @@
-"""Contact messages are readable for any computed numbers: those not finite are nil."""
+"""Contact messages of any computed numbers: readable, as the codec encodes them, nil where not finite."""
 
 from __future__ import annotations
 
+import copy
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 
 from handtouch import wire
+from handtouch.core.active_calibration import ActiveCalibration
+from handtouch.core.encoders import ContactMessageEncoder
 from handtouch.core.pipeline import Pipeline
+from handtouch.core.state import TickState
+from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
 
 ODD = np.array([np.nan, np.inf, -np.inf, 0.0, 1e30, -1e-30, 1.0])
-PARTS = ("position_m", "normal", "covariance_m2", "pad_m")
-NUMBERS = ("force_n", "force_std_n", "residual", "residual_std", "uncompensated_force_n")
+INTEGERS = np.array([0, 1, 0x7F, 0x80, 0xFF, 0x100, 0xFFFF, 0x10000, 0xFFFFFFFF, 1 << 32, 1 << 62])
+PARTS = {"position_m": 3, "normal": 3, "covariance_m2": 9}
+FRAMES = {"palm": 0, "base": 15}
 
 
 class DiscardingSink:
@@ -23,20 +30,79 @@ class DiscardingSink:
         """Discard the message."""
 
 
+def fill_state(state: TickState, rng: np.random.Generator) -> None:
+    """Write odd numbers into a state."""
+    for column in (
+        *(state.values, state.peak_force_n, state.total_current_a, state.uncompensated_force_n),
+        state.palm_values,
+    ):
+        column[:] = rng.choice(ODD, column.shape) if rng.random() < 0.3 else rng.normal(size=column.shape)
+    state.total_current_a[:] = rng.normal(size=state.pads)  # of finite counts
+    for integers in (state.contact_seq, state.sample_ns, state.begin_ns, state.silent_ns):
+        integers[:] = rng.choice(INTEGERS, state.pads)
+    state.contact_id[:], state.group_id[:] = rng.choice(INTEGERS[1:9], (2, state.pads))
+    state.solved[:], state.known[:] = True, True
+    for truths in (state.palm_requested, state.base_requested, state.synchronous):
+        truths[:] = rng.random(state.pads) < 0.5
+    state.palm_status[:], state.base_status[:] = rng.integers(len(FrameStatus), size=(2, state.pads))
+
+
+def finite(values: Any) -> Any:
+    """Return numbers as messages have them: nil unless all are finite."""
+    numbers = np.atleast_1d(values).tolist()
+    if not all(map(math.isfinite, numbers)):
+        return None
+    return tuple(numbers) if np.ndim(values) else numbers[0]
+
+
 @pytest.mark.parametrize("event", ["begin", "update", "end"])
-def test_a_contact_of_non_finite_numbers_is_readable(bench: Any, event: wire.ContactEvent) -> None:
-    pipeline = Pipeline(bench.model, 5_000_000, 0.6, DiscardingSink())
-    rng, columns = np.random.default_rng(1), pipeline.tick.columns
-    for _ in range(300):
-        for name in (*PARTS, *NUMBERS):
-            column = getattr(columns, name)
-            column[:] = rng.choice(ODD, column.shape) if rng.random() < 0.5 else rng.normal(size=column.shape)
-        pipeline.tick.contacts.peak_force_n[:] = rng.choice(ODD, pipeline.model.size)
-        state = pipeline.state
-        state.contact_id[:], state.solved[:], state.known[:] = 1, True, True
+def test_a_contact_message_has_the_values_of_its_columns(bench: Any, event: wire.ContactEvent) -> None:
+    pipeline = Pipeline(copy.deepcopy(bench.model), 5_000_000, 0.6, DiscardingSink())
+    rng, state, columns, pad = np.random.default_rng(1), pipeline.state, pipeline.tick.columns, 1
+    pipeline.model.set_calibration(pad, ActiveCalibration("default"))
+    encoder = ContactMessageEncoder(pipeline.model, pipeline.tick, session=1 << 52)
+    for number in range(300):
+        if number == 200:
+            pipeline.model.set_calibration(
+                pad, ActiveCalibration("c" * 300, diagnoses=("drift", "gain_step"))
+            )
+        fill_state(state, rng)
         pipeline.tick.refresh()
-        pad = int(rng.integers(pipeline.model.size))
-        sent = pipeline.messages._contact_message(pad, event, 10**9, 10**9)
-        read = wire.decode(wire.encode(sent))
-        assert isinstance(read, wire.Contact)
-        assert (read.position_status == "valid") == (read.position_m is not None)
+        retained, now_ns = bool(rng.random() < 0.5), int(state.sample_ns[pad]) + 1234
+        sent = encoder.encode(pad, event, 10**9, now_ns, "stale" if event == "end" else "", retained)
+        contact = wire.decode(wire.encode(sent))
+        assert isinstance(contact, wire.Contact)
+        assert wire.encode(contact)[1] == sent.payload
+        t_ns = 10**9 if event == "end" else int(state.sample_ns[pad])
+        begin_ns = int(state.begin_ns[pad])
+        assert (contact.t_ns, contact.begin_ns, contact.seq) == (t_ns, begin_ns, state.contact_seq[pad])
+        assert (contact.duration_s, contact.age_s) == ((t_ns - begin_ns) * 1e-9, 1234 * 1e-9)
+        assert (contact.event, contact.retained, contact.id) == (event, retained, state.contact_id[pad])
+        located = all(finite(getattr(columns, name)[pad]) for name in ("position_m", "normal", "pad_m"))
+        expected = [finite(getattr(columns, name)[pad].reshape(-1)) for name in PARTS]
+        assert [getattr(contact, name) for name in PARTS] == (expected if located else [None] * 3)
+        assert contact.pad_m == (finite(columns.pad_m[pad]) if located else None)
+        has_std = columns.force_status[pad] in (ForceStatus.VALID, ForceStatus.UNRELIABLE)
+        assert contact.force_std_n == (finite(columns.force_std_n[pad]) if has_std else None)
+        for name in ("force_n", "residual", "residual_std", "total_current_a"):
+            assert getattr(contact, name) == finite(getattr(columns, name)[pad])
+        assert contact.peak_force_n == finite(state.peak_force_n[pad])
+        assert contact.uncompensated_force_n is None  # nothing is compensated
+        assert contact.position_status == PositionStatus(columns.position_status[pad]).text
+        assert contact.force_status == ForceStatus(columns.force_status[pad]).text
+        assert contact.fresh == pipeline.tick.contacts.is_fresh(pad)
+        requested = bool(state.palm_requested[pad] or state.base_requested[pad])
+        assert contact.group == (state.group_id[pad] if requested else 0)
+        assert contact.joints_age_s == (finite(state.palm_values[pad, 30]) if requested else None)
+        for frame, at in FRAMES.items():
+            status = FrameStatus(getattr(state, f"{frame}_status")[pad] if requested else 0)
+            assert getattr(contact, f"{frame}_status") == status.text
+            for name, width in PARTS.items():
+                values = finite(state.palm_values[pad, at : at + width])
+                assert getattr(contact, f"{frame}_{name}") == (
+                    values if status == FrameStatus.VALID else None
+                )
+                at += width
+        later = number >= 200
+        assert (len(contact.calibration_id), len(contact.diagnoses)) == ((300, 2) if later else (7, 0))
+        assert contact.end_reason == ("stale" if event == "end" else "")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +16,7 @@ from handtouch.core.tick import PadColumns, TickResult
 from handtouch.core.transforms import ContactTransforms
 from handtouch.hand.joints import JointSnapshot, JointStateBuffer
 from handtouch.hand.robot_models import RobotModels
+from handtouch.wire import FrameStatus
 
 MS = 1_000_000
 NONE = np.zeros(0, dtype=np.intp)
@@ -26,6 +29,28 @@ PADS = [pad.link for pad in DEPLOYMENT.hands[0].pads]
 NAMES = ROBOTS.joint_names[0]
 TIP, MIDDLE, PROXIMAL = (PADS.index(f"index_{phalanx}") for phalanx in ("distal", "middle", "proximal"))
 HEEL = PADS.index("palm_heel")
+
+
+class ReadTransforms(ContactTransforms):
+    """Transforms whose state is read by the names of the fields of contact messages."""
+
+    def __init__(self, pads: int, robots: RobotModels) -> None:
+        self.state = TickState.empty(pads)
+        super().__init__(["right"] * pads, robots, self.state)
+
+    def contact_fields(self, pad: int) -> dict[str, Any]:
+        state, fields = self.state, dict[str, Any]()
+        if not (state.palm_requested[pad] or state.base_requested[pad]):
+            return fields
+        age_s = float(state.palm_values[pad, 30])
+        fields["group"], fields["joints_age_s"] = int(self.group[pad]), None if np.isnan(age_s) else age_s
+        for frame, status, at in (("palm", state.palm_status, 0), ("base", state.base_status, 15)):
+            fields[f"{frame}_status"] = FrameStatus(int(status[pad])).text
+            if status[pad] == FrameStatus.VALID:
+                values = state.palm_values[pad, at : at + 15].tolist()
+                fields[f"{frame}_position_m"], fields[f"{frame}_normal"] = values[:3], values[3:6]
+                fields[f"{frame}_covariance_m2"] = values[6:]
+        return fields
 
 
 class TouchedHand:
@@ -46,13 +71,13 @@ class TouchedHand:
             self.columns.covariance_m2[pad] = root @ root.T
         self.columns.sample_ns[:] = 100 * MS
         self.pads = np.array(pads, dtype=np.intp)
-        self.transforms = ContactTransforms(["right"] * n, robots)
+        self.transforms = ReadTransforms(n, robots)
         if joints is not None:
             self.transforms.joints_at = lambda _, t_ns: joints.interpolate(t_ns)
         everything = np.ones(n, dtype=np.bool_)
         self.transforms.set_requested(everything, everything)
 
-    def step(self) -> ContactTransforms:
+    def step(self) -> ReadTransforms:
         self.transforms.transform_updated(
             TickResult(100 * MS, self.pads, NONE, NONE, NONE), self.columns, self.ids
         )

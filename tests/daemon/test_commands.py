@@ -237,7 +237,7 @@ def test_snapshot_solves_unrequested_outputs_and_leaves_no_trace(served: Bench) 
         "plane",
     )
     assert np.isnan(columns.position_m[0]).all()
-    assert np.isnan(columns.contact_columns.view("<f4")).all()
+    assert np.isnan(columns.published_values).all()
 
 
 def test_reload_keeps_calibrations_and_contacts(served: Bench) -> None:

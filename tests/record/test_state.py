@@ -118,7 +118,9 @@ def test_a_snapshot_of_everything_leaves_the_state_as_it_was(make_hand: Callable
     hand.stroke(15)
     before = hand.pipeline.save_state()
     messages = hand.pipeline.solved_messages(hand.t_ns)
-    assert messages["contact/h/plane"].position_m is not None
+    contact = wire.decode(wire.encode(messages["contact/h/plane"]))
+    assert isinstance(contact, wire.Contact)
+    assert contact.position_m is not None
     assert hand.pipeline.save_state() == before
 
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 STAGES = (
     *("tables", "tolerances", "locate", "force", "place", "solve", "slip", "receive", "detect", "sheets"),
-    "publish",
+    *("publish", "encode"),
 )
 """Modules of `handtouch.core.stages`, lowest first."""
 DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch import wire
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline
 from handtouch.core.contact_solver import VALUE_SLICES, make_solver
@@ -23,24 +22,17 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
 from handtouch.core.slab import Slab
 from handtouch.core.slip import SlipDetector
-from handtouch.core.stages.publish import PUBLISHED_VALUES, ContactColumns
+from handtouch.core.stages.publish import PUBLISHED_SLICES, PUBLISHED_VALUES, ContactColumns
 from handtouch.core.state import TickState
 from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
 _TOUCHED = int(PadState.TOUCHED)
-_CONTACT_COLUMNS = (
-    *("pad_m", "residual", "position_m", "normal", "force_n", "force_std_n", "residual_std", "covariance_m2"),
+_VALUE_COLUMNS = view_memory(
+    np.concatenate(
+        [[[at.start, at.stop - at.start]] * (at.stop - at.start) for at in PUBLISHED_SLICES.values()]
+    )
 )
-"""As PUBLISHED_SLICE has them."""
-CONTACT_DTYPE = np.dtype(
-    [
-        (name, column.dtype, (column.elements,) if column.elements > 1 else ())
-        for name in _CONTACT_COLUMNS
-        for column in (wire.COLUMNS[wire.HandFrame][name],)
-    ]
-)
-"""Columns of the hand frame that are written per contact."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +70,11 @@ class PadColumns:
     """infinite for a lower bound"""
     uncompensated_force_n: FloatArray
     """force of the contact law, before the sheet behaviour is compensated"""
-    contact_columns: NDArray[np.void]
-    """published contact columns, as CONTACT_DTYPE; all NaN without contact"""
+    published_values: NDArray[np.float32]
+    """memory of the contact columns in `published`"""
+    published: dict[str, NDArray[np.float32]]
+    """columns of hand frames that are copied from here: contact columns (n, ...), NaN without contact, and
+    total_current_a (n,)"""
     position_status: NDArray[np.uint8]
     """PositionStatus"""
     force_status: NDArray[np.uint8]
@@ -90,6 +85,12 @@ class PadColumns:
         """Return views of a state's arrays."""
         values = state.values
         views = {name: values[:, columns] for name, columns in VALUE_SLICES.items()}
+        n = len(values)
+        published = np.full(n * PUBLISHED_VALUES, np.nan, np.float32)
+        columns = {
+            name: published[n * at.start : n * at.stop].reshape((n, -1)[: at.stop - at.start])
+            for name, at in PUBLISHED_SLICES.items()
+        }
         return cls(
             state=state.pad_state,
             sample_ns=state.sample_ns,
@@ -109,9 +110,8 @@ class PadColumns:
             force_n=views["force_n"][:, 0],
             force_std_n=views["force_std_n"][:, 0],
             uncompensated_force_n=state.uncompensated_force_n,
-            contact_columns=np.full((len(values), PUBLISHED_VALUES), np.nan, np.float32).view(CONTACT_DTYPE)[
-                :, 0
-            ],
+            published_values=published,
+            published={**columns, "total_current_a": np.zeros(n, np.float32)},
             position_status=np.zeros(len(values), dtype=np.uint8),
             force_status=np.zeros(len(values), dtype=np.uint8),
         )
@@ -283,8 +283,8 @@ class TickProcessor:
             *(model, self.contacts.currents, self.contacts.offset_std_a, self._estimate_force, columns.values)
         )
         self._published = ContactColumns(
-            *(model.size, self.state.memory(), view_memory(model.position_unreliable)),
-            view_memory(columns.contact_columns.view(np.float32)),
+            *(model.size, self.state.memory(), view_memory(model.position_unreliable), _VALUE_COLUMNS),
+            *(view_memory(columns.published_values), view_memory(columns.published["total_current_a"])),
             *(view_memory(columns.position_status), view_memory(columns.force_status)),
         )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
@@ -11,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.core.contact_solver import VALUE_SLICES
-from handtouch.core.hand_frame import HandFrameEncoder
+from handtouch.core.encoders import ContactMessageEncoder, HandFrameEncoder
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
-from handtouch.core.tick import CONTACT_DTYPE, TickProcessor, TickResult
+from handtouch.core.tick import TickProcessor, TickResult
 from handtouch.core.transforms import ContactTransforms
-from handtouch.wire import ContactEvent, EndReason, ForceStatus, PadState, PositionStatus
+from handtouch.wire import ContactEvent, EndReason, PadState
 
 END_REASONS: dict[PadState, EndReason] = {
     PadState.STALE: "stale",
@@ -28,15 +26,6 @@ END_REASONS: dict[PadState, EndReason] = {
 }
 """End reason of a contact by the state of its pad; "released" for any other."""
 _STOPPED: EndReason = "stopped"
-_WITH_STD = (int(ForceStatus.VALID), int(ForceStatus.UNRELIABLE))
-_POSITION_NAMES = tuple(status.text for status in PositionStatus)
-_FORCE_NAMES = tuple(status.text for status in ForceStatus)
-_PAD_M, _POSITION, _NORMAL, _COVARIANCE = (
-    VALUE_SLICES[name] for name in ("pad_m", "position_m", "normal", "covariance_m2")
-)
-_FORCE, _FORCE_STD, _RESIDUAL, _RESIDUAL_STD = (
-    VALUE_SLICES[name].start for name in ("force_n", "force_std_n", "residual", "residual_std")
-)
 
 
 class MessageSink(Protocol):
@@ -67,6 +56,7 @@ class TickMessages:
         self._tick = tick
         self._session = session
         self._state = tick.state
+        self._contact_encoder = ContactMessageEncoder(model, tick, session)
         self._end_reason: EndReason = ""  # of all contacts, when the daemon stops
         self._encoders = {hand: self._make_encoder(hand, rows) for hand, rows in model.rows_of_hand.items()}
         self._hand_topics = [(hand, f"hand/{hand}", f"raw/{hand}") for hand in model.rows_of_hand]
@@ -93,6 +83,7 @@ class TickMessages:
     def replace_model(self, model: PadModel) -> None:
         """Continue with another model of the same pads."""
         self._model = model
+        self._contact_encoder = ContactMessageEncoder(model, self._tick, self._session)
 
     def end_all_contacts(self, now_ns: int, sink: MessageSink) -> None:
         """Send the end of every contact, because the daemon stops."""
@@ -121,7 +112,7 @@ class TickMessages:
             **{f"hand/{hand}": partial(self._retained_hand, hand) for hand in self._model.rows_of_hand},
         }
 
-    def _retained_contact(self, pad: int, now_ns: int) -> wire.Contact | None:
+    def _retained_contact(self, pad: int, now_ns: int) -> wire.EncodedMessage | None:
         if not self._tick.contacts.touching[pad]:
             return None
         return self._contact_message(pad, "update", 0, now_ns, retained=True)
@@ -159,10 +150,9 @@ class TickMessages:
             "state": columns.state[rows],
             "contact_id": self._tick.contacts.id[rows],
             "sample_ns": columns.sample_ns[rows],
-            "total_current_a": columns.total_current_a[rows],
             "position_status": columns.position_status[rows],
             "force_status": columns.force_status[rows],
-            **{name: columns.contact_columns[name][rows] for name in CONTACT_DTYPE.names or ()},
+            **{name: column[rows] for name, column in columns.published.items()},
         }
 
     def _raw_message(self, hand: str, slab: Slab) -> wire.Raw:
@@ -184,58 +174,10 @@ class TickMessages:
 
     def _contact_message(
         self, pad: int, event: ContactEvent, sync_ns: int, now_ns: int, retained: bool = False
-    ) -> wire.Contact:
-        model, columns, contacts = self._model, self._tick.columns, self._tick.contacts
-        sample_ns = int(columns.sample_ns[pad])
-        begin_ns = int(contacts.begin_ns[pad])
-        values = columns.values[pad].tolist()
-        position, normal, on_pad = values[_POSITION], values[_NORMAL], values[_PAD_M]
-        located = all(map(math.isfinite, (*position, *normal, *on_pad)))
-        covariance = values[_COVARIANCE]
-        bounded = located and all(map(math.isfinite, covariance))  # at a corner it may be unbounded
-        force_status = int(columns.force_status[pad])
-        t_ns = sample_ns if event != "end" else sync_ns
-        modelled = self._tick.sheet_force.modelled[pad]
-        return wire.Contact(
-            v=wire.SCHEMA_VERSION,
-            session=self._session,
-            seq=int(self._state.contact_seq[pad]),
-            t_ns=t_ns,
-            event=event,
-            id=int(contacts.id[pad]),
-            hand=model.hands[pad],
-            link=model.links[pad],
-            frame=model.frame_links[pad],
-            begin_ns=begin_ns,
-            duration_s=(t_ns - begin_ns) * 1e-9,
-            age_s=(now_ns - sample_ns) * 1e-9,
-            position_m=tuple(position) if located else None,
-            normal=tuple(normal) if located else None,
-            covariance_m2=tuple(covariance) if bounded else None,
-            pad_m=tuple(on_pad) if located else None,
-            position_status=_POSITION_NAMES[columns.position_status[pad]],
-            force_n=_finite_or_none(values[_FORCE]),
-            force_std_n=_finite_or_none(values[_FORCE_STD]) if force_status in _WITH_STD else None,
-            peak_force_n=_finite_or_none(contacts.peak_force_n[pad]),
-            force_status=_FORCE_NAMES[force_status],
-            total_current_a=float(columns.total_current_a[pad]),
-            residual=_finite_or_none(values[_RESIDUAL]),
-            residual_std=_finite_or_none(values[_RESIDUAL_STD]),
-            begin_threshold_n=float(model.begin_threshold_n[pad]),
-            end_threshold_n=float(model.end_threshold_n[pad]),
-            calibration_id=model.calibrations[pad].calibration_id,
-            end_reason=self._end_reason_of(pad) if event == "end" else "",
-            retained=retained,
-            uncompensated_force_n=_finite_or_none(columns.uncompensated_force_n[pad]) if modelled else None,
-            diagnoses=model.calibrations[pad].diagnoses,
-            fresh=contacts.is_fresh(pad),
-            **self._transforms.contact_fields(pad),
-        )
+    ) -> wire.EncodedMessage:
+        reason = self._end_reason_of(pad) if event == "end" else ""
+        return self._contact_encoder.encode(pad, event, sync_ns, now_ns, reason, retained)
 
     def _end_reason_of(self, pad: int) -> EndReason:
         state = PadState(int(self._tick.columns.state[pad]))
         return self._end_reason or END_REASONS.get(state, "released")
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

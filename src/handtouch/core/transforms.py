@@ -5,7 +5,6 @@ Public name: `ContactTransforms`. Free of I/O and clocks; joint states come from
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +27,6 @@ FloatArray = NDArray[np.float64]
 _PALM, _BASE, _AGE = slice(0, 15), slice(15, 30), 30
 _PUBLISHED_SLICES = {"position_m": slice(0, 3), "normal": slice(3, 6), "covariance_m2": slice(6, 15)}
 _NOT_COMPUTED, _VALID, _STALE, _INVALID = map(int, FrameStatus)
-_STATUS_NAMES = tuple(status.text for status in FrameStatus)
 
 
 def _no_joints(hand: str, t_ns: int) -> JointSnapshot | None:  # noqa: ARG001
@@ -135,25 +133,6 @@ class ContactTransforms:
                     pose = kinematics.pose_in_palm(link)
                     poses[row, :, :3], poses[row, :, 3] = pose.rotation, pose.translation_m
         return poses
-
-    def contact_fields(self, pad: int) -> dict[str, Any]:
-        """Return fields of a contact message; empty where not requested."""
-        if not self._requested[pad]:
-            return {}
-        values, age_s = self._values[pad].tolist(), float(self._values[pad, _AGE])
-        fields: dict[str, Any] = {
-            "group": int(self.group[pad]),
-            "palm_status": _STATUS_NAMES[self.palm_status[pad]],
-            "base_status": _STATUS_NAMES[self.base_status[pad]],
-            "joints_age_s": age_s if age_s == age_s else None,
-        }
-        for frame, status, at in (("palm", self.palm_status, 0), ("base", self.base_status, 15)):
-            if status[pad] == _VALID:
-                part = values[at : at + 15]
-                fields |= {f"{frame}_{name}": tuple(part[span]) for name, span in _PUBLISHED_SLICES.items()}
-                if not math.isfinite(sum(part)):  # at a corner the covariance may be unbounded
-                    fields[f"{frame}_covariance_m2"] = None
-        return fields
 
     def hand_columns(self, rows: slice) -> dict[str, bytes]:
         """Return columns of a hand frame; empty where not requested."""

@@ -11,6 +11,7 @@ from typing import Protocol
 from handtouch import wire
 from handtouch.core.tick_messages import MessageSink
 
+_CONTACTS = "contact/"
 ContactCallback = Callable[[wire.Contact], None]
 
 
@@ -28,13 +29,15 @@ class ReplaySink:
 
     def has_subscriber(self, topic: str) -> bool:
         """Return True for contacts, and for topics that the publisher has a subscriber of."""
-        if topic.startswith("contact/"):
+        if topic.startswith(_CONTACTS):
             return True
         return self._publisher is not None and self._publisher.has_subscriber(topic)
 
     def send(self, message: wire.OutgoingMessage) -> None:
         """Pass a message on."""
-        if isinstance(message, wire.Contact):
-            self._on_contact(message)
+        if wire.topic_of(message).startswith(_CONTACTS):
+            contact = wire.decode(wire.encode(message))
+            assert isinstance(contact, wire.Contact)
+            self._on_contact(contact)
         if self._publisher is not None:
             self._publisher.send(message)

@@ -10,13 +10,16 @@ cdef class ContactColumns:
     cdef unsigned char[::1] position_unreliable, position_status, force_status, solved
     cdef unsigned char[::1] position_requested, force_requested, known, reliability
     cdef unsigned int[::1] contact_id
-    cdef float[::1] published
-    cdef double[::1] values, uncompensated_force_n, uncompensated_std_n, peak_force_n
+    cdef long long[::1] value_columns
+    cdef float[::1] published, published_current_a
+    cdef double[::1] values, total_current_a, uncompensated_force_n, uncompensated_std_n, peak_force_n
     @cython.locals(k=Py_ssize_t, pad=Py_ssize_t)
     cpdef store_solved(self, Py_ssize_t[::1] pads)
     @cython.locals(pad=Py_ssize_t, i=Py_ssize_t)
     cpdef publish(self)
 
+@cython.locals(before=Py_ssize_t, width=Py_ssize_t)
+cdef Py_ssize_t _published_index(ContactColumns columns, Py_ssize_t pad, Py_ssize_t i) noexcept
 @cython.locals(i=Py_ssize_t, finite=bint)
 cdef bint _is_finite(double[::1] values, Py_ssize_t first, Py_ssize_t count) noexcept
 @cython.locals(values='double[::1]', first=Py_ssize_t, i=Py_ssize_t, value=double, located=bint,

@@ -1,6 +1,6 @@
 """Published columns of contacts: values of solved contacts, with their statuses; NaN where there is none.
 
-Public names: `ContactColumns`, `PUBLISHED_VALUES`, `PUBLISHED_SLICE`.
+Public names: `ContactColumns`, `PUBLISHED_SLICES`, `PUBLISHED_VALUES`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,13 @@ from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_S
 _VALUES, _FIRST = VALUE_COUNT, VALUE_SLICES["pad_m"].start
 _COUNT = VALUE_SLICES["covariance_m2"].stop - _FIRST
 PUBLISHED_VALUES = _COUNT
-PUBLISHED_SLICE = slice(_FIRST, _FIRST + _COUNT)
-"""Values of a contact that are published."""
+PUBLISHED_SLICES = {
+    name: slice(columns.start - _FIRST, columns.stop - _FIRST)
+    for name, columns in VALUE_SLICES.items()
+    if _FIRST <= columns.start < _FIRST + _COUNT
+}
+"""Values of a contact that are published: name -> numbers of its values. The columns are one behind another
+in this order, each (n, values)."""
 _POSITION, _FORCE = VALUE_SLICES["position_m"].start, VALUE_SLICES["force_n"].start
 _FORCE_STD, _ESTIMATE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["force_status"].start
 _MISFIT, _MAX_SQUARED_MISFIT = VALUE_SLICES["squared_misfit"].start, MAX_SQUARED_MISFIT
@@ -29,8 +34,9 @@ _EVIDENCE_MISSING = 0  # ForceReliability.UNRELIABLE
 class ContactColumns:
     """Columns of n pads. arrays: flat memory of the arrays of `TickState` by their names.
 
-    position_unreliable: (n,) of the model. Written: published (n PUBLISHED_VALUES,), position_status and
-    force_status (n,).
+    position_unreliable: (n,) of the model. value_columns: (2 PUBLISHED_VALUES,) of each value, values before
+    its column, and of its column. Written: published (n PUBLISHED_VALUES,), total_current_a, position_status
+    and force_status (n,).
     """
 
     def __init__(
@@ -38,12 +44,16 @@ class ContactColumns:
         pads: int,
         arrays: Mapping[str, Any],
         position_unreliable: memoryview[int],
+        value_columns: memoryview[int],
         published: memoryview[float],
+        total_current_a: memoryview[float],
         position_status: memoryview[int],
         force_status: memoryview[int],
     ) -> None:
         self.pads, self.position_unreliable = pads, position_unreliable
-        self.published = published
+        self.value_columns = value_columns
+        self.published, self.published_current_a = published, total_current_a
+        self.total_current_a = arrays["total_current_a"]
         self.position_status, self.force_status = position_status, force_status
         self.contact_id, self.solved, self.values = arrays["contact_id"], arrays["solved"], arrays["values"]
         self.position_requested = arrays["position_requested"]
@@ -67,12 +77,19 @@ class ContactColumns:
         A contact that ended is published until its id is cleared.
         """
         for pad in range(self.pads):
+            self.published_current_a[pad] = self.total_current_a[pad]
             if self.contact_id[pad] != 0 and self.solved[pad]:
                 _publish_contact(self, pad)
             elif self.position_status[pad] != _NOT_COMPUTED or self.force_status[pad] != _NOT_COMPUTED:
                 self.position_status[pad] = self.force_status[pad] = _NOT_COMPUTED
-                for i in range(pad * _COUNT, (pad + 1) * _COUNT):
-                    self.published[i] = _NAN
+                for i in range(_COUNT):
+                    self.published[_published_index(self, pad, i)] = _NAN
+
+
+def _published_index(columns: ContactColumns, pad: int, i: int) -> int:
+    """Return the position of a pad's value i in the published columns."""
+    before, width = columns.value_columns[2 * i], columns.value_columns[2 * i + 1]
+    return columns.pads * before + pad * width + i - before
 
 
 def _is_finite(values: memoryview[float], first: int, count: int) -> bool:
@@ -88,7 +105,9 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
     values, first = columns.values, pad * _VALUES
     for i in range(_COUNT):
         value = values[first + _FIRST + i]
-        columns.published[pad * _COUNT + i] = value if -_INFINITY < value < _INFINITY else _NAN
+        columns.published[_published_index(columns, pad, i)] = (
+            value if -_INFINITY < value < _INFINITY else _NAN
+        )
     located = _is_finite(values, first + _FIRST, 2) and _is_finite(values, first + _POSITION, 6)
     position = _POSITION_INVALID if columns.position_requested[pad] else _NOT_COMPUTED
     if located:
