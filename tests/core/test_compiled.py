@@ -80,6 +80,27 @@ print(*(f'{stage}-{source_hash(stage)}' for stage in STAGES))"
     assert {name.split("-")[0] for name in after - before} == other
 
 
+@needs_compiled
+def test_only_changed_modules_are_compiled_and_equal_ones_to_equal_bytes(copied: Path) -> None:
+    folder = copied / "handtouch/core/stages/_compiled"
+    files = {path.name.partition("-")[0]: path for path in folder.glob("*.so")}
+    tables = files["tables"].read_bytes()
+    untouched = {
+        path.name: path.stat().st_ino for name, path in files.items() if name not in ("tables", "place")
+    }
+    files["tables"].unlink()
+    with (copied / "handtouch/core/stages/place.py").open("a") as file:
+        file.write("# edited\n")
+    done = run("-m", "handtouch.core.build", source=copied)
+    assert done.returncode == 0, done.stderr
+    after = {path.name: path.stat().st_ino for path in folder.iterdir()}
+    assert len(after) == len(files)
+    assert untouched.items() <= after.items()
+    assert files["place"].name not in after
+    assert files["tables"].read_bytes() == tables
+    assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
+
+
 def test_modules_for_another_machine_are_never_of_this_one(copied: Path) -> None:
     other = "x86_64" if platform.machine() == "aarch64" else "aarch64"
     build = f"from pathlib import Path; from handtouch.core.build import build_stages; \

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
@@ -40,10 +41,11 @@ class BuildError(Exception):
 
 
 def build_stages(source: Path, machine: str = "") -> list[Path]:
-    """Compile the stages of a source tree's `handtouch` package; return the files, new or up to date.
+    """Compile the stages of a source tree's `handtouch` package whose sources changed; return all files.
 
-    Older files are removed. With `machine`, x86_64 or aarch64, the files are for any Linux on it that has
-    MIN_GLIBC, and are in the folder `build` beside `source`. Raises BuildError.
+    Files of other sources are removed. Equal sources and compilers give equal bytes, in any folder. With
+    `machine`, x86_64 or aarch64, the files are for any Linux on it that has MIN_GLIBC, and are in the folder
+    `build` beside `source`. Raises BuildError.
 
     A machine's own Python.h isn't needed: within the stable ABI, it is the same on all 64-bit Linux.
     """
@@ -51,32 +53,33 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
     files = [compiled.compiled_file(name, f"linux_{machine}" if machine else "") for name in compiled.STAGES]
     if machine:
         files = [source.parent / "build" / machine / file.name for file in files]
-    if all(file.exists() for file in files):
+    missing = [(name, file) for name, file in zip(compiled.STAGES, files, strict=True) if not file.exists()]
+    if not missing:
         return files
     compiler, include = _find_compiler(machine), sysconfig.get_path("include")
     if importlib.util.find_spec("Cython") is None:
         raise BuildError("Cython is missing; pip install cython")
     if not (Path(include) / "Python.h").exists():
         raise BuildError(f"{include}/Python.h is missing; on Debian: apt-get install python3-dev")
-    folder = files[0].parent
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as work:
-        for name, file in zip(compiled.STAGES, files, strict=True):
-            if file.exists():
-                continue
-            generated, built = Path(work) / f"{name}.c", Path(work) / f"{name}.so"
+    files[0].parent.mkdir(parents=True, exist_ok=True)
+    command = [*compiler, *_FLAGS, *_LIMITED_API, f"-I{include}"]
+
+    def compile_stage(stage: tuple[str, Path]) -> None:
+        name, file = stage
+        with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=file.parent) as work:
             options = [f"-X{key}={value}" for key, value in _DIRECTIVES.items()]
             source_file = f"handtouch/core/stages/{name}.py"
-            _run([sys.executable, "-m", "cython", *options, "-o", str(generated), source_file], source)
-            _run(
-                [*compiler, *_FLAGS, *_LIMITED_API, f"-I{include}", str(generated), "-o", str(built), "-lm"],
-                source,
-            )
+            _run([sys.executable, "-m", "cython", *options, "-o", f"{work}/{name}.c", source_file], source)
+            _run([*command, f"{name}.c", "-o", f"{name}.so", "-lm"], Path(work))  # its path is in no file
+            built = Path(work) / f"{name}.so"
             if machine:
                 _check_portable(built, machine)
-            shutil.copy(built, file.with_suffix(".new"))
-            file.with_suffix(".new").replace(file)  # never half written where another process loads it
-    for old in set(folder.glob("*.so")) - set(files):
+            built.replace(file)  # never half written where another process loads it
+
+    compile_stage(missing[0])  # by itself: what fails here would fail for all
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(compile_stage, missing[1:]))
+    for old in set(files[0].parent.glob("*.so")) - set(files):
         old.unlink()
     return files
 
@@ -88,7 +91,7 @@ def main() -> int:
     except BuildError as error:
         print(f"handtouch runs uncompiled, some fifty times slower per contact: {error}", file=sys.stderr)
         return 1
-    print(f"compiled {len(files)} modules into {files[0].parent}")
+    print(f"{len(files)} compiled modules are up to date in {files[0].parent}")
     return 0
 
 
