@@ -139,7 +139,7 @@ dist: $(VENV)/.dev ## build the source archive, wheels for x86_64 and aarch64, a
 	$(BIN)/python -m build --no-isolation --sdist
 	for machine in x86_64 aarch64; do \
 		HANDTOUCH_WHEEL_MACHINE=$$machine $(BIN)/python -m build --no-isolation --wheel || exit 1; done
-	$(BIN)/python -m release.sbom run >dist/handtouch.cdx.json
+	$(BIN)/python locks/sbom.py run >dist/handtouch.cdx.json
 
 .PHONY: deb
 deb: ## build the Debian package of the services in build/, for this machine's Python; needs debhelper

@@ -1,4 +1,4 @@
-"""Software bill of materials of a lock, as CycloneDX JSON: `python -m release.sbom run >handtouch.cdx.json`.
+"""Software bill of materials of a lock, as CycloneDX JSON: `python locks/sbom.py run >handtouch.cdx.json`.
 
 Public names: `bill_of_materials`, `locked_packages`, `Package`, `LICENSES`.
 """

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from release.sbom import LICENSES, bill_of_materials, locked_packages
+from locks.sbom import LICENSES, bill_of_materials, locked_packages
 
 SHIPPED = ("run", "view")
 
