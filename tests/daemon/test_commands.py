@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from handtouch.calibration.calibration import (
     LawParameters,
     Offsets,
 )
+from handtouch.client import request
 from handtouch.config import ConfigError, Deployment, parse
 from handtouch.core.pad_model import PadModel
 from handtouch.daemon.daemon import HandtouchDaemon
@@ -90,6 +92,22 @@ def served(bench: Any, endpoints: dict[str, str]) -> Iterator[Bench]:
     yield made
     made.daemon.close()
     logging.getLogger("handtouch").setLevel(logging.NOTSET)
+
+
+def test_a_daemon_whose_every_tick_is_late_answers_and_notifies_the_watchdog(
+    served: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(served.daemon.gravity, "update_directions", lambda _: time.sleep(4e-9 * PERIOD_NS))
+    stop, notified = threading.Event(), list[int]()
+    thread = threading.Thread(target=served.daemon.run, args=(stop, notified.append))
+    thread.start()
+    try:
+        answer = request("status", endpoint=served.control.endpoint, timeout_s=60)
+    finally:
+        stop.set()
+        thread.join()
+    assert answer["service"]["overruns"] > 0
+    assert len(notified) > 1
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -15,6 +15,7 @@ from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.config import Behaviour
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.block_buffer import BlockBuffer
 from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
@@ -128,6 +129,19 @@ class Rig:
 @pytest.fixture
 def rig(bench: Any) -> Rig:
     return Rig(bench)
+
+
+def test_block_of_a_late_tick_leaves_out_samples_of_the_next_cycle(rig: Rig) -> None:
+    pipeline, sync_ns = rig.pipeline, rig.t_ns + PERIOD_NS
+    pipeline.begin_cycle(sync_ns, sync_ns)
+    for pad, delay_ns in enumerate((1000, 2000, PERIOD_NS + 1000)):
+        pipeline.slab.write_pdo(pad, b"\0" * 8, sync_ns + delay_ns)
+    assert pipeline.finish_cycle(sync_ns + PERIOD_NS, sync_ns + PERIOD_NS + 2000) is not None
+    buffer = BlockBuffer(3)
+    buffer.max_ticks = 1
+    block = buffer.add_tick(pipeline)
+    assert block is not None
+    assert (block.sync_ns.tolist(), block.fresh.tolist()) == ([sync_ns], [[True, True, False]])
 
 
 def calibrate(pad: int, serial: int, **changes: Any) -> CalibrationUpdate:

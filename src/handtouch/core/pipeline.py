@@ -112,12 +112,16 @@ class Pipeline:
 
     # Ticks ------------------------------------------------------------------------------------------------
 
+    def finish_cycle(self, sync_ns: int, now_ns: int) -> TickResult | None:
+        """Run the tick of the present cycle, if it is still due at the next SYNC; return its result."""
+        return None if self.cycle.ticked else self._run_tick(now_ns, sync_ns)
+
     def begin_cycle(self, sync_ns: int, now_ns: int) -> TickResult | None:
         """Begin a cycle at a SYNC, sent or received: samples that arrived since `sync_ns` belong to it.
 
         If the tick of the previous cycle is still due, it runs first; its result is returned.
         """
-        late = None if self.cycle.ticked else self._run_tick(now_ns, sync_ns)
+        late = self.finish_cycle(sync_ns, now_ns)
         self.prepare_next_tick()
         self.slab.begin_cycle(sync_ns)
         self.cycle.begin_cycle(sync_ns)

@@ -37,7 +37,9 @@ class BlockBuffer:
         self._sync_ns[k] = pipeline.cycle.sync_ns
         self._sample_ns[k] = tick.columns.sample_ns
         np.copyto(self._counts[k], tick.counts, casting="unsafe")
-        self._fresh[k] = pipeline.slab.fresh
+        # a sample that arrived after the next SYNC, before a late tick, isn't of this tick
+        self._fresh[k] = pipeline.slab.fresh.view(np.bool_)
+        self._fresh[k] &= pipeline.slab.arrival_ns == tick.state.arrival_ns
         self._state[k] = tick.columns.state
         self._contact_id[k] = tick.contacts.id
         self._count = k + 1

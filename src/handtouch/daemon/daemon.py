@@ -280,15 +280,14 @@ class HandtouchDaemon:
             if paused_ns := pause.end_receive(now_ns):
                 self._excuse_pause(paused_ns, now_ns)
             for sync_ns in sync.poll(now_ns, self._received_until_ns):
-                self._begin_cycle(sync_ns, now_ns)
+                self._begin_cycle(sync_ns, now_ns, on_tick)
             ticked = pipeline.tick_if_due(now_ns)
             if ticked is None and sampling.slow_sync and pipeline.slab.fresh_count:
                 ticked = pipeline.tick_without_sync(now_ns)
             if ticked is not None:
                 self.reporter.record_tick(now_ns, self._sent_ns)
                 busy_poll.update_usual_latency(cycle.sync_ns, int(pipeline.slab.arrival_ns.max()))
-                self._process_percepts(ticked)
-                self._after_tick(on_tick)
+                self._complete_tick(ticked, on_tick)
             elif now_ns >= master.wake_ns:
                 master.poll(self._received_until_ns)
 
@@ -315,15 +314,18 @@ class HandtouchDaemon:
             os.sched_yield()
         self.reporter.stage_timer.lap(stage_timer.WAIT, time.monotonic_ns())
 
-    def _begin_cycle(self, sync_ns: int, now_ns: int) -> None:
-        """Begin a cycle at a SYNC that was sent or received."""
+    def _begin_cycle(self, sync_ns: int, now_ns: int, on_tick: Callable[[int], None]) -> None:
+        """Begin a cycle at a SYNC that was sent or received.
+
+        The previous tick comes first if it is still due, as every tick is where the machine is too slow.
+        """
         self.reporter.stage_timer.begin_period(self.sync.overruns, not self.pipeline.cycle.ticked)
         self.inputs.poll(now_ns)
         if (gravity := self.gravity.update_directions(now_ns)) is not None:
             self.pipeline.set_gravity(gravity)
-        late = self.pipeline.begin_cycle(sync_ns, now_ns)
-        if late is not None:
-            self._process_percepts(late)
+        if (late := self.pipeline.finish_cycle(sync_ns, now_ns)) is not None:
+            self._complete_tick(late, on_tick)
+        self.pipeline.begin_cycle(sync_ns, now_ns)
         self.reporter.stage_timer.lap(stage_timer.SYNC, time.monotonic_ns())
 
     def _receive_frames(self, ports: list[Port]) -> None:
@@ -366,8 +368,9 @@ class HandtouchDaemon:
         assert self.supervisor is not None
         self.sampling.set_needed_pads(self.supervisor.active_pads, self._raw_pads, now_ns)
 
-    def _after_tick(self, on_tick: Callable[[int], None]) -> None:
+    def _complete_tick(self, ticked: TickResult, on_tick: Callable[[int], None]) -> None:
         """Do what can wait until the contacts are sent."""
+        self._process_percepts(ticked)
         lap = self.reporter.stage_timer.lap
         self.pipeline.prepare_next_tick()
         now_ns = time.monotonic_ns()

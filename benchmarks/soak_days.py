@@ -1,0 +1,277 @@
+"""Soak test of three days of mixed use, compressed, and of the real processes in cycles of trouble.
+
+Part 1: pipeline, percepts, supervision with its store, and recorder in one process, time as an argument.
+Part 2: daemon, nodes, recorder, view, bridge and a subscriber in real time. Writes
+docs/benchmarks/soak_days.{md,json,png}. ARGS="--hours 72 --minutes 20"; status 1 if something is wrong.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from page import made_by, options, output_folder, progress
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small
+
+import matplotlib
+from bench_latency import machine
+from compressed_days import AFTERWARDS_S, FULL_DISK_S, Days, run_days
+from cycled_processes import growth, in_own_network, run_cycles, unexplained
+
+from handtouch.record.recording import Recording
+from handtouch.record.replay_recording import replay_recording
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+HOURS, MINUTES = 72.0, 20.0
+DISK_MB = 96
+MAX_GROWTH_MB = 20.0
+"""Of the compressed part, from a third on."""
+MAX_GAIN_ERROR = 0.03
+"""rms error of the gains of a calibrated pad: what 2 % standard deviation permits, with 1.5 times of it"""
+RELEARNT_S = 4 * 3600.0
+"""A replaced node explains messages about its calibration so long."""
+DISK_VARIABLE = "HANDTOUCH_SOAK_DISK"
+
+
+def on_small_disk() -> Path:
+    """Return the folder of a small disk; first, run this program again in a mount namespace that has it."""
+    if DISK_VARIABLE not in os.environ:
+        _exec_on_small_disk()
+    return Path(os.environ[DISK_VARIABLE])
+
+
+def _exec_on_small_disk() -> None:
+    user = [] if os.geteuid() == 0 else ["--map-root-user"]
+    script = (
+        f'd=$(mktemp -d) && mount -t tmpfs -o size={DISK_MB}m soak "$d" || exit 2\n'
+        f'{DISK_VARIABLE}=$d "$@"; status=$?; umount "$d"; rmdir "$d"; exit $status'
+    )
+    os.execvp("unshare", ["unshare", "--mount", *user, "sh", "-c", script, "sh", sys.executable, *sys.argv])
+
+
+class Filler:
+    """Fills a disk with a file until nothing more can be written, or removes it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "filler"
+
+    def __call__(self, full: bool) -> None:
+        if not full:
+            self._path.unlink()
+            return
+        with self._path.open("wb", buffering=0) as file:
+            for size in (1 << 20, 1 << 12, 1):
+                try:
+                    while True:
+                        file.write(bytes(size))
+                except OSError as error:
+                    if error.errno != errno.ENOSPC:
+                        raise
+
+
+def compressed(hours: float, disk: Path, recordings: Path) -> dict[str, Any]:
+    """Run the first part; return its figures, with the replay of the last recordings."""
+    days = Days(hours)
+    found = run_days(days, disk / "calibrations.db", Filler(disk), recordings)
+    links = days.use.links
+    found["unexplained"] = [
+        (at, line) for at, line in found.pop("log") if not is_explained(at, line, found["acts"], links)
+    ]
+    found["alarms"] = [
+        (entry["kind"], links[entry["pad"]], begin, end)
+        for entry in found["diagnosed"]
+        for begin, end in entry["at_s"]
+        if not any(
+            act["pad"] == entry["pad"] and act["from_s"] <= end and begin <= act["until_s"] + after(act)
+            for act in found["acts"]
+        )
+    ]
+    replays = []
+    for path in found.pop("last_recordings"):
+        with Recording(Path(path)) as recording:
+            result = replay_recording(recording, lambda _: None).result
+        replays.append((result.ticks, result.compared, result.equal))
+    return found | {"replays": replays, "links": links}
+
+
+def after(act: dict[str, Any]) -> float:
+    """Return the time [s] after an act in which it explains messages of its pad."""
+    return RELEARNT_S if act["kind"] == "swap" else AFTERWARDS_S
+
+
+def is_explained(at: float, line: str, acts: list[dict[str, Any]], links: list[str]) -> bool:
+    """Return True for a message of a faulty or replaced pad, or about the store while its disk is full."""
+    pads = {links.index(link) for link in links if re.search(rf"\b{link}\b", line)}
+    for act in acts:
+        if act["pad"] in pads and act["from_s"] - 1 <= at <= act["until_s"] + after(act):
+            return True
+        if act["kind"] == "disk full" and "store" in line and act["from_s"] <= at <= act["until_s"] + 120:
+            return True
+    return False
+
+
+def problems(found: dict[str, Any]) -> list[str]:
+    """Return what must not be, as text."""
+    wrong = []
+    if days := found.get("compressed"):
+        late = days["memory"][len(days["memory"]) // 3 :]
+        if late[-1][1] - late[0][1] > MAX_GROWTH_MB:
+            wrong.append(f"memory grew from {late[0][1]:.0f} to {late[-1][1]:.0f} MB")
+        if late[-1][2] > late[0][2]:
+            wrong.append(f"descriptors grew from {late[0][2]} to {late[-1][2]}")
+        known = [
+            e for e, state in zip(days["gain_errors"], days["states"], strict=True) if state == "calibrated"
+        ]
+        if max(known, default=0.0) > MAX_GAIN_ERROR:
+            wrong.append(f"the gains of a calibrated pad are wrong by {max(known):.1%}")
+        if days["lost"] or days["malformed"] or days["malformed_messages"] or days["store_error"]:
+            wrong.append(f"lost {days['lost']}, malformed {days['malformed']}, {days['store_error']}")
+        wrong += [f"replay: {same} of {count} equal" for _, count, same in days["replays"] if same != count]
+        wrong += [f"unexplained at {at / 3600:.2f} h: {line[:200]}" for at, line in days["unexplained"]]
+    if cycles := found.get("processes"):
+        wrong += [
+            f"{name} ended with status {code}" for _, name, code in cycles["ends"] if bad_end(name, code)
+        ]
+        if not np.isfinite(cycles["served"]).all():
+            wrong.append("not all pads became operational")
+        if cycles["rows"][-1]["lost"]:
+            wrong.append(f"the subscriber lost {cycles['rows'][-1]['lost']} messages")
+        wrong += [
+            f"unexplained at {at:.0f} s: {name}: {line[:200]}" for at, name, line in cycles["unexplained"]
+        ]
+    return wrong
+
+
+def bad_end(name: str, code: int) -> bool:
+    """Return True for an end by itself: only the recorder ends so (1), as its disk is full."""
+    return code not in ((0, -9, 1) if name == "recorder" else (0, -9))
+
+
+def plot(found: dict[str, Any], path: Path) -> None:
+    """Draw memory, store, processor time and errors of the compressed days."""
+    days = found["compressed"]
+    figure, axes = plt.subplots(2, 2, figsize=(10, 5.5), sharex=True, layout="constrained")
+    at, used, _, _, size = np.array(days["memory"]).T
+    axes[0, 0].plot(at, used)
+    axes[0, 0].set(ylabel="resident memory, MB", ylim=(0, None))
+    axes[0, 1].plot(at, size / 1e6)
+    axes[0, 1].set(ylabel="calibration store, MB", ylim=(0, None))
+    hours = np.arange(len(days["by_hour"])) + 0.5
+    for name, label in (("tick_p50_us", "median"), ("tick_p99_us", "99th percentile")):
+        axes[1, 0].plot(hours, [row[name] for row in days["by_hour"]], ".-", label=label)
+    axes[1, 0].set(ylabel="processor time of a tick, us", xlabel="h", ylim=(0, None))
+    axes[1, 0].legend(frameon=False)
+    axes[1, 1].plot(hours, [row["rms_mm"] for row in days["by_hour"]], ".-")
+    axes[1, 1].set(ylabel="rms position error, mm", xlabel="h", ylim=(0, None))
+    for act in days["acts"]:
+        if act["kind"] == "disk full":
+            for axis in axes.flat:
+                axis.axvspan(act["from_s"] / 3600, act["until_s"] / 3600, color="0.85")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def page(found: dict[str, Any]) -> list[str]:
+    """Return the lines of the page."""
+    text = ["# Three days of mixed use", "", f"{made_by()}; {machine()}, load {os.getloadavg()[0]:.1f}.", ""]
+    if days := found.get("compressed"):
+        rows, acts = days["by_hour"], Counter(act["kind"] for act in days["acts"])
+        ticks, contacts = (sum(row[name] for row in rows) for name in ("ticks", "contacts"))
+        inside = np.average([row["inside"] for row in rows if row["compared"]],
+                            weights=[row["compared"] for row in rows if row["compared"]])  # fmt: skip
+        memory = days["memory"]
+        third = memory[len(memory) // 3]
+        text += [
+            f"## {days['hours']:g} hours, compressed", "",
+            "Time is an argument of everything here, and runs as fast as the processor permits: pipeline, "
+            "percepts, supervision with its store on a small disk, and recorder, in one process; samples of "
+            "a hand of the world `default` from another one, at 100 Hz in use and 20 Hz at rest. Not here: "
+            "sockets, CANopen master and child processes; replaced nodes are the master's events.", "",
+            f"{ticks} ticks, {contacts} contacts, {days['messages']} messages recorded. "
+            + "; ".join(f"{kind}: {count}" for kind, count in acts.items()) + ". "
+            f"Each full disk lasts {min(FULL_DISK_S, 600 * days['hours']) / 60:.0f} min.", "",
+            "| | at 1/3 | at the end |", "|---|---|---|",
+            f"| resident memory, MB | {third[1]:.1f} | {memory[-1][1]:.1f} |",
+            f"| descriptors | {third[2]} | {memory[-1][2]} |",
+            f"| objects of Python | {third[3]} | {memory[-1][3]} |",
+            f"| calibration store, kB | {third[4] / 1e3:.0f} | {memory[-1][4] / 1e3:.0f} |", "",
+            f"Positions of pads without a fault within their 95 % region: {inside:.1%}. Calibrations: "
+            + ", ".join(f"{count} {state}" for state, count in Counter(days["states"]).items())
+            + f"; rms errors of gains {100 * min(days['gain_errors']):.2f} to "
+            f"{100 * max(days['gain_errors']):.2f} %. Replay of the last files (ticks, messages, equal): "
+            f"{days['replays']}. Diagnoses without a cause: {len(days['alarms'])} "
+            f"{sorted({kind for kind, *_ in days['alarms']})}; log messages without one: "
+            f"{len(days['unexplained'])}.", "",
+            "![Memory, store, processor time of a tick and position error by hour](soak_days.png)", "",
+        ]  # fmt: skip
+    if cycles := found.get("processes"):
+        text += [
+            f"## {cycles['minutes']:.0f} minutes of the real processes", "",
+            "Daemon with supervisor and percept process, simulated nodes, recorder, view, Zenoh bridge and a "
+            "subscriber to hand frames and percepts. In each cycle of 40 s a node is replaced and another "
+            "one has a fault, beside the trouble in the table; the disk has store and recordings. Latency is "
+            "from the frame's stamp to the subscriber, with all processes on this machine.", "",
+            "| cycle | trouble | frames | p50, ms | p99, ms | lost |", "|---|---|---|---|---|---|",
+            *(
+                "| {cycle} | {trouble} | {frames} | {p50_ms:.2f} | {p99_ms:.1f} | {lost} |".format(**row)
+                for row in cycles["rows"]
+            ), "",
+            "| process | MB at 1/3 | MB at the end | descriptors |", "|---|---|---|---|",
+            *(
+                f"| {name} | {early:.0f} | {late:.0f} | {files} |"
+                for name, (early, late, files) in growth(cycles["memory"]).items()
+            ), "",
+            f"All pads operational after {cycles['served'][0]:.1f} s, at the end after "
+            f"{cycles['served'][1]:.1f} s; the supervisor process was restarted "
+            f"{cycles['supervisor']['restarts']} times in the last session; log messages without a cause: "
+            f"{len(cycles['unexplained'])}.", "",
+        ]  # fmt: skip
+    wrong = problems(found)
+    return [*text, *(f"* {line}" for line in wrong or ["Nothing is wrong."]), ""]
+
+
+def main() -> int:
+    parser = options(__doc__)
+    parser.add_argument("--hours", type=float, default=HOURS, help="compressed; 0: not that")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="of the processes; 0: not that")
+    asked = parser.parse_args()
+    disk = on_small_disk()
+    in_own_network()
+    if asked.quick:
+        asked.hours, asked.minutes = min(asked.hours, 0.3), min(asked.minutes, 2.0)
+    out = output_folder(asked.quick)
+    path = out / "soak_days.json"
+    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    if asked.minutes:
+        folder = disk / "processes"
+        folder.mkdir()
+        cycles = run_cycles(asked.minutes, folder, Filler(disk))
+        links = [pad.link for _, pad in Days(1.0).use.deployment.pads]
+        cycles["unexplained"] = unexplained(cycles.pop("log"), cycles["acts"], links)
+        found["processes"] = cycles
+        progress(problems({"processes": cycles}))
+    if asked.hours:
+        with tempfile.TemporaryDirectory(prefix="ht.") as recordings:
+            found["compressed"] = compressed(asked.hours, disk, Path(recordings))
+    path.write_text(json.dumps(found, indent=1, default=str) + "\n")
+    if "compressed" in found:
+        plot(found, out / "soak_days.png")
+    text = page(found)
+    (out / "soak_days.md").write_text("\n".join(text))
+    print("\n".join(text))
+    return int(bool(problems(found)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
