@@ -30,9 +30,10 @@ from handtouch import config
 from handtouch.config import shipped
 from handtouch.simulate.faults import INFLUENCES, Fault
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.stimulus import NodeReplacement
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, Family
+from handtouch.simulate.worlds import WORLDS, Family, World
 from handtouch.supervisor.diagnose import DiagnosisModel, HandDiagnostics, HandSamples
 
 ROOT = Path(__file__).parent.parent
@@ -56,13 +57,18 @@ def deployment() -> config.Deployment:
 
 
 class Hour:
-    """An hour of a hand of a world: bouts of use between long rests."""
+    """An hour, or another time, of a hand of a world: bouts of use between long rests.
 
-    def __init__(self, world: str, seed: int) -> None:
+    `faults`, `swaps`: faults that are added to the heat of its bouts, and replaced nodes.
+    """
+
+    def __init__(self, world: World, seed: int, length_s: float = LENGTH_S) -> None:
         self._rng = np.random.default_rng((FIRST_SEED, seed))
         self.links = [pad.link for hand in deployment().hands for pad in hand.pads]
         self.touches: list[ScenarioTouch] = []
-        self.warm: list[Fault] = []
+        self.faults: list[Fault] = []
+        self.swaps: list[NodeReplacement] = []
+        self.length_s = length_s
         self.busy: Spans = []
         self.bouts: Counter[str] = Counter()
         bouts: dict[str, Callable[[float, float], None]] = {
@@ -70,20 +76,25 @@ class Hour:
             "hot cup": self._hot_cup, "two objects": self._two,
         }  # fmt: skip
         at = float(self._rng.uniform(0, 300))
-        while at < LENGTH_S - 30:
+        while at < length_s - 30:
             name = str(self._rng.choice([*bouts], p=[0.35, 0.3, 0.1, 0.1, 0.1, 0.05]))
-            lasts = min(float(np.exp(self._rng.uniform(np.log(10), np.log(180)))), LENGTH_S - at - 5)
+            lasts = min(float(np.exp(self._rng.uniform(np.log(10), np.log(180)))), length_s - at - 5)
             self.bouts[name] += 1
             bouts[name](at, at + lasts)
             self.busy.append((at, at + lasts + LINGER_S))
             at += lasts + LINGER_S + float(self._rng.exponential(lasts * (1 / IN_USE - 1)))
-        self._world = WORLDS[world].draw(Family.REPORTING.seed(FIRST_SEED + seed))
-        self.deployment = self._world.describe(deployment())
+        self.world = world.draw(Family.REPORTING.seed(FIRST_SEED + seed))
+        self.deployment = self.world.describe(deployment())
 
-    def blocks(self) -> Iterator[HandSamples]:
+    def hand(self) -> VirtualHand:
+        """Return the hand in this use."""
+        touches = tuple(self.touches) or (self._touch(self.links[0], 1.0, 0.5, [0.5]),)
+        scenario = Scenario(touch=touches, swap=tuple(self.swaps))
+        return VirtualHand(self.deployment, scenario, self.world, faults=tuple(self.faults))
+
+    def blocks(self, hand: VirtualHand | None = None) -> Iterator[HandSamples]:
         """Samples of all pads, block after block: dense while in use, sparse while at rest."""
-        scenario = Scenario(touch=tuple(self.touches) or (self._touch(self.links[0], 1.0, 0.5, [0.5]),))
-        hand = VirtualHand(self.deployment, scenario, self._world, faults=tuple(self.warm))
+        hand = hand or self.hand()
         for from_s, until_s, rate in self._stretches():
             per_block = round(BLOCK_S * rate)
             count = int((until_s - from_s) * rate) // per_block * per_block
@@ -103,7 +114,7 @@ class Hour:
             yield at, begin_s, IDLE_HZ
             yield begin_s, end_s, BUSY_HZ
             at = end_s
-        yield at, LENGTH_S, IDLE_HZ
+        yield at, self.length_s, IDLE_HZ
 
     # bouts, each from a time to a time
 
@@ -137,7 +148,7 @@ class Hour:
         for link in self._grasp(from_s, until_s - from_s):
             heat = {"link": link, "from_s": from_s, "until_s": until_s, "time_s": 40.0}
             part = float(self._rng.uniform(0.6, 1))
-            self.warm.append(
+            self.faults.append(
                 INFLUENCES["heat"].model_validate({"kind": "heat", **heat, "warmer_by_k": part * warmer})
             )
 
@@ -202,7 +213,7 @@ class Hour:
 def play(task: tuple[str, int]) -> dict[str, Any]:
     """Return the diagnoses in one hour of a hand without faults: world and number."""
     world, seed = task
-    hour, alarms = Hour(world, seed), []
+    hour, alarms = Hour(WORLDS[world], seed), []
     model = DiagnosisModel.from_deployment(hour.deployment, "right")
     diagnosis = HandDiagnostics(model, tables=_TABLES)
     began, diagnosing = time.process_time(), 0.0

@@ -99,8 +99,8 @@ def compressed(hours: float, disk: Path, recordings: Path) -> dict[str, Any]:
     ]
     replays = []
     for path in found.pop("last_recordings"):
-        with Recording(Path(path)) as recording:
-            result = replay_recording(recording, lambda _: None).result
+        recording = Recording(Path(path))
+        result = replay_recording(recording, lambda _: None).result
         replays.append((result.ticks, result.compared, result.equal))
     return found | {"replays": replays, "links": links}
 
