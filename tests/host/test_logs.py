@@ -118,6 +118,19 @@ def test_repeated_cause_is_limited_and_its_suppressed_count_logged(logger: loggi
     assert handler.suppressed == 94
 
 
+def test_a_measured_value_makes_no_cause_of_its_own(logger: logging.Logger) -> None:
+    sink = MemorySink()
+    handler = BoundedLogHandler(sink, clock=lambda: 0, limit=LogRateLimiter(burst=3, window_ns=10 * SECOND))
+    logger.addHandler(handler)
+    for late_ms in range(5):
+        logger.warning("late by %.0f ms", float(late_ms))
+        logger.warning("%s is late", f"bus {late_ms}")
+    handler.start()
+    handler.close()
+    assert [text for text in sink.texts if text.startswith("late")] == [f"late by {n} ms" for n in range(3)]
+    assert len(sink.texts) == 3 + 5
+
+
 def test_malformed_format_string_does_not_raise(
     logger: logging.Logger, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -253,9 +253,12 @@ def _encode_field(key: str, value: str) -> bytes:
 
 
 def _cause(record: logging.LogRecord) -> Cause:
-    """Return the cause of a message: logger, unformatted text, object and the object's state."""
+    """Return the cause of a message: logger, unformatted text, object and the object's state.
+
+    The object is its fields, else its first argument unless that is a measured value.
+    """
     about = " ".join(_fields(record).values())
-    if not about and isinstance(record.args, tuple) and record.args:
+    if not about and isinstance(record.args, tuple) and record.args and not isinstance(record.args[0], float):
         about = str(record.args[0])
     return record.name, str(record.msg), about, str(getattr(record, "state", ""))
 
