@@ -38,6 +38,8 @@ SERVED_S = 90.0
 """Longest time until all pads are operational again, on a machine with other load."""
 TRANSIENT_S = 60.0
 """A trouble explains warnings up to this time after it, on such a machine."""
+HOST_PAUSES = re.compile("the loop was late|late ticks by longest part|was paused")
+"""Messages about other load of the machine."""
 __all__ = ["in_own_network", "run_cycles"]
 
 
@@ -236,10 +238,11 @@ def wait_served(control: str, pads: int, processes: Processes) -> float:
 def unexplained(
     log: list[tuple[float, str, str]], acts: list[dict[str, Any]], links: list[str]
 ) -> list[tuple[float, str, str]]:
-    """Return warnings and errors that no act of the time before explains: any of its own pad, or of all."""
+    """Return warnings and errors that neither an act of the time before explains, of its own pad or of all,
+    nor other load of the machine."""
     left = []
     for at, name, line in log:
-        if not re.search(r"\b(WARNING|ERROR|CRITICAL|Traceback|Error)\b", line):
+        if HOST_PAUSES.search(line) or not re.search(r"\b(WARNING|ERROR|CRITICAL|Traceback|Error)\b", line):
             continue
         pads = {links.index(link) for link in links if re.search(rf"\b{link}\b", line)}
         near = [act for act in acts if act["from_s"] - 1 <= at <= act["until_s"] + TRANSIENT_S]
