@@ -35,8 +35,8 @@ FloatArray = NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
 PADS = {"1:1": Rectangle(1.0, 1.0), "1.8:1": Rectangle(1.8, 1.0)}
 COUNTS = (100, 400, 1600)
-TRIALS = 120
-TRIALS_ELONGATED = 20
+TRIALS = 60
+TRIALS_ELONGATED = 10
 GAIN_STD = 0.02
 
 
@@ -137,7 +137,10 @@ def points(quick: bool) -> tuple[str, list[dict[str, Any]]]:
     seeds = 2 if quick else TRIALS
     note = (
         f"{seeds} trials each; gains {100 * GAIN_STD:g} % off; root mean square over trials and "
-        "channels. The ratio's own scatter is 4 % on the square, 6 % at 1.8:1. Aim: 1.2 at most."
+        "channels; the ratio's own scatter is 5 %. Pads whose deployment states no tolerances of parts: the "
+        "daemon assumes an error of the fractions at each position that neither gains nor noise explain. So "
+        "further contacts add less than noise alone would allow, and the stated deviation is larger than "
+        "the error on pads, as here, that have no such error."
     )
     return note, [row for label in PADS for noise in (1e-4, 1e-3) for row in trials(label, noise, 0.0, seeds)]
 

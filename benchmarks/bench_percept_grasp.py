@@ -21,6 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from grasp_run import Served, drawn_world, served
 from numpy.typing import NDArray
+from scores import Rate, Share
 
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
@@ -330,6 +331,7 @@ def _delays(delays: FloatArray) -> dict[str, Any]:
     low, high = np.percentile(1e3 * delays[found], [50, 95]) if found.any() else (np.nan, np.nan)
     return {
         "slips": len(delays),
+        "detected": int(found.sum()),
         "found": float(found.mean()) if len(delays) else np.nan,
         "ms": float(low),
         "ms_95": float(high),
@@ -368,9 +370,9 @@ def _stiffness_figures(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 def write(figures: dict[str, Any], seeds: int, out: Path) -> str:
     """Write the page; return its text."""
     slip_rows = "\n".join(
-        f"| {name} | {of['slips']} | {of['found']:.0%} | {of['ms']:.0f} / {of['ms_95']:.0f} "
-        f"| {of['ms'] / 5:.0f} | {of['minutes']:.1f} | {of['false']} ({of['rolls']}) "
-        f"| {of['false_per_minute']:.1f} | {of['between']} |"
+        f"| {name} | {of['slips']} | {Share(of['detected'], of['slips'])} "
+        f"| {Share(of['detected'], of['detected'] + of['false'])} | {of['ms']:.0f} / {of['ms_95']:.0f} "
+        f"| {of['minutes']:.1f} | {of['false']} ({of['rolls']}) | {_per_minute(of)} | {of['between']} |"
         for name, of in figures["slip"].items()
     )
     rate = figures["rate"]
@@ -397,8 +399,8 @@ def write(figures: dict[str, Any], seeds: int, out: Path) -> str:
     )
     text = f"""# Percepts of grasps, against MuJoCo's ground truth
 
-The grasps of [grasp](grasp.md), {seeds} seeds, with the same errors unknown to the daemon; the daemon's
-pipeline computes all percepts at 200 Hz. {on}.
+The grasps of [grasp](grasp.md), {seeds} seeds of the reporting family, in the [world](../worlds.md)
+`default` where no other is named; the daemon's pipeline computes all percepts at 200 Hz. {on}.
 
 ## Slip
 
@@ -407,13 +409,14 @@ mm/s it is a grip (soft contacts creep), above {slip} mm/s a slip; its onset is 
 first limit, after 0.1 s of grip. An alarm is `incipient` or `sliding`, published within {after} s and
 before the contact ends.
 
-| | slips | detected | delay ms, median / 95 % | periods | min of grip | false (rolling) | per min | others |
+| | slips | detected, % | precision, % | ms, 50 / 95 % | min of grip | false (rolling) | per min | others |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {slip_rows}
 
-*False*: during a grip, from 0.1 s before to 50 ms after the alarm; in parentheses, those with the centre
-of force moving on the pad by more than 0.2 mm in 0.1 s, as of a rolling finger. *Others*: during motion
-slower than a slip, or shortly before its end. A threshold on the rate of force, |dF/dt| / F > {threshold}
+Intervals are 95 %; *ms*: delay of those detected, median and 95 %. *False*: during a grip, from 0.1 s
+before to 50 ms after the alarm; in parentheses, those with the centre of force moving on the pad by more
+than 0.2 mm in 0.1 s, as of a rolling finger. *Others*: during motion slower than a slip, or shortly before
+its end. A threshold on the rate of force, |dF/dt| / F > {threshold}
 /s, set for at most as many false alarms ({rate_false} per minute), detects {rate_found}, median {rate_ms}
 ms; with {FALSE_PER_MINUTE[0]:.0f} and {FALSE_PER_MINUTE[1]:.0f} per minute, {if_more}. Many of these
 slips don't move the centroid: a ball or a rod pulled along under a fingertip keeps its contact position.
@@ -470,6 +473,15 @@ shape fits only if the object moved by about 2 mm between touches, which increas
     return text
 
 
+def _per_minute(of: dict[str, Any]) -> str:
+    """Return the rate of false alarms with its interval."""
+    if not of["minutes"]:
+        return "-"
+    rate = Rate(of["false"], of["minutes"] / 60)
+    low, high = rate.interval
+    return f"{rate.per_hour / 60:.1f} ({low / 60:.1f}-{high / 60:.1f})"
+
+
 def _size(of: dict[str, Any]) -> str:
     radius, std = of.get("radius_mm", np.nan), of.get("radius_std_mm", np.nan)
     return f"{radius:.1f} +- {std:.1f}" if np.isfinite(radius) else "-"
@@ -493,7 +505,12 @@ def main() -> None:
             runs.append(served(deployment, name, seed, drawn_world("default", seed), perceive=True))
             progress(f"seed {seed}: {name}, {len(runs[-1].percepts)} percepts")
     runs.sort(key=lambda run: args.objects.index(run.grasp.grasped_object.name))
-    print(write({"mujoco": mujoco.__version__} | collect(runs), args.seeds, output_folder(args.quick)))
+    figures = {"mujoco": mujoco.__version__} | collect(runs)
+    for world in ("ideal", "harsh"):
+        others = [served(deployment, name, 1, drawn_world(world, 1), perceive=True) for name in args.objects]
+        figures["slip"][f"seed 1, world `{world}`"] = _together([slips(run, ALARMS) for run in others])
+        progress(f"world {world}")
+    print(write(figures, args.seeds, output_folder(args.quick)))
 
 
 if __name__ == "__main__":
