@@ -411,7 +411,7 @@ def main() -> None:
         lambda: sheet_figures(0.5 if quick else 4.0, 4 if quick else SHEET_PADS, workers),
         lambda: gum_figures(2 if quick else 32, workers),
         lambda: gain_figures(2 if quick else 60),
-        lambda: location_figures(2 if quick else 3, 3.0 if quick else math.inf),
+        lambda: location_figures(2 if quick else 3, 10.0 if quick else math.inf),
     ]
     rows = [row for part in parts for row in part()]
     out, stamp = output_folder(quick), made_by()
