@@ -133,6 +133,7 @@ def test_any_arguments_get_a_reply_and_ticks_continue(
         ("tare", {}, "pads is missing"),
         ("tare", {"pads": []}, "pads = []: must have at least 1 elements"),
         ("tare", {"pads": ["nowhere"]}, 'no pad is named "nowhere"'),
+        ("tare", {"pads": ["plaen"]}, 'did you mean "plane"? there are'),
         ("tare", {"pads": "plane"}, 'pads = "plane": must be an array'),
         ("tare", {"pads": [1]}, "pads[0] = 1: must be a string"),
         ("tare", {"pads": b"plane"}, 'pads = "binary": must be an array'),

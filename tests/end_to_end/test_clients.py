@@ -261,3 +261,6 @@ def test_the_cpp_example_stops_on_touch(working: Any, cpp: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "index_distal touched: " in done.stdout
+    unknown = [example, "right", "index_tip", working.endpoints["live"]]
+    done = subprocess.run(unknown, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+    assert (done.returncode, done.stderr[:48]) == (1, "no link index_tip; the links are thumb_proximal,")

@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from handtouch import config
-from handtouch.canbus.bus.port import BusError, Port
+from handtouch.canbus.bus.port import BusError, Port, open_bus
 from handtouch.cli import doctor_text
 from handtouch.client import keys
 from handtouch.config import shipped
@@ -197,6 +197,8 @@ def test_multicast_group_without_a_route_is_detected() -> None:
 def test_a_missing_multicast_route_is_the_reason_why_a_bus_cannot_be_opened() -> None:
     with pytest.raises(BusError, match=r"no route to ff02::1.*; ip -6 route add"):
         Port.open(bus("udp_multicast", "ff02::1"), Slab(1))
+    with pytest.raises(BusError, match=r"no route to ff02::1.*; ip -6 route add"):
+        open_bus(bus("udp_multicast", "ff02::1"))  # of simulated nodes
 
 
 def test_multicast_group_with_a_route_is_ok(network: list[str]) -> None:

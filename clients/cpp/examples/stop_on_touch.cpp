@@ -2,8 +2,9 @@
 #include <handtouch/hand.hpp>
 
 #include <cstdio>
+#include <exception>
 
-int main(int argc, char** argv) {
+int main(int argc, char** argv) try {
     if (argc < 3) {
         std::fprintf(stderr, "usage: %s HAND LINK [ENDPOINT]\n", argv[0]);
         return 2;
@@ -19,5 +20,8 @@ int main(int argc, char** argv) {
         }
     }
     std::fprintf(stderr, "no frames of hand %s for 5 s: check its name, and that handtouch runs\n", argv[1]);
+    return 1;
+} catch (const std::exception& error) {  // an unknown link
+    std::fprintf(stderr, "%s\n", error.what());
     return 1;
 }

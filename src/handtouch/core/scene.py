@@ -9,6 +9,7 @@ Public names: `ActiveScenes`, `SceneRequirements`, `Demand`, `select_pads`, `FIL
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
 
@@ -50,8 +51,10 @@ def select_pads(patterns: Sequence[str], names: Sequence[PadName]) -> BoolArray:
         full = pattern if "/" in pattern else f"*/{pattern}"
         hits = [fnmatchcase(f"{hand}/{link}", full) for hand, link in names]
         if not any(hits):
-            known = ", ".join(f"{hand}/{link}" for hand, link in names)
-            raise ValueError(f'no pad is named "{pattern}"; there are {known}')
+            known = [f"{hand}/{link}" for hand, link in names]
+            close = get_close_matches(pattern, known if "/" in pattern else [link for _, link in names], 1)
+            hint = f'did you mean "{close[0]}"? ' if close else ""
+            raise ValueError(f'no pad is named "{pattern}"; {hint}there are {", ".join(known)}')
         chosen |= np.array(hits)
     return chosen
 

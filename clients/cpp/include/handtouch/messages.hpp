@@ -95,7 +95,9 @@ struct Frame {
     std::size_t row(std::string_view link) const {
         for (std::size_t i = 0; i < links.size(); ++i)
             if (links[i] == link) return i;
-        throw std::out_of_range("no link " + std::string(link));
+        std::string known;
+        for (const std::string& name : links) known += (known.empty() ? "" : ", ") + name;
+        throw std::out_of_range("no link " + std::string(link) + "; the links are " + known);
     }
 
     bool touched(std::size_t row) const { return state_of(row) == PadState::touched; }

@@ -190,6 +190,8 @@ def open_bus(bus: Bus) -> can.BusABC:
     if bus.interface not in _INTERFACES_WITHOUT_BITRATE:
         options.setdefault("bitrate", bus.bitrate_bit_s)
     try:
+        if bus.interface == "udp_multicast":
+            check_multicast_route(str(bus.channel))
         return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
     except Exception as error:  # drivers raise anything
         raise _open_error(bus, error) from error
@@ -213,7 +215,6 @@ def _open_receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
     if bus.interface == "socketcan":
         return SocketcanReceiver(opener, str(bus.channel)).open()
     if bus.interface == "udp_multicast":
-        check_multicast_route(str(bus.channel))
         return DatagramReceiver(opener).open()
     if bus.interface == "virtual":
         return InProcessReceiver(opener).open()
