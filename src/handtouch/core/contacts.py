@@ -56,6 +56,7 @@ class ContactChanges(NamedTuple):
 
 
 _NO_PADS: IntArray = np.zeros(0, dtype=np.intp)
+_NO_CHANGES = ContactChanges(*[_NO_PADS] * len(ContactChanges._fields))
 
 
 class ContactDetector:
@@ -100,6 +101,8 @@ class ContactDetector:
             *(cycle.period_ns // 2, until_ns),
         )
         counts = stage.began, stage.ended, stage.updated, stage.silent, stage.solved
+        if not any(counts):
+            return _NO_CHANGES
         return ContactChanges(
             *[pads[:k].copy() if k else _NO_PADS for pads, k in zip(self._lists, counts, strict=True)]
         )
