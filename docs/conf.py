@@ -45,9 +45,13 @@ html_theme_options = {"source_edit_link": "", "sidebar_hide_name": False}
 
 
 def as_text(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:  # noqa: ARG001
-    """Docstrings are plain text: nothing in them is markup but `names`, and hanging lines make lists."""
+    """Docstrings are plain text but for `names`; indented blocks are code, and hanging lines make lists."""
     made: list[str] = []
-    for blank, group in itertools.groupby(lines, key=lambda line: not line.strip()):
+    for blank, grouped in itertools.groupby(lines, key=lambda line: not line.strip()):
+        group = list(grouped)
+        if not blank and all(line.startswith("    ") for line in group):
+            made += ["", ".. code-block:: python", "", *group, ""]
+            continue
         block = [re.sub(r"([|*\\]|_\b)", r"\\\1", line) for line in group]
         hanging = not blank and any(line.startswith(" ") for line in block)
         if hanging and made and made[-1].strip():

@@ -77,8 +77,11 @@ class LawValues(TypedDict):
     """Contact law of a pad's sheet."""
 
     contact_ohm_mm2: float
+    """resistance times area of the layer at the reference pressure [ohm mm^2]"""
     alpha: float
+    """its exponent of pressure"""
     ohm_per_square: float
+    """of the sheet"""
 
 
 class PadCalibration(TypedDict):

@@ -137,11 +137,11 @@ class Hand(LinkColumns):
 
     @property
     def age_s(self) -> LinkColumn[float]:
-        """Age of each pad's sample now, by `now_ns`; infinite before the first."""
+        """Age of each pad's sample now [s], by `now_ns`; infinite before the first."""
         return self._require_arrays().age_at(self.now_ns())
 
     def now_ns(self) -> int:
-        """Return the present time on the daemon's monotonic clock.
+        """Return the present time on the daemon's monotonic clock [ns].
 
         For a daemon on another machine by the wall clocks of both, which NTP or PTP must synchronise; raises
         LookupError there until the daemon's offset is received, within half a second.

@@ -88,28 +88,28 @@ class LinkColumns:
     touched = _FrameColumn[bool]("True where the pad has a contact.")
     sampled = _FrameColumn[bool]("True where the pad is sampled, so that no contact means none.")
     contact_id = _FrameColumn[int]("Id of the contact, 0 for none.")
-    sample_ns = _FrameColumn[int]("Time of the sample on the daemon's monotonic clock, 0 before the first.")
-    total_current_a = _FrameColumn[float]("Total current of the newest sample.")
-    position_m = _FrameColumn[FloatArray]("(3,) contact position in the link's frame.")
+    sample_ns = _FrameColumn[int]("Time of the sample on the daemon's clock [ns], 0 before the first.")
+    total_current_a = _FrameColumn[float]("Total current of the newest sample [A].")
+    position_m = _FrameColumn[FloatArray]("(3,) contact position in the link's frame [m].")
     normal = _FrameColumn[FloatArray]("(3,) outward unit normal of the pad at the position.")
-    covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position, row by row.")
-    pad_m = _FrameColumn[FloatArray]("(2,) arc lengths on the pad, from the electrodes x0 and y0.")
+    covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position, row by row [m^2].")
+    pad_m = _FrameColumn[FloatArray]("(2,) arc lengths on the pad, from the electrodes x0 and y0 [m].")
     position_status = _FrameColumn[int]("Status of the position, a `wire.PositionStatus`.")
-    force_n = _FrameColumn[float]("Normal force.")
-    force_std_n = _FrameColumn[float]("Its standard deviation; NaN where the force is a lower bound.")
+    force_n = _FrameColumn[float]("Normal force [N].")
+    force_std_n = _FrameColumn[float]("Its standard deviation [N]; NaN where the force is a lower bound.")
     force_status = _FrameColumn[int]("Status of the force, a `wire.ForceStatus`.")
     residual = _FrameColumn[float]("Deviation from a point contact, as in `wire.Contact`.")
     residual_std = _FrameColumn[float]("Its standard deviation for a point contact.")
     group = _FrameColumn[int]("The same for contacts that one object may bridge, 0 without contact.")
     palm_status = _FrameColumn[int]("Status in the palm's frame, a `wire.FrameStatus`.")
-    palm_position_m = _FrameColumn[FloatArray]("(3,) contact position in the palm's frame.")
+    palm_position_m = _FrameColumn[FloatArray]("(3,) contact position in the palm's frame [m].")
     palm_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the palm's frame.")
-    palm_covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position in the palm's frame.")
+    palm_covariance_m2 = _FrameColumn[FloatArray]("(9,) its covariance in the palm's frame [m^2].")
     base_status = _FrameColumn[int]("Status in the base's frame, a `wire.FrameStatus`.")
-    base_position_m = _FrameColumn[FloatArray]("(3,) contact position in the base's frame.")
+    base_position_m = _FrameColumn[FloatArray]("(3,) contact position in the base's frame [m].")
     base_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the base's frame.")
-    base_covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position in the base's frame.")
-    joints_age_s = _FrameColumn[float]("Time from the sample to the nearest joint state.")
+    base_covariance_m2 = _FrameColumn[FloatArray]("(9,) its covariance in the base's frame [m^2].")
+    joints_age_s = _FrameColumn[float]("Time from the sample to the nearest joint state [s].")
 
     def column(self, name: str) -> LinkColumn[Any]:
         """Return a column by its name. Raises LookupError while it isn't published."""
@@ -172,7 +172,7 @@ class HandArrays(LinkColumns):
         return sum_wrenches(list(self.wrenches(frame, links).values()), missing)
 
     def total_force_n(self, links: str = "*") -> tuple[float, float]:
-        """Return the sum of the normal forces on links that match a pattern, and its standard deviation.
+        """Return the sum of the normal forces on links that match a pattern, and its standard deviation [N].
 
         NaN if one of them has no valid sample or force. Raises LookupError for a pattern without a link.
         """

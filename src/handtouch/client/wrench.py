@@ -21,13 +21,14 @@ class Wrench:
     """Force and moment that contacts exert on the hand, about the origin of a frame."""
 
     force_n: FloatArray
-    """(3,) against the outward normal of a pad"""
+    """(3,) [N], against the outward normal of a pad"""
     moment_nm: FloatArray
-    """(3,) about the frame's origin"""
+    """(3,) [N m], about the frame's origin"""
     covariance: FloatArray
-    """(6, 6) of force and moment, from those of forces and positions; contacts count as independent"""
+    """(6, 6) of force and moment [N^2, N^2 m, N^2 m^2], from those of forces
+    and positions; contacts count as independent"""
     point_m: FloatArray | None
-    """(3,) contact position; None for a sum"""
+    """(3,) [m] contact position; None for a sum"""
     missing: tuple[str, ...] = ()
     """links that aren't included: without a valid sample, or a contact without valid force or position"""
 

@@ -81,7 +81,7 @@ class Rectangle:
             return np.asarray(np.arctan2(*self._tangents(ratio_x, ratio_y)) / _HALF_PI)
 
     def fractions(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Return `side_fractions`, which an ideal pad measures unchanged."""
+        """Return `side_fractions`, shape (4, ...), which an ideal pad measures unchanged."""
         return self.side_fractions(x, y)
 
     def fractions_with_jacobian(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -151,11 +151,11 @@ class Surface(ABC):
 
     @abstractmethod
     def from_rectangle(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the arc lengths (u, v) [m] of the rectangle's (x, y); exact inverse of `to_rectangle`."""
+        """Return the arc lengths u and v [m], shape (...), at the rectangle's (x, y)."""
 
     @abstractmethod
     def to_rectangle(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the rectangle coordinates (x, y) of the arc lengths (u, v) [m]."""
+        """Return the rectangle coordinates x and y, shape (...), of the arc lengths (u, v) [m]."""
 
     @abstractmethod
     def point(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
@@ -181,8 +181,7 @@ class Surface(ABC):
 
     @np.errstate(all="ignore")
     def scale(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Return the ratio of a contact's radius [m] to its radius on the rectangle: metres per rectangle
-        unit.
+        """Return the ratio of a contact's radius [m] to its radius on the rectangle, shape (...).
 
         On an anisotropic sheet a round contact becomes an ellipse, which spreads current as a disc with the
         mean of its half axes for radius does (its logarithmic capacity), so this is the harmonic mean of

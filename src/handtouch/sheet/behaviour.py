@@ -63,7 +63,7 @@ class SheetModel:
         )
 
     def discretise(self, dt_s: float) -> SheetStep:
-        """Precompute one step of `dt_s`."""
+        """Precompute one step of `dt_s`. Raises ValueError unless it is at least 0 and finite."""
         if not 0 <= dt_s < np.inf:
             raise ValueError(f"dt_s must be at least 0 and finite, got {dt_s}")
         return SheetStep(self, dt_s)
