@@ -15,6 +15,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import electrode_network, part_stds
 from tests.core.conftest import DEPLOYMENT, TOLERANT_DEPLOYMENT
+from tests.deployments import deployment_text, pad_text
 
 FloatArray = NDArray[np.float64]
 RESISTED = 2
@@ -208,3 +209,29 @@ def squared_distances(deployment: Deployment, model: PadModel, rng: np.random.Ge
 
 def sides(networks: list[ElectrodeNetwork]) -> FloatArray:
     return np.array([(network.a, network.b) for network in networks])
+
+
+def test_weak_contacts_on_a_long_pad_lie_in_the_stated_regions() -> None:
+    """In its middle they have a plateau of probability, or two maxima."""
+    long = '{ kind = "plane", length_mm = 80.0, width_mm = 20.0 }'
+    deployment = parse(deployment_text(pad_text("long", 1, long)))
+    model, rng = PadModel(deployment), np.random.default_rng(2)
+    currents, values, distances = np.zeros((1, 4)), np.full((1, VALUE_COUNT), np.nan), []
+    solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
+    for _ in range(25):
+        network, gains = drawn_network(deployment, 0, rng), np.exp(rng.normal(0, 0.0115, 4))
+        for x, y, log_total in rng.uniform((0.05, 0.05, -4.6), (0.95, 0.95, -4.0), (16, 3)):
+            fractions = network.fractions(x * network.a, y * network.b)
+            currents[0] = gains * 10**log_total * fractions + model.noise_a[0] * rng.normal(size=4)
+            values[:] = np.nan
+            solver.solve_contacts(np.zeros(1, np.intp).data)
+            if not np.isfinite(values[0, VALUE_SLICES["position_m"]]).all():
+                continue
+            along = np.linalg.svd(values[:, VALUE_SLICES["normal"]])[2][1:]
+            at = np.array([x * model.networks[0].a]), np.array([y * model.networks[0].b])
+            true = model.placement.to_link_frame(np.zeros(1, np.intp), *at, np.zeros((1, 2, 2))).position_m[0]
+            error = along @ (values[0, VALUE_SLICES["position_m"]] - true)
+            covariance = along @ values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3) @ along.T
+            distances.append(float(error @ np.linalg.solve(covariance, error)))
+    assert np.mean(np.array(distances) < chi2.ppf(0.95, 2)) > 0.92  # 0.87 by the curvature at the maximum
+    assert np.mean(np.array(distances) > 25) < 0.01

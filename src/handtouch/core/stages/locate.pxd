@@ -8,6 +8,8 @@ cdef Py_ssize_t _MAX_WHITENINGS
 cdef double _MAX_WHITENING_CELLS
 cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
 cdef double _MAX_EDGE_CELLS, _UNIFORM_VARIANCE, _MIN_INFORMATION, _INFINITY, _HALF_PI
+cdef double _MIN_LONG_ASPECT, _MAX_PROFILE_STEP, _MAX_INSIDE, _TWO_PI
+cdef Py_ssize_t _PROFILE_POINTS, _PROFILE_STEPS
 
 cdef class ModelTable:
     cdef double[::1] values, nodes_x, nodes_y, search_fractions, search_cells
@@ -52,6 +54,8 @@ cdef bint _maximise(ModelTable table, Fit fit, bint tracked) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, points=Py_ssize_t, first=Py_ssize_t, second=Py_ssize_t,
                peak=Py_ssize_t)
 cdef void _search(ModelTable table, Fit fit, bint located) noexcept
+@cython.locals(k=Py_ssize_t, _=Py_ssize_t, along_x=bint, uncertain=bint)
+cdef void _add_other_positions(ModelTable table, Fit fit) noexcept
 @cython.locals(k=Py_ssize_t, row=Py_ssize_t, column=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, best=Py_ssize_t,
                is_peak=bint)
 cdef Py_ssize_t _highest_peak(Fit fit, Py_ssize_t points, Py_ssize_t excluded) noexcept

@@ -32,7 +32,10 @@ _MAX_EDGE_CELLS = 0.5  # of a position on an edge
 _EDGE_BISECTIONS = 12
 _MIN_CORNER_ANGLE_RAD = 0.02
 _MIN_INFORMATION = 1e-300
-_INFINITY, _HALF_PI = math.inf, 0.5 * math.pi
+_MIN_LONG_ASPECT = 2.0  # of a pad on which positions far apart can have the same currents, but for noise
+_PROFILE_POINTS, _PROFILE_STEPS, _MAX_PROFILE_STEP = 20, 4, 3.0  # positions, steps across and cells of a step
+_MAX_INSIDE = 9.0  # squared deviations: within, the covariance represents the probability
+_INFINITY, _HALF_PI, _TWO_PI = math.inf, 0.5 * math.pi, 2.0 * math.pi
 
 
 class ModelTable:
@@ -145,6 +148,7 @@ def locate(
         _refine(table, fit, pad, known, number)
     fit.found = fit.total > 0.0
     if fit.found:
+        _add_other_positions(table, fit)
         _move_out_of_corner(table, fit)
         _widen_at_edge(table, fit, True)
         _widen_at_edge(table, fit, False)
@@ -364,6 +368,54 @@ def _search(table: ModelTable, fit: Fit, located: bool) -> None:
     fit.s, fit.t = best_s, best_t
     _linearise(table, fit)
     fit.step_s = fit.step_t = fit.decrement = 0.0
+
+
+def _add_other_positions(table: ModelTable, fit: Fit) -> None:
+    """Add the probability of positions along a long pad that are more than three deviations away.
+
+    In its middle the currents of the far electrodes vanish: weak contacts have a plateau of probability
+    there, or a second maximum beyond it. The currents of the near ones determine the other coordinate.
+    """
+    along_x = table.side_x > table.side_y
+    longer, shorter = max(table.side_x, table.side_y), min(table.side_x, table.side_y)
+    variance = fit.var_x if along_x else fit.var_y
+    uncertain = _MAX_TRACKED_VARIANCE * shorter * shorter < variance < 1e300
+    if longer < _MIN_LONG_ASPECT * shorter or not uncertain:
+        return
+    s, t, cost, total = fit.s, fit.t, fit.cost, fit.total
+    outside = moment = 0.0
+    for k in range(_PROFILE_POINTS):
+        at = longer * (k + 0.5) / _PROFILE_POINTS
+        away = at - (fit.x if along_x else fit.y)
+        if away * away <= _MAX_INSIDE * variance:
+            continue
+        fit.s, fit.t = s, t
+        if along_x:
+            fit.s = _cell_at(table.nodes_x, table.cells, at)
+        else:
+            fit.t = _cell_at(table.nodes_y, table.cells, at)
+        _linearise(table, fit)
+        for _ in range(_PROFILE_STEPS):
+            if along_x and fit.total > 0.0 and fit.yy > 0.0:
+                step = fit.gradient_y / (fit.yy * fit.total)
+                fit.t = _clamp(table, fit.t + max(-_MAX_PROFILE_STEP, min(_MAX_PROFILE_STEP, step)))
+            elif fit.total > 0.0 and fit.xx > 0.0:
+                step = fit.gradient_x / (fit.xx * fit.total)
+                fit.s = _clamp(table, fit.s + max(-_MAX_PROFILE_STEP, min(_MAX_PROFILE_STEP, step)))
+            _linearise(table, fit)
+        if fit.total > 0.0:
+            weight = math.exp(-0.5 * max(fit.cost - cost, 0.0)) * longer / _PROFILE_POINTS
+            outside += weight
+            moment += weight * away * away
+    fit.s, fit.t = s, t
+    _linearise(table, fit)
+    fit.cost, fit.total = cost, total
+    fit.step_s = fit.step_t = fit.decrement = 0.0
+    added = moment / (outside + math.sqrt(_TWO_PI * variance))
+    if along_x:
+        fit.var_x += added
+    else:
+        fit.var_y += added
 
 
 def _highest_peak(fit: Fit, points: int, excluded: int) -> int:
