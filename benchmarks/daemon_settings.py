@@ -1,10 +1,11 @@
 """Pipeline with the daemon's own settings, for benchmarks that measure what the daemon computes.
 
-Public name: `pipeline_of`.
+Public names: `pipeline_of`; `decoded`, a message as a subscriber has it.
 """
 
 from __future__ import annotations
 
+from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
@@ -32,3 +33,8 @@ def pipeline_of(
     )
     pipeline.node_state[:] = PadState.CLEAR
     return pipeline
+
+
+def decoded(message: wire.OutgoingMessage) -> wire.Message:
+    """Return what a subscriber decodes of a message."""
+    return wire.decode(wire.encode(message))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import zmq
-from daemon_settings import pipeline_of
+from daemon_settings import decoded, pipeline_of
 from inline_process import InlineProcess
 from numpy.typing import NDArray
 
@@ -169,10 +169,11 @@ class _Run:
         return topic.startswith(("contact/", "percept/"))
 
     def send(self, message: wire.OutgoingMessage) -> None:
-        if isinstance(message, wire.Contact):
-            self.contacts.append(message)
-        elif isinstance(message, wire.Percept):
-            self.percepts.append(message)
+        received = decoded(message)
+        if isinstance(received, wire.Contact):
+            self.contacts.append(received)
+        elif isinstance(received, wire.Percept):
+            self.percepts.append(received)
 
     def tick(self, step: int, counts: NDArray[np.int64]) -> None:
         since_ns = round(step * TIME_STEP_S * 1e9)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from daemon_settings import pipeline_of
+from daemon_settings import decoded, pipeline_of
 from numpy.typing import NDArray
 from oracle import PadOracle
 from scores import Estimates, bin_labels
@@ -43,8 +43,11 @@ class Collector:
         return topic.startswith("contact/")
 
     def send(self, message: wire.OutgoingMessage) -> None:
-        if self.sampled is not None and isinstance(message, wire.Contact) and message.event != "end":
-            self.contacts[self.sampled, message.link] = message
+        if self.sampled is None:
+            return
+        contact = decoded(message)
+        if isinstance(contact, wire.Contact) and contact.event != "end":
+            self.contacts[self.sampled, contact.link] = contact
 
 
 def draw_touches(links: Sequence[str], count: int, seed: int) -> tuple[ScenarioTouch, ...]:

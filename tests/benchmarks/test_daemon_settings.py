@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from daemon_settings import pipeline_of
+from hand_touches import serve
 from numpy.typing import NDArray
 
 from handtouch import wire
@@ -83,6 +84,17 @@ def test_a_benchmarks_pipeline_computes_what_the_daemons_does(tmp_path: Path) ->
     for mine, other in zip(*results, strict=True):
         for a, b in zip(mine, other, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+def test_a_benchmark_of_touches_has_the_contact_of_every_touched_pad() -> None:
+    deployment = load(shipped.path("utah_mit.toml"))
+    model = PadModel(deployment)
+    counts = np.zeros((TICKS, model.size, 4), np.int64)
+    counts[10:, :2] = 200
+    contacts = serve(model, deployment, counts, {TICKS - 1: 7})
+    assert {key: contact.link for key, contact in contacts.items()} == {
+        (7, link): link for link in model.links[:2]
+    }
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
