@@ -129,6 +129,13 @@ def test_an_unknown_command_or_choice_is_reported_with_the_closest(
     assert f"did you mean '{closest}'?" in capsys.readouterr().err
 
 
+def test_an_unknown_command_like_no_other_refers_to_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["xyzzy"])
+    assert ended.value.code == 2
+    assert "invalid choice: 'xyzzy'; see `handtouch --help`" in capsys.readouterr().err
+
+
 WITHOUT_DATA = {
     *("demo", "run", "simulate", "view", "bridge ros2", "bridge zenoh", "keys revoke"),
     *("calibrations export", "support"),  # write files of JSON

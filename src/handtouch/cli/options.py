@@ -16,6 +16,8 @@ EXIT_STATUS_HELP = (
     "invalid, or a package that isn't installed; 130 interrupted before the end."
 )
 
+MAX_LISTED_CHOICES = 10
+"""of an error message"""
 LIVE_HELP = "endpoint of the daemon's live stream, which drops what a slow subscriber can't take"
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -47,6 +49,8 @@ class SuggestingParser(argparse.ArgumentParser):
             choices = re.findall(r"[\w-]+", found[3])
             if close := difflib.get_close_matches(found[2], choices, 1):
                 message = f"{found[1]}; did you mean {close[0]!r}?"
+            elif len(choices) > MAX_LISTED_CHOICES:
+                message = f"{found[1]}; see `{self.prog} --help`"
         super().error(message)
 
 
