@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import os
+import time
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +26,7 @@ from handtouch.bridge.ros2.conversion import (
     wrench_message,
 )
 from handtouch.bridge.ros2.messages import MESSAGE_TYPES
-from handtouch.bridge.ros2.network import ros_name
+from handtouch.bridge.ros2.network import Quality, RosNetwork, ros_name
 from handtouch.bridge.ros2.type_hash import ros_type_name, type_hash
 from tests.client.hand_messages import make_contact
 
@@ -164,3 +167,28 @@ def test_the_ellipse_has_the_axes_of_the_covariance(store: Any) -> None:
 )
 def test_names_fit_the_rules_of_ros(text: str, name: str) -> None:
     assert ros_name(text) == name
+
+
+def test_a_topic_is_read_while_it_has_a_reader_and_always_if_its_last_message_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is encoded for a topic that isn't read."""
+    interface = '<Interfaces><NetworkInterface name="lo"/></Interfaces><AllowMulticast>false</AllowMulticast>'
+    monkeypatch.setenv(
+        "CYCLONEDDS_URI", f"<CycloneDDS><Domain><General>{interface}</General></Domain></CycloneDDS>"
+    )
+    network = RosNetwork(os.getpid() % 200)
+    wrenches = network.writer("wrench", ros.WrenchStamped, Quality.SENSOR_DATA)
+    assert network.writer("markers", ros.MarkerArray, Quality.STATE).is_read
+    assert not wrenches.is_read
+    reader = network.reader("wrench", ros.WrenchStamped, Quality.SENSOR_DATA)
+    end_s = time.monotonic() + 60
+    received: list[Any] = []
+    while not received and time.monotonic() < end_s:
+        wrenches.write(ros.WrenchStamped(make_stamper().header(1, "index_tip"), ros.RosWrench()))
+        received = reader.take(1)
+    assert received
+    del reader
+    while wrenches.is_read and time.monotonic() < end_s:
+        gc.collect()
+    assert not wrenches.is_read

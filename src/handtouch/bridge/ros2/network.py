@@ -1,6 +1,6 @@
 """DDS participant with ROS 2's names, qualities of service and type hashes.
 
-Public names: `RosNetwork`, `Quality`, `RosNetworkError`, `ros_name`.
+Public names: `RosNetwork`, `RosWriter`, `Quality`, `RosNetworkError`, `ros_name`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import re
 from enum import Enum
 from typing import Any
 
-from cyclonedds.core import DDSException, Policy, Qos
+from cyclonedds.core import DDSException, Listener, Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.pub import DataWriter
@@ -48,6 +48,35 @@ class Quality(Enum):
         )
 
 
+class RosWriter:
+    """Writer of a topic, created by `RosNetwork.writer`."""
+
+    def __init__(self, participant: DomainParticipant, topic: Topic[Any], qos: Qos, quality: Quality) -> None:
+        self._is_kept, self._readers = quality is Quality.STATE, _ReaderCount()
+        self._writer = DataWriter[Any](participant, topic, qos=qos, listener=self._readers)
+
+    @property
+    def is_read(self) -> bool:
+        """There is a reader, or there may be one later that receives the last message."""
+        return self._is_kept or self._readers.count > 0
+
+    def write(self, message: IdlStruct) -> None:
+        """Send a message, unless it isn't read: encoding costs most of a bridge's time."""
+        if self.is_read:
+            self._writer.write(message)
+
+
+class _ReaderCount(Listener):
+    """Number of matched readers; DDS calls it in a thread of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.count = 0
+
+    def on_publication_matched(self, writer: object, status: Any) -> None:  # noqa: ARG002
+        self.count = status.current_count
+
+
 class RosNetwork:
     """Participant of a domain; topics are below `namespace`, absolute ones (with a slash in front) not.
 
@@ -64,10 +93,10 @@ class RosNetwork:
             ) from error
         self._namespace = namespace.strip("/")
 
-    def writer(self, name: str, kind: type[IdlStruct], quality: Quality) -> DataWriter[Any]:
+    def writer(self, name: str, kind: type[IdlStruct], quality: Quality) -> RosWriter:
         """Return a writer of a topic."""
         qos = quality.qos + Qos(_type_hash_policy(kind))
-        return DataWriter(self._participant, self._topic(name, kind), qos=qos)
+        return RosWriter(self._participant, self._topic(name, kind), qos, quality)
 
     def reader(self, name: str, kind: type[IdlStruct], quality: Quality) -> DataReader[Any]:
         """Return a reader of a topic."""

@@ -8,13 +8,12 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from handtouch import wire
 from handtouch.bridge.ros2 import conversion
 from handtouch.bridge.ros2 import messages as ros
 from handtouch.bridge.ros2.conversion import Stamper
-from handtouch.bridge.ros2.network import Quality, RosNetwork, ros_name
+from handtouch.bridge.ros2.network import Quality, RosNetwork, RosWriter, ros_name
 from handtouch.client.robot import Robot
 
 TOPICS = ("contact/*/*", "hand/*", "health/*/*", "service")
@@ -116,7 +115,7 @@ class _HandRelay:
         self._root = ros_name(name)
         self._contacts = network.writer(f"{self._root}/contacts", ros.ContactArray, Quality.SENSOR_DATA)
         self._markers = network.writer(f"{self._root}/markers", ros.MarkerArray, Quality.STATE)
-        self._wrenches: dict[str, Any] = {}
+        self._wrenches: dict[str, RosWriter] = {}
         self._tick_contacts: list[wire.Contact] = []
         self._active: dict[str, wire.Contact] = {}
         self._shown: dict[str, str] = {}  # link with markers -> its frame
@@ -129,16 +128,18 @@ class _HandRelay:
             self._active.pop(contact.link, None)
         else:
             self._active[contact.link] = contact
-        if (wrench := conversion.wrench_message(contact, self._stamper)) is not None:
-            self._writer_of(contact.link).write(wrench)
+        writer = self._writer_of(contact.link)
+        if writer.is_read and (wrench := conversion.wrench_message(contact, self._stamper)) is not None:
+            writer.write(wrench)
 
     def end_tick(self, frame: wire.HandFrame) -> None:
         """Publish the contacts of the tick whose frame this is, which follows them."""
         contacts, self._tick_contacts = self._tick_contacts, []
         self.links = frame.links
-        header = self._stamper.header(frame.t_ns, self._palm_link)
-        converted = [conversion.contact_message(contact, self._stamper) for contact in contacts]
-        self._contacts.write(ros.ContactArray(header, frame.session, frame.tick, self._name, converted))
+        if self._contacts.is_read:
+            header = self._stamper.header(frame.t_ns, self._palm_link)
+            converted = [conversion.contact_message(contact, self._stamper) for contact in contacts]
+            self._contacts.write(ros.ContactArray(header, frame.session, frame.tick, self._name, converted))
         if contacts:
             self._send_palm_wrench(frame.t_ns)
         if abs(frame.t_ns - self._marked_ns) >= _MARKER_PERIOD_NS:
@@ -155,11 +156,11 @@ class _HandRelay:
         self._send_markers(t_ns)
 
     def _send_palm_wrench(self, t_ns: int) -> None:
-        if not self._palm_link:
+        if not self._palm_link or not (writer := self._writer_of("")).is_read:
             return
         wrench = conversion.palm_wrench(self._active.values(), t_ns, self._palm_link, self._stamper)
         if wrench is not None:
-            self._writer_of("").write(wrench)
+            writer.write(wrench)
 
     def _send_markers(self, t_ns: int) -> None:
         self._marked_ns = t_ns
@@ -177,7 +178,7 @@ class _HandRelay:
     def _number(self, link: str) -> int:
         return self.links.index(link) if link in self.links else len(self.links)
 
-    def _writer_of(self, link: str) -> Any:
+    def _writer_of(self, link: str) -> RosWriter:
         """Return the writer of a link's wrench; of the palm's for an empty name."""
         if link not in self._wrenches:
             parts = [self._root, ros_name(link), "wrench"] if link else [self._root, "wrench"]
