@@ -19,6 +19,14 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 _Columns = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]
 
+_NO_COLUMNS: _Columns = (
+    np.zeros(0, np.intp),
+    np.zeros(0, np.intp),
+    np.zeros((0, 3)),
+    np.zeros((0, 3)),
+    np.zeros(0),
+)
+
 
 @dataclass(frozen=True)
 class LinkPoints:
@@ -70,6 +78,8 @@ class ContactReader:
         return LinkPoints(*columns)
 
     def _read_one(self, environment: int, data: Any) -> _Columns:
+        if not data.ncon:
+            return _NO_COLUMNS
         contacts = data.contact
         geoms = contacts.geom.reshape(-1, 2)
         side, pad, number = np.nonzero(self._senses[:, geoms.T].transpose(1, 0, 2))
@@ -77,8 +87,7 @@ class ContactReader:
         side, pad, number = side[pressed], pad[pressed], number[pressed]
         k = len(pad)
         if not k:
-            none = np.zeros(0, np.intp)
-            return none, none, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+            return _NO_COLUMNS
         forces = np.empty((k, 6))
         for row, contact in enumerate(number.tolist()):
             mujoco.mj_contactForce(self._model, data, contact, forces[row])

@@ -1,0 +1,146 @@
+"""Learn to hold objects of unknown weight and friction with little force, with touch and without.
+
+A linear policy in MuJoCo: the grip force is a constant, plus gains times how far and how fast the contact has
+slid over the thumb's pad. The cross-entropy method tunes them; without touch only the constant. Draws both
+learning curves and the forces for objects that weren't trained on. Needs the extras `gym` and `figures`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats.qmc import Halton
+
+from handtouch.simulate.tactile.grip_environment import (
+    EPISODE_STEPS,
+    MAX_RATE_N_S,
+    PERIOD_S,
+    GripEnvironments,
+    objects_at,
+)
+
+FloatArray = NDArray[np.float64]
+
+CANDIDATES, ELITES = 16, 4
+TRAINED = np.array([[0.05, 0.05], [0.05, 0.95], [0.95, 0.05], [0.95, 0.95], [0.5, 0.5]])
+"""Quantiles of mass and friction of the objects to learn with: light to heavy, slippery to rough."""
+OBJECTS = len(TRAINED)
+MEAN, STD = np.array([2.5, 1.0, 0.0]), np.array([1.5, 0.5, 0.02])
+"""First distribution of the policies: constant [N], gain of the distance [N/mm] and of the speed [N s/mm]."""
+MIN_STD = 0.1 * STD
+WEIGHT_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What policies (count, 3) achieved in an episode each; arrays (count,)."""
+
+    cost: FloatArray
+    force_n: FloatArray
+    """at the end"""
+    dropped: NDArray[np.bool_]
+
+
+def other_objects(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return masses [kg] and coefficients of friction (count,) that cover the range evenly."""
+    return objects_at(Halton(2, seed=2).random(count))
+
+
+def run(grips: GripEnvironments, policies: FloatArray, objects: tuple[FloatArray, FloatArray]) -> Outcome:
+    """Run an episode of each policy (count, 3) with its object."""
+    observation, info = grips.reset(options={"objects": objects})
+    cost = np.zeros(grips.num_envs)
+    begin_mm: FloatArray | None = None
+    before_mm = np.zeros(grips.num_envs)
+    for _ in range(EPISODE_STEPS):
+        touched, x_m = observation["observation.touch"][:, :2].T.astype(np.float64)
+        begin_mm = 1e3 * x_m if begin_mm is None or not touched.all() else begin_mm
+        slid_mm = np.where(touched > 0, 1e3 * x_m - begin_mm, before_mm)
+        speed_mm_s, before_mm = (slid_mm - before_mm) / PERIOD_S, slid_mm
+        features = np.stack([np.ones(grips.num_envs), slid_mm, speed_mm_s])
+        target_n = np.einsum("nk,kn->n", policies, features)
+        error_n = target_n - observation["observation.state"][:, 0]
+        action = np.clip(error_n / (MAX_RATE_N_S * PERIOD_S), -1, 1).astype(np.float32)
+        observation, reward, dropped, _, info = grips.step(action[:, None])
+        cost -= reward
+    return Outcome(cost, info["grip_force_n"], dropped)
+
+
+def learn(
+    grips: GripEnvironments, touch: bool, generations: int, report: Callable[[int, Outcome], None]
+) -> FloatArray:
+    """Return the policy (3,) found; `report` is given what each generation's mean does with other objects."""
+    random, used = np.random.default_rng(7), np.array([1, touch, touch])
+    mean: FloatArray = MEAN * used
+    std: FloatArray = STD * used
+    test, (mass_kg, friction) = other_objects(grips.num_envs), objects_at(TRAINED)
+    objects = np.tile(mass_kg, CANDIDATES), np.tile(friction, CANDIDATES)
+    for generation in range(generations):
+        report(generation, run(grips, np.tile(mean, (grips.num_envs, 1)), test))
+        candidates = mean + std * random.standard_normal((CANDIDATES, 3))
+        cost = run(grips, np.repeat(candidates, OBJECTS, axis=0), objects).cost
+        best = candidates[np.argsort(cost.reshape(CANDIDATES, OBJECTS).mean(axis=1))[:ELITES]]
+        mean, std = best.mean(axis=0), np.maximum(best.std(axis=0), MIN_STD * used)
+    report(generations, run(grips, np.tile(mean, (grips.num_envs, 1)), test))
+    return mean
+
+
+def draw(path: Path, outcomes: dict[str, list[Outcome]], objects: tuple[FloatArray, FloatArray]) -> None:
+    """Draw learning curves, and final forces over the least force that holds each object."""
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    from matplotlib import pyplot
+
+    figure, (curves, forces) = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    needed_n = 0.5 * WEIGHT_M_S2 * objects[0] / objects[1]
+    for (name, found), colour in zip(outcomes.items(), ("tab:blue", "tab:orange"), strict=True):
+        curves.plot([outcome.cost.mean() for outcome in found], color=colour, marker="o", ms=3, label=name)
+        last = found[-1]
+        held = ~last.dropped
+        forces.plot(needed_n[held], last.force_n[held], "o", color=colour, ms=4, label=name)
+        forces.plot(needed_n[~held], last.force_n[~held], "x", color=colour, ms=6)
+    curves.set(xlabel="generation", ylabel="mean cost of objects not trained on")
+    line = np.array([0.0, needed_n.max()])
+    forces.plot(line, line, "k--", lw=1, label="least force")
+    forces.set(xlabel="least force that holds the object [N]", ylabel="final grip force [N]; x: dropped")
+    curves.legend()
+    forces.legend()
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Learn both policies and draw them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--generations", type=int, default=6)
+    parser.add_argument("--world", default="default", help="imperfections of the sensor (default: default)")
+    parser.add_argument("--figure", type=Path, default=Path("learn_grip.png"))
+    arguments = parser.parse_args()
+    grips = GripEnvironments(CANDIDATES * OBJECTS, arguments.world)
+    outcomes: dict[str, list[Outcome]] = {"with touch": [], "without touch": []}
+    for name, found in outcomes.items():
+
+        def report(generation: int, outcome: Outcome, name: str = name, found: Any = found) -> None:
+            found.append(outcome)
+            print(
+                f"{name}, generation {generation:2}: cost {outcome.cost.mean():6.2f}, final force "
+                f"{outcome.force_n.mean():.2f} N, dropped {outcome.dropped.sum()} of {len(outcome.dropped)}",
+                flush=True,
+            )
+
+        policy = learn(grips, name == "with touch", arguments.generations, report)
+        print(f"{name}: {policy[0]:.2f} N + {policy[1]:.2f} N/mm x slid + {policy[2]:.3f} N s/mm x speed")
+    draw(arguments.figure, outcomes, other_objects(grips.num_envs))
+    print(f"figure: {arguments.figure}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,247 @@
+"""A Gymnasium task on MuJoCo and `TactileSensor`: hold an object of unknown weight and friction gently.
+
+Public names: `GripEnvironments` (many at once), `GripEnvironment` (one), `FEATURES`, `objects_at`.
+Needs the extra `gym`.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.config import shipped
+from handtouch.simulate.tactile.sensor import TactileReading, TactileSensor
+
+FloatArray = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+
+PERIOD_S = 0.01
+"""Time of a step: the SYNC period of the deployment."""
+EPISODE_STEPS = 120
+MIN_FORCE_N, MAX_FORCE_N, INITIAL_FORCE_N = 0.3, 8.0, 1.0
+MAX_RATE_N_S = 30.0
+"""Greatest change of the grip force, for the actions -1 and 1."""
+MAX_SLIP_M = 8e-3
+"""The object counts as dropped when it has slid so far."""
+DROP_COST = 10.0
+MASS_KG, FRICTION = (0.03, 0.15), (0.3, 1.0)
+"""Limits of the objects, log-uniform."""
+_LIFT_S = (0.2, 0.7)
+"""The object's weight is transferred from its support to the grip in this time."""
+_PADS = ("thumb_tip", "index_tip")
+_SCENE = """
+<mujoco>
+  <option timestep="0.002" cone="elliptic" impratio="20"/>
+  <default><geom condim="3" friction="0.01 0.005 0.0001"/></default>
+  <worldbody>
+    <body name="thumb_tip" quat="0.70710678 0 0.70710678 0">
+      <geom type="box" size="0.015 0.012 0.002" pos="0 0 -0.002"/>
+    </body>
+    <body name="object" pos="0.02 0 0">
+      <joint name="object_x" type="slide" axis="1 0 0"/>
+      <joint name="object_z" type="slide" axis="0 0 1"/>
+      <geom name="bead" type="sphere" size="0.0213" pos="0.0013 0 0" mass="0.05"/>
+      <geom name="back" type="box" size="0.002 0.02 0.02" pos="0.025 0 0" mass="0.05"/>
+    </body>
+    <body name="index_tip" pos="0.0593 0 0" quat="0.70710678 0 -0.70710678 0">
+      <joint name="finger" type="slide" axis="0 0 1" damping="5" range="-0.01 0.05"/>
+      <geom type="sphere" size="0.012" mass="0.02"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="finger"/></actuator>
+</mujoco>
+"""  # the thumb's plate faces +x, the index finger's tip closes along -x, gravity acts along -z
+
+_TOUCH = ("touched", "x_m", "y_m", "force_n", "force_std_n")
+FEATURES: Mapping[str, Mapping[str, Any]] = {
+    "observation.state": {"dtype": "float32", "shape": (2,), "names": ["grip_force_n", "finger_m"]},
+    "observation.touch": {
+        "dtype": "float32",
+        "shape": (len(_PADS) * len(_TOUCH),),
+        "names": [f"{pad}.{name}" for pad in _PADS for name in _TOUCH],
+    },
+    "action": {"dtype": "float32", "shape": (1,), "names": ["grip_force_rate"]},
+}
+"""Observations and action as LeRobot declares the features of a dataset; its `fps` is 1 / PERIOD_S."""
+
+
+class _Grips:
+    """Simulations of `count` grips; arrays have the first axis (count,)."""
+
+    def __init__(self, count: int, world: str, seed: int) -> None:
+        model = mujoco.MjModel.from_xml_string(_SCENE)
+        self.models = [copy.copy(model) for _ in range(count)]
+        self.states = [mujoco.MjData(own) for own in self.models]
+        self.sensor = TactileSensor(
+            config.load(shipped.path("two_finger.toml")), model, world, seed, environments=count
+        )
+        self.force_n, self.steps = np.full(count, INITIAL_FORCE_N), np.zeros(count, np.int64)
+        self.dropped = np.zeros(count, np.bool_)
+        self._mass_kg = np.zeros(count)
+        self._body = model.body("object").id
+        self._geoms = [model.geom(name).id for name in ("bead", "back")]
+        self.touch = np.zeros((count, len(_PADS) * len(_TOUCH)), np.float32)
+
+    def reset(self, number: int, mass_kg: float, friction: float) -> None:
+        """Put a new object into a grip, supported."""
+        model, data = self.models[number], self.states[number]
+        model.body_inertia[self._body] *= mass_kg / model.body_mass[self._body]
+        model.body_mass[self._body] = mass_kg
+        model.geom_friction[self._geoms, 0] = friction
+        mujoco.mj_setConst(model, data)
+        mujoco.mj_resetData(model, data)
+        self._mass_kg[number], self.force_n[number] = mass_kg, INITIAL_FORCE_N
+        self.steps[number], self.dropped[number] = 0, False
+
+    def read(self) -> None:
+        """Sense all grips."""
+        self.touch = _touch(self.sensor.read(self.states))
+
+    def step(self, actions: FloatArray) -> FloatArray:
+        """Apply actions (count,) for a period; return the rewards (count,)."""
+        active = ~self.dropped
+        rate_n_s = MAX_RATE_N_S * np.clip(actions, -1.0, 1.0)
+        self.force_n = np.where(
+            active, np.clip(self.force_n + PERIOD_S * rate_n_s, MIN_FORCE_N, MAX_FORCE_N), self.force_n
+        )
+        before_m = self.slip_m
+        for number in np.flatnonzero(active).tolist():
+            self._advance(number)
+        self.steps += active
+        self.read()
+        slid_m = self.slip_m
+        self.dropped |= slid_m > MAX_SLIP_M
+        cost = PERIOD_S * self.force_n + 100.0 * np.maximum(slid_m - before_m, 0.0)
+        left_s = PERIOD_S * (EPISODE_STEPS - self.steps)
+        return np.where(active, -cost - self.dropped * (DROP_COST + left_s * MAX_FORCE_N), 0.0)
+
+    @property
+    def slip_m(self) -> FloatArray:
+        """How far the objects have slid down."""
+        return np.array([-data.qpos[1] for data in self.states])
+
+    @property
+    def state(self) -> NDArray[np.float32]:
+        """Commanded force and position of the finger (count, 2)."""
+        finger_m = [data.qpos[2] for data in self.states]
+        return np.stack([self.force_n, finger_m], axis=1).astype(np.float32)
+
+    def _advance(self, number: int) -> None:
+        data = self.states[number]
+        data.ctrl[0] = self.force_n[number]
+        begin_s, end_s = _LIFT_S
+        supported = float(np.clip((end_s - data.time) / (end_s - begin_s), 0.0, 1.0))
+        data.xfrc_applied[self._body, 2] = supported * 9.81 * self._mass_kg[number]
+        mujoco.mj_step(self.models[number], data, self.sensor.steps)
+
+
+def _touch(reading: TactileReading) -> NDArray[np.float32]:
+    """Return touched, position and force of each pad (count, pads x 5); 0 for what isn't known."""
+    position_m = reading.position_m
+    columns = [reading.touched, position_m[..., 0], position_m[..., 1], reading.force_n, reading.force_std_n]
+    return np.nan_to_num(np.stack(columns, axis=-1, dtype=np.float32)).reshape(len(position_m), -1)
+
+
+def _observation_space() -> gymnasium.Space[Any]:
+    return Dict(
+        {
+            name: Box(-np.inf, np.inf, feature["shape"], np.float32)
+            for name, feature in FEATURES.items()
+            if name.startswith("observation.")
+        }
+    )
+
+
+class GripEnvironments(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+    """`count` grips with a sensor of the world `world`, drawn by `seed`.
+
+    An object of unknown weight and friction, held at `INITIAL_FORCE_N`, loses its support; an action
+    (count, 1) in [-1, 1] changes the grip force. A reward is minus the grip's impulse [N s] and 0.1 per
+    millimetre of slip; a dropped object costs `DROP_COST` and the greatest force until the end.
+    Observations: see `FEATURES`. `reset` takes `options={"reset_mask": (count,)}`, as there is no autoreset.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_modes": []}  # noqa: RUF012
+
+    def __init__(self, count: int, world: str = "default", seed: int = 1) -> None:
+        self.num_envs, self.render_mode = count, None
+        self.single_observation_space = _observation_space()
+        self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, count)
+        self.action_space = batch_space(self.single_action_space, count)
+        self._grips = _Grips(count, world, seed)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin episodes; `options["objects"]` (2, count): their masses [kg] and friction, else random."""
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        options = options or {}
+        chosen = np.flatnonzero(options.get("reset_mask", np.ones(self.num_envs, np.bool_)))
+        drawn = self.np_random.random((self.num_envs, 2))
+        mass_kg, friction = options.get("objects", objects_at(drawn))
+        for number in chosen.tolist():
+            self._grips.reset(number, float(mass_kg[number]), float(friction[number]))
+        self._grips.sensor.reset(chosen.tolist())
+        self._grips.read()
+        return self._observation(), {}
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[Observation, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Apply actions (count, 1) for `PERIOD_S`; dropped objects stay dropped."""
+        reward = self._grips.step(np.asarray(actions, np.float64)[:, 0])
+        truncated = self._grips.steps >= EPISODE_STEPS
+        info = {"slip_m": self._grips.slip_m, "grip_force_n": self._grips.force_n.copy()}
+        return self._observation(), reward, self._grips.dropped.copy(), truncated, info
+
+    def _observation(self) -> Observation:
+        return {"observation.state": self._grips.state, "observation.touch": self._grips.touch}
+
+
+class GripEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """One of `GripEnvironments`."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, world: str = "default", seed: int = 1) -> None:
+        self.observation_space = _observation_space()
+        self.action_space = Box(-1.0, 1.0, (1,), np.float32)
+        self._one = GripEnvironments(1, world, seed)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        objects = (options or {}).get("objects", objects_at(self.np_random.random((1, 2))))
+        observation, info = self._one.reset(options={"objects": objects})
+        return {name: value[0] for name, value in observation.items()}, info
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Apply an action (1,) for `PERIOD_S`."""
+        observation, reward, dropped, truncated, info = self._one.step(np.asarray(action)[None])
+        return (
+            {name: value[0] for name, value in observation.items()},
+            float(reward[0]),
+            bool(dropped[0]),
+            bool(truncated[0]),
+            {name: value[0] for name, value in info.items()},
+        )
+
+
+def objects_at(quantiles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return masses [kg] and coefficients of friction (n,) of objects at quantiles (n, 2) of the limits."""
+    low, high = np.log([MASS_KG, FRICTION]).T
+    mass_kg, friction = np.exp(low + (high - low) * quantiles).T
+    return mass_kg, friction
