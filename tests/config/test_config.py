@@ -81,7 +81,7 @@ DEPLOYMENTS = [path for path in sorted(CONFIG.glob("*.toml")) if "\n[[hand]]\n" 
 @pytest.mark.parametrize("path", DEPLOYMENTS, ids=lambda path: path.name)
 def test_shipped_deployments_are_valid(path: Path) -> None:
     deployment = config.load(path)
-    pads = 2 if path.stem == "two_finger" else 15
+    pads = {"two_finger": 2, "outlined": 3}.get(path.stem, 15)
     assert [len(hand.pads) for hand in deployment.hands] == [pads]
 
 
@@ -158,7 +158,7 @@ ERRORS = {
     ),
     "wrong shape": (
         ('kind = "cylinder"', 'kind = "tube"'),
-        THUMB + 'surface.kind = "tube": needs kind = "cone", kind = "cylinder", kind = "plane",',
+        THUMB + 'surface.kind = "tube": needs kind = "cone", kind = "cylinder", kind = "outline",',
     ),
     "wrong option": (
         ('channel = "can0"', 'channel = "can0"\noptions = { fd = [1] }'),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -277,3 +278,26 @@ def test_an_estimate_is_exact_for_exact_currents_in_both_arms_of_an_l_shape() ->
     assert found.x == pytest.approx(x, abs=1e-7)
     assert found.y == pytest.approx(y, abs=1e-7)
     assert found.total == pytest.approx(np.full(4, 3e-3), rel=1e-7)
+
+
+@pytest.mark.parametrize("make", [lambda: disc(4), l_shape], ids=["disc", "L"])
+def test_estimates_next_to_the_boundary_converge_to_the_best_of_a_search(
+    make: Callable[[], OutlineNetwork],
+) -> None:
+    pad, sigma, rng = make(), 3e-3, np.random.default_rng(1)
+    places = rng.uniform(0, pad.outline.perimeter(), 60)
+    away = max(pad.a, pad.b) * 10 ** rng.uniform(-4, -1.5, 60)
+    angle = rng.uniform(0, 2 * np.pi, 60)
+    edge = np.array([pad.outline.boundary_point(float(place)) for place in places]).T
+    x, y = edge + away * np.stack([np.cos(angle), np.sin(angle)])
+    inside = np.flatnonzero(pad.outline.contains(x, y))[:16]
+    currents = pad.fractions(x[inside], y[inside])
+    currents = currents + sigma * rng.normal(size=currents.shape)
+    found = pad.estimate(currents, sigma)
+    assert found.converged.all()
+    grid = np.stack(np.meshgrid(*(np.linspace(0.004, 0.997, 50),) * 2)).reshape(2, -1)
+    table = pad.fractions(pad.a * grid[0], pad.b * grid[1])
+    table = table[:, np.isfinite(table[0])]
+    along = np.maximum(table.T @ currents, 0.0) ** 2 / (table * table).sum(axis=0)[:, None]
+    least = ((currents * currents).sum(axis=0) - along.max(axis=0)) / sigma**2
+    assert (found.chi_squared < least + 1e-3).all()

@@ -1,8 +1,12 @@
-"""Surfaces of every kind that a deployment can have, and one with an anisotropic sheet."""
+"""Surfaces of every kind that a deployment can have; of rectangles, one with an anisotropic sheet."""
 
 from __future__ import annotations
 
+import math
+
 from handtouch.config import surface_table
+
+_BULGE_MM = 8 / math.sin(math.radians(75)) * math.radians(150)
 
 SURFACE_TABLES = {
     "plane": surface_table("plane", length_mm=40.0, width_mm=25.0),
@@ -25,3 +29,30 @@ SURFACE_TABLES = {
         "cylinder", radius_mm=11.0, length_mm=30.0, arc_deg=160.0, resistivity_ratio=1.7
     ),
 }
+
+OUTLINE_TABLES = {
+    "outline_on_sphere": surface_table(
+        "outline_on_sphere",
+        radius_mm=12.0,
+        outline_x_mm=(9.0, -9.0),
+        outline_y_mm=(0.0, 0.0),
+        edge_turn_deg=(180.0, 180.0),
+        corners_mm=tuple(9 * math.pi * turn for turn in (1.25, 1.75, 0.25, 0.75)),
+    ),
+    "outline_on_cylinder": surface_table(
+        "outline_on_cylinder",
+        radius_mm=9.0,
+        outline_x_mm=(0.0, 20.0, 20.0, 0.0),
+        outline_y_mm=(0.0, 0.0, 16.0, 16.0),
+        edge_turn_deg=(0.0, 150.0, 0.0, 0.0),
+        corners_mm=(0.0, 20.0, 20.0 + _BULGE_MM, 40.0 + _BULGE_MM),
+    ),
+    "outline": surface_table(
+        "outline",
+        outline_x_mm=(0.0, 10.0, 44.0, 50.0, 44.0, 6.0),
+        outline_y_mm=(6.0, 0.0, 0.0, 10.0, 38.0, 38.0),
+        edge_turn_deg=(0.0,) * 6,
+        corners_mm=(5.83, 51.49, 84.0, 122.0),
+    ),
+}
+"""Pads of any outline."""

@@ -18,9 +18,9 @@ from handtouch.simulate.contact_patch import (
     mean_half_axis,
 )
 from handtouch.simulate.pad_circuit import contact_layer_ohm
-from handtouch.simulate.pad_geometry import simulated_surface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMapBank, solve_sheet
+from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import ContactSpread, ElectronicsSpread, Fixed, World
 from tests.simulate.surfaces import SURFACE_TABLES

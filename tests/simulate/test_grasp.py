@@ -33,7 +33,7 @@ from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad, MujocoScene
 from handtouch.simulate.grasp.patches import ContactPatches, clip_to_pad, contact_patches
 from handtouch.simulate.grasp.simulation import GraspRecord, hand_contacts, simulate_grasp
-from handtouch.simulate.pad_geometry import simulated_surface
+from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, World
 from tests.simulate.surfaces import SURFACE_TABLES

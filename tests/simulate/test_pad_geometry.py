@@ -7,15 +7,16 @@ import pytest
 
 from handtouch.config import SurfaceTable
 from handtouch.field.surface import SURFACES
-from handtouch.simulate.pad_geometry import simulated_surface
-from tests.simulate.surfaces import SURFACE_TABLES
+from handtouch.simulate.pad_geometry import SimulatedSurface
+from handtouch.simulate.surfaces import simulated_surface
+from tests.simulate.surfaces import OUTLINE_TABLES, SURFACE_TABLES
 
 POSITIONS = [(0.0, 0.0), (0.5, 0.5), (0.02, 0.9), (0.7, 0.3), (1.0, 1.0)]
 tables = pytest.mark.parametrize("table", SURFACE_TABLES.values(), ids=list(SURFACE_TABLES))
 
 
 def test_every_surface_of_a_deployment_can_be_simulated() -> None:
-    assert {table.kind for table in SURFACE_TABLES.values()} == set(SURFACES)
+    assert {table.kind for table in (SURFACE_TABLES | OUTLINE_TABLES).values()} == set(SURFACES)
 
 
 @tables
@@ -39,7 +40,37 @@ def test_isothermal_map_is_conformal(table: SurfaceTable) -> None:
     assert metric.isothermal(0.0) == 0.0
 
 
-@tables
+@pytest.mark.parametrize("kind", OUTLINE_TABLES)
+def test_outlines_agree_with_field(kind: str) -> None:
+    shape, surface = simulated_surface(OUTLINE_TABLES[kind]), OUTLINE_TABLES[kind].build()
+    for x, y in ((0.5, 0.5), (0.02, 0.9), (0.7, 0.3)):
+        s, phi = x * shape.length_m, y * shape.arc
+        rectangle = surface.to_rectangle(*shape.arc_lengths(s, phi))
+        np.testing.assert_allclose(shape.point(s, phi), surface.point(*rectangle), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(shape.normal(s, phi), surface.normal(*rectangle), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", OUTLINE_TABLES)
+def test_resized_outlines_are_longer_and_wider_about_their_middle(kind: str) -> None:
+    shape = simulated_surface(OUTLINE_TABLES[kind])
+    resized = shape.resized(0.4e-3, -0.3e-3)
+
+    def box(it: SimulatedSurface) -> list[float]:
+        way = np.linspace(0, 1, 801)
+        ends = np.concatenate(
+            [[way, 0 * way], [way, 0 * way + 1], [0 * way, way], [0 * way + 1, way]], axis=1
+        )
+        drawn = np.array([it.arc_lengths(p * it.length_m, q * it.arc) for p, q in ends.T])
+        return [float(extent) for extent in np.ptp(drawn, axis=0)]
+
+    growth = np.subtract(box(resized), box(shape))
+    np.testing.assert_allclose(growth, [0.4e-3, -0.3e-3], rtol=1e-3)
+    assert shape.resized(0.0, 0.0) == shape
+
+
+@pytest.mark.parametrize(
+    "table", (SURFACE_TABLES | OUTLINE_TABLES).values(), ids=list(SURFACE_TABLES | OUTLINE_TABLES)
+)
 def test_point_above_a_surface_projects_to_its_foot(table: SurfaceTable) -> None:
     shape = simulated_surface(table)
     for x, y in ((0.5, 0.5), (0.1, 0.9), (0.7, 0.3)):

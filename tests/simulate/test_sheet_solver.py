@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from handtouch.config import SurfaceTable
 from handtouch.field import Electrode, ElectrodeNetwork, Rectangle
-from handtouch.simulate.pad_geometry import SimulatedSurface, simulated_surface
+from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import (
     EDGE_INSET_FRACTION,
     ElectrodeGaps,
@@ -19,6 +19,7 @@ from handtouch.simulate.sheet_solver import (
     SheetMaps,
     solve_sheet,
 )
+from handtouch.simulate.surfaces import simulated_surface
 from tests.simulate.surfaces import SURFACE_TABLES
 
 SQUARE = SimulatedSurface(1.0, 1.0, 1.0, flat=True)

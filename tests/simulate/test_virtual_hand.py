@@ -13,7 +13,7 @@ from handtouch.hand import electrode_network, mount_transform, pad_surface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS
-from tests.simulate.surfaces import SURFACE_TABLES
+from tests.simulate.surfaces import OUTLINE_TABLES, SURFACE_TABLES
 
 LINKS = ("flat", "round", "tapered", "tip")
 IDEAL = WORLDS["ideal"].draw(3)
@@ -40,7 +40,15 @@ def test_currents_agree_with_exact_theory_on_every_surface(
     check_currents(deployment.model_copy(update={"hands": (hand,)}), pad.link)
 
 
-def check_currents(deployment: config.Deployment, link: str) -> None:
+def test_currents_agree_with_exact_theory_on_an_outline(deployment: config.Deployment) -> None:
+    pad, *others = deployment.hands[0].pads
+    table = OUTLINE_TABLES["outline_on_sphere"]
+    pads = (pad.model_copy(update={"surface": table}), *others)
+    hand = deployment.hands[0].model_copy(update={"pads": pads})
+    check_currents(deployment.model_copy(update={"hands": (hand,)}), pad.link, 3e-3)
+
+
+def check_currents(deployment: config.Deployment, link: str, tolerance: float = 2e-4) -> None:
     """Compare currents, position and normal of a touch with `handtouch.field`."""
     hand = VirtualHand(deployment, press(link), IDEAL)
     (true,) = hand.truth(10.0)
@@ -55,7 +63,7 @@ def check_currents(deployment: config.Deployment, link: str) -> None:
     ohm = contact_stack_resistance(sheet.ohm_per_square, contact_ohm_m2, radius_m, outer_m)
     ohm += network.series_resistance(x, y)
     expected = deployment.nodes[pad.node].drive_v / ohm * network.fractions(x, y)
-    np.testing.assert_allclose(true.currents_a, expected, rtol=2e-4, atol=1e-9)
+    np.testing.assert_allclose(true.currents_a, expected, rtol=tolerance, atol=1e-9)
     rotation, translation = mount_transform(pad)
     np.testing.assert_allclose(true.position_m, rotation @ surface.point(x, y) + translation, atol=1e-12)
     np.testing.assert_allclose(true.normal, rotation @ surface.normal(x, y), atol=1e-12)

@@ -46,6 +46,11 @@ class MixedProblem:
         """Number of unknowns of each density."""
         return len(self.panels) * NODES
 
+    @property
+    def nodes(self) -> ComplexArray:
+        """Points of the boundary at which the densities are known (unknowns,), finer towards corners."""
+        return np.asarray(self._anchor + self._offset)
+
     def potentials(self, z: ComplexArray) -> FloatArray:
         """Return the unit potentials at points (n,), shape (count, n)."""
         return np.concatenate([self._values(part)[0] for part in _batches(z)], axis=1)
@@ -144,6 +149,8 @@ class MixedProblem:
         self._density, self._constant = solution[:size], solution[size]
         collected = (self._electrode == np.arange(self.count)[:, None]) * self._weight
         self.conductance: FloatArray = collected @ (outflow @ self._density)
+        self.boundary_potentials: FloatArray = (logs @ self._density / -_TWO_PI + self._constant).T
+        """(count, unknowns), at `nodes`"""
 
     def _rough_panels(self, tolerance: float) -> BoolArray:
         by_panel = self._density.reshape(len(self.panels), NODES, self.count)

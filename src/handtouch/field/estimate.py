@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field.model import FloatArray, ForwardModel, channel_noise, mirrored_inside
+from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
 BoolArray = NDArray[np.bool_]
 
 _MAX_STEPS = 40
-_MAX_SETTLED_DECREMENT = 1e-6  # squared Newton decrement, in variances: the last step leaves far less
+MAX_SETTLED_DECREMENT = 1e-6  # squared Newton decrement, in variances: the last step leaves far less
 _MIN_STEP = 1e-14  # of a side
 _MIN_EDGE_DISTANCE = 1e-9  # of a side, of an estimate from an edge
-_MAX_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
+MAX_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
 MAX_STD_SIDES = 1e3  # a coordinate with a larger deviation is reported as unknown
 CORNER_RADIUS_FACTOR = 0.7
 """Radius about a corner within which currents carry no information, in shorter sides times the root of the
@@ -26,7 +26,6 @@ _ARC_ITERATIONS = 6  # of the search for the direction from a corner
 _MIN_CORNER_ANGLE_RAD = 0.02  # of an estimate near a corner from its sides
 _GUESS_BATCH = 8192  # contacts at once, to bound memory
 _GUESS_GRID = 9  # points per side of the search for a start
-_OUTLINE_GRID_OFFSET = 0.4681  # of a grid cell: keeps the points off edges in simple ratios
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,8 @@ def estimate(
         `currents`. An infinite one leaves its channel out; one that is not positive gives NaN.
     start: (x, y), shape (2, ...), where to begin; found from the currents if absent.
 
-    Gauss-Newton on (x, y) with the total eliminated (variable projection), halved until the likelihood rises.
+    Gauss-Newton on (x, y) with the total eliminated (variable projection), halved until the likelihood rises;
+    on an outline damped, along the boundary where it leads there, from several starts.
     Raises ValueError if the first axis of `currents` is not the model's channels.
     """
     currents = np.asarray(currents, dtype=np.float64)
@@ -90,9 +90,10 @@ def estimate(
         # Currents and noise each in a unit of their own, so that squares stay in range.
         unit = np.ldexp(1.0, np.frexp(np.abs(flat).max(axis=0, initial=0.0))[1])
         exponent = np.frexp(sigma.min(axis=0, initial=np.inf))[1]
-        fit = _LikelihoodFit(model, flat / unit, np.ldexp(sigma, -exponent), np.ldexp(1.0, exponent) / unit)
+        kind: type[LikelihoodFit] = getattr(model, "likelihood_fit", LikelihoodFit)
+        fit = kind(model, flat / unit, np.ldexp(sigma, -exponent), np.ldexp(1.0, exponent) / unit)
         if start is None:
-            begin = fit.initial_positions()
+            begin = None
         else:
             begin = (
                 np.broadcast_to(np.asarray(start, dtype=np.float64), (2, *shape)).reshape(2, -1) / fit.sides
@@ -110,7 +111,7 @@ def estimate(
 
 
 @dataclass(frozen=True)
-class _WhitenedModel:
+class WhitenedModel:
     """The model at one point of each element, whitened; total eliminated.
 
     total: its best value, (n,). misfit: whitened residuals, (channels, n). fractions: whitened. slopes: their
@@ -125,17 +126,17 @@ class _WhitenedModel:
     mixing: FloatArray
     cost: FloatArray
 
-    def select(self, index: NDArray[np.intp] | BoolArray) -> _WhitenedModel:
+    def select(self, index: NDArray[np.intp] | BoolArray) -> WhitenedModel:
         """Return some of the elements."""
-        return _WhitenedModel(*(getattr(self, k)[..., index] for k in self.__dataclass_fields__))
+        return WhitenedModel(*(getattr(self, k)[..., index] for k in self.__dataclass_fields__))
 
-    def assign(self, index: NDArray[np.intp] | BoolArray, other: _WhitenedModel) -> None:
+    def assign(self, index: NDArray[np.intp] | BoolArray, other: WhitenedModel) -> None:
         """Overwrite some of the elements."""
         for k in self.__dataclass_fields__:
             getattr(self, k)[..., index] = getattr(other, k)
 
 
-class _LikelihoodFit:
+class LikelihoodFit:
     """Many independent fits of one model at once; arrays are (..., n), positions in sides of the pad.
 
     noise: standard deviations of the currents (channels, n), in units of `noise_unit` (n,).
@@ -145,7 +146,6 @@ class _LikelihoodFit:
         self, model: ForwardModel, currents: FloatArray, noise: FloatArray, noise_unit: FloatArray
     ) -> None:
         self.model, self.currents, self.noise_unit = model, currents, noise_unit
-        self.mirrored_inside = mirrored_inside(model)
         self.weight = 1 / noise
         self.data = currents * self.weight
         self.sides = np.array([[model.a], [model.b]])
@@ -153,29 +153,28 @@ class _LikelihoodFit:
 
     def initial_positions(self) -> FloatArray:
         """Return a start from the currents alone, shape (2, n): the most likely of a grid of points."""
-        offset = 0.5 if self.mirrored_inside is None else _OUTLINE_GRID_OFFSET
-        side = (np.arange(_GUESS_GRID) + offset) / _GUESS_GRID
-        x, y = self.move_inside(np.stack([place.ravel() for place in np.meshgrid(side, side)]))
-        table = self.model.fractions(self.model.a * x, self.model.b * y).T
+        side = (np.arange(_GUESS_GRID) + 0.5) / _GUESS_GRID
+        return self.most_likely_of(np.stack([place.ravel() for place in np.meshgrid(side, side)]))
+
+    def most_likely_of(self, points: FloatArray) -> FloatArray:
+        """Return the most likely of points (2, k) for each element, (2, n)."""
+        table = self.model.fractions(*(points * self.sides)).T
         on_pad = np.isfinite(table).all(axis=1)
-        x, y, table = x[on_pad], y[on_pad], table[on_pad]
+        points, table = points[:, on_pad], table[on_pad]
         begin = np.empty((2, self.data.shape[1]))
         for first in range(0, self.data.shape[1], _GUESS_BATCH):
             some = slice(first, first + _GUESS_BATCH)
             weight, data = self.weight[:, some], self.data[:, some]
             along, norm = table @ (weight * data), (table * table) @ (weight * weight)
             best = np.argmax(np.maximum(along, 0.0) ** 2 / norm, axis=0)
-            begin[:, some] = x[best], y[best]
+            begin[:, some] = points[:, best]
         return begin
 
     def move_inside(self, point: FloatArray) -> FloatArray:
         """Return points (2, n), where off the pad replaced by nearby points on it."""
-        point = np.clip(point, _MIN_EDGE_DISTANCE, 1 - _MIN_EDGE_DISTANCE)
-        if self.mirrored_inside is None:
-            return point
-        return np.asarray(np.stack(self.mirrored_inside(*(point * self.sides))) / self.sides)
+        return np.clip(point, _MIN_EDGE_DISTANCE, 1 - _MIN_EDGE_DISTANCE)
 
-    def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> _WhitenedModel:
+    def linearise(self, point: FloatArray, index: NDArray[np.intp] | slice) -> WhitenedModel:
         """Evaluate the model at `point`, shape (2, n), for the elements `index`."""
         f, jacobian = self.model.fractions_with_jacobian(*(point * self.sides))
         weight, data = self.weight[:, index], self.data[:, index]
@@ -186,9 +185,9 @@ class _LikelihoodFit:
         misfit = data - total * f
         mixing = (slopes * f).sum(1) / norm
         slopes = slopes - mixing[:, None] * f
-        return _WhitenedModel(total, misfit, f, slopes, mixing, (misfit * misfit).sum(0))
+        return WhitenedModel(total, misfit, f, slopes, mixing, (misfit * misfit).sum(0))
 
-    def gauss_newton_step(self, at: _WhitenedModel, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def gauss_newton_step(self, at: WhitenedModel, point: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the Gauss-Newton step (2, n) and squared decrement (n,); coordinates at an edge are
         fixed.
         """
@@ -209,17 +208,33 @@ class _LikelihoodFit:
         decrement = np.where(xx > 0, along_x**2 / xx, 0.0) + np.where(yy > 0, along_y**2 / yy, 0.0)
         step = np.stack([dx, dy])
         length = np.maximum((np.abs(step) * self.aspect).max(0), 1e-300)
-        return step * np.minimum(1.0, _MAX_STEP / length), decrement
+        return step * np.minimum(1.0, MAX_STEP / length), decrement
 
-    def maximise(self, begin: FloatArray, unit: FloatArray) -> PointEstimate:
-        """Iterate every element to its maximum; converged elements are left alone."""
-        known = np.isfinite(self.data).all(0) & np.isfinite(self.weight).all(0)
+    def maximise(self, begin: FloatArray | None, unit: FloatArray) -> PointEstimate:
+        """Iterate every element to its maximum, from `begin` (2, n) or a start of its own."""
+        known = np.asarray(np.isfinite(self.data).all(0) & np.isfinite(self.weight).all(0))
+        point, best, converged = self.search(begin, known)
+        moved_out = np.concatenate(
+            [self.move_out_of_corners(point, best, converged), self.centre_invalid_points(point, best)]
+        )
+        if moved_out.size:
+            best.assign(moved_out, self.linearise(point[:, moved_out], moved_out))
+        return self.build_estimate(point, best, converged, unit)
+
+    def search(
+        self, begin: FloatArray | None, known: BoolArray
+    ) -> tuple[FloatArray, WhitenedModel, BoolArray]:
+        """Return the maxima (2, n) of the elements `known`, the model there, and whether they converged."""
+        return self.climb(self.initial_positions() if begin is None else begin, known)
+
+    def climb(self, begin: FloatArray, known: BoolArray) -> tuple[FloatArray, WhitenedModel, BoolArray]:
+        """Return the maxima (2, n) next to `begin`; converged elements are left alone."""
         point = self.move_inside(np.where(np.isfinite(begin), begin, 0.5))
         point = np.where(known, point, np.nan)
         best = self.linearise(point, slice(None))
         converged = np.zeros(point.shape[1], dtype=np.bool_)
         damping = np.ones(point.shape[1])
-        settled = _MAX_SETTLED_DECREMENT * self.noise_unit**2
+        settled = MAX_SETTLED_DECREMENT * self.noise_unit**2
         active = np.flatnonzero(known)
         for _ in range(_MAX_STEPS):
             if not active.size:
@@ -236,21 +251,15 @@ class _LikelihoodFit:
             done = (accept & (decrement < settled[active])) | ~moved
             converged[active[done]] = best.total[active[done]] > 0
             active = active[~done]
-        moved_out = np.concatenate(
-            [self.move_out_of_corners(point, best, converged), self.centre_invalid_points(point, best)]
-        )
-        if moved_out.size:
-            best.assign(moved_out, self.linearise(point[:, moved_out], moved_out))
-        return self.build_estimate(point, best, converged, unit)
+        return point, best, converged
 
     def move_out_of_corners(
-        self, point: FloatArray, at: _WhitenedModel, converged: BoolArray
+        self, point: FloatArray, at: WhitenedModel, converged: BoolArray
     ) -> NDArray[np.intp]:
         """Move points out of corners, in place, to where currents carry information; return their indices.
 
-        Of rectangles only. Near a corner the two far currents vanish with the square of its distance r, so
-        that all r up to sqrt(noise) sides are equally likely, and only the direction from the corner is
-        known.
+        Near a corner the two far currents vanish with the square of its distance r, so that all r up to
+        sqrt(noise) sides are equally likely, and only the direction from the corner is known.
         """
         noise = self.noise_unit / np.sqrt((self.weight * self.weight).mean(0))
         radius = np.minimum(
@@ -258,7 +267,7 @@ class _LikelihoodFit:
         )  # in shorter sides; NaN for no contact
         far = point > 0.5
         offset = np.where(far, 1 - point, point) * self.aspect
-        index = np.flatnonzero(np.hypot(*offset) < (radius if self.mirrored_inside is None else 0.0))
+        index = np.flatnonzero(np.hypot(*offset) < radius)
         if index.size:
             corner = np.where(far, 1.0, 0.0)[:, index]
             inward = np.where(far, -1.0, 1.0)[:, index] * radius[index] / self.aspect
@@ -272,14 +281,14 @@ class _LikelihoodFit:
             converged[index] = at.total[index] > 0
         return index
 
-    def centre_invalid_points(self, point: FloatArray, at: _WhitenedModel) -> NDArray[np.intp]:
+    def centre_invalid_points(self, point: FloatArray, at: WhitenedModel) -> NDArray[np.intp]:
         """Move points without a positive total to the centre, in place; return their indices."""
         index = np.flatnonzero(at.total <= 0)
         point[:, index] = self.move_inside(np.full((2, index.size), 0.5))
         return index
 
     def build_estimate(
-        self, point: FloatArray, at: _WhitenedModel, converged: BoolArray, unit: FloatArray
+        self, point: FloatArray, at: WhitenedModel, converged: BoolArray, unit: FloatArray
     ) -> PointEstimate:
         """Return covariance and residual at the points reached, in the units of the pad and the currents."""
         found = at.total > 0
@@ -325,7 +334,7 @@ def estimate_covariance(
 ) -> FloatArray:
     """Return the inverse Fisher information of (x, y, total), shape (n, 3, 3), x and y in sides.
 
-    slopes, mixing: as in `_WhitenedModel`, times the total. fractions: whitened. least: information per
+    slopes, mixing: as in `WhitenedModel`, times the total. fractions: whitened. least: information per
     side^2 (n,) that a coordinate needs; with less, it has infinite variance and no covariances.
 
     A factor F of the covariance is computed first, and the covariance is F F^T: positive semidefinite despite

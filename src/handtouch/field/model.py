@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
+
+MIN_INSET = 1e-6
+"""Least distance from the boundary of points that are moved there, of the larger extent."""
 
 
 class FractionModel(Protocol):
@@ -55,11 +57,18 @@ def spreading_radius(model: ForwardModel, x: FloatArray, y: FloatArray) -> Float
     return np.asarray(radius(x, y), dtype=np.float64)
 
 
-def mirrored_inside(
-    model: ForwardModel,
-) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None:
-    """Return the function that moves points off the pad onto it; None for a rectangle, which needs none."""
-    return getattr(model, "mirrored_inside", None)
+class PadBoundary(NamedTuple):
+    """Points of a pad and the boundary nearest to them, all (n,), in the unit of the pad.
+
+    x, y: on the pad, at least a small distance from its boundary; NaN where none was found. normal_x,
+    normal_y: inward unit normal of the nearest boundary. distance: from it.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    normal_x: FloatArray
+    normal_y: FloatArray
+    distance: FloatArray
 
 
 def channel_noise(noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:

@@ -270,6 +270,11 @@ class Outline:
         """Return the length of a contour."""
         return math.fsum(edge.length for edge in self.contours[contour])
 
+    def area(self) -> float:
+        """Return the area, of holes taken off."""
+        areas = [abs(_area(edges)) for edges in self.contours]
+        return areas[0] - math.fsum(areas[1:])
+
     def contains(self, x: npt.ArrayLike, y: npt.ArrayLike) -> BoolArray:
         """Return True for points inside, shape (...); points on the boundary may be either."""
         z = np.asarray(x, np.float64) + 1j * np.asarray(y, np.float64)
@@ -293,30 +298,30 @@ class Outline:
         index = int(np.argmin([abs(e.point(s) - z)[0] for e, s in zip(edges, near, strict=True)]))
         return math.fsum(e.length for e in edges[:index]) + float(edges[index].length_to(near[index])[0])
 
-    def mirrored_inside(
-        self, x: FloatArray, y: FloatArray, nearest: float, farthest: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return x and y (n,), where outside mirrored by the nearest boundary point.
+    def project_inside(
+        self, x: FloatArray, y: FloatArray, inset: float
+    ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+        """Return points (n,) as complex numbers, those outside or nearer than `inset` moved to that distance
+        from the boundary; the inward unit normals there as complex numbers, and the distances.
 
-        Mirrored points lie between `nearest` and `farthest` from there; NaN where that is outside, too.
+        NaN where no such point was found, as in a sharp corner.
         """
         z = x + 1j * y
-        outside = np.flatnonzero(~self.contains(x, y) & np.isfinite(z))
-        if outside.size:
-            target, best = z[outside], np.full(outside.size, np.inf)
-            for edges, sign in zip(self.contours, self.signs, strict=True):
-                for edge in edges:
-                    s = edge.nearest_parameter(target)
-                    foot, slope = edge.point(s), edge.derivative(s)
-                    distance = np.abs(foot - target)
-                    closer = distance < best
-                    best = np.where(closer, distance, best)
-                    inward = sign * 1j * slope / np.abs(slope)
-                    mirrored = foot + np.clip(distance, nearest, farthest) * inward
-                    z[outside[closer]] = mirrored[closer]
-            still = outside[~self.contains(z[outside].real, z[outside].imag)]
-            z[still] = np.nan
-        return z.real, z.imag
+        best = np.full(z.shape, np.inf)
+        foot, normal = np.array(z), np.zeros(z.shape, np.complex128)
+        for edges, sign in zip(self.contours, self.signs, strict=True):
+            for edge in edges:
+                s = edge.nearest_parameter(z)
+                at, slope = edge.point(s), edge.derivative(s)
+                distance = np.abs(at - z)
+                closer = distance < best
+                best[closer], foot[closer] = distance[closer], at[closer]
+                normal[closer] = (sign * 1j * slope / np.abs(slope))[closer]
+        off = np.flatnonzero(~(self.contains(z.real, z.imag) & (best >= inset)))
+        z[off], best[off] = (foot + inset * normal)[off], inset
+        outside = off[~self.contains(z[off].real, z[off].imag)]
+        z[outside] = np.nan
+        return z, normal, best
 
     def locate_position(self, position: float, contour: int = 0) -> tuple[int, float]:
         """Return edge and parameter at a position; raises ValueError if it is off the contour."""

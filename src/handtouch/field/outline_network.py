@@ -13,19 +13,21 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from handtouch.field._boundary_panels import Stretch, initial_panels
 from handtouch.field._mixed_problem import MixedProblem
+from handtouch.field._outline_fit import OutlineFit
 from handtouch.field._series_resistors import GroundedElectrodes
+from handtouch.field.model import MIN_INSET, PadBoundary
 from handtouch.field.outline import MIN_CLEARANCE, ComplexArray, FloatArray, Outline
 
 _SMOOTH_ANGLE_RAD = 1e-9
 _MAX_IMAGE_DISTANCE = 0.5  # of the larger extent: of a point from its mirror image
 _MIN_IMAGE_CLEARANCE = 0.5  # of a mirror image from the boundary, in distances of its source
-_MIN_INSET, _MAX_INSET = 1e-6, 0.05  # of the larger extent: of points mirrored onto the pad
 _ORIGIN_ROUNDING = 1e-9
 
 
@@ -69,6 +71,8 @@ class OutlineNetwork(GroundedElectrodes):
     shorter than 1e-4 of the larger extent, impossible resistances, and outlines that need more than 6,000
     unknowns.
     """
+
+    likelihood_fit: ClassVar = OutlineFit
 
     def __init__(
         self,
@@ -126,6 +130,27 @@ class OutlineNetwork(GroundedElectrodes):
         """
         return self._problem.conductance
 
+    def boundary_fractions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return `ideal_fractions` (m, n) at points of the outer contour, finer towards corners.
+
+        First their positions on the contour (n,), then x and y (2, n).
+        """
+        edges = self._solved.contours[0]
+        begins = np.cumsum([0.0, *(edge.length for edge in self.outline.contours[0])])
+        numbers = {id(edge): number for number, edge in enumerate(edges)}
+        positions = []
+        for panel in self._problem.panels:
+            number = numbers.get(id(panel.stretch.edge))
+            if number is None:
+                positions.append(np.full(len(panel.t), np.nan))
+            else:
+                positions.append(begins[number] + self.outline.contours[0][number].length_to(panel.s))
+        position = np.concatenate(positions)
+        outer = np.flatnonzero(np.isfinite(position))
+        z = self._problem.nodes[outer] * self._unit
+        points = np.stack([z.real / self._stretch, z.imag])
+        return position[outer], points, self._problem.boundary_potentials[:, outer]
+
     def ideal_fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return the fractions that directly grounded electrodes would collect, shape (m, ...), summing to
         1.
@@ -161,13 +186,22 @@ class OutlineNetwork(GroundedElectrodes):
         values[inside] = np.exp(self._problem.log_spread(z[inside], image, sign))
         return values.reshape(shape) * (self._unit * 2 / (1 + self._stretch))
 
-    def mirrored_inside(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return x and y (n,), where off the pad mirrored by the boundary, at most 5 % of the extent.
+    def project_inside(self, x: FloatArray, y: FloatArray) -> PadBoundary:
+        """Return points (n,), moved to the boundary where off the pad, with the boundary nearest to them."""
+        z, normal, distance = self.outline.project_inside(x, y, MIN_INSET * max(self._extent))
+        return PadBoundary(z.real, z.imag, normal.real, normal.imag, distance)
 
-        A bare boundary mirrors the potentials, too.
-        """
-        extent = max(self._extent)
-        return self.outline.mirrored_inside(x, y, _MIN_INSET * extent, _MAX_INSET * extent)
+    def boundary_points(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return x and y of about `count` points of the pad next to its boundary, evenly spaced."""
+        total = sum(self.outline.perimeter(contour) for contour in range(len(self.outline.contours)))
+        points = []
+        for contour in range(len(self.outline.contours)):
+            length = self.outline.perimeter(contour)
+            own = max(4, round(count * length / total))
+            places = (np.arange(own) + 0.5) * length / own
+            points += [self.outline.boundary_point(float(place), contour) for place in places]
+        found = self.project_inside(*np.array(points).T)
+        return found.x, found.y
 
     def _points(
         self, x: npt.ArrayLike, y: npt.ArrayLike

@@ -1,7 +1,8 @@
 """Sensor surfaces, each with the conformal map that makes it a rectangle.
 
 Public names: `Surface` and its kinds `PlaneSurface`, `PrismSurface`, `CylinderSurface`, `ConeSurface`,
-`SphereSurface`, `RevolutionSurface`; `AnisotropicSurface` wraps any of them; `SURFACES` is their registry.
+`SphereSurface`, `RevolutionSurface`, `OutlineSurface`, `OutlineOnCylinder`, `OutlineOnSphere`;
+`AnisotropicSurface` wraps any of them; `SURFACES` is their registry.
 
 The currents of a sensor don't change under a conformal map, so a pad is solved on its rectangle [0, a] x [0,
 b] and only the result is carried to the surface. For a surface of revolution of radius r(u) at arc length u
@@ -37,6 +38,7 @@ import numpy.typing as npt
 
 from handtouch.field._prism import PrismSurface
 from handtouch.field._revolution import RevolutionSurface
+from handtouch.field.outline_surface import OutlineOnCylinder, OutlineOnSphere, OutlineSurface
 from handtouch.field.surface_base import (
     SURFACES,
     FloatArray,
@@ -55,6 +57,9 @@ __all__ = [
     "AnisotropicSurface",
     "ConeSurface",
     "CylinderSurface",
+    "OutlineOnCylinder",
+    "OutlineOnSphere",
+    "OutlineSurface",
     "PlaneSurface",
     "PrismSurface",
     "RevolutionSurface",

@@ -129,6 +129,25 @@ class Surface(ABC):
         """Return coordinates x and y of the lines of a drawing grid of about `cells` cells a side."""
         return np.linspace(0, self.a, cells + 1), np.linspace(0, self.b, cells + 1)
 
+    def electrode_span(self, side: str, low_m: float, high_m: float) -> tuple[float, float]:
+        """Return begin and end, in rectangle units along a side, of the electrode that leaves `low_m` and
+        `high_m` [m] bare at the side's ends at the lower and the higher coordinate."""
+        length_m = self.extent_m[0]
+        if side in ("x0", "xa"):
+            u_m = 0.0 if side == "x0" else length_m
+            _, (start, margin) = self.to_rectangle([u_m, u_m], [low_m, high_m])
+            return float(start), float(self.b - margin)
+        (start, stop), _ = self.to_rectangle([low_m, length_m - high_m], [0.0, 0.0])
+        return float(start), float(stop)
+
+    def edge_m(self, cells: int) -> FloatArray:
+        """Return the edge of the unrolled pad, about 2 `cells` points (k, 2): arc length from x0, and
+        distance from the centre line."""
+        x = np.linspace(0, self.a, cells + 1)
+        u, widest = self.from_rectangle(x, np.full_like(x, self.b))
+        upper = np.stack([u, widest / 2], axis=1)
+        return np.concatenate([upper, (upper * [1, -1])[::-1]])
+
     def side_lengths_m(self) -> tuple[float, float, float]:
         """Return the lengths along the surface of the profile and of the sides x0 and xa [m]."""
         _, lengths = self.from_rectangle([0.0, self.a], [self.b, self.b])

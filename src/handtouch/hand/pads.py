@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
 from handtouch.field.model import FractionModel
-from handtouch.field.network import Electrode, ElectrodeNetwork
+from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
@@ -71,16 +71,14 @@ def electrode_network(
     gap_offsets_m: added to the gap at each end of the electrodes, broadcast to (4, 2); a gap below 0 counts
     as 0. log_aspect: logarithm of a factor of the rectangle's length along x, electrodes included.
     """
-    surface, length_m = pad_surface(pad), pad_surface(pad).extent_m[0]
+    surface = pad_surface(pad)
     gaps_m = np.maximum(pad.gap_mm * _M_PER_MM + np.broadcast_to(gap_offsets_m, (4, 2)), 0.0)
     stretch = math.exp(log_aspect)
     electrodes = []
-    for side, u_m, (low_m, high_m) in zip(("x0", "xa"), (0.0, length_m), gaps_m[:2], strict=True):
-        _, (start, margin) = surface.to_rectangle([u_m, u_m], [low_m, high_m])
-        electrodes.append(Electrode(side, float(start), float(surface.b - margin)))  # type: ignore[arg-type]
-    for side, (low_m, high_m) in zip(("y0", "yb"), gaps_m[2:], strict=True):
-        (start, stop), _ = surface.to_rectangle([low_m, length_m - high_m], [0.0, 0.0])
-        electrodes.append(Electrode(side, float(stretch * start), float(stretch * stop)))  # type: ignore[arg-type]
+    for side, (low_m, high_m) in zip(SIDES, gaps_m.tolist(), strict=True):
+        factor = stretch if side in ("y0", "yb") else 1.0
+        start, stop = surface.electrode_span(side, low_m, high_m)
+        electrodes.append(Electrode(side, factor * start, factor * stop))
     return ElectrodeNetwork.from_electrodes(
         stretch * surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
     )

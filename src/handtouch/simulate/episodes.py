@@ -16,8 +16,8 @@ import numpy as np
 from handtouch import config
 from handtouch.simulate import draws
 from handtouch.simulate.faults import FAULTS, Fault, Gum, Heat, Moisture
-from handtouch.simulate.pad_geometry import simulated_surface
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.touch import ScenarioTouch
 
 Size = tuple[float, float]

@@ -23,6 +23,8 @@ from scipy.special import i0e, i1e
 from handtouch import config
 from handtouch.simulate.contact_patch import effective_patch, look_up_patches
 from handtouch.simulate.faults import Fault, FaultContacts
+from handtouch.simulate.outline_geometry import SimulatedOutline
+from handtouch.simulate.outline_solver import outline_mutual_resistance
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_circuit import SheetCircuit, Wiring
 from handtouch.simulate.sheet_solver import (
@@ -33,7 +35,7 @@ from handtouch.simulate.sheet_solver import (
 )
 from handtouch.simulate.stimulus import PadStimulus
 from handtouch.simulate.torn_sheet import cut_sheet_maps, is_beyond_cut
-from handtouch.simulate.uneven_sheet import Unevenness
+from handtouch.simulate.unevenness import Unevenness
 
 FloatArray = NDArray[np.float64]
 _MIN_FORCE_N = 1e-6  # avoids a division by 0
@@ -186,7 +188,10 @@ class PadCircuit:
 
     def _mutual_ohm(self, contacts: Sequence[_ContactSeries], rows: NDArray[np.intp]) -> FloatArray:
         """Return mutual resistances (n, k, k) of contacts on 1 ohm per square; 0 on the diagonal."""
-        green = mutual_resistance(self.shape, self.gaps)
+        if isinstance(self.shape, SimulatedOutline):
+            green = outline_mutual_resistance(self.shape, self.gaps)
+        else:
+            green = mutual_resistance(self.shape, self.gaps)
         mutual = np.zeros((len(rows), len(contacts), len(contacts)))
         moving: list[tuple[int, int, float]] = []
         for i, one in enumerate(contacts):
@@ -270,8 +275,7 @@ class PadCircuit:
         radius_m, focus_m = effective_patch(patch[0], patch[1:], self.shape.stretch)
         if not focus_m.any():
             return radius_m, focus_m
-        across_m = self.shape.arc * self.shape.radius(position[0] * self.shape.length_m)
-        return radius_m, focus_m / np.stack([np.full_like(across_m, self.shape.length_m), across_m])
+        return radius_m, self.shape.fractions_of(position, focus_m)
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Geometry of a simulated pad, directly from the millimetres of the deployment.
 
-Public names: `SimulatedSurface` and its subclasses, `SurfaceProjection`, `SheetMetric`, `simulated_surface`.
+Public names: `SimulatedSurface` and its subclasses, `SurfaceProjection`, `SheetMetric`, `profile_length_m`.
 It is independent of `handtouch.field.surface`, so that a mistake in either shows as a position error instead
 of cancelling.
 """
@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BPoly, CubicSpline, PPoly
-
-from handtouch import config
 
 FloatArray = NDArray[np.float64]
 _ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(20)
@@ -130,6 +127,24 @@ class SimulatedSurface(SheetMetric):
         return self._to_pad_frame(
             -math.sin(climb), math.cos(climb) * math.sin(angle), math.cos(climb) * math.cos(angle)
         )
+
+    def arc_lengths(self, s_m: float, phi: float) -> tuple[float, float]:
+        """Return the lengths along the surface from electrodes x0 and y0."""
+        return s_m, phi * float(self.radius(s_m))
+
+    def metres_per_fraction(self, x: float, y: float) -> FloatArray:  # noqa: ARG002
+        """Return the derivatives (2, 2) of positions along the surface by the fractions of the pad."""
+        return np.diag([self.length_m, self.arc * float(self.radius(x * self.length_m))])
+
+    def fractions_of(self, position: FloatArray, vector_m: FloatArray) -> FloatArray:
+        """Return short vectors (2, n) [m] along the surface at positions (2, n), in fractions of the pad."""
+        across_m = self.arc * self.radius(position[0] * self.length_m)
+        return vector_m / np.stack([np.full_like(across_m, self.length_m), across_m])
+
+    def side_units(self) -> tuple[float, float, float, float]:
+        """Return metres along the sides x0, xa, y0, yb per unit of the coordinate along them."""
+        near, far = self.radius([0.0, self.length_m]).tolist()
+        return near, far, 1.0, 1.0
 
     def project(self, points_m: FloatArray) -> SurfaceProjection:
         """Project points (n, 3) in the pad's frame; for points on the surface's axis any foot is correct."""
@@ -380,58 +395,6 @@ def _profile(points_m: tuple[tuple[float, float], ...]) -> _SplineProfile:
     return _SplineProfile(curve, float(s[-1]), from_length, isothermal)
 
 
-def simulated_surface(surface: config.SurfaceTable) -> SimulatedSurface:
-    """Return the geometry of a pad's `surface` table."""
-    built = _BUILDERS[surface.kind](surface)
-    return replace(built, resistivity_ratio=surface.resistivity_ratio)
-
-
-def _plane(table: Any) -> SimulatedSurface:
-    return SimulatedSurface(table.length_mm * 1e-3, table.width_mm * 1e-3, 1.0, flat=True)
-
-
-def _cylinder(table: Any) -> SimulatedSurface:
-    return SimulatedSurface(table.length_mm * 1e-3, math.radians(table.arc_deg), table.radius_mm * 1e-3)
-
-
-def _cone(table: Any) -> SimulatedSurface:
-    slope = (table.far_radius_mm - table.near_radius_mm) / table.slant_mm
-    arc = math.radians(table.arc_deg)
-    return SimulatedSurface(table.slant_mm * 1e-3, arc, table.near_radius_mm * 1e-3, slope)
-
-
-def _sphere(table: Any) -> SimulatedSurface:
-    radius = table.radius_mm * 1e-3
-    length = radius * math.radians(table.to_deg - table.from_deg)
-    start = math.radians(table.from_deg)
-    return SimulatedSurface(length, math.radians(table.arc_deg), radius, sphere_from_rad=start)
-
-
-def _prism(table: Any) -> SimulatedSurface:
-    corners = _pairs(table.section_aside_mm, table.section_up_mm)
-    width = sum(math.dist(a, b) for a, b in itertools.pairwise(corners))
-    return SimulatedPrism(table.length_mm * 1e-3, width, 1.0, flat=True, corners_m=corners)
-
-
-def _revolution(table: Any) -> SimulatedSurface:
-    forward = 1 if table.profile_axial_mm[-1] >= table.profile_axial_mm[0] else -1
-    points = _pairs([forward * axial for axial in table.profile_axial_mm], table.profile_radius_mm)
-    length = _profile(points).length_m
-    return SimulatedRevolution(length, math.radians(table.arc_deg), points[0][1], points_m=points)
-
-
-def _pairs(first_mm: Any, second_mm: Any) -> tuple[tuple[float, float], ...]:
-    return tuple((1e-3 * a, 1e-3 * b) for a, b in zip(first_mm, second_mm, strict=True))
-
-
-_BUILDERS: Mapping[str, Callable[[Any], SimulatedSurface]] = MappingProxyType(
-    {
-        "plane": _plane,
-        "cylinder": _cylinder,
-        "cone": _cone,
-        "sphere": _sphere,
-        "prism": _prism,
-        "revolution": _revolution,
-    }
-)
-"""By `kind` of the deployment's `surface` table."""
+def profile_length_m(points_m: tuple[tuple[float, float], ...]) -> float:
+    """Return the length of the spline profile through points (axial, radius)."""
+    return _profile(points_m).length_m

@@ -96,7 +96,7 @@ def solve_sheet(shape: SimulatedSurface, gaps: ElectrodeGaps, degree: int = 8) -
     sheet = _SheetSolver(metric, gaps, degree)
     currents, constant = sheet.impose_potentials(sheet.membership.T, np.zeros((1, 4)))
     conductance = sheet.membership @ currents
-    fine, coarse = TABLE_NODES, _table_nodes(_RADIUS_BREAKS)
+    fine, coarse = TABLE_NODES, RADIUS_NODES
     s, phi = metric.length_m * fine, metric.arc * fine
     shares = [sheet.potential(currents[:, i], s, phi) + constant[i] for i in range(4)]
     finer = _basis_matrix(_RADIUS_BREAKS, fine)
@@ -112,7 +112,7 @@ class MutualResistance:
     """
 
     def __init__(self, shape: SimulatedSurface, gaps: ElectrodeGaps) -> None:
-        nodes = _table_nodes(_RADIUS_BREAKS)
+        nodes = RADIUS_NODES
         metric, gaps = shape.metric, gaps.stretched(shape.stretch)
         table = _SheetSolver(metric, gaps, _MUTUAL_DEGREE).mutual_table(
             metric.length_m * nodes, metric.arc * nodes
@@ -388,5 +388,7 @@ def _basis_matrix(breaks: FloatArray, at: FloatArray) -> FloatArray:
     return matrix
 
 
+RADIUS_NODES: Final[FloatArray] = _table_nodes(_RADIUS_BREAKS)
+"""Nodes of the coarser tables, of conformal radii and mutual resistances."""
 TABLE_NODES: Final[FloatArray] = _table_nodes(_SHARE_BREAKS)
 """Nodes of the tables of `SheetMaps`, as fractions of a side."""

@@ -1,6 +1,6 @@
 """Sheet whose resistance varies from place to place.
 
-Public names: `Unevenness`, `uneven_sheet_maps`.
+Public name: `uneven_sheet_maps`.
 
 The shares of the electrodes and the conductances between them are those of the uneven sheet. The resistance
 of a contact of radius A is that of the layer on a sheet of the local resistance, and
@@ -12,13 +12,14 @@ source's size: 1e-3 of ln R where the resistance varies by 20 %, 3e-3 by 100 %.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.simulate.coarse_sheet import CoarseGrid
+from handtouch.simulate.outline_geometry import SimulatedOutline
+from handtouch.simulate.outline_solver import solve_outline
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import (
     EDGE_INSET_FRACTION,
@@ -28,6 +29,7 @@ from handtouch.simulate.sheet_solver import (
     solve_sheet,
 )
 from handtouch.simulate.spectral_elements import lobatto_nodes
+from handtouch.simulate.unevenness import Unevenness
 
 FloatArray = NDArray[np.float64]
 
@@ -39,32 +41,11 @@ _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' 
 ).T
 
 
-@dataclass(frozen=True)
-class Unevenness:
-    """Logarithm of the sheet resistance over its nominal value, as a sum of waves.
-
-    amplitudes[i] is that of cos(m pi x) cos(n pi y) with (m, n) = modes[i], x and y fractions of the pad.
-    """
-
-    modes: tuple[tuple[int, int], ...] = ()
-    amplitudes: tuple[float, ...] = ()
-
-    @property
-    def is_even(self) -> bool:
-        """True if the sheet has the same resistance everywhere."""
-        return not any(self.amplitudes)
-
-    def ohm_ratio(self, position: FloatArray) -> FloatArray:
-        """Return the local over the nominal sheet resistance (...) at positions (2, ...)."""
-        log_ratio = np.zeros(position.shape[1:])
-        for (m, n), amplitude in zip(self.modes, self.amplitudes, strict=True):
-            log_ratio += amplitude * np.cos(m * math.pi * position[0]) * np.cos(n * math.pi * position[1])
-        return np.asarray(np.exp(log_ratio))
-
-
 @lru_cache(maxsize=64)
 def uneven_sheet_maps(shape: SimulatedSurface, gaps: ElectrodeGaps, unevenness: Unevenness) -> SheetMaps:
     """Return the maps of an uneven sheet of nominally 1 ohm per square; cached."""
+    if isinstance(shape, SimulatedOutline):
+        return solve_outline(shape, gaps, unevenness)
     maps = solve_sheet(shape, gaps)
     if unevenness.is_even:
         return maps

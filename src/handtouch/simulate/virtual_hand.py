@@ -204,9 +204,8 @@ class VirtualHand:
         row, applied = self.virtual_pads[contact.row], contact.contact
         shape = row.shape
         s_m, phi = applied.x * shape.length_m, applied.y * shape.arc
-        parallel_m = float(shape.radius(s_m))
         in_counts = jacobian * self._gains[contact.row][:, None]
-        in_counts[:, :2] /= (shape.length_m, shape.arc * parallel_m)
+        in_counts[:, :2] @= np.linalg.inv(shape.metres_per_fraction(applied.x, applied.y))
         variance = row.noise_counts**2 + _QUANTISATION_VARIANCE
         covariance = variance * np.linalg.inv(in_counts.T @ in_counts)
         return GroundTruth(
@@ -214,8 +213,7 @@ class VirtualHand:
             row.hand,
             row.pad.link,
             applied.touch_number,
-            s_m,
-            phi * parallel_m,
+            *shape.arc_lengths(s_m, phi),
             _vector(row.rotation @ shape.point(s_m, phi) + row.translation),
             _vector(row.rotation @ shape.normal(s_m, phi)),
             applied.force_n,

@@ -23,7 +23,8 @@ from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.sheet_solver import ElectrodeGaps
 from handtouch.simulate.stimulus import PadStimulus, Stimulus
-from handtouch.simulate.uneven_sheet import Unevenness, uneven_sheet_maps
+from handtouch.simulate.uneven_sheet import uneven_sheet_maps
+from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, HiddenPad
 
 FloatArray = NDArray[np.float64]
@@ -238,10 +239,10 @@ class VirtualPad:
 
 def _true_gaps(shape: SimulatedSurface, hidden: HiddenPad) -> ElectrodeGaps:
     """Return the gaps in the coordinates of the surface."""
-    ends = shape.radius([0.0, shape.length_m])
-    units = (*ends.tolist(), 1.0, 1.0)  # metres per unit of the coordinate along the side
     x0, xa, y0, yb = (
         (1e-3 * before / unit, 1e-3 * after / unit)
-        for before, after, unit in zip(hidden.gap_before_mm, hidden.gap_after_mm, units, strict=True)
+        for before, after, unit in zip(
+            hidden.gap_before_mm, hidden.gap_after_mm, shape.side_units(), strict=True
+        )
     )
     return ElectrodeGaps(x0, xa, y0, yb)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.hand.pads import mount_transform, rotation_from_rpy
 from handtouch.simulate.contact_patch import ContactPatch
-from handtouch.simulate.pad_geometry import SimulatedSurface, simulated_surface
+from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_physics import SheetLaw
+from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.worlds.distributions import Distribution
 from handtouch.simulate.worlds.families import Family
 from handtouch.simulate.worlds.sheet_kinds import SheetKind

@@ -56,10 +56,7 @@ def pad_mesh(surface: Surface, rotation: FloatArray, translation_m: FloatArray) 
 
 def outline_m(surface: Surface) -> FloatArray:
     """Return the edge of the unrolled pad, (k, 2): arc length from x0, and distance from the centre line."""
-    x = np.linspace(0, surface.a, _PAD_GRID_CELLS + 1)
-    u, widest = surface.from_rectangle(x, np.full_like(x, surface.b))
-    upper = np.stack([u, widest / 2], axis=1)
-    return np.concatenate([upper, (upper * [1, -1])[::-1]])
+    return surface.edge_m(_PAD_GRID_CELLS)
 
 
 def to_base64(mesh: TriangleMesh) -> dict[str, str]:

@@ -1,0 +1,242 @@
+"""Solve the potential of a sheet of any outline by finite elements: the simulator's forward model for them.
+
+Public names: `solve_outline` -> `SheetMaps`, `outline_mutual_resistance`.
+
+The sheet's equation is solved on the square that the transfinite map of `SimulatedOutline` takes to the pad,
+where it has the conductivity tensor det J (J' J)^-1. Elements are products of one-dimensional ones, graded
+towards the ends of the electrodes and with limits at the outline's vertices. It uses nothing of
+`handtouch.field`, so that the two can be checked against each other.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.simulate.outline_geometry import SimulatedOutline
+from handtouch.simulate.sheet_solver import (
+    EDGE_INSET_FRACTION,
+    RADIUS_NODES,
+    TABLE_NODES,
+    ElectrodeGaps,
+    MutualResistance,
+    SheetMaps,
+)
+from handtouch.simulate.spectral_elements import ElementAxis, lobatto_nodes
+from handtouch.simulate.unevenness import Unevenness
+
+FloatArray = NDArray[np.float64]
+_DEGREE, _RADIUS_DEGREE = 5, 4
+_MIN_GAP_FRACTION = 1e-3  # of a side
+_TABLE_DEGREE = 12
+_NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_TABLE_DEGREE)
+_TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' nodes
+    np.polynomial.legendre.legvander((2 * _NODES - 1) / (1 - 2 * EDGE_INSET_FRACTION), _TABLE_DEGREE).T,
+    np.polynomial.legendre.legvander((2 * TABLE_NODES - 1) / (1 - 2 * EDGE_INSET_FRACTION), _TABLE_DEGREE).T,
+).T
+
+
+@lru_cache(maxsize=32)
+def solve_outline(shape: SimulatedOutline, gaps: ElectrodeGaps, unevenness: Unevenness) -> SheetMaps:
+    """Return the maps of a sheet of nominally 1 ohm per square; cached.
+
+    Shares and conductance are those of the uneven sheet, the conformal radius that of an even one.
+    """
+    sheet = _OutlineSheet(shape, gaps, unevenness, _DEGREE)
+    to_table = sheet.evaluate(TABLE_NODES, TABLE_NODES)
+    shares = (to_table @ sheet.unit_potentials).T.reshape(4, len(TABLE_NODES), -1)
+    even = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE)
+    coarse = np.stack(np.meshgrid(_NODES, _NODES, indexing="ij")).reshape(2, -1)
+    regular = (even.evaluate(_NODES, _NODES) * even.regular_parts(coarse).T).sum(axis=1)
+    log_radius = 2 * math.pi * regular + np.log(shape.stretch_at(coarse))
+    log_radius -= math.log(
+        (1 + shape.stretch) / 2
+    )  # a disc is stretched to an ellipse, of that mean half axis
+    smooth = log_radius.reshape(2 * (len(_NODES),)) - _log_edge_distance(_NODES)
+    table = _TO_TABLE @ smooth @ _TO_TABLE.T + _log_edge_distance(TABLE_NODES)
+    return SheetMaps(sheet.conductance, np.concatenate([shares, table[None]]))
+
+
+def _log_edge_distance(nodes: FloatArray) -> FloatArray:
+    """Return ln (n, n) of a length on the grid of nodes that vanishes at electrodes as the radius does: in a
+    quadrant it is half the conformal radius."""
+    along = nodes**-2.0 + (1 - nodes) ** -2.0
+    return np.asarray(-np.log(along[:, None] + along) / 2)
+
+
+class _OutlineMutualResistance(MutualResistance):
+    """Green's function of a sheet of any outline with grounded electrodes, as a resistance."""
+
+    def __init__(self, shape: SimulatedOutline, gaps: ElectrodeGaps) -> None:
+        sheet = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE)
+        points = np.stack(np.meshgrid(RADIUS_NODES, RADIUS_NODES, indexing="ij")).reshape(2, -1)
+        regular = sheet.evaluate(RADIUS_NODES, RADIUS_NODES) @ sheet.regular_parts(points)
+        self._outline = shape
+        self._table = regular.reshape(4 * (len(RADIUS_NODES),))
+
+    def resistance_ohm(self, one: FloatArray, other: FloatArray, nearest_m: FloatArray) -> FloatArray:
+        """Return the resistance (n,) between positions (2, n) [fractions], at least `nearest_m` apart."""
+        apart = _stretched(self._outline, one)[0] - _stretched(self._outline, other)[0]
+        distance = np.maximum(np.hypot(*apart), nearest_m / self._outline.stretch_at(one))
+        return np.asarray(self._regular_part(one, other) - np.log(distance) / (2 * math.pi))
+
+
+@lru_cache(maxsize=24)
+def outline_mutual_resistance(shape: SimulatedOutline, gaps: ElectrodeGaps) -> MutualResistance:
+    """Return the Green's function of a sheet; cached."""
+    return _OutlineMutualResistance(shape, gaps)
+
+
+def _stretched(shape: SimulatedOutline, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the drawing and its derivatives, stretched along x until the sheet is isotropic."""
+    drawn, slopes = shape.drawing(position)
+    factors = np.array([shape.stretch, 1.0])
+    return (
+        drawn * factors.reshape(2, *(1,) * (drawn.ndim - 1)),
+        slopes * factors.reshape(2, *(1,) * (slopes.ndim - 1)),
+    )
+
+
+class _OutlineSheet:
+    """Solutions on one sheet; nodes are those of the square, p slowest."""
+
+    def __init__(
+        self, shape: SimulatedOutline, gaps: ElectrodeGaps, unevenness: Unevenness, degree: int
+    ) -> None:
+        from scipy.sparse.linalg import splu
+
+        self._shape, self._degree = shape, degree
+        units = (shape.arc, shape.arc, shape.length_m, shape.length_m)
+        bare = [
+            tuple(max(gap / unit, _MIN_GAP_FRACTION) for gap in pair)
+            for pair, unit in zip(gaps, units, strict=True)
+        ]  # of x0, xa, y0, yb, as fractions of their sides
+        self._bare = bare
+        ends = [
+            [end for before, after in pair for end in (before, 1 - after)] for pair in (bare[2:], bare[:2])
+        ]
+        self._p = ElementAxis.graded(1.0, _distinct([*ends[0], *shape.breaks((0, 2))]), degree)
+        self._q = ElementAxis.graded(1.0, _distinct([*ends[1], *shape.breaks((1, 3))]), degree)
+        stiffness = self._assemble(unevenness)
+        size = (len(self._p.nodes), len(self._q.nodes))
+        number = np.arange(size[0] * size[1]).reshape(size)
+        sides = (number[0], number[-1], number[:, 0], number[:, -1])
+        lines = (self._q.nodes, self._q.nodes, self._p.nodes, self._p.nodes)
+        slack = 1e-9
+        self._electrodes = [
+            side[(line >= before - slack) & (line <= 1 - after + slack)]
+            for side, line, (before, after) in zip(sides, lines, bare, strict=True)
+        ]
+        held = np.concatenate(self._electrodes)
+        self._free = np.setdiff1d(number.ravel(), held)
+        self._stiffness = stiffness
+        self._factors = splu(
+            stiffness[self._free][:, self._free].tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        potentials = np.zeros((number.size, 4))
+        for electrode, nodes in enumerate(self._electrodes):
+            potentials[nodes, electrode] = 1.0
+        self.unit_potentials = self._complete(potentials, np.zeros_like(potentials))
+        """(nodes, 4), with one electrode at 1."""
+        self.conductance: FloatArray = self.unit_potentials.T @ (stiffness @ self.unit_potentials)
+
+    def evaluate(self, p: FloatArray, q: FloatArray) -> FloatArray:
+        """Return the matrix (points, nodes) to the values on the grid p x q."""
+        return np.asarray(np.kron(self._p.evaluate_basis(p), self._q.evaluate_basis(q)), np.float64)
+
+    def regular_parts(self, position: FloatArray) -> FloatArray:
+        """Return the regular part (nodes, k) of the potential of a unit current at positions (2, k).
+
+        It compensates the values of -ln(r) / 2 pi on the electrodes and its flux through the bare boundary.
+        """
+        source = _stretched(self._shape, position)[0]
+        potentials = np.zeros((len(self._p.nodes) * len(self._q.nodes), position.shape[1]))
+        loads = np.zeros_like(potentials)
+        for side in range(4):
+            line = self._q if side < 2 else self._p
+            nodes = self._electrodes[side]
+            at = self._node_positions[:, nodes]
+            apart = _stretched(self._shape, at)[0][:, :, None] - source[:, None]
+            potentials[nodes] = np.log(np.hypot(*apart)) / (2 * math.pi)
+            before, after = self._bare[side]
+            points = line.quadrature_points
+            is_bare = (points < before) | (points > 1 - after)
+            fixed = np.full(int(is_bare.sum()), float(side % 2))
+            way = points[is_bare]
+            on_side = np.stack([fixed, way] if side < 2 else [way, fixed])
+            drawn, slopes = _stretched(self._shape, on_side)
+            along = slopes[:, 1 if side < 2 else 0]
+            x, y = drawn[:, :, None] - source[:, None]
+            sign = 1.0 if side in (1, 2) else -1.0  # of the direction of the outline along the side
+            turn = sign * (x * along[1][:, None] - y * along[0][:, None]) / (x * x + y * y)
+            weights = line.weights[is_bare, None] * turn / (2 * math.pi)
+            numbers = self._side_numbers[side]
+            loads[numbers] += line.values[is_bare].T @ weights
+        return self._complete(potentials, loads)
+
+    @cached_property
+    def _node_positions(self) -> FloatArray:
+        return np.stack(np.meshgrid(self._p.nodes, self._q.nodes, indexing="ij")).reshape(2, -1)
+
+    @cached_property
+    def _side_numbers(self) -> list[NDArray[np.intp]]:
+        number = np.arange(self._node_positions.shape[1]).reshape(len(self._p.nodes), -1)
+        return [number[0], number[-1], number[:, 0], number[:, -1]]
+
+    def _complete(self, potentials: FloatArray, loads: FloatArray) -> FloatArray:
+        """Return the potentials (nodes, k) that are given on the electrodes, with loads elsewhere."""
+        whole = potentials.copy()
+        right = loads - self._stiffness @ potentials
+        whole[self._free] = self._factors.solve(np.ascontiguousarray(right[self._free]))
+        return whole
+
+    def _assemble(self, unevenness: Unevenness):  # type: ignore[no-untyped-def]
+        from scipy.sparse import coo_array
+
+        p, q = self._p, self._q
+        count, points = self._degree + 1, self._degree + 2
+        across = np.stack(np.meshgrid(p.quadrature_points, q.quadrature_points, indexing="ij"))
+        (xp, xq), (yp, yq) = _stretched(self._shape, across)[1]
+        det = xp * yq - xq * yp
+        if not (det > 0).all():
+            raise ValueError(
+                "outline: the simulator's grid folds over; choose corners nearer to its real ones"
+            )
+        weight = np.outer(p.weights, q.weights) / det
+        if not unevenness.is_even:
+            weight = weight / unevenness.ohm_ratio(across)
+        tensors = (weight * (xq * xq + yq * yq), weight * (xp * xp + yp * yp), -weight * (xp * xq + yp * yq))
+        rows, columns, values = [], [], []
+        number = np.arange(len(p.nodes) * len(q.nodes)).reshape(len(p.nodes), -1)
+        for e in range(len(p.breaks) - 1):
+            pick = slice(e * points, (e + 1) * points)
+            own = slice(e * self._degree, e * self._degree + count)
+            at, by = p.values[pick, own], p.slopes[pick, own]
+            for f in range(len(q.breaks) - 1):
+                here = slice(f * points, (f + 1) * points)
+                mine = slice(f * self._degree, f * self._degree + count)
+                value, slope = q.values[here, mine], q.slopes[here, mine]
+                by_p, by_q = np.kron(by, value), np.kron(at, slope)
+                pp, qq, pq = (tensor[pick, here].reshape(-1, 1) for tensor in tensors)
+                local = by_p.T @ (pp * by_p + pq * by_q) + by_q.T @ (qq * by_q + pq * by_p)
+                nodes = number[own, mine].ravel()
+                rows.append(np.repeat(nodes, len(nodes)))
+                columns.append(np.tile(nodes, len(nodes)))
+                values.append(local.ravel())
+        indices = np.concatenate(rows), np.concatenate(columns)
+        return coo_array((np.concatenate(values), indices), shape=2 * (number.size,)).tocsr()
+
+
+def _distinct(ends: list[float]) -> list[float]:
+    """Return sorted ends without those that almost coincide with another one."""
+    kept: list[float] = []
+    for end in sorted(ends):
+        if not kept or end - kept[-1] > 1e-6:
+            kept.append(end)
+    return kept

@@ -1,0 +1,37 @@
+"""Logarithm of a sheet's resistance over its nominal value, as a sum of waves.
+
+Public name: `Unevenness`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Unevenness:
+    """Logarithm of the sheet resistance over its nominal value, as a sum of waves.
+
+    amplitudes[i] is that of cos(m pi x) cos(n pi y) with (m, n) = modes[i], x and y fractions of the pad.
+    """
+
+    modes: tuple[tuple[int, int], ...] = ()
+    amplitudes: tuple[float, ...] = ()
+
+    @property
+    def is_even(self) -> bool:
+        """True if the sheet has the same resistance everywhere."""
+        return not any(self.amplitudes)
+
+    def ohm_ratio(self, position: FloatArray) -> FloatArray:
+        """Return the local over the nominal sheet resistance (...) at positions (2, ...)."""
+        log_ratio = np.zeros(position.shape[1:])
+        for (m, n), amplitude in zip(self.modes, self.amplitudes, strict=True):
+            log_ratio += amplitude * np.cos(m * math.pi * position[0]) * np.cos(n * math.pi * position[1])
+        return np.asarray(np.exp(log_ratio))
