@@ -261,7 +261,6 @@ def test_subscription_flood_is_cut_off_and_disturbs_no_other_subscriber(publishe
         assert publisher.subscriptions == {b"health/", b"service"}
         assert other.lost_messages == 0
         assert publisher.refused["unknown_topic"] < 2000
-        assert publisher.refused["subscription_flood"] < 3  # it doesn't come back at once
 
 
 def test_flood_of_subscriptions_leaves_nothing_to_read_when_it_ends(publisher: Publisher) -> None:
