@@ -123,7 +123,7 @@ def radius_hand(task: tuple[int, int]) -> list[tuple[str, float, str, bool]]:
     """Return sheet, force, pad and whether the 95 % interval of force holds, of valid forces of a hand."""
     number, touches = task
     drawn = bench_worlds.drawn_world("radius", number)
-    deployment = load(shipped.path("utah_mit.toml"))
+    deployment = drawn.describe(load(shipped.path("utah_mit.toml")))
     model, rng = PadModel(deployment), np.random.default_rng((drawn.seed, 10))
     sheet_of = {pad.link: pad.sheet for pad in deployment.hands[0].pads}
     made = tuple(
@@ -347,10 +347,8 @@ def gain_figures(trials: int) -> Iterator[tuple[Claim, Figure]]:
 
 def session(number: int, seconds: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return errors and bounds [m] of all contact samples of the demo's session, and the touch of each."""
-    deployment, drawn = (
-        load(shipped.path("utah_mit.toml")),
-        WORLDS["ideal"].draw(Family.REPORTING.seed(number)),
-    )
+    drawn = WORLDS["ideal"].draw(Family.REPORTING.seed(number))
+    deployment = drawn.describe(load(shipped.path("utah_mit.toml")))
     scenario = Scenario.load(shipped.path("utah_mit_session.toml"))
     hand, model = VirtualHand(deployment, scenario, drawn), PadModel(deployment)
     period_s = deployment.daemon.sync_period_ms * 1e-3
