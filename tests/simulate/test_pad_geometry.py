@@ -8,7 +8,9 @@ import pytest
 from handtouch.config import SurfaceTable
 from handtouch.field.surface import SURFACES
 from handtouch.simulate.pad_geometry import SimulatedSurface
+from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMaps
 from handtouch.simulate.surfaces import simulated_surface
+from handtouch.simulate.torn_sheet import cut_sheet_maps
 from tests.simulate.surfaces import OUTLINE_TABLES, SURFACE_TABLES
 
 POSITIONS = [(0.0, 0.0), (0.5, 0.5), (0.02, 0.9), (0.7, 0.3), (1.0, 1.0)]
@@ -106,3 +108,11 @@ def test_resized_profiles_keep_their_length_as_curves() -> None:
     s = np.linspace(0.0, resized.length_m, 4001)
     points = np.array([resized.point(at, resized.arc / 2) for at in s.tolist()])
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(resized.length_m, rel=1e-6)
+
+
+def test_a_torn_outline_is_refused_instead_of_simulated_as_a_rectangle() -> None:
+    shape = simulated_surface(OUTLINE_TABLES["outline"])
+    gaps = ElectrodeGaps(*(4 * ((1e-3, 1e-3),)))
+    maps = SheetMaps(np.zeros((4, 4)), np.zeros((5, 2, 2)))
+    with pytest.raises(ValueError, match="give the fault to another pad"):
+        cut_sheet_maps(shape, gaps, maps, ("x0y0", 1e-3, 1e-3))

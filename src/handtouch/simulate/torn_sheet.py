@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.simulate.coarse_sheet import CoarseGrid, CoarseSolution
+from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMaps
 
@@ -34,7 +35,12 @@ def _solve_coarse(shape: SimulatedSurface, gaps: ElectrodeGaps, cut: CornerCut |
 def cut_sheet_maps(
     shape: SimulatedSurface, gaps: ElectrodeGaps, maps: SheetMaps, cut: CornerCut
 ) -> SheetMaps:
-    """Return the maps of a sheet whose corner is cut off, with the conformal radius of the intact sheet."""
+    """Return the maps of a sheet whose corner is cut off, with the conformal radius of the intact sheet.
+
+    Raises ValueError for a pad of any outline, whose cuts aren't simulated.
+    """
+    if isinstance(shape, SimulatedOutline):
+        raise ValueError("a torn sheet is simulated on rectangles only; give the fault to another pad")
     after, before = _solve_coarse(shape, gaps, cut), _solve_coarse(shape, gaps, None)
     table = maps.table.copy()
     table[:4] += after.shares - before.shares
