@@ -25,19 +25,19 @@ _LOG_LAYER, _ALPHA, _LOG_RADIUS, _RADIUS_STD, _LOG_SHEET, _DRIVE, _LOG_REFERENCE
     7,
 )
 _MIN_FACTORS = 16
-LAW_PARAMETERS = 21
-RADIUS_NODES = (0.0, 1.3556261799742657, -1.3556261799742657, 2.8569700138728056, -2.8569700138728056)
+LAW_PARAMETERS = 19
+RADIUS_NODES = (0.0, 1.7320508075688772, -1.7320508075688772)
 """Errors of the radius, in standard deviations, that the quadrature evaluates (Gauss and Hermite)."""
 MIN_RADIUS_RATIO = 0.25
 """Least radius of these, relative to the stated one."""
-_NEAR_NODE, _FAR_NODE, _MIN_RADIUS_RATIO = RADIUS_NODES[1], RADIUS_NODES[3], MIN_RADIUS_RATIO
-_MIDDLE_WEIGHT, _NEAR_WEIGHT, _FAR_WEIGHT = 0.5333333333333333, 0.22207592200561263, 0.011257411327720693
+_RADIUS_NODE, _MIN_RADIUS_RATIO = RADIUS_NODES[1], MIN_RADIUS_RATIO
+_MIDDLE_WEIGHT, _OUTER_WEIGHT = 2.0 / 3.0, 1.0 / 6.0
 _BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_CURRENT_FRACTION
 _MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
 _MIN_CURRENT_A = 1e-200
 _TWO_PI, _LOG_PI, _INFINITY = 2.0 * math.pi, math.log(math.pi), math.inf
 _NAN = float("nan")
-_STEP_SIGMA, _MAX_SIGMA, _MAX_NODES = 0.7, 3.5, 48  # of the quadrature over the stack factor
+_STEP_SIGMA, _MAX_SIGMA, _MAX_NODES = 0.9, 3.2, 32  # of the quadrature over the stack factor
 _MIN_RELATIVE_VARIANCE = 1e-18
 _UNLIMITED_SIGMA = 3.0
 
@@ -132,10 +132,8 @@ def estimate_force(
         result.weights = result.mean = result.square = 0.0
         _integrate(stack, law, result, 0.0, _MIDDLE_WEIGHT, least)
         if p[_RADIUS_STD] > 0.0:
-            _integrate(stack, law, result, _NEAR_NODE, _NEAR_WEIGHT, max(p[_MIN_FACTORS + 1], limit))
-            _integrate(stack, law, result, -_NEAR_NODE, _NEAR_WEIGHT, max(p[_MIN_FACTORS + 2], limit))
-            _integrate(stack, law, result, _FAR_NODE, _FAR_WEIGHT, max(p[_MIN_FACTORS + 3], limit))
-            _integrate(stack, law, result, -_FAR_NODE, _FAR_WEIGHT, max(p[_MIN_FACTORS + 4], limit))
+            _integrate(stack, law, result, _RADIUS_NODE, _OUTER_WEIGHT, max(p[_MIN_FACTORS + 1], limit))
+            _integrate(stack, law, result, -_RADIUS_NODE, _OUTER_WEIGHT, max(p[_MIN_FACTORS + 2], limit))
         if result.weights > 0.0:
             mean = result.mean / result.weights
             variance = result.square / result.weights - mean * mean
@@ -178,11 +176,10 @@ def _integrate(
 
 def _lowest_factor(stack: StackTable, law: PadLaw, result: ForceResult, least: float) -> float:
     """Return the stack factor from which on the quadrature has to begin."""
-    factor = least
-    for _ in range(2):  # the spreading depends on it near edges
-        _evaluate_factor(stack, law, result, factor)
-        factor = max(factor + result.excess, least)
+    _evaluate_factor(stack, law, result, least)
+    factor = max(least + result.excess, least)
     _evaluate_factor(stack, law, result, factor)
+    factor = max(factor + result.excess, least)  # the spreading depends on it near edges
     factor = max(least, factor / (1.0 + _MAX_SIGMA * result.std / factor))
     _evaluate_factor(stack, law, result, factor)
     missing = _MAX_SIGMA * result.std - result.excess
