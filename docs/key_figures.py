@@ -169,8 +169,9 @@ def draw_slip(axes: Axes) -> None:
 
 def draw_diagnosis(axes: Axes) -> None:
     """Share of episodes with a fault that are diagnosed correctly."""
-    rows = [row for row in load("diagnose")["tables"]["By fault"] if row["named, %"] != ""]
-    bars = axes.barh([row["fault played"] for row in rows], [row["named, %"] for row in rows], color=BLUE)
+    rows = [row for row in load("diagnose")["tables"]["World default"] if row["events"]]
+    recall = [float(row["recall, %"].split()[0]) for row in rows]
+    bars = axes.barh([row["played"] for row in rows], recall, color=BLUE)
     axes.bar_label(bars, fmt="%.0f", padding=3)
     axes.set(xlabel="episodes with the correct diagnosis, %", xlim=(0, 112))
     axes.invert_yaxis()

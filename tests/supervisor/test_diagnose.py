@@ -118,6 +118,17 @@ def test_gains_within_tolerance_give_no_diagnosis_after_many_contacts(
     assert changes == []
 
 
+def test_offset_names_its_channel_also_while_the_pad_is_held() -> None:
+    """A press of some seconds hides an offset to lower readings: another channel reads most."""
+
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        held = 420 * fractions(0.85, 0.85) if 15 < t < 22 else np.zeros(4)
+        return np.asarray(held - np.array([0, 0, 0, 300 * (t > 5)]))
+
+    _, changes = play(contacts, 30)
+    assert {change.electrodes for change in changes if change.kind == FaultKind.OFFSET} == {("yb",)}
+
+
 def detector(series_ohm: float = 0.0) -> ContactFaultDetector:
     """Detector of the first pad, with the tolerances that its deployment states."""
     made, network = model(), model().networks[0].with_series_ohm([series_ohm] * 4)
