@@ -18,7 +18,8 @@ TEXT = (Path(__file__).parents[2] / "docs" / "hand.md").read_text()
 
 def written(folder: Path, allegro: Path) -> Path:
     """The deployment in docs/hand.md, as a file."""
-    (example,) = re.findall(r"```toml\n(.*?)```", TEXT, flags=re.S)
+    blocks = re.findall(r"```toml\n(.*?)```", TEXT, flags=re.S)
+    (example,) = (block for block in blocks if "allegro_right_hand.urdf" in block)
     path = folder / "hand.toml"
     path.write_text(example.replace("allegro_right_hand.urdf", str(allegro)))
     return path
