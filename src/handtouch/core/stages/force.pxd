@@ -21,7 +21,7 @@ cdef class PadLaw:
 cdef class ForceResult:
     cdef public double force_n, std_n
     cdef double whole, resistors, log_spreading_m, gradient2, variance, log_radius_m, log_force, slope, std
-    cdef double excess, weights, mean, square, log_unit
+    cdef double excess, weights, log_mean, mean, square, log_unit
     cdef public Py_ssize_t status
 
 @cython.locals(p='double[::1]')

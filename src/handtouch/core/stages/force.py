@@ -1,10 +1,11 @@
 """Force: from a contact's total current through the contact law, with its standard deviation.
 
 The same law as `handtouch.field.contact_law`, which is the reference for contacts far from edges whose
-parameters are exact. The force is the mean of its probability given the current: all forces up to the
-greatest of a contact are equally likely before (by their logarithm), and the stack factor that the current
-leaves is normal about that of each force and radius, with the variance of noise, law and distance from the
-edge at that force. So it holds near the maximum current of the sheet, where forces hardly differ in current.
+parameters are exact. The force is the geometric mean of its probability given the current, and its standard
+deviation the root of the mean square difference from it: all forces up to the greatest of a contact are
+equally likely before (by their logarithm), and the stack factor that the current leaves is normal about that
+of each force and radius, with the variance of noise, law and distance from the edge at that force. So it holds
+near the maximum current of the sheet, where forces hardly differ in current.
 """
 
 from __future__ import annotations
@@ -78,8 +79,8 @@ class ForceResult:
     The rest is working memory. `whole`, `resistors`, `log_spreading_m`, `gradient2`, `variance`: of the
     contact, see `estimate_force`; `log_radius_m` assumed for it. Of the force that leaves a stack factor:
     `log_force`, its derivative `slope` by the factor, the factor's standard deviation `std`, and the
-    difference `excess` of what the current leaves from it. `weights`, `mean`, `square`: integrals of the
-    probability, of the force relative to that of `log_unit`, and of its square.
+    difference `excess` of what the current leaves from it. `weights`, `log_mean`, `mean`, `square`: integrals of
+    the probability, and of the force relative to that of `log_unit`: its logarithm, itself and its square.
     """
 
     def __init__(self) -> None:
@@ -87,7 +88,7 @@ class ForceResult:
         self.status = _NOT_ESTIMATED
         self.whole = self.resistors = self.log_spreading_m = self.gradient2 = self.variance = 0.0
         self.log_radius_m = self.log_force = self.slope = self.std = self.excess = 0.0
-        self.weights = self.mean = self.square = self.log_unit = 0.0
+        self.weights = self.log_mean = self.mean = self.square = self.log_unit = 0.0
 
 
 def estimate_force(
@@ -129,17 +130,17 @@ def estimate_force(
     result.status = _LOWER_BOUND
     if result.excess > reach * std:
         result.log_unit = result.log_force
-        result.weights = result.mean = result.square = 0.0
+        result.weights = result.log_mean = result.mean = result.square = 0.0
         _integrate(stack, law, result, 0.0, _MIDDLE_WEIGHT, least)
         if p[_RADIUS_STD] > 0.0:
             _integrate(stack, law, result, _RADIUS_NODE, _OUTER_WEIGHT, max(p[_MIN_FACTORS + 1], limit))
             _integrate(stack, law, result, -_RADIUS_NODE, _OUTER_WEIGHT, max(p[_MIN_FACTORS + 2], limit))
         if result.weights > 0.0:
-            mean = result.mean / result.weights
-            variance = result.square / result.weights - mean * mean
+            force = math.exp(result.log_mean / result.weights)
+            mean_square = (result.square - 2.0 * force * result.mean) / result.weights + force * force
             unit = math.exp(min(300.0, result.log_unit))
-            result.force_n = unit * mean
-            result.std_n = unit * math.sqrt(max(variance, _MIN_RELATIVE_VARIANCE * mean * mean))
+            result.force_n = unit * force
+            result.std_n = unit * math.sqrt(max(mean_square, _MIN_RELATIVE_VARIANCE * force * force))
             result.status = _VALID
     if result.status == _LOWER_BOUND:
         result.log_radius_m = p[_LOG_RADIUS]
@@ -164,8 +165,10 @@ def _integrate(
         step = _STEP_SIGMA * result.std
         weight = 0.5 * (step_before + step) * share * math.exp(-0.5 * sigma * sigma)
         weight *= -result.slope / result.std
-        force = math.exp(result.log_force - result.log_unit)
+        log_force = result.log_force - result.log_unit
+        force = math.exp(log_force)
         result.weights += weight
+        result.log_mean += weight * log_force
         result.mean += weight * force
         result.square += weight * force * force
         if sigma < -_MAX_SIGMA:
