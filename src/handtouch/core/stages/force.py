@@ -4,8 +4,8 @@ The same law as `handtouch.field.contact_law`, which is the reference for contac
 parameters are exact. The force is the geometric mean of its probability given the current, and its standard
 deviation the root of the mean square difference from it: all forces up to the greatest of a contact are
 equally likely before (by their logarithm), and the stack factor that the current leaves is normal about that
-of each force and radius, with the variance of noise, law and distance from the edge at that force. So it holds
-near the maximum current of the sheet, where forces hardly differ in current.
+of each force and radius, with the variance of noise, law and distance from the edge at that force. So it
+holds near the maximum current of the sheet, where forces hardly differ in current.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class ForceResult:
     The rest is working memory. `whole`, `resistors`, `log_spreading_m`, `gradient2`, `variance`: of the
     contact, see `estimate_force`; `log_radius_m` assumed for it. Of the force that leaves a stack factor:
     `log_force`, its derivative `slope` by the factor, the factor's standard deviation `std`, and the
-    difference `excess` of what the current leaves from it. `weights`, `log_mean`, `mean`, `square`: integrals of
-    the probability, and of the force relative to that of `log_unit`: its logarithm, itself and its square.
+    difference `excess` of what the current leaves from it. `weights`, `log_mean`, `mean`, `square`: integrals
+    of the probability, and of the force relative to that of `log_unit`: its logarithm, itself, its square.
     """
 
     def __init__(self) -> None:
