@@ -108,8 +108,8 @@ def test_one_late_pad_names_its_node(rig: Any) -> None:
     assert "heartbeat present; its PDO and heartbeat settings are as configured" in after.reason
 
 
-@pytest.mark.parametrize("role", ["master", "listener"])
-def test_a_pad_that_stays_late_when_the_others_are_back_names_its_node(make_rig: Make, role: str) -> None:
+def running_rig(make_rig: Make, role: str) -> Any:
+    """Return a rig of three operational nodes, which another master has started for a listener."""
     rig = make_rig(3, role=role)
     rig.plug_all()
     if role == "listener":
@@ -119,6 +119,12 @@ def test_a_pad_that_stays_late_when_the_others_are_back_names_its_node(make_rig:
             device.handle_nmt(1)
     rig.start()
     rig.run(500)
+    return rig
+
+
+@pytest.mark.parametrize("role", ["master", "listener"])
+def test_a_pad_that_stays_late_when_the_others_are_back_names_its_node(make_rig: Make, role: str) -> None:
+    rig = running_rig(make_rig, role)
     rig.wire.lose = {0x281, 0x282, 0x283}
     rig.run(50)
     assert all("as from every pad of bus can" in rig.status(n).reason for n in (1, 2, 3))
@@ -143,15 +149,7 @@ def test_nodes_lost_together_name_the_bus_and_one_lost_alone_doesnt(rig: Any) ->
 def test_a_node_that_stays_lost_when_the_others_are_back_names_its_own_connection(
     make_rig: Make, role: str
 ) -> None:
-    rig = make_rig(3, role=role)
-    rig.plug_all()
-    if role == "listener":
-        for device in rig.devices.devices.values():
-            device.write_object(0x1017, 0, 100)
-            device.write_object(0x1801, 2, 1)
-            device.handle_nmt(1)
-    rig.start()
-    rig.run(500)
+    rig = running_rig(make_rig, role)
     rig.wire.cut = {1, 2, 3}
     rig.run(600)
     assert all("as from every node of bus can" in rig.status(n).reason for n in (1, 2, 3))
