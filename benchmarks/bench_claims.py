@@ -42,7 +42,6 @@ from handtouch.wire import Contact
 
 FloatArray = NDArray[np.float64]
 AS_FOUND = "claims_as_found.json"
-NEAR_EDGE, MIDDLE = 0.05, 0.15
 RADIUS_FORCES_N = {"firm": (4.0, 10.0), "soft": (3.0, 8.0)}
 SHEET_PADS = 24
 

@@ -94,7 +94,6 @@ class MessageRecorder:
         self._state_requested_ns = self._flushed_ns = self._file_opened_ns = 0
         self._needs_state = True
         self._state_tick: int | None = None  # of a state without a tick since
-        self._file_lost = 0
 
     @property
     def size(self) -> int:
