@@ -39,7 +39,7 @@ $(VENV)/.dev: pyproject.toml locks/dev.lock | $(BIN)/python
 	@touch $(VENV)/.run $(VENV)/.view $@
 
 # sources that Cython compiles; a run without a compiler is slower, and says so
-CORE := $(wildcard src/handtouch/core/stages/*.py src/handtouch/core/stages/*.pxd) src/handtouch/core/build.py
+CORE := $(wildcard src/handtouch/core/stages/*.py src/handtouch/core/stages/*.pxd) src/handtouch/core/compiled.py
 $(VENV)/.core: $(CORE) | $(VENV)/.dev
 	@$(BIN)/python -m handtouch.core.build && touch $@ || test "$(CI)" != true
 

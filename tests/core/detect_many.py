@@ -9,11 +9,11 @@ import numpy as np
 
 from handtouch.config import parse
 from handtouch.core.cycle import Cycle
-from handtouch.core.encoders import ContactMessageEncoder
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import STANDARD_LAYOUT, ChannelField, Slab
 from handtouch.core.stages import detect
 from handtouch.core.tick import TickProcessor
+from handtouch.core.tick_messages import ContactMessageEncoder
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
 PERIOD_NS = 5_000_000

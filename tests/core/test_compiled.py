@@ -64,8 +64,9 @@ def test_stages_compiled_from_other_sources_are_refused(copied: Path) -> None:
     [
         ("solve.py", {"solve"}),
         ("locate.py", {"locate"}),
-        ("tables.pxd", {"tables", "tolerances", "locate", "place", "solve"}),
+        ("tables.pxd", {"tables", "tolerances", "locate", "solve"}),
         ("receive.pxd", {"receive", "detect"}),
+        ("../build.py", set()),
     ],
 )
 def test_an_edit_makes_those_modules_old_that_are_compiled_from_it(
@@ -84,20 +85,20 @@ print(*(f'{stage}-{source_hash(stage)}' for stage in STAGES))"
 def test_only_changed_modules_are_compiled_and_equal_ones_to_equal_bytes(copied: Path) -> None:
     folder = copied / "handtouch/core/stages/_compiled"
     files = {path.name.partition("-")[0]: path for path in folder.glob("*.so")}
-    tables = files["tables"].read_bytes()
+    slip = files["slip"].read_bytes()
     untouched = {
-        path.name: path.stat().st_ino for name, path in files.items() if name not in ("tables", "place")
+        path.name: path.stat().st_ino for name, path in files.items() if name not in ("slip", "sheets")
     }
-    files["tables"].unlink()
-    with (copied / "handtouch/core/stages/place.py").open("a") as file:
+    files["slip"].unlink()
+    with (copied / "handtouch/core/stages/sheets.py").open("a") as file:
         file.write("# edited\n")
     done = run("-m", "handtouch.core.build", source=copied)
     assert done.returncode == 0, done.stderr
     after = {path.name: path.stat().st_ino for path in folder.iterdir()}
     assert len(after) == len(files)
     assert untouched.items() <= after.items()
-    assert files["place"].name not in after
-    assert files["tables"].read_bytes() == tables
+    assert files["sheets"].name not in after
+    assert files["slip"].read_bytes() == slip
     assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import wire
-from handtouch.core.encoders import HandFrameEncoder
+from handtouch.core.tick_messages import HandFrameEncoder
 
 LINKS = ("palm", "thumb_distal", "index_distal")
 COLUMNS = wire.COLUMNS[wire.HandFrame]

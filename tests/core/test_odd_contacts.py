@@ -11,9 +11,9 @@ import pytest
 
 from handtouch import wire
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.encoders import ContactMessageEncoder
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.state import TickState
+from handtouch.core.tick_messages import ContactMessageEncoder
 from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
 
 ODD = np.array([np.nan, np.inf, -np.inf, 0.0, 1e30, -1e-30, 1.0])

@@ -18,19 +18,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
-_DIRECTIVES = {
-    "language_level": "3",
-    "infer_types": "True",  # locals are C numbers, not objects
-    "boundscheck": "False",
-    "wraparound": "False",
-    "initializedcheck": "False",
-    "cdivision": "True",  # nothing may divide by zero
-    "annotation_typing": "False",  # types are in the .pxd files
-    "binding": "False",
-}
-_FLAGS = ("-O2", "-fPIC", "-shared", "-s", "-fno-strict-aliasing", "-ffp-contract=off", "-w")
-_LIMITED_API = ("-DCYTHON_LIMITED_API=1", "-DPy_LIMITED_API=0x030B0000")
-"""The stable ABI of Python 3.11: one file for this and all later versions."""
 MIN_GLIBC = (2, 17)
 """Oldest C library that files compiled for other machines run with, as manylinux2014 has it."""
 _ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
@@ -62,12 +49,12 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
     if not (Path(include) / "Python.h").exists():
         raise BuildError(f"{include}/Python.h is missing; on Debian: apt-get install python3-dev")
     files[0].parent.mkdir(parents=True, exist_ok=True)
-    command = [*compiler, *_FLAGS, *_LIMITED_API, f"-I{include}"]
+    command = [*compiler, *compiled.FLAGS, *compiled.LIMITED_API, f"-I{include}"]
 
     def compile_stage(stage: tuple[str, Path]) -> None:
         name, file = stage
         with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=file.parent) as work:
-            options = [f"-X{key}={value}" for key, value in _DIRECTIVES.items()]
+            options = [f"-X{key}={value}" for key, value in compiled.DIRECTIVES.items()]
             source_file = f"handtouch/core/stages/{name}.py"
             _run([sys.executable, "-m", "cython", *options, "-o", f"{work}/{name}.c", source_file], source)
             _run([*command, f"{name}.c", "-o", f"{name}.so", "-lm"], Path(work))  # its path is in no file

@@ -23,10 +23,22 @@ from types import ModuleType
 from typing import NamedTuple
 
 STAGES = (
-    *("tables", "tolerances", "locate", "force", "place", "solve", "slip", "receive", "detect", "sheets"),
-    *("publish", "encode"),
+    *("tables", "tolerances", "locate", "force", "solve", "slip", "receive", "detect", "sheets", "publish"),
 )
 """Modules of `handtouch.core.stages`, lowest first."""
+DIRECTIVES = {
+    "language_level": "3",
+    "infer_types": "True",  # locals are C numbers, not objects
+    "boundscheck": "False",
+    "wraparound": "False",
+    "initializedcheck": "False",
+    "cdivision": "True",  # nothing may divide by zero
+    "annotation_typing": "False",  # types are in the .pxd files
+    "binding": "False",
+}
+FLAGS = ("-O2", "-fPIC", "-shared", "-s", "-fno-strict-aliasing", "-ffp-contract=off", "-w")
+LIMITED_API = ("-DCYTHON_LIMITED_API=1", "-DPy_LIMITED_API=0x030B0000")
+"""The stable ABI of Python 3.11: one file for this and all later versions."""
 DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"
 """Environment variable that makes Python run the sources, for debugging."""
 _PACKAGE = "handtouch.core.stages"
@@ -62,7 +74,7 @@ def source_hash(stage: str) -> str:
         used = {name for found in _CIMPORT.findall(text) for name in re.findall(r"\w+", found[0] or found[1])}
         waiting += used - declarations
         declarations |= used
-    digest = hashlib.sha256((_FOLDER.parent / "build.py").read_bytes())
+    digest = hashlib.sha256(repr((DIRECTIVES, FLAGS, LIMITED_API)).encode())
     digest.update((_FOLDER / f"{stage}.py").read_bytes())
     for name in sorted(declarations):
         digest.update((_FOLDER / f"{name}.pxd").read_bytes())

@@ -13,8 +13,8 @@ from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import SEARCH_POINTS, stack_table
 from handtouch.core.stages.locate import Fit
-from handtouch.core.stages.place import Placement
 from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, ContactSolver
+from handtouch.core.stages.tables import Placement
 from handtouch.core.stages.tolerances import PartKnowledge, Whitening, part_count
 
 FloatArray = NDArray[np.float64]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.force import StackTable
 from handtouch.core.stages.locate import ModelTable
-from handtouch.core.stages.place import PadSurface
+from handtouch.core.stages.tables import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.model import spreading_radius
 from handtouch.field.network import Electrode, ElectrodeNetwork

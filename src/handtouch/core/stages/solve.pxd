@@ -1,17 +1,17 @@
 cimport cython
 from libc cimport math
-from handtouch.core.stages cimport force, locate, place, tables, tolerances
+from handtouch.core.stages cimport force, locate, tables, tolerances
 
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
 cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT
 cdef double _NAN, _MAX_SQUARED_MISFIT, _MAX_EXTENT_SIDES
 
 cdef class ContactSolver:
-    cdef list tables, pad_tolerances, laws, surfaces
+    cdef list models, pad_tolerances, laws, surfaces
     cdef force.StackTable stack
     cdef locate.Fit fit
     cdef tolerances.PartKnowledge known
-    cdef place.Placement placement
+    cdef tables.Placement placement
     cdef force.ForceResult result
     cdef Py_ssize_t electrodes
     cdef double[::1] by_x, by_y, by_total
@@ -29,11 +29,11 @@ cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
 cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, values='double[::1]', law=force.PadLaw)
 cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(row=Py_ssize_t, fit=locate.Fit, at=place.Placement, values='double[::1]')
+@cython.locals(row=Py_ssize_t, fit=locate.Fit, at=tables.Placement, values='double[::1]')
 cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(fit=locate.Fit, table=locate.ModelTable, parts=tolerances.PadTolerances)
 cdef void _add_size(ContactSolver solver, Py_ssize_t pad) noexcept
 cdef void _write_row(
-    double[::1] values, Py_ssize_t first, locate.Fit fit, place.Placement at, double t, double w) noexcept
+    double[::1] values, Py_ssize_t first, locate.Fit fit, tables.Placement at, double t, double w) noexcept
 @cython.locals(n=Py_ssize_t)
 cdef void _add_extent(locate.ModelTable table, locate.Fit fit, double residual) noexcept

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from handtouch.core.stages import force, locate, place, tables, tolerances
+from handtouch.core.stages import force, locate, tables, tolerances
 
 _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD = 0, 2, 4, 5, 8, 11, 12, 13
 _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT = 14, 23, 26, 27, 29, 30
@@ -51,13 +51,13 @@ class ContactSolver:
 
     def __init__(
         self,
-        tables: list[locate.ModelTable],
+        models: list[locate.ModelTable],
         pad_tolerances: list[tolerances.PadTolerances],
         laws: list[force.PadLaw],
-        surfaces: list[place.PadSurface],
+        surfaces: list[tables.PadSurface],
         stack: force.StackTable,
         fit: locate.Fit,
-        placement: place.Placement,
+        placement: tables.Placement,
         electrodes: int,
         work: memoryview[float],
         currents: memoryview[float],
@@ -68,7 +68,7 @@ class ContactSolver:
         force_requested: memoryview[int],
         values: memoryview[float],
     ) -> None:
-        self.tables, self.pad_tolerances = tables, pad_tolerances
+        self.models, self.pad_tolerances = models, pad_tolerances
         self.laws, self.surfaces = laws, surfaces
         self.stack, self.fit, self.placement = stack, fit, placement
         self.result = force.ForceResult()
@@ -90,7 +90,7 @@ class ContactSolver:
 def solve_contact(solver: ContactSolver, pad: int) -> None:
     """Locate a pad's contact, estimate its force, and place it in the link's frame."""
     n, row = solver.electrodes, pad * _COUNT
-    fit, table, values = solver.fit, solver.tables[pad], solver.values
+    fit, table, values = solver.fit, solver.models[pad], solver.values
     offset2 = solver.offset_std[pad] * solver.offset_std[pad] / n
     for i in range(n):
         weight = solver.weight[pad * n + i]
@@ -112,7 +112,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     if not fit.found:
         return
     values[row + _CELLS], values[row + _CELLS + 1] = fit.s, fit.t
-    place.place_contact(solver.surfaces[pad], solver.placement, fit.x, fit.y)
+    tables.place_contact(solver.surfaces[pad], solver.placement, fit.x, fit.y)
     _propagate(solver, pad)
     if solver.force_requested[pad]:
         _estimate_force(solver, pad)
@@ -248,7 +248,7 @@ def _write_position(solver: ContactSolver, pad: int) -> None:
 def _add_size(solver: ContactSolver, pad: int) -> None:
     """Add the covariance of positions by the pad's size, which is in proportion to the distance from the
     middle."""
-    fit, table, parts = solver.fit, solver.tables[pad], solver.pad_tolerances[pad]
+    fit, table, parts = solver.fit, solver.models[pad], solver.pad_tolerances[pad]
     aside_x = (solver.placement.u_m - parts.middle_u_m) * parts.size_x / solver.placement.along_m
     aside_y = (fit.y - 0.5 * table.side_y) * parts.size_y
     fit.var_x += aside_x * aside_x
@@ -256,7 +256,7 @@ def _add_size(solver: ContactSolver, pad: int) -> None:
 
 
 def _write_row(
-    values: memoryview[float], first: int, fit: locate.Fit, at: place.Placement, t: float, w: float
+    values: memoryview[float], first: int, fit: locate.Fit, at: tables.Placement, t: float, w: float
 ) -> None:
     """Write a row of the covariance in the link's frame, from components of the tangents."""
     by_t, by_w = fit.var_x * t + fit.cov_xy * w, fit.cov_xy * t + fit.var_y * w
