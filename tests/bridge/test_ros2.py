@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import os
 import time
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import pytest
+import zmq
 from cyclonedds.idl import IdlStruct
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from handtouch import wire
 from handtouch.bridge.ros2 import messages as ros
+from handtouch.bridge.ros2.conflation import Conflation
 from handtouch.bridge.ros2.conversion import (
     Stamper,
     contact_markers,
-    contact_message,
-    palm_wrench,
-    wrench_message,
+    encode_contacts,
+    encode_palm_wrench,
+    encode_wrench,
 )
 from handtouch.bridge.ros2.messages import MESSAGE_TYPES
 from handtouch.bridge.ros2.network import Quality, RosNetwork, ros_name
+from handtouch.bridge.ros2.relay import TOPICS, RosRelay, relay_received
 from handtouch.bridge.ros2.type_hash import ros_type_name, type_hash
-from tests.client.hand_messages import make_contact
+from handtouch.client import Subscriber
+from tests.client.hand_messages import make_contact, make_frame
 
 PACKAGE = Path(__file__).parents[2] / "clients" / "ros2" / "handtouch_msgs"
 WALL_OFFSET_NS = 1_700_000_000_000_000_123
@@ -91,13 +97,13 @@ def test_constants_of_the_msg_file_are_the_codes_of_the_wire(store: Any) -> None
 
 
 def test_every_field_of_a_contact_is_decoded_by_ros(store: Any) -> None:
-    stamper = make_stamper()
-    array = ros.ContactArray(
-        stamper.header(LOCATED.t_ns, "palm"), 2**53 - 1, 9, "right", [contact_message(LOCATED, stamper)]
-    )
-    decoded = store.deserialize_cdr(array.serialize(), "handtouch_msgs/msg/ContactArray")
+    frame = replace(make_frame(seq=1), session=2**53 - 1, tick=9)
+    unknown = make_contact("ring", "begin", 8)
+    encoded = encode_contacts([unknown, LOCATED], frame, "palm", make_stamper())
+    decoded = store.deserialize_cdr(encoded, "handtouch_msgs/msg/ContactArray")
     assert (decoded.session, decoded.tick, decoded.header.frame_id) == (2**53 - 1, 9, "robot1/palm")
-    (contact,) = decoded.contacts
+    first, contact = decoded.contacts
+    assert (first.link, first.diagnoses, first.fresh) == ("ring", [], True)
     stamp = contact.header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == LOCATED.t_ns + WALL_OFFSET_NS
     assert contact.header.frame_id == "robot1/index_tip"
@@ -118,9 +124,9 @@ def test_every_field_of_a_contact_is_decoded_by_ros(store: Any) -> None:
 
 
 def test_a_wrench_is_the_force_on_the_link_about_its_origin(store: Any) -> None:
-    message = wrench_message(LOCATED, make_stamper())
-    assert message is not None
-    decoded = store.deserialize_cdr(message.serialize(), "geometry_msgs/msg/WrenchStamped")
+    encoded = encode_wrench(LOCATED, make_stamper())
+    assert encoded is not None
+    decoded = store.deserialize_cdr(encoded, "geometry_msgs/msg/WrenchStamped")
     force, torque = decoded.wrench.force, decoded.wrench.torque
     assert [force.x, force.y, force.z] == pytest.approx([0.0, -1.5, -2.0])
     expected = np.cross(LOCATED.position_m or (), [0.0, -1.5, -2.0])
@@ -129,18 +135,20 @@ def test_a_wrench_is_the_force_on_the_link_about_its_origin(store: Any) -> None:
 
 def test_wrenches_are_zero_at_the_end_and_absent_where_unknown() -> None:
     stamper = make_stamper()
-    ended = wrench_message(replace(LOCATED, event="end"), stamper)
+    ended = encode_wrench(replace(LOCATED, event="end"), stamper)
     assert ended is not None
-    assert ended.wrench == ros.RosWrench()
-    assert wrench_message(replace(LOCATED, force_n=None), stamper) is None
-    assert palm_wrench([LOCATED, make_contact("thumb_tip", "update", 8)], 1, "palm", stamper) is None
-    total = palm_wrench([LOCATED, LOCATED], 1, "palm", stamper)
+    assert ros.WrenchStamped.deserialize(ended).wrench == ros.RosWrench()
+    assert encode_wrench(replace(LOCATED, force_n=None), stamper) is None
+    unknown = make_contact("thumb_tip", "update", 8)
+    assert encode_palm_wrench([LOCATED, unknown], 1, "palm", stamper) is None
+    total = encode_palm_wrench([LOCATED, LOCATED], 1, "palm", stamper)
     assert total is not None
-    assert total.wrench.force.z == -5.0
-    assert total.wrench.torque.y == pytest.approx(0.5)
-    nothing = palm_wrench([], 1, "palm", stamper)
+    wrench = ros.WrenchStamped.deserialize(total).wrench
+    assert wrench.force.z == -5.0
+    assert wrench.torque.y == pytest.approx(0.5)
+    nothing = encode_palm_wrench([], 1, "palm", stamper)
     assert nothing is not None
-    assert nothing.wrench == ros.RosWrench()
+    assert ros.WrenchStamped.deserialize(nothing).wrench == ros.RosWrench()
 
 
 def test_the_ellipse_has_the_axes_of_the_covariance(store: Any) -> None:
@@ -169,26 +177,64 @@ def test_names_fit_the_rules_of_ros(text: str, name: str) -> None:
     assert ros_name(text) == name
 
 
-def test_a_topic_is_read_while_it_has_a_reader_and_always_if_its_last_message_is_kept(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Nothing is encoded for a topic that isn't read."""
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> RosNetwork:
     interface = '<Interfaces><NetworkInterface name="lo"/></Interfaces><AllowMulticast>false</AllowMulticast>'
     monkeypatch.setenv(
         "CYCLONEDDS_URI", f"<CycloneDDS><Domain><General>{interface}</General></Domain></CycloneDDS>"
     )
-    network = RosNetwork(os.getpid() % 200)
+    return RosNetwork(os.getpid() % 200)
+
+
+def test_a_topic_is_read_while_it_has_a_reader(network: RosNetwork) -> None:
+    """Nothing is encoded for a topic that isn't read."""
     wrenches = network.writer("wrench", ros.WrenchStamped, Quality.SENSOR_DATA)
-    assert network.writer("markers", ros.MarkerArray, Quality.STATE).is_read
     assert not wrenches.is_read
     reader = network.reader("wrench", ros.WrenchStamped, Quality.SENSOR_DATA)
     end_s = time.monotonic() + 60
     received: list[Any] = []
+    sent = encode_wrench(LOCATED, make_stamper())
+    assert sent is not None
     while not received and time.monotonic() < end_s:
-        wrenches.write(ros.WrenchStamped(make_stamper().header(1, "index_tip"), ros.RosWrench()))
+        wrenches.write(sent)
         received = reader.take(1)
-    assert received
+    assert received[0] == ros.WrenchStamped.deserialize(sent)
     del reader
     while wrenches.is_read and time.monotonic() < end_s:
         gc.collect()
     assert not wrenches.is_read
+
+
+def test_a_late_bridge_relays_the_newest_updates_and_every_begin_and_end(network: RosNetwork) -> None:
+    """However long the bridge was stalled, it then sends one update a topic, and reports that it dropped."""
+    stream = f"inproc://{uuid4()}"
+    publisher: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XPUB)
+    publisher.sndhwm = 0
+    publisher.bind(stream)
+    relay = RosRelay(network, make_stamper(), {})
+    arrays = network.reader("right/contacts", ros.ContactArray, Quality.SENSOR_DATA)
+    diagnostics = network.reader("/diagnostics", ros.DiagnosticArray, Quality.STATE)
+    end_s, seq, waiting = time.monotonic() + 60, itertools.count(1), Conflation()
+    with publisher, Subscriber[Any].open(TOPICS, stream, 20_000, "") as source:
+        while not arrays.take(1) and time.monotonic() < end_s:  # until publisher and reader are connected
+            publisher.send_multipart(wire.encode(make_frame(next(seq))))
+            relay_received(source, waiting, relay, 0.0)
+        assert waiting.replaced == 0
+        events: list[wire.ContactEvent] = ["update"] * 400
+        events[0], events[-1] = "begin", "end"
+        for tick, event in enumerate(events, 1):
+            for link in ("index_tip", "thumb_tip"):
+                contact = replace(make_contact(link, event, 1, seq=tick), t_ns=10**10 + tick)
+                publisher.send_multipart(wire.encode(contact))
+            publisher.send_multipart(wire.encode(make_frame(next(seq), t_ns=10**10 + tick)))
+        assert relay_received(source, waiting, relay, 60.0)
+    (array,) = arrays.take(10)
+    times = [contact.header.stamp.nanosec - WALL_OFFSET_NS % 10**9 for contact in array.contacts]
+    assert [contact.link for contact in array.contacts] == ["index_tip", "thumb_tip"] * 3
+    assert [contact.event for contact in array.contacts] == [0, 0, 1, 1, 2, 2]
+    assert times == [1, 1, 399, 399, 400, 400]
+    (report,) = diagnostics.take(1)
+    (bridge,) = (status for status in report.status if status.name == "handtouch: bridge")
+    assert bridge.level == 1
+    replaced = str(2 * 397 + 399)
+    assert {pair.key: pair.value for pair in bridge.values}["replaced"] == replaced

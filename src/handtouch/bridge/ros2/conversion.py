@@ -1,7 +1,7 @@
 """The daemon's messages as ROS 2 messages.
 
-Public names: `Stamper`, `contact_message`, `wrench_message`, `palm_wrench`, `contact_markers`,
-`removed_markers`, `pad_status`, `bus_status`, `daemon_status`.
+Public names: `Stamper`, `encode_contacts`, `encode_wrench`, `encode_palm_wrench`, `encode_zero_wrench`,
+`contact_markers`, `removed_markers`, `pad_status`, `bus_status`, `daemon_status`, `bridge_status`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from handtouch import wire
 from handtouch.bridge.ros2 import messages as ros
+from handtouch.bridge.ros2.cdr import ENCAPSULATION, Layout
 from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
 
+_CONTACTS, _CONTACT, _WRENCH = Layout(ros.ContactArray), Layout(ros.RosContact), Layout(ros.WrenchStamped)
+_UNKNOWN_2, _UNKNOWN_3, _UNKNOWN_9 = ((math.nan,) * count for count in (2, 3, 9))
 _EVENTS = {"begin": 0, "update": 1, "end": 2}
 _POSITION_STATUS = {status.text: int(status) for status in PositionStatus}
 _FORCE_STATUS = {status.text: int(status) for status in ForceStatus}
@@ -44,13 +47,17 @@ class Stamper:
         self.wall_offset_ns: int | None = None
         self._prefix = frame_prefix
 
-    def time(self, t_ns: int) -> ros.Time:
-        """Return a time of the daemon's clock as ROS time."""
-        return ros.Time.from_ns(t_ns + (self.wall_offset_ns or 0))
+    def stamp(self, t_ns: int) -> tuple[int, int]:
+        """Return a time of the daemon's clock as ROS time, in seconds and nanoseconds."""
+        return divmod(t_ns + (self.wall_offset_ns or 0), 1_000_000_000)
+
+    def frame(self, link: str) -> str:
+        """Return the name of a link's frame; empty if `link` is."""
+        return self._prefix + link if link else ""
 
     def header(self, t_ns: int, link: str) -> ros.Header:
         """Return a header with a link's frame; without one if `link` is empty."""
-        return ros.Header(self.time(t_ns), self._prefix + link if link else "")
+        return ros.Header(ros.Time(*self.stamp(t_ns)), self.frame(link))
 
     def monotonic_ns(self, stamp: ros.Time) -> int | None:
         """Return a ROS time on the daemon's clock; None for 0, which means unknown, or before `service`."""
@@ -58,72 +65,92 @@ class Stamper:
         return wall_ns - self.wall_offset_ns if wall_ns and self.wall_offset_ns is not None else None
 
 
-def contact_message(contact: wire.Contact, stamper: Stamper) -> ros.RosContact:
-    """Return a contact; what is unknown is NaN."""
-    return ros.RosContact(
-        header=stamper.header(contact.t_ns, contact.frame),
-        event=_EVENTS[contact.event],
-        id=contact.id,
-        hand=contact.hand,
-        link=contact.link,
-        begin=stamper.time(contact.begin_ns),
-        duration_s=contact.duration_s,
-        age_s=contact.age_s,
-        position_status=_POSITION_STATUS[contact.position_status],
-        position_m=ros.Point(*_numbers(contact.position_m, 3)),
-        normal=ros.Vector3(*_numbers(contact.normal, 3)),
-        covariance_m2=_numbers(contact.covariance_m2, 9),
-        pad_m=_numbers(contact.pad_m, 2),
-        force_status=_FORCE_STATUS[contact.force_status],
-        force_n=_number(contact.force_n),
-        force_std_n=_number(contact.force_std_n),
-        peak_force_n=_number(contact.peak_force_n),
-        uncompensated_force_n=_number(contact.uncompensated_force_n),
-        total_current_a=contact.total_current_a,
-        residual=_number(contact.residual),
-        residual_std=_number(contact.residual_std),
-        begin_threshold_n=contact.begin_threshold_n,
-        end_threshold_n=contact.end_threshold_n,
-        calibration_id=contact.calibration_id,
-        end_reason=contact.end_reason,
-        group=contact.group,
-        palm_status=_FRAME_STATUS[contact.palm_status],
-        palm_position_m=ros.Point(*_numbers(contact.palm_position_m, 3)),
-        palm_normal=ros.Vector3(*_numbers(contact.palm_normal, 3)),
-        palm_covariance_m2=_numbers(contact.palm_covariance_m2, 9),
-        base_status=_FRAME_STATUS[contact.base_status],
-        base_position_m=ros.Point(*_numbers(contact.base_position_m, 3)),
-        base_normal=ros.Vector3(*_numbers(contact.base_normal, 3)),
-        base_covariance_m2=_numbers(contact.base_covariance_m2, 9),
-        joints_age_s=_number(contact.joints_age_s),
-        diagnoses=list(contact.diagnoses),
-        fresh=contact.fresh,
+def encode_contacts(
+    contacts: Sequence[wire.Contact], frame: wire.HandFrame, palm_link: str, stamper: Stamper
+) -> bytes:
+    """Return the encoded `ros.ContactArray` of the contacts of a tick; what is unknown is NaN."""
+    header = (*stamper.stamp(frame.t_ns), stamper.frame(palm_link))
+    data = _CONTACTS.encode((*header, frame.session, frame.tick, frame.hand, len(contacts)))
+    for contact in contacts:
+        data += _CONTACT.encode(_contact_values(contact, stamper), len(data))
+    return ENCAPSULATION + data
+
+
+def _contact_values(contact: wire.Contact, stamper: Stamper) -> tuple[Any, ...]:
+    """Return the values of the fields of `ros.RosContact`, in their order."""
+    return (
+        *stamper.stamp(contact.t_ns),
+        stamper.frame(contact.frame),
+        _EVENTS[contact.event],
+        contact.id,
+        contact.hand,
+        contact.link,
+        *stamper.stamp(contact.begin_ns),
+        contact.duration_s,
+        contact.age_s,
+        _POSITION_STATUS[contact.position_status],
+        *(contact.position_m or _UNKNOWN_3),
+        *(contact.normal or _UNKNOWN_3),
+        *(contact.covariance_m2 or _UNKNOWN_9),
+        *(contact.pad_m or _UNKNOWN_2),
+        _FORCE_STATUS[contact.force_status],
+        _number(contact.force_n),
+        _number(contact.force_std_n),
+        _number(contact.peak_force_n),
+        _number(contact.uncompensated_force_n),
+        contact.total_current_a,
+        _number(contact.residual),
+        _number(contact.residual_std),
+        contact.begin_threshold_n,
+        contact.end_threshold_n,
+        contact.calibration_id,
+        contact.end_reason,
+        contact.group,
+        _FRAME_STATUS[contact.palm_status],
+        *(contact.palm_position_m or _UNKNOWN_3),
+        *(contact.palm_normal or _UNKNOWN_3),
+        *(contact.palm_covariance_m2 or _UNKNOWN_9),
+        _FRAME_STATUS[contact.base_status],
+        *(contact.base_position_m or _UNKNOWN_3),
+        *(contact.base_normal or _UNKNOWN_3),
+        *(contact.base_covariance_m2 or _UNKNOWN_9),
+        _number(contact.joints_age_s),
+        contact.diagnoses,
+        contact.fresh,
     )
 
 
-def wrench_message(contact: wire.Contact, stamper: Stamper) -> ros.WrenchStamped | None:
-    """Return the wrench on the link, about its frame's origin; zero at the end of a contact, None where force
-    or position is unknown."""
-    header = stamper.header(contact.t_ns, contact.frame)
+def encode_wrench(contact: wire.Contact, stamper: Stamper) -> bytes | None:
+    """Return the encoded `ros.WrenchStamped` on the link, about its frame's origin; zero at the end of a
+    contact, None where force or position is unknown."""
     if contact.event == "end":
-        return ros.WrenchStamped(header, ros.RosWrench())
+        return encode_zero_wrench(contact.t_ns, contact.frame, stamper)
     if contact.force_n is None or contact.position_m is None or contact.normal is None:
         return None
     wrench = _wrench(contact.position_m, contact.normal, contact.force_n)
-    return ros.WrenchStamped(header, _wrench_message(wrench))
+    return _encode_wrench(contact.t_ns, contact.frame, wrench, stamper)
 
 
-def palm_wrench(
+def encode_palm_wrench(
     contacts: Iterable[wire.Contact], t_ns: int, palm_link: str, stamper: Stamper
-) -> ros.WrenchStamped | None:
-    """Return the sum of the wrenches of all active contacts of a hand, about its palm's origin; None where
-    the force or the palm position of any is unknown."""
-    total = np.zeros(6)
+) -> bytes | None:
+    """Return the encoded sum of the wrenches of all active contacts of a hand, about its palm's origin; None
+    where the force or the palm position of any is unknown."""
+    wrenches: list[Sequence[float]] = [(0.0,) * 6]
     for contact in contacts:
         if contact.force_n is None or contact.palm_position_m is None or contact.palm_normal is None:
             return None
-        total += _wrench(contact.palm_position_m, contact.palm_normal, contact.force_n)
-    return ros.WrenchStamped(stamper.header(t_ns, palm_link), _wrench_message(total))
+        wrenches.append(_wrench(contact.palm_position_m, contact.palm_normal, contact.force_n))
+    return _encode_wrench(t_ns, palm_link, [sum(values) for values in zip(*wrenches, strict=True)], stamper)
+
+
+def encode_zero_wrench(t_ns: int, link: str, stamper: Stamper) -> bytes:
+    """Return the encoded wrench of a link that isn't touched."""
+    return _encode_wrench(t_ns, link, (0.0,) * 6, stamper)
+
+
+def _encode_wrench(t_ns: int, link: str, wrench: Sequence[float], stamper: Stamper) -> bytes:
+    return ENCAPSULATION + _WRENCH.encode((*stamper.stamp(t_ns), stamper.frame(link), *wrench))
 
 
 def contact_markers(contact: wire.Contact, number: int, stamper: Stamper) -> list[ros.Marker]:
@@ -201,6 +228,13 @@ def daemon_status(service: wire.Service | None) -> ros.DiagnosticStatus:
     return _status(level, "handtouch: daemon", text, "", values)
 
 
+def bridge_status(relayed: int, replaced: int, lost: int, *, is_behind: bool) -> ros.DiagnosticStatus:
+    """Return the status of the bridge itself, from its counts of messages."""
+    values = {"relayed": relayed, "replaced": replaced, "lost": lost}
+    level, text = (WARN, "too slow: drops outdated updates") if is_behind else (OK, "running")
+    return _status(level, "handtouch: bridge", text, "", values)
+
+
 def _status(
     level: int, name: str, message: str, hardware_id: str, values: Mapping[str, Any]
 ) -> ros.DiagnosticStatus:
@@ -208,15 +242,11 @@ def _status(
     return ros.DiagnosticStatus(level, name, message, hardware_id, pairs)
 
 
-def _wrench(position: Sequence[float], normal: Sequence[float], force_n: float) -> Any:
-    """Return force and torque (6,) of a force against the outward normal."""
-    force = -force_n * np.array(normal)
-    return np.concatenate([force, np.cross(position, force)])
-
-
-def _wrench_message(values: Any) -> ros.RosWrench:
-    numbers = values.tolist()
-    return ros.RosWrench(ros.Vector3(*numbers[:3]), ros.Vector3(*numbers[3:]))
+def _wrench(position: Sequence[float], normal: Sequence[float], force_n: float) -> tuple[float, ...]:
+    """Return force and torque of a force against the outward normal."""
+    (x, y, z), (force_x, force_y, force_z) = position, [-force_n * component for component in normal]
+    torque = y * force_z - z * force_y, z * force_x - x * force_z, x * force_y - y * force_x
+    return force_x, force_y, force_z, *torque
 
 
 def _ellipse(header: ros.Header, number: int, at: ros.Point, covariance: Any, color: Any) -> ros.Marker:
@@ -234,10 +264,6 @@ def _ellipse(header: ros.Header, number: int, at: ros.Point, covariance: Any, co
 def _color(contact: wire.Contact) -> ros.ColorRGBA:
     is_valid = contact.position_status == contact.force_status == "valid"
     return ros.ColorRGBA(*(_VALID_COLOR if is_valid else _UNRELIABLE_COLOR), 1.0)
-
-
-def _numbers(values: Sequence[float] | None, count: int) -> list[float]:
-    return [math.nan] * count if values is None else list(values)
 
 
 def _number(value: float | None) -> float:

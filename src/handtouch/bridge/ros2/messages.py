@@ -6,7 +6,7 @@ Fields and their order are those of the `.msg` files, which `clients/ros2/handto
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Self
+from typing import Annotated
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, byte, float32, float64, int32, sequence, uint8, uint32, uint64
@@ -20,11 +20,6 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 
     sec: int32 = 0
     nanosec: uint32 = 0
-
-    @classmethod
-    def from_ns(cls, wall_ns: int) -> Self:
-        """Return a time [ns since 1970]."""
-        return cls(*divmod(wall_ns, 1_000_000_000))
 
 
 @dataclass

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from enum import Enum
+from types import new_class
 from typing import Any
 
 from cyclonedds.core import DDSException, Listener, Policy, Qos
@@ -51,19 +52,35 @@ class Quality(Enum):
 class RosWriter:
     """Writer of a topic, created by `RosNetwork.writer`."""
 
-    def __init__(self, participant: DomainParticipant, topic: Topic[Any], qos: Qos, quality: Quality) -> None:
-        self._is_kept, self._readers = quality is Quality.STATE, _ReaderCount()
+    def __init__(
+        self, participant: DomainParticipant, topic: Topic[Any], kind: type[IdlStruct], qos: Qos
+    ) -> None:
+        self._readers = _ReaderCount()
         self._writer = DataWriter[Any](participant, topic, qos=qos, listener=self._readers)
+        self._encoded: Any = new_class("Encoded", (_Encoded, kind))
 
     @property
     def is_read(self) -> bool:
-        """There is a reader, or there may be one later that receives the last message."""
-        return self._is_kept or self._readers.count > 0
+        """There is a reader now."""
+        return self._readers.count > 0
 
-    def write(self, message: IdlStruct) -> None:
-        """Send a message, unless it isn't read: encoding costs most of a bridge's time."""
-        if self.is_read:
+    def write(self, message: IdlStruct | bytes) -> None:
+        """Send a message, encoded already or not."""
+        if isinstance(message, bytes):
+            encoded = self._encoded.__new__(self._encoded)
+            encoded.data = message
+            self._writer.write(encoded)
+        else:
             self._writer.write(message)
+
+
+class _Encoded:
+    """A message that DDS sends as it is."""
+
+    data: bytes
+
+    def serialize(self, **_: object) -> bytes:
+        return self.data
 
 
 class _ReaderCount(Listener):
@@ -96,7 +113,7 @@ class RosNetwork:
     def writer(self, name: str, kind: type[IdlStruct], quality: Quality) -> RosWriter:
         """Return a writer of a topic."""
         qos = quality.qos + Qos(_type_hash_policy(kind))
-        return RosWriter(self._participant, self._topic(name, kind), qos, quality)
+        return RosWriter(self._participant, self._topic(name, kind), kind, qos)
 
     def reader(self, name: str, kind: type[IdlStruct], quality: Quality) -> DataReader[Any]:
         """Return a reader of a topic."""

@@ -1,6 +1,6 @@
 """Relay from one daemon to ROS 2, and of joint states to the daemon.
 
-Public names: `RosRelay`, `JointStateRelay`, `TOPICS`.
+Public names: `RosRelay`, `JointStateRelay`, `relay_received`, `TOPICS`.
 """
 
 from __future__ import annotations
@@ -8,12 +8,15 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from handtouch import wire
 from handtouch.bridge.ros2 import conversion
 from handtouch.bridge.ros2 import messages as ros
+from handtouch.bridge.ros2.conflation import Conflation
 from handtouch.bridge.ros2.conversion import Stamper
 from handtouch.bridge.ros2.network import Quality, RosNetwork, RosWriter, ros_name
+from handtouch.client import Subscriber
 from handtouch.client.robot import Robot
 
 TOPICS = ("contact/*/*", "hand/*", "health/*/*", "service")
@@ -21,7 +24,27 @@ TOPICS = ("contact/*/*", "hand/*", "health/*/*", "service")
 _DIAGNOSTICS_PERIOD_NS = 1_000_000_000
 _MARKER_PERIOD_NS = 33_000_000
 _MAX_JOINT_STATES_PER_POLL = 32
+_MAX_MESSAGES_PER_ROUND = 2000
 _log = logging.getLogger("handtouch.bridge")
+
+
+def relay_received(source: Subscriber[Any], waiting: Conflation, relay: RosRelay, longest_s: float) -> bool:
+    """Relay all messages that have arrived, the newest of each topic; return False if none has in a time.
+
+    Raises PermissionError if the daemon rejects the key.
+    """
+    message = source.recv(longest_s)
+    if message is None:
+        return False
+    waiting.add(message)
+    for _ in range(_MAX_MESSAGES_PER_ROUND):
+        if (message := source.recv(0)) is None:
+            break
+        waiting.add(message)
+    relay.count_losses(waiting.replaced, source.lost_messages)
+    for message in waiting.take():
+        relay.relay(message)
+    return True
 
 
 class RosRelay:
@@ -37,9 +60,16 @@ class RosRelay:
         self._newest_ns = 0
         self._waiting: list[wire.Message] = []  # until the daemon's wall clock is known
         self._session: int | None = None
+        self._relayed = 0
+        self._losses = self._reported_losses = 0, 0
+
+    def count_losses(self, replaced: int, lost: int) -> None:
+        """Report that so many messages were replaced by newer ones, or lost before the bridge, in total."""
+        self._losses = replaced, lost
 
     def relay(self, message: wire.Message) -> None:
         """Relay one message of the daemon."""
+        self._relayed += 1
         if isinstance(message, wire.Service):
             self._stamper.wall_offset_ns = message.wall_offset_ns
             self._update_service(message)
@@ -79,7 +109,11 @@ class RosRelay:
         """Publish that the daemon is disconnected, and the end of its contacts; nothing if it is known."""
         if self._session is None:
             return
-        _log.warning("daemon disconnected")
+        _log.warning(
+            "daemon disconnected; %d messages relayed, %d replaced by newer ones, %d lost",
+            self._relayed,
+            *self._losses,
+        )
         self._session = None
         for hand in self._hands.values():
             hand.end_all(self._newest_ns)
@@ -94,7 +128,22 @@ class RosRelay:
         if changed and self._newest_ns:
             self._send_diagnostics()
 
+    def _update_bridge(self) -> None:
+        """Keep the bridge's own status: behind if messages were dropped since the last diagnostics."""
+        status = conversion.bridge_status(
+            self._relayed, *self._losses, is_behind=self._losses != self._reported_losses
+        )
+        before = self._statuses.get(status.name)
+        self._statuses[status.name] = status
+        if status.level and not (before and before.level):
+            _log.warning(
+                "bridge too slow: %d updates replaced by newer ones, %d messages lost so far", *self._losses
+            )
+        self._reported_losses = self._losses
+
     def _send_diagnostics(self) -> None:
+        if self._newest_ns - self._sent_ns >= _DIAGNOSTICS_PERIOD_NS:
+            self._update_bridge()
         self._sent_ns = self._newest_ns
         header = self._stamper.header(self._newest_ns, "")
         self._diagnostics.write(ros.DiagnosticArray(header, list(self._statuses.values())))
@@ -129,7 +178,7 @@ class _HandRelay:
         else:
             self._active[contact.link] = contact
         writer = self._writer_of(contact.link)
-        if writer.is_read and (wrench := conversion.wrench_message(contact, self._stamper)) is not None:
+        if writer.is_read and (wrench := conversion.encode_wrench(contact, self._stamper)) is not None:
             writer.write(wrench)
 
     def end_tick(self, frame: wire.HandFrame) -> None:
@@ -137,9 +186,7 @@ class _HandRelay:
         contacts, self._tick_contacts = self._tick_contacts, []
         self.links = frame.links
         if self._contacts.is_read:
-            header = self._stamper.header(frame.t_ns, self._palm_link)
-            converted = [conversion.contact_message(contact, self._stamper) for contact in contacts]
-            self._contacts.write(ros.ContactArray(header, frame.session, frame.tick, self._name, converted))
+            self._contacts.write(conversion.encode_contacts(contacts, frame, self._palm_link, self._stamper))
         if contacts:
             self._send_palm_wrench(frame.t_ns)
         if abs(frame.t_ns - self._marked_ns) >= _MARKER_PERIOD_NS:
@@ -148,8 +195,7 @@ class _HandRelay:
     def end_all(self, t_ns: int) -> None:
         """Publish the end of everything that is shown: the daemon is disconnected."""
         for link, contact in self._active.items():
-            header = self._stamper.header(t_ns, contact.frame)
-            self._writer_of(link).write(ros.WrenchStamped(header, ros.RosWrench()))
+            self._writer_of(link).write(conversion.encode_zero_wrench(t_ns, contact.frame, self._stamper))
         self._active.clear()
         self._tick_contacts.clear()
         self._send_palm_wrench(t_ns)
@@ -158,21 +204,22 @@ class _HandRelay:
     def _send_palm_wrench(self, t_ns: int) -> None:
         if not self._palm_link or not (writer := self._writer_of("")).is_read:
             return
-        wrench = conversion.palm_wrench(self._active.values(), t_ns, self._palm_link, self._stamper)
+        wrench = conversion.encode_palm_wrench(self._active.values(), t_ns, self._palm_link, self._stamper)
         if wrench is not None:
             writer.write(wrench)
 
     def _send_markers(self, t_ns: int) -> None:
         self._marked_ns = t_ns
-        if not (self._active or self._shown):
+        shown = self._active if self._markers.is_read else {}
+        if not (shown or self._shown):
             return
         markers: list[ros.Marker] = []
         for link, frame in self._shown.items():
-            if link not in self._active:
+            if link not in shown:
                 markers += conversion.removed_markers(frame, t_ns, self._number(link), self._stamper)
-        for link, contact in self._active.items():
+        for link, contact in shown.items():
             markers += conversion.contact_markers(contact, self._number(link), self._stamper)
-        self._shown = {link: contact.frame for link, contact in self._active.items()}
+        self._shown = {link: contact.frame for link, contact in shown.items()}
         self._markers.write(ros.MarkerArray(markers))
 
     def _number(self, link: str) -> int:

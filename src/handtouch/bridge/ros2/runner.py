@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from handtouch.bridge.options import BridgeError, connect_endpoint
+from handtouch.bridge.ros2.conflation import Conflation
 from handtouch.client import Subscriber
 from handtouch.client.robot import Robot
 from handtouch.config import Deployment, load
@@ -69,11 +70,13 @@ def run_ros_bridge(options: RosOptions, stop: threading.Event) -> None:
             thread.start()
             opened.callback(thread.join)
             opened.callback(stop.set)  # also when the daemon rejects the key
+        waiting = Conflation()
         while not stop.is_set():
-            message = source.recv(_POLL_S)
-            if message is not None:
-                outgoing.relay(message)
-            elif source.has_received and not source.alive:
+            if (
+                not relay.relay_received(source, waiting, outgoing, _POLL_S)
+                and source.has_received
+                and not source.alive
+            ):
                 outgoing.end_session()
         outgoing.end_session()
 
