@@ -185,6 +185,11 @@ ERRORS = {
         ("gap_mm = 0.8\nmount", "gap_mm = 15.0\nmount"),
         THUMB + "gap_mm = 15.0: leaves no electrode on a side of 30 mm; must be below 15",
     ),
+    "gap offsets that leave no electrode": (
+        ("gap_mm = 0.8\nmount", "gap_mm = 0.8\ngap_offsets_mm = [[0, 0], [0, 0], [20, 20], [0, 0]]\nmount"),
+        THUMB + "gap_offsets_mm = [[0.0, 0.0], [0.0, 0.0], [20.0, 20.0], [0.0, 0.0]]: with gap_mm leaves no "
+        "electrode y0 on a side of 30 mm",
+    ),
     "gaps longer than a cone is wide at its end": (
         ("far_radius_mm = 10.0, slant_mm = 25.0", "far_radius_mm = 0.5, slant_mm = 25.0"),
         INDEX + "gap_mm = 0.8: leaves no electrode on a side of 1.047 mm; must be below 0.5236",

@@ -48,6 +48,13 @@ def test_currents_agree_with_exact_theory_on_an_outline(deployment: config.Deplo
     check_currents(deployment.model_copy(update={"hands": (hand,)}), pad.link, 3e-3)
 
 
+def test_currents_agree_with_exact_theory_for_unequal_gaps(deployment: config.Deployment) -> None:
+    pad, *others = deployment.hands[0].pads
+    pad = pad.model_copy(update={"gap_offsets_mm": ((2.0, 0.0), (0.5, 1.5), (0.0, 3.0), (1.0, 0.0))})
+    hand = deployment.hands[0].model_copy(update={"pads": (pad, *others)})
+    check_currents(deployment.model_copy(update={"hands": (hand,)}), pad.link)
+
+
 def check_currents(deployment: config.Deployment, link: str, tolerance: float = 2e-4) -> None:
     """Compare currents, position and normal of a touch with `handtouch.field`."""
     hand = VirtualHand(deployment, press(link), IDEAL)

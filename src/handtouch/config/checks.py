@@ -280,6 +280,16 @@ def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
             _format_value(pad.gap_mm),
             f"leaves no electrode on a side of {side:.4g} mm; must be below {side / 2:.4g}",
         )
+    else:
+        profile, near, far = surface.build().side_lengths_m()
+        lengths = (near, far, profile, profile)
+        for name, length, gaps in zip(("x0", "xa", "y0", "yb"), lengths, pad.gaps_mm, strict=True):
+            if not sum(gaps) < 1e3 * length:
+                yield Problem(
+                    f"{location}gap_offsets_mm",
+                    _format_value(pad.gap_offsets_mm),
+                    f"with gap_mm leaves no electrode {name} on a side of {1e3 * length:.4g} mm",
+                )
     if pad.gap_mm == 0 and any(pad.series_ohm):
         yield Problem(
             f"{location}gap_mm",

@@ -26,6 +26,7 @@ Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
 Electrode = Literal["x0", "xa", "y0", "yb"]
 Output = Literal["position", "force", "raw", "palm", "base", "motion", "stiffness", "shape", "texture"]
+Ends = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
 PositivePerChannel = Annotated[tuple[Positive, Positive, Positive, Positive], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -339,11 +340,21 @@ class Pad(Table):
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
     surface: PadSurface = Field(description="shape of the sensing surface")
     gap_mm: NonNegative = Field(description="bare length of each side next to its corners, along the surface")
+    gap_offsets_mm: Annotated[tuple[Ends, Ends, Ends, Ends], Field(strict=False)] = Field(
+        ((0.0, 0.0),) * 4,
+        description="bare lengths besides gap_mm at the low and the high end of electrodes x0, xa, y0, yb, "
+        "as `handtouch design` computes them",
+    )
     series_ohm: Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(strict=False)] = (
         Field((0.0, 0.0, 0.0, 0.0), description="series resistors of the electrodes x0, xa, y0, yb to ground")
     )
     mount: Mount = Field(Mount(), description="pose of the pad on its link")
     touch: Touch | None = Field(None, description="thresholds of this pad; default: those of [touch]")
+
+    @property
+    def gaps_mm(self) -> tuple[tuple[float, float], ...]:
+        """Bare lengths [mm] at the low and the high end of electrodes x0, xa, y0, yb: (4, 2)."""
+        return tuple((self.gap_mm + low, self.gap_mm + high) for low, high in self.gap_offsets_mm)
 
 
 class HandTable(Table):

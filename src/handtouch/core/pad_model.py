@@ -398,7 +398,7 @@ def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
     networks = []
     for _, pad in deployment.pads:
         sheet = deployment.sheets[pad.sheet]
-        parameters = (pad.surface, pad.gap_mm, pad.series_ohm, sheet.ohm_per_square)
+        parameters = (pad.surface, pad.gaps_mm, pad.series_ohm, sheet.ohm_per_square)
         if parameters not in shared:
             shared[parameters] = electrode_network(pad, sheet)
         networks.append(shared[parameters])

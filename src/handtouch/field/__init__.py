@@ -12,6 +12,7 @@ from handtouch.field.model import ForwardModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.outline import Outline
 from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
+from handtouch.field.perimeter_network import PerimeterNetwork
 from handtouch.field.rectangle import Location, Rectangle
 from handtouch.field.residual import PointTest, point_test, resolvable_separation
 from handtouch.field.sandwich import Sandwich, SandwichEstimate
@@ -41,6 +42,7 @@ __all__ = [
     "LocatorBank",
     "Outline",
     "OutlineNetwork",
+    "PerimeterNetwork",
     "PlaneSurface",
     "PointEstimate",
     "PointTest",

@@ -72,7 +72,7 @@ def electrode_network(
     as 0. log_aspect: logarithm of a factor of the rectangle's length along x, electrodes included.
     """
     surface = pad_surface(pad)
-    gaps_m = np.maximum(pad.gap_mm * _M_PER_MM + np.broadcast_to(gap_offsets_m, (4, 2)), 0.0)
+    gaps_m = np.maximum(np.array(pad.gaps_mm) * _M_PER_MM + np.broadcast_to(gap_offsets_m, (4, 2)), 0.0)
     stretch = math.exp(log_aspect)
     electrodes = []
     for side, (low_m, high_m) in zip(SIDES, gaps_m.tolist(), strict=True):

@@ -98,7 +98,7 @@ class SupervisorWorker:
         noise = start.noise_counts[:, None] * start.ampere_per_count
         for number, (hand, pad) in enumerate(entries):
             design, sheet = (
-                (pad.surface, pad.gap_mm, pad.series_ohm, pad.sheet, pad.node),
+                (pad.surface, pad.gaps_mm, pad.series_ohm, pad.sheet, pad.node),
                 deployment.sheets[pad.sheet],
             )
             if design not in models:

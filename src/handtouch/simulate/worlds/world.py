@@ -140,7 +140,8 @@ class DrawnWorld:
         rng = self._stream(link)
         gain = parts.gain_ratio.sample(rng, 4)
         resistors = parts.resistor_ratio.sample(rng, 4)
-        gaps = np.maximum(pad.gap_mm + parts.gap_offset_mm.sample(rng, 8), 0.0)
+        nominal = np.array(pad.gaps_mm).T.ravel()
+        gaps = np.maximum(nominal + parts.gap_offset_mm.sample(rng, 8), 0.0)
         mount = self._stream("mount", link)
         return HiddenPad(
             gain_ratio=_four(gain),

@@ -103,7 +103,7 @@ class DiagnosisModel:
         networks, designs = [], []
         for pad, node in zip(pads, nodes, strict=True):
             sheet = deployment.sheets[pad.sheet]
-            design = (pad.surface, pad.gap_mm, pad.series_ohm, sheet, node.gain_std, node.series_std)
+            design = (pad.surface, pad.gaps_mm, pad.series_ohm, sheet, node.gain_std, node.series_std)
             designs.append(design)
             if design not in by_design:
                 by_design[design] = electrode_network(pad, sheet)
