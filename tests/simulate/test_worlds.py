@@ -6,6 +6,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ from handtouch.simulate.worlds import (
     DrawnWorld,
     Family,
     Fixed,
+    HiddenShear,
     LogNormal,
     LogUniform,
     Normal,
+    ShearSpread,
     Uniform,
     World,
 )
@@ -66,6 +69,15 @@ def hand_rate(name: str) -> Draw:
     return lambda drawn, _: drawn.hand_rate(getattr(drawn.world.electronics, name), name)
 
 
+@cache
+def shear_parts(world: str, seed: int) -> HiddenShear:
+    return WORLDS[world].draw(seed).shear("right/round")
+
+
+def shear_value(name: str) -> Draw:
+    return lambda drawn, _: getattr(shear_parts(drawn.world.name, drawn.seed), name)
+
+
 DRAWS: dict[str, Draw] = {
     "parts.gain_ratio": pad_value("gain_ratio"),
     "parts.gap_offset_mm": gap_offset,
@@ -91,6 +103,7 @@ DRAWS: dict[str, Draw] = {
     "electronics.offset_counts_per_k": pad_value("offset_counts_per_k"),
     "electronics.gain_per_k": pad_value("gain_per_k"),
     "electronics.supply_drift_per_s": hand_rate("supply_drift_per_s"),
+    **{f"shear.{entry.name}": shear_value(entry.name) for entry in dataclasses.fields(ShearSpread)},
 }
 
 

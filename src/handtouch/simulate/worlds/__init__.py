@@ -13,6 +13,7 @@ from handtouch.simulate.worlds.distributions import (
 )
 from handtouch.simulate.worlds.families import Family
 from handtouch.simulate.worlds.named import WORLDS, world_with
+from handtouch.simulate.worlds.shear_spread import HiddenShear, ShearSpread
 from handtouch.simulate.worlds.sheet_kinds import SHEET_KINDS, SheetKind
 from handtouch.simulate.worlds.spreads import (
     ContactSpread,
@@ -43,11 +44,13 @@ __all__ = [
     "HiddenContact",
     "HiddenJoints",
     "HiddenPad",
+    "HiddenShear",
     "LogNormal",
     "LogUniform",
     "MountSpread",
     "Normal",
     "PartSpread",
+    "ShearSpread",
     "SheetKind",
     "SheetSpread",
     "Uniform",

@@ -10,6 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from handtouch.simulate.worlds.distributions import Fixed, LogNormal, LogUniform, Normal, Uniform
+from handtouch.simulate.worlds.shear_spread import ShearSpread
 from handtouch.simulate.worlds.sheet_kinds import SHEET_KINDS, SheetKind
 from handtouch.simulate.worlds.spreads import (
     ONE,
@@ -62,6 +63,20 @@ _DEFAULT = World(
         gain_per_k=Normal(0.0, 1e-4),
         supply_drift_per_s=Fixed(1e-5),
     ),
+    ShearSpread(
+        stiffness_ratio=LogNormal(1.0, 0.1),
+        axis_ratio=LogNormal(1.0, 0.02),
+        plate_offset_mm=Uniform(-0.1, 0.1),
+        plate_turn_deg=Normal(0.0, 0.5),
+        edge_offset_mm=Uniform(-0.03, 0.03),
+        film_ratio=LogNormal(1.0, 0.05),
+        film_ohm_ratio=LogNormal(1.0, 0.1),
+        contact_share=Uniform(0.0, 0.05),
+        alpha_offset=Normal(0.0, 0.03),
+        hysteresis=Uniform(0.02, 0.06),
+        creep=Uniform(0.02, 0.05),
+        stiffening=Uniform(0.0, 0.05),
+    ),
 )
 
 _HARSH = World(
@@ -103,6 +118,20 @@ _HARSH = World(
         offset_counts_per_k=Normal(0.0, 5.0),
         gain_per_k=Normal(0.0, 2.5e-4),
         supply_drift_per_s=Fixed(2.5e-5),
+    ),
+    ShearSpread(
+        stiffness_ratio=LogNormal(1.0, 0.2),
+        axis_ratio=LogNormal(1.0, 0.05),
+        plate_offset_mm=Uniform(-0.2, 0.2),
+        plate_turn_deg=Normal(0.0, 1.25),
+        edge_offset_mm=Uniform(-0.08, 0.08),
+        film_ratio=LogNormal(1.0, 0.12),
+        film_ohm_ratio=LogNormal(1.0, 0.25),
+        contact_share=Uniform(0.0, 0.12),
+        alpha_offset=Normal(0.0, 0.08),
+        hysteresis=Uniform(0.05, 0.15),
+        creep=Uniform(0.05, 0.13),
+        stiffening=Uniform(0.0, 0.12),
     ),
 )
 

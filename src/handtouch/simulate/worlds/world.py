@@ -20,6 +20,7 @@ from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.worlds.distributions import Distribution
 from handtouch.simulate.worlds.families import Family
+from handtouch.simulate.worlds.shear_spread import HiddenShear, ShearSpread
 from handtouch.simulate.worlds.sheet_kinds import SheetKind
 from handtouch.simulate.worlds.spreads import (
     ContactSpread,
@@ -46,6 +47,7 @@ class World:
     contacts: ContactSpread = field(default_factory=ContactSpread)
     sheets: SheetSpread = field(default_factory=SheetSpread)
     electronics: ElectronicsSpread = field(default_factory=ElectronicsSpread)
+    shear: ShearSpread = field(default_factory=ShearSpread)
 
     def draw(self, seed: int) -> DrawnWorld:
         """Return the world of one seed; raises ValueError for a seed of no `Family`."""
@@ -199,6 +201,13 @@ class DrawnWorld:
             max(radius_mm, _MIN_RADIUS_RATIO * sheet.contact_radius_mm),
             elongation,
             float(patch.uniform(0, np.pi)),
+        )
+
+    def shear(self, pad_name: str) -> HiddenShear:
+        """Return the properties of the shear pattern and layer of a pad, "hand/link"."""
+        return HiddenShear.draw(
+            self.world.shear,
+            lambda spread, count, name: self._numbers(spread, count, "shear", name, pad_name),
         )
 
     def joints(self, hand: str, count: int) -> HiddenJoints:

@@ -1,0 +1,440 @@
+"""Shear pads: from the overlap of two facing electrode patterns to displacement and tangential force.
+
+Public names: `overlap_ratio`, `edge_excess`, `gap_loss` (film between two plates); `BarCell`, `BarPattern`,
+`DiscPattern`, `ShearPattern`; `FilmLaw`; `ShearPad` -> `ShearEstimate`.
+
+An upper pattern at one potential moves with the skin over a lower one of grounded electrodes, one per
+channel, with a resistive film of thickness t between them. An electrode collects the current of its overlap;
+ratios of currents give the displacement, their sum the conductance of the film, and so the pressure.
+Derivation and limits: docs/shear.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ellipkm1, expit
+
+FloatArray = npt.NDArray[np.float64]
+
+EDGE_EXCESS = 2 * math.log(2) / math.pi
+"""Width, in thicknesses of the film, that current gains beyond an edge of a plate over a larger one."""
+_MAX_STEPS = 30
+_STEP_TOLERANCE = 1e-12
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(3)
+
+
+def overlap_ratio(overlap: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return conductance and its derivative of a film between two half-planes that overlap.
+
+    overlap: in thicknesses of the film, negative apart. The conductance is that of 1 m of edge for a film of
+    1 S/m: K(1 - m) / K(m) with m = 1 / (1 + exp(pi s)), exactly; s + 4 ln 2 / pi for a wide overlap.
+    """
+    s = np.asarray(overlap, np.float64)
+    low = ellipkm1(expit(np.pi * s))
+    return ellipkm1(expit(-np.pi * s)) / low, (np.pi / 2 / low) ** 2
+
+
+def edge_excess(film_m: float) -> float:
+    """Return the width [m] that an edge of a plate over a larger one adds to the area of their overlap."""
+    return EDGE_EXCESS * film_m
+
+
+def gap_loss(gap_m: float, film_m: float) -> float:
+    """Return the width [m] that a gap between two grounded electrodes under one plate takes from the area.
+
+    (4 t / pi) ln cosh(pi g / 4 t), exactly; g less two edge excesses for a wide gap.
+    """
+    wide = math.pi * gap_m / (4 * film_m)
+    return 4 * film_m / math.pi * (wide + math.log1p(math.exp(-2 * wide)) - math.log(2))
+
+
+class ShearPattern(Protocol):
+    """Geometry of a shear pad: effective overlap areas of its channels at any displacement."""
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Components that the currents determine: "x", "y" [m] and "twist" [rad], in this order."""
+
+    @property
+    def channels(self) -> int:
+        """Number of electrodes."""
+
+    @property
+    def travel_m(self) -> float:
+        """Greatest displacement from the centre in any direction at which `areas` holds."""
+
+    @property
+    def centroids_m(self) -> FloatArray:
+        """Centroids (channels, 2) of the overlaps at rest."""
+
+    def areas(self, motion: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return effective areas (n, ...) [m2] at a motion (k, ...), and their derivatives (n, k, ...)."""
+
+
+@dataclass(frozen=True)
+class BarCell:
+    """Edge of an upper bar over one electrode; its overlap grows as the upper pattern moves along direction.
+
+    channel: of the electrode. direction_rad: from x. x_m, y_m: middle of the electrode's edge.
+    """
+
+    channel: int
+    direction_rad: float
+    x_m: float
+    y_m: float
+
+
+@dataclass(frozen=True)
+class BarPattern:
+    """Bars over electrodes with straight edges; build it by `single`, `crossed` or `pinwheel`.
+
+    overlap_m: of each cell at rest. length_m: of each electrode along its edge; the upper bars are longer by
+    the travel on both ends. gap_m: between the two electrodes under one bar, infinite where there is one.
+    Raises ValueError for lengths that aren't positive.
+    """
+
+    cells: tuple[BarCell, ...]
+    components: tuple[str, ...]
+    overlap_m: float
+    length_m: float
+    gap_m: float
+    film_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("overlap_m", "length_m", "gap_m", "film_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+    @classmethod
+    def single(
+        cls, bars: int, pitch_m: float, overlap_m: float, length_m: float, gap_m: float, film_m: float
+    ) -> BarPattern:
+        """Return parallel bars across x, each over an electrode of channel 0 and one of channel 1."""
+        cells = _bar_pairs(bars, pitch_m, gap_m, 0.0, 0, (0.0, 0.0))
+        return cls(cells, ("x",), overlap_m, length_m, gap_m, film_m)
+
+    @classmethod
+    def crossed(
+        cls, bars: int, pitch_m: float, overlap_m: float, length_m: float, gap_m: float, film_m: float
+    ) -> BarPattern:
+        """Return four fields of bars: across x at two opposite corners of the pad, across y at the others.
+
+        Channels x0, xa, y0, yb. A field has the sides bars x pitch_m and length_m; both kinds have their
+        centre in that of the pad.
+        """
+        half = max(bars * pitch_m, length_m) / 2
+        fields = [(0.0, 0, (-half, -half)), (0.0, 0, (half, half))]
+        fields += [(math.pi / 2, 2, (-half, half)), (math.pi / 2, 2, (half, -half))]
+        cells = [cell for field in fields for cell in _bar_pairs(bars, pitch_m, gap_m, *field)]
+        return cls(tuple(cells), ("x", "y"), overlap_m, length_m, gap_m, film_m)
+
+    @classmethod
+    def pinwheel(cls, arm_m: float, overlap_m: float, length_m: float, film_m: float) -> BarPattern:
+        """Return four single bars at distance arm_m from the centre, at -x, +x, -y and +y.
+
+        The first two gain overlap by a counter-clockwise twist, the others lose; so displacement, twist and
+        the film's conductance are four unknowns of four currents.
+        """
+        cells = (
+            BarCell(0, -math.pi / 2, -arm_m, 0.0),
+            BarCell(1, math.pi / 2, arm_m, 0.0),
+            BarCell(2, math.pi, 0.0, -arm_m),
+            BarCell(3, 0.0, 0.0, arm_m),
+        )
+        return cls(cells, ("x", "y", "twist"), overlap_m, length_m, math.inf, film_m)
+
+    @property
+    def channels(self) -> int:
+        """Number of electrodes."""
+        return 1 + max(cell.channel for cell in self.cells)
+
+    @property
+    def travel_m(self) -> float:
+        """Displacement at which an overlap ends."""
+        return self.overlap_m
+
+    @property
+    def centroids_m(self) -> FloatArray:
+        """Centroids (channels, 2) of the overlaps at rest."""
+        sums, counts = np.zeros((self.channels, 2)), np.zeros((self.channels, 1))
+        for cell in self.cells:
+            way = np.array([math.cos(cell.direction_rad), math.sin(cell.direction_rad)])
+            sums[cell.channel] += np.array([cell.x_m, cell.y_m]) + way * self.overlap_m / 2
+            counts[cell.channel] += 1
+        return sums / counts
+
+    def areas(self, motion: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return effective areas (n, ...) [m2] at a motion (k, ...), and their derivatives (n, k, ...).
+
+        motion: the `components`, of which a missing y or twist is 0. A twist turns edges: overlaps are
+        integrated along them.
+        """
+        given = np.asarray(motion, np.float64)
+        x, y, twist = (given[k] if k < len(given) else np.zeros(given.shape[1:]) for k in range(3))
+        excess, film = edge_excess(self.film_m), self.film_m
+        lost = 0.0 if math.isinf(self.gap_m) else self.gap_m / 2 - gap_loss(self.gap_m, film) / 2 - excess
+        length = self.length_m + 2 * excess
+        areas = np.zeros((self.channels, *x.shape))
+        slopes = np.zeros((self.channels, 3, *x.shape))
+        cosine, sine = np.cos(twist), np.sin(twist)
+        for cell in self.cells:
+            way = np.array([math.cos(cell.direction_rad), math.sin(cell.direction_rad)])
+            for node, weight in zip(_GAUSS_NODES, _GAUSS_WEIGHTS / 2, strict=True):
+                along = node * self.length_m / 2  # of a point of the edge from its middle
+                px, py = cell.x_m - way[1] * along, cell.y_m + way[0] * along
+                qx, qy = px + way[0] * self.overlap_m, py + way[1] * self.overlap_m
+                sx, sy = cosine * qx - sine * qy + x - px, sine * qx + cosine * qy + y - py
+                ratio, slope = overlap_ratio((way[0] * sx + way[1] * sy + lost) / film)
+                areas[cell.channel] += weight * length * film * ratio
+                turn = way[0] * (-sine * qx - cosine * qy) + way[1] * (cosine * qx - sine * qy)
+                for k, rate in enumerate((way[0], way[1], turn)):
+                    slopes[cell.channel, k] += weight * length * slope * rate
+        return areas, slopes[:, : len(self.components)]
+
+
+def _bar_pairs(
+    bars: int, pitch_m: float, gap_m: float, direction_rad: float, channel: int, centre_m: tuple[float, float]
+) -> tuple[BarCell, ...]:
+    """Return the cells of bars across a direction; the second channel's overlap grows along it."""
+    way = np.array([math.cos(direction_rad), math.sin(direction_rad)])
+    cells = []
+    for bar in range(bars):
+        middle = np.array(centre_m) + way * pitch_m * (bar - (bars - 1) / 2)
+        for side in (-1, 1):
+            x, y = (middle + side * way * gap_m / 2).tolist()
+            turned = direction_rad + (math.pi if side < 0 else 0.0)
+            cells.append(BarCell(channel + (side > 0), turned, x, y))
+    return tuple(cells)
+
+
+@dataclass(frozen=True)
+class DiscPattern:
+    """Round upper plates, each over four sectors that face -x, +x, -y and +y; gaps along the diagonals.
+
+    discs: number of plates, at distances large enough that they don't disturb each other; all sectors that
+    face one way are one channel. Twist about its own centre doesn't change a disc's overlaps.
+    Raises ValueError for lengths that aren't positive, and for a gap wider than the radius.
+    """
+
+    discs: int
+    radius_m: float
+    gap_m: float
+    film_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("discs", "radius_m", "gap_m", "film_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.gap_m >= self.radius_m:
+            raise ValueError(f"gap_m {self.gap_m} must be less than radius_m {self.radius_m}")
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Displacement along both axes."""
+        return ("x", "y")
+
+    @property
+    def channels(self) -> int:
+        """Number of electrodes."""
+        return 4
+
+    @property
+    def travel_m(self) -> float:
+        """Displacement at which the corner of a sector may leave its disc."""
+        return self.radius_m - self.gap_m
+
+    @property
+    def centroids_m(self) -> FloatArray:
+        """Centroids (channels, 2) of the overlaps at rest, of a disc in the centre."""
+        distance = 4 * math.sqrt(2) / (3 * math.pi) * self.radius_m
+        return distance * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+
+    def areas(self, motion: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return effective areas (4, ...) [m2] at a displacement (2, ...), and derivatives (4, 2, ...).
+
+        NaN where the corner of a sector lies outside the disc.
+        """
+        x, y = np.asarray(motion, np.float64)
+        radius = self.radius_m + edge_excess(self.film_m)
+        inset = gap_loss(self.gap_m, self.film_m) / 2
+        root = math.sqrt(0.5)
+        p, q = root * (x + y), root * (y - x)  # along the diagonals
+        areas, slopes = [], []
+        for across, along in ((-1, 1), (1, -1), (-1, -1), (1, 1)):  # x0, xa, y0, yb
+            low_p, low_q = inset - across * p, inset - along * q
+            area, by_p, by_q = _corner_of_disc(radius, low_p, low_q)
+            by_p, by_q = -across * by_p, -along * by_q
+            areas.append(area)
+            slopes.append([root * (by_p - by_q), root * (by_p + by_q)])
+        return self.discs * np.array(areas), self.discs * np.array(slopes)
+
+
+def _corner_of_disc(
+    radius: float, low_p: FloatArray, low_q: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the area of a disc where p > low_p and q > low_q, and its derivatives by both."""
+    with np.errstate(invalid="ignore"):
+        high_p, high_q = np.sqrt(radius**2 - low_q**2), np.sqrt(radius**2 - low_p**2)
+        outside = ~(low_p**2 + low_q**2 < radius**2)
+        wedge = radius**2 * (np.arccos(low_p / radius) - np.arcsin(low_q / radius))
+        area = (wedge - low_q * (high_p - low_p) - low_p * (high_q - low_q)) / 2
+    area = np.where(outside, np.nan, area)
+    return area, -(high_q - low_q), -(high_p - low_p)
+
+
+@dataclass(frozen=True)
+class FilmLaw:
+    """Conductance of a bonded film per area, siemens_per_m2 (1 + pressure / reference_pa)^alpha.
+
+    plate_m2: area that carries the normal force. gyration_m2: its mean square half-width, w^2 / 12 of a side
+    w: an off-centre normal force tilts the pressure by centre . position / gyration_m2.
+    """
+
+    siemens_per_m2: float
+    reference_pa: float
+    alpha: float
+    plate_m2: float
+    gyration_m2: float
+
+    def conductance(self, normal_force_n: npt.ArrayLike) -> FloatArray:
+        """Return the conductance per area [S/m2] under a central normal force."""
+        pressure = np.asarray(normal_force_n, np.float64) / self.plate_m2
+        return self.siemens_per_m2 * (1 + pressure / self.reference_pa) ** self.alpha
+
+    def normal_force(self, conductance_s_per_m2: npt.ArrayLike) -> FloatArray:
+        """Return the central normal force [N] at a conductance per area: the inverse of `conductance`."""
+        ratio = np.asarray(conductance_s_per_m2, np.float64) / self.siemens_per_m2
+        return self.plate_m2 * self.reference_pa * (ratio ** (1 / self.alpha) - 1)
+
+    def tilt_slopes(self, normal_force_n: npt.ArrayLike, centroids_m: FloatArray) -> FloatArray:
+        """Return d ln(conductance) / d(centre of pressure) [1/m] of each channel, shape (n, 2, ...)."""
+        load = np.asarray(normal_force_n, np.float64) / self.plate_m2 / self.reference_pa
+        return self.alpha / self.gyration_m2 * np.multiply.outer(centroids_m, load / (1 + load))
+
+
+@dataclass(frozen=True)
+class ShearEstimate:
+    """Most likely motion of the upper pattern for the currents of a shear pad.
+
+    motion: (k, ...), the pattern's `components`. covariance: (..., k, k). conductance_s_per_m2: of the film,
+    with its standard deviation for noise. chi_squared: of the misfit, `degrees` of freedom. NaN where a
+    current isn't positive and where no displacement within the travel has such currents.
+    """
+
+    motion: FloatArray
+    covariance: FloatArray
+    conductance_s_per_m2: FloatArray
+    conductance_std: FloatArray
+    chi_squared: FloatArray
+    degrees: int
+
+
+@dataclass(frozen=True)
+class ShearPad:
+    """A shear pattern under a voltage, with the film's law where off-centre pressure is to be compensated."""
+
+    pattern: ShearPattern
+    drive_v: float
+    film: FilmLaw | None = None
+
+    def currents(
+        self, motion: npt.ArrayLike, conductance_s_per_m2: npt.ArrayLike, tilt: npt.ArrayLike = 0.0
+    ) -> FloatArray:
+        """Return the currents (n, ...) [A] at a motion (k, ...); tilt: logarithm of each channel's factor."""
+        areas, _ = self.pattern.areas(motion)
+        return self.drive_v * np.asarray(conductance_s_per_m2) * areas * np.exp(tilt)
+
+    @np.errstate(all="ignore")
+    def estimate(
+        self,
+        currents_a: npt.ArrayLike,
+        noise_a: npt.ArrayLike,
+        *,
+        normal_force_n: npt.ArrayLike = 0.0,
+        centre_m: npt.ArrayLike = (0.0, 0.0),
+        centre_std_m: float = 0.0,
+    ) -> ShearEstimate:
+        """Return motion and conductance for currents (n, ...), by maximum likelihood.
+
+        noise_a: standard deviation of each current, broadcast against them. normal_force_n (...), centre_m
+        (2, ...) with its standard deviation: of the contact above, whose pressure is not even; used with
+        `film` only. Raises ValueError unless the first axis has the pattern's channels.
+        """
+        currents = np.asarray(currents_a, np.float64)
+        count, unknowns = self.pattern.channels, len(self.pattern.components)
+        if currents.shape[:1] != (count,):
+            raise ValueError(f"currents_a has shape {currents.shape}: the pattern has {count} channels")
+        shape = currents.shape[1:]
+        read = np.where(currents > 0, currents, np.nan).reshape(count, -1)
+        noise = np.broadcast_to(np.asarray(noise_a, np.float64), currents.shape).reshape(count, -1)
+        slopes = np.zeros((count, 2, read.shape[1]))
+        if self.film is not None:
+            force = np.broadcast_to(np.asarray(normal_force_n, np.float64), shape).ravel()
+            slopes = self.film.tilt_slopes(np.maximum(force, 0.0), self.pattern.centroids_m)
+        centre = np.asarray(centre_m, np.float64)
+        centre = np.broadcast_to(centre.reshape(2, *centre.shape[1:] or [1] * len(shape)), (2, *shape))
+        centre = centre.reshape(2, -1)
+        tilt = np.einsum("ncm,cm->nm", slopes, centre)
+        # in logarithms: ln I = ln(V Y) + ln area + tilt
+        spread = slopes * centre_std_m
+        weight = np.einsum("icm,jcm->mij", spread, spread)
+        weight += np.einsum("im,ij->mij", (noise / read) ** 2, np.eye(count))
+        information = np.full_like(weight, np.nan)
+        known = np.isfinite(weight).all(axis=(1, 2)) & (noise > 0).all(axis=0)
+        information[known] = np.linalg.inv(weight[known])
+        found = self._fit(np.log(read) - tilt, information)
+        motion, level, covariance, misfit = found
+        conductance = np.exp(level) / self.drive_v
+        return ShearEstimate(
+            motion.reshape(unknowns, *shape),
+            covariance[:, 1:, 1:].reshape(*shape, unknowns, unknowns),
+            conductance.reshape(shape),
+            (conductance * np.sqrt(covariance[:, 0, 0])).reshape(shape),
+            misfit.reshape(shape),
+            count - unknowns - 1,
+        )
+
+    def _fit(
+        self, logs: FloatArray, information: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return motion (k, m), ln(V Y), covariance (m, k + 1, k + 1) and misfit by Gauss-Newton steps."""
+        unknowns, cases = len(self.pattern.components), logs.shape[1]
+        motion, level = np.zeros((unknowns, cases)), np.full(cases, np.nan)
+        travel = self.pattern.travel_m
+        for _ in range(_MAX_STEPS):
+            areas, slopes = self.pattern.areas(motion)
+            columns = np.concatenate([np.ones((logs.shape[0], 1, cases)), slopes / areas[:, None]], axis=1)
+            level = np.where(np.isnan(level), (logs - np.log(areas)).mean(axis=0), level)
+            off = logs - np.log(areas) - level
+            weighted = np.einsum("mij,jkm->mik", information, columns)
+            normal = np.einsum("ikm,mil->mkl", columns, weighted)
+            step = _solve(normal, np.einsum("mik,im->mk", weighted, off))
+            size = np.abs(step[:, 1 : 1 + min(unknowns, 2)]).max(axis=1)
+            damp = np.minimum(1.0, 0.5 * travel / np.maximum(size, 1e-300))
+            level = level + damp * step[:, 0]
+            motion = motion + damp * step[:, 1:].T
+            if not (size > _STEP_TOLERANCE * travel).any():
+                break
+        areas, _ = self.pattern.areas(motion)
+        off = logs - np.log(areas) - level
+        misfit = np.einsum("im,mij,jm->m", off, information, off)
+        lost = ~(np.hypot(motion[0], motion[1] if unknowns > 1 else 0.0) < travel)
+        covariance = _solve(normal, np.broadcast_to(np.eye(unknowns + 1), normal.shape))
+        motion, level, misfit = (np.where(lost, np.nan, value) for value in (motion, level, misfit))
+        covariance[lost] = np.nan
+        return motion, level, covariance, misfit
+
+
+def _solve(matrices: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve (m, k, k) systems; NaN where a matrix isn't finite or singular."""
+    columns = right[..., None] if right.ndim == 2 else right
+    result = np.full(np.broadcast_shapes(columns.shape, (*matrices.shape[:1], 1, 1)), np.nan)
+    regular = np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2)))
+    regular = regular[np.linalg.cond(matrices[regular]) < 1 / np.finfo(np.float64).eps]
+    result[regular] = np.linalg.solve(matrices[regular], columns[regular])
+    return result[..., 0] if right.ndim == 2 else result

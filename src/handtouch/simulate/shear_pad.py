@@ -1,0 +1,243 @@
+"""A simulated shear pad: from forces to displacement, by its layer's history, and to currents.
+
+Public names: `SimulatedShearPad`, `LayerHistory`. The overlap is solved by `shear_film`, with contact
+resistance and the true edges of the electrodes; nothing of `handtouch.field` is used.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from handtouch.config.shear import Bars, CrossedBars, Discs, Pinwheel, Shear
+from handtouch.simulate.shear_film import Plates, solve_section
+from handtouch.simulate.worlds import HiddenShear
+
+FloatArray = NDArray[np.float64]
+
+_MM = 1e-3
+_TABLE_NODES = 7
+_OUTER = 2.3  # of the overlap: width of an electrode
+_WIDE = 8.0  # thicknesses of the film: an overlap whose edges don't see each other
+_PLAY_SHARES = 3.0 ** -np.arange(5)  # radii of plays over the force at half the travel
+_CREEP_S = 5.0
+_POINTS = (np.arange(7) + 0.5) / 7 - 0.5  # along an edge
+_ARC = 400
+
+
+class LayerHistory:
+    """Displacement of the elastic layer of one pad under a changing force, with hysteresis and creep.
+
+    Vector plays of five sizes give loops about in proportion to their force.
+    """
+
+    def __init__(self, shear: Shear, hidden: HiddenShear) -> None:
+        stiffness = np.array(shear.stiffness_n_per_mm) / _MM
+        self._stiffness = stiffness * hidden.stiffness_ratio * np.array(hidden.axis_ratio)
+        self._half_travel_m = _travel_m(shear) / 2
+        self._radii = _PLAY_SHARES * float(stiffness.mean()) * self._half_travel_m
+        self._hidden = hidden
+        self._plays = np.zeros((len(self._radii), 2))
+        self._crept = np.zeros(2)
+
+    def advance(self, force_n: FloatArray, elapsed_s: float) -> FloatArray:
+        """Apply a force (2,) for a time; return the displacement (2,) [m] at its end."""
+        hidden = self._hidden
+        away = force_n - self._plays
+        size = np.linalg.norm(away, axis=1)
+        slack = np.where(size > self._radii, 1 - self._radii / np.maximum(size, 1e-300), 0.0)
+        self._plays += slack[:, None] * away
+        share = hidden.hysteresis
+        carried = (1 - share * len(self._radii)) * force_n + share * self._plays.sum(axis=0)
+        elastic = carried / self._stiffness
+        elastic = elastic / (1 + hidden.stiffening * float(elastic @ elastic) / self._half_travel_m**2)
+        settled = -math.expm1(-elapsed_s / _CREEP_S)
+        self._crept += settled * (hidden.creep * elastic - self._crept)
+        moved: FloatArray = elastic + self._crept
+        return moved
+
+
+@dataclass(frozen=True)
+class SimulatedShearPad:
+    """Electrodes and film of one shear pad."""
+
+    shear: Shear
+    drive_v: float
+    hidden: HiddenShear
+
+    @property
+    def channels(self) -> int:
+        """Number of electrodes."""
+        return 2 if isinstance(self.shear.pattern, Bars) else 4
+
+    def currents(self, displacement_m: FloatArray, normal_n: FloatArray, centre_m: FloatArray) -> FloatArray:
+        """Return currents (channels, n) [A] at displacements (2, n) of the skin.
+
+        normal_n (n,), centre_m (2, n): normal force and its centre, whose pressure is linear over the plate.
+        """
+        hidden, shear = self.hidden, self.shear
+        side = shear.plate_mm * _MM
+        offset = np.array(hidden.plate_offset_mm) * _MM
+        moved = displacement_m + offset[:, None]
+        turn = math.radians(hidden.plate_turn_deg)
+        pressure = np.maximum(normal_n, 0.0) / side**2 / (1e3 * shear.film_reference_kpa)
+        conductivity = shear.film_mm * _MM / (1e-6 * shear.film_ohm_mm2) / hidden.film_ohm_ratio
+        amperes = np.zeros((self.channels, moved.shape[1]))
+        for channel, place, current in self._cells(moved, turn):
+            lean = 1 + 12 * (place @ centre_m) / side**2
+            amperes[channel] += current * (1 + np.maximum(pressure * lean, 0.0)) ** (
+                shear.film_alpha + hidden.alpha_offset
+            )
+        return self.drive_v * conductivity * amperes
+
+    def _cells(self, moved: FloatArray, turn: float) -> list[tuple[int, FloatArray, FloatArray]]:
+        """Return channel, centroid (2,) and current (n,) per volt of each overlap, for a film of 1 S/m."""
+        pattern = self.shear.pattern
+        if isinstance(pattern, Discs):
+            return self._discs(pattern, moved)
+        if isinstance(pattern, Pinwheel):
+            return self._arms(pattern, moved, turn)
+        size = max(pattern.bars * pattern.pitch_mm, pattern.length_mm) / 2 * _MM
+        fields = [(0, np.array([1.0, 0.0]), np.zeros(2))]
+        if isinstance(pattern, CrossedBars):
+            x, y = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+            places = [(0, x, (-1, -1)), (0, x, (1, 1)), (2, y, (-1, 1)), (2, y, (1, -1))]
+            fields = [(channel, way, size * np.array(at)) for channel, way, at in places]
+        found = []
+        length = (pattern.length_mm * _MM + 2 * self._excess_m) * np.ones(2)
+        half = (pattern.gap_mm + pattern.overlap_mm) / 2 * _MM
+        for channel, way, centre in fields:
+            low, high = self._pair_tables[channel > 0]
+            for bar in range(pattern.bars):
+                at = centre + way * pattern.pitch_mm * _MM * (bar - (pattern.bars - 1) / 2)
+                local = self._along_edge(moved, turn, at, way, pattern.length_mm * _MM)
+                found.append((channel, at - half * way, length[0] * low(local).mean(axis=0)))
+                found.append((channel + 1, at + half * way, length[1] * high(local).mean(axis=0)))
+        return found
+
+    def _arms(
+        self, pattern: Pinwheel, moved: FloatArray, turn: float
+    ) -> list[tuple[int, FloatArray, FloatArray]]:
+        arm = pattern.arm_mm * _MM
+        layout = [((-1, 0), (0, -1)), ((1, 0), (0, 1)), ((0, -1), (-1, 0)), ((0, 1), (1, 0))]
+        length = pattern.length_mm * _MM + 2 * self._excess_m
+        found = []
+        for channel, (where, sense) in enumerate(layout):
+            at, way = arm * np.array(where, np.float64), np.array(sense, np.float64)
+            middle = at + way * pattern.overlap_mm * _MM
+            local = self._along_edge(moved, turn, middle, way, pattern.length_mm * _MM)
+            current = length * self._single_tables[channel](local).mean(axis=0)
+            found.append((channel, at + way * pattern.overlap_mm * _MM / 2, current))
+        return found
+
+    def _discs(self, pattern: Discs, moved: FloatArray) -> list[tuple[int, FloatArray, FloatArray]]:
+        """Count the area of every sector under a disc along rays, edges moved by their excess."""
+        radius, film = (
+            pattern.radius_mm * _MM + self._excess_m,
+            self.shear.film_mm * _MM * self.hidden.film_ratio,
+        )
+        film_conductance = 1 / (film * (1 + 2 * self.hidden.contact_share))
+        found = []
+        angles = (np.arange(_ARC) + 0.5) / _ARC * math.pi / 2 - math.pi / 4  # of a sector that faces +x
+        for channel, middle in enumerate((math.pi, 0.0, -math.pi / 2, math.pi / 2)):
+            inset = (pattern.gap_mm / 2 - self.hidden.edge_offset_mm[channel]) * _MM - self._gap_gain_m
+            corner = math.sqrt(2) * inset * np.array([math.cos(middle), math.sin(middle)])
+            ray = np.stack([np.cos(angles + middle), np.sin(angles + middle)])
+            start = corner[:, None] - moved  # from the disc's centre
+            along = ray.T @ start
+            reach = -along + np.sqrt(np.maximum(along**2 - (start**2).sum(axis=0) + radius**2, 0.0))
+            area = (reach**2).mean(axis=0) / 2 * math.pi / 2
+            place = 0.6 * pattern.radius_mm * _MM * np.array([math.cos(middle), math.sin(middle)])
+            found.append((channel, place, pattern.discs * area * film_conductance))
+        return found
+
+    def _along_edge(
+        self, moved: FloatArray, turn: float, at: FloatArray, way: FloatArray, length: float
+    ) -> FloatArray:
+        """Return the motion (points, n) across an edge of points of a bar around `at`."""
+        points = at + np.outer(_POINTS * length, np.array([-way[1], way[0]]))
+        turned = points @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        return np.asarray(((turned - points) @ way)[:, None] + way @ moved)
+
+    @property
+    def _section(self) -> tuple[float, float]:
+        """Thickness of the film and contact resistance as a length of film."""
+        film = self.shear.film_mm * _MM * self.hidden.film_ratio
+        return film, self.hidden.contact_share * film
+
+    @cached_property
+    def _excess_m(self) -> float:
+        """Width that an edge over a larger plate adds."""
+        film, contact = self._section
+        return film * _unit_excess(round(contact / film, 3))
+
+    @cached_property
+    def _gap_gain_m(self) -> float:
+        """Width that the field in half a gap between two sectors adds to each."""
+        assert isinstance(self.shear.pattern, Discs)
+        film, contact = self._section
+        half, wide = self.shear.pattern.gap_mm * _MM / 2, _WIDE * film
+        lower = ((-wide, -half), (half, wide))
+        current = solve_section(Plates(((-2 * wide, 2 * wide),), lower, film, contact)).sum() / 2
+        return float(current * (film + 2 * contact) - (wide - half) - self._excess_m)
+
+    @cached_property
+    def _pair_tables(self) -> tuple[tuple[CubicSpline, CubicSpline], ...]:
+        """Currents of both electrodes under a bar per metre, across x and across y, over its displacement."""
+        pattern = self.shear.pattern
+        assert isinstance(pattern, Bars | CrossedBars)
+        film, contact = self._section
+        edges = np.array(self.hidden.edge_offset_mm) * _MM
+        gap, overlap = pattern.gap_mm * _MM / 2, pattern.overlap_mm * _MM
+        nodes = np.linspace(-1, 1, _TABLE_NODES) * overlap
+        outer = gap + _OUTER * overlap
+        tables = []
+        for first in (0, 2)[: self.channels // 2]:
+            lower = ((-outer, -gap + edges[first]), (gap - edges[first + 1], outer))
+            current = np.array(
+                [
+                    solve_section(Plates(((u - gap - overlap, u + gap + overlap),), lower, film, contact))
+                    for u in nodes
+                ]
+            )
+            tables.append((CubicSpline(nodes, current[:, 0]), CubicSpline(nodes, current[:, 1])))
+        return tuple(tables)
+
+    @cached_property
+    def _single_tables(self) -> tuple[CubicSpline, ...]:
+        """Currents of a single bar's electrode per metre over its motion along the sense of the cell."""
+        pattern = self.shear.pattern
+        assert isinstance(pattern, Pinwheel)
+        film, contact = self._section
+        overlap = pattern.overlap_mm * _MM
+        nodes = np.linspace(-1, 1, _TABLE_NODES) * overlap
+        wide = _OUTER * overlap
+        current = np.array(
+            [
+                solve_section(Plates(((-wide, u),), ((0.0, wide),), film, contact))[0]
+                for u in np.linspace(-0.3, 2.3, 2 * _TABLE_NODES) * overlap
+            ]
+        )
+        table = CubicSpline(np.linspace(-0.3, 2.3, 2 * _TABLE_NODES) * overlap, current)
+        values = [table(nodes + overlap + edge * _MM) for edge in self.hidden.edge_offset_mm]
+        return tuple(CubicSpline(nodes, value) for value in values)
+
+
+def _travel_m(shear: Shear) -> float:
+    pattern = shear.pattern
+    if isinstance(pattern, Discs):
+        return (pattern.radius_mm - pattern.gap_mm) * _MM
+    return pattern.overlap_mm * _MM
+
+
+@lru_cache(maxsize=512)
+def _unit_excess(contact: float) -> float:
+    """Return the width that one edge adds, for a film of 1 m, at a contact resistance."""
+    overlap = _WIDE
+    current = solve_section(Plates(((-overlap, overlap),), ((0.0, 3 * overlap),), 1.0, contact))[0]
+    return float(current * (1 + 2 * contact) - overlap) / 2
