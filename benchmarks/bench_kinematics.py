@@ -134,10 +134,10 @@ def parts(repeats: int) -> dict[str, float]:
     message = encode(JointState("right", 1, names, np.full(16, 0.5)))
     position, point = np.full(16, 0.5), np.array([0.01, 0.0, 0.01])
     clock = iter(range(10**12, 10**15))
-    with zmq.Context() as context:
+    with zmq.Context() as context, Authenticator(context) as authenticator:
         known = {"right": JointStateBuffer(names)}
         pads = [("right", pad.link) for pad in deployment.hands[0].pads]
-        inputs = InputReceiver.open(context, "tcp://127.0.0.1:*", Authenticator.open(context), known, pads)
+        inputs = InputReceiver.open(context, "tcp://127.0.0.1:*", authenticator, known, pads)
 
         def take() -> None:
             now_ns = next(clock)

@@ -30,6 +30,7 @@ from handtouch.config import Deployment, load, shipped
 from handtouch.config.files import deployment_files
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.publisher import Publisher
 from handtouch.host.build import build_info
 from handtouch.simulate.scenario import Scenario
@@ -65,8 +66,9 @@ class Loop:
     def __init__(self, deployment: Deployment, samples: NDArray[np.int64], folder: Path) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
         topics = wire.topics_of(deployment.links_by_hand)
+        self._authenticator = Authenticator(self._context)
         self.publisher = Publisher.open(
-            self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics
+            self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics, self._authenticator
         )
         self.pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.6, self.publisher, self.publisher.session)
         self.pipeline.node_state[:] = PadState.CLEAR
@@ -100,6 +102,7 @@ class Loop:
     def close(self) -> None:
         """Close the endpoints."""
         self.publisher.close()
+        self._authenticator.close()
         self._context.term()
 
     def _service(self, now_ns: int) -> wire.Service:

@@ -119,6 +119,7 @@ def served(
         for step, now in zip(steps.tolist(), counts, strict=True):
             run.tick(step, now)
         run.inputs.close()
+        run.authenticator.close()
     railed = int((np.abs(counts) >= 32767).any(axis=2).sum())
     return _compared(deployment, grasp, patches, run, railed)
 
@@ -144,8 +145,9 @@ class _Run:
         self._clean = encoders.delayed_only(grasp.joint_rad)
         states, self._timely = JointStateBuffer(self._names), JointStateBuffer(self._names)
         pads = list(zip(model.hands, model.links, strict=True))
+        self.authenticator = Authenticator(context)
         self.inputs = InputReceiver.open(
-            context, "tcp://127.0.0.1:*", Authenticator.open(context), {hand: states}, pads
+            context, "tcp://127.0.0.1:*", self.authenticator, {hand: states}, pads
         )
         self.pipeline = pipeline_of(deployment, self, model=model, robots=robots, period_ns=_PERIOD_NS)
         self.pipeline.transforms.joints_at = self.inputs.joints_at

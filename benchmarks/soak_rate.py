@@ -45,6 +45,7 @@ from handtouch.config import (
 )
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.publisher import Publisher
 from handtouch.device import DeviceBus
@@ -322,8 +323,9 @@ def remember(hours: float) -> dict[str, Any]:
     script = np.concatenate([moving, untouched.astype(np.int64)]).astype("<i2")
     rows: list[tuple[float, float, int, int, int]] = []
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, zmq.Context() as context:
-        topics = wire.topics_of(deployment.links_by_hand)
-        publisher = Publisher.open(context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics)
+        topics, authenticator = wire.topics_of(deployment.links_by_hand), Authenticator(context)
+        live, complete = (f"ipc://{folder}/{stream}" for stream in ("live", "complete"))
+        publisher = Publisher.open(context, live, complete, topics, authenticator)
         pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.8, publisher)
         pipeline.node_state[:] = PadState.CLEAR
         reader = context.socket(zmq.SUB)
@@ -354,6 +356,7 @@ def remember(hours: float) -> dict[str, Any]:
         episodes = dict(publisher.congestion_episodes)
         reader.close(0)
         publisher.close()
+        authenticator.close()
     figures = np.array(rows)
     late = figures[len(figures) // 3 :]  # pools fill at first
     slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0])

@@ -13,6 +13,7 @@ import zmq
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.control import (
     LOOP_FRACTION,
     MAX_JOBS,
@@ -49,7 +50,10 @@ class Bench:
 
     def __init__(self) -> None:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.control = ControlServer.open(self.context, "tcp://127.0.0.1:*", clock=lambda: self.work_ns)
+        self.authenticator = Authenticator(self.context)
+        self.control = ControlServer.open(
+            self.context, "tcp://127.0.0.1:*", self.authenticator, clock=lambda: self.work_ns
+        )
         self.work_ns = 0
         self.jobs: list[PendingJob] = []
         self.control.commands.update(
@@ -104,6 +108,7 @@ def bench() -> Iterator[Bench]:
     yield made
     logging.getLogger("handtouch.control").setLevel(logging.NOTSET)
     made.control.close()
+    made.authenticator.close()
     made.context.destroy(0)
 
 
@@ -256,7 +261,8 @@ def test_flood_is_answered_a_few_requests_per_poll(bench: Bench) -> None:
 
 def test_waiting_client_gets_an_error_when_the_daemon_stops() -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    control = ControlServer.open(context, "tcp://127.0.0.1:*")
+    authenticator = Authenticator(context)
+    control = ControlServer.open(context, "tcp://127.0.0.1:*", authenticator)
     jobs = [PendingJob()]
     control.jobs["long"] = lambda _, __: jobs[0]
     with context.socket(zmq.REQ) as asker:
@@ -267,4 +273,5 @@ def test_waiting_client_gets_an_error_when_the_daemon_stops() -> None:
         control.close()
         assert asker.poll(10_000)
         assert "stopping" in msgpack.unpackb(asker.recv())["error"]
+    authenticator.close()
     context.destroy(0)

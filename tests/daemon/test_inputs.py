@@ -46,11 +46,11 @@ def references() -> list[ForceReference]:
 
 @pytest.fixture
 def inputs(references: list[ForceReference]) -> Any:
-    with zmq.Context() as context:
+    with zmq.Context() as context, Authenticator(context) as authenticator:
         limits = np.array([[-0.5, 1.5], [-np.inf, np.inf]])
         states = {"right": JointStateBuffer(("a", "b"), limits=limits)}
         made = InputReceiver.open(
-            context, "tcp://127.0.0.1:*", Authenticator.open(context), states, PADS, references.append
+            context, "tcp://127.0.0.1:*", authenticator, states, PADS, references.append
         )
         yield made
         made.close()
@@ -172,10 +172,8 @@ def test_robot_client_knows_the_hands_of_a_daemon_that_restarts(endpoints: dict[
 
     with Robot(endpoints["inputs"], key="") as robot:
         for hand in ("left", "right", "left"):
-            with zmq.Context() as context:
-                made = InputReceiver.open(
-                    context, endpoints["inputs"], Authenticator(context), {}, [(hand, "tip")]
-                )
+            with zmq.Context() as context, Authenticator(context) as authenticator:
+                made = InputReceiver.open(context, endpoints["inputs"], authenticator, {}, [(hand, "tip")])
                 end_s = time.monotonic() + 60
                 while not robot.wait_connected(0.05) or accepts_right_hand() is not (hand == "right"):
                     made.poll(NOW)

@@ -18,6 +18,7 @@ import zmq
 from handtouch import wire
 from handtouch.client import Subscriber, columns, connect
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.publisher import LIVE_QUEUE_MESSAGES, Publisher
 from handtouch.wire import PadState
 
@@ -42,8 +43,8 @@ CLOCK = Clock()
 
 @pytest.fixture
 def publisher() -> Iterator[Publisher]:
-    with zmq.Context() as context:
-        made = Publisher.open(context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", TOPICS)
+    with zmq.Context() as context, Authenticator(context) as guard:
+        made = Publisher.open(context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", TOPICS, guard)
         yield made
         made.close()
 
@@ -297,6 +298,7 @@ FLOOD_WITH_HEARTBEATS = """
 import contextlib, socket, sys, threading, time
 import zmq
 from handtouch import wire
+from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.publisher import Publisher
 
 greeting = b"\\xff" + bytes(8) + b"\\x7f\\x03\\x01" + b"NULL".ljust(20, b"\\0") + b"\\0" + bytes(31)
@@ -316,7 +318,8 @@ def attack(port):
 
 with zmq.Context() as context:
     topics = wire.topics_of({"h": ["x"]})
-    publisher = Publisher.open(context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", topics)
+    guard = Authenticator(context)
+    publisher = Publisher.open(context, "tcp://127.0.0.1:*", "tcp://127.0.0.1:*", topics, guard)
     port = int(publisher.endpoints["live"].rpartition(":")[2])
     for _ in range(8):
         threading.Thread(target=attack, args=(port,), daemon=True).start()
@@ -403,19 +406,24 @@ def test_unsubscribing_ends_encoding(publisher: Publisher) -> None:
 
 def test_port_in_use_is_reported_with_a_remedy(publisher: Publisher) -> None:
     taken = publisher.endpoints["live"]
-    with zmq.Context() as context, pytest.raises(OSError, match=taken):
-        Publisher.open(context, taken, "tcp://127.0.0.1:*", TOPICS)
+    with zmq.Context() as context, Authenticator(context) as guard, pytest.raises(OSError, match=taken):
+        Publisher.open(context, taken, "tcp://127.0.0.1:*", TOPICS, guard)
 
 
 def test_ipc_endpoint_in_use_is_not_taken_over(endpoints: dict[str, str], tmp_path: Path) -> None:
-    with zmq.Context() as others, zmq.Context() as context:
-        first = Publisher.open(others, endpoints["live"], endpoints["complete"], TOPICS)
+    with (
+        zmq.Context() as others,
+        zmq.Context() as context,
+        Authenticator(others) as theirs,
+        Authenticator(context) as guard,
+    ):
+        first = Publisher.open(others, endpoints["live"], endpoints["complete"], TOPICS, theirs)
         with pytest.raises(OSError, match="another daemon is using it"):
-            Publisher.open(context, endpoints["live"], "tcp://127.0.0.1:*", TOPICS)
+            Publisher.open(context, endpoints["live"], "tcp://127.0.0.1:*", TOPICS, guard)
         first.close()
-    with zmq.Context() as context:
+    with zmq.Context() as context, Authenticator(context) as guard:
         Publisher.open(
-            context, endpoints["live"], endpoints["complete"], TOPICS
+            context, endpoints["live"], endpoints["complete"], TOPICS, guard
         ).close()  # a stale socket file is no obstacle
         with pytest.raises(OSError, match="create it"):
-            Publisher.open(context, f"ipc://{tmp_path}/absent/live", "tcp://127.0.0.1:*", TOPICS)
+            Publisher.open(context, f"ipc://{tmp_path}/absent/live", "tcp://127.0.0.1:*", TOPICS, guard)

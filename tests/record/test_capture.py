@@ -14,6 +14,7 @@ import pytest
 import zmq
 
 from handtouch import wire
+from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.publisher import Publisher
 from handtouch.record.recording import Recording
 
@@ -29,8 +30,9 @@ class Daemon:
         self.hand = hand
         self._context: zmq.Context[Any] = zmq.Context()
         topics = wire.topics_of(hand.deployment.links_by_hand)
+        self._authenticator = Authenticator(self._context)
         self.publisher = Publisher.open(
-            self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics
+            self._context, f"ipc://{folder}/live", f"ipc://{folder}/complete", topics, self._authenticator
         )
         self.endpoint = self.publisher.endpoints["complete"]
         self._seq = 0
@@ -49,6 +51,7 @@ class Daemon:
 
     def close(self) -> None:
         self.publisher.close()
+        self._authenticator.close()
         self._context.term()
 
 

@@ -1,4 +1,4 @@
-"""Access control of the daemon's endpoints: CURVE keys over TCP, and limits on message sizes.
+"""Access control of the daemon's endpoints: CURVE keys over TCP, limits on message sizes and new connections.
 
 Public names: `Authenticator`, `REFUSAL_CAUSES`.
 
@@ -11,17 +11,25 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import struct
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import zmq
 from zmq.utils import z85
-from zmq.utils.monitor import recv_monitor_message
 
 from handtouch.client import keys
 from handtouch.client.connection import KEEPALIVE_OPTIONS
 from handtouch.daemon.cause_counter import CauseCounter
-from handtouch.daemon.connections import client_key_of, close_connection, connection_of
+from handtouch.daemon.connection_limit import ConnectionLimit
+from handtouch.daemon.connections import (
+    client_key_of,
+    close_connection,
+    connection_of,
+    drop_connection_requests,
+    dropped_connection_requests,
+)
 from handtouch.daemon.endpoints import is_readable
 
 REFUSAL_CAUSES = {
@@ -31,6 +39,8 @@ REFUSAL_CAUSES = {
     "no_right": 'client has the right "read", but not "control"',
     "malformed": "peer doesn't speak ZMTP, or disconnected during the handshake",
     "revoked": "client is no longer authorised, or has other rights; its connection is closed",
+    "connection_flood": "clients connect too fast; requests to connect are dropped at random, which delays "
+    "new connections by seconds; find the process that opens one after another",
 }
 """Causes of refused connections: name of the counter -> description."""
 
@@ -47,11 +57,13 @@ _HANDSHAKE_TIMEOUT_MS = 5000
 """A connection that isn't authenticated by then is closed."""
 _MAX_MESSAGE_BYTES = {"read": 1024, "control": 200_000, "inputs": 65_536}
 """Largest message that a client may send; on the streams clients send subscriptions only."""
-_HANDSHAKE_FAILURE_EVENTS = (
+_LISTENING, _ACCEPTED = int(zmq.Event.LISTENING), int(zmq.Event.ACCEPTED)
+_HANDSHAKE_FAILURE_EVENTS = int(
     zmq.Event.HANDSHAKE_FAILED_NO_DETAIL | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
 )  # failures of authentication are counted by `_answer_zap_request`
-_ZMTP_MECHANISM_MISMATCH = 0x11000002
-_ZMTP_CRYPTOGRAPHIC = 0x11000001
+_EVENT_FORMAT = "=Hi"  # ZeroMQ's first frame about an event: which, value
+_HANDSHAKE_CAUSES = {0x11000002: "no_key", 0x11000001: "wrong_server_key"}
+"""With keys: what ZeroMQ reports as a mismatch of mechanisms, and as a cryptographic failure"""
 
 _log = logging.getLogger("handtouch.security")
 
@@ -72,7 +84,7 @@ class Authenticator:
     ) -> None:
         self._refusals = CauseCounter(_log, "connection refused", REFUSAL_CAUSES)
         self._context, self._folder, self._zap = context, folder, zap
-        self._monitors: list[zmq.Socket[bytes]] = []
+        self._monitors: list[_Monitor] = []
         self._last_poll_ns = self._client_files_read_ns = 0
         self._connections: dict[int, tuple[keys.AuthorisedClient, str]] = {}  # descriptor -> client, endpoint
         self._clients: dict[str, keys.AuthorisedClient] = {}
@@ -113,23 +125,21 @@ class Authenticator:
             socket.setsockopt(option, value)
         # with a domain, ZeroMQ refuses the protocol before ZMTP 3, as which it would accept any bytes
         socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
-        if self._folder is None:
-            return
-        socket.setsockopt(zmq.CURVE_SERVER, 1)
-        socket.setsockopt(zmq.CURVE_SECRETKEY, self._key.secret_key.encode())
-        address = f"inproc://refused-{len(self._monitors)}"
-        socket.monitor(address, _HANDSHAKE_FAILURE_EVENTS)
-        monitor: zmq.Socket[bytes] = self._context.socket(zmq.PAIR)
-        monitor.setsockopt(zmq.LINGER, 0)
-        monitor.setsockopt(zmq.RCVHWM, 0)  # a full queue would block ZeroMQ's own thread
-        monitor.connect(address)
-        self._monitors.append(monitor)
+        if self._folder is not None:
+            socket.setsockopt(zmq.CURVE_SERVER, 1)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, self._key.secret_key.encode())
+        number = len(self._monitors)
+        self._monitors.append(_Monitor(self._context, socket, number, self._folder is not None))
 
     def poll(self, now_ns: int) -> None:
-        """Answer handshakes and count refusals, every 10 ms, as polling costs microseconds."""
-        if self._zap is None or now_ns - self._last_poll_ns < _POLL_PERIOD_NS:
+        """Answer handshakes, count connections and refusals; every 10 ms, as polling costs microseconds."""
+        if now_ns - self._last_poll_ns < _POLL_PERIOD_NS:
             return
         self._last_poll_ns = now_ns
+        for monitor in self._monitors:
+            monitor.poll(self._refusals, now_ns)
+        if self._zap is None:
+            return
         if now_ns - self._client_files_read_ns >= _CLIENT_FILES_PERIOD_NS:
             self._reload_clients(now_ns)
         for _ in range(_MAX_HANDSHAKES_PER_POLL):
@@ -138,13 +148,6 @@ class Authenticator:
             self._zap.send_multipart(
                 self._answer_zap_request(self._zap.recv_multipart(zmq.NOBLOCK), now_ns), zmq.NOBLOCK
             )
-        for monitor in self._monitors:
-            for _ in range(_MAX_EVENTS_PER_POLL):
-                if not is_readable(monitor):
-                    break
-                value = recv_monitor_message(monitor, zmq.NOBLOCK)["value"]
-                cause = {_ZMTP_MECHANISM_MISMATCH: "no_key", _ZMTP_CRYPTOGRAPHIC: "wrong_server_key"}
-                self._refusals.add(cause.get(value, "malformed"), "", now_ns)
 
     def authorise(self, frame: zmq.Frame, right: str, endpoint: str, now_ns: int) -> bool:
         """Return True if the sender of a frame that was received at an endpoint has a right.
@@ -163,6 +166,12 @@ class Authenticator:
             return False
         self._connections[connection] = client, endpoint
         return right == "read" or client.rights == "control"
+
+    def __enter__(self) -> Authenticator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """Close the authentication sockets; call it after the secured sockets are closed."""
@@ -212,6 +221,54 @@ class Authenticator:
                 "no client is authorised; create a client key with handtouch keys client %s NAME",
                 self._folder,
             )
+
+
+class _Monitor:
+    """Reads what ZeroMQ reports about the connections of one socket, and limits their rate."""
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        socket: zmq.Socket[bytes],
+        number: int,
+        needs_keys: bool,
+    ) -> None:
+        self._causes = _HANDSHAKE_CAUSES if needs_keys else {}
+        address = f"inproc://connections-{number}"
+        socket.monitor(address, _LISTENING | _ACCEPTED | _HANDSHAKE_FAILURE_EVENTS)
+        self._events: zmq.Socket[bytes] = context.socket(zmq.PAIR)
+        self._events.setsockopt(zmq.LINGER, 0)
+        self._events.setsockopt(zmq.RCVHWM, 0)  # a full queue would block ZeroMQ's own thread
+        self._events.connect(address)
+        self._listener, self._endpoint, self._dropped = -1, "", 0
+        self._limit = ConnectionLimit(lambda _: False)
+
+    def poll(self, refusals: CauseCounter, now_ns: int) -> None:
+        """Count connections and refusals since the last call; adapt the share of dropped requests."""
+        accepted = 0
+        for _ in range(_MAX_EVENTS_PER_POLL):
+            if not is_readable(self._events):
+                break
+            description, endpoint = self._events.recv_multipart(zmq.NOBLOCK)
+            event, value = struct.unpack(_EVENT_FORMAT, description)
+            if event == _ACCEPTED:
+                accepted += 1
+            elif event == _LISTENING:
+                self._listener, self._endpoint = value, endpoint.decode()
+                self._limit = ConnectionLimit(partial(drop_connection_requests, value, self._endpoint))
+            else:
+                refusals.add(self._causes.get(value, "malformed"), "", now_ns)
+        self._limit.count(accepted, now_ns)
+        if self._limit.halvings:
+            dropped = dropped_connection_requests(self._listener, self._endpoint)
+            if dropped != self._dropped:
+                refusals.add(
+                    "connection_flood", self._endpoint, now_ns, (dropped - self._dropped) % (1 << 32)
+                )
+                self._dropped = dropped
+
+    def close(self) -> None:
+        self._events.close()
 
 
 def _fingerprint_folder(folder: Path) -> object:

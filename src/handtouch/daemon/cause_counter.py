@@ -24,14 +24,14 @@ class CauseCounter:
         self._log, self._subject, self._texts = log, subject, texts
         self._last_logged: dict[str, tuple[int, int]] = {}
 
-    def add(self, cause: str, detail: str, now_ns: int) -> None:
-        """Count an event, and log it if its cause was not logged in the last 10 s."""
-        self.counts[cause] += 1
+    def add(self, cause: str, detail: str, now_ns: int, events: int = 1) -> None:
+        """Count an event or several, and log it if its cause was not logged in the last 10 s."""
+        self.counts[cause] += events
         self.last_problem = self._texts[cause] + (f": {detail}" if detail else "")
         last_ns, last_count = self._last_logged.get(cause, (now_ns - _LOG_REPEAT_PERIOD_NS, 0))
         if now_ns - last_ns < _LOG_REPEAT_PERIOD_NS:
             return
-        more = self.counts[cause] - last_count - 1
+        more = self.counts[cause] - last_count - events
         suffix = f"; {more} more since the last report" if more else ""
         self._log.warning("%s: %s%s", self._subject, self.last_problem, suffix)
         self._last_logged[cause] = now_ns, self.counts[cause]

@@ -1,6 +1,7 @@
-"""Connections of clients to the daemon's endpoints: which one a message came over, and how to close one.
+"""Connections of clients to the daemon's endpoints: which one a message came over, how to close or delay one.
 
-Public names: `connection_of`, `client_key_of`, `close_connection`, `block_connection`.
+Public names: `connection_of`, `client_key_of`, `close_connection`, `block_connection`,
+`drop_connection_requests`, `dropped_connection_requests`.
 """
 
 from __future__ import annotations
@@ -13,8 +14,15 @@ import struct
 
 import zmq
 
-_SO_ATTACH_FILTER = 26  # not in Python's module
-_ACCEPT_NOTHING = struct.pack("HBBI", 0x06, 0, 0, 0)  # socket filter: return 0 bytes of every packet
+_SO_ATTACH_FILTER, _SO_DETACH_FILTER, _SO_MEMINFO = 26, 27, 55  # not in Python's module
+_MEMINFO_FORMAT = "9I"  # the last: packets that the socket has dropped
+
+Instruction = tuple[int, int, int, int]
+"""Of a socket filter (classic BPF): code, jump if true, jump if false, operand"""
+_LOAD_BYTE, _LOAD_WORD, _AND, _JUMP_IF_EQUAL, _RETURN = 0x30, 0x20, 0x54, 0x15, 0x06
+_TCP_FLAGS, _SYN_ACK, _SYN = 13, 0x12, 0x02
+_RANDOM = 0xFFFFF000 + 56
+_ACCEPT, _DROP = (_RETURN, 0, 0, 0x40000), (_RETURN, 0, 0, 0)
 
 
 def connection_of(frame: zmq.Frame) -> int:
@@ -64,6 +72,43 @@ def block_connection(descriptor: int, endpoint: str) -> bool:
     return False
 
 
+def drop_connection_requests(listener: int, endpoint: str, halvings: int) -> bool:
+    """Make the kernel drop requests to connect to a TCP endpoint at random; return False if that fails.
+
+    `listener` is the descriptor that listens there; one request of 2^`halvings` gets through, each with
+    `halvings` = 0. Established connections aren't affected. Who connects repeats its request after 1, 3, 7 s.
+    """
+    with contextlib.suppress(OSError), _open_duplicate(listener) as listening:
+        if _is_of_endpoint(listening.getsockname(), endpoint):
+            if halvings:
+                _attach_filter(
+                    listening,
+                    (_LOAD_BYTE, 0, 0, _TCP_FLAGS),
+                    (_AND, 0, 0, _SYN_ACK),
+                    (_JUMP_IF_EQUAL, 0, 3, _SYN),
+                    (_LOAD_WORD, 0, 0, _RANDOM),
+                    (_AND, 0, 0, (1 << halvings) - 1),
+                    (_JUMP_IF_EQUAL, 0, 1, 0),
+                    _ACCEPT,
+                    _DROP,
+                )
+            else:
+                listening.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+            return True
+    return False
+
+
+def dropped_connection_requests(listener: int, endpoint: str) -> int:
+    """Return how many requests to connect the kernel has dropped, modulo 2^32; 0 if it can't say."""
+    with contextlib.suppress(OSError), _open_duplicate(listener) as listening:
+        if _is_of_endpoint(listening.getsockname(), endpoint):
+            size = struct.calcsize(_MEMINFO_FORMAT)
+            return int(
+                struct.unpack(_MEMINFO_FORMAT, listening.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, size))[-1]
+            )
+    return 0
+
+
 def _open_duplicate(descriptor: int) -> socket.socket:
     return socket.fromfd(descriptor, socket.AF_INET, socket.SOCK_STREAM)
 
@@ -75,11 +120,16 @@ def _drop_packets(connection: socket.socket) -> None:
     ZeroMQ while it waits for the hot thread to take subscriptions: a heartbeat among them would abort it
     (zeromq/libzmq issue 4364).
     """
-    instructions = ctypes.create_string_buffer(_ACCEPT_NOTHING)
-    program = struct.pack("@HP", 1, ctypes.addressof(instructions))
-    connection.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
+    _attach_filter(connection, _DROP)
     # the peer's answer to an orderly end would be dropped, too: reset the connection when ZeroMQ closes it
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+
+
+def _attach_filter(connection: socket.socket, *instructions: Instruction) -> None:
+    """Make the kernel run a filter on the TCP header of each packet for a socket."""
+    code = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in instructions))
+    program = struct.pack("@HP", len(instructions), ctypes.addressof(code))
+    connection.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
 
 
 def _is_of_endpoint(address: object, endpoint: str) -> bool:

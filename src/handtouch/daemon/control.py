@@ -112,11 +112,10 @@ class ControlServer:
         cls,
         context: zmq.Context[zmq.Socket[bytes]],
         endpoint: str,
-        authenticator: Authenticator | None = None,
+        authenticator: Authenticator,
         clock: Callable[[], int] = time.thread_time_ns,
     ) -> ControlServer:
         """Bind the endpoint. Raises OSError naming it and a remedy."""
-        authenticator = authenticator or Authenticator(context)
         return cls(*open_control_socket(context, endpoint, authenticator), authenticator, clock=clock)
 
     def poll(self, now_ns: int) -> None:

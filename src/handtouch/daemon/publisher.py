@@ -85,7 +85,7 @@ class Publisher:
         live: str,
         complete: str,
         topics: Iterable[str],
-        authenticator: Authenticator | None = None,
+        authenticator: Authenticator,
         session: int = 0,
         retained_messages: RetainedMessages | None = None,
     ) -> Publisher:
@@ -93,7 +93,6 @@ class Publisher:
 
         Raises OSError naming the endpoint that can't be bound and a remedy.
         """
-        authenticator = authenticator or Authenticator(context)
         sockets: dict[str, zmq.Socket[bytes]] = {}
         endpoints: dict[str, str] = {}
         for stream, endpoint, queue in (

@@ -212,7 +212,8 @@ class Service:
     """begun since the daemon started"""
     rejected: Annotated[dict[str, Any], dict[str, int]]
     """cause -> rejected connections; `unknown_topic` -> subscriptions to prefixes of no topic,
-    `subscription_flood` -> connections cut off for too many, `request` -> refused requests"""
+    `subscription_flood` -> connections cut off for too many, `connection_flood` -> requests to connect that
+    were dropped as clients connected too fast, `request` -> refused requests"""
     process: Annotated[dict[str, Any], ProcessStatistics]
     """resources of the daemon"""
     buses: Annotated[dict[str, Any], dict[str, BusStatistics]]
