@@ -238,3 +238,16 @@ def test_a_late_bridge_relays_the_newest_updates_and_every_begin_and_end(network
     assert bridge.level == 1
     replaced = str(2 * 397 + 399)
     assert {pair.key: pair.value for pair in bridge.values}["replaced"] == replaced
+
+
+def test_a_malformed_message_costs_no_other(network: RosNetwork) -> None:
+    """A name that isn't UTF-8 passes DDS, and fails in decoding."""
+    writer = network.writer("/joint_states", ros.RosJointState, Quality.STATE)
+    reader = network.reader("/joint_states", ros.RosJointState, Quality.SENSOR_DATA)
+    state = ros.RosJointState(name=["index_mcp"], position=[0.5])
+    writer.write(state.serialize().replace(b"index", b"ind\xffx"))
+    writer.write(state)
+    received, end_s = list[Any](), time.monotonic() + 60
+    while not received and time.monotonic() < end_s:
+        received = reader.take(10)
+    assert received == [state]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, byte, float32, float64, int32, sequence, uint8, uint32, uint64
+from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint8, uint32, uint64
 
 # Annotations are types, not text, which the base class can't resolve in all cases.
 
@@ -178,9 +178,15 @@ class KeyValue(IdlStruct, typename="diagnostic_msgs::msg::dds_::KeyValue_"):
 
 @dataclass
 class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs::msg::dds_::DiagnosticStatus_"):
-    """diagnostic_msgs/DiagnosticStatus."""
+    """diagnostic_msgs/DiagnosticStatus.
 
-    level: byte = 0
+    `ros_bytes`: fields of ROS's type `byte`, which rmw_cyclonedds declares to DDS as uint8. As DDS's `byte`
+    the topic would not match.
+    """
+
+    ros_bytes = ("level",)
+
+    level: uint8 = 0
     name: str = ""
     message: str = ""
     hardware_id: str = ""

@@ -1,18 +1,20 @@
 """DDS participant with ROS 2's names, qualities of service and type hashes.
 
-Public names: `RosNetwork`, `RosWriter`, `Quality`, `RosNetworkError`, `ros_name`.
+Public names: `RosNetwork`, `RosWriter`, `RosReader`, `Quality`, `RosNetworkError`, `ros_name`.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from enum import Enum
 from types import new_class
 from typing import Any
 
-from cyclonedds.core import DDSException, Listener, Policy, Qos
+from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
+from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
@@ -20,6 +22,7 @@ from cyclonedds.util import duration
 
 from handtouch.bridge.ros2.type_hash import type_hash
 
+_log = logging.getLogger("handtouch.bridge")
 _BLOCKING_S = 0.1
 """Longest that a reliable subscriber which doesn't keep up may delay a message"""
 
@@ -55,14 +58,15 @@ class RosWriter:
     def __init__(
         self, participant: DomainParticipant, topic: Topic[Any], kind: type[IdlStruct], qos: Qos
     ) -> None:
-        self._readers = _ReaderCount()
-        self._writer = DataWriter[Any](participant, topic, qos=qos, listener=self._readers)
+        self._writer = DataWriter[Any](participant, topic, qos=qos)
         self._encoded: Any = new_class("Encoded", (_Encoded, kind))
 
     @property
     def is_read(self) -> bool:
         """There is a reader now."""
-        return self._readers.count > 0
+        # a listener, called in a thread of DDS, can delay the end of the process by half a minute
+        status = self._writer.get_publication_matched_status()  # type: ignore[no-untyped-call]
+        return bool(status.current_count)
 
     def write(self, message: IdlStruct | bytes) -> None:
         """Send a message, encoded already or not."""
@@ -83,15 +87,28 @@ class _Encoded:
         return self.data
 
 
-class _ReaderCount(Listener):
-    """Number of matched readers; DDS calls it in a thread of its own."""
+class RosReader:
+    """Reader of a topic, created by `RosNetwork.reader`."""
 
-    def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-        self.count = 0
+    def __init__(self, participant: DomainParticipant, topic: Topic[Any], qos: Qos) -> None:
+        self._reader = DataReader[Any](participant, topic, qos=qos)
+        self._name, self._has_reported = topic.get_name(), False
 
-    def on_publication_matched(self, writer: object, status: Any) -> None:  # noqa: ARG002
-        self.count = status.current_count
+    def take(self, count: int) -> list[Any]:
+        """Return messages that have arrived, at most `count`; malformed ones are logged once and dropped."""
+        messages = []
+        for _ in range(count):
+            try:
+                taken = self._reader.take(1)  # a malformed one loses those taken with it
+            except Exception as error:  # noqa: BLE001 - decoding raises many kinds
+                if not self._has_reported:
+                    _log.warning("%s: malformed message dropped: %s", self._name, error)
+                self._has_reported = True
+                continue
+            if not taken:
+                break
+            messages += [message for message in taken if not isinstance(message, InvalidSample)]
+        return messages
 
 
 class RosNetwork:
@@ -115,10 +132,10 @@ class RosNetwork:
         qos = quality.qos + Qos(_type_hash_policy(kind))
         return RosWriter(self._participant, self._topic(name, kind), kind, qos)
 
-    def reader(self, name: str, kind: type[IdlStruct], quality: Quality) -> DataReader[Any]:
+    def reader(self, name: str, kind: type[IdlStruct], quality: Quality) -> RosReader:
         """Return a reader of a topic."""
         qos = quality.qos + Qos(_type_hash_policy(kind))
-        return DataReader(self._participant, self._topic(name, kind), qos=qos)
+        return RosReader(self._participant, self._topic(name, kind), qos)
 
     def _topic(self, name: str, kind: type[IdlStruct]) -> Topic[Any]:
         full = (

@@ -92,6 +92,7 @@ class RosRelay:
         if not isinstance(message, wire.Contact):  # the time of an end or a retained one isn't of the newest
             self._newest_ns = max(self._newest_ns, message.t_ns)
             if self._newest_ns - self._sent_ns >= _DIAGNOSTICS_PERIOD_NS:
+                self._update_bridge()
                 self._send_diagnostics()
 
     def _update_service(self, service: wire.Service) -> None:
@@ -142,8 +143,6 @@ class RosRelay:
         self._reported_losses = self._losses
 
     def _send_diagnostics(self) -> None:
-        if self._newest_ns - self._sent_ns >= _DIAGNOSTICS_PERIOD_NS:
-            self._update_bridge()
         self._sent_ns = self._newest_ns
         header = self._stamper.header(self._newest_ns, "")
         self._diagnostics.write(ros.DiagnosticArray(header, list(self._statuses.values())))
@@ -263,10 +262,9 @@ class JointStateRelay:
     def forward_waiting(self) -> int:
         """Forward the joint states that have arrived; return their number."""
         states = self._reader.take(_MAX_JOINT_STATES_PER_POLL)
-        valid = [state for state in states if isinstance(state, ros.RosJointState)]
-        for state in valid:
+        for state in states:
             self._forward(state)
-        return len(valid)
+        return len(states)
 
     def _forward(self, state: ros.RosJointState) -> None:
         if not state.name or len(state.position) != len(state.name):

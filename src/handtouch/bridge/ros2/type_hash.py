@@ -11,7 +11,7 @@ import typing
 from typing import Any
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, sequence
+from cyclonedds.idl.types import array, byte, sequence
 
 _TYPE_IDS = {
     "uint8": 3, "int32": 6, "uint32": 7, "uint64": 9, "float32": 10, "float64": 11, "byte": 16,
@@ -44,8 +44,13 @@ def type_hash(kind: type[IdlStruct]) -> str:
 def _describe(kind: type[IdlStruct], nested: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return the description of a type, and add those of the types in its fields to `nested`."""
     hints = typing.get_type_hints(kind, include_extras=True)
+    ros_bytes = getattr(kind, "ros_bytes", ())
     described = [
-        {"name": name, "type": _describe_field(hints[name], nested)} for name in kind.__annotations__
+        {
+            "name": name,
+            "type": _describe_field(byte if name in ros_bytes else hints[name], nested),
+        }
+        for name in kind.__annotations__
     ]
     return {"type_name": ros_type_name(kind), "fields": described}
 
