@@ -282,8 +282,8 @@ sample of each touch:
 {region_rows}
 
 The deployment states `mount_std_mm = 0.2` and `mount_std_deg = 0.5`, and joint states carry the standard
-deviation of the joints. Gains and patches are not stated: where the currents don't fit a point, the
-covariance is widened by the misfit.
+deviation of the joints. The tolerances of parts are stated as the world draws them. Patches are not: where
+the currents don't fit a point, the covariance is widened by the misfit.
 
 ## Force: N
 
