@@ -28,12 +28,12 @@ from scores import Estimates, EstimateScore, concatenate, slices
 from sheet_use import FULL_N, drawn_sheets, score_use
 
 from handtouch.config import Behaviour, load, shipped
-from handtouch.core.cycle import Cycle
 from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import run_tick
 from handtouch.core.sheet_force import SheetForceCompensation, sheet_behaviour_of
-from handtouch.core.slab import Slab
+from handtouch.core.slab import Cycle, Slab
 from handtouch.core.state import TickState
-from handtouch.core.tick import TickProcessor, TickResult
+from handtouch.core.tick import TickProcessor
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.worlds import WORLDS, Family
 
@@ -91,7 +91,7 @@ class Rig:
         self.cycle.begin_cycle(self.t_ns)
         for slot, data in enumerate(np.rint(counts).astype("<i2")):
             self.slab.write_pdo(slot, data.tobytes(), self.t_ns + 1000)
-        self.tick.run_tick(self.slab, self._up, self.cycle)
+        run_tick(self.tick, self.slab, self._up, self.cycle)
 
 
 # Held object
@@ -118,26 +118,18 @@ def without_following(tick: TickProcessor) -> None:
 
 def without_gate(tick: TickProcessor) -> None:
     """Baselines follow in contact too."""
-    baseline, learn = tick.baseline, tick.baseline.update_baseline
+    baseline, learn, state = tick.baseline, tick.baseline.update_baseline, tick.state
 
     def ungated(sync_ns: int, touching: NDArray[np.bool_]) -> bool:
-        baseline.held[:] = False
-        return learn(sync_ns, touching & False)
-
-    baseline.update_baseline = ungated  # type: ignore[method-assign]
-
-    run_tick, state = tick.run_tick, tick.state
-
-    def collecting(*inputs: Any) -> TickResult:
-        result = run_tick(*inputs)
-        rows = np.concatenate([result.began, result.updated])
+        rows = np.flatnonzero(touching)
         excess = tick.counts[rows] - baseline.expected_counts[rows]
         state.block_sum[rows] += excess
         state.block_squares[rows] += np.square(excess)
         state.block_count[rows] += 1
-        return result
+        baseline.held[:] = False
+        return learn(sync_ns, touching & False)
 
-    tick.run_tick = collecting  # type: ignore[method-assign, assignment]
+    baseline.update_baseline = ungated  # type: ignore[method-assign]
 
 
 HALVES: dict[str, Callable[[TickProcessor], None]] = {

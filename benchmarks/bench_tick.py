@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from page import made_by, options, output_folder
 
 from handtouch.config import Deployment, load, shipped
-from handtouch.core.cycle import Cycle
 from handtouch.core.pad_model import PadModel
-from handtouch.core.slab import Slab
+from handtouch.core.pipeline import run_tick
+from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor
 
 PADS = (15, 60, 240, 960)
@@ -80,7 +80,7 @@ class Driver:
 
     def run_tick(self) -> None:
         """Run the measured tick."""
-        self.tick.run_tick(self.slab, self._up, self.cycle)
+        run_tick(self.tick, self.slab, self._up, self.cycle)
 
     def floor(self) -> None:
         """Convert counts to currents and find touched pads."""

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 
 from handtouch.config import parse
-from handtouch.core.cycle import Cycle
 from handtouch.core.pad_model import PadModel
-from handtouch.core.slab import STANDARD_LAYOUT, ChannelField, Slab
+from handtouch.core.pipeline import run_tick
+from handtouch.core.slab import STANDARD_LAYOUT, ChannelField, Cycle, Slab
 from handtouch.core.stages import detect
 from handtouch.core.tick import TickProcessor
 from handtouch.core.tick_messages import ContactMessageEncoder
@@ -46,7 +46,7 @@ def main(count: int) -> None:
                 data = np.rint(counts).astype("<i2").tobytes()
                 slab.write_pdo(pad, data, t_ns + int(rng.integers(-PERIOD_NS, PERIOD_NS)))
         until_ns = t_ns + PERIOD_NS // 2 if number % 7 == 0 else 1 << 62
-        tick.run_tick(slab, node_state, cycle, until_ns)
+        run_tick(tick, slab, node_state, cycle, until_ns)
         tick.prepare_next_tick()
         digest.update(tick.state.save())
         digest.update(tick.columns.published_values.tobytes() + tick.columns.force_status.tobytes())

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch.core.contacts import ContactChanges, ContactDetector, DetectionSettings
-from handtouch.core.cycle import Cycle
-from handtouch.core.slab import Slab
+from handtouch.core.pipeline import detect_contacts
+from handtouch.core.slab import Cycle, Slab
 from handtouch.core.state import TickState
 
 BEGIN, END = 20.0, 10.0
@@ -33,7 +33,7 @@ class Detector:
         if sampled or not trusted:
             self._slab.write_pdo(0, counts.tobytes(), self._cycle.sync_ns + 1)
         self._slab.unpack_counts()
-        return self.contacts.detect_contacts(self._slab, self._up, self._cycle)
+        return detect_contacts(self.contacts, self._slab, self._up, self._cycle)
 
 
 def test_a_contact_begins_after_the_debounce_with_the_time_of_its_first_sample() -> None:

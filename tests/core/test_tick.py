@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handtouch.core.cycle import Cycle
-from handtouch.core.slab import Slab
+from handtouch.core.pipeline import run_tick
+from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor, TickResult
 from handtouch.wire import PadState
 
@@ -39,7 +39,7 @@ class Driver:
             if pad not in silent:
                 data = np.asarray(counts.get(pad, np.zeros(4)), dtype="<i2").tobytes()
                 self.slab.write_pdo(pad, data, self.t_ns + 1000)
-        return self.tick.run_tick(self.slab, self.node_state, self.cycle)
+        return run_tick(self.tick, self.slab, self.node_state, self.cycle)
 
     def state(self, pad: int) -> PadState:
         return PadState(int(self.tick.columns.state[pad]))
@@ -256,7 +256,7 @@ def test_samples_received_in_one_batch_with_their_sync_belong_to_it(driver: Driv
     driver.slab.begin_cycle(sync_ns)
     assert driver.slab.fresh.tolist() == [1, 0, 0]
     driver.cycle.begin_cycle(sync_ns)
-    driver.tick.run_tick(driver.slab, driver.node_state, driver.cycle)
+    run_tick(driver.tick, driver.slab, driver.node_state, driver.cycle)
     assert driver.tick.columns.sample_ns[PLANE] == sync_ns
 
 
@@ -266,9 +266,9 @@ def test_a_late_tick_ignores_samples_of_the_next_cycle(driver: Driver) -> None:
     before_ns = driver.t_ns
     next_ns = before_ns + 2 * PERIOD_NS
     driver.slab.write_pdo(PLANE, touch[PLANE].tobytes(), next_ns + 500)
-    driver.tick.run_tick(driver.slab, driver.node_state, driver.cycle, until_ns=next_ns)
+    run_tick(driver.tick, driver.slab, driver.node_state, driver.cycle, until_ns=next_ns)
     assert driver.tick.columns.sample_ns[PLANE] == before_ns
     driver.slab.begin_cycle(next_ns)
     driver.cycle.begin_cycle(next_ns)
-    assert driver.tick.run_tick(driver.slab, driver.node_state, driver.cycle).began.tolist() == [PLANE]
+    assert run_tick(driver.tick, driver.slab, driver.node_state, driver.cycle).began.tolist() == [PLANE]
     assert driver.tick.columns.sample_ns[PLANE] == next_ns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from handtouch.core.cycle import BusyPoll
+from handtouch.daemon.busy_poll import BusyPoll
 
 
 def learned(busy_ns: int) -> BusyPoll:

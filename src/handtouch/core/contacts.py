@@ -10,9 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.cycle import Cycle
 from handtouch.core.memory import view_memory
-from handtouch.core.slab import Slab
 from handtouch.core.stages.detect import ContactDetection
 from handtouch.core.state import TickState
 
@@ -20,7 +18,6 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 FloatArray = NDArray[np.float64]
 
-NO_LIMIT_NS = np.iinfo(np.int64).max
 _MAX_SILENT_PERIODS = 3
 
 
@@ -55,10 +52,6 @@ class ContactChanges(NamedTuple):
     solved: IntArray
 
 
-_NO_PADS: IntArray = np.zeros(0, dtype=np.intp)
-_NO_CHANGES = ContactChanges(*[_NO_PADS] * len(ContactChanges._fields))
-
-
 class ContactDetector:
     """Contacts of n pads, at most one each, in a tick's state.
 
@@ -75,7 +68,8 @@ class ContactDetector:
         self.currents, self.offset_std_a = np.zeros(expected_counts.shape), np.zeros(state.pads)
         self._state, self._expected_counts = state, expected_counts
         self._rows = np.zeros((len(ContactChanges._fields), state.pads), dtype=np.intp)
-        self._lists = list(self._rows)
+        self.lists = list(self._rows)
+        """pads of a tick's changes, as long as the numbers in `stage` say"""
         self.set_settings(settings)
 
     def set_settings(self, settings: DetectionSettings) -> None:
@@ -84,27 +78,8 @@ class ContactDetector:
         arrays["expected_counts"] = view_memory(self._expected_counts)
         arrays["currents"], arrays["excess"] = view_memory(self.currents), view_memory(np.zeros(4))
         arrays["offset_std_a"] = view_memory(self.offset_std_a)
-        self._stage = ContactDetection(
+        self.stage = ContactDetection(
             self._state.pads, self._state.memory() | arrays, view_memory(self._rows)
-        )
-
-    def detect_contacts(
-        self, slab: Slab, node_state: NDArray[np.uint8], cycle: Cycle, until_ns: int = NO_LIMIT_NS
-    ) -> ContactChanges:
-        """Process the samples in a slab that arrived before `until_ns`, of pads whose `node_state` (n,) is 0.
-
-        A contact on a pad without valid samples ends at once; one that misses a sample keeps its state.
-        """
-        stage = self._stage
-        stage.detect_contacts(
-            *(slab.memory, node_state.data, cycle.sync_ns, cycle.previous_sync_ns),
-            *(cycle.period_ns // 2, until_ns),
-        )
-        counts = stage.began, stage.ended, stage.updated, stage.silent, stage.solved
-        if not any(counts):
-            return _NO_CHANGES
-        return ContactChanges(
-            *[pads[:k].copy() if k else _NO_PADS for pads, k in zip(self._lists, counts, strict=True)]
         )
 
     def is_fresh(self, pad: int) -> bool:

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment
-from handtouch.core.cycle import Cycle
 from handtouch.core.events import Event, encode_calibration, encode_event
-from handtouch.core.slab import Slab
+from handtouch.core.slab import Cycle, Slab
 from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor
 from handtouch.core.tick_messages import MessageSink
@@ -44,8 +43,7 @@ class TickJournal:
 
     def __init__(self, pipeline: _Pipeline, session: int, sink: MessageSink) -> None:
         self._pipeline, self._session, self._sink = pipeline, session, sink
-        self._tick_seq = self._state_seq = self._config_seq = 0  # seq of each topic
-        self._has_subscriber = False  # to ticks
+        self._state_seq = self._config_seq = 0  # seq of each topic
         self._published_limits = b""
         self._config: tuple[str, Mapping[str, bytes], Mapping[str, Any]] | None = None
 
@@ -67,22 +65,16 @@ class TickJournal:
             self._sink.send(message)
 
     def publish_first_state(self, now_ns: int) -> None:
-        """Publish config and state before a tick, if the messages `tick` begin with this one."""
-        subscribed = self._sink.has_subscriber("tick")
-        if subscribed and not self._has_subscriber:
-            self._state_seq += 1
-            if (config := self._config_message(now_ns, retained=True)) is not None:
-                self._sink.send(config)
-            self._sink.send(self._state_message(now_ns, retained=False))
-        self._has_subscriber = subscribed
+        """Publish config and state before the tick that the messages `tick` begin with."""
+        self._state_seq += 1
+        if (config := self._config_message(now_ns, retained=True)) is not None:
+            self._sink.send(config)
+        self._sink.send(self._state_message(now_ns, retained=False))
 
     def publish_tick_inputs(
         self, events: Sequence[Event], now_ns: int, until_ns: int, stopped: bool = False
     ) -> None:
-        """Publish the inputs of the last tick."""
-        self._tick_seq += 1
-        if not self._sink.has_subscriber("tick"):
-            return
+        """Publish the inputs of the last tick, or with `stopped` the end of the session."""
         pipeline = self._pipeline
         tick, cycle, slab = pipeline.tick, pipeline.cycle, pipeline.slab
         limits = slab.limits.tobytes()
@@ -91,7 +83,7 @@ class TickJournal:
             wire.TickInputs(
                 v=wire.SCHEMA_VERSION,
                 session=self._session,
-                seq=self._tick_seq,
+                seq=pipeline.ticks + stopped,
                 t_ns=cycle.sync_ns,
                 tick=pipeline.ticks,
                 previous_sync_ns=cycle.previous_sync_ns,

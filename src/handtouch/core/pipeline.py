@@ -1,4 +1,7 @@
-"""Pipeline from SYNC to messages, driven by a live bus or by a recording."""
+"""Path of a sample: from the slab to the messages of a tick, driven by a live bus or by a recording.
+
+Public names: `Pipeline`; `run_tick`, `detect_contacts`, `solve_contacts`, stages of its ticks.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,13 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.cycle import Cycle
+from handtouch.core.contacts import ContactChanges, ContactDetector, IntArray
 from handtouch.core.events import CalibrationEvent, DemandEvent, Event, ForceEvent, GravityEvent, ModelEvent
 from handtouch.core.journal import TickJournal
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.sheet_force import ForceReference
-from handtouch.core.slab import Slab
+from handtouch.core.slab import Cycle, Slab
 from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor, TickResult
 from handtouch.core.tick_messages import MessageSink, TickMessages
@@ -24,6 +27,8 @@ from handtouch.hand.robot_models import RobotModels
 from handtouch.wire import PadState
 
 _NO_LIMIT_NS = np.iinfo(np.int64).max
+_NO_PADS: IntArray = np.zeros(0, dtype=np.intp)
+_NO_CHANGES = ContactChanges(*[_NO_PADS] * len(ContactChanges._fields))
 
 
 class Pipeline:
@@ -63,6 +68,7 @@ class Pipeline:
         """the model that a `ModelEvent` applies"""
         self._sink = sink
         self.journal = TickJournal(self, session, sink)
+        self._recorded = False  # the last tick
         self._expected_pads = self.tick.expected_pads()
         self._expected_count = 0
 
@@ -142,6 +148,7 @@ class Pipeline:
 
     def replay_tick(self, now_ns: int, until_ns: int | None) -> TickResult:
         """Run a recorded tick on its inputs in slab, cycle and `node_state`, and the events added."""
+        self.prepare_next_tick()
         return self._run_tick(now_ns, _NO_LIMIT_NS if until_ns is None else until_ns)
 
     def prepare_next_tick(self) -> None:
@@ -153,24 +160,31 @@ class Pipeline:
         self.prepare_next_tick()
         self.messages.end_all_contacts(now_ns, self._sink)
         self.messages.send_hand_frames(self.slab, self.ticks, self.cycle.sync_ns, self._sink)
-        self.journal.publish_tick_inputs((), now_ns, _NO_LIMIT_NS, stopped=True)
+        if self._sink.has_subscriber("tick"):
+            self.journal.publish_tick_inputs((), now_ns, _NO_LIMIT_NS, stopped=True)
 
     def _run_tick(self, now_ns: int, until_ns: int) -> TickResult:
-        self.prepare_next_tick()
-        self.journal.publish_first_state(now_ns)
+        recorded = self._sink.has_subscriber("tick")
+        if recorded and not self._recorded:
+            self.journal.publish_first_state(now_ns)
+        self._recorded = recorded
         events, self._events = self._events, []
         for event in events:
             event.apply(self)
         self.cycle.ticked = True
-        result = self.tick.run_tick(self.slab, self.node_state, self.cycle, until_ns)
-        self.transforms.transform_updated(result, self.tick.columns, self.tick.contacts.id)
+        tick, messages = self.tick, self.messages
+        result = run_tick(tick, self.slab, self.node_state, self.cycle, until_ns)
+        if self.transforms.any_requested:
+            self.transforms.transform_updated(result, tick.columns, tick.contacts.id)
         self.on_tick_computed()
-        self.messages.send_contacts(result, now_ns, self._sink)
+        messages.send_contacts(result, now_ns, self._sink)
         if self.ticks % int(self.state.ticks_per_hand_frame[0]) == 0:
-            self.messages.send_hand_frames(self.slab, self.ticks, self.cycle.sync_ns, self._sink)
-        self.journal.publish_tick_inputs(events, now_ns, until_ns)
+            messages.send_hand_frames(self.slab, self.ticks, self.cycle.sync_ns, self._sink)
+        if recorded:
+            self.journal.publish_tick_inputs(events, now_ns, until_ns)
         self.on_messages_queued()
-        self.tick.detect_slips(result)
+        if tick.slip.any_requested:
+            tick.detect_slips(result)
         return result
 
     def _samples_complete(self) -> bool:
@@ -190,10 +204,21 @@ class Pipeline:
         """Return contacts and hand frames by topic with everything computed, requested or not; the state is
         left as it was."""
         saved = self.save_state()
-        self.tick.solve_all()
+        self._solve_all()
         messages = {topic: make(now_ns) for topic, make in self.messages.retained_messages().items()}
         self.load_state(saved, TickState.layout())
         return {topic: message for topic, message in messages.items() if message is not None}
+
+    def _solve_all(self) -> None:
+        """Compute position and force of every touched pad, requested or not."""
+        tick = self.tick
+        everything = np.ones(self.model.size, dtype=np.bool_)
+        tick.set_requested(everything, everything, self.state.update_interval_ticks)
+        touching = np.flatnonzero(tick.contacts.touching)
+        if len(touching):
+            solve_contacts(tick, touching)
+            tick.sheet_force.store_forces()
+            tick.output.publish()
 
     def load_state(
         self, saved: bytes, layout: str, calibrations: Sequence[ActiveCalibration] | None = None
@@ -208,3 +233,61 @@ class Pipeline:
         self.calibrations = list(self.model.calibrations) if calibrations else self.calibrations
         self.tick.refresh()
         self.transforms.refresh()
+
+
+# Stages of a tick -----------------------------------------------------------------------------------------
+
+
+def run_tick(
+    tick: TickProcessor,
+    slab: Slab,
+    node_state: NDArray[np.uint8],
+    cycle: Cycle,
+    until_ns: int = _NO_LIMIT_NS,
+) -> TickResult:
+    """Process the samples of a cycle, and those of the previous one that arrived after its tick.
+
+    Samples that arrived at `until_ns` or later belong to the next cycle. `node_state` (n,):
+    PadState.CLEAR where the node is up, else the state to give its pad.
+    """
+    tick.counts, tick.sync_ns = slab.unpack_counts(), cycle.sync_ns
+    changes = detect_contacts(tick.contacts, slab, node_state, cycle, until_ns)
+    if len(changes.began):
+        tick.sheet_force.begin_contacts(changes.began)
+    if len(changes.solved):
+        solve_contacts(tick, changes.solved)
+    if tick.sheet_force.any_modelled:
+        tick.sheet_force.compensate_forces(cycle.sync_ns)
+    tick.output.publish()
+    return TickResult(cycle.sync_ns, changes.began, changes.updated, changes.ended, changes.silent)
+
+
+def detect_contacts(
+    contacts: ContactDetector,
+    slab: Slab,
+    node_state: NDArray[np.uint8],
+    cycle: Cycle,
+    until_ns: int = _NO_LIMIT_NS,
+) -> ContactChanges:
+    """Compute the currents of samples that arrived before `until_ns`, and detect contacts on pads whose
+    `node_state` (n,) is 0.
+
+    A contact on a pad without valid samples ends at once; one that misses a sample keeps its state.
+    """
+    stage = contacts.stage
+    stage.detect_contacts(
+        *(slab.memory, node_state.data, cycle.sync_ns, cycle.previous_sync_ns),
+        *(cycle.period_ns // 2, until_ns),
+    )
+    counts = stage.began, stage.ended, stage.updated, stage.silent, stage.solved
+    if not any(counts):
+        return _NO_CHANGES
+    return ContactChanges(
+        *[pads[:k].copy() if k else _NO_PADS for pads, k in zip(contacts.lists, counts, strict=True)]
+    )
+
+
+def solve_contacts(tick: TickProcessor, pads: IntArray) -> None:
+    """Locate the contacts on these pads (k,), place them in their links' frames and estimate their forces."""
+    tick.solver.solve_contacts(pads.data)
+    tick.output.store_solved(pads.data)

@@ -108,8 +108,8 @@ class SheetForceCompensation:
         self._results = np.zeros((4, n))
         self._reset()
         self.groups = _make_groups(behaviours, held, self._results)
-        self._stage = self._make_stage()
-        self._periods = -1  # of the groups' steps
+        stage = self._make_stage()
+        self.compensate_forces, self.store_forces = stage.compensate_forces, stage.store_forces
 
     def with_behaviours(
         self, before: Sequence[SheetBehaviour | None], behaviours: Sequence[SheetBehaviour | None]
@@ -201,31 +201,6 @@ class SheetForceCompensation:
         self._begin_s[began] = self.touched_s[began]
         self._new_contacts[began] = True
 
-    def compensate_forces(self, sync_ns: int) -> None:
-        """Advance all sheets to `sync_ns`, and compensate the forces of touched pads with a model.
-
-        They are those of the contact law in the state, `uncompensated_force_n` and `uncompensated_std_n`
-        [N]; untouched pads count as 0.
-        """
-        stage = self._stage
-        periods = stage.elapsed_periods(sync_ns)
-        if periods != self._periods:
-            self._periods = periods
-            for group in self.groups:
-                group.set_interval(periods * self._period_ns * 1e-9)
-        for group in self.groups:
-            if stage.compensate_sheets(group.step):
-                group.compensator.update_back_force()
-        stage.find_pressed(periods * self._period_ns * 1e-9)
-        if stage.due:
-            self._update_uncertainty()
-        if stage.pressed:
-            stage.store_forces()
-
-    def store_forces(self) -> None:
-        """Replace the forces of touched pads in the contacts' values by compensated ones."""
-        self._stage.store_forces()
-
     def update_gains(
         self, reference: ForceReference, sample_ns: npt.NDArray[np.int64], touching: BoolArray
     ) -> int:
@@ -275,7 +250,17 @@ class SheetForceCompensation:
             SHEET_PLAYS,
             self._period_ns,
             UPDATE_PERIOD_S,
+            self._update,
+            lambda dt_s: [group.interval(dt_s) for group in self.groups],
         )
+
+    def _update(self, uncertainties: bool) -> None:
+        """Update back forces that are due, and with `uncertainties` those of forces."""
+        for number, group in enumerate(self.groups):
+            if self._held.back_waited_s[number] >= UPDATE_PERIOD_S:
+                group.compensator.update_back_force()
+        if uncertainties:
+            self._update_uncertainty()
 
     def _update_uncertainty(self) -> None:
         """Update standard deviations and reliability of touched pads; periodically and at contact begin."""
@@ -321,15 +306,14 @@ class _BehaviourGroup:
             behaviour.model, len(pads), behaviour.uncertainty, update_period_s=UPDATE_PERIOD_S, state=state
         )
         self.compensator.last_step = results[:, first : first + len(pads)]
-        self.set_interval(0.0)
         if behaviour.back_force_std_n:
             self.compensator.set_back_force(0.0, behaviour.back_force_std_n)
 
-    def set_interval(self, dt_s: float) -> None:
-        """Set the interval of the next steps."""
+    def interval(self, dt_s: float) -> SheetInterval:
+        """Return an interval of this duration."""
         model = self.compensator.model
         creep, hysteresis = model.creep.discretise(dt_s), model.hysteresis.inverse
-        self.step = SheetInterval(
+        return SheetInterval(
             self._number,
             self._first,
             self._first + len(self.pads),

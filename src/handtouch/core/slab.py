@@ -3,7 +3,7 @@
 A PDO's data is a little-endian word of 64 bits and a channel a bit field of one such word, so that samples of
 any width and mapping are stored as received and unpacked for the whole hand at once.
 
-Public names: `Slab`, `CountSlab`, `ChannelField`, `ChannelLayout`, `STANDARD_LAYOUT`, `MAX_PDOS`.
+Public names: `Slab`, `CountSlab`, `Cycle`, `ChannelField`, `ChannelLayout`, `STANDARD_LAYOUT`, `MAX_PDOS`.
 """
 
 from __future__ import annotations
@@ -194,6 +194,34 @@ class CountSlab(Slab):
     def unpack_counts(self) -> NDArray[np.int64]:
         """Return counts (size, 4); the array is reused by the next sample."""
         return self._counts
+
+
+class Cycle:
+    """The present SYNC period: `sync_ns` is its SYNC, `previous_sync_ns` the one before.
+
+    Exactly one tick falls due between two calls of `begin_cycle`. Without a SYNC (none on this bus, or a dead
+    producer) the timer takes over at `sync_overdue_ns`, so that silence is detected too.
+    """
+
+    def __init__(self, period_ns: int, window: float) -> None:
+        self.period_ns = period_ns
+        self.window_ns = round(period_ns * window)
+        self.sync_ns = self.previous_sync_ns = 0
+        self.ticked = True
+
+    def begin_cycle(self, sync_ns: int) -> None:
+        """Begin a cycle at a SYNC, sent or received."""
+        self.previous_sync_ns, self.sync_ns = self.sync_ns, sync_ns
+        self.ticked = False
+
+    def is_tick_due(self, now_ns: int, complete: bool) -> bool:
+        """Return True when the tick is due; `complete`: every expected sample has arrived."""
+        return not self.ticked and (complete or now_ns - self.sync_ns >= self.window_ns)
+
+    @property
+    def sync_overdue_ns(self) -> int:
+        """Time at which the timer replaces a missing SYNC of another producer."""
+        return self.sync_ns + self.period_ns + self.period_ns // 2
 
 
 class _PartialSample:

@@ -1,7 +1,6 @@
-"""The tick: one vectorised pass from the slab's counts to the contacts of all hands.
+"""Stages of a tick with what they read and write, and what changes them between two ticks.
 
-counts -> currents -> touched pads -> position and force of those -> link frame -> begin, update, end.
-Free of I/O and clocks: the state is in `TickState`, the time is an argument.
+Public names: `TickProcessor`, `PadColumns`, `TickResult`. `pipeline.run_tick` runs the stages.
 """
 
 from __future__ import annotations
@@ -15,12 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline
 from handtouch.core.contact_solver import VALUE_SLICES, make_solver
-from handtouch.core.contacts import NO_LIMIT_NS, BoolArray, ContactDetector, DetectionSettings, IntArray
-from handtouch.core.cycle import Cycle
+from handtouch.core.contacts import BoolArray, ContactDetector, DetectionSettings, IntArray
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
-from handtouch.core.slab import Slab
 from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.publish import PUBLISHED_SLICES, PUBLISHED_VALUES, ContactColumns
 from handtouch.core.state import TickState
@@ -130,7 +127,7 @@ class TickResult(NamedTuple):
 
 
 class TickProcessor:
-    """The tick of all pads of a model; `state`: its state, of the model's size."""
+    """Stages of all pads of a model; `state`: their state, of the model's size."""
 
     def __init__(self, model: PadModel, period_ns: int, state: TickState | None = None) -> None:
         self.model = model
@@ -156,7 +153,8 @@ class TickProcessor:
             held=held,
         )
         """slip and lift-off of contacts, where requested"""
-        self._sync_ns = 0  # of the last tick
+        self.sync_ns = 0
+        """of the last tick"""
         # requested, and the pad isn't in quarantine
         self._estimate_force = np.zeros(model.size, dtype=np.bool_)
         self._set_stages(model)
@@ -173,7 +171,7 @@ class TickProcessor:
         self.sheet_force.refresh()
         self.slip.refresh()
         np.greater(held.force_requested, model.quarantined, out=self._estimate_force)
-        self._published.publish()
+        self.output.publish()
 
     def expected_pads(self) -> NDArray[np.bool_]:
         """Return the pads whose sample a tick waits for: those alive and sampled by SYNC."""
@@ -189,16 +187,6 @@ class TickProcessor:
         held.update_interval_ticks[:] = interval_ticks
         self.discard_solutions(changed)
         self.refresh()
-
-    def solve_all(self) -> None:
-        """Compute position and force of every touched pad, requested or not; the state's owner undoes it."""
-        everything = np.ones(self.model.size, dtype=np.bool_)
-        self.set_requested(everything, everything, self.state.update_interval_ticks)
-        touching = np.flatnonzero(self.contacts.touching)
-        if len(touching):
-            self._solve_contacts(touching)
-            self.sheet_force.store_forces()
-            self._published.publish()
 
     def set_baseline(self, pad: int, offset_counts: ArrayLike, std_counts: ArrayLike = 0.0) -> None:
         """Set the untouched counts (4,) of a pad and their standard deviation, from a store or a tare."""
@@ -241,48 +229,18 @@ class TickProcessor:
         held.uncompensated_force_n[pads] = np.nan
         self.slip.restart_contacts(pads)  # a position that a new calibration moves doesn't slip
 
-    def run_tick(
-        self,
-        slab: Slab,
-        node_state: NDArray[np.uint8],
-        cycle: Cycle,
-        until_ns: int = NO_LIMIT_NS,
-    ) -> TickResult:
-        """Process the samples of a cycle, and those of the previous one that arrived after its tick.
-
-        Samples that arrived at `until_ns` or later belong to the next cycle. `node_state` (n,):
-        PadState.CLEAR where the node is up, else the state to give its pad.
-        """
-        self.counts = slab.unpack_counts()
-        changes = self.contacts.detect_contacts(slab, node_state, cycle, until_ns)
-        self._sync_ns = cycle.sync_ns
-        if len(changes.began):
-            self.sheet_force.begin_contacts(changes.began)
-        if len(changes.solved):
-            self._solve_contacts(changes.solved)
-        if self.sheet_force.any_modelled:
-            self.sheet_force.compensate_forces(cycle.sync_ns)
-        self._published.publish()
-        return TickResult(cycle.sync_ns, changes.began, changes.updated, changes.ended, changes.silent)
-
     def clear_ended(self, ended: IntArray) -> None:
         """Clear the ids and published columns of ended contacts, after their last message was built."""
-        if len(ended):
-            self.state.contact_id[ended] = 0
-            self._published.publish()
-
-    def _solve_contacts(self, pads: IntArray) -> None:
-        """Compute position and force of the contacts on these pads."""
-        self._solver.solve_contacts(pads.data)
-        self._published.store_solved(pads.data)
+        self.state.contact_id[ended] = 0
+        self.output.publish()
 
     def _set_stages(self, model: PadModel) -> None:
         """Set the stages that read the model's arrays in place."""
         columns = self.columns
-        self._solver = make_solver(
+        self.solver = make_solver(
             *(model, self.contacts.currents, self.contacts.offset_std_a, self._estimate_force, columns.values)
         )
-        self._published = ContactColumns(
+        self.output = ContactColumns(
             *(model.size, self.state.memory(), view_memory(model.position_unreliable), _VALUE_COLUMNS),
             *(view_memory(columns.published_values), view_memory(columns.published["total_current_a"])),
             *(view_memory(columns.position_status), view_memory(columns.force_status)),
@@ -290,13 +248,12 @@ class TickProcessor:
 
     def detect_slips(self, result: TickResult) -> None:
         """Detect slip and lift-off of a tick's contacts; call it once the tick's messages are out."""
-        if self.slip.any_requested:
-            self.slip.detect_slips(np.concatenate([result.began, result.updated]))
+        self.slip.detect_slips(np.concatenate([result.began, result.updated]))
 
     def prepare_next_tick(self) -> None:
         """Update the baseline. Call between two ticks, off the critical path: it changes no contact."""
-        if self._sync_ns:
-            self.baseline.update_baseline(self._sync_ns, self.contacts.touching)
+        if self.sync_ns:
+            self.baseline.update_baseline(self.sync_ns, self.contacts.touching)
 
 
 def _detection_settings(model: PadModel) -> DetectionSettings:

@@ -94,8 +94,9 @@ class TickMessages:
             for pad in rows.tolist():
                 if sink.has_subscriber(self._topics[pad]):
                     sink.send(self._contact_message(pad, event, result.sync_ns, now_ns))
-        self._tick.clear_ended(result.ended)
-        self._transforms.discard(result.ended)
+        if len(result.ended):
+            self._tick.clear_ended(result.ended)
+            self._transforms.discard(result.ended)
 
     def replace_model(self, model: PadModel) -> None:
         """Continue with another model of the same pads."""
@@ -139,7 +140,7 @@ class TickMessages:
 
     def _hand_frame(self, hand: str, retained: bool = False) -> wire.EncodedMessage:
         rows = self._model.rows_of_hand[hand]
-        optional = self._transforms.hand_columns(rows)
+        optional = self._transforms.hand_columns(rows) if self._transforms.any_requested else {}
         seq, tick_number, sync_ns = self._frame_numbers()
         return self._encoders[hand].encode(seq, sync_ns, tick_number, retained, optional)
 

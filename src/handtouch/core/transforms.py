@@ -92,8 +92,6 @@ class ContactTransforms:
         self, result: TickResult, columns: PadColumns, contact_id: NDArray[np.uint32]
     ) -> None:
         """Transform the contacts that a tick updated; `contact_id` (n,)."""
-        if not self.any_requested:
-            return
         self.used_joints.clear()
         rows = np.concatenate([result.began, result.updated])
         self._transform_pads(rows[self._requested.take(rows)], columns)
@@ -136,7 +134,7 @@ class ContactTransforms:
 
     def hand_columns(self, rows: slice) -> dict[str, bytes]:
         """Return columns of a hand frame; empty where not requested."""
-        if not self.any_requested or not self._requested[rows].any():
+        if not self._requested[rows].any():
             return {}
         values = self._values[rows].astype("<f4")
         columns = {

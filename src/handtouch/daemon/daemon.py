@@ -32,7 +32,6 @@ from handtouch.canbus.nodes.spec import NodeSpec, node_specs
 from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
 from handtouch.core.compiled import Compilation
-from handtouch.core.cycle import BusyPoll
 from handtouch.core.gravity import GravityTracker
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
@@ -45,6 +44,7 @@ from handtouch.core.scene import (
 from handtouch.core.tick import TickResult
 from handtouch.daemon import stage_timer
 from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.busy_poll import BusyPoll
 from handtouch.daemon.commands import ControlCommands
 from handtouch.daemon.control import ControlServer, open_control_socket
 from handtouch.daemon.endpoints import remove_socket_file

@@ -6,8 +6,7 @@ cdef long long _MAX_PAUSE_NS
 
 cdef class SheetInterval:
     cdef Py_ssize_t number, first, stop, elements, plays
-    cdef readonly double dt_s
-    cdef double total, base
+    cdef double dt_s, total, base
     cdef double[::1] lines, transition, widths_n, weights
 
 cdef class SheetStage:
@@ -18,17 +17,21 @@ cdef class SheetStage:
     cdef unsigned char[::1] touching, load_is_old, reliability, new_contact
     cdef double[::1] gain, results, values, apparent_n, elements, plays, back_n, flow_s, impulse_ns
     cdef double[::1] back_waited_s, force_n, std_n, relative_std, waited_s
-    cdef readonly Py_ssize_t pressed
-    cdef readonly bint due
-    @cython.locals(elapsed_ns='long long', periods='long long')
-    cpdef long long elapsed_periods(self, long long sync_ns)
-    @cython.locals(old=bint, row=Py_ssize_t, waited_s=double)
-    cpdef bint compensate_sheets(self, SheetInterval step)
-    @cython.locals(row=Py_ssize_t, pad=Py_ssize_t)
-    cpdef find_pressed(self, double dt_s)
+    cdef object update, make_steps
+    cdef list steps
+    cdef long long periods
+    cdef bint due
+    @cython.locals(periods='long long', back_due=bint, k=Py_ssize_t)
+    cpdef compensate_forces(self, long long sync_ns)
     @cython.locals(row=Py_ssize_t, pad=Py_ssize_t, first=Py_ssize_t, force=double, saturated=bint)
     cpdef store_forces(self)
 
+@cython.locals(elapsed_ns='long long', periods='long long')
+cdef long long _elapsed_periods(SheetStage stage, long long sync_ns) noexcept
+@cython.locals(old=bint, row=Py_ssize_t, waited_s=double)
+cdef bint _compensate_sheets(SheetStage stage, SheetInterval step) noexcept
+@cython.locals(row=Py_ssize_t, pad=Py_ssize_t, pressed=bint)
+cdef void _find_pressed(SheetStage stage, double dt_s) noexcept
 @cython.locals(pad=Py_ssize_t, first=Py_ssize_t, last=Py_ssize_t, i=Py_ssize_t, apparent=double, finite=bint,
                effective=double, before=double, load=double)
 cdef void _compensate_sheet(SheetStage stage, SheetInterval step, Py_ssize_t row, bint old) noexcept

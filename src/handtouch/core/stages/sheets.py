@@ -6,7 +6,7 @@ Public names: `SheetStage`, `SheetInterval`. The equations are those of
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
@@ -53,7 +53,8 @@ class SheetStage:
 
     pads: (n,) pad of each row of the sheets' state, of which the first `sheets` are used. gain: (n,) of each
     pad's force. results: (4 n,) load, load before hysteresis, effective load and reading of each row.
-    `due`: uncertainties are to be updated now, `pressed` sheets are touched.
+    update: called with True when uncertainties of forces are to be updated, with False when back forces only.
+    make_steps: returns the intervals of all behaviours of a duration [s].
     """
 
     def __init__(
@@ -67,7 +68,11 @@ class SheetStage:
         plays: int,
         period_ns: int,
         update_period_s: float,
+        update: Callable[[bool], None],
+        make_steps: Callable[[float], list[SheetInterval]],
     ) -> None:
+        self.update, self.make_steps = update, make_steps
+        self.periods, self.steps, self.due = -1, make_steps(0.0), False
         self.pads, self.sheets, self.gain, self.results = pads, sheets, gain, results
         self.columns, self.play_columns = elements, plays
         self.rows = len(pads)
@@ -82,44 +87,25 @@ class SheetStage:
         self.relative_std, self.reliability = arrays["relative_std"], arrays["force_reliability"]
         self.last_touch_ns, self.new_contact = arrays["last_touch_ns"], arrays["new_contact"]
         self.updated_ns, self.waited_s = arrays["sheets_updated_ns"], arrays["uncertainty_waited_s"]
-        self.pressed, self.due = 0, False
 
-    def elapsed_periods(self, sync_ns: int) -> int:
-        """Advance the sheets' time; return the whole periods since the last tick, keeping the rest."""
-        elapsed_ns: int = sync_ns - self.updated_ns[0]
-        if elapsed_ns > _MAX_PAUSE_NS or elapsed_ns < 0:
-            self.updated_ns[0] = sync_ns
-            return 0
-        periods = (elapsed_ns + self.period_ns // 2) // self.period_ns
-        self.updated_ns[0] += periods * self.period_ns
-        return periods
+    def compensate_forces(self, sync_ns: int) -> None:
+        """Advance all sheets to `sync_ns`, and compensate the forces of touched pads with a model.
 
-    def compensate_sheets(self, step: SheetInterval) -> bool:
-        """Compute loads of sheets of one behaviour; return True if their back forces are to be updated."""
-        old = self.load_is_old[step.number] != 0
-        for row in range(step.first, step.stop):
-            _compensate_sheet(self, step, row, old)
-        self.load_is_old[step.number] = 0
-        waited_s: float = self.back_waited_s[step.number] + step.dt_s
-        self.back_waited_s[step.number] = waited_s
-        return waited_s >= self.update_period_s
-
-    def find_pressed(self, dt_s: float) -> None:
-        """Apply the gains to the forces of touched pads; decide whether uncertainties are due."""
-        self.pressed, self.due = 0, False
-        for row in range(self.sheets):
-            pad = self.pads[row]
-            if self.touching[pad]:
-                self.pressed += 1
-                self.last_touch_ns[pad] = self.updated_ns[0]
-                self.force_n[pad] *= self.gain[pad]
-                if self.new_contact[pad]:
-                    self.due = True
-        self.waited_s[0] += dt_s
-        if self.pressed == 0:
-            self.waited_s[0] = 0.0
-        elif self.waited_s[0] >= self.update_period_s:
-            self.due = True
+        They are those of the contact law in the state, `uncompensated_force_n` and `uncompensated_std_n`
+        [N]; untouched pads count as 0.
+        """
+        periods = _elapsed_periods(self, sync_ns)
+        if periods != self.periods:
+            self.periods = periods
+            self.steps = self.make_steps(periods * self.period_ns * 1e-9)
+        back_due = False
+        for k in range(len(self.steps)):
+            if _compensate_sheets(self, self.steps[k]):
+                back_due = True
+        _find_pressed(self, periods * self.period_ns * 1e-9)
+        if back_due or self.due:
+            self.update(self.due)
+        self.store_forces()
 
     def store_forces(self) -> None:
         """Replace the forces of touched pads in the contacts' values by compensated ones."""
@@ -132,6 +118,46 @@ class SheetStage:
             self.values[first + _FORCE] = _NAN if self.reliability[pad] == _INVALID else force
             saturated = self.values[first + _FORCE_STATUS] == _LOWER_BOUND
             self.values[first + _FORCE_STD] = _INFINITY if saturated else self.std_n[pad]
+
+
+def _elapsed_periods(stage: SheetStage, sync_ns: int) -> int:
+    """Advance the sheets' time; return the whole periods since the last tick, keeping the rest."""
+    elapsed_ns: int = sync_ns - stage.updated_ns[0]
+    if elapsed_ns > _MAX_PAUSE_NS or elapsed_ns < 0:
+        stage.updated_ns[0] = sync_ns
+        return 0
+    periods = (elapsed_ns + stage.period_ns // 2) // stage.period_ns
+    stage.updated_ns[0] += periods * stage.period_ns
+    return periods
+
+
+def _compensate_sheets(stage: SheetStage, step: SheetInterval) -> bool:
+    """Compute loads of sheets of one behaviour; return True if their back forces are to be updated."""
+    old = stage.load_is_old[step.number] != 0
+    for row in range(step.first, step.stop):
+        _compensate_sheet(stage, step, row, old)
+    stage.load_is_old[step.number] = 0
+    waited_s: float = stage.back_waited_s[step.number] + step.dt_s
+    stage.back_waited_s[step.number] = waited_s
+    return waited_s >= stage.update_period_s
+
+
+def _find_pressed(stage: SheetStage, dt_s: float) -> None:
+    """Apply the gains to the forces of touched pads; decide whether uncertainties are due."""
+    pressed = stage.due = False
+    for row in range(stage.sheets):
+        pad = stage.pads[row]
+        if stage.touching[pad]:
+            pressed = True
+            stage.last_touch_ns[pad] = stage.updated_ns[0]
+            stage.force_n[pad] *= stage.gain[pad]
+            if stage.new_contact[pad]:
+                stage.due = True
+    stage.waited_s[0] += dt_s
+    if not pressed:
+        stage.waited_s[0] = 0.0
+    elif stage.waited_s[0] >= stage.update_period_s:
+        stage.due = True
 
 
 def _compensate_sheet(stage: SheetStage, step: SheetInterval, row: int, old: bool) -> None:
