@@ -85,20 +85,20 @@ print(*(f'{stage}-{source_hash(stage)}' for stage in STAGES))"
 def test_only_changed_modules_are_compiled_and_equal_ones_to_equal_bytes(copied: Path) -> None:
     folder = copied / "handtouch/core/stages/_compiled"
     files = {path.name.partition("-")[0]: path for path in folder.glob("*.so")}
-    slip = files["slip"].read_bytes()
+    tables = files["tables"].read_bytes()
     untouched = {
-        path.name: path.stat().st_ino for name, path in files.items() if name not in ("slip", "sheets")
+        path.name: path.stat().st_ino for name, path in files.items() if name not in ("tables", "receive")
     }
-    files["slip"].unlink()
-    with (copied / "handtouch/core/stages/sheets.py").open("a") as file:
+    files["tables"].unlink()
+    with (copied / "handtouch/core/stages/receive.py").open("a") as file:
         file.write("# edited\n")
     done = run("-m", "handtouch.core.build", source=copied)
     assert done.returncode == 0, done.stderr
     after = {path.name: path.stat().st_ino for path in folder.iterdir()}
     assert len(after) == len(files)
     assert untouched.items() <= after.items()
-    assert files["sheets"].name not in after
-    assert files["slip"].read_bytes() == slip
+    assert files["receive"].name not in after
+    assert files["tables"].read_bytes() == tables
     assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
 
 
