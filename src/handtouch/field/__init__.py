@@ -15,6 +15,7 @@ from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.perimeter_network import PerimeterNetwork
 from handtouch.field.rectangle import Location, Rectangle
 from handtouch.field.residual import PointTest, point_test, resolvable_separation
+from handtouch.field.resolve import ContactShape, ResolvedContacts, ShapeEstimate, resolve_contacts
 from handtouch.field.sandwich import Sandwich, SandwichEstimate
 from handtouch.field.surface import (
     AnisotropicSurface,
@@ -26,12 +27,14 @@ from handtouch.field.surface import (
     SphereSurface,
     Surface,
 )
+from handtouch.field.switched import SwitchedNetwork
 
 __all__ = [
     "AnisotropicSurface",
     "BoundaryElectrode",
     "ConeSurface",
     "ContactLaw",
+    "ContactShape",
     "CylinderSurface",
     "Electrode",
     "ElectrodeNetwork",
@@ -48,13 +51,17 @@ __all__ = [
     "PointTest",
     "PrismSurface",
     "Rectangle",
+    "ResolvedContacts",
     "RevolutionSurface",
     "Sandwich",
     "SandwichEstimate",
+    "ShapeEstimate",
     "SphereSurface",
     "Surface",
+    "SwitchedNetwork",
     "contact_stack_resistance",
     "estimate",
     "point_test",
     "resolvable_separation",
+    "resolve_contacts",
 ]

@@ -94,6 +94,11 @@ class GroundedElectrodes(ABC):
         drop = np.asarray(self.series_ohm) / self.sheet_ohm_per_square
         return -self._mix @ self.conductance * np.where(np.isfinite(drop), drop, 0.0)
 
+    @property
+    def currents_per_ideal(self) -> FloatArray:
+        """Matrix (m, m) from the fractions of directly grounded electrodes to those measured."""
+        return self._mix
+
     def estimate(
         self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None
     ) -> PointEstimate:

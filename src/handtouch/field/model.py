@@ -57,6 +57,16 @@ def spreading_radius(model: ForwardModel, x: FloatArray, y: FloatArray) -> Float
     return np.asarray(radius(x, y), dtype=np.float64)
 
 
+def move_inside(model: FractionModel, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points (n,), where off the pad replaced by the nearest on it; NaN where none was found."""
+    project = getattr(getattr(model, "network", model), "project_inside", None)
+    if project is not None:
+        found: PadBoundary = project(x, y)
+        return found.x, found.y
+    inset = MIN_INSET * max(model.a, model.b)
+    return np.clip(x, inset, model.a - inset), np.clip(y, inset, model.b - inset)
+
+
 class PadBoundary(NamedTuple):
     """Points of a pad and the boundary nearest to them, all (n,), in the unit of the pad.
 
