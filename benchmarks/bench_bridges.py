@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -35,7 +36,7 @@ from handtouch.config import shipped
 
 LINKS = tuple(pad.link for pad in config.load(shipped.path("utah_mit.toml")).hands[0].pads)
 PREFIX = "lab"
-START_S = 60.0
+START_S = 120.0
 _SENTINEL = 0x7A5A5A5A5A5A5A5A
 """Of `t_ns` in encoded messages: eight bytes that are replaced by the time of sending."""
 
@@ -121,25 +122,27 @@ def route(endpoint: str, pipe: Connection) -> None:
 
 
 def subscribe_zenoh(endpoint: str, pipe: Connection) -> None:
-    """Receive all contacts from the router; send their number and a sample of their latencies [s]."""
+    """Receive all contacts from the router; send their number, a sample of their latencies [s], and the
+    number of hands that they are of."""
     import zenoh
 
-    count, latencies = 0, []
+    count, latencies, hands = 0, [], set()
 
     def receive(sample: zenoh.Sample) -> None:
         nonlocal count
         now_ns = time.monotonic_ns()
         count += 1
+        hands.add(str(sample.key_expr).split("/", 2)[1])
         if count % 16 == 0:
             latencies.append(1e-9 * (now_ns - msgpack.unpackb(bytes(sample.payload))["t_ns"]))
 
     with zenoh.open(_zenoh_config("client", connect=[endpoint])) as session:
         session.declare_subscriber(f"{PREFIX}/*/contact/**", receive)
-        _report_counts(pipe, lambda: (count, latencies))
+        _report_counts(pipe, lambda: (count, latencies, len(hands)))
 
 
 def subscribe_ros(domain: int, pipe: Connection) -> None:
-    """Receive the wrenches of all links; send their number and a sample of their latencies [s]."""
+    """Receive the wrenches of all links; send their number, a sample of their latencies [s], and 1 if any."""
     from handtouch.bridge.ros2 import messages as ros
     from handtouch.bridge.ros2.network import Quality, RosNetwork
 
@@ -163,7 +166,7 @@ def subscribe_ros(domain: int, pipe: Connection) -> None:
 
     thread = threading.Thread(target=receive)
     thread.start()
-    _report_counts(pipe, lambda: (count, latencies))
+    _report_counts(pipe, lambda: (count, latencies, min(count, 1)))
     stop.set()
     thread.join()
 
@@ -224,31 +227,38 @@ def start_bridge(opened: ExitStack, *arguments: str) -> int:
 
 
 def measure(
-    publisher: Part, subscriber: Part, bridges: Sequence[int], router: Part | None, seconds: float
+    publisher: Part,
+    subscriber: Part,
+    bridges: Sequence[int],
+    router: Part | None,
+    seconds: float,
+    hands: int = 1,
 ) -> dict[str, Any]:
     """Publish for a time; return rates, losses, latencies, and processor time per contact of each process."""
 
-    def count() -> tuple[int, list[float]]:
+    def count() -> tuple[int, list[float], int]:
         subscriber.pipe.send("count")
-        found: tuple[int, list[float]] = subscriber.pipe.recv()
+        found: tuple[int, list[float], int] = subscriber.pipe.recv()
         return found
 
     publisher.pipe.send("start")
     end_s = time.monotonic() + START_S
-    while count()[0] == 0 and time.monotonic() < end_s:
+    while count()[2] < hands and time.monotonic() < end_s:
         time.sleep(0.2)
-    time.sleep(2.0)  # until all bridges relay
+    if (relayed := count()[2]) < hands:
+        raise RuntimeError(f"{relayed} of {hands} hands are received after {START_S:g} s")
+    time.sleep(2.0)  # what waited until then has passed
     pids = {"publishers": [publisher.pid], "bridges": bridges, "subscriber": [subscriber.pid]}
     if router is not None:
         pids["router"] = [router.pid]
-    before_s, (first, old), begin_s = (
+    before_s, (first, old, _), begin_s = (
         {name: cpu_s(*ids) for name, ids in pids.items()},
         count(),
         time.monotonic(),
     )
     time.sleep(seconds)
     used_s = {name: cpu_s(*ids) - before_s[name] for name, ids in pids.items()}
-    (last, latencies), took_s = count(), time.monotonic() - begin_s
+    (last, latencies, _), took_s = count(), time.monotonic() - begin_s
     publisher.pipe.send("stop")
     sent, sent_s = publisher.pipe.recv()
     received = last - first
@@ -301,8 +311,24 @@ def measure_fleet(hands: int, touched: int, rate_hz: float, seconds: float) -> d
             )
             for number, endpoint in enumerate(endpoints)
         ]
-        time.sleep(1.0 + 0.5 * hands)
-        return {"hands": hands, **measure(publisher, subscriber, bridges, router, seconds)}
+        return {"hands": hands, **measure(publisher, subscriber, bridges, router, seconds, hands)}
+
+
+def saturation(fleet: Sequence[dict[str, Any]], contacts_per_s: float) -> str:
+    """State how many hands of so many contacts a second fill a core of each process, by the largest fleet
+    that was received completely."""
+    complete = [row for row in fleet if row["received per s"] > 0.98 * row["sent per s"]]
+    if not complete:
+        return "No fleet was received completely."
+    row = complete[-1]
+    core = {name: 1e6 / (row[f"{name}, us"] * contacts_per_s) for name in ("bridges", "router", "subscriber")}
+    first = "router" if core["router"] < core["subscriber"] else "subscriber"
+    return (
+        f"By the processor time with {row['hands']} hands, the largest fleet received completely: a bridge "
+        f"takes {1 / core['bridges']:.3f} of a core of its robot; {core['router']:.0f} hands fill a core of "
+        f"the router, {core['subscriber']:.0f} one of the subscriber. So the {first} saturates first, unless "
+        f"bridges share a machine: {core['bridges']:.0f} of them fill a core."
+    )
 
 
 def main() -> None:
@@ -326,7 +352,7 @@ def main() -> None:
         "router, one subscriber, all on this machine. Processor time of all processes of a kind per received "
         "contact."
     )
-    lines += table("Fleet over Zenoh", note, fleet)
+    lines += [*table("Fleet over Zenoh", note, fleet), *textwrap.wrap(saturation(fleet, 300.0), 110), ""]
     (out / "bridges.md").write_text("\n".join(lines))
     results = {"machine": machine, "ros2": ros, "fleet": fleet}
     (out / "bridges.json").write_text(json.dumps(results, indent=1) + "\n")

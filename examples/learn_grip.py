@@ -1,8 +1,10 @@
 """Learn to hold objects of unknown weight and friction with little force, with touch and without.
 
 A linear policy in MuJoCo: the grip force is a constant, plus gains times how far and how fast the contact has
-slid over the thumb's pad. The cross-entropy method tunes them; without touch only the constant. Draws both
-learning curves and the forces for objects that weren't trained on. Needs the extras `gym` and `figures`.
+slid over the thumb's pad. The cross-entropy method tunes them; without touch only the constant. Each seed is
+another sensor of the world, with other random candidates. Draws both learning curves, with 95 % intervals of
+the mean over the seeds, and the forces for objects that weren't trained on. Needs the extras `gym` and
+`figures`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 from scipy.stats.qmc import Halton
 
 from handtouch.simulate.tactile.grip_environment import (
@@ -73,10 +76,14 @@ def run(grips: GripEnvironments, policies: FloatArray, objects: tuple[FloatArray
 
 
 def learn(
-    grips: GripEnvironments, touch: bool, generations: int, report: Callable[[int, Outcome], None]
+    grips: GripEnvironments,
+    touch: bool,
+    generations: int,
+    seed: int,
+    report: Callable[[int, Outcome], None],
 ) -> FloatArray:
     """Return the policy (3,) found; `report` is given what each generation's mean does with other objects."""
-    random, used = np.random.default_rng(7), np.array([1, touch, touch])
+    random, used = np.random.default_rng(seed), np.array([1, touch, touch])
     mean: FloatArray = MEAN * used
     std: FloatArray = STD * used
     test, (mass_kg, friction) = other_objects(grips.num_envs), objects_at(TRAINED)
@@ -91,7 +98,20 @@ def learn(
     return mean
 
 
-def draw(path: Path, outcomes: dict[str, list[Outcome]], objects: tuple[FloatArray, FloatArray]) -> None:
+def mean_interval(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of values (seeds, ...) and half of its 95 % interval, by Student's distribution."""
+    count = len(values)
+    return values.mean(axis=0), student.ppf(0.975, count - 1) * values.std(axis=0, ddof=1) / np.sqrt(count)
+
+
+def mean_costs(outcomes: list[list[Outcome]]) -> FloatArray:
+    """Return the mean cost of all objects, (seeds, generations)."""
+    return np.array([[outcome.cost.mean() for outcome in found] for found in outcomes])
+
+
+def draw(
+    path: Path, outcomes: dict[str, list[list[Outcome]]], objects: tuple[FloatArray, FloatArray]
+) -> None:
     """Draw learning curves, and final forces over the least force that holds each object."""
     import matplotlib as mpl
 
@@ -101,11 +121,13 @@ def draw(path: Path, outcomes: dict[str, list[Outcome]], objects: tuple[FloatArr
     figure, (curves, forces) = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     needed_n = 0.5 * WEIGHT_M_S2 * objects[0] / objects[1]
     for (name, found), colour in zip(outcomes.items(), ("tab:blue", "tab:orange"), strict=True):
-        curves.plot([outcome.cost.mean() for outcome in found], color=colour, marker="o", ms=3, label=name)
-        last = found[-1]
-        held = ~last.dropped
-        forces.plot(needed_n[held], last.force_n[held], "o", color=colour, ms=4, label=name)
-        forces.plot(needed_n[~held], last.force_n[~held], "x", color=colour, ms=6)
+        mean, half = mean_interval(mean_costs(found))
+        curves.plot(mean, color=colour, marker="o", ms=3, label=name)
+        curves.fill_between(np.arange(len(mean)), mean - half, mean + half, color=colour, alpha=0.2, lw=0)
+        held = ~np.array([seed[-1].dropped for seed in found])
+        force_n, least_n = np.array([seed[-1].force_n for seed in found]), np.tile(needed_n, (len(found), 1))
+        forces.plot(least_n[held], force_n[held], "o", color=colour, ms=2, label=name)
+        forces.plot(least_n[~held], force_n[~held], "x", color=colour, ms=6)
     curves.set(xlabel="generation", ylabel="mean cost of objects not trained on")
     line = np.array([0.0, needed_n.max()])
     forces.plot(line, line, "k--", lw=1, label="least force")
@@ -121,24 +143,36 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--generations", type=int, default=6)
+    parser.add_argument("--seeds", type=int, default=5, help="number of repetitions, 2 or more (default: 5)")
     parser.add_argument("--world", default="default", help="imperfections of the sensor (default: default)")
     parser.add_argument("--figure", type=Path, default=Path("learn_grip.png"))
     arguments = parser.parse_args()
-    grips = GripEnvironments(CANDIDATES * OBJECTS, arguments.world)
-    outcomes: dict[str, list[Outcome]] = {"with touch": [], "without touch": []}
-    for name, found in outcomes.items():
+    if arguments.seeds < 2:
+        parser.error("--seeds must be 2 or more: an interval needs repetitions")
+    outcomes: dict[str, list[list[Outcome]]] = {"with touch": [], "without touch": []}
+    for seed in range(1, 1 + arguments.seeds):
+        grips = GripEnvironments(CANDIDATES * OBJECTS, arguments.world, seed)
+        for name, repetitions in outcomes.items():
+            found: list[Outcome] = []
+            repetitions.append(found)
 
-        def report(generation: int, outcome: Outcome, name: str = name, found: Any = found) -> None:
-            found.append(outcome)
-            print(
-                f"{name}, generation {generation:2}: cost {outcome.cost.mean():6.2f}, final force "
-                f"{outcome.force_n.mean():.2f} N, dropped {outcome.dropped.sum()} of {len(outcome.dropped)}",
-                flush=True,
-            )
+            def report(generation: int, outcome: Outcome, name: str = name, found: Any = found) -> None:
+                found.append(outcome)
+                print(
+                    f"seed {len(outcomes[name])}, {name}, generation {generation:2}: cost "
+                    f"{outcome.cost.mean():6.2f}, final force {outcome.force_n.mean():.2f} N, dropped "
+                    f"{outcome.dropped.sum()} of {len(outcome.dropped)}",
+                    flush=True,
+                )
 
-        policy = learn(grips, name == "with touch", arguments.generations, report)
-        print(f"{name}: {policy[0]:.2f} N + {policy[1]:.2f} N/mm x slid + {policy[2]:.3f} N s/mm x speed")
-    draw(arguments.figure, outcomes, other_objects(grips.num_envs))
+            policy = learn(grips, name == "with touch", arguments.generations, seed, report)
+            print(f"{name}: {policy[0]:.2f} N + {policy[1]:.2f} N/mm x slid + {policy[2]:.3f} N s/mm x speed")
+    final = {name: mean_costs(found)[:, -1] for name, found in outcomes.items()}
+    saved = final["without touch"] - final["with touch"]
+    for name, costs in {**final, "saved by touch": saved}.items():
+        mean, half = mean_interval(costs)
+        print(f"{name}: mean cost {mean:.2f} +- {half:.2f} (95 %, {len(costs)} seeds)")
+    draw(arguments.figure, outcomes, other_objects(CANDIDATES * OBJECTS))
     print(f"figure: {arguments.figure}")
 
 

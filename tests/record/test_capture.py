@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import zmq
 
 from handtouch import wire
+from handtouch.cli import record
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.publisher import Publisher
 from handtouch.record.recording import Recording
@@ -134,3 +136,18 @@ def test_a_silent_endpoint_is_reported(tmp_path: Path) -> None:
     )
     assert status == 1
     assert "no message received" in err
+
+
+@pytest.mark.parametrize("is_installed", [True, False])
+def test_a_recording_without_foxgloves_topics_names_the_extra(
+    is_installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if is_installed:
+        pytest.importorskip("foxglove", reason="needs the extra foxglove")
+    else:
+        monkeypatch.setitem(sys.modules, "handtouch.record.foxglove", None)
+    stopped = threading.Event()
+    stopped.set()
+    monkeypatch.setattr(record, "stop_on_signals", lambda: stopped)
+    record.run(as_json=False, out=tmp_path / "out.mcap", endpoint=f"ipc://{tmp_path}/complete")
+    assert ("pip install 'handtouch[foxglove]'" in capsys.readouterr().err) is not is_installed

@@ -17,6 +17,7 @@ from handtouch.host.signals import stop_on_signals
 from handtouch.record.capture import BYTES_PER_MB, Capture, RecordOptions
 
 NO_MESSAGE_TEXT = "no message received; is `handtouch run` running?"
+NO_FOXGLOVE_TEXT = "without Foxglove's topics (/handtouch/...); for them: pip install 'handtouch[foxglove]'"
 _MAX_SHOWN_MINUTES = 600
 
 
@@ -34,6 +35,8 @@ def run(*, as_json: bool, **options: Any) -> int:
     stop = stop_on_signals()
     with ProgressLine() as line:
         line.print_line(f"recording {capture.endpoint} into {capture.files.folder or '.'}; stop with Ctrl-C")
+        if not capture.has_foxglove:
+            line.print_line(NO_FOXGLOVE_TEXT)
         with capture:
             try:
                 capture.run(stop, _RecordingProgress(capture, line).update)

@@ -105,13 +105,15 @@ class Capture:
     """A recording of one daemon; use as a context manager, around `run`.
 
     Opened by `open`. `recorder` has the counts, `files` the paths; `end_reason`: why `run` returned before it
-    was stopped, else empty.
+    was stopped, else empty. `has_foxglove`: Foxglove's topics are recorded, by the extra `foxglove`.
     """
 
     def __init__(self, options: RecordOptions, endpoint: str, source: Subscriber[Any]) -> None:
         self.endpoint = endpoint
         self.files = RecordingFiles(options, endpoint)
-        self.recorder = MessageRecorder(self.files.open_next, _rotation_limits(options), _scene_converter())
+        make_scenes = _scene_converter()
+        self.has_foxglove = make_scenes is not NoScenes
+        self.recorder = MessageRecorder(self.files.open_next, _rotation_limits(options), make_scenes)
         self.end_reason = ""
         self._options, self._source = options, source
 
