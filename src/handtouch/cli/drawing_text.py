@@ -15,7 +15,7 @@ def run_figures(out: Path, as_json: bool = False) -> int:
     from handtouch.field.figures import draw_figures
 
     paths: list[Path] = []
-    if status := _draw("figures", lambda progress: paths.extend(draw_figures(out, progress))):
+    if status := draw_with_progress("figures", lambda progress: paths.extend(draw_figures(out, progress))):
         return status
     if as_json:
         print_json({"files": paths})
@@ -38,7 +38,7 @@ def run_design(config_path: Path, link: str | None, out: Path, as_json: bool = F
         print(f"handtouch design: {error}", file=sys.stderr)
         return 2
     paths: list[Path] = []
-    if status := _draw("design", lambda progress: paths.extend(draw_design(pad, out, progress))):
+    if status := draw_with_progress("design", lambda progress: paths.extend(draw_design(pad, out, progress))):
         return status
     errors = [(force_n, *error_summary(pad, force_n)) for force_n in (pad.light_touch_n, FIRM_TOUCH_N)]
     if as_json:
@@ -52,7 +52,7 @@ def run_design(config_path: Path, link: str | None, out: Path, as_json: bool = F
     return 0
 
 
-def _draw(command: str, draw: Callable[[Callable[[str], None]], None]) -> int:
+def draw_with_progress(command: str, draw: Callable[[Callable[[str], None]], None]) -> int:
     """Draw with a progress line; exit status 0, 1 (folder can't be written), 2 (without matplotlib)."""
     try:
         with ProgressLine() as progress:

@@ -56,18 +56,76 @@ def add(commands: Subparsers) -> None:
     )
     add_json(figures)
 
+    _add_design(commands)
+
+
+def _add_design(commands: Subparsers) -> None:
     design = add_command(
         commands,
         "design",
-        "handtouch.cli.drawing_text:run_design",
-        "draw maps of a pad's expected position error from noise, for the design in a deployment file",
+        "handtouch.cli.design_text:run",
+        "draw a pad's expected position error, or find the best electrodes for a goal (docs/design.md)",
     )
     add_config(design)
-    design.add_argument("--link", metavar="LINK", help="pad to draw (default: the first)")
+    design.add_argument("--link", metavar="LINK", help="pad to design (default: the first)")
     add_output(
         design, "out", "folder to write to (default: design)", default=Path("design"), metavar="FOLDER"
     )
     add_json(design)
+    design.add_argument(
+        "--goal",
+        choices=("position", "force", "two-contacts", "linearity"),
+        help="optimise: standard deviation of position or of force, least separation of two contacts, error "
+        "of plain log-ratios; default: draw the pad as it is",
+    )
+    design.add_argument(
+        "--statistic",
+        choices=("worst", "mean"),
+        default="worst",
+        help="of the goal over the inner 80 %% of the pad (default: worst; mean: root mean square)",
+    )
+    design.add_argument(
+        "--world",
+        choices=("ideal", "default", "harsh"),
+        default="default",
+        help="tolerances of the parts (default: default; ideal: none, the nominal optimum)",
+    )
+    design.add_argument(
+        "--force",
+        dest="force_n",
+        type=positive_number,
+        default=1.0,
+        metavar="N",
+        help="force of the contacts to design for (default: 1)",
+    )
+    design.add_argument(
+        "--electrodes",
+        type=integer(4, 12, "4 to 12 electrodes"),
+        metavar="COUNT",
+        help="electrodes anywhere on the boundary, for a node of as many channels; default: one on each "
+        "side, which a deployment can describe",
+    )
+    for name, default, text in (
+        ("min-gap-mm", 0.3, "least bare length at an end of an electrode"),
+        ("min-electrode-mm", 3.0, "least length of an electrode"),
+    ):
+        design.add_argument(
+            f"--{name}",
+            type=positive_number,
+            default=default,
+            metavar="MM",
+            help=f"{text} (default: {default})",
+        )
+    design.add_argument(
+        "--max-series-ohm",
+        type=float,
+        default=1000.0,
+        metavar="OHM",
+        help="largest series resistor; 0: none are used (default: 1000)",
+    )
+    design.add_argument(
+        "--no-check", dest="check", action="store_false", help="skip the check by the simulator"
+    )
 
 
 def _add_scan(commands: Subparsers) -> None:

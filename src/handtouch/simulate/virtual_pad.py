@@ -1,6 +1,6 @@
 """One pad of a virtual hand, with its true parts, contacts and faults: counts of its channels at any time.
 
-Public name: `VirtualPad`. It has neither clock nor state: the same time gives the same counts.
+Public names: `VirtualPad`, `true_gaps`. It has neither clock nor state: the same time gives the same counts.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class VirtualPad:
         full = np.array([node.full_scale_counts or high for high in limits[:, 1]])
         per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(hidden.gain_ratio)
         shape = world.surface(hand, pad)
-        gaps = _true_gaps(shape, hidden)
+        gaps = true_gaps(shape, hidden)
         unevenness = Unevenness(UNEVEN_MODES, hidden.unevenness)
         circuit = PadCircuit(
             shape,
@@ -237,7 +237,7 @@ class VirtualPad:
         return [fault for fault in self.faults if fault not in self._stuck_faults]
 
 
-def _true_gaps(shape: SimulatedSurface, hidden: HiddenPad) -> ElectrodeGaps:
+def true_gaps(shape: SimulatedSurface, hidden: HiddenPad) -> ElectrodeGaps:
     """Return the gaps in the coordinates of the surface."""
     x0, xa, y0, yb = (
         (1e-3 * before / unit, 1e-3 * after / unit)

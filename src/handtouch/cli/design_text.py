@@ -1,0 +1,178 @@
+"""Output of `handtouch design`: layouts before and after, drawings and tables."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from handtouch.cli.progress import ProgressLine
+from handtouch.host.json_output import print_json
+
+if TYPE_CHECKING:
+    from handtouch.design import DesignResult, ElectrodeLayout, PadTask, Statistic
+
+_CHECK_SEED = 0  # of the deployment's tolerances, which don't depend on it
+
+
+def run(
+    config_path: Path,
+    link: str | None,
+    out: Path,
+    goal: str | None,
+    statistic: Statistic,
+    world: str,
+    force_n: float,
+    electrodes: int | None,
+    min_gap_mm: float,
+    min_electrode_mm: float,
+    max_series_ohm: float,
+    check: bool,
+    as_json: bool = False,
+) -> int:
+    """Draw a pad as it is, or optimise it for a goal; return the exit status.
+
+    2 for an invalid file, link or combination of options, or without matplotlib; 1 if the folder cannot be
+    written.
+    """
+    if goal is None:
+        from handtouch.cli.drawing_text import run_design
+
+        return run_design(config_path, link, out, as_json)
+    from handtouch import config
+    from handtouch.design import GOALS, FabricationLimits, PadTask, optimise_layout
+    from handtouch.simulate.worlds import WORLDS
+
+    try:
+        described = WORLDS[world].draw(_CHECK_SEED).describe(config.load(config_path))
+        task = PadTask.from_deployment(described, link, force_n, nominal=world == "ideal")
+        limits = FabricationLimits(min_gap_mm, min_electrode_mm, max_series_ohm)
+        with ProgressLine() as progress:
+            result = optimise_layout(task, GOALS[goal], statistic, limits, electrodes, progress.update)
+            simulated = _simulated(task, result, world, progress) if check else None
+            files = _write(config_path, task, result, world, out, progress)
+    except (config.ConfigError, ValueError, ImportError) as error:
+        print(f"handtouch design: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"handtouch design: {error}", file=sys.stderr)
+        return 1
+    if as_json:
+        print_json(_as_json(task, result, simulated, files))
+    else:
+        _print(task, result, world, simulated, files)
+    return 0
+
+
+def _simulated(
+    task: PadTask, result: DesignResult, world: str, progress: ProgressLine
+) -> tuple[float, float] | None:
+    """Return the goal before and after as simulated; None where it can't be."""
+    from handtouch.design import CHECKED_GOALS, goal_value, simulated_goal_map
+    from handtouch.simulate.worlds import WORLDS
+
+    if result.goal.name not in CHECKED_GOALS or not result.after.is_on_sides(task.boundary):
+        return None
+    task = task.with_points(len(result.map_after))
+    draws = 1 if world == "ideal" else 12
+    before, after = (
+        goal_value(
+            simulated_goal_map(
+                task, layout, result.goal, WORLDS[world].only("parts"), draws, on_progress=progress.update
+            ),
+            result.statistic,
+        )
+        for layout in (result.before, result.after)
+    )
+    return before, after
+
+
+def _write(
+    config_path: Path, task: PadTask, result: DesignResult, world: str, out: Path, progress: ProgressLine
+) -> list[Path]:
+    """Write pictures, drawings and, where possible, the deployment; return their paths."""
+    from handtouch.design import deployment_text, fabrication_drawing
+    from handtouch.design.drawing import write_dxf, write_svg
+    from handtouch.design.pictures import draw_before_and_after
+
+    out.mkdir(parents=True, exist_ok=True)
+    stem = f"{task.pad.link}_{result.goal.name.replace('-', '_')}"
+    progress.update("drawing")
+    title = f"{task.pad.link}: {result.goal.description}, {task.force_n:g} N, world {world}"
+    files = draw_before_and_after(task, result, title, out / f"{stem}_map")
+    drawing = fabrication_drawing(task, result.after)
+    texts = {f"{stem}.svg": write_svg(drawing), f"{stem}.dxf": write_dxf(drawing)}
+    if result.after.is_on_sides(task.boundary):
+        texts[f"{stem}.toml"] = deployment_text(config_path, task, result.after, out)
+    for name, text in texts.items():
+        (out / name).write_text(text, encoding="utf-8")
+        files.append(out / name)
+    return files
+
+
+def _rows(task: PadTask, layout: ElectrodeLayout) -> list[dict[str, Any]]:
+    """Return what each electrode measures, in mm and ohm."""
+    from handtouch.design.fabrication import electrode_names
+
+    return [
+        {
+            "electrode": name,
+            "start_mm": round(1e3 * start, 4),
+            "stop_mm": round(1e3 * stop, 4),
+            "bare_after_mm": round(1e3 * gap, 4),
+            "series_ohm": ohm,
+        }
+        for name, (start, stop), gap, ohm in zip(
+            electrode_names(task, layout),
+            layout.stretches_m.tolist(),
+            layout.gaps_m(task.boundary).tolist(),
+            layout.series_ohm.tolist(),
+            strict=True,
+        )
+    ]
+
+
+def _as_json(
+    task: PadTask, result: DesignResult, simulated: tuple[float, float] | None, files: list[Path]
+) -> dict[str, Any]:
+    return {
+        "pad": task.pad.link,
+        "goal": result.goal.name,
+        "unit": result.goal.unit,
+        "statistic": result.statistic,
+        "before": result.value_before,
+        "after": result.value_after,
+        "simulated": {"before": simulated[0], "after": simulated[1]} if simulated else None,
+        "electrodes": _rows(task, result.after),
+        "files": files,
+    }
+
+
+def _print(
+    task: PadTask,
+    result: DesignResult,
+    world: str,
+    simulated: tuple[float, float] | None,
+    files: list[Path],
+) -> None:
+    goal, unit = result.goal, result.goal.unit
+    ratio = result.value_before / result.value_after
+    print(f"{task.pad.link}: {goal.description}, {result.statistic}, {task.force_n:g} N, world {world}")
+    print(f"  before     {result.value_before:8.4g} {unit}")
+    print(f"  after      {result.value_after:8.4g} {unit}   {ratio:.2f} times better")
+    if simulated:
+        before, after = simulated
+        print(f"  simulated  {before:8.4g} {unit} before, {after:.4g} {unit} after")
+    print(f"  {'electrode':<10}{'from, mm':>9}{'to, mm':>9}{'then bare':>11}{'series, ohm':>13}")
+    for row in _rows(task, result.after):
+        print(
+            f"  {row['electrode']:<10}{row['start_mm']:>9.2f}{row['stop_mm']:>9.2f}"
+            f"{row['bare_after_mm']:>11.2f}{row['series_ohm']:>13g}"
+        )
+    if not result.after.is_on_sides(task.boundary):
+        print(
+            "  no tables: a deployment describes four electrodes, one on each side; neither was it simulated"
+        )
+    elif ratio == 1:
+        print("  nothing better was found within these limits")
+    print(*files, sep="\n")
