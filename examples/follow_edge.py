@@ -1,7 +1,7 @@
 """Follow an edge: slide a round fingertip along it so that it stays under the middle of the pad.
 
 The contact position on the pad corrects the course; past positions in the base's frame give the direction
-of the edge. The latter need joint states, which the gripper sends, and `pip install 'handtouch[urdf]'`.
+of the edge. The latter need joint states, which the gripper sends.
 """
 
 from __future__ import annotations

@@ -30,7 +30,6 @@ LOADED = (
     "handtouch.cli.status",
     "can.interfaces.socketcan",
     "can.interfaces.udp_multicast",
-    "pinocchio",
 )
 _REQUEST_BYTES = 1 << 20
 _STREAMS = ("live", "complete", "control", "inputs")

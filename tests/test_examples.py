@@ -76,7 +76,6 @@ def test_the_grip_force_is_constant_while_the_object_relaxes(
 def test_the_edge_stays_under_the_centre_of_the_pad(
     programs: Any, endpoints: Any, gripper: GripperClient
 ) -> None:
-    pytest.importorskip("pinocchio")
     follow = programs("follow_edge")
 
     async def act() -> list[tuple[float, float]]:

@@ -88,7 +88,6 @@ def percept_time_s(live: str) -> float:
 
 def test_question_is_answered_by_a_squeeze_and_not_posed_again(setup: Any) -> None:
     """Percepts take no time before a client subscribes."""
-    pytest.importorskip("pinocchio")  # links in the palm
     with GripperClient(setup.robot, timeout_s=LONGEST_S) as gripper:
         gripper.reset("block", equilibrium_stiffness_n_m=STIFFNESS_N_M, relaxing_stiffness_n_m=0.0)
         assert percept_time_s(setup.live) == 0.0

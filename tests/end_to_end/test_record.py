@@ -8,8 +8,6 @@ import subprocess
 import time
 from typing import Any
 
-import pytest
-
 from handtouch import Robot
 from handtouch.client import request
 from handtouch.record.recording import Recording
@@ -18,7 +16,6 @@ LONGEST_S = 90.0
 
 
 def test_a_recording_with_control_requests_is_replayed_bit_for_bit(rig: Any) -> None:
-    pytest.importorskip("pinocchio")
     rig.simulate()
     rig.start("run")
     rig.wait_operational()

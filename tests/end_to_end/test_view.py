@@ -99,7 +99,7 @@ def start_view(rig: Any, port: int) -> str:
 
 
 def expected_m(link: str) -> NDArray[np.float64]:
-    """Return the position of a touch in the base frame: on the mounted pad, with joints by Pinocchio."""
+    """Return the position of a touch in the base frame: on the mounted pad, by the kinematics."""
     deployment = config.load(shipped.path("utah_mit.toml"))
     pad = next(pad for pad in deployment.hands[0].pads if pad.link == link)
     surface, (rotation, at) = pad_surface(pad), mount_transform(pad)

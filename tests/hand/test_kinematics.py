@@ -86,6 +86,72 @@ def test_poses_equal_products_of_joint_transforms(
             np.testing.assert_allclose(found.translation_m, expected[:3, 3], atol=1e-12)
 
 
+@st.composite
+def trees(draw: st.DrawFn) -> tuple[str, list[str]]:
+    """URDF of a random tree of all kinds of joints, some mimicking others, and its links but the root."""
+    number = st.floats(-2.0, 2.0).map(lambda value: round(value, 6))
+    lines, count = ['<link name="l0"/>'], draw(st.integers(1, 8))
+    movable: list[str] = []
+    for k in range(1, count + 1):
+        kinds = ["revolute", "continuous", "prismatic", "fixed"]
+        kind = draw(st.sampled_from(kinds[:3] if k == 1 else kinds))  # Pinocchio needs one that moves
+        xyz, rpy = (" ".join(str(draw(number)) for _ in range(3)) for _ in range(2))
+        axis = draw(st.sampled_from(["1 0 0", "0 -1 0", "0 0 1", "1 -2 3", "0.3 0.4 0"]))
+        parts = f'<parent link="l{draw(st.integers(0, k - 1))}"/><child link="l{k}"/>'
+        parts += f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
+        if kind in ("revolute", "prismatic"):
+            parts += '<limit lower="-9" upper="9" effort="1" velocity="1"/>'
+        if kind != "fixed" and movable and draw(st.booleans()):
+            mimicked, factor, offset = draw(st.sampled_from(movable)), draw(number), draw(number)
+            parts += f'<mimic joint="{mimicked}" multiplier="{factor}" offset="{offset}"/>'
+        elif kind != "fixed":
+            movable.append(f"j{k}")
+        lines += [f'<link name="l{k}"/>', f'<joint name="j{k}" type="{kind}">{parts}</joint>']
+    return f'<robot name="r">{"".join(lines)}</robot>', [f"l{k}" for k in range(count + 1)]
+
+
+@settings(max_examples=40, deadline=None)
+@given(tree=trees(), seed=st.integers(0, 2**32 - 1))
+def test_poses_and_jacobians_equal_those_of_pinocchio(tree: tuple[str, list[str]], seed: int) -> None:
+    pinocchio = pytest.importorskip("pinocchio")
+    text, links = tree
+    robot, rng = urdf.parse_urdf(text), np.random.default_rng(seed)
+    palm = str(rng.choice(links))
+    kinematics = HandKinematics(robot, links, palm, "l0")
+    position = rng.uniform(-3, 3, len(kinematics.joints))
+    kinematics.set_joint_positions(position)
+    given = dict(zip(kinematics.joints, position.tolist(), strict=True))
+    model = pinocchio.buildModelFromXML(text)
+    q, by_joint = pinocchio.neutral(model), np.zeros((model.nv, len(given)))
+    for number in range(1, model.njoints):
+        joint, name = model.joints[number], model.names[number]
+        mover, factor, offset = robot.joints[name].mimic or (name, 1.0, 0.0)
+        value = factor * given.get(mover, 0.0) + offset
+        turned = [math.cos(value), math.sin(value)]
+        q[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else turned
+        if mover in given:
+            by_joint[joint.idx_v, kinematics.joints.index(mover)] = factor
+    data = model.createData()
+    pinocchio.computeJointJacobians(model, data, q)
+    pinocchio.updateFramePlacements(model, data)
+    frame = {link: model.getFrameId(link, pinocchio.FrameType.BODY) for link in links}
+    twist = {
+        link: pinocchio.getFrameJacobian(model, data, at, pinocchio.WORLD).reshape(6, model.nv)
+        for link, at in frame.items()
+    }
+    point = rng.normal(size=3)
+    for number, link in enumerate(links):
+        for other, in_base in ((palm, False), ("l0", True)):
+            expected = data.oMf[frame[other]].actInv(data.oMf[frame[link]])
+            found = kinematics.pose_in_base(number) if in_base else kinematics.pose_in_palm(number)
+            np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-12)
+            np.testing.assert_allclose(found.translation_m, expected.translation, atol=1e-12)
+            linear, angular = np.split(twist[link] - twist[other], 2)
+            moved = linear + np.cross(angular.T, data.oMf[frame[link]].act(point)).T
+            slope = data.oMf[frame[other]].rotation.T @ moved @ by_joint
+            np.testing.assert_allclose(kinematics.point_jacobian(number, point, in_base), slope, atol=1e-12)
+
+
 def test_jacobians_equal_finite_differences(hand: tuple[urdf.RobotDescription, HandKinematics]) -> None:
     _, kinematics = hand
     m, link = len(kinematics.joints), len(kinematics.palm_joint_mask) - 1

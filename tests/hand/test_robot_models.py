@@ -14,7 +14,7 @@ from handtouch.config import (
     load,
     shipped,
 )
-from handtouch.hand import kinematics, urdf
+from handtouch.hand import urdf
 from handtouch.hand.body_distance import signed_distance_m
 from handtouch.hand.robot_models import (
     RobotModels,
@@ -133,17 +133,12 @@ def test_hand_that_does_not_fit_is_served_in_link_frames_only(tmp_path: Path) ->
     assert drop_invalid_urdfs(right, "hand.toml") == (right, ())
 
 
-def test_palm_output_needs_a_urdf_and_pinocchio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_palm_output_needs_a_urdf(tmp_path: Path) -> None:
     scene = ("[touch]", '[scene]\noutputs = ["palm"]\n\n[touch]')
     names = [("urdf =", "# urdf ="), ("palm_link", "# palm_link"), ("base_link", "# base_link")]
     with pytest.raises(ConfigError, match=r"\[scene\]: outputs.*needs a hand with a URDF"):
         check_urdfs(changed(tmp_path, scene, *names), "hand.toml")
-    monkeypatch.setattr(kinematics, "pinocchio_available", lambda: False)
-    with pytest.raises(ConfigError, match=r"pip install 'handtouch\[urdf\]'"):
-        check_urdfs(changed(tmp_path, scene), "hand.toml")
-    without = check_urdfs(changed(tmp_path), "hand.toml")
-    assert RobotModels(without).hands == []
-    assert any("handtouch[urdf]" in doubt for doubt in unchecked_items(without))
+    check_urdfs(changed(tmp_path, scene), "hand.toml")
 
 
 def test_joint_states_may_use_other_names(tmp_path: Path) -> None:

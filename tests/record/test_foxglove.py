@@ -25,6 +25,7 @@ from websockets.typing import Subprotocol
 from handtouch import config
 from handtouch.client import connect
 from handtouch.config import shipped
+from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.urdf import read_urdf
 from handtouch.record.foxglove import (
     FRAMES_TOPIC,
@@ -83,9 +84,6 @@ def matrix(frame: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def test_frames_of_links_equal_the_kinematics() -> None:
-    pytest.importorskip("pinocchio")
-    from handtouch.hand.kinematics import HandKinematics
-
     foxglove = configured()
     at = frames(foxglove.convert("service", {"hands": {"right": LINKS}}, 10 * SECOND_NS))
     angles = {"index_mcp": 0.5, "index_pip": 0.3, "thumb_cmc": -0.2}

@@ -143,7 +143,7 @@ def test_patches_preserve_force_and_centre() -> None:
     assert 0 < made.force_fraction_off_pad < 1
 
 
-def test_link_poses_agree_between_pinocchio_and_mujoco(ball: GraspRecord) -> None:
+def test_link_poses_equal_those_of_mujoco(ball: GraspRecord) -> None:
     kinematics = RobotModels(HAND).kinematics[0]
     order = [ball.joints.index(name) for name in kinematics.joints]
     for step in (500, 1200, 2000):

@@ -25,7 +25,6 @@ from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load, shipped
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.table_cache import build_pad_model
-from handtouch.hand import kinematics
 from handtouch.host.signals import stop_on_signals
 from handtouch.simulate.grasp import grasp_stimulus as grasped
 from handtouch.simulate.scenario import Scenario
@@ -199,8 +198,8 @@ class _ContactCollector:
 
 
 def _with_palm_output(deployment: Deployment) -> Deployment:
-    """Return the deployment with contacts also in the palm's frame, if Pinocchio and a URDF are available."""
-    if not kinematics.pinocchio_available() or not any(hand.urdf for hand in deployment.hands):
+    """Return the deployment with contacts also in the palm's frame, if a hand has a URDF."""
+    if not any(hand.urdf for hand in deployment.hands):
         return deployment
     scene = deployment.scene.model_copy(update={"outputs": (*deployment.scene.outputs, "palm")})
     return deployment.model_copy(update={"scene": scene})

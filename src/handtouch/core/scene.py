@@ -286,7 +286,7 @@ class Demand:
                 skipped[output] = "in no scene"
             elif output == "contact" or outputs[output][pad]:
                 if output in ("palm", "base") and not self.transformable[pad]:
-                    skipped[output] = "the hand has no URDF, or handtouch[urdf] isn't installed"
+                    skipped[output] = "the hand has no URDF"
             elif not subscribed:
                 skipped[output] = "no subscriber"
             else:

@@ -1,13 +1,14 @@
 """Signed distance of a point from the body of a link: negative inside.
 
-Public names: `signed_distance_m`, `find_mesh`, `load_triangles`. Meshes are read by Coal, part of the extra
-`handtouch[urdf]`.
+Public names: `signed_distance_m`, `find_mesh`, `load_triangles`, `can_read_meshes`. Meshes are read by Coal,
+the extra `handtouch[urdf]`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,11 @@ def _distance_from_shape(shape: BodyShape, points: FloatArray, folder: Path) -> 
 def _distance_from_excess(excess: FloatArray) -> FloatArray:
     """Return the distance from a box or cylinder, given each coordinate's excess over its size (n, k)."""
     return np.asarray(np.linalg.norm(np.maximum(excess, 0.0), axis=1) + np.minimum(excess.max(axis=1), 0.0))
+
+
+def can_read_meshes() -> bool:
+    """Return True if Coal is installed."""
+    return find_spec("coal") is not None
 
 
 @lru_cache(maxsize=64)

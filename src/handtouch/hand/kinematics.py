@@ -1,27 +1,19 @@
-"""Forward kinematics of a hand from its URDF, by Pinocchio: poses of its links in the palm and base
-frames.
+"""Forward kinematics of a hand from its URDF: poses of its links in the palm and base frames.
 
-Public names: `HandKinematics`, `LinkPose`, `pinocchio_available`. Needs the extra `handtouch[urdf]`;
-Pinocchio is imported by the first `HandKinematics`, and takes 0.2 s and some 50 MB.
+Public names: `HandKinematics`, `LinkPose`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.hand.urdf import MOVABLE_JOINT_TYPES, RobotDescription
+from handtouch.hand.urdf import MOVABLE_JOINT_TYPES, RobotDescription, UrdfJoint
 
 FloatArray = NDArray[np.float64]
-
-
-def pinocchio_available() -> bool:
-    """Return whether Pinocchio is installed."""
-    return find_spec("pinocchio") is not None
 
 
 class LinkPose(NamedTuple):
@@ -44,120 +36,93 @@ class HandKinematics:
     """
 
     def __init__(self, robot: RobotDescription, links: Sequence[str], palm: str, base: str) -> None:
-        import pinocchio
-
-        self._pin = pinocchio
-        self._model = pinocchio.buildModelFromXML(robot.path.read_text(encoding="utf-8"))
-        self._data = self._model.createData()
-        self._frames = [self._frame_id(robot, link) for link in links]
-        self._palm, self._base = self._frame_id(robot, palm), self._frame_id(robot, base)
-        chains = [[robot.joints_between(link, other) for link in links] for other in (palm, base)]
-        moving = {
-            j.mimic[0] if j.mimic else j.name
-            for of in chains
-            for c in of
-            for j in c
-            if j.kind in MOVABLE_JOINT_TYPES
-        }
+        chains = [robot.joint_chain(link) for link in (*links, palm, base)]
+        depths = {joint.name: depth for chain in chains for depth, joint in enumerate(chain)}
+        tree = [robot.joints[name] for name in sorted(depths, key=lambda name: depths[name])]
+        number = {robot.root: 0} | {joint.child: row for row, joint in enumerate(tree, 1)}  # of each frame
+        *frames, self._palm, self._base = (number[link] for link in (*links, palm, base))
+        self._frames = np.array(frames, dtype=np.intp)
+        self._set_tree(tree, [number[joint.parent] for joint in tree], list(depths.values()))
+        above = np.array([[joint in chain for joint in tree] for chain in chains], np.float64)
+        above = above.reshape(len(chains), len(tree))
+        self._signs = above[:-2] - above[-2], above[:-2] - above[-1]
+        """(n, t) in palm and base: 1 for a joint that moves the link, -1 for one that moves palm or base"""
+        movers = [joint.mimic[0] if joint.mimic else joint.name for joint in tree]
+        relative = np.abs(above[:-2, None] - above[None, -2:]).any(axis=(0, 1))
+        moving = {movers[row] for row in np.flatnonzero(relative) if tree[row].kind in MOVABLE_JOINT_TYPES}
         self.joints = tuple(name for name in robot.joints if name in moving)
+        m = len(self.joints)
         self.continuous = np.array(
             [robot.joints[n].kind == "continuous" for n in self.joints], dtype=np.bool_
         )
         self.limits = np.array([robot.joints[n].limits for n in self.joints]).reshape(-1, 2)
-        self.palm_joint_mask, self.base_joint_mask = (
-            np.array(
-                [
-                    [any(name in (j.name, j.mimic and j.mimic[0]) for j in chain) for name in self.joints]
-                    for chain in of
-                ],
-                dtype=np.bool_,
-            ).reshape(len(links), len(self.joints))
-            for of in chains
+        moved_by = np.array([[mover == name for name in self.joints] for mover in movers], np.float64)
+        moved_by = moved_by.reshape(len(tree), m)  # each joint of the tree, by the joints
+        self._matrix = (
+            moved_by * np.array([joint.mimic[1] if joint.mimic else 1.0 for joint in tree])[:, None]
         )
-        self._build_joint_map(robot)
+        self._offset = np.array([joint.mimic[2] if joint.mimic else 0.0 for joint in tree])
+        self.palm_joint_mask, self.base_joint_mask = (np.abs(signs) @ moved_by > 0 for signs in self._signs)
+        self._poses = np.tile(np.eye(4), (1 + len(tree), 1, 1))  # of the root and the joints' child links
+        self.set_joint_positions(np.zeros(m))
 
     def set_joint_positions(self, position_rad: FloatArray) -> None:
         """Set the joint positions (m,): radians, metres for prismatic joints. NaN counts as 0."""
-        if np.isnan(position_rad).any():
-            position_rad = np.nan_to_num(position_rad)
-        turned = self._matrix @ position_rad + self._offset
-        q = self._neutral_q.copy()
-        q[self._plain_q] = turned[self._plain_v]
-        if len(self._turning_q):
-            angle = turned[self._turning_v]
-            q[self._turning_q], q[self._turning_q + 1] = np.cos(angle), np.sin(angle)
-        self._pin.forwardKinematics(self._model, self._data, q)
-        self._q = q
-        self._jacobians: dict[int, Any] = {}
-        self._frame_placements: dict[int, Any] = {}
+        moved = self._matrix @ np.nan_to_num(position_rad) + self._offset
+        angle = moved * self._turns
+        sine, versine = np.sin(angle)[:, None, None], (2.0 * np.sin(0.5 * angle) ** 2)[:, None, None]
+        motion = self._motion
+        motion[:, :3, :3] = np.eye(3) + sine * self._cross + versine * self._cross_squared  # Rodrigues
+        motion[:, :3, 3] = self._slides * moved[:, None]
+        local = self._origins @ motion
+        for children, parents in self._levels:
+            self._poses[children] = self._poses[parents] @ local[children - 1]
 
     def pose_in_palm(self, link: int) -> LinkPose:
         """Return the pose of link number `link` in the palm frame."""
-        return self._relative_pose(self._palm, self._frames[link])
+        return self._relative_pose(self._palm, link)
 
     def pose_in_base(self, link: int) -> LinkPose:
         """Return the pose of link number `link` in the base frame."""
-        return self._relative_pose(self._base, self._frames[link])
+        return self._relative_pose(self._base, link)
 
     def direction_in_links(self, in_base: FloatArray) -> FloatArray:
         """Return a direction (3,) of the base frame in the frame of each link, (n, 3)."""
-        reference = self._frame_placement(self._base).rotation @ in_base
-        return np.array([reference @ self._frame_placement(frame).rotation for frame in self._frames])
+        in_root = self._poses[self._base, :3, :3] @ in_base
+        return np.asarray(in_root @ self._poses[self._frames, :3, :3])
 
     def point_jacobian(self, link: int, position_m: FloatArray, in_base: bool = False) -> FloatArray:
         """Return the derivative (3, m) [m/rad] of a point (3,) of the link by the joints, in palm or base
         frame.
         """
-        frame, other = self._frames[link], self._base if in_base else self._palm
-        reference = self._frame_placement(other)
-        x, y, z = self._frame_placement(frame).act(position_m)
-        twist = self._frame_jacobian(frame) - self._frame_jacobian(other)
-        lever = np.array(
-            [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
-        )  # cross product of a rotation with the position
-        moved = twist[:3] + lever @ twist[3:]
-        return np.asarray(reference.rotation.T @ moved @ self._matrix, np.float64)
+        pose, joints = self._poses[self._frames[link]], self._poses[1:]
+        point = pose[:3, :3] @ position_m + pose[:3, 3]
+        axes = (joints[:, :3, :3] @ self._axes[:, :, None])[:, :, 0]
+        moved = self._turns[:, None] * np.cross(axes, point - joints[:, :3, 3])
+        moved += (joints[:, :3, :3] @ self._slides[:, :, None])[:, :, 0]
+        moved *= self._signs[in_base][link][:, None]
+        reference = self._poses[self._base if in_base else self._palm]
+        return np.asarray((moved @ reference[:3, :3]).T @ self._matrix)
 
-    def _frame_jacobian(self, frame: int) -> Any:
-        """Return the Jacobian (6, nv) of a frame by Pinocchio's coordinates, about the world's origin."""
-        found = self._jacobians.get(frame)
-        if found is None:
-            if not self._jacobians:
-                self._pin.computeJointJacobians(self._model, self._data, self._q)
-            found = self._pin.getFrameJacobian(self._model, self._data, frame, self._pin.WORLD)
-            self._jacobians[frame] = found
-        return found
+    def _relative_pose(self, seen_from: int, link: int) -> LinkPose:
+        reference, pose = self._poses[seen_from], self._poses[self._frames[link]]
+        back = reference[:3, :3].T
+        return LinkPose(back @ pose[:3, :3], back @ (pose[:3, 3] - reference[:3, 3]))
 
-    def _relative_pose(self, seen_from: int, frame: int) -> LinkPose:
-        pose = self._frame_placement(seen_from).actInv(self._frame_placement(frame))
-        return LinkPose(pose.rotation, pose.translation)
-
-    def _frame_placement(self, frame: int) -> Any:
-        placement = self._frame_placements.get(frame)
-        if placement is None:
-            placement = self._frame_placements[frame] = self._pin.updateFramePlacement(
-                self._model, self._data, frame
-            )
-        return placement
-
-    def _frame_id(self, robot: RobotDescription, link: str) -> int:
-        robot.bodies[link]
-        return int(self._model.getFrameId(link, self._pin.FrameType.BODY))
-
-    def _build_joint_map(self, robot: RobotDescription) -> None:
-        """Map `joints` linearly to Pinocchio's coordinates: order, mimicking joints, continuous joints."""
-        model = self._model
-        self._matrix = np.zeros((model.nv, len(self.joints)))
-        self._offset = np.zeros(model.nv)
-        self._neutral_q = self._pin.neutral(model)
-        plain: list[tuple[int, int]] = []
-        turning: list[tuple[int, int]] = []
-        for number in range(1, model.njoints):
-            joint, kind = robot.joints[model.names[number]], model.joints[number]
-            name, factor, self._offset[kind.idx_v] = joint.mimic or (joint.name, 1.0, 0.0)
-            if name in self.joints:
-                self._matrix[kind.idx_v, self.joints.index(name)] = factor
-            (plain if kind.nq == 1 else turning).append((kind.idx_q, kind.idx_v))
-        self._plain_q, self._plain_v = np.array(plain, dtype=np.intp).reshape(-1, 2).T
-        self._turning_q, self._turning_v = np.array(turning, dtype=np.intp).reshape(-1, 2).T
-        self.set_joint_positions(np.zeros(len(self.joints)))
+    def _set_tree(self, tree: Sequence[UrdfJoint], parents: Sequence[int], depths: Sequence[int]) -> None:
+        """Set what is constant of the joints (t) of a tree, in the order of their depths."""
+        t, parent = len(tree), np.array(parents, dtype=np.intp)
+        depth = np.sort(np.array(depths, dtype=np.intp))
+        self._levels = [
+            (np.flatnonzero(depth == level) + 1, parent[depth == level]) for level in range(len(set(depths)))
+        ]
+        """frames at one depth, and their parents"""
+        self._origins = np.tile(np.eye(4), (t, 1, 1))
+        for origin, joint in zip(self._origins, tree, strict=True):
+            origin[:3, :3], origin[:3, 3] = joint.rotation, joint.translation_m
+        self._motion = np.tile(np.eye(4), (t, 1, 1))
+        self._axes = np.array([joint.axis for joint in tree]).reshape(t, 3)
+        self._turns = np.array([joint.kind in ("revolute", "continuous") for joint in tree], np.float64)
+        self._slides = self._axes * np.array([[joint.kind == "prismatic"] for joint in tree]).reshape(t, 1)
+        self._cross = np.cross(self._axes[:, None], np.eye(3)).transpose(0, 2, 1)  # as matrices (t, 3, 3)
+        self._cross_squared = self._cross @ self._cross

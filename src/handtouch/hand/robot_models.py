@@ -20,8 +20,8 @@ from handtouch.config import (
     HandTable,
     Problem,
 )
-from handtouch.hand import kinematics, urdf
-from handtouch.hand.body_distance import find_mesh, signed_distance_m
+from handtouch.hand import urdf
+from handtouch.hand.body_distance import can_read_meshes, find_mesh, signed_distance_m
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.pads import MountUncertainty, mount_transform
 from handtouch.hand.urdf import RobotDescription, UrdfError
@@ -59,7 +59,7 @@ class RobotModels:
         self.gravity: list[NDArray[np.float64]] = []
         first = 0
         for hand in deployment.hands:
-            if hand.urdf and kinematics.pinocchio_available():
+            if hand.urdf:
                 robot = urdf.read_urdf(Path(hand.urdf))
                 links = [pad.mount.link or pad.link for pad in hand.pads]
                 made = HandKinematics(
@@ -116,12 +116,6 @@ def _unavailable_frames(deployment: Deployment) -> Iterator[Problem]:
     requested = sorted({"palm", "base"} & set(deployment.scene.outputs))
     if requested and not any(hand.urdf for hand in deployment.hands):
         yield Problem("[scene]: outputs", _value_text(requested), "needs a hand with a URDF: [[hand]] urdf")
-    elif requested and not kinematics.pinocchio_available():
-        yield Problem(
-            "[scene]: outputs",
-            _value_text(requested),
-            f"needs a package that isn't installed: {INSTALL_COMMAND}",
-        )
 
 
 def unchecked_items(deployment: Deployment) -> Iterator[str]:
@@ -129,13 +123,11 @@ def unchecked_items(deployment: Deployment) -> Iterator[str]:
     for hand in deployment.hands:
         if not hand.urdf:
             continue
-        if not kinematics.pinocchio_available():
-            yield f"{hand.name}: urdf: contacts aren't published in palm and base frame; {INSTALL_COMMAND}"
         robot = urdf.read_urdf(Path(hand.urdf))
         for pad in hand.pads:
             meshes = [s.file for s in robot.bodies[pad.mount.link or pad.link] if s.kind == "mesh"]
             lost = [mesh for mesh in meshes if find_mesh(mesh, robot.path.parent) is None]
-            if lost or (meshes and not kinematics.pinocchio_available()):
+            if lost or (meshes and not can_read_meshes()):
                 why = f"file {lost[0]} not found" if lost else f"meshes are read with {INSTALL_COMMAND}"
                 yield f"{hand.name}/{pad.link}: position on the link's body not checked: {why}"
 
