@@ -74,7 +74,7 @@ def _simulated(
     if result.goal.name not in CHECKED_GOALS or not result.after.is_on_sides(task.boundary):
         return None
     task = task.with_points(len(result.map_after))
-    draws = 1 if world == "ideal" else 12
+    draws = 4 if world == "ideal" else 12
     before, after = (
         goal_value(
             simulated_goal_map(

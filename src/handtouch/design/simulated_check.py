@@ -32,6 +32,7 @@ Shares = Callable[[FloatArray, FloatArray], FloatArray]
 CHECKED_GOALS = ("position", "linearity", "two-contacts")
 _RING = [2, 1, 3, 0]  # channels y0, xa, yb, x0 of the simulator's x0, xa, y0, yb
 _ITERATIONS = 3
+_NOISE_SAMPLES = 25  # of each drawn pad
 _DIRECTIONS_RAD = np.arange(4) * np.pi / 4
 
 
@@ -57,14 +58,17 @@ def simulated_goal_map(
         on_progress(f"simulating pad {number + 1} of {draws}")
         drawn = world.draw(family.seed(number))
         shares = _channel_shares(task, layout, drawn)
-        noise = np.random.default_rng(number).standard_normal((len(x), 4))
-        noise *= (task.noise_a / response.total_a)[:, None]
         if goal.name == "two-contacts":
             squares += _pair_squares(task, layout, goal, response, shares)
-        elif goal.name == "linearity":
-            squares += line_errors(task, response.fractions, shares(x, y).T + noise)
-        else:
-            squares += _position_squares(task, layout, response, shares(x, y).T + noise)
+            continue
+        rng, currents = np.random.default_rng(number), shares(x, y).T
+        for _ in range(_NOISE_SAMPLES):
+            noise = rng.standard_normal((len(x), 4)) * (task.noise_a / response.total_a)[:, None]
+            if goal.name == "linearity":
+                found = line_errors(task, response.fractions, currents + noise)
+            else:
+                found = _position_squares(task, layout, response, currents + noise)
+            squares += found / _NOISE_SAMPLES
     return goal.factor * np.sqrt(squares / draws).reshape(task.points, task.points)
 
 
