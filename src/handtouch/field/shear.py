@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +25,7 @@ FloatArray = npt.NDArray[np.float64]
 EDGE_EXCESS = 2 * math.log(2) / math.pi
 """Width, in thicknesses of the film, that current gains beyond an edge of a plate over a larger one."""
 _MAX_STEPS = 30
-_STEP_TOLERANCE = 1e-12
+_STEP_TOLERANCE = 1e-10
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
@@ -153,6 +154,22 @@ class BarPattern:
         """Number of electrodes."""
         return 1 + max(cell.channel for cell in self.cells)
 
+    @cached_property
+    def _edges(self) -> FloatArray:
+        """Direction and position (m, 4) of points of integration along the electrodes' edges."""
+        points = []
+        for cell in self.cells:
+            way = np.array([math.cos(cell.direction_rad), math.sin(cell.direction_rad)])
+            along = _GAUSS_NODES * self.length_m / 2
+            points += [[*way, cell.x_m - way[1] * node, cell.y_m + way[0] * node] for node in along]
+        return np.array(points)
+
+    @cached_property
+    def _edge_weights(self) -> FloatArray:
+        """Share (channels, m) of each of these points in the electrode of a channel."""
+        member = np.array([cell.channel for cell in self.cells]) == np.arange(self.channels)[:, None]
+        return np.kron(member, _GAUSS_WEIGHTS / 2)
+
     @property
     def travel_m(self) -> float:
         """Displacement at which an overlap ends."""
@@ -179,21 +196,17 @@ class BarPattern:
         excess, film = edge_excess(self.film_m), self.film_m
         lost = 0.0 if math.isinf(self.gap_m) else self.gap_m / 2 - gap_loss(self.gap_m, film) / 2 - excess
         length = self.length_m + 2 * excess
-        areas = np.zeros((self.channels, *x.shape))
-        slopes = np.zeros((self.channels, 3, *x.shape))
+        edges = self._edges.reshape(-1, 4, *[1] * x.ndim)
+        wx, wy, px, py = (edges[:, k] for k in range(4))
+        qx, qy = px + wx * self.overlap_m, py + wy * self.overlap_m
         cosine, sine = np.cos(twist), np.sin(twist)
-        for cell in self.cells:
-            way = np.array([math.cos(cell.direction_rad), math.sin(cell.direction_rad)])
-            for node, weight in zip(_GAUSS_NODES, _GAUSS_WEIGHTS / 2, strict=True):
-                along = node * self.length_m / 2  # of a point of the edge from its middle
-                px, py = cell.x_m - way[1] * along, cell.y_m + way[0] * along
-                qx, qy = px + way[0] * self.overlap_m, py + way[1] * self.overlap_m
-                sx, sy = cosine * qx - sine * qy + x - px, sine * qx + cosine * qy + y - py
-                ratio, slope = overlap_ratio((way[0] * sx + way[1] * sy + lost) / film)
-                areas[cell.channel] += weight * length * film * ratio
-                turn = way[0] * (-sine * qx - cosine * qy) + way[1] * (cosine * qx - sine * qy)
-                for k, rate in enumerate((way[0], way[1], turn)):
-                    slopes[cell.channel, k] += weight * length * slope * rate
+        rx, ry = cosine * qx - sine * qy, sine * qx + cosine * qy
+        ratio, slope = overlap_ratio((wx * (rx + x - px) + wy * (ry + y - py) + lost) / film)
+        turn = wy * rx - wx * ry
+        rates = np.stack([slope * wx, slope * wy, slope * turn], axis=1)
+        weights = length * self._edge_weights
+        areas = np.tensordot(weights, film * ratio, axes=1)
+        slopes = np.tensordot(weights, rates, axes=1)
         return areas, slopes[:, : len(self.components)]
 
 
@@ -336,11 +349,16 @@ class ShearEstimate:
 
 @dataclass(frozen=True)
 class ShearPad:
-    """A shear pattern under a voltage, with the film's law where off-centre pressure is to be compensated."""
+    """A shear pattern under a voltage, with the film's law where off-centre pressure is to be compensated.
+
+    part_std: relative error of each channel that is the same in all samples, by gains and edges. It weights
+    the currents; as a tare removes what it does to a displacement, covariances don't include it.
+    """
 
     pattern: ShearPattern
     drive_v: float
     film: FilmLaw | None = None
+    part_std: float = 0.0
 
     def currents(
         self, motion: npt.ArrayLike, conductance_s_per_m2: npt.ArrayLike, tilt: npt.ArrayLike = 0.0
@@ -386,9 +404,9 @@ class ShearPad:
         weight += np.einsum("im,ij->mij", (noise / read) ** 2, np.eye(count))
         information = np.full_like(weight, np.nan)
         known = np.isfinite(weight).all(axis=(1, 2)) & (noise > 0).all(axis=0)
-        information[known] = np.linalg.inv(weight[known])
-        found = self._fit(np.log(read) - tilt, information)
-        motion, level, covariance, misfit = found
+        information[known] = np.linalg.inv(weight[known] + self.part_std**2 * np.eye(count))
+        motion, level, gain, misfit = self._fit(np.log(read) - tilt, information)
+        covariance = gain @ weight @ gain.swapaxes(1, 2)
         conductance = np.exp(level) / self.drive_v
         return ShearEstimate(
             motion.reshape(unknowns, *shape),
@@ -402,7 +420,9 @@ class ShearPad:
     def _fit(
         self, logs: FloatArray, information: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return motion (k, m), ln(V Y), covariance (m, k + 1, k + 1) and misfit by Gauss-Newton steps."""
+        """Return motion (k, m), ln(V Y), derivatives (m, 1 + k, n) of both by the logs, ln(V Y) first, and
+        misfit, by Gauss-Newton steps.
+        """
         unknowns, cases = len(self.pattern.components), logs.shape[1]
         motion, level = np.zeros((unknowns, cases)), np.full(cases, np.nan)
         travel = self.pattern.travel_m
@@ -424,16 +444,16 @@ class ShearPad:
         off = logs - np.log(areas) - level
         misfit = np.einsum("im,mij,jm->m", off, information, off)
         lost = ~(np.hypot(motion[0], motion[1] if unknowns > 1 else 0.0) < travel)
-        covariance = _solve(normal, np.broadcast_to(np.eye(unknowns + 1), normal.shape))
+        gain = _solve(normal, weighted.swapaxes(1, 2))
         motion, level, misfit = (np.where(lost, np.nan, value) for value in (motion, level, misfit))
-        covariance[lost] = np.nan
-        return motion, level, covariance, misfit
+        gain[lost] = np.nan
+        return motion, level, gain, misfit
 
 
 def _solve(matrices: FloatArray, right: FloatArray) -> FloatArray:
     """Solve (m, k, k) systems; NaN where a matrix isn't finite or singular."""
     columns = right[..., None] if right.ndim == 2 else right
-    result = np.full(np.broadcast_shapes(columns.shape, (*matrices.shape[:1], 1, 1)), np.nan)
+    result = np.full_like(columns, np.nan)
     regular = np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2)))
     regular = regular[np.linalg.cond(matrices[regular]) < 1 / np.finfo(np.float64).eps]
     result[regular] = np.linalg.solve(matrices[regular], columns[regular])

@@ -5,6 +5,7 @@ Public names: `ShearSpread`, `HiddenShear`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.config.shear import Shear
 from handtouch.simulate.worlds.distributions import Distribution, Fixed
 
 FloatArray = NDArray[np.float64]
@@ -46,6 +48,19 @@ class ShearSpread:
     """Displacement that creep adds to a lasting force, relative."""
     stiffening: Distribution = _ZERO
     """Relative growth of the stiffness at a displacement of half the travel."""
+
+    def describe(self, shear: Shear, overlap_mm: float) -> Shear:
+        """Return a table as its builder writes it: with the tolerances of his parts, for edges that overlap
+        by `overlap_mm`."""
+        edges = self.edge_offset_mm.std / math.sqrt(2) / overlap_mm
+        common = (self.stiffness_ratio.std, self.creep.mean, self.stiffening.mean, self.hysteresis.mean)
+        return shear.model_copy(
+            update={
+                "stiffness_std": math.hypot(*common),
+                "axis_std": math.hypot(self.axis_ratio.std, edges),
+                "hysteresis": self.hysteresis.mean,
+            }
+        )
 
 
 @dataclass(frozen=True)

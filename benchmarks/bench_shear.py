@@ -1,0 +1,269 @@
+"""Measure shear pads: overlap against elements, accuracy and coverage of the tangential force by world.
+
+Prints its tables and writes docs/benchmarks/shear.md, shear.json and shear.png.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+from page import made_by, options, output_folder, progress, table
+from scores import Estimates, EstimateScore, bin_labels, concatenate, draw_calibration, slices
+
+from handtouch.config.shear import Shear
+from handtouch.field.elastic_layer import calibrate_layer
+from handtouch.field.shear import DiscPattern, ShearPad, overlap_ratio
+from handtouch.simulate.shear_film import Plates, solve_film, solve_section
+from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, Any]
+
+DRIVE_V, FULL_SCALE_A, COUNTS, NOISE_COUNTS = 5.0, 25e-3, 32767, 1.0
+BARS = {
+    "kind": "crossed_bars",
+    "bars": 2,
+    "pitch_mm": 3.4,
+    "overlap_mm": 0.6,
+    "length_mm": 6.0,
+    "gap_mm": 0.4,
+}
+PATTERNS: dict[str, dict[str, Any]] = {
+    "crossed bars": BARS,
+    "discs": {"kind": "discs", "discs": 9, "radius_mm": 2.0, "gap_mm": 0.4},
+}
+EDGE_MM = {"crossed bars": 0.6, "discs": 2.0}
+"""Overlap that an error of an edge compares with."""
+MAX_NORMAL_N, FRICTION, MAX_FORCE_N = 8.0, 0.8, 3.0
+CENTRE_STD_M, NORMAL_STD = 1e-3, 0.1
+"""Errors of the contact above: its centre, and its normal force, relative."""
+REFERENCE_STD = 0.01
+PART_STD = 0.03
+CREEP = 0.03
+"""Of a load that is held for seconds, against one of a moment."""
+REFERENCES_N = 2.0 * np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+EARLIER_LOADS = 3
+
+
+def shear_table(pattern: str) -> Shear:
+    """Return the example's pad with a pattern."""
+    return Shear(
+        pattern=PATTERNS[pattern],  # type: ignore[arg-type]
+        film_mm=0.15,
+        film_ohm_mm2=9000.0,
+        plate_mm=14.0,
+        stiffness_n_per_mm=(12.0, 12.0),
+    )
+
+
+class Load(NamedTuple):
+    """A load on the pad: tangential and normal force, centre of pressure, time that it lasts."""
+
+    force_n: FloatArray
+    normal_n: float
+    centre_m: FloatArray
+    held_s: float
+
+
+class Bench:
+    """One drawn pad with its node, loads and estimator."""
+
+    def __init__(self, drawn: DrawnWorld, nominal: Shear, edge_mm: float) -> None:
+        self.rng = np.random.default_rng((drawn.seed, 5))
+        hidden = drawn.shear("bench/tip")
+        self._history = LayerHistory(nominal, hidden)
+        self._pad = SimulatedShearPad(nominal, DRIVE_V, hidden)
+        gains = drawn.world.parts.gain_ratio.sample(self.rng, 4)
+        self._counts_per_a = COUNTS / FULL_SCALE_A * gains[: self._pad.channels]
+        self._noise = NOISE_COUNTS * float(drawn.world.electronics.noise_ratio.sample(self.rng, 1)[0])
+        self.stated = drawn.world.shear.describe(nominal, edge_mm)
+        self._estimator = ShearPad(nominal.build_pattern(), DRIVE_V, nominal.build_film(), PART_STD)
+        self._loads: list[Load] = []
+        self._moved: list[FloatArray] = []
+
+    def apply(self, load: Load) -> None:
+        """Apply a load, which is read at its end, and take it off."""
+        for share in np.linspace(0.2, 1.0, 5):
+            moved = self._history.advance(share * load.force_n, load.held_s / 5)
+        self._loads.append(load)
+        self._moved.append(moved)
+        for _ in range(3):
+            self._history.advance(np.zeros(2), 0.3)
+
+    def estimates(self) -> tuple[FloatArray, FloatArray]:
+        """Return displacements (2, n) from the first load, and covariances (n, 2, 2), that are estimated."""
+        normal = np.array([load.normal_n for load in self._loads])
+        centre = np.array([load.centre_m for load in self._loads]).T
+        amperes = self._pad.currents(np.array(self._moved).T, normal, centre)
+        counts = amperes * self._counts_per_a[:, None] + self._noise * self.rng.standard_normal(amperes.shape)
+        found = self._estimator.estimate(
+            np.rint(counts) * FULL_SCALE_A / COUNTS,
+            np.hypot(NOISE_COUNTS, 0.3) * FULL_SCALE_A / COUNTS,
+            normal_force_n=normal * (1 + NORMAL_STD * self.rng.standard_normal(len(normal))),
+            centre_m=centre + CENTRE_STD_M * self.rng.standard_normal(centre.shape),
+            centre_std_m=CENTRE_STD_M,
+        )
+        return found.motion[:2] - found.motion[:2, :1], found.covariance[:, :2, :2]
+
+    def random_load(self) -> Load:
+        """Draw a load within friction."""
+        normal = float(self.rng.uniform(0.5, MAX_NORMAL_N))
+        size = float(self.rng.uniform(0, min(FRICTION * normal, MAX_FORCE_N)))
+        angle = float(self.rng.uniform(0, 2 * np.pi))
+        force = size * np.array([np.cos(angle), np.sin(angle)])
+        return Load(force, normal, self.rng.uniform(-2e-3, 2e-3, 2), float(self.rng.uniform(0.1, 3)))
+
+
+def force_errors(pattern: str, world: str, seed: int) -> list[Estimates]:
+    """Return the error of one load on one drawn pad, before and after its calibration."""
+    drawn = WORLDS[world].draw(Family.REPORTING.seed(seed))
+    bench = Bench(drawn, shear_table(pattern), EDGE_MM[pattern])
+    bench.apply(Load(np.zeros(2), 0.0, np.zeros(2), 0.1))  # tare
+    factor = 1 + REFERENCE_STD * bench.rng.standard_normal()
+    for force in REFERENCES_N.T:
+        bench.apply(Load(force * factor, 3.0, np.zeros(2), 2.0))
+    for _ in range(EARLIER_LOADS):
+        bench.apply(bench.random_load())
+    load = bench.random_load()
+    bench.apply(load)
+    moved, covariance = bench.estimates()
+    stated = bench.stated.build_layer()
+    known = calibrate_layer(
+        moved[:, 1:5],
+        REFERENCES_N,
+        float(np.hypot(REFERENCE_STD, CREEP)),
+        stated.hysteresis,
+        stated.zero_std_n,
+    )
+    found = []
+    for layer in (stated, known):
+        peak = np.hypot(*layer.force(moved).vector_n).max()
+        estimate = layer.force(moved[:, -1], covariance[-1], peak)
+        found.append(
+            Estimates(
+                (estimate.vector_n - load.force_n)[None],
+                estimate.covariance_n2[None],
+                np.array([bool(np.isfinite(estimate.vector_n).all())]),
+                np.ones(1),
+                estimate.covariance_n2[None],
+                {"force": bin_labels([np.hypot(*load.force_n)], (0.5, 1.5), "N")},
+            )
+        )
+    return found
+
+
+def world_rows(quick: bool) -> tuple[list[Row], list[Row], dict[str, Estimates]]:
+    """Scores by pattern and world, by size of the force, and the estimates themselves."""
+    rows, by_force, curves = [], [], {}
+    for world in ("default", "harsh"):
+        for pattern in PATTERNS:
+            pairs = [force_errors(pattern, world, seed) for seed in range(20 if quick else 400)]
+            for number, state in enumerate(("as built", "calibrated")):
+                every = concatenate([pair[number] for pair in pairs])
+                head = {"world": world, "pattern": pattern, "pad": state}
+                rows.append(head | EstimateScore.of_estimates(every).row(bounds=False))
+                if pattern == "crossed bars":
+                    curves[f"{world}, {state}"] = every
+                    by_force += [
+                        {"world": world, "pad": state, "force": label}
+                        | EstimateScore.of_estimates(some).row(bounds=False)
+                        for label, some in slices(every, "force")
+                    ]
+            progress(f"{world}, {pattern}")
+    return rows, by_force, curves
+
+
+def section_rows() -> list[Row]:
+    """Closed form of an overlap against finite elements, with contact resistance too."""
+    rows = []
+    for overlap in (-1.0, 0.0, 1.0, 4.0):
+        exact = float(overlap_ratio(overlap)[0])
+        row: Row = {"overlap, thicknesses": overlap, "closed form": exact}
+        for share in (0.0, 0.05, 0.2):
+            plates = Plates(((-10.0, overlap),), ((0.0, 10.0),), 1.0, share)
+            current = solve_section(plates, fine=True)[0] * (1 + 2 * share)
+            row[f"elements, contact resistance {100 * share:g} %: difference"] = float(current - exact)
+        rows.append(row)
+    return rows
+
+
+def disc_rows(quick: bool) -> list[Row]:
+    """Displacement of a disc of radius 1 from currents by finite volumes, without any model of edges."""
+    rows = []
+    for film, gap in ((0.25, 0.4), (0.15, 0.4))[: 1 if quick else 2]:
+        cell, moved = film / 4, np.array([0.3, 0.0])
+        count, fine = round(3.2 / cell), 6
+        at = ((np.arange(count * fine) + 0.5) / fine) * cell - 1.6
+        x, y = np.meshgrid(at, at, indexing="ij")
+        p, q = (x + y) / np.sqrt(2), (y - x) / np.sqrt(2)
+        shares = [np.hypot(x - moved[0], y - moved[1]) < 1]
+        for across, along in ((-1, 1), (1, -1), (-1, -1), (1, 1)):
+            shares.append((across * p > gap / 2) & (along * q > gap / 2))
+        upper, *lower = (mask.reshape(count, fine, count, fine).mean(axis=(1, 3)) for mask in shares)
+        currents = solve_film(upper, lower, cell, film, 4)
+        found = ShearPad(DiscPattern(1, 1.0, gap, film), 1.0).estimate(currents[:, None], 1e-6)
+        rows.append(
+            {
+                "film over radius": film,
+                "gap over radius": gap,
+                "displacement over radius": float(moved[0]),
+                "estimate": float(found.motion[0, 0]),
+                "error, %": float(100 * (found.motion[0, 0] / moved[0] - 1)),
+            }
+        )
+        progress(f"disc, film {film}")
+    return rows
+
+
+def main() -> None:
+    quick = options(__doc__).parse_args().quick
+    sections, discs = section_rows(), disc_rows(quick)
+    worlds, by_force, curves = world_rows(quick)
+    page = [
+        "# Shear pads",
+        "",
+        f"{made_by()}.",
+        "",
+        "Tangential forces of the example pad of [shear pads](../shear.md): 14 mm, 12 N/mm, film of 0.15 mm. "
+        f"Every touch is on another drawn pad: tared, loaded {EARLIER_LOADS} times for 0.1 to 3 s by up to "
+        f"{MAX_FORCE_N:g} N at normal forces up to {MAX_NORMAL_N:g} N, 2 mm off the centre at most; then one "
+        f"load is scored. The contact above is known with {1e3 * CENTRE_STD_M:g} mm and "
+        f"{100 * NORMAL_STD:g} %. *As built*: stated tolerances of parts only; *calibrated*: by four loads "
+        "of 2 N, known to 1 %.",
+        "",
+        "![Observed against stated probability, crossed bars](shear.png)",
+        "",
+        *table("By world and pattern", "Force vectors; errors in newton.", worlds),
+        *table("By size of the force", "Crossed bars.", by_force),
+        *table(
+            "Overlap by finite elements",
+            "Conductance per length of edge, film of 1 S/m and thickness 1; with contact resistance of a "
+            "share of the film's at either side, referred to the whole resistance.",
+            sections,
+        ),
+        *table(
+            "Discs by finite volumes",
+            "Four cells through the film; the theory leaves out the field at the rim's ends of the gaps.",
+            discs,
+        ),
+    ]
+    folder = output_folder(quick)
+    (folder / "shear.md").write_text("\n".join(page))
+    data = {"worlds": worlds, "by_force": by_force, "sections": sections, "discs": discs}
+    (folder / "shear.json").write_text(json.dumps(data, indent=1) + "\n")
+    figure, axes = plt.subplots(figsize=(5, 5))
+    draw_calibration(axes, curves)
+    figure.tight_layout()
+    figure.savefig(folder / "shear.png", dpi=90)
+
+
+if __name__ == "__main__":
+    main()
