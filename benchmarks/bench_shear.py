@@ -160,12 +160,12 @@ def force_errors(pattern: str, world: str, seed: int) -> list[Estimates]:
     return found
 
 
-def world_rows(quick: bool) -> tuple[list[Row], list[Row], dict[str, Estimates]]:
+def world_rows(touches: int) -> tuple[list[Row], list[Row], dict[str, Estimates]]:
     """Scores by pattern and world, by size of the force, and the estimates themselves."""
     rows, by_force, curves = [], [], {}
     for world in ("default", "harsh"):
         for pattern in PATTERNS:
-            pairs = [force_errors(pattern, world, seed) for seed in range(20 if quick else 400)]
+            pairs = [force_errors(pattern, world, seed) for seed in range(touches)]
             for number, state in enumerate(("as built", "calibrated")):
                 every = concatenate([pair[number] for pair in pairs])
                 head = {"world": world, "pattern": pattern, "pad": state}
@@ -184,10 +184,10 @@ def world_rows(quick: bool) -> tuple[list[Row], list[Row], dict[str, Estimates]]
 def section_rows() -> list[Row]:
     """Closed form of an overlap against finite elements, with contact resistance too."""
     rows = []
-    for overlap in (-1.0, 0.0, 1.0, 4.0):
+    for overlap in (-1.0, 0.0, 4.0):
         exact = float(overlap_ratio(overlap)[0])
         row: Row = {"overlap, thicknesses": overlap, "closed form": exact}
-        for share in (0.0, 0.05, 0.2):
+        for share in (0.0, 0.1):
             plates = Plates(((-10.0, overlap),), ((0.0, 10.0),), 1.0, share)
             current = solve_section(plates, fine=True)[0] * (1 + 2 * share)
             row[f"elements, contact resistance {100 * share:g} %: difference"] = float(current - exact)
@@ -198,7 +198,7 @@ def section_rows() -> list[Row]:
 def disc_rows(quick: bool) -> list[Row]:
     """Displacement of a disc of radius 1 from currents by finite volumes, without any model of edges."""
     rows = []
-    for film, gap in ((0.25, 0.4), (0.15, 0.4))[: 1 if quick else 2]:
+    for film, gap in ((0.25, 0.4), (0.2, 0.4))[: 1 if quick else 2]:
         cell, moved = film / 4, np.array([0.3, 0.0])
         count, fine = round(3.2 / cell), 6
         at = ((np.arange(count * fine) + 0.5) / fine) * cell - 1.6
@@ -224,9 +224,12 @@ def disc_rows(quick: bool) -> list[Row]:
 
 
 def main() -> None:
-    quick = options(__doc__).parse_args().quick
+    parser = options(__doc__)
+    parser.add_argument("--touches", type=int, default=400, help="drawn pads of each row")
+    args = parser.parse_args()
+    quick: bool = args.quick
+    worlds, by_force, curves = world_rows(20 if quick else args.touches)
     sections, discs = section_rows(), disc_rows(quick)
-    worlds, by_force, curves = world_rows(quick)
     page = [
         "# Shear pads",
         "",
