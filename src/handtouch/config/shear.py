@@ -1,6 +1,6 @@
 """The table `[shear.NAME]`: a kind of shear pad, its electrode pattern, film and elastic layer.
 
-Public names: `Shear`, `ShearPatternTable` and the tables of its kinds, `SHEAR_PATTERNS`.
+Public names: `Shear`, `ShearPatternTable` and the tables of its kinds.
 """
 
 from __future__ import annotations
@@ -74,13 +74,6 @@ class Discs(Table):
 
 
 ShearPatternTable = Annotated[Bars | CrossedBars | Pinwheel | Discs, Field(discriminator="kind")]
-SHEAR_PATTERNS: dict[str, type[Table]] = {
-    "bars": Bars,
-    "crossed_bars": CrossedBars,
-    "discs": Discs,
-    "pinwheel": Pinwheel,
-}
-"""Table of the pattern of each kind."""
 
 
 class Shear(Table):
@@ -111,7 +104,6 @@ class Shear(Table):
     zero_std_n: Annotated[float, Field(ge=0)] = Field(
         0.02, description="error of a component at rest after the tare (1 sigma)"
     )
-    friction: Positive = Field(0.8, description="coefficient of friction assumed before a slip was observed")
 
     def build_pattern(self) -> ShearPattern:
         """Return the pattern in metres. Raises ValueError for one that can't exist."""
