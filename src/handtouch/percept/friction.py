@@ -27,8 +27,12 @@ _STUCK_SHARE = 0.7  # of the ratio of a slip: what stuck above it, stuck on anot
 _RATE_TIME_S = 0.02  # smoothing of the ratio's rate
 _HORIZON_S = 0.03
 _MIN_NORMAL_SIGMA = 3.0  # normal force in its standard deviations, below which there is no ratio
-_ALARM, _CLEAR = 0.5, 0.3  # probability of incipient slip that raises and clears it
+_STICK_S = 0.1  # a ratio that a contact held for so long stuck; a faster rise teaches nothing yet
+_ALARM, _CLEAR = 0.3, 0.15  # probability of incipient slip that raises and clears it
 _MAX_GAP_S = 0.1
+
+
+_NOTHING_HELD = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -101,13 +105,12 @@ class FrictionMonitor:
         self._ratio = [math.nan] * pads
         self._rate = [0.0] * pads
         self._alarmed = [False] * pads
-        self._contact_max = [0.0] * pads
+        self._held: list[tuple[float, float]] = [_NOTHING_HELD] * pads
 
     def end_contact(self, pad: int) -> None:
         """Forget the contact on a pad."""
         self._time_s[pad] = self._ratio[pad] = math.nan
-        self._rate[pad] = self._contact_max[pad] = 0.0
-        self._alarmed[pad] = False
+        self._rate[pad], self._alarmed[pad], self._held[pad] = 0.0, False, _NOTHING_HELD
 
     def confirm_slip(self, pad: int) -> None:
         """Learn from a slip on a pad that was observed by its motion: the ratio there is the limit."""
@@ -148,7 +151,17 @@ class FrictionMonitor:
         ahead = ratio + _HORIZON_S * max(self._rate[pad], 0.0)
         probability = self.limit.probability_below(ahead)
         self._alarmed[pad] = probability > (_CLEAR if self._alarmed[pad] else _ALARM)
-        if not (slips or self._alarmed[pad]):
-            self.limit = self.limit.after_sticking(ratio)
+        self._learn_sticking(pad, t_s, ratio, sticks=not (slips or self._alarmed[pad]))
         label = "incipient" if self._alarmed[pad] else "sticking"
         return FrictionState(ratio, spread, self._rate[pad], 1 - ratio / self.limit.mean, probability, label)
+
+    def _learn_sticking(self, pad: int, t_s: float, ratio: float, *, sticks: bool) -> None:
+        """Learn the least ratio of each span of `_STICK_S` in which a contact sticks."""
+        begin_s, least = self._held[pad]
+        if not sticks or math.isnan(begin_s):
+            self._held[pad] = (t_s, ratio) if sticks else _NOTHING_HELD
+        elif t_s - begin_s < _STICK_S:
+            self._held[pad] = begin_s, min(least, ratio)
+        else:
+            self.limit = self.limit.after_sticking(least)
+            self._held[pad] = t_s, ratio
