@@ -131,7 +131,7 @@ class FrictionMonitor:
         """Process a sample: tangential force (2,) with covariance (2, 2), normal force with its standard
         deviation; `slips`: its motion shows a slip, so that it teaches no bound.
         """
-        fx, fy = (float(value) for value in force_n)
+        fx, fy = np.asarray(force_n, np.float64).tolist()
         if not (normal_n > _MIN_NORMAL_SIGMA * normal_std_n and math.isfinite(fx + fy)):
             self.end_contact(pad)
             return _UNKNOWN
