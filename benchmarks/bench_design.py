@@ -97,8 +97,8 @@ def main() -> None:
         f"`handtouch design` for `{LINK}` of config/utah_mit.toml: worst value over the inner 80 %, within "
         "the default limits (gaps from 0.3 mm, electrodes from 3 mm, resistors to 1 kohm). *Theory* is what "
         f"is minimised; *simulated* are root mean squares over {draws} pads of the reporting family, solved "
-        f"by the simulator's finite elements, the greatest of {POINTS**2} positions: that of few pads lies above "
-        f"that of many. *ideal* and *default* are worlds. {made_by()}.",
+        f"by the simulator's finite elements, the greatest of {POINTS**2} positions: of few pads it lies "
+        f"above that of many. *ideal* and *default* are worlds. {made_by()}.",
         "",
         *table(
             "Goals",
