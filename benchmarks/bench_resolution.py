@@ -40,8 +40,9 @@ NOISE = 1e-4  # of the total, on each channel
 FALSE_ALARM, DETECTION = 1e-3, 0.9
 GAIN_STD, GAP_STD, ANISOTROPY_STD = 0.012, 0.12, 0.02  # mm for the gap; the defaults of deployments
 ELECTRODES = {4: (1, 1), 6: (1, 2), 8: (2, 2), 12: (3, 3)}  # on each of x0 and xa, and of y0 and yb
-SEPARATIONS = SIDE * np.geomspace(0.015, 0.75, 14)
+SEPARATIONS = SIDE * np.geomspace(0.01, 0.75, 24)
 MARGIN = 0.1  # of the side, of centres from the boundary
+MAX_POWER = 12  # of the separation, to which the deviation is proportional
 TIME_PERIODS = 16
 LINE_LENGTH = 4.0  # mm
 EVEN_NODES = (np.arange(16) + 0.5) / 8 - 1  # of a line
@@ -93,9 +94,9 @@ def needed_deviation(freedom: int) -> float:
 def resolved_separations(
     model: ForwardModel, x: FloatArray, y: FloatArray, angle: FloatArray, noise: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the separations (n,) from which equal pairs are more than a point, and two contacts.
+    """Return the separations (n,) from which on equal pairs are more than a point, and two contacts.
 
-    Infinite where they would leave the pad first. noise: per total, (channels, n) or a number.
+    Infinite where they leave the pad first. noise: per total, (channels, n) or a number.
     """
     half = SEPARATIONS[:, None] / 2 * np.exp(1j * angle)
     currents = model.fractions(x + half.real, y + half.imag) + model.fractions(x - half.real, y - half.imag)
@@ -122,14 +123,17 @@ def resolved_separations(
 
 
 def _crossing(deviation: FloatArray, needed: float) -> float:
-    """Return the first separation with the needed deviation, which goes by powers of it."""
-    enough = np.flatnonzero(deviation >= needed)
-    if not enough.size:
+    """Return the separation from which on all have the needed deviation, which goes by powers of it."""
+    known = np.isfinite(deviation)
+    first = np.flatnonzero(known & (deviation < needed)).max(initial=-1) + 1
+    if first == len(deviation) or not known[first]:
         return np.inf
-    first = enough[0]
     if first == 0:
         return float(SEPARATIONS[0])
     logs = np.log(np.maximum(deviation[first - 1 : first + 1], 1e-12))
+    power = (logs[1] - logs[0]) / np.log(SEPARATIONS[first] / SEPARATIONS[first - 1])
+    if power > MAX_POWER:  # a jump, where the line that is equivalent would leave the pad
+        return float(SEPARATIONS[first])
     place = (np.log(needed) - logs[0]) / (logs[1] - logs[0])
     return float(SEPARATIONS[first - 1] * (SEPARATIONS[first] / SEPARATIONS[first - 1]) ** place)
 
@@ -312,7 +316,7 @@ def draw(path: Any, found: dict[int, tuple[FloatArray, FloatArray]], rows: list[
             image = ax.imshow(
                 whole(values), origin="lower", extent=extent, vmin=0, vmax=(4, 14)[row], cmap="viridis"
             )
-            ax.set(title=f"{number} electrodes: {title}", xlabel="x, mm", ylabel="y, mm")
+            ax.set(title=f"{number}: {title}", xlabel="x, mm", ylabel="y, mm")
             ax.title.set_fontsize(9)
             figure.colorbar(image, ax=ax, label="separation, mm", shrink=0.8)
     ax = axes[1, 0]
@@ -350,8 +354,8 @@ def main() -> None:
         "",
         "![Maps of the separation; information against segments](resolution.png)",
         "",
-        "Maps: noise of 1e-4 of the total on each channel, the largest of four directions; white where no "
-        "pair that is on the pad is resolved.",
+        "Maps: number of electrodes, noise of 1e-4 of the total on each channel, the largest of four "
+        "directions; white where no pair that is on the pad is resolved.",
         "",
         *table(
             "How far apart two contacts must be",

@@ -8,6 +8,7 @@ from handtouch.field.contact_law import (
     contact_stack_resistance,
 )
 from handtouch.field.estimate import PointEstimate, estimate
+from handtouch.field.mesh_network import MeshNetwork, read_stl
 from handtouch.field.model import ForwardModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.outline import Outline
@@ -43,6 +44,7 @@ __all__ = [
     "ForwardModel",
     "Location",
     "LocatorBank",
+    "MeshNetwork",
     "Outline",
     "OutlineNetwork",
     "PerimeterNetwork",
@@ -62,6 +64,7 @@ __all__ = [
     "contact_stack_resistance",
     "estimate",
     "point_test",
+    "read_stl",
     "resolvable_separation",
     "resolve_contacts",
 ]
