@@ -184,12 +184,13 @@ def main() -> None:
         "",
         *table(
             "Alarms",
-            f"Grasps of {', '.join(objects)}; seeds: {seeds}; as in [percepts of grasps](percept_grasp.md), with "
-            "the same onsets of slips. All pads carry calibrated shear pads under MuJoCo's tangential forces, "
-            f"read at {1 / (STEPS * TIME_STEP_S):.0f} Hz; normal forces have an error of {100 * NORMAL_STD:g} %. "
-            f"An alarm from {EARLY_S:g} s before an onset to {LATE_S:g} s after it is of that slip, any other "
-            "one is false; delays are negative before the onset. *Learned*: a slip teaches its ratio "
-            f"{CONFIRMED_S:g} s after its onset, as if position had confirmed it, to all pads of the hand.",
+            f"Grasps of {', '.join(objects)}; seeds: {seeds}; as in [percepts of "
+            "grasps](percept_grasp.md), with the same onsets of slips. All pads carry calibrated shear pads "
+            f"under MuJoCo's tangential forces, read at {1 / (STEPS * TIME_STEP_S):.0f} Hz; normal forces "
+            f"have an error of {100 * NORMAL_STD:g} %. An alarm from {EARLY_S:g} s before an onset to "
+            f"{LATE_S:g} s after it is of that slip, any other one is false; delays are negative before the "
+            f"onset. *Learned*: a slip teaches its ratio {CONFIRMED_S:g} s after its onset, as if position "
+            "had confirmed it, to all pads of the hand.",
             rows,
         ),
     ]
