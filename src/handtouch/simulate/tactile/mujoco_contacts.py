@@ -1,6 +1,6 @@
 """Contact points on the links of a hand in a MuJoCo simulation.
 
-Public names: `LinkPoints` (points on the links), `ContactReader` (reads them from MuJoCo's data).
+Public names: `LinkPoints` (points on the links), `NO_POINTS`, `ContactReader` (reads MuJoCo's data).
 """
 
 from __future__ import annotations
@@ -17,15 +17,6 @@ from handtouch import config
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-_Columns = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]
-
-_NO_COLUMNS: _Columns = (
-    np.zeros(0, np.intp),
-    np.zeros(0, np.intp),
-    np.zeros((0, 3)),
-    np.zeros((0, 3)),
-    np.zeros(0),
-)
 
 
 @dataclass(frozen=True)
@@ -52,6 +43,9 @@ class LinkPoints:
         )
 
 
+NO_POINTS = LinkPoints(*(np.zeros(0, np.intp),) * 2, *(np.zeros((0, 3)),) * 2, np.zeros(0))
+
+
 class ContactReader:
     """Reads the contacts of the pads of a deployment from data of a model.
 
@@ -73,35 +67,38 @@ class ContactReader:
 
     def read(self, states: Sequence[Any]) -> LinkPoints:
         """Return the contacts of environments with the data `states`, after a step or mj_forward."""
-        found = [self._read_one(number, data) for number, data in enumerate(states)]
-        columns = [np.concatenate(column) for column in zip(*found, strict=True)]
-        return LinkPoints(*columns)
-
-    def _read_one(self, environment: int, data: Any) -> _Columns:
-        if not data.ncon:
-            return _NO_COLUMNS
-        contacts = data.contact
-        geoms = contacts.geom.reshape(-1, 2)
-        side, pad, number = np.nonzero(self._senses[:, geoms.T].transpose(1, 0, 2))
-        pressed = contacts.efc_address[number] >= 0
-        side, pad, number = side[pressed], pad[pressed], number[pressed]
-        k = len(pad)
-        if not k:
-            return _NO_COLUMNS
+        touched = [number for number, data in enumerate(states) if data.ncon]
+        if not touched:
+            return NO_POINTS
+        found = [states[number] for number in touched]
+        contacts = [data.contact for data in found]
+        geoms = np.concatenate([each.geom for each in contacts]).reshape(-1, 2)
+        address = np.concatenate([each.efc_address for each in contacts])
+        counts = [data.ncon for data in found]
+        begins = np.cumsum([0, *counts])
+        owners = np.repeat(np.arange(len(found)), counts)
+        side, pad, contact = np.nonzero(self._senses[:, geoms.T].transpose(1, 0, 2) & (address >= 0))
+        order = np.argsort(owners[contact], kind="stable")
+        side, pad, contact = side[order], pad[order], contact[order]
+        owner, bodies, k = owners[contact], self._bodies[pad], len(pad)
         forces = np.empty((k, 6))
-        for row, contact in enumerate(number.tolist()):
-            mujoco.mj_contactForce(self._model, data, contact, forces[row])
+        for row, (data, index) in enumerate(
+            zip(owner.tolist(), (contact - begins[owner]).tolist(), strict=True)
+        ):
+            mujoco.mj_contactForce(self._model, found[data], index, forces[row])
+        frames = np.concatenate([each.frame for each in contacts]).reshape(-1, 3, 3)[contact]
         # rows of a contact's frame: its normal, from the first geom to the second, and two tangents
-        on_second = np.einsum("ki,kij->kj", forces[:, :3], contacts.frame[number].reshape(k, 3, 3))
+        on_second = np.einsum("ki,kij->kj", forces[:, :3], frames)
         on_link = np.where(side[:, None] == 1, on_second, -on_second)
-        bodies = self._bodies[pad]
-        rotation = data.xmat[bodies].reshape(k, 3, 3)
-        return (
-            np.full(k, environment),
+        rotation = np.stack([data.xmat for data in found])[owner, bodies].reshape(k, 3, 3)
+        origin = np.stack([data.xpos for data in found])[owner, bodies]
+        position = np.concatenate([each.pos for each in contacts])[contact]
+        return LinkPoints(
+            np.array(touched)[owner],
             pad,
-            np.einsum("kji,kj->ki", rotation, contacts.pos[number] - data.xpos[bodies]),
+            np.einsum("kji,kj->ki", rotation, position - origin),
             np.einsum("kji,kj->ki", rotation, on_link),
-            self._curvature[geoms[number, 1 - side]],
+            self._curvature[geoms[contact, 1 - side]],
         )
 
 

@@ -17,7 +17,7 @@ from handtouch.config.channels import order_by_electrode, resolve_channels
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import CountSlab
-from handtouch.simulate.tactile.mujoco_contacts import ContactReader, LinkPoints
+from handtouch.simulate.tactile.mujoco_contacts import NO_POINTS, ContactReader, LinkPoints
 from handtouch.simulate.tactile.simulated_pads import SimulatedPads
 from handtouch.simulate.worlds import WORLDS, World
 from handtouch.wire import PadState
@@ -120,9 +120,8 @@ class TactileSensor:
         self._cores = _pipelines(deployment, environments, self._period_ns)
         self._samples = 0
         self._restarted: set[int] = set()
-        untouched = LinkPoints(*(np.zeros(0, np.intp),) * 2, *(np.zeros((0, 3)),) * 2, np.zeros(0))
         for _ in range(round(settling_s / self.period_s)):
-            self._process(self._sample(untouched))
+            self._process(self._sample(NO_POINTS))
 
     @property
     def steps(self) -> int:
