@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from skfem import Basis, BilinearForm, ElementTriP3, MeshTri, condense, solve
+from skfem.helpers import dot, grad
 
 from handtouch.field import BoundaryElectrode, MeshNetwork, Outline, OutlineNetwork, read_stl
 
@@ -108,6 +110,26 @@ def test_the_potential_of_a_strip_is_the_integral_of_its_varying_resistance() ->
     assert fractions[1] == pytest.approx(np.expm1(x) / whole, abs=3e-4)
     assert jacobian[1, 0] == pytest.approx(np.exp(x) / whole, abs=0.03)
     assert pad.conductance == pytest.approx(np.array([[1, -1], [-1, 1]]) / whole, rel=1e-3)
+
+
+def test_a_resistance_that_varies_along_and_across_equals_finite_elements_of_third_order() -> None:
+    def resistance(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(np.exp(0.8 * x * y + 0.5 * np.sin(3 * y - x)))
+
+    conduction = BilinearForm(lambda u, v, w: dot(grad(u), grad(v)) / resistance(*w.x))
+    basis = Basis(MeshTri.init_tensor(np.linspace(0, 2, 17), np.linspace(0, 1, 9)), ElementTriP3())
+    operator = conduction.assemble(basis)
+    right = basis.get_dofs(lambda x: x[0] > 2 - 1e-9)
+    held = np.concatenate([basis.get_dofs(lambda x: x[0] < 1e-9).flatten(), right.flatten()])
+    values = np.zeros(basis.N)
+    values[right.flatten()] = 1.0
+    values = solve(*condense(operator, x=values, D=held))
+    points, triangles = strip()
+    centres = points[triangles].mean(axis=1)
+    pad = MeshNetwork(points, triangles, SIDES, SHEET, relative_resistance=resistance(*centres[:, :2].T))
+    x, y = np.random.default_rng(3).uniform(0.02, 0.98, (2, 50)) * [[2], [1]]
+    assert pad.fractions(x, y)[1] == pytest.approx(basis.probes(np.stack([x, y])) @ values, abs=5e-4)
+    assert pad.conductance[1, 1] == pytest.approx(values @ operator @ values, rel=1e-3)
 
 
 def test_a_sloped_strip_is_a_longer_one() -> None:
