@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 
 _STENCIL = 7  # nodes that a slope is computed from
 _FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB
-CELLS_PER_TOLERANCE_CELL = 3  # tables of tolerances have 1.8 MB
+CELLS_PER_TOLERANCE_CELL = 3  # tables of tolerances have 0.9 MB
 _TOLERANCE_STEP = 3e-5  # of differences, in sides
 _PATCH_STEP = 0.02  # of second differences: currents of a patch vary no faster
 _EDGE_CELL, _ELECTRODE_END_CELL = 0.003, 0.008
@@ -76,10 +76,10 @@ class ForwardTable:
     of the nodes and their derivatives by cell. search_fractions: (81, n), search_cells: (2, 9), see
     `ModelTable`.
 
-    tolerance_nodes: (37, 37, 4, 10 n), on every third node: fields of the 2 n ends of electrodes, and
-    derivatives of the fractions by the logarithm of a / b, by waves of the sheet resistance, and second ones
-    by x x and x y, see `PadTolerances`. end_vectors: (2 n, n),
-    derivatives of the fractions by the bare length at each end, two of each electrode, per its field.
+    tolerance_nodes: (37, 37, 4, 10 n), on every third node, in single precision: fields of the 2 n ends of
+    electrodes, and derivatives of the fractions by the logarithm of a / b, by waves of the sheet resistance,
+    and second ones by x x and x y, see `PadTolerances`. end_vectors: (2 n, n), derivatives of the fractions
+    by the bare length at each end, two of each electrode, per its field.
     series_vectors: (n, n), by the logarithm of each resistor, per its electrode's fraction.
     """
 
@@ -88,7 +88,7 @@ class ForwardTable:
     nodes_y: FloatArray
     search_fractions: FloatArray
     search_cells: FloatArray
-    tolerance_nodes: FloatArray
+    tolerance_nodes: NDArray[np.float32]
     end_vectors: FloatArray
     series_vectors: FloatArray
 
@@ -187,7 +187,7 @@ class _Axis:
 
 def _tabulate_tolerances(
     network: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[NDArray[np.float32], FloatArray]:
     """Return nodes of the fields of a network's ends and of the derivatives by its aspect and by waves of its
     sheet's resistance, and the vectors of its ends.
 
@@ -226,7 +226,7 @@ def _tabulate_tolerances(
     columns = np.concatenate(
         [fields, by_aspect, by_waves.reshape(-1, *s.shape), *_second_derivatives(network, s, t)]
     )
-    return hermite_table(np.moveaxis(columns, 0, -1)), np.array(vectors)
+    return hermite_table(np.moveaxis(columns, 0, -1)).astype(np.float32), np.array(vectors)
 
 
 def _second_derivatives(

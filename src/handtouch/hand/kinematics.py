@@ -64,6 +64,7 @@ class HandKinematics:
         self._offset = np.array([joint.mimic[2] if joint.mimic else 0.0 for joint in tree])
         self.palm_joint_mask, self.base_joint_mask = (np.abs(signs) @ moved_by > 0 for signs in self._signs)
         self._poses = np.tile(np.eye(4), (1 + len(tree), 1, 1))  # of the root and the joints' child links
+        self._twists: tuple[FloatArray, FloatArray] | None = None  # at the present positions, if needed
         self.set_joint_positions(np.zeros(m))
 
     def set_joint_positions(self, position_rad: FloatArray) -> None:
@@ -77,6 +78,7 @@ class HandKinematics:
         local = self._origins @ motion
         for children, parents in self._levels:
             self._poses[children] = self._poses[parents] @ local[children - 1]
+        self._twists = None
 
     def pose_in_palm(self, link: int) -> LinkPose:
         """Return the pose of link number `link` in the palm frame."""
@@ -95,14 +97,23 @@ class HandKinematics:
         """Return the derivative (3, m) [m/rad] of a point (3,) of the link by the joints, in palm or base
         frame.
         """
-        pose, joints = self._poses[self._frames[link]], self._poses[1:]
-        point = pose[:3, :3] @ position_m + pose[:3, 3]
-        axes = (joints[:, :3, :3] @ self._axes[:, :, None])[:, :, 0]
-        moved = self._turns[:, None] * np.cross(axes, point - joints[:, :3, 3])
-        moved += (joints[:, :3, :3] @ self._slides[:, :, None])[:, :, 0]
-        moved *= self._signs[in_base][link][:, None]
+        pose = self._poses[self._frames[link]]
+        x, y, z = pose[:3, :3] @ position_m + pose[:3, 3]
+        lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # cross products of rows with the point
+        turning, moving = self._joint_twists()
+        moved = (turning @ lever + moving) * self._signs[in_base][link][:, None]
         reference = self._poses[self._base if in_base else self._palm]
         return np.asarray((moved @ reference[:3, :3]).T @ self._matrix)
+
+    def _joint_twists(self) -> tuple[FloatArray, FloatArray]:
+        """Return the angular velocities (t, 3) that the tree's joints cause, each at a rate of 1, and the
+        velocities of the root's origin."""
+        if self._twists is None:
+            rotation, origin = self._poses[1:, :3, :3], self._poses[1:, :3, 3]
+            turning = (rotation @ self._axes[:, :, None])[:, :, 0] * self._turns[:, None]
+            sliding = (rotation @ self._slides[:, :, None])[:, :, 0]
+            self._twists = turning, np.cross(origin, turning) + sliding
+        return self._twists
 
     def _relative_pose(self, seen_from: int, link: int) -> LinkPose:
         reference, pose = self._poses[seen_from], self._poses[self._frames[link]]

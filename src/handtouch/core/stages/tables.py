@@ -66,7 +66,8 @@ def read_table(
 def read_values(
     table: memoryview[float], cells: int, columns: int, s: float, t: float, out: memoryview[float]
 ) -> None:
-    """Write the values of all columns at (s, t) into `out`, (columns,); see `read_table`."""
+    """Write the values of all columns at (s, t) of a table in single precision into `out`, (columns,); see
+    `read_table`."""
     i, j = int(s), int(t)
     if i > cells - 1:
         i = cells - 1

@@ -5,7 +5,8 @@ from handtouch.core.stages cimport tables
 cdef Py_ssize_t _WAVES
 
 cdef class PadTolerances:
-    cdef double[::1] values, end_vectors, series_vectors
+    cdef float[::1] values
+    cdef double[::1] end_vectors, series_vectors
     cdef Py_ssize_t cells
     cdef double cell_ratio, aspect_std, wave_std, series_std, sheet_std, middle_u_m, size_x, size_y
     cdef double[::1] elongations
