@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from handtouch.hand.urdf import MOVABLE_JOINT_TYPES, RobotDescription, UrdfJoint
 
 FloatArray = NDArray[np.float64]
+_IDENTITY = np.eye(3)
 
 
 class LinkPose(NamedTuple):
@@ -69,11 +70,13 @@ class HandKinematics:
 
     def set_joint_positions(self, position_rad: FloatArray) -> None:
         """Set the joint positions (m,): radians, metres for prismatic joints. NaN counts as 0."""
-        moved = self._matrix @ np.nan_to_num(position_rad) + self._offset
+        if np.isnan(position_rad).any():
+            position_rad = np.nan_to_num(position_rad)
+        moved = self._matrix @ position_rad + self._offset
         angle = moved * self._turns
         sine, versine = np.sin(angle)[:, None, None], (2.0 * np.sin(0.5 * angle) ** 2)[:, None, None]
         motion = self._motion
-        motion[:, :3, :3] = np.eye(3) + sine * self._cross + versine * self._cross_squared  # Rodrigues
+        motion[:, :3, :3] = sine * self._cross + versine * self._cross_squared + _IDENTITY  # Rodrigues
         motion[:, :3, 3] = self._slides * moved[:, None]
         local = self._origins @ motion
         for children, parents in self._levels:
