@@ -25,7 +25,7 @@ from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches
 from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
-from handtouch.core.stages.force import LAW_PARAMETERS, MIN_RADIUS_RATIO, RADIUS_NODES, PadLaw
+from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.core.stages.tolerances import PadTolerances, part_count
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
@@ -47,6 +47,7 @@ _SHEET_TOLERANCES = {
 
 
 PART_COUNT = part_count(4)
+_MIN_RADIUS_RATIO = 0.3  # least radius of a contact, relative to the stated one
 _LOCAL_UNEVENNESS = 1.5  # standard deviation of ln of the local sheet resistance, per wave's: a sum of five
 
 
@@ -317,23 +318,17 @@ class PadModel:
             float(np.ravel(column)[0])
             for column in (law.contact_ohm_m2, law.alpha, law.radius_m, law.radius_std_m, law.reference_pa)
         )
-        variances, axes = np.linalg.eigh(np.array(self.law(pad).covariance))
-        self.law_parameters[pad, :7] = (
-            math.log(layer) + alpha * math.log(reference),
-            alpha,
-            math.log(radius),
-            radius_std / radius,
-            math.log(self._sheet_ohm[pad]),
-            self._drive_v[pad],
-            math.log(reference),
+        log_radius, radius_variance = _log_radius(radius, radius_std)
+        log_sheet, greatest_n = math.log(self._sheet_ohm[pad]), self._parts[pad][2].max_force_n
+        log_reference_n = math.log(math.pi * reference) + 2 * log_radius
+        # x^2 = A^2 rho / sigma, here at 1 N
+        log_x2 = log_sheet + 2 * log_radius - math.log(layer) - alpha * log_reference_n
+        log_max_x2 = log_x2 + alpha * math.log(greatest_n) if greatest_n else math.inf
+        self.law_parameters[pad] = (
+            *(log_x2, 1 / alpha, 2 - 2 * alpha, log_radius, radius_variance, log_sheet, self._drive_v[pad]),
+            *(log_x2 / alpha + log_reference_n, *np.array(self.law(pad).covariance)[np.triu_indices(3)]),
+            *(log_max_x2, float(stack_factor(np.exp(0.5 * log_max_x2))) if greatest_n else 0.0),
         )
-        self.law_parameters[pad, 7:16] = (axes * np.sqrt(np.maximum(variances, 0.0))).T.ravel()
-        greatest_n = self._parts[pad][2].max_force_n
-        if greatest_n:
-            ratio = np.maximum(1 + np.array(RADIUS_NODES) * radius_std / radius, MIN_RADIUS_RATIO)
-            # specific resistances go as area^alpha
-            x = radius * np.sqrt(self._sheet_ohm[pad] / law.resistivity(greatest_n)) * ratio ** (1 - alpha)
-            self.law_parameters[pad, 16:] = stack_factor(x)
 
     def stage_tolerances(self) -> list[PadTolerances]:
         """Return the tolerances of the pads' parts as the stages take them."""
@@ -363,6 +358,15 @@ class PadModel:
     def _threshold_current(self, force_n: FloatArray) -> FloatArray:
         """Return the total current of a contact of that force at the centre of each pad."""
         return self._law.current(force_n, self._drive_v, self._sheet_ohm, *self._centre_spreading)
+
+
+def _log_radius(radius: float, std: float) -> tuple[float, float]:
+    """Return mean and variance of the logarithm of a contact radius."""
+    sigma = np.linspace(-5.0, 5.0, 401)
+    log_ratio = np.log(np.maximum(1 + sigma * std / radius, _MIN_RADIUS_RATIO))
+    weight = np.exp(-0.5 * sigma**2)
+    mean = float(np.average(log_ratio, weights=weight))
+    return math.log(radius) + mean, float(np.average(np.square(log_ratio - mean), weights=weight))
 
 
 def _triangle(covariance: FloatArray) -> FloatArray:

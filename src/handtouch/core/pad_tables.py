@@ -21,6 +21,7 @@ from handtouch.core.stages.force import StackTable
 from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.tables import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
+from handtouch.field.contact_stack import stack_factor
 from handtouch.field.model import spreading_radius
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.surface import Surface
@@ -44,6 +45,8 @@ _MAX_SURFACE_ERROR = 1e-7
 """Of a pad's size, between the nodes."""
 _STACK_INTERVALS = 2048
 _MIN_LOG_FACTOR, _MAX_LOG_FACTOR = -16.0, 32.0
+_MIN_LOG_X2, _MAX_LOG_X2, _LOG_X2_WIDTH = -24.0, 24.0, 1 / 16
+FORCE_NODES = 12
 
 
 def hermite_table(values: FloatArray) -> FloatArray:
@@ -312,11 +315,19 @@ def _mid_cell_values(nodes: FloatArray) -> FloatArray:
 
 @cache
 def stack_table() -> StackTable:
-    """Return the inverse of the contact stack's factor: cubics of its logarithm."""
+    """Return the contact stack's factor by ln x^2, its inverse, and the nodes of integrals over ln x^2."""
     knots = np.linspace(_MIN_LOG_FACTOR, _MAX_LOG_FACTOR, _STACK_INTERVALS + 1)
     width = float(knots[1] - knots[0])
     level, by_factor = log_stack_inverse(np.exp(knots))
     slope = by_factor * np.exp(knots) * width
     chord, left, right = np.diff(level), slope[:-1], slope[1:]
     pieces = np.stack([left + right - 2 * chord, 3 * chord - 2 * left - right, left, level[:-1]], axis=1)
-    return StackTable(view_memory(np.ascontiguousarray(pieces)), _STACK_INTERVALS, _MIN_LOG_FACTOR, width)
+    log_x2 = np.arange(_MIN_LOG_X2, _MAX_LOG_X2 + _LOG_X2_WIDTH / 2, _LOG_X2_WIDTH)
+    factor = stack_factor(np.exp(log_x2 / 2))
+    by_log_x2 = (1 - np.exp(log_x2) * np.square(factor)) / 2
+    points, weights = np.polynomial.legendre.leggauss(FORCE_NODES)
+    return StackTable(
+        *(view_memory(np.ascontiguousarray(pieces)), _MIN_LOG_FACTOR, width),
+        *(view_memory(np.stack([factor, by_log_x2 * _LOG_X2_WIDTH], axis=1)), _MIN_LOG_X2, _LOG_X2_WIDTH),
+        view_memory(np.stack([(1 + points) / 2, weights], axis=1)),
+    )

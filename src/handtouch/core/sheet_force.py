@@ -402,7 +402,7 @@ def sheet_behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
         model,
         uncertainty,
         behaviour.gain_std,
-        behaviour.back_force_std_n,
+        behaviour.back_force_std_n * float(np.max(model.adaptation.share)),
         behaviour.forget_time_s,
         behaviour.slow_creep,
     )

@@ -3,9 +3,13 @@
 The same law as `handtouch.field.contact_law`, which is the reference for contacts far from edges whose
 parameters are exact. The force is the geometric mean of its probability given the current, and its standard
 deviation the root of the mean square difference from it: all forces up to the greatest of a contact are
-equally likely before (by their logarithm), and the stack factor that the current leaves is normal about that
-of each force and radius, with the variance of noise, law and distance from the edge at that force. So it
-holds near the maximum current of the sheet, where forces hardly differ in current.
+equally likely before (by their logarithm), and the logarithm of the resistance that the current leaves is
+normal about that of each force, with the variance of noise, law, contact radius and distance from the edge at
+that force. So it holds near the maximum current of the sheet, where forces hardly differ in current.
+
+The integral is over ln x^2 = ln(A^2 rho / sigma), which is linear in the logarithm of the force. The radius
+A is log-normal: mean and variance by it are those of the second-order expansion of that logarithm, whose
+second derivative follows from the first, d f / d ln x^2 = (1 - x^2 f^2) / 2.
 """
 
 from __future__ import annotations
@@ -15,56 +19,53 @@ import math
 from handtouch.field import contact_law
 
 _VALID, _LOWER_BOUND, _NOT_ESTIMATED = 0, 1, 2  # of a result's status
-_LOG_LAYER, _ALPHA, _LOG_RADIUS, _RADIUS_STD, _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _AXES = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-)
-_MIN_FACTORS = 16
-LAW_PARAMETERS = 19
-RADIUS_NODES = (0.0, 1.7320508075688772, -1.7320508075688772)
-"""Errors of the radius, in standard deviations, that the quadrature evaluates (Gauss and Hermite)."""
-MIN_RADIUS_RATIO = 0.25
-"""Least radius of these, relative to the stated one."""
-_RADIUS_NODE, _MIN_RADIUS_RATIO = RADIUS_NODES[1], MIN_RADIUS_RATIO
-_MIDDLE_WEIGHT, _OUTER_WEIGHT = 2.0 / 3.0, 1.0 / 6.0
+_LOG_X2, _PER_ALPHA, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE = 0, 1, 2, 3, 4
+_LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR = 5, 6, 7, 8, 14, 15
+LAW_PARAMETERS = 16
 _BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_CURRENT_FRACTION
 _MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
-_MIN_CURRENT_A = 1e-200
-_TWO_PI, _LOG_PI, _INFINITY = 2.0 * math.pi, math.log(math.pi), math.inf
-_NAN = float("nan")
-_STEP_SIGMA, _MAX_SIGMA, _MAX_NODES = 0.9, 3.2, 32  # of the quadrature over the stack factor
+_MIN_CURRENT_A, _MIN_LEFT = 1e-200, 1e-12
+_TWO_PI, _INFINITY, _NAN = 2.0 * math.pi, math.inf, float("nan")
+_MAX_SIGMA = 3.3  # of the quadrature over the stack factor
 _MIN_RELATIVE_VARIANCE = 1e-18
 _UNLIMITED_SIGMA = 3.0
+_MAX_LOG_FORCE = 300.0
 
 
 class StackTable:
-    """Inverse of the stack factor I0(x) / (x I1(x)): ln x^2 as cubic polynomials of the factor's logarithm.
+    """The stack factor I0(x) / (x I1(x)) as a function of ln x^2, its inverse, and nodes of a quadrature.
 
-    coefficients: (4 intervals,), highest power first, intervals of `width` from `first` on.
+    inverse: (4 inverse_intervals,) cubics of ln x^2 by the factor's logarithm, highest power first, intervals
+    of `inverse_width` from `inverse_first` on. values: (2 (intervals + 1),) the factor and its derivative per
+    interval at ln x^2 = first + k width. nodes: (2 count,) of Gauss and Legendre on 0 to 1, and weights.
     """
 
-    def __init__(self, coefficients: memoryview[float], intervals: int, first: float, width: float) -> None:
-        self.coefficients = coefficients
-        self.intervals = intervals
-        self.first = first
-        self.width = width
+    def __init__(
+        self,
+        inverse: memoryview[float],
+        inverse_first: float,
+        inverse_width: float,
+        values: memoryview[float],
+        first: float,
+        width: float,
+        nodes: memoryview[float],
+    ) -> None:
+        self.inverse, self.inverse_intervals = inverse, len(inverse) // 4
+        self.inverse_first, self.inverse_width = inverse_first, inverse_width
+        self.values, self.intervals = values, len(values) // 2 - 1
+        self.first, self.per_width = first, 1.0 / width
+        self.nodes, self.node_count = nodes, len(nodes) // 2
 
 
 class PadLaw:
     """Contact law of one pad, in logarithms, and what it is applied to.
 
-    parameters: (LAW_PARAMETERS,) ln of specific resistance times reference pressure^alpha; alpha; ln of the
-    contact radius [m] and its standard deviation; ln of the sheet resistance; drive voltage; ln of the
-    reference pressure; three axes of the calibrated law's covariance, one standard deviation each of (ln
-    specific resistance, alpha, ln sheet resistance); and the stack factors of the greatest force, at the
-    radii of RADIUS_NODES, 0 where it is unknown. series: (n n,) quadratic form of the series resistors [ohm];
-    has_series: any isn't 0.
+    parameters: (LAW_PARAMETERS,) ln x^2 at 1 N; 1 / alpha; 2 - 2 alpha, derivative of ln x^2 by that of the
+    radius at one force; mean of the logarithm of the contact radius [m], and its variance; ln of the sheet
+    resistance; drive voltage; ln of the force at the reference pressure; upper triangle of the calibrated
+    law's covariance (ln specific resistance, alpha, ln sheet resistance); and ln x^2 with its stack factor at
+    the greatest force, infinite and 0 where that is unknown. series: (n n,) quadratic form of the series
+    resistors [ohm]; has_series: any isn't 0.
     """
 
     def __init__(self, parameters: memoryview[float], series: memoryview[float], has_series: bool) -> None:
@@ -76,19 +77,18 @@ class PadLaw:
 class ForceResult:
     """Force of one contact [N]; `std_n` is infinite where `status` is LOWER_BOUND.
 
-    The rest is working memory. `whole`, `resistors`, `log_spreading_m`, `gradient2`, `variance`: of the
-    contact, see `estimate_force`; `log_radius_m` assumed for it. Of the force that leaves a stack factor:
-    `log_force`, its derivative `slope` by the factor, the factor's standard deviation `std`, and the
-    difference `excess` of what the current leaves from it. `weights`, `log_mean`, `mean`, `square`: integrals
-    of the probability, and of the force relative to that of `log_unit`: its logarithm, itself, its square.
+    The rest is working memory. Of the contact: `left`, stack factor and spreading that its current leaves;
+    `high`, `low` and `bend`: limits of the spreading, the lower one less `bend` times the share of the
+    current that adapts to the edge; `by_radius`: derivative of their mean; `variance`, see `estimate_force`.
+    At one ln x^2: standard deviation `std` of `left`; `sigma`, by how many of them its logarithm is above the
+    expected one; `density` of the logarithm, over that of `sigma`; and ln x^2 a standard deviation, `step`.
     """
 
     def __init__(self) -> None:
         self.force_n = self.std_n = _NAN
         self.status = _NOT_ESTIMATED
-        self.whole = self.resistors = self.log_spreading_m = self.gradient2 = self.variance = 0.0
-        self.log_radius_m = self.log_force = self.slope = self.std = self.excess = 0.0
-        self.weights = self.log_mean = self.mean = self.square = self.log_unit = 0.0
+        self.left = self.high = self.low = self.bend = self.by_radius = self.variance = 0.0
+        self.sigma = self.std = self.step = self.density = 0.0
 
 
 def estimate_force(
@@ -112,118 +112,125 @@ def estimate_force(
     result.status = _NOT_ESTIMATED
     if not total_a > _BOUND_SIGMA * total_std_a:
         return
-    p = law.parameters
     whole = whole_factor(law, total_a)
     noise = whole * total_std_a / total_a
-    result.whole, result.resistors = whole, _TWO_PI * math.exp(-p[_LOG_SHEET]) * series_ohm
-    result.log_spreading_m, result.gradient2 = log_spreading_m, gradient2
+    resistors = whole / law.parameters[_DRIVE] * total_a * series_ohm
+    ratio = log_spreading_m - law.parameters[_LOG_RADIUS]
+    result.left = max(whole - resistors, _MIN_LEFT)
+    result.high, result.low = max(ratio, _MIN_LOG_SPREADING_RATIO), max(ratio, 0.0)
+    result.bend = 0.0
+    if gradient2 > 0.0:
+        result.bend = 0.25 * min(gradient2 * math.exp(2.0 * law.parameters[_LOG_RADIUS]), 1.0)
+    result.by_radius = 0.0
+    if ratio > 0.0:
+        result.by_radius = -1.0 if ratio > _MIN_LOG_SPREADING_RATIO else -0.5
     result.variance = max(noise * noise + position_variance, 0.0)
-    result.log_radius_m = p[_LOG_RADIUS]
-    spread = max(log_spreading_m - p[_LOG_RADIUS], _MIN_LOG_SPREADING_RATIO)
-    limit = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (spread + result.resistors)
-    least = max(p[_MIN_FACTORS], limit)
-    _evaluate_factor(stack, law, result, least)
-    by_radius = (-1.0 + (2.0 - 2.0 * p[_ALPHA]) / (result.slope * p[_ALPHA])) * p[_RADIUS_STD]
-    std = math.sqrt(result.std * result.std + by_radius * by_radius)
-    # without a greatest force, those from the limit on are equally likely, and have no mean
-    reach = -_BOUND_SIGMA if p[_MIN_FACTORS] > limit else _UNLIMITED_SIGMA
-    result.status = _LOWER_BOUND
-    if result.excess > reach * std:
-        result.log_unit = result.log_force
-        result.weights = result.log_mean = result.mean = result.square = 0.0
-        _integrate(stack, law, result, 0.0, _MIDDLE_WEIGHT, least)
-        if p[_RADIUS_STD] > 0.0:
-            _integrate(stack, law, result, _RADIUS_NODE, _OUTER_WEIGHT, max(p[_MIN_FACTORS + 1], limit))
-            _integrate(stack, law, result, -_RADIUS_NODE, _OUTER_WEIGHT, max(p[_MIN_FACTORS + 2], limit))
-        if result.weights > 0.0:
-            force = math.exp(result.log_mean / result.weights)
-            mean_square = (result.square - 2.0 * force * result.mean) / result.weights + force * force
-            unit = math.exp(min(300.0, result.log_unit))
-            result.force_n = unit * force
-            result.std_n = unit * math.sqrt(max(mean_square, _MIN_RELATIVE_VARIANCE * force * force))
-            result.status = _VALID
-    if result.status == _LOWER_BOUND:
-        result.log_radius_m = p[_LOG_RADIUS]
-        _evaluate_factor(stack, law, result, max(least + result.excess + _BOUND_SIGMA * std, least))
-        result.force_n, result.std_n = math.exp(min(300.0, result.log_force)), _INFINITY
+    # beyond a share of the maximum current, forces hardly differ in current
+    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (result.high + resistors)
+    is_limited = law.parameters[_MIN_FACTOR] >= least
+    top = law.parameters[_MAX_LOG_X2]
+    if not is_limited:
+        top = find_log_x2(stack, least)
+    least = max(least, law.parameters[_MIN_FACTOR])
+    log_x2 = min(find_log_x2(stack, max(result.left - 0.5 * (result.high + result.low), least)), top)
+    _evaluate(stack, law, result, log_x2)
+    if log_x2 >= top or not is_limited:
+        sigma, std = result.sigma, result.std
+        if log_x2 < top:
+            _evaluate(stack, law, result, top)
+            sigma, std = result.sigma, result.std
+            _evaluate(stack, law, result, log_x2)
+        # without a greatest force, those from the limit on are equally likely, and have no mean
+        if not sigma > (-_BOUND_SIGMA if is_limited else _UNLIMITED_SIGMA):
+            log_x2 = find_log_x2(stack, least + max((sigma + _BOUND_SIGMA) * std, 0.0))
+            log_force = (log_x2 - law.parameters[_LOG_X2]) * law.parameters[_PER_ALPHA]
+            result.force_n, result.std_n = math.exp(min(_MAX_LOG_FORCE, log_force)), _INFINITY
+            result.status = _LOWER_BOUND
+            return
+    _integrate(stack, law, result, log_x2, top)
 
 
-def _integrate(
-    stack: StackTable, law: PadLaw, result: ForceResult, radius_sigma: float, share: float, least: float
-) -> None:
-    """Add the integrals over the stack factor, from the least one up, at a radius of this probability.
-
-    Trapezoids: steps are in proportion to the factor's standard deviation.
-    """
-    p = law.parameters
-    ratio = max(1.0 + radius_sigma * p[_RADIUS_STD], _MIN_RADIUS_RATIO)
-    result.log_radius_m = p[_LOG_RADIUS] + math.log(ratio)
-    factor, step_before = _lowest_factor(stack, law, result, least), 0.0
-    for _ in range(_MAX_NODES):
-        _evaluate_factor(stack, law, result, factor)
-        sigma = result.excess / result.std
-        step = _STEP_SIGMA * result.std
-        weight = 0.5 * (step_before + step) * share * math.exp(-0.5 * sigma * sigma)
-        weight *= -result.slope / result.std
-        log_force = result.log_force - result.log_unit
+def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float, top: float) -> None:
+    """Integrate over ln x^2 up to `top`, about a likely one, at which the result was evaluated."""
+    per_alpha = law.parameters[_PER_ALPHA]
+    low = max(stack.first, log_x2 - (_MAX_SIGMA + result.sigma) * result.step)
+    high = min(top, log_x2 + (_MAX_SIGMA - result.sigma) * result.step)
+    _evaluate(stack, law, result, low)
+    low = max(stack.first, low - (_MAX_SIGMA + result.sigma) * result.step)
+    if high < top:
+        _evaluate(stack, law, result, high)
+        high = min(top, high + (_MAX_SIGMA - result.sigma) * result.step)
+    weights = log_mean = mean = square = 0.0
+    for k in range(stack.node_count):
+        at = low + (high - low) * stack.nodes[2 * k]
+        _evaluate(stack, law, result, at)
+        weight = stack.nodes[2 * k + 1] * math.exp(-0.5 * result.sigma * result.sigma) * result.density
+        log_force = (at - log_x2) * per_alpha
         force = math.exp(log_force)
-        result.weights += weight
-        result.log_mean += weight * log_force
-        result.mean += weight * force
-        result.square += weight * force * force
-        if sigma < -_MAX_SIGMA:
-            break
-        step_before = step
-        factor += step
+        weight /= force
+        weights += weight
+        log_mean += weight * log_force
+        mean += weight * force
+        square += weight * force * force
+    if weights > 0.0:
+        force = math.exp(log_mean / weights)
+        mean_square = (square - 2.0 * force * mean) / weights + force * force
+        log_unit = (log_x2 - law.parameters[_LOG_X2]) * per_alpha
+        unit = math.exp(max(-_MAX_LOG_FORCE, min(_MAX_LOG_FORCE, log_unit)))
+        result.force_n = unit * force
+        result.std_n = unit * math.sqrt(max(mean_square, _MIN_RELATIVE_VARIANCE * force * force))
+        result.status = _VALID
 
 
-def _lowest_factor(stack: StackTable, law: PadLaw, result: ForceResult, least: float) -> float:
-    """Return the stack factor from which on the quadrature has to begin."""
-    _evaluate_factor(stack, law, result, least)
-    factor = max(least + result.excess, least)
-    _evaluate_factor(stack, law, result, factor)
-    factor = max(factor + result.excess, least)  # the spreading depends on it near edges
-    factor = max(least, factor / (1.0 + _MAX_SIGMA * result.std / factor))
-    _evaluate_factor(stack, law, result, factor)
-    missing = _MAX_SIGMA * result.std - result.excess
-    return max(least, factor - missing) if missing > 0.0 else factor
-
-
-def _evaluate_factor(stack: StackTable, law: PadLaw, result: ForceResult, factor: float) -> None:
-    """Compute the force that leaves a stack factor, and how far the current is from it.
+def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float) -> None:
+    """Compute how far the current is from that of a force, which is given by ln x^2.
 
     The sheet's resistance from the contact to the electrodes: that of a small contact is ln(R / A), less what
     the current's density inside it adapts to the gradient of the potential, (A grad ln R)^2 / 4 times
     I2(x) / I0(x) = 1 - 2 / (x^2 factor); a contact that hangs over the edge is between that of one moved
     inside and that of its current at its centre. The mean of the two limits, and their variance.
     """
-    p = law.parameters
-    alpha, log_radius_m = p[_ALPHA], result.log_radius_m
-    log_x2, slope = _log_x2(stack, factor), _log_x2_slope(stack, factor)
-    log_specific = p[_LOG_SHEET] + 2.0 * log_radius_m - log_x2  # ln of ohm m^2
-    log_pressure = (p[_LOG_LAYER] - log_specific) / alpha
-    by_log_x2 = 1.0 / slope
-    ratio = result.log_spreading_m - log_radius_m
-    adaptation = max(1.0 - 2.0 * math.exp(-min(log_x2, 700.0)) / factor, 0.0)
-    steepness = min(result.gradient2 * math.exp(2.0 * log_radius_m), 1.0)
-    high = max(ratio, _MIN_LOG_SPREADING_RATIO)
-    low = max(ratio, 0.0) - 0.25 * steepness * adaptation
-    spread = 0.5 * (high + low)
-    result.log_force = _LOG_PI + 2.0 * log_radius_m + log_pressure
-    result.slope = slope / alpha
-    result.excess = result.whole - result.resistors - spread - factor
-    variance = result.variance + 0.25 * (high - low) * (high - low)
-    by_sheet, by_alpha = factor + spread + by_log_x2, by_log_x2 * (log_pressure - p[_LOG_REFERENCE])
-    for k in range(_AXES, _AXES + 9, 3):
-        change = by_alpha * p[k + 1] - by_log_x2 * p[k] + by_sheet * p[k + 2]
-        variance += change * change
-    result.std = math.sqrt(max(variance, _MIN_RELATIVE_VARIANCE * factor * factor))
+    place = (log_x2 - stack.first) * stack.per_width
+    k = int(place)
+    if k < 0:
+        k = 0
+    if k > stack.intervals - 1:
+        k = stack.intervals - 1
+    t = place - k
+    k *= 2
+    rise = stack.values[k + 2] - stack.values[k]
+    cubic = stack.values[k + 1] + stack.values[k + 3] - 2.0 * rise
+    square = rise - stack.values[k + 1] - cubic
+    factor = stack.values[k] + t * (stack.values[k + 1] + t * (square + t * cubic))
+    slope = (stack.values[k + 1] + t * (2.0 * square + 3.0 * t * cubic)) * stack.per_width
+    density = 1.0 - 2.0 * slope  # (x factor)^2
+    bend = result.bend
+    if bend > 0.0:
+        bend *= max(1.0 - 2.0 * factor / density, 0.0)
+    width = result.high - result.low + bend
+    total = factor + 0.5 * (result.high + result.low - bend)
+    by_radius, radius_variance = law.parameters[_BY_RADIUS], law.parameters[_RADIUS_VARIANCE]
+    first = by_radius * slope + result.by_radius - bend
+    second = -0.5 * by_radius * by_radius * density * (1.0 + 2.0 * slope / factor) - first * first / total
+    by_sheet = total + slope
+    by_alpha = slope * (log_x2 * law.parameters[_PER_ALPHA] - law.parameters[_LOG_REFERENCE])
+    variance = result.variance + 0.25 * width * width
+    variance += radius_variance * (first * first + 0.5 * second * second * radius_variance)
+    variance += law.parameters[_COVARIANCE] * slope * slope
+    variance += law.parameters[_COVARIANCE + 3] * by_alpha * by_alpha
+    variance += law.parameters[_COVARIANCE + 5] * by_sheet * by_sheet
+    mixed = law.parameters[_COVARIANCE + 4] * by_alpha * by_sheet
+    mixed -= slope * (law.parameters[_COVARIANCE + 1] * by_alpha + law.parameters[_COVARIANCE + 2] * by_sheet)
+    variance += 2.0 * mixed
+    std = math.sqrt(max(variance, _MIN_RELATIVE_VARIANCE * factor * factor))
+    result.std, result.step, result.density = std, -std / slope, total / std
+    result.sigma = (math.log(result.left / total) - 0.5 * second * radius_variance / total) * result.density
 
 
 def whole_factor(law: PadLaw, total_a: float) -> float:
     """Return the stack factor that would leave the drive's whole voltage to the contact."""
-    p = law.parameters
-    return _TWO_PI * math.exp(-p[_LOG_SHEET]) * p[_DRIVE] / max(total_a, _MIN_CURRENT_A)
+    per_sheet = _TWO_PI * math.exp(-law.parameters[_LOG_SHEET])
+    return per_sheet * law.parameters[_DRIVE] / max(total_a, _MIN_CURRENT_A)
 
 
 def series_resistance(law: PadLaw, currents: memoryview[float], first: int, electrodes: int) -> float:
@@ -240,32 +247,16 @@ def series_resistance(law: PadLaw, currents: memoryview[float], first: int, elec
     return form / (total * total) if total > 0.0 else 0.0
 
 
-def _log_x2(stack: StackTable, factor: float) -> float:
+def find_log_x2(stack: StackTable, factor: float) -> float:
     """Return ln x^2 where I0(x) / (x I1(x)) is `factor`."""
-    place = (math.log(factor) - stack.first) / stack.width
-    k = _interval(stack, place)
+    place = (math.log(factor) - stack.inverse_first) / stack.inverse_width
+    k = int(place)
+    if k < 0:
+        k = 0
+    if k > stack.inverse_intervals - 1:
+        k = stack.inverse_intervals - 1
     t = place - k
-    c = stack.coefficients
-    if t < 0.0 or t > 1.0:  # straight beyond the table
-        edge = 0.0 if t < 0.0 else 1.0
-        level = ((c[4 * k] * edge + c[4 * k + 1]) * edge + c[4 * k + 2]) * edge + c[4 * k + 3]
-        rate = (3.0 * c[4 * k] * edge + 2.0 * c[4 * k + 1]) * edge + c[4 * k + 2]
-        return level + rate * (t - edge)
-    return ((c[4 * k] * t + c[4 * k + 1]) * t + c[4 * k + 2]) * t + c[4 * k + 3]
-
-
-def _log_x2_slope(stack: StackTable, factor: float) -> float:
-    """Return the derivative of ln x^2 by the factor."""
-    place = (math.log(factor) - stack.first) / stack.width
-    k = _interval(stack, place)
-    t = max(0.0, min(1.0, place - k))
-    c = stack.coefficients
-    return ((3.0 * c[4 * k] * t + 2.0 * c[4 * k + 1]) * t + c[4 * k + 2]) / (stack.width * factor)
-
-
-def _interval(stack: StackTable, place: float) -> int:
-    if place <= 0.0:
-        return 0
-    if place >= stack.intervals:
-        return stack.intervals - 1
-    return int(place)
+    k *= 4
+    return ((stack.inverse[k] * t + stack.inverse[k + 1]) * t + stack.inverse[k + 2]) * t + stack.inverse[
+        k + 3
+    ]

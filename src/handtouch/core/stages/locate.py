@@ -197,7 +197,9 @@ def _clamp(table: ModelTable, s: float) -> float:
 
 def _coordinate(nodes: memoryview[float], cells: int, s: float) -> float:
     """Return the coordinate on the pad at s cells, a cubic between the nodes."""
-    i = min(int(s), cells - 1)
+    i = int(s)
+    if i > cells - 1:
+        i = cells - 1
     p = s - i
     near, far, near_slope, far_slope = nodes[2 * i], nodes[2 * i + 2], nodes[2 * i + 1], nodes[2 * i + 3]
     rise = p * p * (3.0 - 2.0 * p)
@@ -206,7 +208,9 @@ def _coordinate(nodes: memoryview[float], cells: int, s: float) -> float:
 
 def _cell_length(nodes: memoryview[float], cells: int, s: float) -> float:
     """Return the derivative of `_coordinate`."""
-    i = min(int(s), cells - 1)
+    i = int(s)
+    if i > cells - 1:
+        i = cells - 1
     p = s - i
     near_slope, far_slope = nodes[2 * i + 1], nodes[2 * i + 3]
     rise = 6.0 * p * (1.0 - p) * (nodes[2 * i + 2] - nodes[2 * i])

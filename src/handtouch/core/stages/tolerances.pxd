@@ -46,7 +46,7 @@ cdef void _compute_changes(
     n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, cell=Py_ssize_t, vector='double[::1]', fields='double[::1]')
 cdef void _add_elongation(
     Whitening whitening, PadTolerances pad, double[::1] weight, double total, double s) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]', vector='double[::1]')
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void _add_square(Whitening whitening) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t)
 cdef void _invert_root(double[::1] matrix, Py_ssize_t n) noexcept

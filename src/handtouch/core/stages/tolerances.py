@@ -228,7 +228,9 @@ def _add_elongation(
     the second derivative along that direction, as potentials are harmonic; the direction is unknown.
     """
     n, vector, fields = whitening.electrodes, whitening.vector, whitening.fields
-    cell = min(int(s), pad.cells - 1)
+    cell = int(s)
+    if cell > pad.cells - 1:
+        cell = pad.cells - 1
     beyond = s - cell
     std = (1.0 - beyond) * pad.elongations[cell] + beyond * pad.elongations[cell + 1]
     for k in range(2):
@@ -239,10 +241,10 @@ def _add_elongation(
 
 def _add_square(whitening: Whitening) -> None:
     """Add the square of `vector` to the lower triangle."""
-    n, matrix, vector = whitening.electrodes, whitening.matrix, whitening.vector
+    n = whitening.electrodes
     for i in range(n):
         for j in range(i + 1):
-            matrix[i * n + j] += vector[i] * vector[j]
+            whitening.matrix[i * n + j] += whitening.vector[i] * whitening.vector[j]
 
 
 def _invert_root(matrix: memoryview[float], n: int) -> None:
