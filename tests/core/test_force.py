@@ -70,30 +70,39 @@ def test_a_force_next_to_an_electrode_covers_that_of_a_cut_off_patch(
     assert std < 0.75 * force_n
 
 
-def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability() -> None:
+WIDE = """contact_radius_std_mm = 1.0
+contact_ohm_std = 0.15
+alpha_std = 0.12
+ohm_per_square_std = 0.25"""
+
+
+@pytest.mark.parametrize("tolerances", ["contact_radius_std_mm = 0.5", WIDE], ids=["default", "wide"])
+def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(tolerances: str) -> None:
     text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
+    text = text.replace("contact_radius_std_mm = 0.5", tolerances)
     model, rng = PadModel(parse(text)), np.random.default_rng(4)
     sheet, network = parse(text).sheets["s"], model.networks[0]
     fractions = network.fractions(network.a / 2, network.b / 2)
     spreading_m = float(network.spreading_radius(network.a / 2, network.b / 2))
-    inside, forces = [], np.exp(rng.uniform(np.log(0.5), np.log(GREATEST_N), 600))
+    errors, forces = [], np.exp(rng.uniform(np.log(0.2), np.log(GREATEST_N), 600))
     for force_n in forces.tolist():
         law = ContactLaw(
             1e-6 * sheet.contact_ohm_mm2 * np.exp(sheet.contact_ohm_std * rng.normal()),
             sheet.alpha + sheet.alpha_std * rng.normal(),
-            1e-3 * (sheet.contact_radius_mm + sheet.contact_radius_std_mm * rng.normal()),
+            1e-3 * max(1.0, sheet.contact_radius_mm + sheet.contact_radius_std_mm * rng.normal()),
             reference_pa=1e3 * sheet.reference_kpa,
         )
         sheet_ohm = sheet.ohm_per_square * np.exp(sheet.ohm_per_square_std * rng.normal())
-        found, std, status = solve(
-            model, float(law.current(force_n, 5.0, sheet_ohm, spreading_m)) * fractions
-        )
-        inside.append((status == ForceEstimateStatus.VALID, abs(found - force_n) < 1.96 * std))
-    valid, held = np.array(inside).T
-    strong = forces > 5
-    assert valid.mean() > 0.97
+        current = float(law.current(force_n, 5.0, sheet_ohm, spreading_m))
+        found, std, status = solve(model, current * fractions)
+        errors.append((status == ForceEstimateStatus.VALID, (found - force_n) / std))
+    valid, error = np.array(errors).T
+    valid = valid.astype(np.bool_)
+    held = np.abs(error) < 1.96
+    assert valid.mean() > 0.9
     assert 0.92 < held[valid].mean() < 0.99
-    assert 0.90 < held[valid & strong].mean() <= 1.0
+    for slice_ in (forces < 1, (forces > 1) & (forces < 5), forces > 5):
+        assert 0.84 < held[valid & slice_].mean() <= 1.0
 
 
 def test_without_a_greatest_force_those_at_the_sheets_limit_are_lower_bounds(bench: Any) -> None:

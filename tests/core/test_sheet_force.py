@@ -172,6 +172,13 @@ def test_standard_deviations_cover_a_long_hold_with_another_final_value() -> Non
     assert np.sqrt(np.mean(off**2)) > 0.33 * np.sqrt(np.mean(rig.compensation.std_n**2))
 
 
+def test_a_sheet_that_does_not_adapt_has_no_adapted_force_from_earlier_loads() -> None:
+    behaviour = sheet_behaviour_of(Behaviour(adaptation_share=0.0, back_force_std_n=0.3))
+    assert Rig(1, QUICK, behaviour).compensation.back_force[1][0] == 0
+    half = sheet_behaviour_of(Behaviour(adaptation_share=0.5, back_force_std_n=0.3))
+    assert Rig(1, QUICK, half).compensation.back_force[1][0] == pytest.approx(0.15)
+
+
 def test_uncertainty_of_slow_creep_grows_with_the_logarithm_of_the_contact_time() -> None:
     stds = []
     for slow_creep in (0.0, 0.03):

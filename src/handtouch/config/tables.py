@@ -238,7 +238,9 @@ class Behaviour(Table):
         "(1 - 1/e) of an adaptation to 1 N; inversely proportional to the adapted force",
     )
     back_force_std_n: NonNegative = Field(
-        0.1, description="adapted force at the daemon's start, from earlier loads (1 sigma)"
+        0.1,
+        description="adapted force at the daemon's start, from earlier loads, of a sheet that adapts fully "
+        "(1 sigma); in proportion to adaptation_share",
     )
 
 
@@ -259,7 +261,7 @@ class Sheet(Table):
     max_force_n: Positive | None = Field(
         None,
         description="greatest force of a contact; forces near the maximum current of the sheet, which hardly "
-        "differ in current, are taken as equally likely up to it; default: unknown, they are lower bounds",
+        "differ in current, are intervals up to it; default: unknown, they are lower bounds",
     )
     ohm_per_square_std: Annotated[float, Field(ge=0, le=1)] = Field(
         0.1, description="relative error of ohm_per_square (1 sigma); default: that of printed carbon"

@@ -1,11 +1,12 @@
 """Force: from a contact's total current through the contact law, with its standard deviation.
 
 The same law as `handtouch.field.contact_law`, which is the reference for contacts far from edges whose
-parameters are exact. The force is the geometric mean of its probability given the current, and its standard
-deviation the root of the mean square difference from it: all forces up to the greatest of a contact are
-equally likely before (by their logarithm), and the logarithm of the resistance that the current leaves is
-normal about that of each force, with the variance of noise, law, contact radius and distance from the edge at
-that force. So it holds near the maximum current of the sheet, where forces hardly differ in current.
+parameters are exact. The force is the harmonic mean of its probability given the current: the value of the
+least mean square error over the force, as mean and median are too high where forces hardly differ in current.
+Its standard deviation is the root of the mean square difference from it. All forces up to the greatest of a
+contact are equally likely before (by their logarithm); the logarithm of the resistance that the current
+leaves is normal about that of each force, with the variance of noise, law, contact radius and distance from
+the edge at that force. So it holds near the maximum current of the sheet.
 
 The integral is over ln x^2 = ln(A^2 rho / sigma), which is linear in the logarithm of the force. The radius
 A is log-normal: mean and variance by it are those of the second-order expansion of that logarithm, whose
@@ -79,7 +80,8 @@ class ForceResult:
 
     The rest is working memory. Of the contact: `left`, stack factor and spreading that its current leaves;
     `high`, `low` and `bend`: limits of the spreading, the lower one less `bend` times the share of the
-    current that adapts to the edge; `by_radius`: derivative of their mean; `variance`, see `estimate_force`.
+    current that adapts to the edge; `by_radius`: derivative of their mean; `variance`, by noise, of the
+    logarithm of `left`.
     At one ln x^2: standard deviation `std` of `left`; `sigma`, by how many of them its logarithm is above the
     expected one; `density` of the logarithm, over that of `sigma`; and ln x^2 a standard deviation, `step`.
     """
@@ -124,7 +126,7 @@ def estimate_force(
     result.by_radius = 0.0
     if ratio > 0.0:
         result.by_radius = -1.0 if ratio > _MIN_LOG_SPREADING_RATIO else -0.5
-    result.variance = max(noise * noise + position_variance, 0.0)
+    result.variance = max(noise * noise + position_variance, 0.0) / (result.left * result.left)
     # beyond a share of the maximum current, forces hardly differ in current
     least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (result.high + resistors)
     is_limited = law.parameters[_MIN_FACTOR] >= least
@@ -140,7 +142,7 @@ def estimate_force(
             _evaluate(stack, law, result, top)
             sigma, std = result.sigma, result.std
             _evaluate(stack, law, result, log_x2)
-        # without a greatest force, those from the limit on are equally likely, and have no mean
+        # without a greatest force, those from the limit on differ too little in current to have a mean
         if not sigma > (-_BOUND_SIGMA if is_limited else _UNLIMITED_SIGMA):
             log_x2 = find_log_x2(stack, least + max((sigma + _BOUND_SIGMA) * std, 0.0))
             log_force = (log_x2 - law.parameters[_LOG_X2]) * law.parameters[_PER_ALPHA]
@@ -160,20 +162,18 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
     if high < top:
         _evaluate(stack, law, result, high)
         high = min(top, high + (_MAX_SIGMA - result.sigma) * result.step)
-    weights = log_mean = mean = square = 0.0
+    weights = inverse = mean = square = 0.0
     for k in range(stack.node_count):
         at = low + (high - low) * stack.nodes[2 * k]
         _evaluate(stack, law, result, at)
         weight = stack.nodes[2 * k + 1] * math.exp(-0.5 * result.sigma * result.sigma) * result.density
-        log_force = (at - log_x2) * per_alpha
-        force = math.exp(log_force)
-        weight /= force
+        force = math.exp((at - log_x2) * per_alpha)
         weights += weight
-        log_mean += weight * log_force
+        inverse += weight / force
         mean += weight * force
         square += weight * force * force
     if weights > 0.0:
-        force = math.exp(log_mean / weights)
+        force = weights / inverse
         mean_square = (square - 2.0 * force * mean) / weights + force * force
         log_unit = (log_x2 - law.parameters[_LOG_X2]) * per_alpha
         unit = math.exp(max(-_MAX_LOG_FORCE, min(_MAX_LOG_FORCE, log_unit)))
@@ -214,7 +214,10 @@ def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float
     second = -0.5 * by_radius * by_radius * density * (1.0 + 2.0 * slope / factor) - first * first / total
     by_sheet = total + slope
     by_alpha = slope * (log_x2 * law.parameters[_PER_ALPHA] - law.parameters[_LOG_REFERENCE])
-    variance = result.variance + 0.25 * width * width
+    # errors of the spreading don't grow with the rest: a logarithm's slope is that between the two values
+    chord = (result.left + total + 4.0 * math.sqrt(result.left * total)) / 6.0
+    width *= total / chord
+    variance = result.variance * total * total + 0.25 * width * width
     variance += radius_variance * (first * first + 0.5 * second * second * radius_variance)
     variance += law.parameters[_COVARIANCE] * slope * slope
     variance += law.parameters[_COVARIANCE + 3] * by_alpha * by_alpha
