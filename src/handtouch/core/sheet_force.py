@@ -66,7 +66,7 @@ class SheetBehaviour:
     gain_std: float
     back_force_std_n: float
     forget_time_s: float
-    slow_creep: float
+    prior: sheet.BankPrior
 
 
 class SheetForceCompensation:
@@ -96,7 +96,6 @@ class SheetForceCompensation:
         )
         self.log_gain, self.log_gain_std = held.log_gain, held.log_gain_std
         self._first_gain_std = np.array([0.0 if b is None else b.gain_std for b in behaviours])
-        self._slow_creep = np.array([0.0 if b is None else b.slow_creep for b in behaviours])
         self._last_touch_ns, self._compared_ns = held.last_touch_ns, held.compared_ns
         self._confirmed, self._begin_s = held.force_confirmed, held.touched_at_begin_s
         self._updated_ns = held.sheets_updated_ns  # time of the sheets' state
@@ -121,20 +120,22 @@ class SheetForceCompensation:
         kept = np.array([old == new for old, new in zip(before, behaviours, strict=True)])
         names = ("force_n", "std_n", "state", "contacts", "touched_s", "log_gain", "log_gain_std")
         values = {name: getattr(self, name)[kept] for name in (*names, "_confirmed")}
-        updated_ns, (back_n, back_std_n) = self._updated_ns.copy(), self.back_force
+        updated_ns, learned, (back_n, back_std_n) = self._updated_ns.copy(), self.learned, self.back_force
         fresh = SheetForceCompensation(behaviours, self._period_ns, self._held)
         for name in names:
             getattr(fresh, name)[kept] = values[name]
         fresh.refresh()
         fresh._updated_ns[:] = updated_ns
         for pad in np.flatnonzero(kept & self.modelled).tolist():
-            fresh.set_back_force(pad, back_n[pad], back_std_n[pad], confirmed=False)
+            fresh.set_back_force(pad, back_n[pad], back_std_n[pad], learned[pad], confirmed=False)
         fresh._confirmed[kept] = values["_confirmed"]
         return fresh
 
     def refresh(self) -> None:
         """Compute what follows from the state, after that was loaded."""
         np.exp(self.log_gain, out=self._gain)
+        for group in self.groups:
+            group.bank.update_weights()
 
     def _reset(self) -> None:
         """Begin with fresh sheets, without evidence."""
@@ -149,12 +150,17 @@ class SheetForceCompensation:
             column[:] = 0
         self.log_gain_std[:] = self._first_gain_std
 
-    def set_back_force(self, pad: int, back_n: float, std_n: float, *, confirmed: bool = True) -> None:
-        """Set the back force of a pad's sheet [N], e.g. from a store; `confirmed`: its forces are reliable
-        without further evidence. Ignored for a pad without sheet model."""
+    def set_back_force(
+        self, pad: int, back_n: float, std_n: float, learned: Sequence[float] = (), *, confirmed: bool = True
+    ) -> None:
+        """Set the back force of a pad's sheet [N], e.g. from a store, and what was learned of its behaviour
+        (`learned`; empty: unchanged); `confirmed`: its forces are reliable without further evidence. Ignored for
+        a pad without sheet model."""
         if not self.modelled[pad]:
             return
         group, row = self._find_group(pad)
+        if len(learned):
+            group.bank.set_learned(row, np.asarray(learned, np.float64))
         back, spread = group.compensator.back_n.copy(), group.compensator.back_std_n.copy()
         back[row], spread[row] = back_n, std_n
         group.compensator.set_back_force(back, spread)
@@ -184,6 +190,22 @@ class SheetForceCompensation:
         for group in self.groups:
             back[group.rows], std[group.rows] = group.compensator.back_n, group.compensator.back_std_n
         return back, std
+
+    @property
+    def learned(self) -> FloatArray:
+        """What was learned of each sheet's behaviour (n, `sheet.BANK_LEARNED`); NaN where not modelled."""
+        found = np.full((len(self.force_n), sheet.BANK_LEARNED), np.nan)
+        for group in self.groups:
+            found[group.rows] = group.bank.learned
+        return found
+
+    @property
+    def rejected(self) -> FloatArray:
+        """Probability (n,) that a sheet doesn't adapt although its model does; 0 where none does."""
+        found = np.zeros(len(self.force_n))
+        for group in self.groups:
+            found[group.rows] = group.bank.rejected()
+        return found
 
     def _find_group(self, pad: int) -> tuple[_BehaviourGroup, int]:
         """Return the group of a pad, and its row there."""
@@ -275,9 +297,7 @@ class SheetForceCompensation:
         with np.errstate(all="ignore"):
             relative = self._held.uncompensated_std_n[pressed] / apparent_n[pressed]
         variance = np.square(self.std_n[pressed]) + np.square(relative * force)
-        held_s = self.touched_s[pressed] - self._begin_s[pressed]
-        wander = self._slow_creep[pressed] * np.log1p(held_s / _MIN_CONTACT_AGE_S)
-        variance += np.square(force) * (np.square(self.log_gain_std[pressed]) + np.square(wander))
+        variance += np.square(force * self.log_gain_std[pressed])
         std = np.sqrt(variance)
         self._relative_std[pressed] = std / np.maximum(force, _MIN_FORCE_N)
         enough = (self.contacts[pressed] >= _MIN_CONTACTS) & (self.touched_s[pressed] >= _MIN_TOUCHED_S)
@@ -296,17 +316,24 @@ class _BehaviourGroup:
         behaviour: SheetBehaviour,
         pads: IntArray,
         state: sheet.CompensatorState,
+        bank: sheet.BankState,
         results: FloatArray,
     ) -> None:
         self.pads, self._number, self._first = pads, number, first
         whole = len(pads) == pads[-1] - pads[0] + 1
         self.rows: slice | IntArray = slice(int(pads[0]), int(pads[-1]) + 1) if whole else pads
         self._forget_time_s = behaviour.forget_time_s
+        self.bank = sheet.ModelBank(behaviour.model.adaptation, behaviour.prior, bank)
         self.compensator = sheet.SheetCompensator(
-            behaviour.model, len(pads), behaviour.uncertainty, update_period_s=UPDATE_PERIOD_S, state=state
+            behaviour.model,
+            len(pads),
+            behaviour.uncertainty,
+            update_period_s=UPDATE_PERIOD_S,
+            state=state,
+            bank=self.bank,
         )
         self.compensator.last_step = results[:, first : first + len(pads)]
-        if behaviour.back_force_std_n:
+        if behaviour.back_force_std_n and np.any(behaviour.model.adaptation.share):
             self.compensator.set_back_force(0.0, behaviour.back_force_std_n)
 
     def interval(self, dt_s: float) -> SheetInterval:
@@ -338,6 +365,7 @@ class _BehaviourGroup:
         )
         std[rows] = np.sqrt(kept * (np.square(std[rows]) + (1 - kept) * np.square(back[rows])))
         back[rows] *= kept
+        self.bank.begin_contacts(rows, pause_s / self._forget_time_s, _MIN_UNTOUCHED_PROBABILITY)
 
 
 def _make_groups(
@@ -363,13 +391,18 @@ def _make_groups(
         for part in vars(state).values():
             part[:] = 0
         state.powered[:] = True
-        groups.append(_BehaviourGroup(number, rows.start, kind, pads, state, results))
+        bank = sheet.BankState(
+            *(held.bank_log_weight[rows], held.bank_back_n[rows], held.bank_exponent[rows]),
+            *(held.bank_exponent_variance[rows], held.bank_sum[rows], held.bank_before[rows]),
+            *(held.bank_window[rows], held.bank_age_s[rows], held.bank_growth[rows]),
+        )
+        groups.append(_BehaviourGroup(number, rows.start, kind, pads, state, bank, results))
     return groups
 
 
 def sheet_behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
     """Build the preset with the deployment's changes, and the uncertainty of its parameters."""
-    preset = {"S1": sheet.S1, "S2": sheet.S2}[behaviour.preset]
+    preset = {"S1": sheet.S1, "S2": sheet.S2, "unknown": sheet.UNKNOWN}[behaviour.preset]
     adaptation, creep, noise = preset.adaptation, preset.creep, preset.fluctuation
     share, time_s = 1 - creep.instant, creep.times_s[0]
     share = share if behaviour.creep_share is None else behaviour.creep_share
@@ -404,5 +437,15 @@ def sheet_behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
         behaviour.gain_std,
         behaviour.back_force_std_n * float(np.max(model.adaptation.share)),
         behaviour.forget_time_s,
-        behaviour.slow_creep,
+        _prior_of(behaviour),
+    )
+
+
+def _prior_of(behaviour: Behaviour) -> sheet.BankPrior:
+    """Return how far a sheet may be from its description."""
+    if behaviour.preset == "unknown":
+        return sheet.BankPrior(log_time_std=1.5, not_adapting=0.5, exponent_std=0.1)
+    measured = behaviour.adaptation_share is not None
+    return sheet.BankPrior(
+        not_adapting=0.01 if measured else 0.05, exponent_std=max(behaviour.slow_creep, 0.05)
     )

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.slip import SLIP_COUNT
 from handtouch.core.stages.solve import VALUE_COUNT
+from handtouch.sheet import BANK_MODELS, BANK_WINDOW
 from handtouch.wire import PadState
 
 VERSION = 1
@@ -163,6 +164,16 @@ class TickState:
     powered: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
     back_waited_s: Annotated[FloatArray, Stored("<f8", _PADS)]
     load_is_old: Annotated[BoolArray, Stored("?", _PADS)]
+    # models of these sheets, see `sheet.ModelBank`
+    bank_log_weight: Annotated[FloatArray, Stored("<f8", _PADS, BANK_MODELS)]
+    bank_back_n: Annotated[FloatArray, Stored("<f8", _PADS, BANK_MODELS)]
+    bank_exponent: Annotated[FloatArray, Stored("<f8", _PADS, BANK_MODELS)]
+    bank_exponent_variance: Annotated[FloatArray, Stored("<f8", _PADS, BANK_MODELS)]
+    bank_sum: Annotated[FloatArray, Stored("<f8", _PADS, BANK_MODELS)]
+    bank_before: Annotated[FloatArray, Stored("<f8", _PADS, BANK_MODELS, fill=math.nan)]
+    bank_window: Annotated[FloatArray, Stored("<f8", _PADS, BANK_WINDOW)]
+    bank_age_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    bank_growth: Annotated[FloatArray, Stored("<f8", _PADS, fill=1)]
 
     # palm and base frames, see `ContactTransforms` and `ContactGroups`
     palm_status: Annotated[Uint8Array, Stored("u1", _PADS)]

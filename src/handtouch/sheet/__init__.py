@@ -1,6 +1,7 @@
 """Sheet behaviour over time: forward models for simulation, inverse ones for compensation. No I/O."""
 
 from handtouch.sheet.adaptation import Adaptation, AdaptationState
+from handtouch.sheet.bank import BANK_LEARNED, BANK_MODELS, BANK_WINDOW, BankPrior, BankState, ModelBank
 from handtouch.sheet.behaviour import (
     SheetHistory,
     SheetModel,
@@ -22,22 +23,30 @@ from handtouch.sheet.presets import (
     S1_BENCH,
     S2,
     S2_BENCH,
+    UNKNOWN,
     BenchCircuit,
 )
 
 __all__ = [
+    "BANK_LEARNED",
+    "BANK_MODELS",
+    "BANK_WINDOW",
     "GRAM_FORCE_N",
     "S1",
     "S1_BENCH",
     "S2",
     "S2_BENCH",
+    "UNKNOWN",
     "Adaptation",
     "AdaptationState",
+    "BankPrior",
+    "BankState",
     "BenchCircuit",
     "CompensatorState",
     "Creep",
     "Fluctuation",
     "FluctuationState",
+    "ModelBank",
     "ParameterUncertainty",
     "PrandtlIshlinskii",
     "SheetCompensator",

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from handtouch.sheet.adaptation import AdaptationState
+from handtouch.sheet.bank import ModelBank
 from handtouch.sheet.behaviour import SheetModel
 
 FloatArray = npt.NDArray[np.float64]
@@ -96,9 +97,11 @@ class SheetCompensator:
         *,
         update_period_s: float = 0.0,
         state: CompensatorState | None = None,
+        bank: ModelBank | None = None,
     ) -> None:
         self.model, self.uncertainty = model, ParameterUncertainty() if uncertainty is None else uncertainty
         state = CompensatorState.empty(model, pads) if state is None else state
+        self.bank = bank
         self._state, self._inverse_hysteresis = state, model.hysteresis.inverse
         self._plays, self._elements, self._powered = state.plays, state.elements, state.powered
         self._adaptation = AdaptationState(state.back_n, np.zeros(pads), state.current_flow_s)
@@ -135,6 +138,8 @@ class SheetCompensator:
         self.update_back_force()
         self.back_n[:] = back_n
         self.back_std_n[:] = std_n
+        if self.bank is not None:
+            self.bank.set_back_force(self.back_n)
         self._state.load_is_old[0] = True
 
     def reset_pads(self, pads: npt.NDArray[np.intp]) -> None:
@@ -145,6 +150,8 @@ class SheetCompensator:
         rows = (state.back_n, state.peak_n, state.current_flow_s, *deviations, *self._plays, *self._elements)
         for row in rows:
             row[pads] = 0.0
+        if self.bank is not None:
+            self.bank.reset_pads(pads)
 
     def set_powered(self, powered: npt.ArrayLike) -> None:
         """Switch the potential, (n,) or (); without it the back force decays."""
@@ -175,6 +182,9 @@ class SheetCompensator:
         press, flicker, fixed = self._irreducible_variance
         variance = np.square(math.sqrt(press) * effective + self._press_n[pads]) + flicker * effective
         variance += np.square(self.back_std_n[pads])
+        if self.bank is not None:
+            back_std_n, growth_std = self.bank.spread(pads)
+            variance += np.square(back_std_n) + np.square(growth_std * effective)
         variance += np.square(self.uncertainty.creep * (effective - reading))
         if len(self._plays):
             variance += np.square(self.uncertainty.hysteresis * (load - before))
@@ -215,7 +225,9 @@ class SheetCompensator:
         """Return the load before adaptation, updating its state."""
         remaining = self._adaptation_step.remaining_fraction(self._adaptation)
         load = self._adaptation_step.inverse(self._adaptation, effective, remaining)
-        self._propagate_uncertainty(load, np.where(flows, remaining, 1.0), np.where(flows, 0.0, self._dt_s))
+        pause_s = np.where(flows, 0.0, self._dt_s)
+        share = self._adaptation_step.share
+        self._propagate_uncertainty(load, np.where(flows, remaining, 1.0), share, pause_s)
         self._adaptation_step.recover(self._adaptation, self._powered)
         return load
 
@@ -234,22 +246,32 @@ class SheetCompensator:
         """Update the back force from the loads since its last update."""
         state, flow = self._adaptation, self._flow_s
         step = self.model.adaptation.discretise(flow)
-        remaining = step.remaining_fraction(state)
         load = self._impulse / np.where(flow > 0, flow, 1.0)
-        step.update_back_force(state, load, flow > 0, remaining)
-        self._propagate_uncertainty(load, remaining, self._state.waited_s[0] - flow)
+        pause_s = self._state.waited_s[0] - flow
+        if self.bank is None:
+            remaining, share = step.remaining_fraction(state), step.share
+            step.update_back_force(state, load, flow > 0, remaining)
+        else:
+            remaining, share = self.bank.advance(load - state.back_n, flow, state.current_flow_s)
+            state.current_flow_s += flow
+            state.back_n[:] = self.bank.mean_back_n()
+        self._propagate_uncertainty(load, remaining, share, pause_s)
         if not self._powered.all():
             self.model.adaptation.discretise(float(self._state.waited_s[0])).recover(state, self._powered)
+            if self.bank is not None:
+                self.bank.set_back_force(state.back_n)
         self._state.waited_s[0] = 0.0
         flow[:] = self._impulse[:] = 0.0
 
-    def _propagate_uncertainty(self, load: FloatArray, remaining: FloatArray, pause_s: FloatArray) -> None:
+    def _propagate_uncertainty(
+        self, load: FloatArray, remaining: FloatArray, share: FloatArray, pause_s: FloatArray
+    ) -> None:
         """Update the back force's standard deviation: parameters, error of the press, and pauses.
 
         An error of the back force is in the load, and so in what is learned next: it decays slower than the
         back force, d(error)/dt = -(1 - share) error / time. Errors of one press add up linearly; those of
         several presses are independent. In a pause an undetected press may have wiped the back force."""
-        spread, back, share = self.back_std_n, self._adaptation.back_n, self._adaptation_step.share
+        spread, back = self.back_std_n, self._adaptation.back_n
         learned = 1 - remaining
         lasts = 1 - learned * (1 - share)
         effective = np.maximum(load - back, 0.0)

@@ -1,6 +1,6 @@
 """The two sheets of the paper, and the bench circuit they were measured with.
 
-Public names: `S1`, `S2`, `S1_BENCH`, `S2_BENCH`, `BenchCircuit`, `GRAM_FORCE_N`.
+Public names: `S1`, `S2`, `UNKNOWN`, `S1_BENCH`, `S2_BENCH`, `BenchCircuit`, `GRAM_FORCE_N`.
 
 docs/theory.md states the source of each number. The paper reports no contact law of S2 and only alpha of S1:
 the loads at which layer and sheet have equal resistance are assumptions.
@@ -40,6 +40,11 @@ S2 = SheetModel(
     temperature=TemperatureResponse(gain_per_k=0.01),
     fluctuation=Fluctuation(press_std=0.171, noise_std=0.01),
 )
+UNKNOWN = SheetModel(
+    Adaptation(share=0.85, time_s=3000.0, recovery_s=1.5 * HOUR_S, threshold_n=0.03),
+    fluctuation=Fluctuation(press_std=0.15, noise_std=0.01),
+)
+"""A sheet that nobody has measured: the paper's usual numbers, as probable as no adaptation at all."""
 
 
 @dataclass(frozen=True)

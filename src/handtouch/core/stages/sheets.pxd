@@ -15,7 +15,7 @@ cdef class SheetStage:
     cdef long long period_ns
     cdef double update_period_s
     cdef unsigned char[::1] touching, load_is_old, reliability, new_contact
-    cdef double[::1] gain, results, values, apparent_n, elements, plays, back_n, flow_s, impulse_ns
+    cdef double[::1] gain, results, values, apparent_n, growth, elements, plays, back_n, flow_s, impulse_ns
     cdef double[::1] back_waited_s, force_n, std_n, relative_std, waited_s
     cdef object update, make_steps
     cdef list steps

@@ -83,6 +83,7 @@ class SheetStage:
         self.back_n, self.flow_s = arrays["back_n"], arrays["flow_s"]
         self.impulse_ns, self.back_waited_s = arrays["impulse_ns"], arrays["back_waited_s"]
         self.load_is_old = arrays["load_is_old"]
+        self.growth = arrays["bank_growth"]
         self.force_n, self.std_n = arrays["compensated_force_n"], arrays["compensated_std_n"]
         self.relative_std, self.reliability = arrays["relative_std"], arrays["force_reliability"]
         self.last_touch_ns, self.new_contact = arrays["last_touch_ns"], arrays["new_contact"]
@@ -175,6 +176,7 @@ def _compensate_sheet(stage: SheetStage, step: SheetInterval, row: int, old: boo
         return
     effective = apparent / step.total if old else _invert_creep(stage, step, first, apparent)
     _advance_creep(stage, step, first, effective, old)
+    effective /= stage.growth[row]
     before = effective + stage.back_n[row] if effective > 0.0 else 0.0
     if effective > 0.0:
         stage.impulse_ns[row] += step.dt_s * before

@@ -1,0 +1,294 @@
+"""Bank of sheet models: adaptation and slow creep of each pad, learned from how it is used.
+
+Public names: `ModelBank`, `BankState`, `BankPrior`; `BANK_MODELS`, `BANK_WINDOW`, `BANK_LEARNED`.
+
+No force is measured, but a load that is held steadily has one value. Each model of the bank makes loads of the
+readings; a model whose loads drift while the hand holds still is less probable. Models differ in the speed of
+adaptation and the end of slow creep, and each estimates its own exponent of slow creep, by a Kalman filter.
+
+A contact is divided into windows of doubling length, 1 to 2 s old, 2 to 4 s, ... The change of the load from one
+window to the next is the hand's: either it holds steadily, within the scatter inside the windows, or it doesn't,
+which is no evidence for any model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from handtouch.sheet.adaptation import Adaptation
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
+
+_SPEEDS = ((0.0, 1.0), (1.0, 0.2), (1.0, 0.4), (1.0, 0.63), (1.0, 1.0), (1.0, 1.6), (1.0, 3.0))
+"""Of adaptation: share and time constant, over those of the preset."""
+_CREEP_ENDS_S = (40.0, np.inf)
+_MODELS = [(share, time, end) for end in _CREEP_ENDS_S for share, time in _SPEEDS]
+_SHARE, _TIME, _CREEP_END_S = np.array(_MODELS).T
+BANK_MODELS, BANK_WINDOW, BANK_LEARNED = len(_SHARE), 7, 3 * len(_SHARE)
+
+_FIRST_S = 1.0
+"""Begin of the first window."""
+_REFERENCE_S = np.where(np.isfinite(_CREEP_END_S), 10.0, _FIRST_S)
+"""Age at which a reading is the load's."""
+_STEADY_PROBABILITY = 0.5
+_STEADY_STD, _UNSTEADY_STD = 0.01, 0.15
+"""Of changes of the log reading between windows of a steady hold, and of one that isn't."""
+_SATURATED_PROBABILITY, _SATURATED_SHARE = 0.5, 0.1
+"""Of a press that finds its sheet adapted to it already, if the share of adaptation is small; and the part of a
+load that isn't adapted to at which that is half as probable. With a share of 1 there is no such press."""
+_CORRELATION_S = 1.0
+"""Of the scatter inside a window."""
+_KEPT, _MIN_LOG_WEIGHT = 0.995, -30.0
+"""Evidence that is left of former windows at each new one; least log likelihood of a model."""
+_EXPONENT_WALK, _MAX_EXPONENT = 0.001, 0.25
+_MIN_SLOPE = 0.02
+
+
+@dataclass(frozen=True)
+class BankPrior:
+    """Prior of a bank. log_time_std: scale of the logarithm of adaptation's time over the preset's (Cauchy);
+    not_adapting: probability that the sheet doesn't adapt; exponent_std: standard deviation of slow creep's."""
+
+    log_time_std: float = 0.5
+    not_adapting: float = 0.05
+    exponent_std: float = 0.05
+
+    def log_weights(self) -> FloatArray:
+        """Return the logarithms of the models' weights (BANK_MODELS,)."""
+        times = np.where(_SHARE > 0, 1 / (1 + np.square(np.log(_TIME) / self.log_time_std)), 0.0)
+        times /= times.sum()
+        none = np.where(_SHARE > 0, 0.0, 1 / len(_CREEP_ENDS_S))
+        return np.log((1 - self.not_adapting) * times + self.not_adapting * none)
+
+
+@dataclass(frozen=True)
+class BankState:
+    """State of n pads, which a bank updates in place."""
+
+    log_weight: FloatArray
+    """(n, BANK_MODELS) log likelihood of the holds so far"""
+    back_n: FloatArray
+    """(n, BANK_MODELS) back force [N]"""
+    exponent: FloatArray
+    """(n, BANK_MODELS) of slow creep: a lasting load reads age^exponent times as much at an age in seconds"""
+    exponent_variance: FloatArray
+    """(n, BANK_MODELS)"""
+    sum: FloatArray
+    """(n, BANK_MODELS) integral of the log load over the present window"""
+    before: FloatArray
+    """(n, BANK_MODELS) mean log load of the window before; NaN: none"""
+    window: FloatArray
+    """(n, BANK_WINDOW) length [s] of the present window, integrals of the log reading and of its square; variance
+    of the log reading in the window before, its length, mean log reading, and age at its middle"""
+    age_s: FloatArray
+    """(n,) age of the contact"""
+    growth: FloatArray
+    """(n,) reading over load by slow creep at that age"""
+
+    @classmethod
+    def empty(cls, pads: int) -> BankState:
+        """Return the state of fresh sheets."""
+        models = np.zeros((6, pads, BANK_MODELS))
+        return cls(*models, np.zeros((pads, BANK_WINDOW)), np.zeros(pads), np.ones(pads))
+
+
+class ModelBank:
+    """Bank of models of n pads around the preset's `adaptation`."""
+
+    def __init__(self, adaptation: Adaptation, prior: BankPrior, state: BankState) -> None:
+        self._state = state
+        self._share = _SHARE * float(np.asarray(adaptation.share))
+        self._time_s = _TIME * float(np.asarray(adaptation.time_s))
+        left = 1 - self._share
+        self._saturated = np.where(
+            self._share > 0, _SATURATED_PROBABILITY * left / (left + _SATURATED_SHARE), 0.0
+        )
+        self._fatigue_s = float(np.asarray(adaptation.fatigue_s))
+        self._prior, self._log_prior = prior, prior.log_weights()
+        self._weights = np.zeros_like(state.log_weight)
+        self.reset_pads(np.arange(len(state.age_s)))
+
+    def update_weights(self) -> None:
+        """Compute the models' probabilities after the state was changed."""
+        log = self._log_prior + self._state.log_weight
+        log -= log.max(axis=1, keepdims=True)
+        np.exp(log, out=self._weights)
+        self._weights /= self._weights.sum(axis=1, keepdims=True)
+
+    def mean_back_n(self) -> FloatArray:
+        """Return the mean back force (n,) [N] over the models."""
+        return np.asarray((self._weights * self._state.back_n).sum(axis=1))
+
+    def spread(self, rows: IntArray | slice) -> tuple[FloatArray, FloatArray]:
+        """Return standard deviations over the models (k,): of the back force [N], and of the logarithm of slow
+        creep's factor."""
+        state, weights = self._state, self._weights[rows]
+        ages = _log_age(state.age_s[rows])
+        within = (weights * state.exponent_variance[rows] * np.square(ages)).sum(1)
+        growth = _variance(weights, state.exponent[rows] * ages) + within
+        return np.sqrt(_variance(weights, state.back_n[rows])), np.sqrt(growth)
+
+    @property
+    def learned(self) -> FloatArray:
+        """What was learned of each pad, (n, BANK_LEARNED): log likelihoods, exponents and their variances."""
+        state = self._state
+        return np.hstack([state.log_weight, state.exponent, state.exponent_variance])
+
+    def set_learned(self, row: int, learned: FloatArray) -> None:
+        """Set it for one pad, from a store. Raises ValueError for another number of values, or what `learned`
+        can't return."""
+        if learned.shape != (BANK_LEARNED,) or not np.isfinite(learned).all():
+            raise ValueError(f"{BANK_LEARNED} finite values are needed, got {learned}")
+        weight, exponent, variance = learned.reshape(3, BANK_MODELS)
+        if (exponent < 0).any() or (exponent > _MAX_EXPONENT).any() or (variance < 0).any():
+            raise ValueError(f"exponents must be from 0 to {_MAX_EXPONENT}, got {exponent}, variances {variance}")
+        state = self._state
+        state.log_weight[row] = np.clip(weight - weight.max(), _MIN_LOG_WEIGHT, 0.0)
+        state.exponent[row], state.exponent_variance[row] = exponent, variance
+        self.update_weights()
+
+    def rejected(self) -> FloatArray:
+        """Return the probability (n,) that a sheet doesn't adapt although the preset does."""
+        if not self._share.any():
+            return np.zeros(len(self._weights))
+        return np.asarray(self._weights[:, self._share == 0].sum(1))
+
+    def set_back_force(self, back_n: FloatArray) -> None:
+        """Scale the models' back forces to the mean (n,) [N]."""
+        mean = self.mean_back_n()
+        adapting = np.maximum((self._weights * (self._share > 0)).sum(1), 1e-3)
+        known = mean > 1e-9
+        factor = np.where(known, back_n / np.where(known, mean, 1.0), 0.0)
+        fresh = np.where(self._share > 0, (back_n / adapting)[:, None], 0.0)
+        self._state.back_n[:] = np.where(known[:, None], self._state.back_n * factor[:, None], fresh)
+
+    def reset_pads(self, rows: IntArray) -> None:
+        """Reset some pads to fresh sheets of which nothing is known but the prior."""
+        for part in fields(self._state):
+            getattr(self._state, part.name)[rows] = 0.0
+        self._state.growth[rows] = 1.0
+        self._state.before[rows] = np.nan
+        self._state.exponent_variance[rows] = self._prior.exponent_std**2
+        self.update_weights()
+
+    def begin_contacts(self, rows: IntArray, pause: FloatArray, least_kept: float) -> None:
+        """Begin contacts after pauses [forget times]; undetected presses may have wiped back forces."""
+        state = self._state
+        state.back_n[rows] *= least_kept + (1 - least_kept) / (1 + pause[:, None] * state.back_n[rows])
+        state.before[rows] = np.nan
+        state.sum[rows] = 0.0
+        state.window[rows] = 0.0
+        state.age_s[rows] = 0.0
+        self._update_growth(rows)
+
+    def advance(
+        self, effective_n: FloatArray, flow_s: FloatArray, current_flow_s: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Advance all models under mean effective loads (n,) [N] while current flowed for `flow_s` (n,) [s].
+
+        Return mean over the models (n,) of the fraction of adaptation that remains, and of its share."""
+        state, n = self._state, len(flow_s)
+        remaining, share = np.ones(n), np.zeros(n)
+        rows = np.flatnonzero((flow_s > 0) & (effective_n > 0))
+        if not rows.size:
+            return remaining, share
+        flow, before_s = flow_s[rows], state.age_s[rows]
+        age = before_s + flow
+        state.age_s[rows] = age
+        reading = effective_n[rows] * state.growth[rows]
+        creep = np.exp(-state.exponent[rows] * _log_age(age))
+        effective = reading[:, None] * creep
+        load = effective + state.back_n[rows]
+        speed = 1 + (current_flow_s[rows] + flow / 2) / self._fatigue_s
+        learned = -np.expm1(-(flow * speed)[:, None] / self._time_s)
+        old = age > _FIRST_S
+        self._add_to_windows(rows[old], flow[old], np.log(reading[old]), np.log(load[old]))
+        ended = np.exp2(np.ceil(np.log2(np.maximum(before_s, 2 * _FIRST_S)))) <= age
+        ended &= state.window[rows, 0] > 0
+        if ended.any():
+            self._end_windows(rows[ended], (effective / load)[ended])
+        state.back_n[rows] += (self._share * load - state.back_n[rows]) * learned
+        weights = self._weights[rows]
+        learned *= self._share > 0
+        mean_learned = (weights * learned).sum(1)
+        remaining[rows] = 1 - mean_learned
+        share[rows] = (weights * learned * self._share).sum(1) / np.maximum(mean_learned, 1e-12)
+        self._update_growth(rows)
+        return remaining, share
+
+    def _update_growth(self, rows: IntArray) -> None:
+        state = self._state
+        creep = np.exp(-state.exponent[rows] * _log_age(state.age_s[rows]))
+        state.growth[rows] = 1 / (self._weights[rows] * creep).sum(1)
+
+    def _add_to_windows(
+        self, rows: IntArray, flow: FloatArray, log_reading: FloatArray, log_load: FloatArray
+    ) -> None:
+        state = self._state
+        state.sum[rows] += flow[:, None] * log_load
+        state.window[rows, 0] += flow
+        state.window[rows, 1] += flow * log_reading
+        state.window[rows, 2] += flow * np.square(log_reading)
+
+    def _end_windows(self, rows: IntArray, slope: FloatArray) -> None:
+        """Compare windows that ended with those before; slope (k, BANK_MODELS): d log load / d log reading."""
+        state, slope = self._state, np.maximum(slope, _MIN_SLOPE)
+        length, total, squares = state.window[rows, :3].T
+        mean, reading = state.sum[rows] / length[:, None], total / length
+        scatter = np.maximum(squares / length - np.square(reading), 0.0)
+        ended = np.column_stack([scatter, length, reading, state.age_s[rows] - length / 2])
+        both = np.isfinite(state.before[rows, 0])
+        if both.any():
+            mean[both] -= self._compare_windows(rows[both], slope[both], mean[both], ended[both])
+            self.update_weights()
+        state.before[rows], state.sum[rows] = mean, 0.0
+        state.window[rows, :3], state.window[rows, 3:] = 0.0, ended
+
+    def _compare_windows(
+        self, rows: IntArray, slope: FloatArray, mean: FloatArray, ended: FloatArray
+    ) -> FloatArray:
+        """Update likelihoods and exponents; return what the latter change in the mean log loads."""
+        state, before = self._state, self._state.window[rows, 3:]
+        scatter, length, reading, middle_s = ended.T
+        scatter_before, length_before, reading_before, middle_before_s = before.T
+        ages = _log_age(middle_s) - _log_age(middle_before_s)
+        noise = scatter * np.minimum(_CORRELATION_S / length, 1) + _STEADY_STD**2
+        noise += scatter_before * np.minimum(_CORRELATION_S / length_before, 1)
+        uncertain = state.exponent_variance[rows] * ages
+        variance = noise[:, None] + uncertain * ages
+        change = reading - reading_before
+        adapting = (mean - state.before[rows]) / slope
+        saturated = change[:, None] - state.exponent[rows] * ages
+        steady = _STEADY_PROBABILITY * (1 - self._saturated) * _density(adapting, variance)
+        still = _STEADY_PROBABILITY * self._saturated * _density(saturated, variance)
+        unsteady = _density(change, _UNSTEADY_STD**2 + scatter + scatter_before)
+        likelihood = steady + still + (1 - _STEADY_PROBABILITY) * unsteady[:, None]
+        gain = uncertain / variance
+        move = gain * (steady * adapting + still * saturated) / likelihood
+        move = np.clip(state.exponent[rows] + move, 0.0, _MAX_EXPONENT) - state.exponent[rows]
+        state.exponent[rows] += move
+        state.exponent_variance[rows] *= 1 - gain * ages * (steady + still) / likelihood
+        state.exponent_variance[rows] += _EXPONENT_WALK**2
+        found = _KEPT * state.log_weight[rows] + np.log(likelihood)
+        found -= found.max(axis=1, keepdims=True)
+        state.log_weight[rows] = np.maximum(found, _MIN_LOG_WEIGHT)
+        return np.asarray(slope * _log_age(middle_s) * move)
+
+
+def _log_age(age_s: FloatArray) -> FloatArray:
+    """Return logarithms (k, BANK_MODELS) of the ages (k,) [s] that count for slow creep."""
+    return np.asarray(np.log(np.clip(age_s[:, None], _FIRST_S, _CREEP_END_S) / _REFERENCE_S))
+
+
+def _density(change: FloatArray, variance: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * np.square(change) / variance) / np.sqrt(variance))
+
+
+def _variance(weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the weighted variance of each row."""
+    mean = (weights * values).sum(1)
+    return np.asarray(np.maximum((weights * np.square(values)).sum(1) - np.square(mean), 0.0))
