@@ -179,22 +179,6 @@ def test_a_sheet_that_does_not_adapt_has_no_adapted_force_from_earlier_loads() -
     assert Rig(1, QUICK, half).compensation.back_force[1][0] == pytest.approx(0.15)
 
 
-def test_uncertainty_of_slow_creep_grows_with_the_logarithm_of_the_contact_time() -> None:
-    stds = []
-    for slow_creep in (0.0, 0.03):
-        behaviour = sheet_behaviour_of(
-            Behaviour(gain_std=0.0, back_force_std_n=0.0, parameter_std_fraction=0.0, slow_creep=slow_creep)
-        )
-        rig, load = Rig(1, calm(sheet.S1), behaviour), np.array([2.0])
-        std = []
-        for seconds in (5.0, 95.0):
-            rig.run(seconds, load)
-            std.append(rig.compensation.std_n[0] / rig.compensation.force_n[0])
-        stds.append(np.array(std))
-    added = np.sqrt(stds[1] ** 2 - stds[0] ** 2)
-    np.testing.assert_allclose(added, 0.03 * np.log1p([5.0, 100.0]), rtol=0.05)
-
-
 def test_reference_forces_estimate_the_gain_at_a_limited_rate() -> None:
     behaviour = sheet_behaviour_of(Behaviour(gain_std=0.2, back_force_std_n=0.0))
     rig, rng, load = Rig(2, calm(sheet.S1), behaviour), np.random.default_rng(6), np.array([2.0, 2.0])
@@ -251,6 +235,8 @@ def test_loads_are_those_of_the_inverse_model(
     behaviour = sheet_behaviour_of(
         Behaviour(preset=preset, hysteresis_width=hysteresis_width, gain_std=0.0, back_force_std_n=0.0)
     )
+    certain = sheet.BankPrior(log_time_std=1e-12, not_adapting=1e-18, exponent_std=0.0)
+    behaviour = replace(behaviour, prior=certain)
     inverse = sheet.SheetCompensator(behaviour.model, 1, behaviour.uncertainty, update_period_s=DT_S)
     rig = Rig(1, calm(sheet.S1), behaviour)
     for apparent, touching, periods in steps:
@@ -258,7 +244,7 @@ def test_loads_are_those_of_the_inverse_model(
         rig.touching[:] = touching
         rig.compensate(np.array([apparent]))
         expected = inverse.compensate(np.array([apparent * touching]), periods * DT_S)
-        np.testing.assert_allclose(rig.compensation.force_n, expected, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(rig.compensation.force_n, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_the_keys_of_a_behaviour_change_its_preset() -> None:

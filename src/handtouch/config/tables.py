@@ -231,8 +231,8 @@ class Behaviour(Table):
     )
     slow_creep: Annotated[float, Field(ge=0, le=1)] = Field(
         0.02,
-        description="relative growth of a reading each time that a touch lasts e times longer (1 sigma): "
-        "creep by a power law, which isn't compensated",
+        description="relative growth of a reading each time that a touch lasts e times longer (1 sigma, from "
+        "0.05 on): creep by a power law, which is learned from use",
     )
     forget_time_s: Positive = Field(
         45.0,

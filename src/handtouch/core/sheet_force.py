@@ -154,8 +154,8 @@ class SheetForceCompensation:
         self, pad: int, back_n: float, std_n: float, learned: Sequence[float] = (), *, confirmed: bool = True
     ) -> None:
         """Set the back force of a pad's sheet [N], e.g. from a store, and what was learned of its behaviour
-        (`learned`; empty: unchanged); `confirmed`: its forces are reliable without further evidence. Ignored for
-        a pad without sheet model."""
+        (`learned`; empty: unchanged); `confirmed`: its forces are reliable without further evidence. Ignored
+        for a pad without sheet model."""
         if not self.modelled[pad]:
             return
         group, row = self._find_group(pad)
@@ -193,18 +193,10 @@ class SheetForceCompensation:
 
     @property
     def learned(self) -> FloatArray:
-        """What was learned of each sheet's behaviour (n, `sheet.BANK_LEARNED`); NaN where not modelled."""
+        """Learned behaviour of each sheet (n, `sheet.BANK_LEARNED`); NaN where not modelled."""
         found = np.full((len(self.force_n), sheet.BANK_LEARNED), np.nan)
         for group in self.groups:
             found[group.rows] = group.bank.learned
-        return found
-
-    @property
-    def rejected(self) -> FloatArray:
-        """Probability (n,) that a sheet doesn't adapt although its model does; 0 where none does."""
-        found = np.zeros(len(self.force_n))
-        for group in self.groups:
-            found[group.rows] = group.bank.rejected()
         return found
 
     def _find_group(self, pad: int) -> tuple[_BehaviourGroup, int]:

@@ -2,13 +2,13 @@
 
 Public names: `ModelBank`, `BankState`, `BankPrior`; `BANK_MODELS`, `BANK_WINDOW`, `BANK_LEARNED`.
 
-No force is measured, but a load that is held steadily has one value. Each model of the bank makes loads of the
-readings; a model whose loads drift while the hand holds still is less probable. Models differ in the speed of
-adaptation and the end of slow creep, and each estimates its own exponent of slow creep, by a Kalman filter.
+No force is measured, but a load that is held steadily has one value. Each model of the bank makes loads of
+the readings; a model whose loads drift while the hand holds still is less probable. Models differ in the
+speed of adaptation and the end of slow creep; each estimates its own exponent by a Kalman filter.
 
-A contact is divided into windows of doubling length, 1 to 2 s old, 2 to 4 s, ... The change of the load from one
-window to the next is the hand's: either it holds steadily, within the scatter inside the windows, or it doesn't,
-which is no evidence for any model.
+A contact is divided into windows of doubling length, 1 to 2 s old, 2 to 4 s, ... The change of the load from
+one window to the next is the hand's: either it holds steadily, within the scatter inside the windows, or it
+doesn't, which is no evidence for any model.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _STEADY_PROBABILITY = 0.5
 _STEADY_STD, _UNSTEADY_STD = 0.01, 0.15
 """Of changes of the log reading between windows of a steady hold, and of one that isn't."""
 _SATURATED_PROBABILITY, _SATURATED_SHARE = 0.5, 0.1
-"""Of a press that finds its sheet adapted to it already, if the share of adaptation is small; and the part of a
-load that isn't adapted to at which that is half as probable. With a share of 1 there is no such press."""
+"""Of a press that finds its sheet adapted to it already, if the share of adaptation is small; and the part of
+a load that isn't adapted to at which that is half as probable. With a share of 1 there is no such press."""
 _CORRELATION_S = 1.0
 """Of the scatter inside a window."""
 _KEPT, _MIN_LOG_WEIGHT = 0.995, -30.0
@@ -50,8 +50,8 @@ _MIN_SLOPE = 0.02
 
 @dataclass(frozen=True)
 class BankPrior:
-    """Prior of a bank. log_time_std: scale of the logarithm of adaptation's time over the preset's (Cauchy);
-    not_adapting: probability that the sheet doesn't adapt; exponent_std: standard deviation of slow creep's."""
+    """Prior of a bank. log_time_std: scale of the logarithm of adaptation's time over the preset's (Cauchy).
+    not_adapting: probability that the sheet doesn't adapt. exponent_std: of slow creep."""
 
     log_time_std: float = 0.5
     not_adapting: float = 0.05
@@ -82,8 +82,8 @@ class BankState:
     before: FloatArray
     """(n, BANK_MODELS) mean log load of the window before; NaN: none"""
     window: FloatArray
-    """(n, BANK_WINDOW) length [s] of the present window, integrals of the log reading and of its square; variance
-    of the log reading in the window before, its length, mean log reading, and age at its middle"""
+    """(n, BANK_WINDOW) length [s] of the present window, integrals of the log reading and of its square; of
+    the window before, variance of the log reading, length, mean log reading, and age at its middle"""
     age_s: FloatArray
     """(n,) age of the contact"""
     growth: FloatArray
@@ -92,8 +92,9 @@ class BankState:
     @classmethod
     def empty(cls, pads: int) -> BankState:
         """Return the state of fresh sheets."""
-        models = np.zeros((6, pads, BANK_MODELS))
-        return cls(*models, np.zeros((pads, BANK_WINDOW)), np.zeros(pads), np.ones(pads))
+        weight, back, exponent, variance, total, before = np.zeros((6, pads, BANK_MODELS))
+        window, age_s, growth = np.zeros((pads, BANK_WINDOW)), np.zeros(pads), np.ones(pads)
+        return cls(weight, back, exponent, variance, total, before, window, age_s, growth)
 
 
 class ModelBank:
@@ -124,8 +125,8 @@ class ModelBank:
         return np.asarray((self._weights * self._state.back_n).sum(axis=1))
 
     def spread(self, rows: IntArray | slice) -> tuple[FloatArray, FloatArray]:
-        """Return standard deviations over the models (k,): of the back force [N], and of the logarithm of slow
-        creep's factor."""
+        """Return standard deviations over the models (k,): of the back force [N], and of the logarithm of
+        slow creep's factor."""
         state, weights = self._state, self._weights[rows]
         ages = _log_age(state.age_s[rows])
         within = (weights * state.exponent_variance[rows] * np.square(ages)).sum(1)
@@ -134,7 +135,7 @@ class ModelBank:
 
     @property
     def learned(self) -> FloatArray:
-        """What was learned of each pad, (n, BANK_LEARNED): log likelihoods, exponents and their variances."""
+        """Learned behaviour of each pad (n, BANK_LEARNED): log likelihoods, exponents and their variances."""
         state = self._state
         return np.hstack([state.log_weight, state.exponent, state.exponent_variance])
 
@@ -145,17 +146,13 @@ class ModelBank:
             raise ValueError(f"{BANK_LEARNED} finite values are needed, got {learned}")
         weight, exponent, variance = learned.reshape(3, BANK_MODELS)
         if (exponent < 0).any() or (exponent > _MAX_EXPONENT).any() or (variance < 0).any():
-            raise ValueError(f"exponents must be from 0 to {_MAX_EXPONENT}, got {exponent}, variances {variance}")
+            raise ValueError(
+                f"exponents must be from 0 to {_MAX_EXPONENT}, got {exponent}, variances {variance}"
+            )
         state = self._state
         state.log_weight[row] = np.clip(weight - weight.max(), _MIN_LOG_WEIGHT, 0.0)
         state.exponent[row], state.exponent_variance[row] = exponent, variance
         self.update_weights()
-
-    def rejected(self) -> FloatArray:
-        """Return the probability (n,) that a sheet doesn't adapt although the preset does."""
-        if not self._share.any():
-            return np.zeros(len(self._weights))
-        return np.asarray(self._weights[:, self._share == 0].sum(1))
 
     def set_back_force(self, back_n: FloatArray) -> None:
         """Scale the models' back forces to the mean (n,) [N]."""
@@ -235,7 +232,7 @@ class ModelBank:
         state.window[rows, 2] += flow * np.square(log_reading)
 
     def _end_windows(self, rows: IntArray, slope: FloatArray) -> None:
-        """Compare windows that ended with those before; slope (k, BANK_MODELS): d log load / d log reading."""
+        """Compare windows that ended with those before; slope (k, BANK_MODELS): log load over reading."""
         state, slope = self._state, np.maximum(slope, _MIN_SLOPE)
         length, total, squares = state.window[rows, :3].T
         mean, reading = state.sum[rows] / length[:, None], total / length

@@ -42,9 +42,10 @@ S2 = SheetModel(
 )
 UNKNOWN = SheetModel(
     Adaptation(share=0.85, time_s=3000.0, recovery_s=1.5 * HOUR_S, threshold_n=0.03),
+    Creep.first_order(0.7, 0.25),
     fluctuation=Fluctuation(press_std=0.15, noise_std=0.01),
 )
-"""A sheet that nobody has measured: the paper's usual numbers, as probable as no adaptation at all."""
+"""A sheet that wasn't measured: the paper's usual numbers, as probable as no adaptation at all."""
 
 
 @dataclass(frozen=True)

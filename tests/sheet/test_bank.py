@@ -1,0 +1,102 @@
+"""A bank of models learns from steady holds, without a force reference."""
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from handtouch.sheet import BANK_LEARNED, S1, S2, BankPrior, BankState, Creep, ModelBank, SheetModel
+
+PERIOD_S = 1.0
+GRIPS = (16, 256) * 6
+
+
+class Hold:
+    """Grips of 3 N on one sheet, with flicker: `model` is its true behaviour, `assumed` the file's."""
+
+    def __init__(self, model: SheetModel, assumed: SheetModel) -> None:
+        self.state = BankState.empty(1)
+        self.bank = ModelBank(assumed.adaptation, BankPrior(), self.state)
+        self._model, self._sheet = model, model.initial_state(1)
+        self._rng, self._flow_s = np.random.default_rng(5), np.zeros(1)
+
+    def grip(self, long_s: float, swing: float = 0.0) -> tuple[float, float]:
+        """Hold 3 N; return the compensated force and its standard deviation at the end."""
+        self.bank.begin_contacts(np.array([0]), np.zeros(1), 0.3)
+        step, flow = self._model.discretise(PERIOD_S), np.full(1, PERIOD_S)
+        reading: npt.NDArray[np.float64] = np.zeros(1)
+        for t in np.arange(0, long_s, PERIOD_S):
+            load = 3.0 * (1 + swing * np.sin(t))
+            smooth = step.forward(self._sheet, load)
+            reading = smooth * (1 + 0.005 * self._rng.standard_normal())
+            self.bank.advance(reading / self.state.growth, flow, self._flow_s)
+            self._flow_s += flow
+        back_std, creep_std = self.bank.spread(slice(None))
+        effective = reading / self.state.growth
+        std = np.hypot(back_std, creep_std * effective)
+        step.forward(self._sheet, 0.0)
+        return float((effective + self.bank.mean_back_n()).item()), float(std.item())
+
+
+def without(model: SheetModel, creep: Creep) -> SheetModel:
+    """Return a sheet with this creep that doesn't fluctuate."""
+    return SheetModel(model.adaptation, creep)
+
+
+SETTLED = Creep(1.0, (), ())
+NOT_ADAPTING = SheetModel(type(S1.adaptation)(0.0, 3000.0, 5400.0, 0.02), SETTLED)
+
+
+def test_adaptation_that_a_sheet_does_not_show_is_no_longer_compensated() -> None:
+    hold = Hold(NOT_ADAPTING, S1)
+    for long_s in GRIPS:
+        force, _ = hold.grip(long_s)
+    assert hold.bank.mean_back_n()[0] < 0.1
+    assert force == pytest.approx(3.0, rel=0.03)
+
+
+def test_adaptation_that_a_sheet_shows_stays_compensated() -> None:
+    hold = Hold(without(S2, SETTLED), S2)
+    for long_s in GRIPS:
+        force, _ = hold.grip(long_s)
+    assert hold.bank.mean_back_n()[0] > 0.3
+    assert force == pytest.approx(3.0, rel=0.06)
+
+
+def test_slow_creep_is_learned_and_compensated() -> None:
+    hold = Hold(SheetModel(NOT_ADAPTING.adaptation, Creep.power_law(0.08)), NOT_ADAPTING)
+    assert Creep.power_law(0.08).response(128.0) > 1.4
+    for long_s in GRIPS[:4]:
+        hold.grip(long_s)
+    force, _ = hold.grip(128)
+    assert force == pytest.approx(3.0, rel=0.06)
+
+
+def test_intervals_narrow_with_use() -> None:
+    hold = Hold(NOT_ADAPTING, NOT_ADAPTING)
+    _, first = hold.grip(4)
+    for _ in range(20):
+        hold.grip(16)
+    _, last = hold.grip(4)
+    assert last < first / 3
+
+
+def test_unsteady_holds_are_no_evidence() -> None:
+    hold = Hold(NOT_ADAPTING, S1)
+    before = hold.bank.learned[0, : BANK_LEARNED // 3].copy()
+    for _ in range(5):
+        hold.grip(20, swing=0.5)
+    change = hold.bank.learned[0, : BANK_LEARNED // 3] - before
+    assert np.abs(change).max() < 1.0
+
+
+def test_what_was_learned_can_be_set_again() -> None:
+    hold = Hold(NOT_ADAPTING, S1)
+    for long_s in GRIPS[:4]:
+        hold.grip(long_s)
+    fresh = Hold(NOT_ADAPTING, S1)
+    fresh.bank.set_learned(0, hold.bank.learned[0])
+    np.testing.assert_allclose(fresh.bank.learned, hold.bank.learned)
+    with pytest.raises(ValueError, match=str(BANK_LEARNED)):
+        fresh.bank.set_learned(0, np.zeros(3))
+    with pytest.raises(ValueError, match="exponents"):
+        fresh.bank.set_learned(0, np.full(BANK_LEARNED, -1.0))
