@@ -195,7 +195,7 @@ class Behaviour(Table):
     preset: Literal["S1", "S2", "unknown"] = Field(
         "S1",
         description="sheet of the paper whose values are the defaults of the keys below; unknown: one that "
-        "wasn't measured, with wide intervals of force that narrow with use",
+        "wasn't measured, with wide intervals of force",
     )
     adaptation_share: Annotated[float, Field(ge=0, le=1)] | None = Field(
         None, description="fraction of a sustained load that adaptation removes"
