@@ -42,7 +42,7 @@ def assert_equal(one: ForwardTable, other: ForwardTable) -> None:
     for ours, theirs in zip(astuple(one), astuple(other), strict=True):
         np.testing.assert_array_equal(ours, theirs)
         assert ours.flags.c_contiguous
-        assert ours.dtype == np.float64
+        assert ours.dtype == theirs.dtype
 
 
 def test_a_cached_table_is_the_computed_one(tmp_path: Path, computed: list[ElectrodeNetwork]) -> None:

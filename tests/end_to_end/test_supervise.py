@@ -223,9 +223,13 @@ def test_killing_the_supervisor_process_affects_no_contact_and_no_tick(bench: Be
     bench.wait("running again", lambda: bench.figures["lag_s"] is not None)
     assert bench.figures["pid"] != pid
     assert bench.figures["exit_reason"] == "signal 9"
-    elapsed = (time.monotonic_ns() - since_ns) // round(PERIOD_MS * 1e6)
-    # a busy machine overruns some anyway; nothing else is missing
-    assert bench.daemon.pipeline.ticks + bench.daemon.sync.overruns - periods >= elapsed - 2
+
+    def missing() -> int:
+        passed = bench.daemon.pipeline.ticks + bench.daemon.sync.overruns - periods
+        return (time.monotonic_ns() - since_ns) // round(PERIOD_MS * 1e6) - passed
+
+    # a busy machine overruns some anyway, and may be late just now; nothing else is missing
+    bench.wait("on time", lambda: missing() <= 2)
     seqs: dict[str, list[int]] = {}
     for contact in bench.contacts[seen:]:
         seqs.setdefault(contact.link, []).append(contact.seq)
