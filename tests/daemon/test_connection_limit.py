@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.connection_limit import MAX_BURST, MAX_PER_S, ConnectionLimit
+from handtouch.daemon.connections import dropped_connection_requests
 from handtouch.daemon.endpoints import bind_endpoint
 
 _POLL_NS = 10_000_000
@@ -20,7 +21,7 @@ _SECOND_NS = 1_000_000_000
 
 
 class Kernel:
-    """Takes the share of requests that it was told to, of `per_poll` in each poll."""
+    """Takes the share of requests that is set, of `per_poll` in each poll."""
 
     def __init__(self, supported: bool = True) -> None:
         self.limit = ConnectionLimit(self._set)
@@ -130,3 +131,11 @@ def test_client_that_opens_connections_without_pause_waits_and_others_stay_conne
         now_ns += _SECOND_NS
         authenticator.poll(now_ns)
     assert all(_opens(port, 30) for _ in range(20))
+
+
+def test_number_of_dropped_requests_is_unknown_without_the_listener() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert dropped_connection_requests(server.fileno(), f"tcp://127.0.0.1:{port}") == 0
+        assert dropped_connection_requests(server.fileno(), f"tcp://127.0.0.1:{port - 1}") is None
+    assert dropped_connection_requests(-1, f"tcp://127.0.0.1:{port}") is None

@@ -261,7 +261,7 @@ class _Monitor:
         self._limit.count(accepted, now_ns)
         if self._limit.halvings:
             dropped = dropped_connection_requests(self._listener, self._endpoint)
-            if dropped != self._dropped:
+            if dropped is not None and dropped != self._dropped:
                 refusals.add(
                     "connection_flood", self._endpoint, now_ns, (dropped - self._dropped) % (1 << 32)
                 )

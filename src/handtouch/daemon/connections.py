@@ -98,15 +98,15 @@ def drop_connection_requests(listener: int, endpoint: str, halvings: int) -> boo
     return False
 
 
-def dropped_connection_requests(listener: int, endpoint: str) -> int:
-    """Return how many requests to connect the kernel has dropped, modulo 2^32; 0 if it can't say."""
+def dropped_connection_requests(listener: int, endpoint: str) -> int | None:
+    """Return how many requests to connect the kernel has dropped, modulo 2^32; None if it can't say."""
     with contextlib.suppress(OSError), _open_duplicate(listener) as listening:
         if _is_of_endpoint(listening.getsockname(), endpoint):
             size = struct.calcsize(_MEMINFO_FORMAT)
             return int(
                 struct.unpack(_MEMINFO_FORMAT, listening.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, size))[-1]
             )
-    return 0
+    return None
 
 
 def _open_duplicate(descriptor: int) -> socket.socket:
