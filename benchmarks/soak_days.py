@@ -153,6 +153,11 @@ def problems(found: dict[str, Any]) -> list[str]:
     return wrong
 
 
+def stamp() -> str:
+    """Return commit, machine and load of one of the two parts, which can be run apart."""
+    return f"{made_by()}; {machine()}, load {os.getloadavg()[0]:.1f}"
+
+
 def bad_end(name: str, code: int) -> bool:
     """Return True for an end by itself: only the recorder ends so (1), as its disk is full."""
     return code not in ((0, -9, 1) if name == "recorder" else (0, -9))
@@ -184,7 +189,7 @@ def plot(found: dict[str, Any], path: Path) -> None:
 
 def page(found: dict[str, Any]) -> list[str]:
     """Return the lines of the page."""
-    text = ["# Three days of mixed use", "", f"{made_by()}; {machine()}, load {os.getloadavg()[0]:.1f}.", ""]
+    text = ["# Three days of mixed use", ""]
     if days := found.get("compressed"):
         rows, acts = days["by_hour"], Counter(act["kind"] for act in days["acts"])
         ticks, contacts = (sum(row[name] for row in rows) for name in ("ticks", "contacts"))
@@ -193,7 +198,7 @@ def page(found: dict[str, Any]) -> list[str]:
         memory = days["memory"]
         third = memory[len(memory) // 3]
         text += [
-            f"## {days['hours']:g} hours, compressed", "",
+            f"## {days['hours']:g} hours, compressed", "", f"{days['made']}.", "",
             "Time is an argument of everything here, and runs as fast as the processor permits: pipeline, "
             "percepts, supervision with its store on a small disk, and recorder, in one process; samples of "
             "a hand of the world `default` from another one, at 100 Hz in use and 20 Hz at rest. Not here: "
@@ -217,7 +222,7 @@ def page(found: dict[str, Any]) -> list[str]:
         ]  # fmt: skip
     if cycles := found.get("processes"):
         text += [
-            f"## {cycles['minutes']:.0f} minutes of the real processes", "",
+            f"## {cycles['minutes']:.0f} minutes of the real processes", "", f"{cycles['made']}.", "",
             "Daemon with supervisor and percept process, simulated nodes, recorder, view, Zenoh bridge and a "
             "subscriber to hand frames and percepts. In each cycle of 40 s a node is replaced and another "
             "one has a fault, beside the trouble in the table; the disk has store and recordings. Latency is "
@@ -259,11 +264,11 @@ def main() -> int:
         cycles = run_cycles(asked.minutes, folder, Filler(disk))
         links = [pad.link for _, pad in Days(1.0).use.deployment.pads]
         cycles["unexplained"] = unexplained(cycles.pop("log"), cycles["acts"], links)
-        found["processes"] = cycles
+        found["processes"] = cycles | {"made": stamp()}
         progress(problems({"processes": cycles}))
     if asked.hours:
         with tempfile.TemporaryDirectory(prefix="ht.") as recordings:
-            found["compressed"] = compressed(asked.hours, disk, Path(recordings))
+            found["compressed"] = compressed(asked.hours, disk, Path(recordings)) | {"made": stamp()}
     path.write_text(json.dumps(found, indent=1, default=str) + "\n")
     if "compressed" in found:
         plot(found, out / "soak_days.png")
