@@ -16,6 +16,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -83,26 +84,39 @@ class LogRateLimiter:
 
     def __init__(self, burst: int = _MAX_MESSAGES_PER_WINDOW, window_ns: int = _RATE_WINDOW_NS) -> None:
         self._max_messages, self._window_ns = burst, window_ns
-        self._causes: dict[Cause, list[int]] = {}  # start of the window [ns], count
+        self._causes: dict[Cause, _Window] = {}
         self._lock = threading.Lock()
 
-    def allows(self, cause: Cause, now_ns: int) -> bool:
+    def allows(self, cause: Cause, text: str, now_ns: int) -> bool:
         """Count a message; return False if the limit of its cause is reached."""
         with self._lock:
             if len(self._causes) >= _MAX_CAUSES and cause not in self._causes:
                 cause = (*cause[:2], "", "")
-            seen = self._causes.setdefault(cause, [now_ns, 0])
-            if now_ns - seen[0] >= self._window_ns and seen[1] <= self._max_messages:
-                seen[:] = [now_ns, 0]
-            seen[1] += 1
-            return seen[1] <= self._max_messages
+            window = self._causes.get(cause)
+            if window is None or (
+                now_ns - window.since_ns >= self._window_ns and window.count <= self._max_messages
+            ):
+                window = self._causes[cause] = _Window(now_ns)
+            window.count += 1
+            window.text = text
+            return window.count <= self._max_messages
 
-    def take_suppressed(self, now_ns: int) -> list[tuple[Cause, int]]:
-        """Return causes whose window has ended, with their numbers of suppressed messages; reset them."""
+    def take_suppressed(self, now_ns: int) -> list[tuple[str, str, int]]:
+        """Return logger, newest text and number of suppressed messages of causes whose window has ended."""
         with self._lock:
-            ended = [cause for cause, seen in self._causes.items() if now_ns - seen[0] >= self._window_ns]
-            counts = [(cause, self._causes.pop(cause)[1] - self._max_messages) for cause in ended]
-        return [(cause, count) for cause, count in counts if count > 0]
+            ended = [c for c, window in self._causes.items() if now_ns - window.since_ns >= self._window_ns]
+            windows = [(cause[0], self._causes.pop(cause)) for cause in ended]
+        counts = [(name, window.text, window.count - self._max_messages) for name, window in windows]
+        return [(name, text, count) for name, text, count in counts if count > 0]
+
+
+@dataclass(slots=True)
+class _Window:
+    """Messages of one cause since the window's beginning."""
+
+    since_ns: int
+    count: int = 0
+    text: str = ""
 
 
 class BoundedLogHandler(logging.Handler):
@@ -133,13 +147,11 @@ class BoundedLogHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Queue the record; count it if it is suppressed or the queue is full."""
         try:
-            if not self._rate_limiter.allows(_cause(record), self._clock()):
+            text = record.getMessage()  # now, as the arguments may change before they are written
+            if not self._rate_limiter.allows(_cause(record), text, self._clock()):
                 self.suppressed += 1
                 return
-            record.msg, record.args = (
-                record.getMessage(),
-                None,
-            )  # the arguments may change before they are written
+            record.msg, record.args = text, None
             self._queue.put_nowait(record)
         except queue.Full:
             self.dropped += 1
@@ -176,10 +188,8 @@ class BoundedLogHandler(logging.Handler):
         """Log the numbers of suppressed and dropped messages."""
         if now_ns - self._last_check_ns >= _SUPPRESSED_CHECK_PERIOD_NS:
             self._last_check_ns = now_ns
-            for (name, text, about, state), count in self._rate_limiter.take_suppressed(now_ns):
-                about = f" about {about}" if about else ""
-                about += f" ({state})" if state else ""
-                self._write_warning(name, f'{count} more messages like "{text}"{about} in the last 10 s')
+            for name, text, count in self._rate_limiter.take_suppressed(now_ns):
+                self._write_warning(name, f'{count} more messages in the last 10 s like "{text}"')
         if self.dropped > self._reported_dropped:
             lost, self._reported_dropped = self.dropped - self._reported_dropped, self.dropped
             self._write_warning(_ROOT_LOGGER, f"{lost} log messages dropped: the log reader is too slow")
