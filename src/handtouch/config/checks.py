@@ -5,14 +5,13 @@ Public names: `problems_in`, `problems_in_buses`, `UDP_MULTICAST_PORT`.
 
 from __future__ import annotations
 
-import difflib
 import ipaddress
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from handtouch.config.problems import Problem
+from handtouch.config.problems import Problem, suggest_name
 from handtouch.config.tables import (
     Bus,
     Daemon,
@@ -176,7 +175,7 @@ def _check_buses(buses: Iterable[Bus]) -> Iterator[Problem]:
         location = f'[[bus]] {number} "{bus.name}": '
         if bus.interface not in VALID_INTERFACES:
             known = sorted(VALID_INTERFACES)
-            remedy = f"{_suggestion(bus.interface, known)}python-can knows {', '.join(known)}"
+            remedy = f"{suggest_name(bus.interface, known)}python-can knows {', '.join(known)}"
             yield Problem(f"{location}interface", _format_value(bus.interface), remedy)
         if bus.interface == "udp_multicast" and not _is_multicast(str(bus.channel)):
             yield Problem(
@@ -260,7 +259,7 @@ def _check_references(location: str, pad: Pad, deployment: Deployment) -> Iterat
             yield Problem(
                 f"{location}{key}",
                 _format_value(value),
-                f"no {header} of that name; {_suggestion(value, names)}{there}",
+                f"no {header} of that name; {suggest_name(value, names)}{there}",
             )
 
 
@@ -296,11 +295,6 @@ def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
             _format_value(pad.gap_mm),
             "touching electrodes share their currents, so series_ohm needs a gap above 0",
         )
-
-
-def _suggestion(value: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(value, known, 1)
-    return f'did you mean "{close[0]}"? ' if close else ""
 
 
 def _format_value(value: object) -> str:

@@ -1,6 +1,6 @@
 """Errors in a deployment file, each with its location in the file, the value and a remedy.
 
-Public names: `Problem`, `ConfigError`, `problems_of`. The definitions of the tables are in
+Public names: `Problem`, `ConfigError`, `problems_of`, `suggest_name`. The definitions of the tables are in
 `handtouch.config.tables`.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -246,3 +246,9 @@ def _join_alternatives(alternatives: Iterator[str]) -> str:
 def _format_input(value: object) -> str:
     text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def suggest_name(value: str, known: Sequence[str]) -> str:
+    """Return a question that suggests the closest known name, followed by a space; empty if none is close."""
+    close = difflib.get_close_matches(value, known, 1)
+    return f'did you mean "{close[0]}"? ' if close else ""

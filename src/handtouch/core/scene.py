@@ -9,13 +9,13 @@ Public names: `ActiveScenes`, `SceneRequirements`, `Demand`, `select_pads`, `FIL
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.config.problems import suggest_name
 from handtouch.config.tables import SceneRequest
 from handtouch.wire import PERCEPT_KINDS
 
@@ -52,8 +52,7 @@ def select_pads(patterns: Sequence[str], names: Sequence[PadName]) -> BoolArray:
         hits = [fnmatchcase(f"{hand}/{link}", full) for hand, link in names]
         if not any(hits):
             known = [f"{hand}/{link}" for hand, link in names]
-            close = get_close_matches(pattern, known if "/" in pattern else [link for _, link in names], 1)
-            hint = f'did you mean "{close[0]}"? ' if close else ""
+            hint = suggest_name(pattern, known if "/" in pattern else [link for _, link in names])
             raise ValueError(f'no pad is named "{pattern}"; {hint}there are {", ".join(known)}')
         chosen |= np.array(hits)
     return chosen

@@ -5,7 +5,6 @@ Public names: `RobotModels`, `check_urdfs`, `drop_invalid_urdfs`, `unchecked_ite
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from handtouch.config import (
     HandTable,
     Problem,
 )
+from handtouch.config.problems import suggest_name
 from handtouch.hand import urdf
 from handtouch.hand.body_distance import can_read_meshes, find_mesh, signed_distance_m
 from handtouch.hand.kinematics import HandKinematics
@@ -198,9 +198,7 @@ def _mount_problems(at: str, pad: config.Pad, link: str, robot: RobotDescription
 
 
 def _no_such(what: str, name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    suggestion = f'did you mean "{near[0]}"? ' if near else ""
-    return f"the URDF has no such {what}; {suggestion}known: {', '.join(known)}"
+    return f"the URDF has no such {what}; {suggest_name(name, known)}known: {', '.join(known)}"
 
 
 def _value_text(value: object) -> str:
