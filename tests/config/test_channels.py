@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from handtouch.config import shipped
+from handtouch.config import parse, shipped
 from handtouch.config.channels import (
     ELECTRODES,
     STANDARD_CHANNELS,
@@ -18,6 +18,7 @@ from handtouch.config.channels import (
     resolve_channels,
 )
 from handtouch.config.eds import REAL32, EdsError, ValueType
+from tests.deployments import deployment_text, pad_text
 
 FOLDER = Path(__file__).parent.parent / "data" / "eds"
 FLOATS = ("0x6403:1", "0x6403:2", "0x6403:3", "0x6403:4")
@@ -101,8 +102,9 @@ def test_real32_channels_have_their_counts_per_unit() -> None:
 
 
 def test_order_of_electrodes_is_that_of_the_pad_whatever_the_wiring() -> None:
+    pad = parse(deployment_text(pad_text("plane", 1))).pads[0].pad
     for wired in itertools.permutations(ELECTRODES):
-        ordered = order_by_electrode(STANDARD_CHANNELS, wired)
+        ordered = order_by_electrode(STANDARD_CHANNELS, pad.model_copy(update={"electrodes": wired}))
         assert [wired[channel.sub - 1] for channel in ordered] == list(ELECTRODES)
 
 

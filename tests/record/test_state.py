@@ -74,7 +74,7 @@ def test_a_restored_pipeline_continues_as_the_saved_one(
         _do(first, action)
     first.step({})  # events added before belong to a tick
     saved, calibrations = first.pipeline.save_state(), first.pipeline.calibrations
-    second.pipeline.load_state(saved, TickState.layout(), calibrations)
+    second.pipeline.load_state(saved, first.pipeline.state.layout(), calibrations)
     second.pipeline.slab = _copy_of(first.pipeline.slab)  # samples are inputs, not state
     second.t_ns = first.t_ns
     first.sink.messages.clear()
@@ -105,7 +105,7 @@ def test_loaded_arrays_keep_their_identity_and_views(make_hand: Callable[..., An
     first, second = make_hand(), make_hand()
     first.stroke(30)
     columns = second.pipeline.tick.columns
-    second.pipeline.load_state(first.pipeline.save_state(), TickState.layout())
+    second.pipeline.load_state(first.pipeline.save_state(), first.pipeline.state.layout())
     assert np.shares_memory(columns.position_m, second.pipeline.state.block)
     np.testing.assert_array_equal(columns.position_m, first.pipeline.tick.columns.position_m)
 
@@ -128,7 +128,7 @@ def test_a_state_of_another_layout_is_rejected_changing_nothing(make_hand: Calla
     pipeline = make_hand().pipeline
     before = pipeline.save_state()
     other = b"\1" * len(before)
-    for layout, data in (("0-abc", other), ("", other), (TickState.layout(), other[:-64])):
+    for layout, data in (("0-abc", other), ("", other), (pipeline.state.layout(), other[:-64])):
         with pytest.raises(StateLayoutError, match=r"layout|bytes"):
             pipeline.load_state(data, layout)
     assert pipeline.save_state() == before

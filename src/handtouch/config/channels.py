@@ -1,4 +1,4 @@
-"""Objects of a node's four channels, with their types, from configuration and EDS.
+"""Objects of a node's channels, with their types, from configuration and EDS.
 
 A channel is an integer, its count, or REAL32: count = value x counts per unit, rounded.
 
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from handtouch.config import Node, eds
+from handtouch.config import Node, Pad, eds
 from handtouch.config.eds import REAL32, ValueType
 
 ELECTRODES = ("x0", "xa", "y0", "yb")
@@ -83,7 +83,7 @@ class WritableObject:
     size_bytes: int
 
 
-Channels = tuple[Channel, Channel, Channel, Channel]
+Channels = tuple[Channel, ...]
 
 STANDARD_CHANNELS: Channels = (
     Channel(0x6401, 1),
@@ -137,8 +137,7 @@ def resolve_channels(objects: Sequence[str], path: Path | str | None) -> Channel
         if any((channel.index, channel.sub) == (index, sub) for channel in channels):
             raise eds.EdsError(f'"{text}" is given twice; each channel needs its own object')
         channels.append(Channel(index, sub, kind.bits, kind.signed, counts_per_unit))
-    first, second, third, fourth = channels
-    return first, second, third, fourth
+    return tuple(channels)
 
 
 def parse_writable_object(text: str) -> WritableObject:
@@ -151,10 +150,9 @@ def parse_writable_object(text: str) -> WritableObject:
     return WritableObject(index, sub, kind.bits // 8)
 
 
-def order_by_electrode(channels: Channels, electrodes: Sequence[str]) -> Channels:
-    """Return the channels of the electrodes x0, xa, y0, yb; `electrodes` lists each channel's electrode."""
-    x0, xa, y0, yb = (channels[electrodes.index(name)] for name in ELECTRODES)
-    return x0, xa, y0, yb
+def order_by_electrode(channels: Channels, pad: Pad) -> Channels:
+    """Return the channels of a pad's electrodes, in their order; `channels` are those of its node."""
+    return tuple(channels[pad.electrodes.index(name)] for name in pad.electrode_names)
 
 
 def full_scale_counts(node: Node) -> int:

@@ -356,6 +356,11 @@ class Pad(Table):
     touch: Touch | None = Field(None, description="thresholds of this pad; default: those of [touch]")
 
     @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Names of the electrodes, in the order of the columns of all currents."""
+        return ("x0", "xa", "y0", "yb")
+
+    @property
     def gaps_mm(self) -> tuple[tuple[float, float], ...]:
         """Bare lengths [mm] at the low and the high end of electrodes x0, xa, y0, yb: (4, 2)."""
         return tuple((self.gap_mm + low, self.gap_mm + high) for low, high in self.gap_offsets_mm)

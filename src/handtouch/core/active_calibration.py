@@ -14,7 +14,7 @@ from handtouch.calibration.calibration import LawParameters, LearnedParts
 class ActiveCalibration:
     """Calibration of a pad, and what is known about its quality.
 
-    gains: of the electrodes x0, xa, y0, yb. law: None, the deployment's. gain_covariance: (16,) of log gains;
+    gains: (n,) of the electrodes. law: None, the deployment's. gain_covariance: (n n,) of log gains;
     None, as the deployment states. parts: learned with the gains; None, as the deployment states.
     quarantined: no force is published. diagnoses: names of those responsible for `quarantined` or
     `position_unreliable`.

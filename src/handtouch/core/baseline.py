@@ -40,19 +40,19 @@ _MAX_RETURN_FRACTION = 0.5  # of the end threshold: a released pad's distance fr
 _CONFIDENCE_SIGMA = 3.0
 _MIN_COMMON_DRIFT_PADS = 3  # untouched pads of a hand
 _GRAVITY_GAIN, _MIN_TURN_SQUARED = 0.02, 0.05  # fraction of an innovation; squared change of unit gravity
-_ONES = np.ones(4)
 
 
 class Baseline:
-    """Baselines of n pads of four channels x0, xa, y0, yb [counts]; `hands` are the rows of each hand.
+    """Baselines of the channels of n pads [counts]; `hands` are the rows of each hand.
 
     noise_counts: configured noise of a channel. begin_counts, end_counts: sums of channels at which a contact
     begins and ends. max_rise_time_s: a reading that takes longer to rise to `end_counts` is drift. All (n,).
+    electrode_counts: (n,) number of channels of each pad, those of `state` by default.
 
-    Public state: `offset` (n, 4); `std` (n,) of the sum of the four; `noise_squared` (n, 4) [counts^2] of
+    Public state: `offset` (n, c); `std` (n,) of the sum of the channels; `noise_squared` (n, c) [counts^2] of
     untouched samples; `held` (n,): touched, or released and not back yet; `unverified` (n,): no reading has
     agreed with the baseline yet; `known` (n,): set, or measured untouched; `drift_speed` (n,): recent drift
-    of the sum, without the common one [counts/s]; `gravity_slope` (n, 4, 3): change of a channel per unit of
+    of the sum, without the common one [counts/s]; `gravity_slope` (n, c, 3): change of a channel per unit of
     gravity.
     """
 
@@ -64,9 +64,13 @@ class Baseline:
         max_rise_time_s: FloatArray,
         hands: Iterable[slice],
         state: TickState | None = None,
+        electrode_counts: IntArray | None = None,
     ) -> None:
         n, hands = len(noise_counts), list(hands)
         held = TickState.empty(n, len(hands)) if state is None else state
+        self._channels = np.full(n, held.channels) if electrode_counts is None else electrode_counts
+        self._used = (np.arange(held.channels) < self._channels[:, None]).astype(np.float64)
+        self._ones, self._root_channels = np.ones(held.channels), np.sqrt(self._channels)
         self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
         self.offset, self.std, self.noise_squared = held.offset, held.offset_std, held.noise_squared
         self.held, self.unverified, self.known = held.held, held.unverified, held.known
@@ -77,10 +81,10 @@ class Baseline:
         self.common_drift = held.common_drift
         """drift per channel common to each hand's pads"""
         self.std[:] = begin_counts / _CONFIDENCE_SIGMA
-        self.noise_squared[:] = np.square(noise_counts)[:, None]
+        self.noise_squared[:] = np.square(noise_counts)[:, None] * self._used
         self.drift_speed[:] = _INITIAL_DRIFT_SIGMA_PER_S * noise_counts
-        self.expected_counts = np.zeros((n, 4))
-        """(n, 4) counts to subtract from a reading"""
+        self.expected_counts = np.zeros((n, held.channels))
+        """(n, c) counts to subtract from a reading"""
         self._hand_membership = np.zeros((len(hands), n))
         for row, pads in enumerate(hands):
             self._hand_membership[row, pads] = 1.0
@@ -101,11 +105,12 @@ class Baseline:
         self._update_expected()
 
     def set_offset(self, pad: int, offset: npt.ArrayLike, std: npt.ArrayLike = 0.0) -> None:
-        """Set a pad's offsets (4,) and their standard deviations (4,) or () [counts], from a store or a tare.
-        The next reading is a contact only if it differs by more than these explain."""
-        self.offset[pad] = offset
+        """Set offsets (k,) of a pad's k channels, and their standard deviations (k,) or () [counts], from a
+        store or a tare. The next reading is a contact only if it differs by more than these explain."""
+        count = self._channels[pad]
+        self.offset[pad, :count] = offset
         self.offset[pad] -= self.gravity_slope[pad] @ self.gravity[pad]
-        self.std[pad] = np.sqrt(np.sum(np.square(np.broadcast_to(std, 4))))
+        self.std[pad] = np.sqrt(np.sum(np.square(np.broadcast_to(std, count))))
         self.unverified[pad] = self.known[pad] = True
         self.held[pad] = self.touching[pad]
         self._anchored_s[pad] = 0.0
@@ -115,9 +120,10 @@ class Baseline:
     def reset_pad(self, pad: int) -> None:
         """Forget what was learned of a pad, because its node was replaced."""
         self.gravity_slope[pad] = 0.0
-        self.noise_squared[pad] = self._noise[pad] ** 2
+        self.noise_squared[pad] = self._noise[pad] ** 2 * self._used[pad]
         self.drift_speed[pad] = _INITIAL_DRIFT_SIGMA_PER_S * self._noise[pad]
-        self.set_offset(pad, np.zeros(4), self._begin_threshold[pad] / (2 * _CONFIDENCE_SIGMA))
+        std = self._begin_threshold[pad] / (self._root_channels[pad] * _CONFIDENCE_SIGMA)
+        self.set_offset(pad, np.zeros(self._channels[pad]), std)
         self.known[pad] = False
 
     def set_gravity(self, gravity: FloatArray) -> None:
@@ -131,7 +137,7 @@ class Baseline:
 
     @property
     def noise_counts(self) -> FloatArray:
-        """Standard deviation of each channel (n, 4), measured while untouched."""
+        """Standard deviation of each channel (n, c), measured while untouched."""
         return np.asarray(np.sqrt(self.noise_squared))
 
     def update_baseline(self, sync_ns: int, touching: BoolArray) -> bool:
@@ -148,13 +154,13 @@ class Baseline:
         self.held |= touching
         sampled = self._count > 0
         mean = self._sum / np.maximum(self._count, 1.0)[:, None]
-        total = mean @ _ONES
+        total = mean @ self._ones
         self._release_returned(sampled & ~touching, total)
         free = sampled & ~self.held
         dt_s = np.asarray((sync_ns - self._drift_until_ns) * 1e-9, np.float64)
         np.copyto(self._drift_until_ns, sync_ns, where=free | self.held)
         moved = self._track_offsets(mean, free, dt_s)
-        self._update_drift(moved @ _ONES, free, elapsed_ns * 1e-9, dt_s)
+        self._update_drift(moved @ self._ones, free, elapsed_ns * 1e-9, dt_s)
         self._blocks[0] += 1
         if self._blocks[0] % _NOISE_PERIOD_BLOCKS == 0:
             self._update_noise(mean, free)
@@ -170,25 +176,25 @@ class Baseline:
 
     def _release_returned(self, sampled: BoolArray, total: FloatArray) -> None:
         """End the hold of pads that read nearly their baseline again."""
-        near = _MAX_RETURN_FRACTION * self._end_threshold + _CONFIDENCE_SIGMA * np.hypot(
-            self.std, 2 * self._noise
-        )
+        sum_std = np.hypot(self.std, self._root_channels * self._noise)
+        near = _MAX_RETURN_FRACTION * self._end_threshold + _CONFIDENCE_SIGMA * sum_std
         less = sampled & (total < -near) & (total >= -self._begin_threshold)
         if np.count_nonzero(less):
             self.unverified |= less
             self.held |= less  # until the next block: only a part of this one may be without the touch
             self.std[less] = self._begin_threshold[less] / _CONFIDENCE_SIGMA
+            sum_std = np.hypot(self.std, self._root_channels * self._noise)
             sampled = sampled & ~less
         elif not np.count_nonzero(self.unverified) and not np.count_nonzero(self.held):
             return
-        first_near = _CONFIDENCE_SIGMA * np.hypot(self.std, 2 * self._noise)
+        first_near = _CONFIDENCE_SIGMA * sum_std
         first_near = np.minimum(first_near, np.maximum(self._begin_threshold, _CONFIDENCE_SIGMA * self.std))
         near = np.where(self.unverified, first_near, near)
         back = sampled & (np.abs(total) <= near)
         first = np.flatnonzero(back & self.unverified)
         if len(first):
             count = self._count[first]
-            variance = np.square(self._noise[first]) * 4 / count
+            variance = np.square(self._noise[first]) * self._channels[first] / count
             gain = np.square(self.std[first]) / (np.square(self.std[first]) + variance)
             jump = self._sum[first] * (gain / count)[:, None]
             self.offset[first] += jump
@@ -201,8 +207,8 @@ class Baseline:
 
     def _track_offsets(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> FloatArray:
         """Move offsets towards the readings: do/dt = excess / time constant, up to the maximum rate. Return
-        the change (n, 4). Exact for a constant reading, whatever the intervals."""
-        excess = np.abs(mean) @ _ONES
+        the change (n, c). Exact for a constant reading, whatever the intervals."""
+        excess = np.abs(mean) @ self._ones
         linear = self._max_rate * _TRACKING_TIME_S
         bound_s = np.maximum(excess - linear, 0.0) / self._max_rate
         remaining = np.minimum(excess, linear) * np.exp(np.minimum(bound_s - dt_s, 0.0) / _TRACKING_TIME_S)
@@ -217,19 +223,22 @@ class Baseline:
         pads = self._hand_membership @ free
         shift = np.where(
             pads >= _MIN_COMMON_DRIFT_PADS,
-            self._hand_membership @ (moved * free) / np.maximum(4 * pads, 1.0),
+            self._hand_membership
+            @ (moved * free)
+            / np.maximum(self._hand_membership @ (self._channels * free), 1.0),
             0.0,
         )
         self.common_drift += shift
         kept = shift @ self._hand_membership * self.held
-        self.offset += kept[:, None]
+        self.offset += kept[:, None] * self._used
         settled = (
             self.drift_speed * _TRACKING_TIME_S + _MAX_RETURN_FRACTION * self._noise - self.std
         ) * -np.expm1(-dt_s / _TRACKING_TIME_S)
         self.std += np.where(free, settled, self.drift_speed * elapsed_s)
         self._anchored_s += free * dt_s
         if np.count_nonzero(due := self._anchored_s >= _DRIFT_SPEED_PERIOD_S):
-            own = self.offset @ _ONES - 4 * (self.common_drift @ self._hand_membership)
+            common = self._channels * (self.common_drift @ self._hand_membership)
+            own = self.offset @ self._ones - common
             speed = np.abs(own - self._anchor)[due] / self._anchored_s[due]
             self.drift_speed[due] += _DRIFT_SPEED_GAIN * (speed - self.drift_speed[due])
             self._anchor[due], self._anchored_s[due] = own[due], 0.0

@@ -29,7 +29,7 @@ def make_solver(
 ) -> ContactSolver:
     """Return a solver of contacts that reads and writes these arrays in place.
 
-    currents: (pads, n) [A]. offset_std_a: (pads,) of the sum of the currents, from the baseline.
+    currents: (pads, channels) [A]. offset_std_a: (pads,) of the sum of the currents, from the baseline.
     force_requested: (pads,). values: (pads, VALUE_COUNT), laid out as VALUE_SLICES; NaN for new contacts.
     """
     n = currents.shape[1]

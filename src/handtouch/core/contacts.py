@@ -25,7 +25,7 @@ class DetectionSettings(NamedTuple):
     """Settings of n pads, read in place in every tick."""
 
     ampere_per_count: FloatArray
-    """(n, 4)"""
+    """(n, channels)"""
     mean_ampere_per_count: FloatArray
     """(n,)"""
     noise_counts: FloatArray
@@ -56,16 +56,16 @@ class ContactDetector:
     """Contacts of n pads, at most one each, in a tick's state.
 
     `touching` (n,) bool; `id` (n,) uint32, 0 without contact; `begin_ns` (n,) time of the first sample above
-    the begin threshold; `peak_force_n` (n,) greatest valid force of the contact [N]; `currents` (n, 4)
+    the begin threshold; `peak_force_n` (n,) greatest valid force of the contact [N]; `currents` (n, channels)
     [A], and of contacts that are to be solved `offset_std_a` (n,) of their sum, from the baseline.
 
-    expected_counts: (n, 4) of untouched pads, read in place.
+    expected_counts: (n, channels) of untouched pads, read in place.
     """
 
     def __init__(self, settings: DetectionSettings, expected_counts: FloatArray, state: TickState) -> None:
         self.touching, self.id, self.begin_ns = state.touching, state.contact_id, state.begin_ns
         self.peak_force_n, self._next_id = state.peak_force_n, state.next_contact_id
-        self.currents, self.offset_std_a = np.zeros(expected_counts.shape), np.zeros(state.pads)
+        self.currents, self.offset_std_a = np.zeros_like(expected_counts), np.zeros(state.pads)
         self._state, self._expected_counts = state, expected_counts
         self._rows = np.zeros((len(ContactChanges._fields), state.pads), dtype=np.intp)
         self.lists = list(self._rows)
@@ -76,7 +76,8 @@ class ContactDetector:
         """Change the settings; they apply to present contacts too."""
         arrays = {name: view_memory(array) for name, array in settings._asdict().items()}
         arrays["expected_counts"] = view_memory(self._expected_counts)
-        arrays["currents"], arrays["excess"] = view_memory(self.currents), view_memory(np.zeros(4))
+        arrays["currents"] = view_memory(self.currents)
+        arrays["excess"] = view_memory(np.zeros(self._state.channels))
         arrays["offset_std_a"] = view_memory(self.offset_std_a)
         self.stage = ContactDetection(
             self._state.pads, self._state.memory() | arrays, view_memory(self._rows)

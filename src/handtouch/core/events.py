@@ -46,7 +46,7 @@ class Event(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class BaselineEvent:
-    """Offsets (4,) of a pad and their standard deviations [counts]: a tare, or from a calibration."""
+    """Offsets (n,) of a pad and their standard deviations [counts]: a tare, or from a calibration."""
 
     kind: ClassVar[str] = "baseline"
     pad: int

@@ -27,6 +27,7 @@ _NO_LIMIT_NS = np.iinfo(np.int64).max
 class _Pipeline(Protocol):
     """The part of `Pipeline` that is recorded."""
 
+    state: TickState
     tick: TickProcessor
     cycle: Cycle
     slab: Slab
@@ -108,7 +109,7 @@ class TickJournal:
             seq=self._state_seq,
             t_ns=now_ns,
             tick=self._pipeline.ticks,
-            layout=TickState.layout(),
+            layout=self._pipeline.state.layout(),
             state=self._pipeline.save_state(),
             calibrations=tuple(map(encode_calibration, self._pipeline.tick.model.calibrations)),
             limits=self._pipeline.slab.limits.tobytes(),

@@ -15,7 +15,6 @@ from handtouch import config
 from handtouch.calibration.calibration import Calibration, LawParameters, LearnedParts, matrix
 from handtouch.config import Deployment
 from handtouch.config.channels import (
-    ELECTRODES,
     Channels,
     order_by_electrode,
     resolve_channels,
@@ -46,7 +45,6 @@ _SHEET_TOLERANCES = {
 }
 
 
-PART_COUNT = part_count(4)
 _MIN_RADIUS_RATIO = 0.3  # least radius of a contact, relative to the stated one
 _LOCAL_UNEVENNESS = 1.5  # standard deviation of ln of the local sheet resistance, per wave's: a sum of five
 
@@ -55,11 +53,12 @@ class PadModel:
     """Columns of the n pads of a deployment, in its order, which is also the slab's.
 
     `hands`, `links`, `frame_links` (URDF links) and `calibration_ids` (n,) are names; `rows_of_hand`: hand ->
-    slice of rows; `calibrations` (n,): the active ones. `ampere_per_count` (n, 4) of the electrodes x0, xa,
-    y0, yb includes `gains` (n, 4); `noise_counts` (n,) and `noise_a` (n, 4) are standard deviations of a
+    slice of rows; `calibrations` (n,): the active ones. `electrode_counts` (n,): electrodes of each pad; `c`,
+    `channels`, is the largest of them. Columns beyond a pad's own are 0. `ampere_per_count` (n, c) of the
+    electrodes includes `gains` (n, c); `noise_counts` (n,) and `noise_a` (n, c) are standard deviations of a
     channel. The counts of untouched pads are state of the tick: see `Baseline`.
 
-    `gain_covariance` (n, 4, 4) is that of log gains; `part_axes` (n, 4 + p, 4 + p), `part_offsets` (n, p) and
+    `gain_covariance` (n, c, c) is that of log gains; `part_axes` (n, (c + p)^2), `part_offsets` (n, p) and
     `touch_errors` (n,): see `PartKnowledge`; `quarantined` (n,): no force is published;
     `position_unreliable` (n,).
 
@@ -69,7 +68,7 @@ class PadModel:
     slower rise to `end_threshold_n` is drift. `behaviours` (n,): sheet behaviour, None where it isn't
     modelled.
 
-    `forward_tables`, `surface_tables` and `law_parameters` are what the stages read; `weight` (n, 4) is
+    `forward_tables`, `surface_tables` and `law_parameters` are what the stages read; `weight` (n, c) is
     1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that they tabulate.
     """
 
@@ -90,24 +89,32 @@ class PadModel:
         self.frame_links = [pad.mount.link or pad.link for pad in pads]
         self.rows_of_hand = _rows_of_hands(self.hands)
         self.default_calibration_ids = [default_calibration_id_of(pad, deployment) for pad in pads]
-        self.calibrations = [ActiveCalibration(name) for name in self.default_calibration_ids]
         kinds = {name: resolve_channels(node.channels, node.eds) for name, node in deployment.nodes.items()}
-        self.ampere_per_count = np.array(
+        self.electrode_counts = np.array([len(pad.electrode_names) for pad in pads])
+        self.channels = int(self.electrode_counts.max())
+        self.calibrations = [self.default_calibration(pad) for pad in range(self.size)]
+        self._used = np.arange(self.channels) < self.electrode_counts[:, None]
+        self.ampere_per_count = np.zeros((self.size, self.channels))
+        self.ampere_per_count[self._used] = np.concatenate(
             [_ampere_per_count(pad, deployment, kinds[pad.node]) for pad in pads]
         )
         counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
         self.noise_counts = np.array(counts)
         self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
-        self.weight = 1 / self.noise_a
-        self.mean_ampere_per_count = self.ampere_per_count.mean(axis=1)
+        self.weight = np.zeros(self.noise_a.shape)
+        self.weight[self._used] = 1 / self.noise_a[self._used]
+        self.mean_ampere_per_count = self.ampere_per_count.sum(axis=1) / self.electrode_counts
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
-        self.gains = np.ones((self.size, 4))
-        self._stated_gain_covariance = np.stack([node.gain_std**2 * np.eye(4) for node in nodes])
+        self.gains = self._used.astype(np.float64)
+        self._stated_gain_covariance = np.stack(
+            [node.gain_std**2 * np.diag(gains) for node, gains in zip(nodes, self.gains, strict=True)]
+        )
         self.gain_covariance = self._stated_gain_covariance.copy()
         self.touch_errors = np.zeros(self.size)
-        self.part_offsets = np.zeros((self.size, PART_COUNT))
-        self.part_axes = np.zeros((self.size, 4 + PART_COUNT, 4 + PART_COUNT))
+        parts = part_count(self.channels)
+        self.part_offsets = np.zeros((self.size, parts))
+        self.part_axes = np.zeros((self.size, (self.channels + parts) ** 2))
         for pad in range(self.size):
             self._set_parts(pad, None)
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
@@ -132,7 +139,10 @@ class PadModel:
         self._drive_v = np.array([node.drive_v for node in nodes])
         self._file_laws = [law_of(sheet) for sheet in sheets]
         self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
-        self._series_form = np.stack([network.series_quadratic_form for network in networks])
+        self._series_form = np.zeros((self.size, self.channels, self.channels))
+        for form, network in zip(self._series_form, networks, strict=True):
+            count = len(network.series_ohm)
+            form[:count, :count] = network.series_quadratic_form
         self._has_series = np.array([any(pad.series_ohm) for pad in pads])
         self._law = ContactLaw(
             np.array([sheet.contact_ohm_mm2 * 1e-6 for sheet in sheets]),
@@ -155,12 +165,16 @@ class PadModel:
         """Tables of the same forward models for offline use, built on first use; large, no part of a tick."""
         return LocatorBank(self.networks)
 
+    def default_calibration(self, pad: int) -> ActiveCalibration:
+        """Return the calibration of a pad without one: the deployment's."""
+        return ActiveCalibration(self.default_calibration_ids[pad], (1.0,) * int(self.electrode_counts[pad]))
+
     def apply_calibration(self, pad: int, calibration: Calibration, name: str) -> None:
         """Apply gains and contact law of a pad's calibration; its offsets are applied to the baseline.
 
         Parts that the calibration lacks are the deployment's.
         """
-        gains = calibration.gains.factors if calibration.gains else (1.0,) * 4
+        gains = calibration.gains.factors if calibration.gains else (1.0,) * int(self.electrode_counts[pad])
         self.set_gains_and_law(pad, gains, name, calibration.law)
 
     def set_calibration(self, pad: int, calibration: ActiveCalibration) -> None:
@@ -169,13 +183,17 @@ class PadModel:
         before, self.calibrations[pad] = self.calibrations[pad], calibration
         if calibration.law != before.law:
             self._set_law(pad, calibration.law)
-        self.gains[pad] = calibration.gains
+        count = self.electrode_counts[pad]
+        self.gains[pad, :count] = calibration.gains
         self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
         self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
-        self.weight[pad] = 1 / self.noise_a[pad]
-        self.mean_ampere_per_count[pad] = self.ampere_per_count[pad].mean()
-        stated, covariance = self._stated_gain_covariance[pad], calibration.gain_covariance
-        self.gain_covariance[pad] = stated if covariance is None else np.reshape(covariance, (4, 4))
+        self.weight[pad, :count] = 1 / self.noise_a[pad, :count]
+        self.mean_ampere_per_count[pad] = self.ampere_per_count[pad].sum() / count
+        self.gain_covariance[pad] = self._stated_gain_covariance[pad]
+        if calibration.gain_covariance is not None:
+            self.gain_covariance[pad, :count, :count] = np.reshape(
+                calibration.gain_covariance, (count, count)
+            )
         self._set_parts(pad, calibration.parts)
         self.quarantined[pad] = calibration.quarantined
         self.position_unreliable[pad] = calibration.position_unreliable
@@ -183,7 +201,7 @@ class PadModel:
     def set_gains_and_law(
         self, pad: int, gains: ArrayLike, calibration_id: str, law: LawParameters | None = None
     ) -> None:
-        """Set the gains of the channels x0, xa, y0, yb of a pad, its contact law and calibration id.
+        """Set the gains of the channels of a pad, its contact law and calibration id.
 
         `law` None: the deployment's.
         """
@@ -194,13 +212,16 @@ class PadModel:
 
     def _set_parts(self, pad: int, parts: LearnedParts | None) -> None:
         """Apply what is known of the parts of a pad, None: as the deployment states, and of its gains."""
+        count = int(self.electrode_counts[pad])
+        size = count + part_count(count)
+        self.part_offsets[pad] = self.touch_errors[pad] = 0.0
         if parts is not None:
-            self.part_axes[pad] = _triangle(np.array(parts.covariance))
-            self.part_offsets[pad], self.touch_errors[pad] = parts.offsets, parts.touch_error
+            axes = _triangle(np.array(parts.covariance))
+            self.part_offsets[pad, : size - count], self.touch_errors[pad] = parts.offsets, parts.touch_error
         else:
-            self.part_axes[pad] = np.eye(4 + PART_COUNT)
-            self.part_axes[pad, :4, :4] = _triangle(self.gain_covariance[pad])
-            self.part_offsets[pad] = self.touch_errors[pad] = 0.0
+            axes = np.eye(size)
+            axes[:count, :count] = _triangle(self.gain_covariance[pad, :count, :count])
+        self.part_axes[pad, : size * size] = axes.ravel()
 
     @property
     def calibration_ids(self) -> list[str]:
@@ -210,12 +231,12 @@ class PadModel:
     @property
     def begin_threshold_counts(self) -> FloatArray:
         """Sum of the channels at which a contact begins (n,)."""
-        return np.asarray(self.begin_threshold_a / self.ampere_per_count.mean(axis=1))
+        return np.asarray(self.begin_threshold_a / self.mean_ampere_per_count)
 
     @property
     def end_threshold_counts(self) -> FloatArray:
         """Sum of the channels at which a contact ends (n,)."""
-        return np.asarray(self.end_threshold_a / self.ampere_per_count.mean(axis=1))
+        return np.asarray(self.end_threshold_a / self.mean_ampere_per_count)
 
     def law(self, pad: int) -> LawParameters:
         """Return the contact law of a pad: its calibration's, or the deployment's."""
@@ -233,7 +254,7 @@ class PadModel:
         position_unreliable: bool = False,
         diagnoses: tuple[str, ...] = (),
     ) -> None:
-        """Set the covariance (4, 4) of a pad's log gains, None: as the deployment states.
+        """Set the covariance (k, k) of a pad's k log gains, None: as the deployment states.
 
         `quarantined`: publish no force; `position_unreliable`: publish positions as unreliable; because of
         `diagnoses`.
@@ -281,7 +302,7 @@ class PadModel:
         """Estimate forces of contacts on the pads `index` (n,) from total currents and their standard
         deviation.
 
-        `currents` (4, n), in any unit, and the spreading radius there identify the position.
+        `currents` (c, n), in any unit, and the spreading radius there identify the position.
         """
         return self._law.select(index).force(
             total_a,
@@ -338,9 +359,14 @@ class PadModel:
     def stage_laws(self) -> list[PadLaw]:
         """Return the contact laws as the stages take them; they follow later changes."""
         return [
-            PadLaw(view_memory(parameters), view_memory(np.ascontiguousarray(form)), bool(has_series))
-            for parameters, form, has_series in zip(
-                self.law_parameters, self._series_form, self._has_series, strict=True
+            PadLaw(
+                view_memory(parameters),
+                view_memory(np.ascontiguousarray(form[:count, :count])),
+                bool(has_series),
+            )
+            for parameters, form, count, has_series in zip(
+                *(self.law_parameters, self._series_form, self.electrode_counts, self._has_series),
+                strict=True,
             )
         ]
 
@@ -352,7 +378,10 @@ class PadModel:
         pads = np.arange(self.size)
         scale = self.placement.to_link_frame(pads, x, y, np.zeros((self.size, 2, 2))).scale_m_per_unit
         radius = np.array([net.spreading_radius(*at) for net, *at in zip(networks, x, y, strict=True)])
-        fractions = np.stack([net.fractions(*at) for net, *at in zip(networks, x, y, strict=True)], axis=1)
+        fractions = np.zeros((self.channels, self.size))
+        fractions.T[self._used] = np.concatenate(
+            [net.fractions(*at) for net, *at in zip(networks, x, y, strict=True)]
+        )
         return radius * scale, self._series_resistance(pads, fractions)
 
     def _threshold_current(self, force_n: FloatArray) -> FloatArray:
@@ -381,12 +410,12 @@ def _behaviour_of_sheet(sheet: config.Sheet) -> SheetBehaviour | None:
 
 
 def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:
-    """Return the current per count of the electrodes x0, xa, y0, yb."""
+    """Return the current per count of the electrodes."""
     node = deployment.nodes[pad.node]
-    scale = [node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES]
+    scale = [node.channel_scale[pad.electrodes.index(name)] for name in pad.electrode_names]
     return [
         node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor
-        for channel, factor in zip(order_by_electrode(channels, pad.electrodes), scale, strict=True)
+        for channel, factor in zip(order_by_electrode(channels, pad), scale, strict=True)
     ]
 
 

@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.force import StackTable
 from handtouch.core.stages.locate import ModelTable
+from handtouch.core.stages.solve import MAX_SQUARED_MISFIT
 from handtouch.core.stages.tables import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.contact_stack import stack_factor
@@ -144,7 +146,19 @@ class ForwardTable:
             view_memory(self.search_fractions),
             view_memory(self.search_cells),
             SEARCH_POINTS,
+            _misfit_scale(self.electrodes),
         )
+
+
+def _misfit_scale(electrodes: int) -> float:
+    """Return the factor from a squared misfit of n currents at the limit to MAX_SQUARED_MISFIT, which is as
+    likely of one degree of freedom (chi-squared by Wilson and Hilferty, PNAS 17, 1931)."""
+    freedom = electrodes - 3
+    if freedom <= 1:
+        return 1.0
+    variance = 2 / (9 * freedom)
+    deviations = NormalDist().inv_cdf(math.erf(math.sqrt(MAX_SQUARED_MISFIT / 2)))
+    return MAX_SQUARED_MISFIT / (freedom * (1 - variance + deviations * math.sqrt(variance)) ** 3)
 
 
 class _Axis:

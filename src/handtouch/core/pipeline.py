@@ -50,8 +50,8 @@ class Pipeline:
         robots: RobotModels | None = None,
     ) -> None:
         self.model = model
-        self.state = TickState.empty(model.size, len(model.rows_of_hand))
-        self.slab = Slab(model.size)
+        self.state = TickState.empty(model.size, len(model.rows_of_hand), model.channels)
+        self.slab = Slab(model.size, model.channels)
         self.cycle = Cycle(period_ns, window)
         self.tick = TickProcessor(model, period_ns, self.state)
         self.transforms = ContactTransforms(model.hands, robots, self.state)
@@ -206,7 +206,7 @@ class Pipeline:
         saved = self.save_state()
         self._solve_all()
         messages = {topic: make(now_ns) for topic, make in self.messages.retained_messages().items()}
-        self.load_state(saved, TickState.layout())
+        self.load_state(saved, self.state.layout())
         return {topic: message for topic, message in messages.items() if message is not None}
 
     def _solve_all(self) -> None:

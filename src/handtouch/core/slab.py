@@ -18,7 +18,7 @@ from handtouch.core.memory import view_memory
 from handtouch.core.stages import receive
 
 MAX_PDOS = 4
-"""Most PDOs that the four channels of a pad may be spread over."""
+"""Most PDOs that the channels of a pad may be spread over."""
 PDO_BYTES = 8
 _SAMPLE_BYTES = MAX_PDOS * PDO_BYTES
 
@@ -42,8 +42,8 @@ class ChannelField:
         return integer_limits(self.bits, self.signed)
 
 
-ChannelLayout = tuple[ChannelField, ChannelField, ChannelField, ChannelField]
-"""Fields of the electrodes x0, xa, y0, yb."""
+ChannelLayout = tuple[ChannelField, ...]
+"""Fields of a pad's electrodes, in their order."""
 
 STANDARD_LAYOUT: ChannelLayout = (
     ChannelField(0, 0, 16, True),
@@ -57,13 +57,15 @@ STANDARD_LAYOUT: ChannelLayout = (
 class Slab:
     """Latest complete sample of each of `size` pads, as arrays in memory that the receive path writes.
 
+    channels: of the pad with most electrodes; those that a pad lacks count 0, and are at no limit.
+
     `arrival_ns` (size,) int64 arrival of its last PDO on the host's monotonic clock, 0 before the first;
     `fresh` (size,) uint8, 1 if it arrived since `begin_cycle`; `repeat_counts` (size,) int64, samples that
     replaced a fresh one.
     """
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    def __init__(self, size: int, channels: int = 4) -> None:
+        self.size, self.channels = size, channels
         self.arrival_ns: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
         self.repeat_counts: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
         self.fresh_count = 0
@@ -75,12 +77,12 @@ class Slab:
         self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
         self._single = bytearray(size)  # 1 where a sample is one PDO
         self._partial_samples: dict[int, _PartialSample] = {}  # of pads with several PDOs
-        self._fields = np.zeros((size, 4, receive.FIELD_WORDS), dtype=np.int64)
-        self._counts_per_unit = np.zeros((size, 4))  # of REAL32 fields, 0 for integers
+        self._fields = np.zeros((size, channels, receive.FIELD_WORDS), dtype=np.int64)
+        self._counts_per_unit = np.zeros((size, channels))  # of REAL32 fields, 0 for integers
         self._is_real: NDArray[np.bool_] | None = None
-        self._low_limits = np.zeros((size, 4), dtype=np.int64)
-        self._high_limits = np.zeros((size, 4), dtype=np.int64)
-        self._counts = np.zeros((size, 4), dtype=np.int64)
+        self._low_limits = np.zeros((size, channels), dtype=np.int64)
+        self._high_limits = np.zeros((size, channels), dtype=np.int64)
+        self._counts = np.zeros((size, channels), dtype=np.int64)
         self.memory = receive.SampleMemory(
             self._words.data,
             self._arrival_ns,
@@ -91,10 +93,14 @@ class Slab:
         )
         """the same memory as the stages take it"""
         for slot in range(size):
-            self.set_layout(slot, STANDARD_LAYOUT)
+            self.set_layout(slot, STANDARD_LAYOUT[:channels])
 
     def set_layout(self, slot: int, layout: ChannelLayout) -> None:
         """Set the channel fields of a slot, STANDARD_LAYOUT by default; its present sample is discarded."""
+        self._fields[slot] = 0
+        self._fields[slot, :, 0] = slot * MAX_PDOS
+        self._counts_per_unit[slot] = 0.0
+        self._low_limits[slot], self._high_limits[slot] = -1, 1
         for channel, field in enumerate(layout):
             sign = 1 << field.bits - 1 if field.signed else 0
             word = slot * MAX_PDOS + field.pdo
@@ -145,7 +151,7 @@ class Slab:
         return end, self.memory.stored_bytes
 
     def unpack_counts(self) -> NDArray[np.int64]:
-        """Return counts (size, 4) of the electrodes x0, xa, y0, yb; the array is reused by the next call."""
+        """Return counts (size, channels) of the electrodes; the array is reused by the next call."""
         receive.unpack_counts(self.memory)
         if self._is_real is not None:
             self._convert_real(self._counts, self._is_real)
@@ -160,12 +166,12 @@ class Slab:
         counts[is_real] = np.where(np.isnan(rounded), low, np.clip(rounded, low, high))
 
     def saturated(self, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which of the counts (size, 4) are at a limit of their channel's range."""
+        """Return which of the counts (size, channels) are at a limit of their channel's range."""
         return (counts >= self._high_limits) | (counts <= self._low_limits)
 
     @property
     def limits(self) -> NDArray[np.int64]:
-        """Counts (size, 8) at which the four channels are at the bottom and at the top of their range."""
+        """Counts (size, 2 channels) at the bottom, then at the top of the channels' ranges."""
         return np.hstack([self._low_limits, self._high_limits])
 
     def begin_cycle(self, sync_ns: int) -> None:
@@ -176,23 +182,23 @@ class Slab:
 
 
 class CountSlab(Slab):
-    """A slab whose samples are counts of all pads at once, not PDOs; `limits` (size, 4, 2): the lowest and
-    highest count of each channel."""
+    """A slab whose samples are counts of all pads at once, not PDOs; `limits` (size, channels, 2): the lowest
+    and highest count of each channel."""
 
     def __init__(self, limits: NDArray[np.int64]) -> None:
-        super().__init__(len(limits))
+        super().__init__(*limits.shape[:2])
         low, high = limits[:, :, 0], limits[:, :, 1]
         self._low_limits[:], self._high_limits[:] = np.where(low < 0, low + 1, -1), high
 
     def store_counts(self, counts: NDArray[np.int64], arrival_ns: int) -> None:
-        """Store a sample (size, 4) of all pads."""
+        """Store a sample (size, channels) of all pads."""
         self._counts[:] = counts
         self.arrival_ns.fill(arrival_ns)
         self.fresh.fill(1)
         self.fresh_count = self.size
 
     def unpack_counts(self) -> NDArray[np.int64]:
-        """Return counts (size, 4); the array is reused by the next sample."""
+        """Return counts (size, channels); the array is reused by the next sample."""
         return self._counts
 
 

@@ -45,21 +45,26 @@ class StateLayoutError(ValueError):
 
 
 class Stored:
-    """Type, shape ("pads", "hands" or a number for each dimension) and first value of a field."""
+    """Type, shape ("pads", "hands", "channels" or a number for each dimension) and first value of a field."""
 
     def __init__(self, dtype: str, *shape: int | str, fill: float = 0) -> None:
         self.dtype, self.shape, self.fill = np.dtype(dtype), shape, fill
 
 
-_PADS, _HANDS = "pads", "hands"
+_PADS, _HANDS, _CHANNELS = "pads", "hands", "channels"
+_USUAL_CHANNELS = 4
 
 
 @dataclass(frozen=True)
 class TickState:
-    """State of `pads` pads on `hands` hands; made by `empty`. All arrays are views of `block`."""
+    """State of `pads` pads on `hands` hands; made by `empty`. All arrays are views of `block`.
+
+    channels: number of electrodes of the pad that has most.
+    """
 
     pads: int
     hands: int
+    channels: int
     block: Uint8Array = field(repr=False)
 
     ticks: Annotated[IntArray, Stored("<i8", 1)]
@@ -114,9 +119,9 @@ class TickState:
     ticks_per_hand_frame: Annotated[IntArray, Stored("<i8", 1, fill=1)]
 
     # baselines, see `Baseline`
-    offset: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
+    offset: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
     offset_std: Annotated[FloatArray, Stored("<f8", _PADS)]
-    noise_squared: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
+    noise_squared: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
     held: Annotated[BoolArray, Stored("?", _PADS)]
     unverified: Annotated[BoolArray, Stored("?", _PADS, fill=1)]
     known: Annotated[BoolArray, Stored("?", _PADS)]
@@ -129,9 +134,9 @@ class TickState:
     common_drift: Annotated[FloatArray, Stored("<f8", _HANDS)]
     gravity: Annotated[FloatArray, Stored("<f8", _PADS, 3)]
     smoothed_gravity: Annotated[FloatArray, Stored("<f8", _PADS, 3)]
-    gravity_slope: Annotated[FloatArray, Stored("<f8", _PADS, 4, 3)]
-    block_sum: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
-    block_squares: Annotated[FloatArray, Stored("<f8", _PADS, 4)]
+    gravity_slope: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS, 3)]
+    block_sum: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
+    block_squares: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
     block_count: Annotated[FloatArray, Stored("<f8", _PADS)]
     block_begin_ns: Annotated[IntArray, Stored("<i8", 1, fill=-_MAX_PAUSE_NS)]
     blocks: Annotated[IntArray, Stored("<i8", 1)]
@@ -199,9 +204,9 @@ class TickState:
     frame_sync_ns: Annotated[IntArray, Stored("<i8", 1)]
 
     @classmethod
-    def empty(cls, pads: int, hands: int = 1) -> TickState:
+    def empty(cls, pads: int, hands: int = 1, channels: int = _USUAL_CHANNELS) -> TickState:
         """Return the state before the first tick."""
-        sizes = {_PADS: pads, _HANDS: hands}
+        sizes = {_PADS: pads, _HANDS: hands, _CHANNELS: channels}
         places: list[tuple[str, Stored, tuple[int, ...], int]] = []
         end = 0
         for name, stored in _stored_fields():
@@ -214,14 +219,12 @@ class TickState:
             size = math.prod(shape) * stored.dtype.itemsize
             arrays[name] = block[begin : begin + size].view(stored.dtype).reshape(shape)
             arrays[name].fill(stored.fill)
-        return cls(pads, hands, block, **arrays)
+        return cls(pads, hands, channels, block, **arrays)
 
-    @staticmethod
-    @cache
-    def layout() -> str:
-        """Return version and hash of the declared fields."""
-        text = "\n".join(f"{name} {stored.dtype.str} {stored.shape}" for name, stored in _stored_fields())
-        return f"{VERSION}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    def layout(self) -> str:
+        """Return version and hash of the declared fields, and the number of channels if it isn't four."""
+        usual = self.channels == _USUAL_CHANNELS
+        return _declared_layout() + ("" if usual else f", {self.channels} channels")
 
     def memory(self) -> dict[str, memoryview[Any]]:
         """Return the memory of the arrays by name, flat, as the stages take it."""
@@ -243,6 +246,16 @@ class TickState:
                 f"{len(self.block)}"
             )
         self.block[:] = np.frombuffer(saved, dtype=np.uint8)
+
+
+@cache
+def _declared_layout() -> str:
+    fields_text = "\n".join(
+        f"{name} {stored.dtype.str} "
+        f"{tuple(_USUAL_CHANNELS if size == _CHANNELS else size for size in stored.shape)}"
+        for name, stored in _stored_fields()
+    )
+    return f"{VERSION}-{hashlib.sha256(fields_text.encode()).hexdigest()[:12]}"
 
 
 def _stored_fields() -> Iterator[tuple[str, Stored]]:

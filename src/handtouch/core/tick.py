@@ -41,7 +41,7 @@ class PadColumns:
     sample_ns: NDArray[np.int64]
     """SYNC of the newest sample, 0 before the first"""
     total_current_a: FloatArray
-    """sum of the four channels"""
+    """sum of the channels"""
     values: FloatArray
     """(n, VALUE_COUNT) contact values of each pad's last sample of a contact; most below are views of it"""
     xy: FloatArray
@@ -131,14 +131,18 @@ class TickProcessor:
 
     def __init__(self, model: PadModel, period_ns: int, state: TickState | None = None) -> None:
         self.model = model
-        self.state = held = TickState.empty(model.size, len(model.rows_of_hand)) if state is None else state
+        if state is None:
+            state = TickState.empty(model.size, len(model.rows_of_hand), model.channels)
+        self.state = held = state
         self.columns = PadColumns.of_state(held)
-        self.counts: NDArray[np.int64] = np.zeros((model.size, 4), dtype=np.int64)
+        self.counts: NDArray[np.int64] = np.zeros((model.size, model.channels), dtype=np.int64)
         """counts of the last tick"""
         held.max_sample_period_ns[:] = period_ns
         self.baseline = Baseline(
             *(model.noise_counts, model.begin_threshold_counts, model.end_threshold_counts),
-            *(model.max_rise_time_s, model.rows_of_hand.values(), held),
+            *(model.max_rise_time_s, model.rows_of_hand.values()),
+            state=held,
+            electrode_counts=model.electrode_counts,
         )
         """counts of untouched pads"""
         self.contacts = ContactDetector(_detection_settings(model), self.baseline.expected_counts, held)
@@ -189,7 +193,7 @@ class TickProcessor:
         self.refresh()
 
     def set_baseline(self, pad: int, offset_counts: ArrayLike, std_counts: ArrayLike = 0.0) -> None:
-        """Set the untouched counts (4,) of a pad and their standard deviation, from a store or a tare."""
+        """Set the untouched counts (n,) of a pad and their standard deviation, from a store or a tare."""
         self.baseline.set_offset(pad, offset_counts, std_counts)
         self.discard_solutions(np.array([pad]))
 

@@ -283,7 +283,7 @@ class SupervisorClient:
     def _quarantine_pad(self, pad: int) -> None:
         """Discard the calibration of a pad whose node was replaced, until the new node is calibrated."""
         pipeline = self._pipeline
-        default = ActiveCalibration(pipeline.model.default_calibration_ids[pad])
+        default = pipeline.model.default_calibration(pad)
         self._log_gain_covariance[pad], self._parts[pad] = _UNKNOWN_LOG_GAIN_COVARIANCE, None
         self._manual_parts.pop(pad, None)
         self._unconfirmed_calibrations.pop(pad, None)

@@ -67,7 +67,7 @@ class _LogReplayer:
         pads = [entry.pad for entry in deployment.pads]
         for slot, pad in enumerate(pads):
             kind = deployment.nodes[pad.node]
-            channels = order_by_electrode(resolve_channels(kind.channels, kind.eds), pad.electrodes)
+            channels = order_by_electrode(resolve_channels(kind.channels, kind.eds), pad)
             mapping = mapping_from_eds(kind.eds, pad.node_id, channels)
             self.pipeline.slab.set_layout(slot, mapping.layout)
             for number, tpdo in enumerate(mapping.tpdos):

@@ -72,7 +72,7 @@ class VirtualPad:
         """Build a pad with the touches, faults and replacements of its link."""
         node, hidden = deployment.nodes[pad.node], world.pad(hand, pad)
         sheet = world.sheet(hand, pad, deployment.sheets[pad.sheet])
-        channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad.electrodes)
+        channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad)
         limits = np.array([channel.limits for channel in channels])
         scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES])
         full = np.array([node.full_scale_counts or high for high in limits[:, 1]])

@@ -78,7 +78,7 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
                 product_code=kind.product_code,
                 revision=kind.revision,
                 serial=pad.serial,
-                channels=order_by_electrode(resolve_channels(kind.channels, kind.eds), pad.electrodes),
+                channels=order_by_electrode(resolve_channels(kind.channels, kind.eds), pad),
                 allow_pdo_remapping=kind.allow_pdo_remapping,
                 allow_nmt_reset=kind.allow_nmt_reset,
                 idle=_idle_settings(kind, deployment.daemon.sync_period_ms),

@@ -1,11 +1,11 @@
 cimport cython
 from handtouch.core.stages.receive cimport SampleMemory
 
-cdef Py_ssize_t _VALUES, _CHANNELS, _CLEAR, _TOUCHED, _STALE, _FAULTED, _MAX_SILENT
+cdef Py_ssize_t _VALUES, _CLEAR, _TOUCHED, _STALE, _FAULTED, _MAX_SILENT
 cdef double _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION, _NAN
 
 cdef class ContactDetection:
-    cdef Py_ssize_t pads
+    cdef Py_ssize_t pads, channels
     cdef readonly Py_ssize_t began, ended, updated, silent, solved
     cdef long long[::1] rows
     cdef double[::1] expected_counts, currents, ampere_per_count, noise_counts

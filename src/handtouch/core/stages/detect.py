@@ -12,7 +12,6 @@ from handtouch.core.stages.receive import SampleMemory
 from handtouch.core.stages.solve import VALUE_COUNT
 
 _VALUES = VALUE_COUNT
-_CHANNELS = 4
 _CLEAR, _TOUCHED, _STALE, _FAULTED = 0, 1, 2, 4  # PadState
 _MAX_SILENT = 3  # periods
 _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION = 10.0, 0.02  # of a channel's noise, and of all channels
@@ -20,12 +19,13 @@ _NAN = float("nan")
 
 
 class ContactDetection:
-    """Detection of contacts on n pads of four channels, at most one each.
+    """Detection of contacts on n pads, at most one each.
 
-    arrays: flat memory of the arrays of `TickState` by their names; of the model: ampere_per_count (n 4),
+    arrays: flat memory of the arrays of `TickState` by their names; of the model: ampere_per_count (n c),
     mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,), begin_samples,
-    end_samples and max_gap_periods (n,); expected_counts (n 4) of untouched pads. Written for the solver:
-    currents (n 4,) and offset_std_a (n,), the standard deviation of their sums from the baseline [A].
+    end_samples and max_gap_periods (n,); expected_counts (n c) of untouched pads. Written for the solver:
+    currents (n c,) and offset_std_a (n,), the standard deviation of their sums from the baseline [A].
+    c is the number of channels of the pad that has most; those that a pad lacks have no current.
 
     rows: (5 n,): pads whose contact began, ended, has a new sample and didn't begin, misses one, or is to be
     solved, `began`, `ended`, `updated`, `silent` and `solved` of them, n from one list to the next.
@@ -36,6 +36,7 @@ class ContactDetection:
         self.began = self.ended = self.updated = self.silent = self.solved = 0
         # model
         self.expected_counts, self.currents = arrays["expected_counts"], arrays["currents"]
+        self.channels = len(self.currents) // pads
         self.ampere_per_count, self.noise_counts = arrays["ampere_per_count"], arrays["noise_counts"]
         self.mean_ampere_per_count = arrays["mean_ampere_per_count"]
         self.offset_std, self.offset_std_a = arrays["offset_std"], arrays["offset_std_a"]
@@ -131,8 +132,8 @@ def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> No
     """
     railed, total, magnitude = False, 0.0, 0.0
     low = high = 0.0
-    for c in range(_CHANNELS):
-        i = pad * _CHANNELS + c
+    for c in range(stage.channels):
+        i = pad * stage.channels + c
         count = memory.counts[i]
         if count <= memory.low_limits[i] or count >= memory.high_limits[i]:
             railed = True
@@ -207,7 +208,7 @@ def _begin_contact(stage: ContactDetection, pad: int) -> None:
     stage.peak_force_n[pad] = _NAN
     for i in range(pad * _VALUES, (pad + 1) * _VALUES):
         stage.values[i] = _NAN  # not a starting point: it is of the contact before
-    for i in range(pad * _CHANNELS, (pad + 1) * _CHANNELS):
+    for i in range(pad * stage.channels, (pad + 1) * stage.channels):
         stage.block_sum[i] = stage.block_squares[i] = 0.0
     stage.block_count[pad] = 0.0
     stage.rows[stage.began] = pad
@@ -245,8 +246,8 @@ def _count_sample(stage: ContactDetection, pad: int) -> None:
     stage.sample_counts[pad] += 1
     free = stage.trusted and not stage.touching[pad]
     if free and stage.total_current_a[pad] <= stage.begin_threshold_a[pad]:
-        for c in range(_CHANNELS):
+        for c in range(stage.channels):
             excess = stage.excess[c]
-            stage.block_sum[pad * _CHANNELS + c] += excess
-            stage.block_squares[pad * _CHANNELS + c] += excess * excess
+            stage.block_sum[pad * stage.channels + c] += excess
+            stage.block_squares[pad * stage.channels + c] += excess * excess
         stage.block_count[pad] += 1.0

@@ -14,7 +14,7 @@ cdef Py_ssize_t _PROFILE_POINTS, _PROFILE_STEPS
 cdef class ModelTable:
     cdef double[::1] values, nodes_x, nodes_y, search_fractions, search_cells
     cdef Py_ssize_t cells, electrodes, points
-    cdef double side_x, side_y
+    cdef double side_x, side_y, misfit_scale
 
 cdef class Fit:
     cdef double[::1] readings, data, weight, fractions, slope_x, slope_y, raw, beside, scaled, gain
@@ -25,7 +25,7 @@ cdef class Fit:
     cdef public double var_x, var_y, cov_xy, cov_x_total, cov_y_total, var_total
     cdef public bint found
 
-@cython.locals(i=Py_ssize_t, first=Py_ssize_t, tracked=bint, settled=bint, variance=double)
+@cython.locals(i=Py_ssize_t, tracked=bint, settled=bint, variance=double)
 cdef void locate(
     ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known, Py_ssize_t number,
     double[::1] gain_covariance, double s, double t) noexcept

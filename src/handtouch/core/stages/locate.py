@@ -43,7 +43,8 @@ class ModelTable:
 
     values: columns are the fractions of the n electrodes and ln of the spreading radius. nodes_x, nodes_y:
     (2 (cells + 1),) coordinate of each node, and its derivative by cell. search_fractions: (points^2, n) on a
-    square grid, x fastest; search_cells: (2 points,) its coordinates along x, then y, in cells.
+    square grid, x fastest; search_cells: (2 points,) its coordinates along x, then y, in cells. misfit_scale:
+    from the squared misfit of n currents, n - 3 degrees of freedom, to one that is as likely of one.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class ModelTable:
         search_fractions: memoryview[float],
         search_cells: memoryview[float],
         points: int,
+        misfit_scale: float,
     ) -> None:
         self.values = values
         self.cells = cells
@@ -65,6 +67,7 @@ class ModelTable:
         self.search_fractions = search_fractions
         self.search_cells = search_cells
         self.points = points
+        self.misfit_scale = misfit_scale
 
 
 class Fit:
@@ -122,8 +125,8 @@ def locate(
 ) -> None:
     """Find the most likely contact for the readings in `fit`; (s, t): last position in cells, NaN if new.
 
-    number: of the pad. gain_covariance: of log gains, (pads n n,). `fit.found` is False where no contact
-    explains the currents better than none.
+    number: of the pad. gain_covariance: of log gains, (pads c c,), c channels a pad. `fit.found` is False
+    where no contact explains the currents better than none.
     """
     fit.sum = 0.0
     for i in range(table.electrodes):
@@ -138,8 +141,7 @@ def locate(
         variance = max(fit.var_x / (table.side_x * table.side_x), fit.var_y / (table.side_y * table.side_y))
         settled = fit.cost <= _MAX_TRACKED_COST and variance <= _MAX_TRACKED_VARIANCE
     if not settled:
-        first = number * table.electrodes * table.electrodes
-        tolerances.whiten_by_gains(fit.whitening, gain_covariance, first, fit.readings)
+        tolerances.whiten_by_gains(fit.whitening, gain_covariance, number, fit.readings)
         tolerances.apply_whitening(fit.whitening, fit.readings, 0, fit.data)
         fit.whitened_s = fit.whitened_t = _INFINITY
         if not tracked:

@@ -28,9 +28,9 @@ class SampleMemory:
 
     words: (slots 4,) PDOs. arrival_ns, repeat_counts: (slots,). fresh: (slots,). single: (slots,), 1 where a
     sample is one PDO. `new_fresh` and `stored_bytes` are those of the last call of `store_samples`.
-    counts: (slots 4,), written by `unpack_counts`; of each, low_limits and high_limits, at which a channel is
-    saturated, and fields (slots 4 FIELD_WORDS,): index of its word, first bit, mask of its bits, and the
-    value of its sign bit, 0 without sign.
+    counts: (slots channels,), written by `unpack_counts`; of each, low_limits and high_limits, at which a
+    channel is saturated, and fields (slots channels FIELD_WORDS,): index of its word, first bit, mask of its
+    bits, and the value of its sign bit, 0 without sign.
     """
 
     def __init__(

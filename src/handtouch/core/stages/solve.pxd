@@ -5,6 +5,7 @@ from handtouch.core.stages cimport force, locate, tables, tolerances
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
 cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT
 cdef double _NAN, _MAX_SQUARED_MISFIT, _MAX_EXTENT_SIDES
+cdef Py_ssize_t _PAIRED_CHANNELS
 
 cdef class ContactSolver:
     cdef list models, pad_tolerances, laws, surfaces
@@ -20,12 +21,13 @@ cdef class ContactSolver:
     @cython.locals(k=Py_ssize_t)
     cpdef solve_contacts(self, Py_ssize_t[::1] pads)
 
+@cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit,
+               table=locate.ModelTable, values='double[::1]')
+cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, table=locate.ModelTable,
                values='double[::1]')
-cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, values='double[::1]')
+@cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, values='double[::1]')
 cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, values='double[::1]', law=force.PadLaw)
 cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad) noexcept

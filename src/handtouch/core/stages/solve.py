@@ -25,24 +25,27 @@ VALUE_SLICES = {
     "pad_noise_m2": slice(_PAD_NOISE, _PAD_NOISE + 3),  # of pad_m from channel noise: uu, uv, vv
     "force_status": slice(_FORCE_STATUS, _FORCE_STATUS + 1),  # ForceEstimateStatus
     "cells": slice(_CELLS, _CELLS + 2),  # position in the pad's table, where the next tick starts from
-    "squared_misfit": slice(_MISFIT, _MISFIT + 1),  # of a point, in variances of noise and tolerances
+    "squared_misfit": slice(_MISFIT, _MISFIT + 1),  # of a point, see MAX_SQUARED_MISFIT
 }
 """Layout of a row of values."""
 _NAN = float("nan")
 MAX_SQUARED_MISFIT = 9.0
-"""Squared misfit of a point contact, of one degree of freedom, that noise and tolerances explain. Beyond it
-the contact is no point: the covariance is inflated by the excess (Birge, Phys. Rev. 40, 1932), as the errors
-of currents along the directions that move the position are as large as along the observable one, and by the
-extent that explains the residual."""
+"""Squared misfit of a point contact, in variances of noise and tolerances, that these explain; of n currents,
+n - 3 degrees of freedom, scaled so that this is as likely as of one. Beyond it the contact is no point: the
+covariance is inflated by the excess (Birge, Phys. Rev. 40, 1932), as the errors of currents along the
+directions that move the position are as large as along the observable one, and of four currents by the extent
+that explains the residual."""
 _MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _MAX_EXTENT_SIDES = 0.5
+_PAIRED_CHANNELS = 4  # electrodes x0, xa, y0, yb
 
 
 class ContactSolver:
     """Solves contacts of the pads of a model; arrays are flat, with a row a pad.
 
-    currents, weight: (pads n,) currents [A] and 1 / noise [1/A]. known: of gains and parts.
-    gain_covariance: (pads n n,) of log gains.
+    electrodes: number c of channels of the pad that has most.
+    currents, weight: (pads c,) currents [A] and 1 / noise [1/A]; a pad reads as many as it has electrodes.
+    known: of gains and parts. gain_covariance: (pads c c,) of log gains.
     offset_std: (pads,) of the sum of the currents, from the
     baseline [A]; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
     force is to be estimated. values: (pads VALUE_COUNT,), the result; NaN for a new contact, else the search
@@ -89,14 +92,15 @@ class ContactSolver:
 
 def solve_contact(solver: ContactSolver, pad: int) -> None:
     """Locate a pad's contact, estimate its force, and place it in the link's frame."""
-    n, row = solver.electrodes, pad * _COUNT
     fit, table, values = solver.fit, solver.models[pad], solver.values
+    n, row, first = table.electrodes, pad * _COUNT, pad * solver.electrodes
+    fit.whitening.electrodes = n
     offset2 = solver.offset_std[pad] * solver.offset_std[pad] / n
     for i in range(n):
-        weight = solver.weight[pad * n + i]
+        weight = solver.weight[first + i]
         weight /= math.sqrt(1.0 + offset2 * weight * weight)
         fit.weight[i] = weight
-        fit.readings[i] = solver.currents[pad * n + i] * weight
+        fit.readings[i] = solver.currents[first + i] * weight
     locate.locate(
         table,
         fit,
@@ -116,15 +120,15 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     _propagate(solver, pad)
     if solver.force_requested[pad]:
         _estimate_force(solver, pad)
-    if fit.cost > _MAX_SQUARED_MISFIT:
+    if fit.cost > _MAX_SQUARED_MISFIT and n == _PAIRED_CHANNELS:
         _add_extent(table, fit, values[row + _RESIDUAL])
     _write_position(solver, pad)
 
 
 def _propagate(solver: ContactSolver, pad: int) -> None:
     """Compute residual and derivatives by the currents; inflate the covariance for misfit."""
-    n, row, fit, values = solver.electrodes, pad * _COUNT, solver.fit, solver.values
-    total, pair, modelled, noise = fit.total, 0.0, 0.0, 0.0
+    fit, values, row = solver.fit, solver.values, pad * _COUNT
+    n, total, pair, modelled, noise = fit.whitening.electrodes, fit.total, 0.0, 0.0, 0.0
     # derivatives of (x, y, total) by each whitened current, from slopes by cell; then by each current
     per_x, per_y = total / fit.scale_x, total / fit.scale_y
     var_x = fit.var_x if fit.var_x < 1e300 else 0.0
@@ -155,7 +159,10 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
         if i < 2:
             by += 1.0 / total
         noise += (by / fit.weight[i]) * (by / fit.weight[i])
-    values[row + _RESIDUAL], values[row + _RESIDUAL_STD] = residual, math.sqrt(noise)
+    if n == _PAIRED_CHANNELS:
+        values[row + _RESIDUAL], values[row + _RESIDUAL_STD] = residual, math.sqrt(noise)
+    table = solver.models[pad]
+    fit.cost *= table.misfit_scale
     values[row + _MISFIT] = fit.cost
     _write_pad_noise(solver, pad)
     excess = fit.cost - _MAX_SQUARED_MISFIT
@@ -189,10 +196,10 @@ def _add_extent(table: locate.ModelTable, fit: locate.Fit, residual: float) -> N
 
 def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
     """Write the covariance of the arc lengths from channel noise alone."""
-    n, values, row = solver.electrodes, solver.values, pad * _COUNT
-    xx = xy = yy = 0.0
+    n, values, row = solver.fit.whitening.electrodes, solver.values, pad * _COUNT
+    first, xx, xy, yy = pad * solver.electrodes, 0.0, 0.0, 0.0
     for i in range(n):
-        noise = 1.0 / solver.weight[pad * n + i]
+        noise = 1.0 / solver.weight[first + i]
         x, y = solver.by_x[i] * noise, solver.by_y[i] * noise
         xx += x * x
         xy += x * y
@@ -204,8 +211,8 @@ def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
 
 
 def _estimate_force(solver: ContactSolver, pad: int) -> None:
-    n, row, fit, values = solver.electrodes, pad * _COUNT, solver.fit, solver.values
-    law = solver.laws[pad]
+    fit, values, row = solver.fit, solver.values, pad * _COUNT
+    n, law = fit.whitening.electrodes, solver.laws[pad]
     log_spreading_m = fit.raw[n] + math.log(solver.placement.scale_m)
     # the stack factor is whole / total - ln R(x, y): its variance beyond that of the total alone
     slope_x, slope_y = fit.raw[2 * n + 1] / fit.scale_x, fit.raw[3 * n + 2] / fit.scale_y
@@ -224,7 +231,7 @@ def _estimate_force(solver: ContactSolver, pad: int) -> None:
         log_spreading_m,
         (slope_x * slope_x + slope_y * slope_y) / (solver.placement.scale_m * solver.placement.scale_m),
         variance,
-        force.series_resistance(law, solver.currents, pad * n, n),
+        force.series_resistance(law, solver.currents, pad * solver.electrodes, n),
     )
     values[row + _FORCE], values[row + _FORCE_STD] = solver.result.force_n, solver.result.std_n
     values[row + _FORCE_STATUS] = 1.0 * solver.result.status

@@ -14,16 +14,17 @@ cdef class PadTolerances:
 
 cdef class PartKnowledge:
     cdef double[::1] axes, offsets, touch_errors
+    cdef Py_ssize_t size, parts
 
 cdef class Whitening:
     cdef double[::1] matrix, shift, fields, changes, vector
-    cdef Py_ssize_t electrodes
+    cdef Py_ssize_t electrodes, channels
 
 cpdef Py_ssize_t part_count(Py_ssize_t electrodes) noexcept
 
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, matrix='double[::1]')
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, channels=Py_ssize_t, matrix='double[::1]')
 cdef void whiten_by_gains(
-    Whitening whitening, double[::1] gain_covariance, Py_ssize_t first, double[::1] readings) noexcept
+    Whitening whitening, double[::1] gain_covariance, Py_ssize_t number, double[::1] readings) noexcept
 @cython.locals(
     n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, parts=Py_ssize_t, size=Py_ssize_t, varied=Py_ssize_t,
     row=Py_ssize_t, matrix='double[::1]', vector='double[::1]', changes='double[::1]', axes='double[::1]',

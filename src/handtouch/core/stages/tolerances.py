@@ -63,21 +63,25 @@ class PadTolerances:
 class PartKnowledge:
     """Knowledge of the log gains of all pads, and of their parts in standard deviations as stated.
 
-    A pad has n log gains, then p = `part_count(n)` parts. axes: (pads (n + p)^2,), rows of an upper triangle
-    whose product with its transpose is their covariance. offsets: (pads p,) most likely values of the parts.
-    touch_errors: (pads,) standard deviation of the fractions of a touch, another one each time.
+    A pad has n log gains, then p = `part_count(n)` parts. axes: (pads size,), of each pad the (n + p)^2
+    numbers of an upper triangle, row by row, whose product with its transpose is their covariance. offsets:
+    (pads parts,) most likely values of the parts. `size` and `parts` are those of the pad with most
+    electrodes. touch_errors: (pads,) standard deviation of the fractions of a touch, another one each time.
     """
 
     def __init__(
         self, axes: memoryview[float], offsets: memoryview[float], touch_errors: memoryview[float]
     ) -> None:
         self.axes, self.offsets, self.touch_errors = axes, offsets, touch_errors
+        pads = len(touch_errors)
+        self.size, self.parts = len(axes) // pads, len(offsets) // pads
 
 
 class Whitening:
     """Whitening of currents over noise: `matrix` (n n,) is lower triangular; its product with currents that
     noise and tolerances vary is uncorrelated, of variance 1. `shift` (n,): what the offsets of the parts add
     to the currents over noise. `fields` (10 n,), `changes` (p n,), `vector` (n,): working memory.
+    `electrodes` is n of the present pad, `channels` that of the pad with most.
     """
 
     def __init__(
@@ -87,11 +91,11 @@ class Whitening:
         fields: memoryview[float],
         changes: memoryview[float],
         vector: memoryview[float],
-        electrodes: int,
+        channels: int,
     ) -> None:
         self.matrix, self.shift = matrix, shift
         self.fields, self.changes, self.vector = fields, changes, vector
-        self.electrodes = electrodes
+        self.electrodes = self.channels = channels
 
 
 def part_count(electrodes: int) -> int:
@@ -100,18 +104,19 @@ def part_count(electrodes: int) -> int:
 
 
 def whiten_by_gains(
-    whitening: Whitening, gain_covariance: memoryview[float], first: int, readings: memoryview[float]
+    whitening: Whitening, gain_covariance: memoryview[float], number: int, readings: memoryview[float]
 ) -> None:
     """Set the whitening for a contact at an unknown position: that by gains alone, each by itself.
 
-    gain_covariance: of log gains, (n n,) from index `first` on. readings: (n,) currents over noise.
+    gain_covariance: of log gains, (pads c c,), c channels a pad. readings: (n,) currents over noise of pad
+    `number`.
     """
-    n, matrix = whitening.electrodes, whitening.matrix
+    n, matrix, channels = whitening.electrodes, whitening.matrix, whitening.channels
     for i in range(n):
         whitening.shift[i] = 0.0
         for j in range(n):
             matrix[i * n + j] = 0.0
-        variance = gain_covariance[first + i * n + i] * readings[i] * readings[i]
+        variance = gain_covariance[(number * channels + i) * channels + i] * readings[i] * readings[i]
         matrix[i * n + i] = 1.0 / math.sqrt(1.0 + variance)
 
 
@@ -144,7 +149,7 @@ def whiten(
         _compute_changes(whitening, pad, fractions, weight, total, s, t)
         varied = parts if pad.has_series else parts - n - 1
     for k in range(n + varied):
-        row = (number * size + k) * size
+        row = number * known.size + k * size
         for i in range(n):
             vector[i] = axes[row + i] * total * fractions[i] * weight[i] if i >= k else 0.0
         for j in range(max(k - n, 0), varied):
@@ -156,7 +161,7 @@ def whiten(
     if pad.is_elongated:
         _add_elongation(whitening, pad, weight, total, s * pad.cell_ratio)
     for j in range(varied):
-        step = offsets[number * parts + j]
+        step = offsets[number * known.parts + j]
         if step != 0.0:
             for i in range(n):
                 whitening.shift[i] += step * changes[j * n + i]

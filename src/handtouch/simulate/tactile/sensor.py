@@ -238,7 +238,7 @@ def _channel_limits(deployment: config.Deployment) -> NDArray[np.int64]:
             [
                 channel.limits
                 for channel in order_by_electrode(
-                    resolve_channels(nodes[pad.node].channels, nodes[pad.node].eds), pad.electrodes
+                    resolve_channels(nodes[pad.node].channels, nodes[pad.node].eds), pad
                 )
             ]
             for _, pad in deployment.pads

@@ -93,7 +93,7 @@ class DiagnosisModel:
         nodes = [deployment.nodes[pad.node] for pad in pads]
         scale, limits = np.zeros((len(pads), 4)), np.zeros((len(pads), 4, 2))
         for row, (pad, node) in enumerate(zip(pads, nodes, strict=True)):
-            channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad.electrodes)
+            channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad)
             for k, (name, channel) in enumerate(zip(ELECTRODES, channels, strict=True)):
                 full = node.full_scale_counts or channel.limits[1]
                 factor = node.channel_scale[pad.electrodes.index(name)]
