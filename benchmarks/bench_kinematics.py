@@ -20,6 +20,7 @@ from page import made_by, options, output_folder
 from handtouch import wire
 from handtouch.config import load, shipped
 from handtouch.config.tables import SceneRequest
+from handtouch.core.link_poses import LinkPoses
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import ActiveScenes, Demand
@@ -34,12 +35,13 @@ JOINTS_EVERY_NS = 1_000_000
 STRENGTH = 20.0  # of the threshold's current
 PLAIN = ("position", "force")
 STATED = {"mount_std_mm": 0.3, "mount_std_deg": 1.0, "joint_std_deg": 0.3}
+EXACT = dict.fromkeys(STATED, 0.0)
 CASES: dict[str, tuple[tuple[str, ...], dict[str, float] | None]] = {
     "no URDF": (PLAIN, None),
     "URDF, palm not asked for": (PLAIN, STATED),
-    "palm": ((*PLAIN, "palm"), {}),
+    "palm": ((*PLAIN, "palm"), EXACT),
     "palm, uncertain mounts and joints": ((*PLAIN, "palm"), STATED),
-    "palm and base": ((*PLAIN, "palm", "base"), {}),
+    "palm and base": ((*PLAIN, "palm", "base"), EXACT),
     "palm and base, uncertain mounts and joints": ((*PLAIN, "palm", "base"), STATED),
 }
 """Outputs, and what the file states of the hand; None: no URDF."""
@@ -127,12 +129,12 @@ def parts(repeats: int) -> dict[str, float]:
 
     deployment = load(shipped.path("utah_mit.toml"))
     robots = RobotModels(deployment)
-    kinematics, names = robots.kinematics[0], robots.joint_names[0]
+    poses, names = LinkPoses(robots.kinematics[0]), robots.joint_names[0]
     states = JointStateBuffer(names)
     for number in range(64):
         states.add_state(number * JOINTS_EVERY_NS, names, np.full(16, 0.01 * number))
     message = encode(JointState("right", 1, names, np.full(16, 0.5)))
-    position, point = np.full(16, 0.5), np.array([0.01, 0.0, 0.01])
+    position, point, std = np.full(16, 0.5), np.array([0.01, 0.0, 0.01]), np.full(16, 0.01)
     clock = iter(range(10**12, 10**15))
     with zmq.Context() as context, Authenticator(context) as authenticator:
         known = {"right": JointStateBuffer(names)}
@@ -145,19 +147,19 @@ def parts(repeats: int) -> dict[str, float]:
             inputs.process_message([topic, payload.replace(b"\xa4t_ns\x01", b"\xa4t_ns\xc0")], now_ns)
 
         def pose() -> None:
-            kinematics.set_joint_positions(position)
+            poses.set_joint_positions(position)
             for link in range(5):
-                kinematics.pose_in_palm(link)
+                poses.pose_in_palm(link)
 
         found = {
             "take in a joint state of 16 joints": _each_us(take, repeats),
             "of that, decode it": _each_us(lambda: decode(message), repeats),
             "look for messages, none there": _each_us(lambda: inputs.poll(0), repeats),
             "joints at the time of a sample": _each_us(lambda: states.interpolate(60_500_000), repeats),
-            "kinematics of 16 joints": _each_us(lambda: kinematics.set_joint_positions(position), repeats),
+            "kinematics of 16 joints": _each_us(lambda: poses.set_joint_positions(position), repeats),
             "kinematics, and the poses of 5 links in the palm": _each_us(pose, repeats),
-            "slope of a point with the joints, of one pose": _each_us(
-                lambda: kinematics.point_jacobian(0, point), repeats
+            "covariance of a point from the joints": _each_us(
+                lambda: poses.joint_covariance_m2(0, point, std), repeats
             ),
         }
         assert not inputs.dropped, inputs.problem

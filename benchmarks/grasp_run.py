@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment, Touch
+from handtouch.core.link_poses import LinkPoses
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
 from handtouch.daemon.authentication import Authenticator
@@ -136,8 +137,8 @@ class _Run:
         perceive: bool = False,
     ) -> None:
         model, robots = PadModel(deployment), RobotModels(deployment)
-        self.kinematics = robots.kinematics[0]
-        hand, names = deployment.hands[0].name, self.kinematics.joints
+        self.poses = LinkPoses(robots.kinematics[0])
+        hand, names = deployment.hands[0].name, robots.kinematics[0].joints
         self._order = np.array([grasp.joints.index(name) for name in names])
         self._names, self._hand = robots.joint_names[0], hand
         encoders = EncoderErrors.of_world(world, grasp)
@@ -283,7 +284,7 @@ def _split(
     pad: int,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Return the true position in the palm, and the error's components by cause, which sum to the error."""
-    kinematics, built = run.kinematics, grasp.pads[pad]
+    poses, built = run.poses, grasp.pads[pad]
     rotation, offset_m = mount_transform(deployment.hands[0].pads[pad])
     x, y = patches.force_centre[step, pad].tolist()
     in_pad = built.shape.point(x * built.shape.length_m, y * built.shape.arc)
@@ -294,8 +295,8 @@ def _split(
     used, timely = run.used[step]
 
     def by(position_rad: FloatArray) -> FloatArray:
-        kinematics.set_joint_positions(position_rad)
-        pose = kinematics.pose_in_palm(pad)
+        poses.set_joint_positions(position_rad)
+        pose = poses.pose_in_palm(pad)
         return np.asarray(pose.rotation @ reported + pose.translation_m)
 
     return true_rotation @ true_on_link + origin, {

@@ -13,6 +13,7 @@ from handtouch.config import (
     shipped,
 )
 from handtouch.core.gravity import GravityTracker
+from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.joints import JointStateBuffer
 from handtouch.hand.robot_models import RobotModels, check_urdfs
 from tests.core.conftest import DEPLOYMENT as PLAIN
@@ -23,6 +24,7 @@ DEPLOYMENT = load(shipped.path("utah_mit.toml"))
 ROBOTS = RobotModels(DEPLOYMENT)
 KINEMATICS, NAMES = ROBOTS.kinematics[0], ROBOTS.joint_names[0]
 PADS = [pad.link for pad in DEPLOYMENT.hands[0].pads]
+POSES = LinkPoses(KINEMATICS)
 MOVED = KINEMATICS.base_joint_mask.any(axis=1)
 
 
@@ -49,15 +51,15 @@ def test_gravity_on_a_link_is_that_of_the_base_rotated_by_the_joints() -> None:
     rig.joints(position)
     found = rig.step()
     assert found is not None
-    KINEMATICS.set_joint_positions(position)
+    POSES.set_joint_positions(position)
     for link in range(len(PADS)):
-        expected = KINEMATICS.pose_in_base(link).rotation.T @ [0.0, 0.0, -1.0]
+        expected = POSES.pose_in_base(link).rotation.T @ [0.0, 0.0, -1.0]
         np.testing.assert_allclose(found[link], expected, atol=1e-12)
     rig.down = np.array([1.0, 0.0, 0.0])
     rig.joints(position)
     rotated = rig.step()
     assert rotated is not None
-    np.testing.assert_allclose(rotated[0], KINEMATICS.pose_in_base(0).rotation.T @ rig.down, atol=1e-12)
+    np.testing.assert_allclose(rotated[0], POSES.pose_in_base(0).rotation.T @ rig.down, atol=1e-12)
 
 
 def test_gravity_is_updated_after_a_rotation_and_once_per_baseline_block() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
+from handtouch.core.link_poses import LinkPose, LinkPoses
 from handtouch.core.state import TickState
 from handtouch.core.tick import PadColumns, TickResult
 from handtouch.core.transforms import ContactTransforms
@@ -60,10 +62,11 @@ class TouchedHand:
         self, *pads: int, joints: JointStateBuffer | None = None, robots: RobotModels = ROBOTS
     ) -> None:
         n = len(PADS)
-        self.columns, self.ids = PadColumns.of_state(TickState.empty(n)), np.zeros(n, dtype=np.uint32)
+        self.transforms = ReadTransforms(n, robots)
+        self.columns = PadColumns.of_state(self.transforms.state)
         rng = np.random.default_rng(1)
         for pad in pads:
-            self.ids[pad] = pad + 1
+            self.transforms.state.contact_id[pad] = pad + 1
             self.columns.position_m[pad] = rng.normal(size=3) * 0.01
             normal = rng.normal(size=3)
             self.columns.normal[pad] = normal / np.linalg.norm(normal)
@@ -71,16 +74,13 @@ class TouchedHand:
             self.columns.covariance_m2[pad] = root @ root.T
         self.columns.sample_ns[:] = 100 * MS
         self.pads = np.array(pads, dtype=np.intp)
-        self.transforms = ReadTransforms(n, robots)
         if joints is not None:
             self.transforms.joints_at = lambda _, t_ns: joints.interpolate(t_ns)
         everything = np.ones(n, dtype=np.bool_)
         self.transforms.set_requested(everything, everything)
 
     def step(self) -> ReadTransforms:
-        self.transforms.transform_updated(
-            TickResult(100 * MS, self.pads, NONE, NONE, NONE), self.columns, self.ids
-        )
+        self.transforms.transform_updated(TickResult(100 * MS, self.pads, NONE, NONE, NONE))
         return self.transforms
 
 
@@ -99,11 +99,11 @@ def test_position_normal_and_covariance_are_transformed_by_the_pose_of_the_link(
     position = np.random.default_rng(seed).uniform(-0.5, 1.5, len(NAMES))
     touched = TouchedHand(TIP, HEEL, joints=joint_states(100, position))
     frames, columns = touched.step(), touched.columns
-    kinematics = ROBOTS.kinematics[0]
-    kinematics.set_joint_positions(position)
+    poses = LinkPoses(ROBOTS.kinematics[0])
+    poses.set_joint_positions(position)
     for pad in (TIP, HEEL):
         contact = frames.contact_fields(pad)
-        for name, pose in (("palm", kinematics.pose_in_palm(pad)), ("base", kinematics.pose_in_base(pad))):
+        for name, pose in (("palm", poses.pose_in_palm(pad)), ("base", poses.pose_in_base(pad))):
             assert contact[f"{name}_status"] == "valid"
             expected = pose.rotation @ columns.position_m[pad] + pose.translation_m
             np.testing.assert_allclose(contact[f"{name}_position_m"], expected, atol=1e-12)
@@ -169,18 +169,47 @@ def test_mount_tolerances_add_the_covariance_of_displaced_pads() -> None:
     for touched in (stated, unstated):
         touched.columns.position_m[TIP] = middle_m + on_link
         touched.step()
-    kinematics = ROBOTS.kinematics[0]
-    kinematics.set_joint_positions(position)
+    poses = LinkPoses(ROBOTS.kinematics[0])
+    poses.set_joint_positions(position)
     rng = np.random.default_rng(4)
     moved = 1e-3 * position_mm * rng.normal(size=(20_000, 3))
     moved += np.cross(np.radians(angle_deg) * rng.normal(size=(20_000, 3)), on_link)
-    for frame, pose in (("palm", kinematics.pose_in_palm(TIP)), ("base", kinematics.pose_in_base(TIP))):
+    for frame, pose in (("palm", poses.pose_in_palm(TIP)), ("base", poses.pose_in_base(TIP))):
         wide, narrow = (
             np.reshape(touched.transforms.contact_fields(TIP)[f"{frame}_covariance_m2"], (3, 3))
             for touched in (stated, unstated)
         )
         drawn = np.cov(moved @ pose.rotation.T, rowvar=False)
         np.testing.assert_allclose(wide - narrow, drawn, atol=0.03 * drawn.max())
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_covariance_sums_those_of_contact_mount_and_joints(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mount_mm, mount_deg, joint_deg = rng.uniform(0, 1, 3)
+    robots = stating(mount_std_mm=mount_mm, mount_std_deg=mount_deg, joint_std_deg=joint_deg)
+    position = rng.uniform(-0.5, 1.5, len(NAMES))
+    touched = TouchedHand(TIP, HEEL, joints=joint_states(100, position), robots=robots)
+    frames, poses = touched.step(), LinkPoses(ROBOTS.kinematics[0])
+    for pad, frame in itertools.product((TIP, HEEL), ("palm", "base")):
+        at = touched.columns.position_m[pad]
+
+        def pose(joints: NDArray[np.float64], pad: int = pad, frame: str = frame) -> LinkPose:
+            poses.set_joint_positions(joints)
+            return poses.pose_in_palm(pad) if frame == "palm" else poses.pose_in_base(pad)
+
+        def placed(joints: NDArray[np.float64], at: NDArray[np.float64] = at) -> NDArray[np.float64]:
+            return np.asarray(pose(joints).rotation @ at + pose(joints).translation_m)
+
+        arm = at - np.array(DEPLOYMENT.hands[0].pads[pad].mount.position_mm) * 1e-3
+        turning = np.radians(mount_deg) ** 2 * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        on_link = touched.columns.covariance_m2[pad] + (1e-3 * mount_mm) ** 2 * np.eye(3) + turning
+        slopes = [(placed(position + d) - placed(position - d)) / 2e-5 for d in 1e-5 * np.eye(len(NAMES))]
+        of_joints = np.radians(joint_deg) ** 2 * np.transpose(slopes) @ slopes
+        rotation = pose(position).rotation
+        found = np.reshape(frames.contact_fields(pad)[f"{frame}_covariance_m2"], (3, 3))
+        np.testing.assert_allclose(found, rotation @ on_link @ rotation.T + of_joints, rtol=1e-6, atol=1e-13)
 
 
 def test_the_configured_joint_std_applies_to_joint_states_without_one() -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from handtouch import Robot, config
 from handtouch.config import shipped
+from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.pads import mount_transform, pad_surface
 from handtouch.hand.urdf import read_urdf
@@ -106,8 +107,9 @@ def expected_m(link: str) -> NDArray[np.float64]:
     x, y = TOUCHES[link]
     robot = read_urdf(shipped.path("utah_mit.urdf"))
     kinematics = HandKinematics(robot, [link], "palm", robot.root)
-    kinematics.set_joint_positions(np.array([ANGLES.get(name, 0.0) for name in kinematics.joints]))
-    pose = kinematics.pose_in_base(0)
+    poses = LinkPoses(kinematics)
+    poses.set_joint_positions(np.array([ANGLES.get(name, 0.0) for name in kinematics.joints]))
+    pose = poses.pose_in_base(0)
     on_link = rotation @ surface.point(x * surface.a, y * surface.b) + at
     return np.asarray(pose.rotation @ on_link + pose.translation_m)
 

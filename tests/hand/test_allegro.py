@@ -11,6 +11,7 @@ import pytest
 
 from handtouch.cli.check_text import run
 from handtouch.config import ConfigError, load
+from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.robot_models import RobotModels, check_urdfs, unchecked_items
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hand.md").read_text()
@@ -34,12 +35,12 @@ def test_documented_example_fits_the_hand(
     assert not list(unchecked_items(deployment))
     (kinematics,) = RobotModels(deployment).kinematics
     assert kinematics.joints == ("joint_0.0", "joint_1.0", "joint_2.0", "joint_3.0")
-    kinematics.set_joint_positions(np.zeros(4))
-    straight = kinematics.pose_in_palm(2)
+    poses = LinkPoses(kinematics)
+    straight = poses.pose_in_palm(2)
     # phalanx lengths published by the maker, spread by 5 degrees
     assert straight.translation_m[2] == pytest.approx(0.1355 * math.cos(math.radians(5)) - 0.0015, abs=1e-4)
-    kinematics.set_joint_positions(np.array([0.0, 1.0, 1.0, 1.0]))
-    assert kinematics.pose_in_palm(2).translation_m[0] > 0.04  # it closes towards the palm's side, x
+    poses.set_joint_positions(np.array([0.0, 1.0, 1.0, 1.0]))
+    assert poses.pose_in_palm(2).translation_m[0] > 0.04  # it closes towards the palm's side, x
 
 
 def test_pad_facing_into_the_hand_is_reported(tmp_path: Path, allegro: Path) -> None:

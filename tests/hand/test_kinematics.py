@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handtouch.config import shipped
+from handtouch.core.link_poses import LinkPoses
 from handtouch.hand import urdf
 from handtouch.hand.kinematics import HandKinematics
 
@@ -72,15 +73,16 @@ def test_poses_equal_products_of_joint_transforms(
     hand: tuple[urdf.RobotDescription, HandKinematics], seed: int
 ) -> None:
     robot, kinematics = hand
+    poses = LinkPoses(kinematics)
     position = np.random.default_rng(seed).uniform(-1.5, 1.5, len(kinematics.joints))
-    kinematics.set_joint_positions(position)
+    poses.set_joint_positions(position)
     by_name = dict(zip(kinematics.joints, position.tolist(), strict=True))
     palm = pose(robot, "palm" if "palm" in robot.bodies else "palm_link", by_name)
     for number, link in enumerate(robot.bodies):
         in_base = pose(robot, link, by_name)
         for expected, found in (
-            (in_base, kinematics.pose_in_base(number)),
-            (np.linalg.solve(palm, in_base), kinematics.pose_in_palm(number)),
+            (in_base, poses.pose_in_base(number)),
+            (np.linalg.solve(palm, in_base), poses.pose_in_palm(number)),
         ):
             np.testing.assert_allclose(found.rotation, expected[:3, :3], atol=1e-12)
             np.testing.assert_allclose(found.translation_m, expected[:3, 3], atol=1e-12)
@@ -112,14 +114,14 @@ def trees(draw: st.DrawFn) -> tuple[str, list[str]]:
 
 @settings(max_examples=40, deadline=None)
 @given(tree=trees(), seed=st.integers(0, 2**32 - 1))
-def test_poses_and_jacobians_equal_those_of_pinocchio(tree: tuple[str, list[str]], seed: int) -> None:
+def test_poses_and_covariances_equal_those_of_pinocchio(tree: tuple[str, list[str]], seed: int) -> None:
     pinocchio = pytest.importorskip("pinocchio")
     text, links = tree
     robot, rng = urdf.parse_urdf(text), np.random.default_rng(seed)
     palm = str(rng.choice(links))
     kinematics = HandKinematics(robot, links, palm, "l0")
-    position = rng.uniform(-3, 3, len(kinematics.joints))
-    kinematics.set_joint_positions(position)
+    poses, position = LinkPoses(kinematics), rng.uniform(-3, 3, len(kinematics.joints))
+    poses.set_joint_positions(position)
     given = dict(zip(kinematics.joints, position.tolist(), strict=True))
     model = pinocchio.buildModelFromXML(text)
     q, by_joint = pinocchio.neutral(model), np.zeros((model.nv, len(given)))
@@ -139,39 +141,40 @@ def test_poses_and_jacobians_equal_those_of_pinocchio(tree: tuple[str, list[str]
         link: pinocchio.getFrameJacobian(model, data, at, pinocchio.WORLD).reshape(6, model.nv)
         for link, at in frame.items()
     }
-    point = rng.normal(size=3)
+    point, std = rng.normal(size=3), rng.uniform(0, 1, len(given))
     for number, link in enumerate(links):
         for other, in_base in ((palm, False), ("l0", True)):
             expected = data.oMf[frame[other]].actInv(data.oMf[frame[link]])
-            found = kinematics.pose_in_base(number) if in_base else kinematics.pose_in_palm(number)
+            found = poses.pose_in_base(number) if in_base else poses.pose_in_palm(number)
             np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-12)
             np.testing.assert_allclose(found.translation_m, expected.translation, atol=1e-12)
             linear, angular = np.split(twist[link] - twist[other], 2)
             moved = linear + np.cross(angular.T, data.oMf[frame[link]].act(point)).T
-            slope = data.oMf[frame[other]].rotation.T @ moved @ by_joint
-            np.testing.assert_allclose(kinematics.point_jacobian(number, point, in_base), slope, atol=1e-12)
+            slope = data.oMf[frame[other]].rotation.T @ moved @ by_joint * std
+            covariance = poses.joint_covariance_m2(number, point, std, in_base)
+            np.testing.assert_allclose(covariance, slope @ slope.T, rtol=1e-12, atol=1e-10)
 
 
-def test_jacobians_equal_finite_differences(hand: tuple[urdf.RobotDescription, HandKinematics]) -> None:
+def test_covariances_of_single_joints_are_squares_of_finite_differences(
+    hand: tuple[urdf.RobotDescription, HandKinematics],
+) -> None:
     _, kinematics = hand
-    m, link = len(kinematics.joints), len(kinematics.palm_joint_mask) - 1
+    poses, m, link = LinkPoses(kinematics), len(kinematics.joints), len(kinematics.palm_joint_mask) - 1
     position, point = np.random.default_rng(3).uniform(-1, 1, m), np.array([0.01, -0.02, 0.03])
 
     def at(joints: FloatArray, in_base: bool) -> FloatArray:
-        kinematics.set_joint_positions(joints)
-        found = kinematics.pose_in_base(link) if in_base else kinematics.pose_in_palm(link)
+        poses.set_joint_positions(joints)
+        found = poses.pose_in_base(link) if in_base else poses.pose_in_palm(link)
         return np.asarray(found.rotation @ point + found.translation_m)
 
     for in_base in (False, True):
-        kinematics.set_joint_positions(position)
-        slope = kinematics.point_jacobian(link, point, in_base)
-        step = 1e-6 * np.eye(m)
-        expected = (
-            np.stack([at(position + d, in_base) - at(position - d, in_base) for d in step], axis=1) / 2e-6
-        )
-        np.testing.assert_allclose(slope, expected, atol=1e-8)
-        needs = (kinematics.base_joint_mask if in_base else kinematics.palm_joint_mask)[link]
-        assert not np.abs(slope[:, ~needs]).max(initial=0.0) > 0
+        needed = (kinematics.base_joint_mask if in_base else kinematics.palm_joint_mask)[link]
+        for joint, step in enumerate(1e-6 * np.eye(m)):
+            slope = (at(position + step, in_base) - at(position - step, in_base)) / 2e-6
+            poses.set_joint_positions(position)
+            covariance = poses.joint_covariance_m2(link, point, np.eye(m)[joint], in_base)
+            np.testing.assert_allclose(covariance, np.outer(slope, slope), atol=1e-8)
+            assert needed[joint] == (covariance.trace() > 1e-12)
 
 
 def test_shipped_hand_has_sixteen_joints_and_closes_over_its_palm() -> None:
@@ -180,16 +183,17 @@ def test_shipped_hand_has_sixteen_joints_and_closes_over_its_palm() -> None:
     kinematics = HandKinematics(robot, [*tips, "palm_heel"], "palm", "base")
     assert len(kinematics.joints) == 16
     assert kinematics.palm_joint_mask.sum(axis=1).tolist() == [4, 4, 4, 4, 0]
+    poses = LinkPoses(kinematics)
     closed = np.array([0.0 if name.endswith("abduction") else 0.9 for name in kinematics.joints])
     for number, tip in enumerate(tips):
-        kinematics.set_joint_positions(np.zeros(16))
-        open_hand = kinematics.pose_in_palm(number).translation_m.copy()
-        kinematics.set_joint_positions(closed)
-        found = kinematics.pose_in_palm(number).translation_m
+        poses.set_joint_positions(np.zeros(16))
+        open_hand = poses.pose_in_palm(number).translation_m.copy()
+        poses.set_joint_positions(closed)
+        found = poses.pose_in_palm(number).translation_m
         assert found[2] > 0.02, tip  # out of the palm
         assert abs(found[0]) < abs(open_hand[0]) + 0.01
-    kinematics.set_joint_positions(closed)
-    thumb, index = kinematics.pose_in_palm(0).translation_m, kinematics.pose_in_palm(1).translation_m
+    poses.set_joint_positions(closed)
+    thumb, index = poses.pose_in_palm(0).translation_m, poses.pose_in_palm(1).translation_m
     assert math.dist(thumb, index) < 0.1
 
 

@@ -25,6 +25,7 @@ from websockets.typing import Subprotocol
 from handtouch import config
 from handtouch.client import connect
 from handtouch.config import shipped
+from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.urdf import read_urdf
 from handtouch.record.foxglove import (
@@ -91,12 +92,13 @@ def test_frames_of_links_equal_the_kinematics() -> None:
     at |= frames(foxglove.convert("joints/right", joints, 10 * SECOND_NS))
     robot = read_urdf(shipped.path("utah_mit.urdf"))
     kinematics = HandKinematics(robot, LINKS, "palm", robot.root)
-    kinematics.set_joint_positions(np.array([angles.get(name, 0.0) for name in kinematics.joints]))
+    poses = LinkPoses(kinematics)
+    poses.set_joint_positions(np.array([angles.get(name, 0.0) for name in kinematics.joints]))
     for number, link in enumerate(LINKS):
         pose, frame = np.eye(4), link
         while frame != robot.root:
             pose, frame = matrix(at[frame]) @ pose, at[frame]["parent_frame_id"]
-        expected = kinematics.pose_in_base(number)
+        expected = poses.pose_in_base(number)
         assert np.allclose(pose[:3, :3], expected.rotation)
         assert np.allclose(pose[:3, 3], expected.translation_m)
 

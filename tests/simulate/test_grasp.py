@@ -18,6 +18,7 @@ from handtouch import config
 from handtouch.cli import demo
 from handtouch.cli.simulate import run as simulate
 from handtouch.config import shipped
+from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.pads import mount_transform
 from handtouch.hand.robot_models import RobotModels
 from handtouch.simulate import grasp as grasping
@@ -145,11 +146,12 @@ def test_patches_preserve_force_and_centre() -> None:
 
 def test_link_poses_equal_those_of_mujoco(ball: GraspRecord) -> None:
     kinematics = RobotModels(HAND).kinematics[0]
+    poses = LinkPoses(kinematics)
     order = [ball.joints.index(name) for name in kinematics.joints]
     for step in (500, 1200, 2000):
-        kinematics.set_joint_positions(ball.joint_rad[step, order])
+        poses.set_joint_positions(ball.joint_rad[step, order])
         for row in range(len(PADS)):
-            pose = kinematics.pose_in_palm(row)
+            pose = poses.pose_in_palm(row)
             np.testing.assert_allclose(pose.rotation, ball.link_rotation[step, row], atol=1e-9)
             np.testing.assert_allclose(pose.translation_m, ball.link_m[step, row], atol=1e-9)
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from handtouch import config, wire
 from handtouch.config import shipped
+from handtouch.core.link_poses import LinkPoses
 from handtouch.field.surface import (
     ConeSurface,
     CylinderSurface,
@@ -132,14 +133,14 @@ def test_link_poses_agree_with_the_kinematics() -> None:
     scene = scene_of(DEPLOYMENT, FILES)
     robot = read_urdf(shipped.path("utah_mit.urdf"))
     kinematics = HandKinematics(robot, LINKS, "palm", robot.root)
-    kinematics.set_joint_positions(np.zeros(len(kinematics.joints)))
+    poses = LinkPoses(kinematics)
     for number, pad in enumerate(scene["pads"]):
         rotation, at, node = np.eye(3), np.zeros(3), pad["node"]
         while node >= 0:
             graph_node = scene["nodes"][node]
             turn = np.reshape(graph_node["rotation"], (3, 3))
             rotation, at, node = turn @ rotation, turn @ at + graph_node["translation"], graph_node["parent"]
-        pose = kinematics.pose_in_base(number)
+        pose = poses.pose_in_base(number)
         assert np.allclose(rotation, pose.rotation)
         assert np.allclose(at, pose.translation_m)
     moved = {node["joint"].split("/")[1] for node in scene["nodes"] if "joint" in node}

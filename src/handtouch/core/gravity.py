@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.baseline import BLOCK_DURATION_NS
+from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
 
@@ -31,6 +32,7 @@ class GravityTracker:
         gravity_at: Callable[[str], FloatArray | None],
     ) -> None:
         self._robots, self._joints_at, self._gravity_at = robots, joints_at, gravity_at
+        self._poses = [LinkPoses(kinematics) for kinematics in robots.kinematics]
         self._link_directions = np.full((pads, 3), np.nan)
         self._next_ns = 0
         self._last_inputs: list[FloatArray | None] = [None] * len(robots.hands)
@@ -47,7 +49,7 @@ class GravityTracker:
     def _update_hand(self, number: int, now_ns: int) -> bool:
         """Update a hand's links; return True if one has turned since the last update."""
         robots = self._robots
-        hand, kinematics, rows = robots.hands[number], robots.kinematics[number], robots.pad_rows[number]
+        hand, poses, rows = robots.hands[number], self._poses[number], robots.pad_rows[number]
         joints = self._joints_at(hand, now_ns)
         if joints is None:
             return False
@@ -58,9 +60,9 @@ class GravityTracker:
         if _is_unchanged(inputs, self._last_inputs[number]):
             return False
         self._last_inputs[number] = inputs
-        kinematics.set_joint_positions(joints.position_rad)
-        unknown = kinematics.base_joint_mask @ ~known
-        in_links = kinematics.direction_in_links(gravity)
+        poses.set_joint_positions(joints.position_rad)
+        unknown = robots.kinematics[number].base_joint_mask @ ~known
+        in_links = poses.direction_in_links(gravity)
         self._link_directions[rows] = np.where(unknown[:, None], np.nan, in_links)
         return True
 

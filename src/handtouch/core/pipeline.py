@@ -175,7 +175,7 @@ class Pipeline:
         tick, messages = self.tick, self.messages
         result = run_tick(tick, self.slab, self.node_state, self.cycle, until_ns)
         if self.transforms.any_requested:
-            self.transforms.transform_updated(result, tick.columns, tick.contacts.id)
+            self.transforms.transform_updated(result)
         self.on_tick_computed()
         messages.send_contacts(result, now_ns, self._sink)
         if self.ticks % int(self.state.ticks_per_hand_frame[0]) == 0:

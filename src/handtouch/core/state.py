@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.memory import view_memory
+from handtouch.core.stages.frames import FRAME_VALUES
 from handtouch.core.stages.slip import SLIP_COUNT
 from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.sheet import BANK_MODELS, BANK_WINDOW
@@ -27,7 +28,6 @@ from handtouch.wire import PadState
 
 VERSION = 1
 """Of what the fields mean; their names, types and shapes are in the hash of the layout."""
-PALM_VALUES = 31
 SHEET_ELEMENTS = SHEET_PLAYS = 8
 _ALIGNMENT = 64
 _MAX_PAUSE_NS = 3600 * 10**9
@@ -183,7 +183,7 @@ class TickState:
     # palm and base frames, see `ContactTransforms` and `ContactGroups`
     palm_status: Annotated[Uint8Array, Stored("u1", _PADS)]
     base_status: Annotated[Uint8Array, Stored("u1", _PADS)]
-    palm_values: Annotated[FloatArray, Stored("<f8", _PADS, PALM_VALUES, fill=math.nan)]
+    palm_values: Annotated[FloatArray, Stored("<f8", _PADS, 2 * FRAME_VALUES + 1, fill=math.nan)]
     palm_rotation: Annotated[FloatArray, Stored("<f8", _PADS, 3, 3, fill=math.nan)]
     joint_variance_m2: Annotated[FloatArray, Stored("<f8", _PADS)]
     group_id: Annotated[Uint32Array, Stored("<u4", _PADS)]

@@ -1,4 +1,4 @@
-"""Hands: pads on links, robot descriptions (URDF), kinematics, joint states and contact groups.
+"""Hands: pads on links, robot descriptions (URDF), kinematic trees and joint states.
 
 Public names: `pad_surface`, `mount_transform`, `electrode_network`, `models_with_other_parts`,
 `part_stds`, `PadGeometry`, `LinkContacts`.

@@ -34,24 +34,12 @@ class MountUncertainty:
     """Uncertainty of the mounts of a hand's pads on their links."""
 
     def __init__(self, hand: config.HandTable) -> None:
-        self._origin_m = np.array([pad.mount.position_mm for pad in hand.pads]) * _M_PER_MM
-        self._position_variance_m2 = (hand.mount_std_mm * _M_PER_MM) ** 2
-        self._rotation_variance_rad2 = math.radians(hand.mount_std_deg) ** 2
-
-    def position_covariance_m2(
-        self, pads: NDArray[np.intp], position_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the covariance (k, 3, 3) [m^2] that mounts add to positions (k, 3) on pads (k,), in link
-        frames.
-
-        A rotation error of s about each axis through the pad's origin moves a point at r by s^2 (r.r 1 - r
-        r').
-        """
-        arm = position_m - self._origin_m[pads]
-        even = self._position_variance_m2 + self._rotation_variance_rad2 * np.einsum("ki,ki->k", arm, arm)
-        return np.asarray(
-            even[:, None, None] * np.eye(3) - self._rotation_variance_rad2 * (arm[:, :, None] * arm[:, None])
-        )
+        self.origin_m = np.array([pad.mount.position_mm for pad in hand.pads]) * _M_PER_MM
+        """(n, 3) of the pads on their links"""
+        self.position_variance_m2 = (hand.mount_std_mm * _M_PER_MM) ** 2
+        """along each axis"""
+        self.rotation_variance_rad2 = math.radians(hand.mount_std_deg) ** 2
+        """about each axis"""
 
 
 def rotation_from_rpy(rpy_rad: ArrayLike) -> NDArray[np.float64]:

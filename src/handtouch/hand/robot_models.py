@@ -43,7 +43,7 @@ class RobotModels:
     `hands`: names; `kinematics`; `pad_rows`: numbers of its pads among those of the deployment, in the order
     of the kinematics' links; `joint_names`: names of the kinematics' joints in joint states;
     `joints_stale_s`, `group_distance_m`; `gravity`: unit vector (3,) in the base frame; `mounts`: uncertainty
-    of its mounts, None if not stated; `joint_std`: (m,) for joints whose states carry no deviation [rad, m if
+    of its mounts; `joint_std`: (m,) for joints whose states carry no deviation [rad, m if
     prismatic]. Raises UrdfError, KeyError or OSError for errors that `check_urdfs` reports.
     """
 
@@ -54,7 +54,7 @@ class RobotModels:
         self.joint_names: list[tuple[str, ...]] = []
         self.joints_stale_s: list[float] = []
         self.group_distance_m: list[float] = []
-        self.mounts: list[MountUncertainty | None] = []
+        self.mounts: list[MountUncertainty] = []
         self.joint_std: list[FloatArray] = []
         self.gravity: list[NDArray[np.float64]] = []
         first = 0
@@ -71,9 +71,7 @@ class RobotModels:
                 self.joint_names.append(tuple(_message_joint_name(hand, joint) for joint in made.joints))
                 self.joints_stale_s.append(hand.joint_state_timeout_ms * 1e-3)
                 self.group_distance_m.append(hand.grouping_distance_mm * 1e-3)
-                self.mounts.append(
-                    MountUncertainty(hand) if hand.mount_std_mm or hand.mount_std_deg else None
-                )
+                self.mounts.append(MountUncertainty(hand))
                 slides = np.array([robot.joints[name].kind == "prismatic" for name in made.joints], np.bool_)
                 std = np.where(slides, hand.joint_std_mm * 1e-3, np.radians(hand.joint_std_deg))
                 self.joint_std.append(std)
