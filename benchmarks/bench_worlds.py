@@ -31,8 +31,8 @@ from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.pad_model import PadModel, networks_of
-from handtouch.hand import models_with_other_parts, part_stds
+from handtouch.core.pad_model import PadModel
+from handtouch.hand import electrode_network, models_with_other_parts, part_stds
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import (
@@ -93,8 +93,9 @@ def learnt_gains(hand: VirtualHand, deployment: Deployment, model: PadModel, num
     period_s = deployment.daemon.sync_period_ms * 1e-3
     held = SAMPLE_S - period_s * np.arange(LEARNT_SAMPLES)[::-1]
     times_s = (REST_S + np.array(numbers)[:, None] * STEP_S + held).ravel()
-    for row, (network, (_, pad)) in enumerate(zip(networks_of(deployment), deployment.pads, strict=True)):
+    for row, (_, pad) in enumerate(deployment.pads):
         node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
+        network = electrode_network(pad, sheet)
         others = models_with_other_parts(network, pad, node, sheet)
         calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet))
         calibrator.assign_node(row + 1, None, None, "", 0)

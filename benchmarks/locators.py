@@ -25,6 +25,7 @@ from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolv
 from handtouch.core.pad_model import PadModel
 from handtouch.field import ElectrodeNetwork, LocatorBank, Rectangle
 from handtouch.field.paper_methods import LogRatioTable, log_ratio, single_sum_fractions
+from handtouch.hand import electrode_network
 from tests.deployments import deployment_text, pad_text
 
 FloatArray = NDArray[np.float64]
@@ -61,7 +62,11 @@ class Setup:
     @cached_property
     def pad(self) -> Rectangle | ElectrodeNetwork:
         """The exact forward model."""
-        return self.model.networks[0] if self.gap_mm else self.rectangle
+        if not self.gap_mm:
+            return self.rectangle
+        deployment = self.deployment(1)
+        pad = deployment.pads[0].pad
+        return electrode_network(pad, deployment.sheets[pad.sheet])
 
     @property
     def rectangle(self) -> Rectangle:

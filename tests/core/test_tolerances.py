@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import electrode_network, part_stds
 from tests.core.conftest import DEPLOYMENT, TOLERANT_DEPLOYMENT
 from tests.deployments import deployment_text, pad_text
@@ -175,12 +178,12 @@ def test_size_of_a_pad_makes_positions_uncertain_in_proportion_to_the_distance_f
 
 
 def solve(
-    model: PadModel, xy: FloatArray, networks: list[ElectrodeNetwork] | None = None,
+    model: PadModel, xy: FloatArray, networks: Sequence[RectangleNetwork] | None = None,
     gains: FloatArray | float = 1.0, rng: np.random.Generator | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return covariances (3, 3, 3), positions and normals (3, 3) of contacts at xy (3, 2), in sides."""
-    networks = networks or model.networks
-    fractions = np.array([net.fractions(*at) for net, at in zip(networks, xy * sides(networks), strict=True)])
+    used = networks or model.networks
+    fractions = np.array([net.fractions(*at) for net, at in zip(used, xy * sides(used), strict=True)])
     currents, values = gains * 2e-3 * fractions, np.full((3, VALUE_COUNT), np.nan)
     if rng:
         currents += model.noise_a * rng.normal(size=(3, 4))
@@ -207,7 +210,7 @@ def squared_distances(deployment: Deployment, model: PadModel, rng: np.random.Ge
     return np.array(found)
 
 
-def sides(networks: list[ElectrodeNetwork]) -> FloatArray:
+def sides(networks: Sequence[RectangleNetwork]) -> FloatArray:
     return np.array([(network.a, network.b) for network in networks])
 
 

@@ -13,6 +13,8 @@ from pathlib import Path
 
 from handtouch.config.problems import Problem, suggest_name
 from handtouch.config.tables import (
+    MAX_ELECTRODES,
+    MIN_ELECTRODES,
     Bus,
     Daemon,
     Deployment,
@@ -21,9 +23,12 @@ from handtouch.config.tables import (
     Touch,
 )
 from handtouch.config.units import pad_unit_problems, unit_problems
+from handtouch.field.outline import MIN_CLEARANCE
+from handtouch.field.outline_surface import OutlineSurface
 
 UDP_MULTICAST_PORT = 43113
 """python-can's default port of a udp_multicast bus."""
+_MAX_OVERLAP_MM = 1e-6  # of arcs that end in one point: rounding
 
 
 def problems_in(deployment: Deployment) -> Iterator[Problem]:
@@ -46,12 +51,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
             yield from _check_references(location, pad, deployment)
             in_wrong_unit = list(pad_unit_problems(location, pad))
             yield from in_wrong_unit or _check_shape(location, pad)
-            if len(set(pad.electrodes)) < 4:
-                yield Problem(
-                    f"{location}electrodes",
-                    _format_value(pad.electrodes),
-                    "must name each of x0, xa, y0, yb once",
-                )
+            yield from _check_electrodes(location, pad, deployment)
             if pad.touch:
                 yield from _check_touch(f"{location}touch.", pad.touch)
             if (pad.bus, pad.node_id) in taken:
@@ -229,6 +229,13 @@ def _check_node(location: str, node: Node) -> Iterator[Problem]:
             _format_value(node.heartbeat_timeout_ms),
             f"must be longer than heartbeat_ms = {node.heartbeat_ms}; usually three times as long",
         )
+    lists: dict[str, Sequence[object]] = {"channel_scale": node.channel_scale}
+    if node.idle is not None:
+        lists["idle.delta_objects"] = node.idle.delta_objects
+    for key, values in lists.items():
+        if len(values) != len(node.channels):
+            remedy = f"needs {len(node.channels)} values, one for each of channels, has {len(values)}"
+            yield Problem(f"{location}: {key}", _format_value(values), remedy)
     if node.eds and not Path(node.eds).is_file():
         yield Problem(
             f"{location}: eds",
@@ -263,6 +270,62 @@ def _check_references(location: str, pad: Pad, deployment: Deployment) -> Iterat
             )
 
 
+def _check_electrodes(location: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
+    """Check the names of a pad's electrodes, and that each of them has a channel."""
+    names = pad.electrode_names
+    if sorted(pad.electrodes) != sorted(names):
+        once = f"must name each of {', '.join(names)} once"
+        yield Problem(f"{location}electrodes", _format_value(pad.electrodes), once)
+    for key in ("gap_offsets_mm", "series_ohm"):
+        values = getattr(pad, key)
+        if len(values) != len(names):
+            remedy = f"needs {len(names)} values, one for each electrode, has {len(values)}"
+            yield Problem(f"{location}{key}", _format_value(values), remedy)
+    node = deployment.nodes.get(pad.node)
+    if node is not None and len(node.channels) != len(names):
+        yield Problem(
+            f"{location}node",
+            _format_value(pad.node),
+            f"has {len(node.channels)} channels, the pad {len(names)} electrodes; list as many objects in "
+            f"channels of [node.{pad.node}], or of a kind of node for this pad",
+        )
+
+
+def _check_arcs(location: str, pad: Pad) -> Iterator[Problem]:
+    """Check that electrodes on arcs follow each other along the outline of a pad with possible gaps."""
+    key, value = f"{location}electrode_arcs_mm", _format_value(pad.electrode_arcs_mm)
+    surface = pad.surface.build()
+    if not isinstance(surface, OutlineSurface):
+        yield Problem(key, value, "only pads with an outline have arcs; leave it out")
+        return
+    if not MIN_ELECTRODES <= len(pad.arcs_mm) <= MAX_ELECTRODES:
+        remedy = f"names {len(pad.arcs_mm)} electrodes; {MIN_ELECTRODES} to {MAX_ELECTRODES} are supported"
+        yield Problem(key, value, remedy)
+        return
+    whole = 1e3 * surface.outline.perimeter()
+    if any(not -whole < end < 2 * whole for arc in pad.arcs_mm for end in arc):
+        yield Problem(key, value, f"the outline is {whole:.5g} mm long; lengths must be within it")
+        return
+    first = pad.arcs_mm[0][0]
+    lengths = [(stop - start) % whole for start, stop in pad.arcs_mm]
+    starts = [(start - first) % whole for start, _ in pad.arcs_mm] + [whole]
+    for number, (name, length, gaps) in enumerate(
+        zip(pad.electrode_names, lengths, pad.gaps_mm, strict=True)
+    ):
+        if sum(gaps) >= length:
+            remedy = f"gap_mm leaves no electrode {name}, which covers {length:.4g} mm"
+            yield Problem(f"{location}gap_mm", _format_value(pad.gap_mm), remedy)
+        bare = starts[number + 1] - starts[number] - length
+        after = pad.electrode_names[(number + 1) % len(lengths)]
+        if starts[number + 1] <= starts[number]:
+            remedy = f"{after} must follow {name} counter-clockwise along the outline"
+            yield Problem(key, value, remedy)
+            return
+        least = MIN_CLEARANCE * whole - gaps[1] - pad.gaps_mm[(number + 1) % len(lengths)][0]
+        if bare < max(least, -_MAX_OVERLAP_MM):
+            yield Problem(key, value, f"{name} and {after} touch or overlap; leave a gap between them")
+
+
 def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
     """Check that a pad's surface, gaps and series resistors are possible."""
     surface = pad.surface
@@ -271,6 +334,9 @@ def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
         value = getattr(surface, key or "kind")
         yield Problem(f"{location}surface.{key or 'kind'}", _format_value(value), remedy)
     if problems:
+        return
+    if pad.electrode_arcs_mm is not None:
+        yield from _check_arcs(location, pad)
         return
     side = 1e3 * min(*surface.build().side_lengths_m())
     if not 2 * pad.gap_mm < side:

@@ -6,9 +6,9 @@ Public names: `Deployment` and the tables in it; `TABLES`, by their names in the
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from handtouch.config.base import Table
 from handtouch.config.surfaces import PadSurface
@@ -24,10 +24,13 @@ NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
-Electrode = Literal["x0", "xa", "y0", "yb"]
 Output = Literal["position", "force", "raw", "palm", "base", "motion", "stiffness", "shape", "texture"]
 Ends = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
-PositivePerChannel = Annotated[tuple[Positive, Positive, Positive, Positive], Field(strict=False)]
+MIN_ELECTRODES, MAX_ELECTRODES = 3, 16
+SIDE_ELECTRODES = ("x0", "xa", "y0", "yb")
+_PerChannel = Field(strict=False, min_length=MIN_ELECTRODES, max_length=MAX_ELECTRODES)
+PositivePerChannel = Annotated[tuple[Positive, ...], _PerChannel]
+Arc = Annotated[tuple[float, float], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
@@ -118,9 +121,9 @@ class Idle(Table):
     period_ms: Annotated[int, Field(ge=10, le=65_535)] = Field(
         100, description="event timer of the TPDO (0x1800 + n sub 5): the longest time between two samples"
     )
-    delta_objects: Annotated[tuple[str, str, str, str], Field(strict=False)] = Field(
+    delta_objects: Annotated[tuple[str, ...], _PerChannel] = Field(
         ("0x6426:1:u32", "0x6426:2:u32", "0x6426:3:u32", "0x6426:4:u32"),
-        description="objects that delta_counts is written to, one per channel",
+        description="objects that delta_counts is written to, one per channel; default: 0x6426 sub 1 and up",
     )
     enable_object: str | None = Field(
         "0x6423:0:u8", description="object that is set to 1 to enable transmission on change"
@@ -137,9 +140,9 @@ class Node(Table):
     product_code: Unsigned32 | None = Field(
         None, description="expected product code (0x1018 sub 2); default: any"
     )
-    channels: Annotated[tuple[str, str, str, str], Field(strict=False)] = Field(
+    channels: Annotated[tuple[str, ...], _PerChannel] = Field(
         ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"),
-        description="objects of the four channels, INDEX:SUB; with a type (i16, u24) where no EDS gives it, "
+        description="objects of the 3 to 16 channels, INDEX:SUB; with a type (i16, u24) where no EDS has it, "
         "REAL32 as f32/1000 for 1000 counts per unit",
     )
     allow_pdo_remapping: bool = Field(
@@ -160,7 +163,8 @@ class Node(Table):
     )
     channel_scale: PositivePerChannel = Field(
         (1.0, 1.0, 1.0, 1.0),
-        description="gain of each channel: current per count, relative to full_scale_ma / full_scale_counts",
+        description="gain of each channel: current per count, relative to full_scale_ma / full_scale_counts; "
+        "default: 1 for each",
     )
     noise_counts: Positive = Field(description="noise of one channel (1 sigma)")
     gain_std: Annotated[float, Field(ge=0, le=1)] = Field(
@@ -187,6 +191,19 @@ class Node(Table):
         le=300_000,
         description="heartbeat consumer time: a node without heartbeat for this long is lost",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_channels(cls, values: Any) -> Any:
+        """Fill in what depends on the number of channels."""
+        channels = values.get("channels") if isinstance(values, dict) else None
+        if not isinstance(channels, list | tuple) or len(channels) == len(SIDE_ELECTRODES):
+            return values
+        filled = {"channel_scale": (1.0,) * len(channels)} | values
+        if isinstance(idle := values.get("idle"), dict):
+            deltas = tuple(f"0x6426:{sub}:u32" for sub in range(1, len(channels) + 1))
+            filled["idle"] = {"delta_objects": deltas} | idle
+        return filled
 
 
 class Behaviour(Table):
@@ -337,32 +354,60 @@ class Pad(Table):
     node_id: NodeId = Field(description="CANopen node id, 1 to 127")
     serial: Unsigned32 | None = Field(None, description="serial number (0x1018 sub 4) of the pad's node")
     node: Name = Field(description="kind of node, a [node.NAME] table")
-    electrodes: Annotated[tuple[Electrode, Electrode, Electrode, Electrode], Field(strict=False)] = Field(
-        ("x0", "xa", "y0", "yb"),
-        description="electrodes that the node's four channels are wired to, in channel order",
+    electrodes: Annotated[tuple[Name, ...], _PerChannel] = Field(
+        SIDE_ELECTRODES,
+        description="electrodes that the node's channels are wired to, in channel order; default: x0, xa, "
+        "y0, yb, or those of electrode_arcs_mm",
+    )
+    electrode_arcs_mm: dict[Name, Arc] | None = Field(
+        None,
+        description="of a pad with an outline, names of 3 to 16 electrodes in the order in which they follow "
+        "each other counter-clockwise, each with the part of the outline that it covers, less gap_mm at both "
+        "ends: lengths along it from the first vertex; default: one electrode between each two of corners_mm",
     )
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
     surface: PadSurface = Field(description="shape of the sensing surface")
     gap_mm: NonNegative = Field(description="bare length of each side next to its corners, along the surface")
-    gap_offsets_mm: Annotated[tuple[Ends, Ends, Ends, Ends], Field(strict=False)] = Field(
+    gap_offsets_mm: Annotated[tuple[Ends, ...], _PerChannel] = Field(
         ((0.0, 0.0),) * 4,
         description="bare lengths besides gap_mm at the low and the high end of electrodes x0, xa, y0, yb, "
-        "as `handtouch design` computes them",
+        "as `handtouch design` computes them, or at both ends of each arc; default: 0",
     )
-    series_ohm: Annotated[tuple[NonNegative, NonNegative, NonNegative, NonNegative], Field(strict=False)] = (
-        Field((0.0, 0.0, 0.0, 0.0), description="series resistors of the electrodes x0, xa, y0, yb to ground")
+    series_ohm: Annotated[tuple[NonNegative, ...], _PerChannel] = Field(
+        (0.0, 0.0, 0.0, 0.0),
+        description="series resistors of electrodes x0, xa, y0, yb, or of each arc, to ground; default: 0",
     )
     mount: Mount = Field(Mount(), description="pose of the pad on its link")
     touch: Touch | None = Field(None, description="thresholds of this pad; default: those of [touch]")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_electrodes(cls, values: Any) -> Any:
+        """Fill in what depends on the number of electrodes."""
+        arcs = values.get("electrode_arcs_mm") if isinstance(values, dict) else None
+        if not isinstance(arcs, dict):
+            return values
+        count = len(arcs)
+        defaults = {
+            "electrodes": tuple(arcs),
+            "gap_offsets_mm": ((0.0, 0.0),) * count,
+            "series_ohm": (0.0,) * count,
+        }
+        return defaults | values
+
     @property
     def electrode_names(self) -> tuple[str, ...]:
         """Names of the electrodes, in the order of the columns of all currents."""
-        return ("x0", "xa", "y0", "yb")
+        return SIDE_ELECTRODES if self.electrode_arcs_mm is None else tuple(self.electrode_arcs_mm)
+
+    @property
+    def arcs_mm(self) -> tuple[tuple[float, float], ...]:
+        """Begin and end [mm] of each electrode of `electrode_arcs_mm`: (n, 2); empty without."""
+        return tuple((self.electrode_arcs_mm or {}).values())
 
     @property
     def gaps_mm(self) -> tuple[tuple[float, float], ...]:
-        """Bare lengths [mm] at the low and the high end of electrodes x0, xa, y0, yb: (4, 2)."""
+        """Bare lengths [mm] at the low and the high end of each electrode: (n, 2)."""
         return tuple((self.gap_mm + low, self.gap_mm + high) for low, high in self.gap_offsets_mm)
 
 

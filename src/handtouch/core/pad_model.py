@@ -29,11 +29,11 @@ from handtouch.core.stages.tolerances import PadTolerances, part_count
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
 from handtouch.field.contact_stack import stack_factor
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import (
     PadGeometry,
-    electrode_network,
     mount_transform,
+    pad_network,
     pad_surface,
 )
 
@@ -75,7 +75,7 @@ class PadModel:
     def __init__(
         self,
         deployment: Deployment,
-        forward_table: Callable[[ElectrodeNetwork], ForwardTable] = ForwardTable.from_network,
+        forward_table: Callable[[RectangleNetwork], ForwardTable] = ForwardTable.from_network,
     ) -> None:
         """Compute the parameters; `forward_table` returns that of a pad's network, once per distinct one."""
         entries = deployment.pads
@@ -371,7 +371,7 @@ class PadModel:
         ]
 
     def _spreading_at_centre(
-        self, networks: Sequence[ElectrodeNetwork]
+        self, networks: Sequence[RectangleNetwork]
     ) -> tuple[FloatArray, FloatArray | float]:
         """Return spreading radius [m] and series resistance [ohm] at the centre of each pad."""
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
@@ -425,15 +425,15 @@ def _rows_of_hands(hands: list[str]) -> dict[str, slice]:
     return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
 
 
-def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
+def networks_of(deployment: Deployment) -> list[RectangleNetwork]:
     """Return the electrode network of every pad; identical pads share one object and its table."""
-    shared: dict[tuple[object, ...], ElectrodeNetwork] = {}
+    shared: dict[tuple[object, ...], RectangleNetwork] = {}
     networks = []
     for _, pad in deployment.pads:
         sheet = deployment.sheets[pad.sheet]
-        parameters = (pad.surface, pad.gaps_mm, pad.series_ohm, sheet.ohm_per_square)
+        parameters = (pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, sheet.ohm_per_square)
         if parameters not in shared:
-            shared[parameters] = electrode_network(pad, sheet)
+            shared[parameters] = pad_network(pad, sheet)
         networks.append(shared[parameters])
     return networks
 
@@ -452,6 +452,7 @@ def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
     deployment file gets its serial number. Nor with tolerances: they are no part of what is calibrated.
     """
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
-    text = pad.model_copy(update={"serial": None}).model_dump_json()
+    absent = set() if pad.arcs_mm else {"electrode_arcs_mm"}
+    text = pad.model_copy(update={"serial": None}).model_dump_json(exclude=absent)
     text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=_SHEET_TOLERANCES)
     return "nominal-" + hashlib.sha256(text.encode()).hexdigest()[:12]

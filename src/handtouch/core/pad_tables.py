@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from statistics import NormalDist
 
@@ -25,7 +25,7 @@ from handtouch.core.stages.tables import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.contact_stack import stack_factor
 from handtouch.field.model import spreading_radius
-from handtouch.field.network import Electrode, ElectrodeNetwork
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import unevenness_slopes
 
@@ -98,11 +98,11 @@ class ForwardTable:
     series_vectors: FloatArray
 
     @classmethod
-    def from_network(cls, model: ElectrodeNetwork) -> ForwardTable:
+    def from_network(cls, model: RectangleNetwork) -> ForwardTable:
         """Tabulate a pad's electrode network."""
         ends: tuple[set[float], set[float]] = {0.0, model.a}, {0.0, model.b}
-        for electrode in model.electrodes:
-            ends[_axis_along(electrode)].update((electrode.start, electrode.stop))
+        for end in model.ends:
+            ends[end.axis].add(end[end.axis])
         axes = (
             _Axis(model.a, sorted(ends[0] - {0.0, model.a})),
             _Axis(model.b, sorted(ends[1] - {0.0, model.b})),
@@ -203,7 +203,7 @@ class _Axis:
 
 
 def _tabulate_tolerances(
-    network: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
+    network: RectangleNetwork, nodes_x: FloatArray, nodes_y: FloatArray
 ) -> tuple[NDArray[np.float32], FloatArray]:
     """Return nodes of the fields of a network's ends and of the derivatives by its aspect and by waves of its
     sheet's resistance, and the vectors of its ends.
@@ -213,32 +213,18 @@ def _tabulate_tolerances(
     s, t = np.meshgrid(_inside(nodes_x[:, 0]) / network.a, _inside(nodes_y[:, 0]) / network.b)
     nominal = network.fractions(s * network.a, t * network.b)
 
-    def slope(stretch: float, electrodes: Sequence[Electrode], step: float) -> FloatArray:
+    def slope(other: RectangleNetwork, step: float) -> FloatArray:
         """Return derivatives (n, y, x) at fixed fractions of the sides."""
-        other = ElectrodeNetwork.from_electrodes(
-            stretch * network.a, network.b, electrodes, network.sheet_ohm_per_square, network.series_ohm
-        )
         return np.asarray((other.fractions(s * other.a, t * other.b) - nominal) / step)
 
     fields, vectors = [], []
-    for number, electrode in enumerate(network.electrodes):
-        step = _TOLERANCE_STEP * (network.a, network.b)[_axis_along(electrode)]
-        for other in (
-            replace(electrode, start=electrode.start + step), replace(electrode, stop=electrode.stop - step),
-        ):  # fmt: skip
-            electrodes = (*network.electrodes[:number], other, *network.electrodes[number + 1 :])
-            by_end = slope(1.0, electrodes, step)  # of rank 1
-            left, singular, right = np.linalg.svd(by_end.reshape(len(by_end), -1), full_matrices=False)
-            vectors.append(left[:, 0] * singular[0])
-            fields.append(right[0].reshape(s.shape))
-    stretch = math.exp(_TOLERANCE_STEP)
-    longer = [
-        electrode
-        if _axis_along(electrode)
-        else replace(electrode, start=stretch * electrode.start, stop=stretch * electrode.stop)
-        for electrode in network.electrodes
-    ]
-    by_aspect = slope(stretch, longer, _TOLERANCE_STEP)
+    for number, end in enumerate(network.ends):
+        step = _TOLERANCE_STEP * (network.a, network.b)[end.axis]
+        by_end = slope(network.with_moved_end(number, step), step)  # of rank 1
+        left, singular, right = np.linalg.svd(by_end.reshape(len(by_end), -1), full_matrices=False)
+        vectors.append(left[:, 0] * singular[0])
+        fields.append(right[0].reshape(s.shape))
+    by_aspect = slope(network.stretched(math.exp(_TOLERANCE_STEP)), _TOLERANCE_STEP)
     by_waves = unevenness_slopes(network, s * network.a, t * network.b)
     columns = np.concatenate(
         [fields, by_aspect, by_waves.reshape(-1, *s.shape), *_second_derivatives(network, s, t)]
@@ -247,7 +233,7 @@ def _tabulate_tolerances(
 
 
 def _second_derivatives(
-    network: ElectrodeNetwork, s: FloatArray, t: FloatArray
+    network: RectangleNetwork, s: FloatArray, t: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return derivatives (n, y, x) of the fractions by x x and by x y, at fractions s, t of the sides."""
     half = _PATCH_STEP * network.a
@@ -256,11 +242,6 @@ def _second_derivatives(
     more, less = (network.fractions_with_jacobian(x + step, y)[1] for step in (half, -half))
     by_x, by_y = np.moveaxis((more - less) / (2 * half), 1, 0)
     return by_x, by_y
-
-
-def _axis_along(electrode: Electrode) -> int:
-    """Return the axis along which an electrode lies, 0 for x."""
-    return 0 if electrode.side in ("y0", "yb") else 1
 
 
 def _inside(x: FloatArray) -> FloatArray:

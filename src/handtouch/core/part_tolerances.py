@@ -14,7 +14,7 @@ from handtouch import config
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages.tolerances import PadTolerances
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.field.surface import Surface
 from handtouch.hand.pads import log_aspect_std, pad_surface, relative_size_stds
 
@@ -26,7 +26,7 @@ def stage_tolerances(
     pad: config.Pad,
     node: config.Node,
     sheet: config.Sheet,
-    network: ElectrodeNetwork,
+    network: RectangleNetwork,
     table: ForwardTable,
 ) -> PadTolerances:
     """Return the tolerances of a pad, gains aside; `network` and `table` are the pad's."""
@@ -70,17 +70,7 @@ def _elongations(sheet: config.Sheet, surface: Surface, x: FloatArray) -> FloatA
     return np.ascontiguousarray(difference_m2 / (2 * math.sqrt(2)) / (along_x * along_y))
 
 
-def _metres_per_unit(pad: config.Pad, network: ElectrodeNetwork) -> list[float]:
+def _metres_per_unit(pad: config.Pad, network: RectangleNetwork) -> list[float]:
     """Return the length on the surface of a unit of the rectangle, along each electrode at each end."""
-    surface, scales = pad_surface(pad), []
-    for electrode in network.electrodes:
-        for end in (electrode.start, electrode.stop):
-            x, y = {
-                "x0": (0.0, end),
-                "xa": (network.a, end),
-                "y0": (end, 0.0),
-                "yb": (end, network.b),
-            }[electrode.side]
-            along_x, along_y = surface.scales(x, y)
-            scales.append(float(along_x if electrode.side in ("y0", "yb") else along_y))
-    return scales
+    surface = pad_surface(pad)
+    return [float(surface.scales(end.x, end.y)[end.axis]) for end in network.ends]

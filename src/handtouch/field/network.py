@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from handtouch.field._disc import CirclePoints, DiscMap
 from handtouch.field._electrodes import ElectrodePotentials
-from handtouch.field._series_resistors import GroundedElectrodes
 from handtouch.field.rectangle import Location, Rectangle
+from handtouch.field.rectangle_network import ElectrodeEnd, RectangleNetwork
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -46,7 +46,7 @@ class Electrode:
     stop: float
 
 
-class ElectrodeNetwork(GroundedElectrodes):
+class ElectrodeNetwork(RectangleNetwork):
     """A resistive rectangle [0, a] x [0, b] with any electrodes on its boundary; a `ForwardModel`.
 
     The usual case is four electrodes that leave `gap` bare from each corner along each side: one number, or
@@ -100,6 +100,36 @@ class ElectrodeNetwork(GroundedElectrodes):
     def b(self) -> float:
         """Length along y, from side y0 to yb."""
         return self._rectangle.b
+
+    @property
+    def ends(self) -> tuple[ElectrodeEnd, ...]:
+        """Low and high end of each electrode: (2 m,)."""
+        fixed = {"x0": 0.0, "xa": self.a, "y0": 0.0, "yb": self.b}
+        return tuple(
+            ElectrodeEnd(at, fixed[side], 0) if side in ("y0", "yb") else ElectrodeEnd(fixed[side], at, 1)
+            for side, start, stop in ((one.side, one.start, one.stop) for one in self.electrodes)
+            for at in (start, stop)
+        )
+
+    def with_moved_end(self, end: int, step: float) -> ElectrodeNetwork:
+        """Return the pad with an end (index of `ends`) moved inward, which makes its electrode shorter."""
+        number, is_stop = divmod(end, 2)
+        old = self.electrodes[number]
+        new = replace(old, stop=old.stop - step) if is_stop else replace(old, start=old.start + step)
+        electrodes = (*self.electrodes[:number], new, *self.electrodes[number + 1 :])
+        return self.from_electrodes(self.a, self.b, electrodes, self.sheet_ohm_per_square, self.series_ohm)
+
+    def stretched(self, factor: float) -> ElectrodeNetwork:
+        """Return the pad with a, and the electrodes along x, multiplied by a factor."""
+        longer = [
+            replace(electrode, start=factor * electrode.start, stop=factor * electrode.stop)
+            if electrode.side in ("y0", "yb")
+            else electrode
+            for electrode in self.electrodes
+        ]
+        return self.from_electrodes(
+            factor * self.a, self.b, longer, self.sheet_ohm_per_square, self.series_ohm
+        )
 
     @property
     def conductance(self) -> FloatArray:

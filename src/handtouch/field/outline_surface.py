@@ -142,6 +142,30 @@ class OutlineSurface(Surface):
         start, stop = (x if side in ("y0", "yb") else y).tolist()
         return start, stop
 
+    def perimeter_positions(self, ends_m: npt.ArrayLike) -> FloatArray:
+        """Return electrodes on arcs (m, 2) of the outline [m] as `PerimeterNetwork` takes them.
+
+        Begin and end of each, counter-clockwise; positions on the outline are modulo its length.
+        """
+        length = self.outline.perimeter()
+        found: list[float] = []
+        whole, begins = 2 * (self.a + self.b), np.cumsum([0.0, self.a, self.b, self.a])
+        for position in np.ravel(ends_m).tolist():
+            beyond = [(position - corner) % length for corner in self.corners_m]
+            side = next(k for k in range(4) if beyond[k] <= self._side_lengths[k])
+            x, y = (
+                float(at)
+                for at in self._map.from_outline(
+                    np.asarray(complex(*self.outline.boundary_point(position % length)))
+                )
+            )
+            along = (x, y, self.a - x, self.b - y)[side]
+            place = float(begins[side] + np.clip(along, 0.0, (self.a, self.b)[side % 2]))
+            while found and place <= found[-1]:
+                place += whole
+            found.append(place)
+        return np.reshape(found, (-1, 2))
+
     def edge_m(self, cells: int) -> FloatArray:
         count = 4 * cells
         length = self.outline.perimeter()

@@ -13,14 +13,14 @@ import numpy.typing as npt
 
 from handtouch.field._disc import CirclePoints, DiscMap
 from handtouch.field._electrodes import ElectrodePotentials
-from handtouch.field._series_resistors import GroundedElectrodes
 from handtouch.field.rectangle import Rectangle
+from handtouch.field.rectangle_network import ElectrodeEnd, RectangleNetwork
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 
-class PerimeterNetwork(GroundedElectrodes):
+class PerimeterNetwork(RectangleNetwork):
     """A resistive rectangle [0, a] x [0, b] with electrodes on any stretches of its boundary; a
     `ForwardModel`.
 
@@ -66,6 +66,30 @@ class PerimeterNetwork(GroundedElectrodes):
     def b(self) -> float:
         """Length along y."""
         return self._rectangle.b
+
+    @property
+    def ends(self) -> tuple[ElectrodeEnd, ...]:
+        """Begin and end of each electrode: (2 m,)."""
+        positions = self.spans.ravel()
+        x, y = perimeter_point(self.a, self.b, positions)
+        within = np.mod(positions, self.a + self.b)
+        axes = (within >= self.a).astype(int)
+        return tuple(map(ElectrodeEnd, x.tolist(), y.tolist(), axes.tolist()))
+
+    def with_moved_end(self, end: int, step: float) -> PerimeterNetwork:
+        """Return the pad with an end (index of `ends`) moved inward, which makes its electrode shorter."""
+        spans = self.spans.copy()
+        spans[divmod(end, 2)] += -step if end % 2 else step
+        return PerimeterNetwork(self.a, self.b, spans, self.sheet_ohm_per_square, self.series_ohm)
+
+    def stretched(self, factor: float) -> PerimeterNetwork:
+        """Return the pad with a, and the electrodes along x, multiplied by a factor."""
+        longer = factor * self.a
+        rounds, within = np.divmod(self.spans, 2 * (self.a + self.b))
+        knots = np.cumsum([0.0, self.a, self.b, self.a, self.b])
+        moved = np.interp(within, knots, np.cumsum([0.0, longer, self.b, longer, self.b]))
+        spans = moved + rounds * 2 * (longer + self.b)
+        return PerimeterNetwork(longer, self.b, spans, self.sheet_ohm_per_square, self.series_ohm)
 
     @property
     def conductance(self) -> FloatArray:

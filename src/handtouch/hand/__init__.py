@@ -1,6 +1,6 @@
 """Hands: pads on links, robot descriptions (URDF), kinematic trees and joint states.
 
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `models_with_other_parts`,
+Public names: `pad_surface`, `mount_transform`, `electrode_network`, `pad_network`, `models_with_other_parts`,
 `part_stds`, `PadGeometry`, `LinkContacts`.
 """
 
@@ -9,6 +9,7 @@ from handtouch.hand.pads import (
     electrode_network,
     models_with_other_parts,
     mount_transform,
+    pad_network,
     pad_surface,
     part_stds,
 )
@@ -19,6 +20,7 @@ __all__ = [
     "electrode_network",
     "models_with_other_parts",
     "mount_transform",
+    "pad_network",
     "pad_surface",
     "part_stds",
 ]

@@ -1,7 +1,7 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `models_with_other_parts`, `part_stds`,
-`relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
+Public names: `pad_surface`, `mount_transform`, `pad_network`, `electrode_network`, `models_with_other_parts`,
+`part_stds`, `relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from handtouch import config
 from handtouch.field.model import FractionModel
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
+from handtouch.field.outline_surface import OutlineSurface
+from handtouch.field.perimeter_network import PerimeterNetwork
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
@@ -51,14 +54,30 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(yaw @ pitch @ roll)
 
 
+def pad_network(pad: config.Pad, sheet: config.Sheet) -> RectangleNetwork:
+    """Return the pad's electrodes on its rectangle, whether on its sides or on arcs of its outline."""
+    if not pad.arcs_mm:
+        return electrode_network(pad, sheet)
+    surface = pad_surface(pad)
+    if not isinstance(surface, OutlineSurface):
+        raise ValueError("electrode_arcs_mm: only pads with an outline have arcs")
+    ends_m = _M_PER_MM * (np.array(pad.arcs_mm) + np.array(pad.gaps_mm) * (1.0, -1.0))
+    spans = surface.perimeter_positions(ends_m)
+    return PerimeterNetwork(surface.a, surface.b, spans, sheet.ohm_per_square, pad.series_ohm)
+
+
 def electrode_network(
     pad: config.Pad, sheet: config.Sheet, gap_offsets_m: ArrayLike = 0.0, log_aspect: float = 0.0
 ) -> ElectrodeNetwork:
     """Return the pad's electrodes on its rectangle, with the bare corners as measured on the surface.
 
+    Raises ValueError for a pad with electrodes on arcs of its outline, which has a `pad_network` only.
+
     gap_offsets_m: added to the gap at each end of the electrodes, broadcast to (4, 2); a gap below 0 counts
     as 0. log_aspect: logarithm of a factor of the rectangle's length along x, electrodes included.
     """
+    if pad.arcs_mm:
+        raise ValueError(f"{pad.link}: not supported for electrodes on arcs (electrode_arcs_mm)")
     surface = pad_surface(pad)
     gaps_m = np.maximum(np.array(pad.gaps_mm) * _M_PER_MM + np.broadcast_to(gap_offsets_m, (4, 2)), 0.0)
     stretch = math.exp(log_aspect)

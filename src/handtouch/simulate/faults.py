@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from handtouch.config.base import Table
 from handtouch.config.channels import ELECTRODES
-from handtouch.config.tables import Electrode, Name, NonNegative, Positive
+from handtouch.config.tables import Name, NonNegative, Positive
 from handtouch.simulate import draws
 from handtouch.simulate.sheet_circuit import Wiring
 from handtouch.simulate.smoothstep import smoothstep_array
@@ -27,6 +27,7 @@ from handtouch.wire.faults import FaultKind
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
+Electrode = Literal["x0", "xa", "y0", "yb"]
 Corner = Literal["x0y0", "x0yb", "xay0", "xayb"]
 Size = tuple[float, float]
 

@@ -30,7 +30,7 @@ class PadEdit:
     node_id: int
     node: str
     serial: int | None
-    electrodes: tuple[str, str, str, str]
+    electrodes: tuple[str, ...]
 
     @classmethod
     def from_pad(cls, pad: config.Pad) -> PadEdit:
