@@ -53,10 +53,10 @@ def position_parts(tasks: Sequence[tuple[str, int]], workers: int, touches: int)
     """Return positions by world, uncalibrated hands."""
     parts: dict[str, list[Estimates]] = {}
     with ProcessPoolExecutor(workers) as pool:
-        every = [(name, number, touches, 0) for name, number in tasks]
+        every = [(name, number, touches, ()) for name, number in tasks]
         for (name, number, *_), found in zip(every, pool.map(bench_worlds.play, every), strict=True):
             own = found["position"]
-            mask = own.columns["state"] == bench_worlds.STATES[0]
+            mask = own.columns["state"] == bench_worlds.CONFIGURED
             parts.setdefault(name, []).append(own.where(mask))
             progress(f"position: {name}, hand {number + 1}")
     return {name: concatenate(some) for name, some in parts.items()}

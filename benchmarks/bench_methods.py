@@ -150,7 +150,7 @@ def world_case(setup: Setup, pads: int, touches: int) -> Case:
 
     variance, noise = [], []
     for row, pad in enumerate(entries):
-        oracle = PadOracle.build(drawn, deployment, hand_name, pad, model.noise_a[0], gains_known=False)
+        oracle = PadOracle.build(drawn, deployment, hand_name, pad, model.noise_a[0])
         own = [by_link[pad.link] for by_link in truth]
         u, v, force = np.array([(record.u_m, record.v_m, record.force_n) for record in own]).T
         variance.append(np.trace(oracle.covariances(u, v, force).position_m2, axis1=1, axis2=2))

@@ -1,8 +1,8 @@
 """Position and force in the worlds `ideal`, `default` and `harsh`: coverage, sharpness and validity.
 
 Every hand is the shipped one with hidden quantities drawn for a seed of the reporting family. Touches of any
-force anywhere on its 15 pads go through the daemon's own pipeline, once as configured and once with the gains
-that its automatic calibration found from other touches; one sample of each touch is compared. Writes
+force anywhere on its 15 pads go through the daemon's own pipeline, once as configured and again with
+what its automatic calibration found from other touches; one sample of each touch is compared. Writes
 docs/benchmarks/worlds.{md,json,png}.
 """
 
@@ -11,9 +11,9 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
-from hand_touches import FORCES_N, REST_S, SAMPLE_S, STEP_S, compare, draw_touches, sampled
+from hand_touches import (
+    FORCES_N,
+    REST_S,
+    SAMPLE_S,
+    STEP_S,
+    Key,
+    TouchReadings,
+    compare,
+    draw_touches,
+)
 from numpy.typing import NDArray
 from oracle import PadOracle
 from page import made_by, options, output_folder, table
@@ -34,6 +43,7 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.hand import electrode_network, models_with_other_parts, part_stds
 from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import (
     WORLDS,
@@ -67,8 +77,13 @@ SINGLE = {
 """Worlds in which only some quantities are hidden, as those of earlier claims; contact patches as stated."""
 WARM_UP = 12
 """Touches before those that are compared: as many as compensation of sheets needs for evidence."""
-LEARNT_SAMPLES = 12
-STATES = ("as configured", "calibrated")
+HELD_SAMPLES, REST_SAMPLES, REST_PAUSES = 12, 6, 4
+"""Of a contact that is learned from; of each pause before a contact, and pauses, for its zeros."""
+DRAWN_PER_LEARNT = 1.3
+"""Touches drawn for each contact that the calibration uses: not those at edges, weak ones, saturated ones."""
+CONFIGURED = "as configured"
+LEARNT = (32, 256)
+"""Contacts after which estimates are compared again, in the world `default`; elsewhere after the first."""
 SLICES = ("edge distance", "force", "sheet", "sheet kind", "surface", "aspect")
 
 
@@ -78,70 +93,134 @@ def drawn_world(name: str, number: int) -> DrawnWorld:
     return replace(world, mounts=MountSpread()).draw(Family.REPORTING.seed(number))
 
 
-def with_stated_radius(deployment: Deployment, drawn: DrawnWorld) -> Deployment:
-    """Return the deployment with the spread of contact radii in this world as its builder states it."""
+def with_stated_touches(deployment: Deployment, drawn: DrawnWorld) -> Deployment:
+    """Return the deployment with the spread of contact radii in this world as its builder states it, and with
+    sheets that weren't loaded before, as they are here."""
     spread = drawn.world.contacts.radius_sigma.std
-    sheets = {
-        name: sheet.model_copy(update={"contact_radius_std_mm": spread * sheet.contact_radius_std_mm})
-        for name, sheet in deployment.sheets.items()
-    }
+    sheets = {}
+    for name, sheet in deployment.sheets.items():
+        stated: dict[str, Any] = {"contact_radius_std_mm": spread * sheet.contact_radius_std_mm}
+        if sheet.behaviour:
+            stated["behaviour"] = sheet.behaviour.model_copy(update={"back_force_std_n": 0.0})
+        sheets[name] = sheet.model_copy(update=stated)
     return deployment.model_copy(update={"sheets": sheets})
 
 
-def learnt_gains(hand: VirtualHand, deployment: Deployment, model: PadModel, numbers: range) -> None:
-    """Calibrate the model's gains by touches of these numbers, as the supervisor does."""
-    period_s = deployment.daemon.sync_period_ms * 1e-3
-    held = SAMPLE_S - period_s * np.arange(LEARNT_SAMPLES)[::-1]
-    times_s = (REST_S + np.array(numbers)[:, None] * STEP_S + held).ravel()
-    for row, (_, pad) in enumerate(deployment.pads):
-        node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
-        network = electrode_network(pad, sheet)
-        others = models_with_other_parts(network, pad, node, sheet)
-        calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet))
-        calibrator.assign_node(row + 1, None, None, "", 0)
-        readings = hand.counts(row, times_s).reshape(len(numbers), LEARNT_SAMPLES, 4).mean(axis=1)
-        noise_a = model.noise_a[row] / np.sqrt(LEARNT_SAMPLES)
-        for number, reading in zip(numbers, readings, strict=True):
-            sync_ns = round((REST_S + number * STEP_S + SAMPLE_S) * 1e9)
-            contact = StationaryContact(
-                reading * model.ampere_per_count[row], noise_a, LEARNT_SAMPLES, sync_ns
-            )
-            update = calibrator.add_contact(contact)
-            if update.apply:
-                learnt = calibrator.gains
-        if calibrator.calibration_state == "calibrated":
-            covariance = tuple(np.ravel(learnt.covariance).tolist())
-            calibration = ActiveCalibration(
-                f"{row + 1}-1", learnt.factors, gain_covariance=covariance, parts=learnt.parts
-            )
-            model.set_calibration(row, calibration)
+def state_after(contacts: int) -> str:
+    """Return the name of the state after this many contacts."""
+    return f"after {contacts} contacts" if contacts else CONFIGURED
 
 
-def play(task: tuple[str, int, int, int]) -> dict[str, Estimates]:
-    """Return estimates of position and force of a hand: name of the world, number, touches, learnt ones."""
-    name, number, touches, learnt = task
+STATES = tuple(state_after(contacts) for contacts in (0, *LEARNT))
+
+
+@dataclass(frozen=True)
+class Learning:
+    """What a pad's calibration knows after some contacts; `touches`: those that it was given."""
+
+    calibration: ActiveCalibration | None
+    touches: list[int]
+
+
+def learn(
+    hand: VirtualHand,
+    deployment: Deployment,
+    model: PadModel,
+    row: int,
+    numbers: range,
+    counts: Sequence[int],
+) -> list[Learning]:
+    """Calibrate a pad by touches of these numbers, as the supervisor does, until it has used each of
+    `counts`."""
+    period_s, (_, pad) = deployment.daemon.sync_period_ms * 1e-3, deployment.pads[row]
+    begin_s = REST_S + np.array(numbers)[:, None] * STEP_S
+    held_s = begin_s + SAMPLE_S - period_s * np.arange(HELD_SAMPLES)
+    rest_s = begin_s - period_s * np.arange(1, REST_SAMPLES + 1)
+    held, rest = (
+        hand.counts(row, times.ravel()).reshape(*times.shape, 4).mean(axis=1) for times in (held_s, rest_s)
+    )
+    padded = np.concatenate([rest[:1].repeat(REST_PAUSES - 1, axis=0), rest])
+    rest = np.lib.stride_tricks.sliding_window_view(padded, REST_PAUSES, axis=0).mean(axis=-1)
+    node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
+    network = electrode_network(pad, sheet)
+    others = models_with_other_parts(network, pad, node, sheet)
+    calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet))
+    calibrator.assign_node(row + 1, None, None, "", 0)
+    noise_a = contact_noise_a(model, row)
+    found: list[Learning] = []
+    applied, given = None, []
+    for number, reading, zeros in zip(numbers, held, rest, strict=True):
+        if reading.max() >= model.max_counts[row]:
+            continue
+        sync_ns = round((REST_S + number * STEP_S + SAMPLE_S) * 1e9)
+        currents_a = (reading - zeros) * model.ampere_per_count[row]
+        given.append(number)
+        if calibrator.add_contact(StationaryContact(currents_a, noise_a, HELD_SAMPLES, sync_ns)).apply:
+            gains = calibrator.gains
+            covariance = tuple(np.ravel(gains.covariance).tolist())
+            applied = ActiveCalibration(
+                f"{row + 1}-1", gains.factors, gain_covariance=covariance, parts=gains.parts
+            )
+        if calibrator.estimate.contacts >= counts[len(found)]:
+            calibrated = calibrator.calibration_state == "calibrated"
+            found.append(Learning(applied if calibrated else None, list(given)))
+            if len(found) == len(counts):
+                break
+    return found + [Learning(None, given)] * (len(counts) - len(found))
+
+
+def contact_noise_a(model: PadModel, row: int) -> FloatArray:
+    """Return the noise (4,) [A] of a contact's mean less its zeros."""
+    return np.asarray(model.noise_a[row] * np.sqrt(1 / HELD_SAMPLES + 1 / (REST_SAMPLES * REST_PAUSES)))
+
+
+def play(task: tuple[str, int, int, tuple[int, ...]]) -> dict[str, Estimates]:
+    """Return estimates of position and force of a hand: name of the world, number, touches, and the numbers
+    of contacts after which they are compared again."""
+    name, number, touches, counts = task
     drawn = drawn_world(name, number)
     deployment = drawn.describe(load(shipped.path("utah_mit.toml")))
-    model = PadModel(with_stated_radius(deployment, drawn))
-    stimulus = Scenario(touch=draw_touches(model.links, WARM_UP + touches + learnt, drawn.seed))
-    hand = VirtualHand(deployment, stimulus, drawn)
+    stated = with_stated_touches(deployment, drawn)
+    model = PadModel(stated)
     numbers = range(WARM_UP, WARM_UP + touches)
+    others = range(numbers.stop, numbers.stop + round(DRAWN_PER_LEARNT * max(counts, default=0)))
+    stimulus = Scenario(touch=draw_touches(model.links, others.stop, drawn.seed))
+    hand = VirtualHand(deployment, stimulus, drawn)
+    readings = TouchReadings.of_hand(hand, deployment, numbers)
+    learnt = [learn(hand, deployment, model, row, others, counts) for row in range(model.size) if counts]
+    touched_at = {
+        (k, truth.link): truth
+        for k in others
+        for truth in hand.truth(REST_S + k * STEP_S + SAMPLE_S)
+    }  # fmt: skip
+    oracles = [
+        PadOracle.build(drawn, deployment, hand_name, pad, model.noise_a[row])
+        for row, (hand_name, pad) in enumerate(deployment.pads)
+    ]
     parts: dict[str, list[Estimates]] = {"position": [], "force": []}
-    for state in STATES if name in NAMED and learnt else STATES[:1]:
-        if state == "calibrated":
-            learnt_gains(hand, deployment, model, range(numbers.stop, numbers.stop + learnt))
-        contacts, truths = sampled(hand, model, deployment, numbers)
-        for row, (hand_name, pad) in enumerate(deployment.pads):
-            oracle = PadOracle.build(
-                drawn, deployment, hand_name, pad, model.noise_a[row], gains_known=state == "calibrated"
-            )
-            found = [(contacts.get(key), truth) for key, truth in truths.items() if key[1] == pad.link]
+    for step, contacts_before in enumerate((0, *counts)):
+        if contacts_before:
+            for row in range(model.size):
+                calibration = learnt[row][step - 1].calibration
+                if calibration:
+                    model.set_calibration(row, calibration)
+        contacts = readings.contacts(model, stated)
+        for row, (_, pad) in enumerate(deployment.pads):
+            oracle = oracles[row]
+            if contacts_before:
+                oracle = oracle.with_contacts(
+                    true_contacts(touched_at, pad.link, learnt[row][step - 1].touches),
+                    contact_noise_a(model, row),
+                )
+            found = [
+                (contacts.get(key), truth) for key, truth in readings.truths.items() if key[1] == pad.link
+            ]
             position, force = compare(
                 found,
                 oracle,
                 {
                     "world": name,
-                    "state": state,
+                    "state": state_after(contacts_before),
                     "pad": f"{number}/{pad.link}",
                     "sheet": pad.sheet,
                     "sheet kind": kind.name if (kind := drawn.sheet_kind(pad.sheet)) else "ideal",
@@ -150,6 +229,12 @@ def play(task: tuple[str, int, int, int]) -> dict[str, Estimates]:
             parts["position"].append(position)
             parts["force"].append(force)
     return {quantity: concatenate(some) for quantity, some in parts.items()}
+
+
+def true_contacts(truths: Mapping[Key, GroundTruth], link: str, touches: Sequence[int]) -> FloatArray:
+    """Return arc lengths [m] and forces [N] of these touches of a pad, (3, k)."""
+    every = [truths[number, link] for number in touches]
+    return np.array([(truth.u_m, truth.v_m, truth.force_n) for truth in every]).T
 
 
 UNITS = {"position": ("mm", 1e3), "force": ("N", 1.0)}
@@ -163,21 +248,24 @@ def rows_of(parts: Mapping[str, Estimates], quantity: str) -> list[dict[str, Any
 
 def sections(found: Mapping[str, Mapping[str, Estimates]]) -> list[str]:
     """Return the lines of all tables, which are printed too."""
-    page: list[str] = []
+    page = table("Sharpness by contacts", "World `default`.", sharpness(found))
     for quantity, (unit, _) in UNITS.items():
         every = {name: found[name][quantity] for name in found}
         parts = {
-            f"{name}, {state}": part for name, both in every.items() for state, part in slices(both, "state")
+            f"{name}, {state}": by_state[state]
+            for name, by_state in ((name, dict(slices(both, "state"))) for name, both in every.items())
+            for state in STATES
+            if state in by_state
         }
         page += table(quantity.capitalize(), f"Errors and deviations in {unit}.", rows_of(parts, quantity))
         for by in SLICES:
             cut = {
                 f"{name}, {value}": part
                 for name in NAMED
-                for value, part in slices(dict(slices(every[name], "state"))[STATES[0]], by)
+                for value, part in slices(dict(slices(every[name], "state"))[CONFIGURED], by)
             }
             page += table(f"{quantity.capitalize()} by {by}", "As configured.", rows_of(cut, quantity))
-    radius = dict(slices(found["radius"]["force"], "state"))[STATES[0]]
+    radius = dict(slices(found["radius"]["force"], "state"))[CONFIGURED]
     cut = {
         f"{sheet}, {value}": part
         for sheet, own in slices(radius, "sheet")
@@ -189,11 +277,28 @@ def sections(found: Mapping[str, Mapping[str, Estimates]]) -> list[str]:
     return page
 
 
+def sharpness(found: Mapping[str, Mapping[str, Estimates]]) -> list[dict[str, Any]]:
+    """Return rows: median stated standard deviation over the oracle's, in the world `default`."""
+    rows = []
+    for contacts in (0, *LEARNT):
+        row: dict[str, Any] = {"contacts before": contacts}
+        for quantity, (unit, factor) in UNITS.items():
+            every = found["default"][quantity]
+            score = EstimateScore.of_estimates(every.where(every.columns["state"] == state_after(contacts)))
+            row |= {
+                f"{quantity}, median std, {unit}": factor * score.median_std,
+                f"oracle, {unit}": factor * score.oracle_std,
+                f"{quantity}, ratio": score.median_std / score.oracle_std,
+            }
+        rows.append(row)
+    return rows
+
+
 def draw(found: Mapping[str, Mapping[str, Estimates]], path: Path) -> None:
-    """Draw stated against observed probability, as configured and calibrated."""
+    """Draw stated against observed probability, as configured and after the first contacts."""
     figure, panels = plt.subplots(2, 2, figsize=(9, 9), layout="constrained")
     for axes, quantity in zip(panels, UNITS, strict=True):
-        for panel, state in zip(axes, STATES, strict=True):
+        for panel, state in zip(axes, STATES[:2], strict=True):
             draw_calibration(
                 panel, {name: dict(slices(found[name][quantity], "state"))[state] for name in NAMED}
             )
@@ -208,14 +313,14 @@ def main() -> None:
         "--hands", type=int, default=8, help="of each named world; half as many of the others"
     )
     parser.add_argument("--touches", type=int, default=20, help="of each pad")
-    parser.add_argument("--learnt", type=int, default=160, help="touches of each pad for its calibration")
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
     asked = parser.parse_args()
     if asked.quick:
-        asked.hands, asked.touches, asked.learnt = 1, 2, 40
+        asked.hands, asked.touches = 1, 2
+    learnt = {name: LEARNT if name == "default" else LEARNT[:1] for name in NAMED}
     names, few = (*NAMED, *SINGLE), (asked.hands + 1) // 2
     tasks = [
-        (name, number, asked.touches, asked.learnt)
+        (name, number, asked.touches, learnt.get(name, ()))
         for name in names
         for number in range(asked.hands if name in NAMED else few)
     ]
@@ -233,8 +338,7 @@ def main() -> None:
         "# Position and force by world", "",
         f"{made_by()}; {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}.", "",
         HEAD.format(
-            hands=asked.hands, few=few, touches=asked.touches, learnt=asked.learnt,
-            low=FORCES_N[0], high=FORCES_N[1],
+            hands=asked.hands, few=few, touches=asked.touches, low=FORCES_N[0], high=FORCES_N[1],
         ), "", "![stated and observed probability](worlds.png)", "",
     ]  # fmt: skip
     (out / "worlds.md").write_text("\n".join([*head, *sections(found)]))
@@ -255,15 +359,19 @@ of each pad, {low:g} to {high:g} N (log-uniform), anywhere from 2 % of a side in
 each, 0.32 s after it began. 12 touches come first, as evidence for the compensation of sheets. Deployment
 files describe sheets as their builder would, and state the standard deviations of the parts and contacts of
 their world, also those of uneven sheets and elongated contacts. Pads are mounted as stated; for mounts and
-joints see [grasp](grasp.md). *Calibrated*: with the gains and parts that automatic calibration learned from
-{learnt} other touches of each pad, where it reached that state.
+joints see [grasp](grasp.md). Sheets are fresh, and stated to be (`back_force_std_n` 0): the default of 0.1 N
+for loads before the daemon's start widens forces below 1 N. *After 32 (256) contacts*: with the gains and
+parts that automatic calibration learned from so many other touches of each pad, where it reached that state.
+It doesn't use touches within 5 % of a side from an edge, weak ones and saturated ones.
 
 * Shares are in % of valid estimates, with 95 % intervals (Clopper and Pearson); those of *valid* are of all
   touches, also missed ones. Touches of one pad share its parts: the intervals are of touches on these pads.
 * *> 5 sigma*: Mahalanobis distance of the truth from the estimate.
 * *Oracle*: the standard deviation that an estimator could honestly state that knows the distributions of
-  gains, gaps, sizes, sheets and patches (calibrated: and the gains), but not their values: Laplace's
-  approximation about the true values. It knows the history of the sheet.
+  gains, gaps, sizes, sheets and patches, but not their values, and what all contacts before say about them:
+  Laplace's approximation about the true values. It knows the history of the sheet, and neither drift nor
+  uneven sheets nor elongated patches. Contacts don't measure
+  a pad's size, so positions keep its tolerance.
 * *CRPS*: of normal distributions in closed form; of positions, in two dimensions, the energy score.
 * *Error / bound*: of each touch by its own bound from noise alone (Cramer-Rao): rms, and quantiles."""
 

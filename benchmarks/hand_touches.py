@@ -1,12 +1,13 @@
 """Single touches all over a hand through the daemon's pipeline: position and force of one sample of each.
 
-Public names: `draw_touches`, `serve`, `sampled`, `compare`, `position_error`, `force_error`, and the times of
-a touch `REST_S`, `STEP_S`, `TOUCH_S`, `SAMPLE_S`.
+Public names: `draw_touches`, `serve`, `sampled`, `TouchReadings`, `compare`, `position_error`, `force_error`,
+and the times of a touch `REST_S`, `STEP_S`, `TOUCH_S`, `SAMPLE_S`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -89,14 +90,34 @@ def serve(
 
 def sampled(hand: VirtualHand, model: PadModel, deployment: Deployment, numbers: range) -> Sampled:
     """Serve all touches up to the last of these numbers, `STEP_S` apart; return contacts and truths."""
-    period_s = deployment.daemon.sync_period_ms * 1e-3
-    times_s = period_s * np.arange(round((REST_S + numbers.stop * STEP_S) / period_s))
-    counts = np.stack([hand.counts(row, times_s) for row in range(model.size)], axis=1)
-    ticks = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
-    truths = {
-        (k, truth.link): truth for tick, k in ticks.items() for truth in hand.truth(float(times_s[tick]))
-    }
-    return serve(model, deployment, counts, ticks), truths
+    readings = TouchReadings.of_hand(hand, deployment, numbers)
+    return readings.contacts(model, deployment), readings.truths
+
+
+@dataclass(frozen=True)
+class TouchReadings:
+    """Counts (ticks, pads, 4) of touches, and truths of their samples; `sampled`: touch number by tick."""
+
+    counts: NDArray[np.int64]
+    sampled: Mapping[int, int]
+    truths: dict[Key, GroundTruth]
+
+    @classmethod
+    def of_hand(cls, hand: VirtualHand, deployment: Deployment, numbers: range) -> TouchReadings:
+        """Return all touches up to the last of these numbers, `STEP_S` apart; these numbers are sampled."""
+        period_s = deployment.daemon.sync_period_ms * 1e-3
+        times_s = period_s * np.arange(round((REST_S + numbers.stop * STEP_S) / period_s))
+        rows = range(len(deployment.pads))
+        counts = np.stack([hand.counts(row, times_s) for row in rows], axis=1)
+        ticks = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
+        truths = {
+            (k, truth.link): truth for tick, k in ticks.items() for truth in hand.truth(float(times_s[tick]))
+        }
+        return cls(counts, ticks, truths)
+
+    def contacts(self, model: PadModel, deployment: Deployment) -> dict[Key, wire.Contact]:
+        """Return the contacts at the samples, through the daemon's pipeline."""
+        return serve(model, deployment, self.counts, self.sampled)
 
 
 def compare(

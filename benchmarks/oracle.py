@@ -38,7 +38,9 @@ class _Hidden:
 
     log_gain: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     gap_m: tuple[float, ...] = (0.0,) * 8
-    log_aspect: float = 0.0
+    log_length: float = 0.0
+    log_width: float = 0.0
+    log_anisotropy: float = 0.0
     log_sheet: float = 0.0
     radius_m: float = 0.0
     log_layer: float = 0.0
@@ -48,6 +50,7 @@ class _Hidden:
 class PadOracle:
     """Readings of a pad as a function of contact and hidden parameters, about the true ones.
 
+    `learnt`: information (p, p) of earlier contacts about the hidden parameters, None without any.
     Nearer an edge than twice a contact's radius the currents are those of `ContactLaw`, whose spreading
     resistance has a lower limit there; the simulator's are up to a quarter larger.
     """
@@ -60,6 +63,7 @@ class PadOracle:
         drive_v: float,
         noise_a: FloatArray,
         prior_std: dict[str, float],
+        learnt: FloatArray | None = None,
     ) -> None:
         self.surface: Surface = pad_surface(pad)
         self.surface_name = type(pad.surface).__name__.lower()
@@ -67,6 +71,7 @@ class PadOracle:
         self.aspect = max(length_m, width_m) / min(length_m, width_m)
         self._pad, self._sheet, self._hidden = pad, sheet, hidden
         self._drive_v, self._noise_a, self._prior_std = drive_v, noise_a, prior_std
+        self._learnt = learnt
 
     @classmethod
     def build(
@@ -76,8 +81,6 @@ class PadOracle:
         hand: str,
         pad: config.Pad,
         noise_a: FloatArray,
-        *,
-        gains_known: bool,
     ) -> PadOracle:
         """Return the oracle of a pad in a drawn world, with that world's distributions for prior."""
         world, sheet = drawn.world, deployment.sheets[pad.sheet]
@@ -85,14 +88,11 @@ class PadOracle:
         length_mm = 1e3 * surface.extent_m[0]
         width_mm = length_mm * surface.b / surface.a
         prior_std = {
-            "log_gain": 0.0 if gains_known else parts.gain_ratio.std,
+            "log_gain": parts.gain_ratio.std,
             "gap_m": 1e-3 * parts.gap_offset_mm.std,
-            "log_aspect": float(
-                np.hypot(
-                    np.hypot(parts.length_offset_mm.std / length_mm, parts.width_offset_mm.std / width_mm),
-                    parts.anisotropy_ratio.std / 2,
-                )
-            ),
+            "log_length": parts.length_offset_mm.std / length_mm,
+            "log_width": parts.width_offset_mm.std / width_mm,
+            "log_anisotropy": parts.anisotropy_ratio.std,
             "log_sheet": parts.sheet_ohm_ratio.std,
             "radius_m": 1e-3 * world.contacts.radius_sigma.std * sheet.contact_radius_std_mm,
             "log_layer": world.sheets.contact_ohm_ratio.std,
@@ -107,8 +107,39 @@ class PadOracle:
         s, t = x / self.surface.a, y / self.surface.b
         return np.asarray(np.min([s, 1 - s, t, 1 - t], axis=0))
 
+    def with_contacts(self, contacts: FloatArray, noise_a: FloatArray) -> PadOracle:
+        """Return the oracle after contacts at unknown places with unknown forces: the number that each leaves
+        over, as four currents have three unknowns, is information about the pad.
+
+        contacts: (3, k) true arc lengths [m] and forces [N]. noise_a: (4,) of the mean of its samples.
+        """
+        design, _ = self._design(*contacts)
+        whitened = design / noise_a[:, None]
+        contact = whitened[:, :, :3] / np.linalg.norm(whitened[:, :, :3], axis=1, keepdims=True)
+        left_over = np.linalg.qr(contact, mode="complete").Q[:, :, 3]
+        scores = np.einsum("nc,ncp->np", left_over, whitened[:, :, 3:])
+        learnt = scores.T @ scores + (0.0 if self._learnt is None else self._learnt)
+        return PadOracle(
+            self._pad, self._sheet, self._hidden, self._drive_v, self._noise_a, self._prior_std, learnt
+        )
+
     def covariances(self, u_m: FloatArray, v_m: FloatArray, force_n: FloatArray) -> OracleCovariances:
         """Return covariances at true contacts: arc lengths (n,) [m] and forces (n,) [N]."""
+        design, prior = self._design(u_m, v_m, force_n)
+        learnt = np.zeros((len(prior), len(prior)))
+        if self._learnt is not None:
+            learnt[3:, 3:] = self._learnt
+        full = laplace_covariance(design, self._noise_a, prior, learnt)
+        noise_only = laplace_covariance(design[:, :, :3], self._noise_a, prior[:3])
+        metres = self._metres(u_m, v_m, len(prior))
+        position = metres @ full @ np.swapaxes(metres, 1, 2)
+        force = full[:, 2:3, 2:3] * (force_n**2)[:, None, None]
+        return OracleCovariances(position, force, np.sqrt(noise_only[:, 2, 2]) * force_n)
+
+    def _design(
+        self, u_m: FloatArray, v_m: FloatArray, force_n: FloatArray
+    ) -> tuple[FloatArray, list[float]]:
+        """Return derivatives (n, 4, 3 + p) by x, y, ln of force and hidden parameters, and their priors."""
         x, y = self.surface.to_rectangle(u_m, v_m)
         side = _STEP * min(self.surface.a, self.surface.b)
         contact = np.stack([x, y, np.log(force_n)])
@@ -118,23 +149,31 @@ class PadOracle:
             change = self._readings(more, _Hidden()) - self._readings(less, _Hidden())
             columns.append(change / (2 * step.max()))
         prior = [np.inf] * 3
-        for std, above, below, width in self._shifts():
+        for _, std, above, below, width in self._shifts():
             columns.append((self._readings(contact, above) - self._readings(contact, below)) / width)
             prior.append(std)
-        design = np.moveaxis(np.array(columns), 0, -1).swapaxes(0, 1)  # (n, 4, parameters)
-        full = laplace_covariance(design, self._noise_a, prior)
-        noise_only = laplace_covariance(design[:, :, :3], self._noise_a, prior[:3])
-        metres = self.surface.scales(x, y).T
-        position = full[:, :2, :2] * metres[:, :, None] * metres[:, None, :]
-        force = full[:, 2:3, 2:3] * (force_n**2)[:, None, None]
-        return OracleCovariances(position, force, np.sqrt(noise_only[:, 2, 2]) * force_n)
+        return np.moveaxis(np.array(columns), 0, -1).swapaxes(0, 1), prior
+
+    def _metres(self, u_m: FloatArray, v_m: FloatArray, parameters: int) -> FloatArray:
+        """Return derivatives (n, 2, parameters) of the position [m] from the pad's middle; x and y are
+        fractions of a pad of unknown size."""
+        x, y = self.surface.to_rectangle(u_m, v_m)
+        along, around = self.surface.scales(x, y)
+        metres = np.zeros((len(u_m), 2, parameters))
+        metres[:, 0, 0], metres[:, 1, 1] = along, around
+        for number, (name, *_) in enumerate(self._shifts(), 3):
+            if name == "log_length":
+                metres[:, 0, number] = u_m - self.surface.extent_m[0] / 2
+            elif name == "log_width":
+                metres[:, 1, number] = (y - self.surface.b / 2) * around
+        return metres
 
     def _size_m(self) -> tuple[float, float]:
         middle = self.surface.a / 2, self.surface.b / 2
         return self.surface.extent_m[0], float(self.surface.b * self.surface.scale(*middle))
 
-    def _shifts(self) -> Iterator[tuple[float, _Hidden, _Hidden, float]]:
-        """Yield prior deviation, two shifted values and their distance of every hidden parameter."""
+    def _shifts(self) -> Iterator[tuple[str, float, _Hidden, _Hidden, float]]:
+        """Yield name, prior deviation, two shifted values and their distance of every hidden parameter."""
         for name, std in self._prior_std.items():
             if std == 0:
                 continue
@@ -149,12 +188,12 @@ class PadOracle:
                         else tuple(sign * (k == index) for k in range(len(zero)))
                     )
                     pair.append(_Hidden(**{name: moved}))  # type: ignore[arg-type]
-                yield std, pair[0], pair[1], 2 * step
+                yield name, std, pair[0], pair[1], 2 * step
 
     def _readings(self, contact: FloatArray, hidden: _Hidden) -> FloatArray:
         """Return the currents (4, n) that the channels report of contacts: x, y, ln of force (3, n)."""
         x, y, log_force = contact
-        stretch = np.exp(hidden.log_aspect)
+        stretch = np.exp(hidden.log_length - hidden.log_width + hidden.log_anisotropy / 2)
         sheet_ohm = self._sheet.ohm_per_square * np.exp(hidden.log_sheet)
         network = self._network(stretch, sheet_ohm, hidden.gap_m)
         at = stretch * x, y

@@ -329,17 +329,22 @@ def normal_crps(error: ArrayLike, std: ArrayLike) -> FloatArray:
     return np.asarray(std * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)))
 
 
-def laplace_covariance(design: FloatArray, noise_std: ArrayLike, prior_std: ArrayLike) -> FloatArray:
+def laplace_covariance(
+    design: FloatArray, noise_std: ArrayLike, prior_std: ArrayLike, prior_information: ArrayLike = 0.0
+) -> FloatArray:
     """Return the oracle's covariance (n, p, p): of a normal posterior about the true parameters.
 
     `design` (n, m, p): derivatives of m readings by p parameters at their true values; `noise_std`
-    broadcasts to (n, m); `prior_std` (p,): of the world's own distribution, inf for what is estimated alone.
+    broadcasts to (n, m); `prior_std` (p,): of the world's own distribution, inf for what is estimated alone;
+    `prior_information` (p, p): of other readings, beside it.
     No estimator that knows the distributions of hidden quantities, but not their values, can honestly state
     less.
     """
     weighted = design / np.broadcast_to(np.asarray(noise_std, np.float64), design.shape[:2])[..., None]
     information = np.swapaxes(weighted, 1, 2) @ weighted
-    information += np.diag(np.asarray(prior_std, np.float64) ** -2.0)
+    information += np.diag(np.asarray(prior_std, np.float64) ** -2.0) + np.asarray(
+        prior_information, np.float64
+    )
     scale = 1 / np.sqrt(np.diagonal(information, axis1=1, axis2=2))  # parameters differ by many orders
     scaled = information * scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :])

@@ -11,6 +11,7 @@ from oracle import OracleCovariances, PadOracle
 from handtouch import config
 from handtouch.config import load, shipped
 from handtouch.core.pad_model import PadModel
+from handtouch.hand import pad_surface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
@@ -53,11 +54,16 @@ def truths(deployment: config.Deployment, drawn: DrawnWorld) -> list[GroundTruth
 
 
 def covariances(
-    deployment: config.Deployment, drawn: DrawnWorld, found: list[GroundTruth], *, gains_known: bool = False
+    deployment: config.Deployment, drawn: DrawnWorld, found: list[GroundTruth], contacts_before: int = 0
 ) -> OracleCovariances:
     ((hand, pad),) = deployment.pads
     noise_a = PadModel(deployment).noise_a[0]
-    oracle = PadOracle.build(drawn, deployment, hand, pad, noise_a, gains_known=gains_known)
+    oracle = PadOracle.build(drawn, deployment, hand, pad, noise_a)
+    if contacts_before:
+        place = np.random.default_rng(1).uniform(0.1, 0.9, (2, contacts_before))
+        size = np.array([[oracle.surface.a], [oracle.surface.b]])
+        at_m = oracle.surface.from_rectangle(*(size * place))
+        oracle = oracle.with_contacts(np.stack([*at_m, np.full(contacts_before, FORCE_N)]), noise_a)
     u, v = np.array([(truth.u_m, truth.v_m) for truth in found]).T
     return oracle.covariances(u, v, np.full(len(found), FORCE_N))
 
@@ -90,14 +96,30 @@ def test_it_evaluates_at_the_true_parts(deployment: config.Deployment) -> None:
     assert np.abs(np.trace(nominal.position_m2, axis1=1, axis2=2) / rms_m**2 - 1).max() > 0.02
 
 
-def test_hidden_gains_widen_positions_until_they_are_known(deployment: config.Deployment) -> None:
+def test_hidden_gains_widen_positions_until_contacts_determine_them(deployment: config.Deployment) -> None:
     drawn = world(PartSpread(gain_ratio=Uniform(0.98, 1.02)))
     found = truths(deployment, world(PartSpread()))
-    hidden, known = (
-        np.trace(covariances(deployment, drawn, found, gains_known=known).position_m2, axis1=1, axis2=2)
-        for known in (False, True)
+    none, few, many = (
+        np.trace(covariances(deployment, drawn, found, contacts).position_m2, axis1=1, axis2=2)
+        for contacts in (0, 32, 2048)
     )
-    assert (hidden > 100 * known).all()
+    known = np.trace(covariances(deployment, world(PartSpread()), found).position_m2, axis1=1, axis2=2)
+    assert (none > 10 * few).all()
+    assert (few > many).all()
+    assert many == pytest.approx(known, rel=0.05)
+
+
+def test_no_number_of_contacts_measures_a_pads_size(deployment: config.Deployment) -> None:
+    """Fractions go with the ratio of the sides: one of the two remains as uncertain as it was."""
+    drawn = world(PartSpread(length_offset_mm=Uniform(-0.1, 0.1)))
+    found = truths(deployment, world(PartSpread()))[1:2]
+    ((_, pad),) = deployment.pads
+    surface = pad_surface(pad)
+    wider = world(PartSpread(length_offset_mm=Uniform(-0.1, 0.1), width_offset_mm=Uniform(-0.1, 0.1)))
+    alone, both = (covariances(deployment, one, found, 2048).position_m2[0] for one in (drawn, wider))
+    share = (found[0].u_m - surface.extent_m[0] / 2) / surface.extent_m[0]
+    assert both[0, 0] > (0.5 * share * 0.1e-3 / np.sqrt(3)) ** 2
+    assert both[0, 0] > 4 * alone[0, 0]
 
 
 def test_a_hidden_radius_widens_forces_up_to_what_the_contact_layer_alone_would(

@@ -44,7 +44,7 @@ _MIN_CONTACTS_TO_STORE_AGAIN = 4 * BATCH_CONTACTS
 _MAX_CALIBRATED_LOG_GAIN_STD = 0.02
 """Standard deviation of the least certain log gain of a calibrated node. In this direction gains hardly
 change a position: by 0.3 to 0.5 % of the pad's length, rms, from 1:1 to 2:1."""
-_MODEL_ERROR, _MODEL_ERROR_WITHOUT_PARTS = 1e-4, 5e-4
+_MODEL_ERROR, _MODEL_ERROR_WITHOUT_PARTS = 5e-5, 5e-4
 """Standard deviation of the fractions by what neither gains nor parts with tolerances explain."""
 _MANUAL_REMEDY = "measure them with `handtouch calibrate`"
 
