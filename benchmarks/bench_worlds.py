@@ -79,8 +79,9 @@ WARM_UP = 12
 """Touches before those that are compared: as many as compensation of sheets needs for evidence."""
 HELD_SAMPLES, REST_SAMPLES, REST_PAUSES = 12, 6, 4
 """Of a contact that is learned from; of each pause before a contact, and pauses, for its zeros."""
-DRAWN_PER_LEARNT = 1.3
-"""Touches drawn for each contact that the calibration uses: not those at edges, weak ones, saturated ones."""
+DRAWN_PER_LEARNT, DRAWN_MORE = 1.3, 32
+"""Touches drawn for each contact that the calibration uses (not those at edges, weak ones, saturated ones), and
+how many more, as it takes contacts in groups."""
 CONFIGURED = "as configured"
 LEARNT = (32, 256)
 """Contacts after which estimates are compared again, in the world `default`; elsewhere after the first."""
@@ -183,7 +184,8 @@ def play(task: tuple[str, int, int, tuple[int, ...]]) -> dict[str, Estimates]:
     stated = with_stated_touches(deployment, drawn)
     model = PadModel(stated)
     numbers = range(WARM_UP, WARM_UP + touches)
-    others = range(numbers.stop, numbers.stop + round(DRAWN_PER_LEARNT * max(counts, default=0)))
+    drawn_touches = round(DRAWN_PER_LEARNT * max(counts)) + DRAWN_MORE if counts else 0
+    others = range(numbers.stop, numbers.stop + drawn_touches)
     stimulus = Scenario(touch=draw_touches(model.links, others.stop, drawn.seed))
     hand = VirtualHand(deployment, stimulus, drawn)
     readings = TouchReadings.of_hand(hand, deployment, numbers)

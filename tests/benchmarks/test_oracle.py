@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bench_worlds import contact_noise_a, learn
+from hand_touches import REST_S, SAMPLE_S, STEP_S, draw_touches
 from oracle import OracleCovariances, PadOracle
 
 from handtouch import config
 from handtouch.config import load, shipped
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.hand import pad_surface
 from handtouch.simulate.scenario import Scenario
@@ -17,9 +20,11 @@ from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import (
+    WORLDS,
     ContactSpread,
     DrawnWorld,
     Family,
+    MountSpread,
     Normal,
     PartSpread,
     Uniform,
@@ -140,3 +145,29 @@ def test_a_hidden_radius_widens_forces_up_to_what_the_contact_layer_alone_would(
     assert (narrow < 1.01 * layer_alone * FORCE_N).all()
     assert (narrow > 0.1 * layer_alone * FORCE_N).all()
     assert wide == pytest.approx(2 * narrow, rel=0.01)
+
+
+def test_positions_are_nearly_as_certain_as_can_be_after_32_contacts(deployment: config.Deployment) -> None:
+    """Median of the stated standard deviations, at most 1.3 times the oracle's that got the same contacts."""
+    drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(Family.TUNING.seed(3))
+    described = drawn.describe(deployment)
+    ((hand_name, pad),) = described.pads
+    model, touches = PadModel(described), draw_touches(["index_distal"], 80, drawn.seed)
+    hand = VirtualHand(described, Scenario(touch=touches), drawn)
+    (learnt,) = learn(hand, described, model, 0, range(80), (32,))
+    assert learnt.calibration is not None
+    at = [truth for k in learnt.touches for truth in hand.truth(REST_S + k * STEP_S + SAMPLE_S)]
+    u, v, force_n = np.array([(truth.u_m, truth.v_m, truth.force_n) for truth in at]).T
+    oracle = PadOracle.build(drawn, described, hand_name, pad, model.noise_a[0])
+    best = oracle.with_contacts(np.stack([u, v, force_n]), contact_noise_a(model, 0))
+    model.set_calibration(0, learnt.calibration)
+    currents_a, values = np.zeros((1, 4)), np.full((1, VALUE_COUNT), np.nan)
+    solver = make_solver(model, currents_a, np.zeros(1), np.ones(1, np.bool_), values)
+    stated = []
+    for truth in at:
+        values[:] = np.nan
+        currents_a[0] = model.gains[0] * truth.currents_a
+        solver.solve_contacts(np.arange(1).data)
+        stated.append(np.trace(values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)))
+    least = np.trace(best.covariances(u, v, force_n).position_m2, axis1=1, axis2=2)
+    assert 1.0 < np.median(np.sqrt(stated)) / np.median(np.sqrt(least)) < 1.3
