@@ -80,7 +80,7 @@ WARM_UP = 12
 HELD_SAMPLES, REST_SAMPLES, REST_PAUSES = 12, 6, 4
 """Of a contact that is learned from; of each pause before a contact, and pauses, for its zeros."""
 DRAWN_PER_LEARNT, DRAWN_MORE = 1.3, 32
-"""Touches drawn for each contact that the calibration uses (not those at edges, weak ones, saturated ones), and
+"""Touches drawn for each contact that the calibration uses (none at edges, no weak or saturated ones), and
 how many more, as it takes contacts in groups."""
 CONFIGURED = "as configured"
 LEARNT = (32, 256)

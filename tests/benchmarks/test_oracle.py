@@ -148,8 +148,8 @@ def test_a_hidden_radius_widens_forces_up_to_what_the_contact_layer_alone_would(
 
 
 def test_positions_are_nearly_as_certain_as_can_be_after_32_contacts(deployment: config.Deployment) -> None:
-    """Median of the stated standard deviations, at most 1.3 times the oracle's that got the same contacts."""
-    drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(Family.TUNING.seed(3))
+    """Median of the stated standard deviations, by the oracle's that got the same contacts."""
+    drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(Family.TUNING.seed(4))
     described = drawn.describe(deployment)
     ((hand_name, pad),) = described.pads
     model, touches = PadModel(described), draw_touches(["index_distal"], 80, drawn.seed)
@@ -170,4 +170,4 @@ def test_positions_are_nearly_as_certain_as_can_be_after_32_contacts(deployment:
         solver.solve_contacts(np.arange(1).data)
         stated.append(np.trace(values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)))
     least = np.trace(best.covariances(u, v, force_n).position_m2, axis1=1, axis2=2)
-    assert 1.0 < np.median(np.sqrt(stated)) / np.median(np.sqrt(least)) < 1.3
+    assert 1.0 < np.median(np.sqrt(stated)) / np.median(np.sqrt(least)) < 1.24
