@@ -59,7 +59,9 @@ def load(name: str) -> Any:
 def draw_position(axes: Axes) -> None:
     """Rms error of valid positions by world."""
     results = load("worlds")
-    for shift, colour, state in ((-0.2, BLUE, "as configured"), (0.2, ORANGE, "calibrated")):
+    states = {key.split(", ")[1] for key in results if key.startswith("ideal, ")}
+    (learnt,) = states - {"as configured"}
+    for shift, colour, state in ((-0.2, BLUE, "as configured"), (0.2, ORANGE, learnt)):
         errors = [1e3 * results[f"{world}, {state}, position"]["rms_error"] for world in WORLDS]
         bars = axes.bar([n + shift for n in range(len(WORLDS))], errors, 0.38, color=colour, label=state)
         axes.bar_label(bars, fmt="%.2g", padding=2)

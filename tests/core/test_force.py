@@ -21,15 +21,22 @@ GREATEST_N = 15.0
 
 def solve(model: PadModel, currents: FloatArray) -> tuple[float, float, int]:
     """Return force, standard deviation and status of a contact with these currents (4,) on the first pad."""
-    every = np.zeros((model.size, 4))
-    every[0] = currents
-    values = np.full((model.size, VALUE_COUNT), np.nan)
-    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
-    solver.solve_contacts(np.zeros(1, np.intp).data)
-    force, std, status = (
-        values[0, VALUE_SLICES[name]][0] for name in ("force_n", "force_std_n", "force_status")
-    )
+    force, std, status = solve_each(model, currents[None])[0]
     return float(force), float(std), int(status)
+
+
+def solve_each(model: PadModel, currents: FloatArray) -> FloatArray:
+    """Return the same (n, 3) of contacts with these currents (n, 4), one after the other."""
+    every, values = np.zeros((model.size, 4)), np.full((model.size, VALUE_COUNT), np.nan)
+    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+    found = []
+    for own in currents:
+        every[0], values[0] = own, np.nan
+        solver.solve_contacts(np.zeros(1, np.intp).data)
+        found.append(
+            [values[0, VALUE_SLICES[name]][0] for name in ("force_n", "force_std_n", "force_status")]
+        )
+    return np.array(found)
 
 
 def patch_factor(distance: float, x: float, alpha: float) -> float:
@@ -76,15 +83,16 @@ alpha_std = 0.12
 ohm_per_square_std = 0.25"""
 
 
-@pytest.mark.parametrize("tolerances", ["contact_radius_std_mm = 0.5", WIDE], ids=["default", "wide"])
-def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(tolerances: str) -> None:
-    text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
-    text = text.replace("contact_radius_std_mm = 0.5", tolerances)
+def solve_drawn(text: str, forces: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return forces, standard deviations and status (n,) of contacts in the middle of the first pad.
+
+    Law and radius of each are drawn from the tolerances of a deployment.
+    """
     model, rng = PadModel(parse(text)), np.random.default_rng(4)
     sheet, network = parse(text).sheets["s"], model.networks[0]
     fractions = network.fractions(network.a / 2, network.b / 2)
     spreading_m = float(network.spreading_radius(network.a / 2, network.b / 2))
-    errors, forces = [], np.exp(rng.uniform(np.log(0.2), np.log(GREATEST_N), 600))
+    currents = []
     for force_n in forces.tolist():
         law = ContactLaw(
             1e-6 * sheet.contact_ohm_mm2 * np.exp(sheet.contact_ohm_std * rng.normal()),
@@ -93,11 +101,18 @@ def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(toleranc
             reference_pa=1e3 * sheet.reference_kpa,
         )
         sheet_ohm = sheet.ohm_per_square * np.exp(sheet.ohm_per_square_std * rng.normal())
-        current = float(law.current(force_n, 5.0, sheet_ohm, spreading_m))
-        found, std, status = solve(model, current * fractions)
-        errors.append((status == ForceEstimateStatus.VALID, (found - force_n) / std))
-    valid, error = np.array(errors).T
-    valid = valid.astype(np.bool_)
+        currents.append(float(law.current(force_n, 5.0, sheet_ohm, spreading_m)) * fractions)
+    force, std, status = solve_each(model, np.array(currents)).T
+    return force, std, status
+
+
+@pytest.mark.parametrize("tolerances", ["contact_radius_std_mm = 0.5", WIDE], ids=["default", "wide"])
+def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(tolerances: str) -> None:
+    text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
+    text = text.replace("contact_radius_std_mm = 0.5", tolerances)
+    forces = np.exp(np.random.default_rng(3).uniform(np.log(0.2), np.log(GREATEST_N), 600))
+    found, std, status = solve_drawn(text, forces)
+    valid, error = status == ForceEstimateStatus.VALID, (found - forces) / std
     held = np.abs(error) < 1.96
     assert valid.mean() > 0.9
     assert 0.92 < held[valid].mean() < 0.99
@@ -113,3 +128,22 @@ def test_without_a_greatest_force_those_at_the_sheets_limit_are_lower_bounds(ben
     found, std, status = solve(model, float(law.current(30.0, 5.0, 2400.0, spreading_m)) * fractions)
     assert (status, std) == (ForceEstimateStatus.LOWER_BOUND, np.inf)
     assert found < 30.0
+
+
+RADIUS_ALONE = """contact_radius_std_mm = 0.5
+contact_ohm_std = 0.0
+alpha_std = 0.0
+ohm_per_square_std = 0.0"""
+
+
+@pytest.mark.parametrize(
+    "tolerances", ["contact_radius_std_mm = 0.5", RADIUS_ALONE], ids=["default", "radius"]
+)
+def test_lower_bounds_are_below_the_force_with_the_probability_of_two_deviations(tolerances: str) -> None:
+    text = TOLERANT_DEPLOYMENT.replace("contact_radius_std_mm = 0.5", tolerances)
+    forces = np.exp(np.random.default_rng(3).uniform(np.log(0.5), np.log(60.0), 500))
+    found, _, status = solve_drawn(text, forces)
+    bound = status == ForceEstimateStatus.LOWER_BOUND
+    assert bound[forces > 15].mean() > 0.9
+    assert (found[bound] < forces[bound]).mean() > 0.977
+    assert np.median(found[bound & (forces < 12)] / forces[bound & (forces < 12)]) > 0.4
