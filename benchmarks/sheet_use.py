@@ -96,7 +96,9 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
     laws = [law for some in sheets for law in some.laws]
     states = [SheetState.fresh(law) for law in laws]
     behaviours = [
-        sheet_behaviour_of(some.behaviour) if some.behaviour else None for some in sheets for _ in some.laws
+        sheet_behaviour_of(some.behaviour, some.name) if some.behaviour else None
+        for some in sheets
+        for _ in some.laws
     ]
     held = TickState.empty(len(laws))
     compensation = SheetForceCompensation(behaviours, round(DT_S * 1e9), held)

@@ -13,9 +13,11 @@ import pytest
 from handtouch.canbus.bus.bus_state import BusFault, BusState, ErrorState
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent, SerialChanged
+from handtouch.config import Behaviour
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.status_reporter import StatusReporter
 from handtouch.wire.emergency import Emergency
+from tests.sheet.test_bank import Pads
 
 PERIOD_NS = 5_000_000
 SECOND_NS = 1_000_000_000
@@ -27,7 +29,7 @@ class Rig:
     def __init__(self, bench: Any) -> None:
         self.events: list[MasterEvent] = []
         self.bus_state = BusState()
-        pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
+        pipeline = self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
         master = SimpleNamespace(drain_events=self._drain, states=np.full(3, NodeState.OPERATIONAL))
         port = SimpleNamespace(bus_state=self.bus_state, counters=SimpleNamespace(bits=0, overflow=0))
         publisher = SimpleNamespace(has_subscriber=lambda _: False)
@@ -170,3 +172,20 @@ def test_new_problem_in_the_same_state_is_a_warning(rig: Rig, caplog: pytest.Log
     rig.update_bus(None, queue_full=20)
     rig.poll()
     assert rig.bus_lines(caplog)[1:] == [(logging.INFO, "bus can0: active")]
+
+
+def test_rejected_adaptation_is_logged_once_for_each_pad(
+    bench: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    sheet = bench.deployment.sheets["s"].model_copy(update={"behaviour": Behaviour()})
+    deployment = bench.deployment.model_copy(update={"sheets": {"s": sheet}})
+    rig = Rig(replace(bench, deployment=deployment, model=type(bench.model)(deployment)))
+    caplog.set_level(logging.INFO, "handtouch.health")
+    learned = Pads([False, False]).bank.learned[0]
+    for pad in (0, 1):
+        rig.pipeline.tick.sheet_force.set_back_force(pad, 0.0, 0.1, learned.tolist())
+    for _ in range(3):
+        rig.poll()
+    lines = [r.getMessage() for r in caplog.records if "adaptation" in r.getMessage()]
+    assert len(lines) == 3  # the third pad has a sheet of the same material
+    assert sum(line.startswith("h/round: adaptation of its sheet is not compensated") for line in lines) == 1

@@ -23,6 +23,7 @@ from handtouch.supervisor.ipc import (
     WorkerMessage,
     WorkerStatus,
     pack_worker_message,
+    unpack_block,
 )
 from handtouch.wire import PadState
 from handtouch.wire.diagnosis import Diagnosis
@@ -329,3 +330,42 @@ def test_state_of_the_process_is_published(rig: Rig) -> None:
     assert statistics["summary"] == "3 nominal"
     assert statistics["store_error"] == "the store is damaged"
     assert statistics["lag_s"] >= 1.0
+
+
+def modelled(bench: Any) -> Rig:
+    """Return a rig whose sheets have a modelled behaviour."""
+    sheet = bench.deployment.sheets["s"].model_copy(update={"behaviour": Behaviour()})
+    return Rig(replace(bench, deployment=bench.deployment.model_copy(update={"sheets": {"s": sheet}})))
+
+
+def test_learned_behaviour_of_a_sheet_is_restored_and_sent_until_its_node_is_replaced(bench: Any) -> None:
+    rig = modelled(bench)
+    fresh = rig.pipeline.tick.sheet_force.learned_of(0)
+    learned = fresh.copy()
+    learned[1:5] = -3.0
+    rig.receive(
+        CalibrationUpdate(
+            pad=0, serial=11, calibration_id="11-2", gains=(1, 1, 1, 1), back_n=0.2, learned=tuple(learned)
+        )
+    )
+    rig.step()
+    np.testing.assert_array_equal(rig.pipeline.tick.sheet_force.learned_of(0), learned)
+    rig.process.sent.clear()
+    for _ in range(80):
+        rig.step()
+    blocks = [unpack_block(m, 3) for m in map(msgpack.unpackb, rig.process.sent) if m["kind"] == "block"]
+    assert {int(block.learned_pad) for block in blocks} == {0, 1, 2}
+    (sent,) = {block.learned.tobytes() for block in blocks if block.learned_pad == 0}
+    assert sent == learned.tobytes()
+    rig.swap(0, 11, 21)
+    rig.step()
+    np.testing.assert_array_equal(rig.pipeline.tick.sheet_force.learned_of(0), fresh)
+
+
+def test_learned_behaviour_that_no_sheet_has_is_refused(bench: Any) -> None:
+    rig = modelled(bench)
+    before = rig.pipeline.tick.sheet_force.learned_of(0)
+    update = CalibrationUpdate(pad=0, serial=11, calibration_id="11-2", gains=(1, 1, 1, 1), back_n=0.2)
+    rig.receive(pack_worker_message(update).replace(b'"learned":[]', b'"learned":[1,2,3]'))
+    assert rig.supervisor.malformed == 1
+    np.testing.assert_array_equal(rig.pipeline.tick.sheet_force.learned_of(0), before)

@@ -100,3 +100,45 @@ def test_what_was_learned_can_be_set_again() -> None:
         fresh.bank.set_learned(0, np.zeros(3))
     with pytest.raises(ValueError, match="exponents"):
         fresh.bank.set_learned(0, np.full(BANK_LEARNED, -1.0))
+
+
+class Pads:
+    """A bank of pads with one material, each of which adapts or doesn't; all but the last are held."""
+
+    def __init__(self, adapts: list[bool]) -> None:
+        self.state = BankState.empty(len(adapts))
+        self.bank = ModelBank(S1.adaptation, BankPrior(), self.state)
+        sheets = [without(S1, SETTLED) if one else NOT_ADAPTING for one in adapts]
+        steps = [sheet.discretise(PERIOD_S) for sheet in sheets]
+        states = [sheet.initial_state(1) for sheet in sheets]
+        held = np.arange(len(adapts)) < len(adapts) - 1
+        flow, flow_s = np.where(held, PERIOD_S, 0.0), np.zeros(len(adapts))
+        for _ in range(3):
+            self.bank.begin_contacts(np.flatnonzero(held), np.zeros(held.sum()), 0.3)
+            for _ in range(256):
+                loads = [step.forward(state, 3.0).item() for step, state in zip(steps, states, strict=True)]
+                self.bank.advance(np.array(loads, np.float64) / self.state.growth, flow, flow_s)
+                flow_s += flow
+            for step, state in zip(steps, states, strict=True):
+                step.forward(state, 0.0)
+
+
+def test_adaptation_is_rejected_where_holds_are_steady_and_then_none_is_compensated() -> None:
+    pads = Pads([False, False, False])
+    assert pads.bank.rejected[:2].all()
+    assert (pads.bank.mean_back_n()[:2] == 0.0).all()
+
+
+def test_adaptation_is_rejected_on_no_pad_that_shows_it() -> None:
+    assert not Pads([True, True, True]).bank.rejected.any()
+
+
+def test_pads_of_one_material_are_evidence_for_a_pad_that_was_not_touched() -> None:
+    assert Pads([False, False, False, False]).bank.rejected.all()
+    alone = ModelBank(S1.adaptation, BankPrior(), BankState.empty(1))
+    assert not alone.rejected.any()
+
+
+def test_a_pad_that_adapts_differs_from_others_of_its_material() -> None:
+    rejected = Pads([False, False, False, False, True, False]).bank.rejected
+    assert rejected.tolist() == [True, True, True, True, False, True]

@@ -20,10 +20,12 @@ from handtouch.calibration.calibration import (
     LawParameters,
     Offsets,
     Provenance,
+    StoredSheetState,
     matrix,
 )
 from handtouch.calibration.store import Store
 from handtouch.calibration.store_client import MountingPoint, StoreClient
+from handtouch.sheet import S1, BankPrior, BankState, ModelBank
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
@@ -365,3 +367,52 @@ print(client.error)
     user = bare.split() if os.geteuid() == 0 else []
     done = subprocess.run([*user, sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
     assert "calibrations are read, but new ones are not kept" in done.stdout, done.stderr
+
+
+def learned_behaviour() -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return what a bank could have learned of a sheet."""
+    learned = np.array(ModelBank(S1.adaptation, BankPrior(), BankState.empty(1)).learned[0], np.float64)
+    learned[: len(learned) // 3] -= np.linspace(0.0, 6.0, len(learned) // 3)
+    return learned
+
+
+def store_sheet_state(bench: Bench, path: Path, back_n: float) -> None:
+    """Let a session with node 11 at the first pad end with a back force and learned behaviour."""
+    worker = make_worker(bench, path)
+    worker.process_message(bench.introduce([11, 12, 13]), NOW)
+    block = bench.block(np.zeros((5, 3, 4)), np.zeros((5, 3), np.uint32), 100)
+    block |= {"back_n": np.array([back_n, np.nan, np.nan]).tobytes(), "back_std_n": np.full(3, 0.1).tobytes()}
+    block |= {"learned_pad": np.int32(0).tobytes(), "learned": learned_behaviour().tobytes()}
+    worker.process_message(block, NOW)
+    worker.finish(NOW)
+
+
+def test_learned_behaviour_of_a_sheet_is_kept_for_the_next_session(bench: Bench, tmp_path: Path) -> None:
+    store_sheet_state(bench, tmp_path / "c.db", 0.4)
+    messages = make_worker(bench, tmp_path / "c.db").process_message(bench.introduce([11, 12, 13]), NOW)
+    (update,) = calibrations(messages, 0)
+    assert update.back_n == pytest.approx(0.4)
+    assert update.learned == tuple(learned_behaviour())
+
+
+def test_replaced_node_gets_nothing_that_was_learned_of_the_former(bench: Bench, tmp_path: Path) -> None:
+    store_sheet_state(bench, tmp_path / "c.db", 0.4)
+    messages = make_worker(bench, tmp_path / "c.db").process_message(bench.introduce([21, 12, 13]), NOW)
+    assert not any(update.learned for update in calibrations(messages, 0))
+
+
+@pytest.mark.parametrize(
+    ("version", "numbers", "restored"),
+    [(1, [0.4, 0.1], True), (3, [0.4, 0.1], False), (2, [0.4, 0.1, *[-1.0] * 42], False)],
+    ids=["without_learned_behaviour", "newer", "damaged"],
+)
+def test_sheet_state_of_another_version_restores_what_is_known_of_it(
+    bench: Bench, tmp_path: Path, version: int, numbers: list[float], restored: bool
+) -> None:
+    state = StoredSheetState("back force", version, msgpack.packb(numbers))
+    with Store(tmp_path / "c.db") as store:
+        origin = Provenance("baseline and sheet state tracked", hand="h", link=LINKS[0])
+        store.write(11, MOUNTING_POINT.config, Calibration(sheet=state), origin, NOW)
+    messages = make_worker(bench, tmp_path / "c.db").process_message(bench.introduce([11, 12, 13]), NOW)
+    (update,) = calibrations(messages, 0)
+    assert (update.back_n, update.learned) == (0.4 if restored else None, ())

@@ -1,12 +1,12 @@
 """Schedule of storing baselines and sheet states, which the daemon tracks.
 
-Public: `StoreSchedule`; `restored_back_force`, which reads a stored sheet state.
+Public: `StoreSchedule`; `RestoredSheet`, read from a stored sheet state by `restored_sheet`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgpack
 import numpy as np
@@ -18,6 +18,7 @@ from handtouch.calibration.calibration import (
     StoredSheetState,
     channel_values,
 )
+from handtouch.sheet import BANK_LEARNED, check_learned
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +28,10 @@ _MIN_OFFSET_CHANGE = 2.0
 """Least change of a channel's offset that is stored, in counts and standard deviations of a reading."""
 _MIN_BACK_FORCE_CHANGE = 0.1
 """Least relative change of the back force that is stored, of 1 N at least."""
-_STATE_KIND, _STATE_VERSION = "back force", 1
+_MIN_LEARNED_CHANGE = 0.5
+"""Least change of a log likelihood of the sheet's models that is stored."""
+_STATE_KIND, _STATE_VERSION = "back force", 2
+"""Back force, its standard deviation, and what was learned; version 1 has the first two only."""
 _SHEET_RECOVERY_S = 3600.0
 """Time constant of a sheet without potential, assumed since the state was stored."""
 
@@ -55,6 +59,14 @@ class TrackedState(Protocol):
     def back_std_n(self) -> FloatArray:
         """Return the standard deviations (n,) [N] of the back forces."""
 
+    @property
+    def learned_pad(self) -> NDArray[np.int32]:
+        """Return the pad () whose learned behaviour this is."""
+
+    @property
+    def learned(self) -> FloatArray:
+        """Return the learned behaviour (`BANK_LEARNED`,) of its sheet, NaN if not modelled."""
+
 
 class StoreSchedule:
     """Schedule of n pads; `update_block` with every block."""
@@ -63,11 +75,13 @@ class StoreSchedule:
         self._block: TrackedState | None = None
         self._stored_offset_counts: FloatArray = np.full((pads, 4), np.nan)
         self._stored_back_force_n = np.full(pads, np.nan)
+        self._learned, self._stored_learned = np.full((2, pads, BANK_LEARNED), np.nan)
         self._next_ns = np.full(pads, -1, dtype=np.int64)
 
     def update_block(self, block: TrackedState) -> None:
         """Keep the newest state that the daemon tracks."""
         self._block = block
+        self._learned[int(block.learned_pad)] = block.learned
 
     def reset_pad(self, pad: int) -> None:
         """Restart the schedule of a pad, whose node was replaced."""
@@ -76,6 +90,7 @@ class StoreSchedule:
             np.nan,
             -1,
         )
+        self._learned[pad] = self._stored_learned[pad] = np.nan
 
     def due_parts(
         self, pad: int, now_ns: int, last: bool = False
@@ -101,22 +116,39 @@ class StoreSchedule:
     def _due_sheet_state(self, pad: int, block: TrackedState) -> StoredSheetState | None:
         back, std = float(block.back_n[pad]), float(block.back_std_n[pad])
         before = self._stored_back_force_n[pad]
-        if not math.isfinite(back) or abs(back - before) < _MIN_BACK_FORCE_CHANGE * max(before, 1.0):
+        learned = self._learned[pad]
+        if not (math.isfinite(back) and np.isfinite(learned).all()):
             return None
-        self._stored_back_force_n[pad] = back
-        return StoredSheetState(_STATE_KIND, _STATE_VERSION, msgpack.packb([back, std]))
+        is_known = np.abs(learned - self._stored_learned[pad]).max() < _MIN_LEARNED_CHANGE  # False for NaN
+        if is_known and abs(back - before) < _MIN_BACK_FORCE_CHANGE * max(before, 1.0):
+            return None
+        self._stored_back_force_n[pad], self._stored_learned[pad] = back, learned
+        numbers = msgpack.packb([back, std, *learned.tolist()])
+        return StoredSheetState(_STATE_KIND, _STATE_VERSION, numbers)
 
 
-def restored_back_force(version: CalibrationVersion, away_s: float) -> tuple[float, float] | None:
-    """Return back force and standard deviation [N], away_s after it was stored; None if unknown."""
+class RestoredSheet(NamedTuple):
+    """State of a sheet from a store: back force and its standard deviation [N], and what was learned of its
+    behaviour, (`BANK_LEARNED`,) or empty."""
+
+    back_n: float
+    back_std_n: float
+    learned: tuple[float, ...]
+
+
+def restored_sheet(version: CalibrationVersion, away_s: float) -> RestoredSheet | None:
+    """Return the state of a sheet away_s after it was stored; None if unknown."""
     state = version.calibration.sheet
-    if state is None or (state.kind, state.version) != (_STATE_KIND, _STATE_VERSION):
+    if state is None or state.kind != _STATE_KIND or state.version > _STATE_VERSION:
         return None
     try:
-        back, std = map(float, _unpack_numbers(state.data))
+        back, std, *learned = map(float, _unpack_numbers(state.data))
+        if learned:
+            check_learned(learned)
     except (ValueError, TypeError):
         return None
-    return back, math.hypot(std, back * -math.expm1(-away_s / _SHEET_RECOVERY_S))
+    std = math.hypot(std, back * -math.expm1(-away_s / _SHEET_RECOVERY_S))
+    return RestoredSheet(back, std, tuple(learned))
 
 
 def _unpack_numbers(data: bytes) -> Any:

@@ -69,6 +69,7 @@ def print_status(answer: dict[str, Any], console: Console) -> None:
         console.print(line, highlight=False, markup=False)
     _print_pads(answer["pads"], console)
     _print_supervisor(answer, console)
+    _print_rejected_adaptation(answer, console)
     percepts = service.get("percepts")
     if percepts is not None and (percepts["state"] != "stopped" or percepts["restarts"]):
         text = f"percepts {_process_text(percepts)}; {percepts['dropped']} messages dropped"
@@ -161,6 +162,13 @@ def _print_supervisor(answer: dict[str, Any], console: Console) -> None:
         for diagnosis in pad.get("diagnoses", ()):
             text = f"{pad['hand']}/{pad['link']}: {diagnosis_text(diagnosis)}"
             console.print(text, highlight=False, markup=False, style="yellow")
+
+
+def _print_rejected_adaptation(answer: dict[str, Any], console: Console) -> None:
+    """Print the pads whose adaptation isn't compensated."""
+    if rejected := [pad["link"] for pad in answer["pads"] if pad.get("adaptation_status") == "rejected"]:
+        text = f"adaptation not compensated, as steady holds drift less without: {', '.join(rejected)}"
+        console.print(text, highlight=False, markup=False)
 
 
 def _calibration_note(pad: dict[str, Any]) -> str:

@@ -93,15 +93,17 @@ class ReplacementEvent:
 
 @dataclass(frozen=True, slots=True)
 class BackForceEvent:
-    """Back force of a pad's sheet and its standard deviation [N], from a store."""
+    """Back force of a pad's sheet and its standard deviation [N], and what was learned of its behaviour
+    (`SheetForceCompensation.learned_of`; empty: unknown), from a store."""
 
     kind: ClassVar[str] = "back_force"
     pad: int
     back_n: float
     std_n: float
+    learned: tuple[float, ...] = ()
 
     def apply(self, target: EventTarget) -> None:
-        target.tick.sheet_force.set_back_force(self.pad, self.back_n, self.std_n)
+        target.tick.sheet_force.set_back_force(self.pad, self.back_n, self.std_n, self.learned)
 
 
 @dataclass(frozen=True, slots=True)

@@ -125,7 +125,7 @@ class PadModel:
         self.end_samples = np.array([touch.end_samples for touch in touches])
         self.max_gap_periods = np.array([touch.max_gap_periods for touch in touches])
         self.max_rise_time_s = np.array([touch.max_rise_time_s for touch in touches])
-        kinds_of_sheet = {name: _behaviour_of_sheet(sheet) for name, sheet in deployment.sheets.items()}
+        kinds_of_sheet = {name: _behaviour_of_sheet(sheet, name) for name, sheet in deployment.sheets.items()}
         self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]
         networks = networks_of(deployment)
         self.networks = networks
@@ -405,8 +405,8 @@ def _triangle(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(root, mode="r"))
 
 
-def _behaviour_of_sheet(sheet: config.Sheet) -> SheetBehaviour | None:
-    return sheet_behaviour_of(sheet.behaviour) if sheet.behaviour else None
+def _behaviour_of_sheet(sheet: config.Sheet, name: str) -> SheetBehaviour | None:
+    return sheet_behaviour_of(sheet.behaviour, name) if sheet.behaviour else None
 
 
 def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:

@@ -59,7 +59,10 @@ class ForceReference(NamedTuple):
 
 @dataclass(frozen=True)
 class SheetBehaviour:
-    """Models of a `[sheet.NAME.behaviour]`, and the uncertainty of their parameters."""
+    """Models of a `[sheet.NAME.behaviour]`, and the uncertainty of their parameters.
+
+    material: name of the sheet; what pads with it show is evidence for one another.
+    """
 
     model: sheet.SheetModel
     uncertainty: sheet.ParameterUncertainty
@@ -67,6 +70,7 @@ class SheetBehaviour:
     back_force_std_n: float
     forget_time_s: float
     prior: sheet.BankPrior
+    material: str = ""
 
 
 class SheetForceCompensation:
@@ -120,14 +124,15 @@ class SheetForceCompensation:
         kept = np.array([old == new for old, new in zip(before, behaviours, strict=True)])
         names = ("force_n", "std_n", "state", "contacts", "touched_s", "log_gain", "log_gain_std")
         values = {name: getattr(self, name)[kept] for name in (*names, "_confirmed")}
-        updated_ns, learned, (back_n, back_std_n) = self._updated_ns.copy(), self.learned, self.back_force
+        learned = [self.learned_of(pad) for pad in range(len(kept))]
+        updated_ns, (back_n, back_std_n) = self._updated_ns.copy(), self.back_force
         fresh = SheetForceCompensation(behaviours, self._period_ns, self._held)
         for name in names:
             getattr(fresh, name)[kept] = values[name]
         fresh.refresh()
         fresh._updated_ns[:] = updated_ns
         for pad in np.flatnonzero(kept & self.modelled).tolist():
-            fresh.set_back_force(pad, back_n[pad], back_std_n[pad], learned[pad], confirmed=False)
+            fresh.set_back_force(pad, back_n[pad], back_std_n[pad], learned[pad].tolist(), confirmed=False)
         fresh._confirmed[kept] = values["_confirmed"]
         return fresh
 
@@ -154,8 +159,8 @@ class SheetForceCompensation:
         self, pad: int, back_n: float, std_n: float, learned: Sequence[float] = (), *, confirmed: bool = True
     ) -> None:
         """Set the back force of a pad's sheet [N], e.g. from a store, and what was learned of its behaviour
-        (`learned`; empty: unchanged); `confirmed`: its forces are reliable without further evidence. Ignored
-        for a pad without sheet model."""
+        (`learned_of`; empty: unchanged); `confirmed`: its forces are reliable without further evidence.
+        Ignored for a pad without sheet model. Raises ValueError as `sheet.ModelBank.set_learned`."""
         if not self.modelled[pad]:
             return
         group, row = self._find_group(pad)
@@ -191,13 +196,20 @@ class SheetForceCompensation:
             back[group.rows], std[group.rows] = group.compensator.back_n, group.compensator.back_std_n
         return back, std
 
+    def learned_of(self, pad: int) -> FloatArray:
+        """Return the learned behaviour of a sheet (`sheet.BANK_LEARNED`,); NaN if not modelled."""
+        if not self.modelled[pad]:
+            return np.full(sheet.BANK_LEARNED, np.nan)
+        group, row = self._find_group(pad)
+        return np.asarray(group.bank.learned[row])
+
     @property
-    def learned(self) -> FloatArray:
-        """Learned behaviour of each sheet (n, `sheet.BANK_LEARNED`); NaN where not modelled."""
-        found = np.full((len(self.force_n), sheet.BANK_LEARNED), np.nan)
+    def adaptation_rejected(self) -> BoolArray:
+        """Sheets (n,) whose adaptation isn't compensated, as their holds are steadier without."""
+        rejected = np.zeros(len(self.force_n), np.bool_)
         for group in self.groups:
-            found[group.rows] = group.bank.learned
-        return found
+            rejected[group.rows] = group.bank.rejected
+        return rejected
 
     def _find_group(self, pad: int) -> tuple[_BehaviourGroup, int]:
         """Return the group of a pad, and its row there."""
@@ -392,8 +404,9 @@ def _make_groups(
     return groups
 
 
-def sheet_behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
-    """Build the preset with the deployment's changes, and the uncertainty of its parameters."""
+def sheet_behaviour_of(behaviour: Behaviour, material: str = "") -> SheetBehaviour:
+    """Build the preset with the deployment's changes, and the uncertainty of its parameters, of the sheet of
+    that name."""
     preset = {"S1": sheet.S1, "S2": sheet.S2, "unknown": sheet.UNKNOWN}[behaviour.preset]
     adaptation, creep, noise = preset.adaptation, preset.creep, preset.fluctuation
     share, time_s = 1 - creep.instant, creep.times_s[0]
@@ -430,6 +443,7 @@ def sheet_behaviour_of(behaviour: Behaviour) -> SheetBehaviour:
         behaviour.back_force_std_n * float(np.max(model.adaptation.share)),
         behaviour.forget_time_s,
         _prior_of(behaviour),
+        material,
     )
 
 
@@ -439,5 +453,7 @@ def _prior_of(behaviour: Behaviour) -> sheet.BankPrior:
         return sheet.BankPrior(log_time_std=1.5, not_adapting=0.5, exponent_std=0.1)
     measured = behaviour.adaptation_share is not None
     return sheet.BankPrior(
-        not_adapting=0.01 if measured else 0.05, exponent_std=max(behaviour.slow_creep, 0.05)
+        log_time_std=0.25 if measured else 0.5,
+        not_adapting=0.01 if measured else 0.15,
+        exponent_std=max(behaviour.slow_creep, 0.05),
     )

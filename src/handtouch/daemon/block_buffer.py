@@ -29,7 +29,7 @@ class BlockBuffer:
         self._fresh: NDArray[np.bool_] = np.zeros((k, pads), np.bool_)
         self._state: NDArray[np.uint8] = np.zeros((k, pads), np.uint8)
         self._contact_id: NDArray[np.uint32] = np.zeros((k, pads), np.uint32)
-        self._count = 0
+        self._count = self._learned_pad = 0
 
     def add_tick(self, pipeline: Pipeline) -> SampleBlock | None:
         """Copy the columns of the newest tick; return the block if it is complete, else None."""
@@ -53,7 +53,9 @@ class BlockBuffer:
 
     def _take_block(self, pipeline: Pipeline) -> SampleBlock:
         k, self._count = slice(0, self._count), 0
-        baseline, back = pipeline.tick.baseline, pipeline.tick.sheet_force.back_force
+        baseline, sheet_force = pipeline.tick.baseline, pipeline.tick.sheet_force
+        back, pad = sheet_force.back_force, self._learned_pad
+        self._learned_pad = (pad + 1) % len(back[0])
         return SampleBlock(
             self._sync_ns[k],
             self._sample_ns[k],
@@ -66,4 +68,6 @@ class BlockBuffer:
             np.sqrt(baseline.noise_squared),
             back[0],
             back[1],
+            np.array(pad, np.int32),
+            sheet_force.learned_of(pad),
         )

@@ -30,7 +30,7 @@ from handtouch.daemon.percept_client import PerceptClient
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.stage_timer import StageTimer
 from handtouch.daemon.supervisor_client import SupervisorClient
-from handtouch.wire import NodeStateName, PadState
+from handtouch.wire import AdaptationStatusName, NodeStateName, PadState
 
 _SECOND_NS = 1_000_000_000
 _HEALTH_PERIOD_NS = round(wire.HEALTH.period_s * _SECOND_NS)
@@ -111,6 +111,7 @@ class StatusReporter:
         self._service_window = _RateWindow(self._started_ns, self._totals())
         self._sample_rate_hz = np.zeros(n)
         self._rates_hz: dict[str, float] = {}
+        self._rejected_adaptation = np.zeros(n, dtype=np.bool_)
         self._tick_durations_ns: list[int] = []
         self._tick_us: dict[str, float] = {}
         self._logged_problems = dict.fromkeys(ports, "")  # of each bus, without digits
@@ -160,6 +161,7 @@ class StatusReporter:
                 _loop_log.warning("late ticks by longest part: %s", ", ".join(parts), extra=about)
             self._tick_durations_ns.clear()
             self._log_bus_problems()
+            self._log_rejected_adaptation()
             self._service_seq += 1
             self._publish("service", partial(self._make_service, now_ns))
 
@@ -201,6 +203,19 @@ class StatusReporter:
             state = f"EMCY 0x{event.emergency.code:04X}{' cleared' if cleared else ''}"
         extra = {"fields": {"hand": hand, "link": link}, "state": state}
         _log.log(level, "node 0x%02X (%s/%s): %s", node_id, hand, link, event, extra=extra)
+
+    def _log_rejected_adaptation(self) -> None:
+        rejected = self._pipeline.tick.sheet_force.adaptation_rejected
+        for pad in np.flatnonzero(rejected != self._rejected_adaptation).tolist():
+            hand, link = self._names[pad]
+            text = (
+                "adaptation of its sheet is not compensated: steady holds drift less without; "
+                "if other pads with this sheet show the same, set adaptation_share = 0"
+                if rejected[pad]
+                else "adaptation of its sheet is compensated again"
+            )
+            _log.info("%s/%s: %s", hand, link, text, extra={"fields": {"hand": hand, "link": link}})
+        self._rejected_adaptation = rejected
 
     def _log_bus_transitions(self) -> None:
         for name, port in self._ports.items():
@@ -297,8 +312,15 @@ class StatusReporter:
             retained=False,
             error_register=status.error_register,
             error_history=status.error_history,
+            adaptation_status=self._adaptation_status(pad),
             **(self.supervisor.health_fields(pad) if self.supervisor is not None else {}),
         )
+
+    def _adaptation_status(self, pad: int) -> AdaptationStatusName:
+        sheet_force = self._pipeline.tick.sheet_force
+        if not sheet_force.modelled[pad]:
+            return ""
+        return "rejected" if sheet_force.adaptation_rejected[pad] else "compensated"
 
     def _disabled_reason(self, pad: int) -> str:
         by = self._disabled_by.get(pad)

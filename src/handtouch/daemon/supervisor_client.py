@@ -357,7 +357,7 @@ class SupervisorClient:
         if offsets is not None:
             pipeline.add_event(BaselineEvent(pad, offsets, message.offset_std or (0.0,) * 4))
         if message.back_n is not None:
-            pipeline.add_event(BackForceEvent(pad, message.back_n, message.back_std_n))
+            pipeline.add_event(BackForceEvent(pad, message.back_n, message.back_std_n, message.learned))
         self.changed_pads.add(pad)
         _log.info(
             "%s: calibration %s", self._pad_name(pad), message.calibration_id, extra=self._log_fields(pad)

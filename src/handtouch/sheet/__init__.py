@@ -1,7 +1,15 @@
 """Sheet behaviour over time: forward models for simulation, inverse ones for compensation. No I/O."""
 
 from handtouch.sheet.adaptation import Adaptation, AdaptationState
-from handtouch.sheet.bank import BANK_LEARNED, BANK_MODELS, BANK_WINDOW, BankPrior, BankState, ModelBank
+from handtouch.sheet.bank import (
+    BANK_LEARNED,
+    BANK_MODELS,
+    BANK_WINDOW,
+    BankPrior,
+    BankState,
+    ModelBank,
+    check_learned,
+)
 from handtouch.sheet.behaviour import (
     SheetHistory,
     SheetModel,
@@ -55,4 +63,5 @@ __all__ = [
     "SheetModelState",
     "SheetStep",
     "TemperatureResponse",
+    "check_learned",
 ]

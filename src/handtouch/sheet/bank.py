@@ -1,10 +1,15 @@
 """Bank of sheet models: adaptation and slow creep of each pad, learned from how it is used.
 
-Public names: `ModelBank`, `BankState`, `BankPrior`; `BANK_MODELS`, `BANK_WINDOW`, `BANK_LEARNED`.
+Public names: `ModelBank`, `BankState`, `BankPrior`, `check_learned`; `BANK_MODELS`, `BANK_WINDOW`,
+`BANK_LEARNED`.
 
 No force is measured, but a load that is held steadily has one value. Each model of the bank makes loads of
 the readings; a model whose loads drift while the hand holds still is less probable. Models differ in the
 speed of adaptation and the end of slow creep; each estimates its own exponent by a Kalman filter.
+
+Whether a sheet adapts at all is a property of its material: the evidence of the other pads of a bank, which
+have sheets of the same material, is part of each pad's prior. Where adaptation was rejected, none is
+compensated.
 
 A contact is divided into windows of doubling length, 1 to 2 s old, 2 to 4 s, ... The change of the load from
 one window to the next is the hand's: either it holds steadily, within the scatter inside the windows, or it
@@ -13,6 +18,7 @@ doesn't, which is no evidence for any model.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -22,6 +28,7 @@ from handtouch.sheet.adaptation import Adaptation
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
+BoolArray = npt.NDArray[np.bool_]
 
 _SPEEDS = ((0.0, 1.0), (1.0, 0.2), (1.0, 0.4), (1.0, 0.63), (1.0, 1.0), (1.0, 1.6), (1.0, 3.0))
 """Of adaptation: share and time constant, over those of the preset."""
@@ -42,6 +49,10 @@ _SATURATED_PROBABILITY, _SATURATED_SHARE = 0.5, 0.1
 a load that isn't adapted to at which that is half as probable. With a share of 1 there is no such press."""
 _CORRELATION_S = 1.0
 """Of the scatter inside a window."""
+_EXCEPTION = 0.02
+"""Probability that one pad's sheet adapts and others of its material don't, or the reverse."""
+_REJECTED = 0.9
+"""Probability that a sheet doesn't adapt, above which adaptation is rejected."""
 _KEPT, _MIN_LOG_WEIGHT = 0.995, -30.0
 """Evidence that is left of former windows at each new one; least log likelihood of a model."""
 _EXPONENT_WALK, _MAX_EXPONENT = 0.001, 0.25
@@ -54,7 +65,7 @@ class BankPrior:
     not_adapting: probability that the sheet doesn't adapt. exponent_std: of slow creep."""
 
     log_time_std: float = 0.5
-    not_adapting: float = 0.05
+    not_adapting: float = 0.15
     exponent_std: float = 0.05
 
     def log_weights(self) -> FloatArray:
@@ -110,7 +121,10 @@ class ModelBank:
         )
         self._fatigue_s = float(np.asarray(adaptation.fatigue_s))
         self._prior, self._log_prior = prior, prior.log_weights()
-        self._weights = np.zeros_like(state.log_weight)
+        self._adapts = self._share > 0
+        self._weights = self._applied = np.zeros_like(state.log_weight)
+        self.rejected: BoolArray = np.zeros(len(state.age_s), np.bool_)
+        """(n,), adaptation was rejected: holds are steadier without its compensation"""
         self.reset_pads(np.arange(len(state.age_s)))
 
     def update_weights(self) -> None:
@@ -118,20 +132,40 @@ class ModelBank:
         log = self._log_prior + self._state.log_weight
         log -= log.max(axis=1, keepdims=True)
         np.exp(log, out=self._weights)
+        if self._adapts.any():
+            self._pool_evidence()
         self._weights /= self._weights.sum(axis=1, keepdims=True)
+        none = self._weights * ~self._adapts
+        self.rejected = self._adapts.any() & (none.sum(1) > _REJECTED)
+        self._applied = np.where(self.rejected[:, None], none, self._weights)
+        self._applied /= self._applied.sum(axis=1, keepdims=True)
+
+    def _pool_evidence(self) -> None:
+        """Replace the prior probability that a pad's sheet doesn't adapt by one that follows from the others.
+
+        The material adapts or doesn't; each sheet is an exception with a small probability, which bounds the
+        evidence of each pad."""
+        probability = self._prior.not_adapting
+        odds, rare = probability / (1 - probability), min(_EXCEPTION, probability, 1 - probability)
+        adapting = self._weights[:, self._adapts].sum(1)
+        ratio = self._weights[:, ~self._adapts].sum(1) / (adapting * odds)
+        evidence = np.log(((1 - rare) * ratio + rare) / (rare * ratio + 1 - rare))
+        others = 1 / (1 + np.exp(-(math.log(odds) + evidence.sum() - evidence)))
+        prior = others * (1 - rare) + (1 - others) * rare
+        self._weights[:, ~self._adapts] *= (prior / (1 - prior) / odds)[:, None]
 
     def mean_back_n(self) -> FloatArray:
         """Return the mean back force (n,) [N] over the models."""
-        return np.asarray((self._weights * self._state.back_n).sum(axis=1))
+        return np.asarray((self._applied * self._state.back_n).sum(axis=1))
 
     def spread(self, rows: IntArray | slice) -> tuple[FloatArray, FloatArray]:
         """Return standard deviations over the models (k,): of the back force [N], and of the logarithm of
         slow creep's factor."""
-        state, weights = self._state, self._weights[rows]
+        state, weights, applied = self._state, self._weights[rows], self._applied[rows]
         ages = _log_age(state.age_s[rows])
         within = (weights * state.exponent_variance[rows] * np.square(ages)).sum(1)
-        growth = _variance(weights, state.exponent[rows] * ages) + within
-        return np.sqrt(_variance(weights, state.back_n[rows])), np.sqrt(growth)
+        growth = _variance(weights, applied, state.exponent[rows] * ages) + within
+        return np.sqrt(_variance(weights, applied, state.back_n[rows])), np.sqrt(growth)
 
     @property
     def learned(self) -> FloatArray:
@@ -140,15 +174,9 @@ class ModelBank:
         return np.hstack([state.log_weight, state.exponent, state.exponent_variance])
 
     def set_learned(self, row: int, learned: FloatArray) -> None:
-        """Set it for one pad, from a store. Raises ValueError for another number of values, or what `learned`
-        can't return."""
-        if learned.shape != (BANK_LEARNED,) or not np.isfinite(learned).all():
-            raise ValueError(f"{BANK_LEARNED} finite values are needed, got {learned}")
+        """Set it for one pad, from a store. Raises ValueError as `check_learned`."""
+        check_learned(learned)
         weight, exponent, variance = learned.reshape(3, BANK_MODELS)
-        if (exponent < 0).any() or (exponent > _MAX_EXPONENT).any() or (variance < 0).any():
-            raise ValueError(
-                f"exponents must be from 0 to {_MAX_EXPONENT}, got {exponent}, variances {variance}"
-            )
         state = self._state
         state.log_weight[row] = np.clip(weight - weight.max(), _MIN_LOG_WEIGHT, 0.0)
         state.exponent[row], state.exponent_variance[row] = exponent, variance
@@ -209,7 +237,7 @@ class ModelBank:
         if ended.any():
             self._end_windows(rows[ended], (effective / load)[ended])
         state.back_n[rows] += (self._share * load - state.back_n[rows]) * learned
-        weights = self._weights[rows]
+        weights = self._applied[rows]
         learned *= self._share > 0
         mean_learned = (weights * learned).sum(1)
         remaining[rows] = 1 - mean_learned
@@ -220,7 +248,7 @@ class ModelBank:
     def _update_growth(self, rows: IntArray) -> None:
         state = self._state
         creep = np.exp(-state.exponent[rows] * _log_age(state.age_s[rows]))
-        state.growth[rows] = 1 / (self._weights[rows] * creep).sum(1)
+        state.growth[rows] = 1 / (self._applied[rows] * creep).sum(1)
 
     def _add_to_windows(
         self, rows: IntArray, flow: FloatArray, log_reading: FloatArray, log_load: FloatArray
@@ -276,6 +304,16 @@ class ModelBank:
         return np.asarray(slope * _log_age(middle_s) * move)
 
 
+def check_learned(learned: npt.ArrayLike) -> None:
+    """Raise ValueError unless `ModelBank.learned` could have a row of these values."""
+    values = np.asarray(learned, np.float64)
+    if values.shape != (BANK_LEARNED,) or not np.isfinite(values).all():
+        raise ValueError(f"{BANK_LEARNED} finite values are needed, got {values}")
+    _, exponent, variance = values.reshape(3, BANK_MODELS)
+    if (exponent < 0).any() or (exponent > _MAX_EXPONENT).any() or (variance < 0).any():
+        raise ValueError(f"exponents must be from 0 to {_MAX_EXPONENT}, got {exponent}, variances {variance}")
+
+
 def _log_age(age_s: FloatArray) -> FloatArray:
     """Return logarithms (k, BANK_MODELS) of the ages (k,) [s] that count for slow creep."""
     return np.asarray(np.log(np.clip(age_s[:, None], _FIRST_S, _CREEP_END_S) / _REFERENCE_S))
@@ -285,7 +323,7 @@ def _density(change: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * np.square(change) / variance) / np.sqrt(variance))
 
 
-def _variance(weights: FloatArray, values: FloatArray) -> FloatArray:
-    """Return the weighted variance of each row."""
-    mean = (weights * values).sum(1)
-    return np.asarray(np.maximum((weights * np.square(values)).sum(1) - np.square(mean), 0.0))
+def _variance(weights: FloatArray, applied: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the weighted variance of each row about its mean with the applied weights."""
+    mean = (applied * values).sum(1, keepdims=True)
+    return np.asarray((weights * np.square(values - mean)).sum(1))

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError, field_validator
 
 from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LearnedParts
 from handtouch.config import Deployment, Table
+from handtouch.sheet import BANK_LEARNED, check_learned
 from handtouch.wire.diagnosis import Diagnosis
 
 MAX_DIAGNOSES = 8
@@ -87,7 +88,9 @@ class SampleBlock:
     sync_ns (k,); sample_ns (k, n); counts (k, n, 4), raw; fresh (k, n): the sample belongs to the tick;
     pad_state (k, n) PadState; contact_id (k, n), 0 for none; at the end of the block: offset_counts (n, 4),
     standard deviation offset_std (n,) of their sum, NaN if unknown, noise_counts (n, 4) as estimated; back_n
-    and back_std_n (n,): back force of the sheets [N], to which they have adapted, NaN if unknown.
+    and back_std_n (n,): back force of the sheets [N], to which they have adapted, NaN if unknown; learned
+    (`sheet.BANK_LEARNED`,): learned behaviour of the sheet of one pad, `learned_pad` (), another one in each
+    block, NaN if not modelled.
     """
 
     sync_ns: NDArray[np.int64]
@@ -101,6 +104,8 @@ class SampleBlock:
     noise_counts: FloatArray
     back_n: FloatArray
     back_std_n: FloatArray
+    learned_pad: NDArray[np.int32] = field(default_factory=lambda: np.zeros((), np.int32))
+    learned: FloatArray = field(default_factory=lambda: np.full(BANK_LEARNED, np.nan))
 
     def dump(self) -> bytes:
         """Return the block as msgpack."""
@@ -133,7 +138,9 @@ def pack_serials(now: Sequence[int | None], before: Sequence[int | None], sync_n
 def unpack_block(message: dict[str, Any], pads: int) -> SampleBlock:
     """Return the block in a message of the daemon, which is trusted."""
     ticks = int(message["ticks"])
-    arrays: dict[str, Any] = {"sync_ns": np.frombuffer(message["sync_ns"], "<i8")}
+    whole = {"sync_ns": "<i8", "learned_pad": "<i4", "learned": "<f8"}
+    arrays: dict[str, Any] = {name: np.frombuffer(message[name], kind) for name, kind in whole.items()}
+    arrays["learned_pad"] = arrays["learned_pad"].reshape(())
     for name, (kind, width, per_tick) in _BLOCK_LAYOUT.items():
         shape = (*((ticks,) if per_tick else ()), pads, *((width,) if width > 1 else ()))
         arrays[name] = np.frombuffer(message[name], kind).reshape(shape)
@@ -167,7 +174,8 @@ class CalibrationUpdate(Table):
 
     covariance: (4, 4) of log gains, row by row; None, as the deployment states. parts: of the pad, learned
     with the gains; None, as the deployment states. If known: offset_counts and their standard deviations, per
-    channel; contact law; back_n, back_std_n: back force [N] of its sheet.
+    channel; contact law; back_n, back_std_n: back force [N] of its sheet; learned: its behaviour, as
+    `sheet.ModelBank.learned`, or empty.
     """
 
     kind: Literal["calibration"] = "calibration"
@@ -182,6 +190,14 @@ class CalibrationUpdate(Table):
     law: ContactLawMessage | None = None
     back_n: Annotated[float, Field(ge=0)] | None = None
     back_std_n: Annotated[float, Field(ge=0)] = 0.0
+    learned: tuple[float, ...] = ()
+
+    @field_validator("learned")
+    @classmethod
+    def _check_learned(cls, learned: tuple[float, ...]) -> tuple[float, ...]:
+        if learned:
+            check_learned(learned)
+        return learned
 
 
 class CalibrationAssessment(Table):

@@ -28,7 +28,7 @@ from handtouch.calibration.calibration import (
 )
 from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
-from handtouch.calibration.store_schedule import StoreSchedule, restored_back_force
+from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import electrode_network, models_with_other_parts, part_stds
@@ -331,8 +331,8 @@ class SupervisorWorker:
             found["offset_std"] = channel_values(np.sqrt(known.offsets.variance))
         if known.law:
             found["law"] = ContactLawMessage.model_validate(asdict(known.law))
-        if back := restored_back_force(version, age_s(version, now)):
-            found["back_n"], found["back_std_n"] = back
+        if sheet := restored_sheet(version, age_s(version, now)):
+            found |= sheet._asdict()
         return update.model_copy(update=found)
 
     # Reports ----------------------------------------------------------------------------------------------

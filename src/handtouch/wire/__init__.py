@@ -30,7 +30,7 @@ from handtouch.wire.contact import (
     PerceptKind,
     Vector3,
 )
-from handtouch.wire.health import Health, JointPositions, NodeStateName
+from handtouch.wire.health import AdaptationStatusName, Health, JointPositions, NodeStateName
 from handtouch.wire.percept_input import PerceptInput
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.sequence import SequenceTracker
@@ -61,6 +61,7 @@ __all__ = [
     "SCHEMA_VERSION",
     "SERVICE",
     "TOPICS",
+    "AdaptationStatusName",
     "Column",
     "Config",
     "Contact",

@@ -13,6 +13,7 @@ NodeStateName = Literal[
     "absent", "booting", "identified", "configuring", "settling", "operational", "stale", "faulted", "stopped"
 ]
 CalibrationStateName = Literal["default", "calibrated", "quarantined", "manual_required", ""]
+AdaptationStatusName = Literal["compensated", "rejected", ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,9 @@ class Health:
     error_history: tuple[int, ...] = ()
     """pre-defined error field (0x1003) as read at boot and after a failure, the latest error first: error
     code in bits 0 to 15, manufacturer's information in bits 16 to 31"""
+    adaptation_status: AdaptationStatusName = ""
+    """adaptation of the sheet in `force_n`: `compensated`; `rejected`: not compensated on this pad, because
+    forces of steady holds drift less without; absent where sheet behaviour isn't modelled"""
     calibration_state: CalibrationStateName = ""
     """`default`: the deployment's values; `calibrated`; `quarantined`: not relied on after its node was
     replaced; `manual_required`: automatic calibration failed. This and the following are absent where
