@@ -51,7 +51,8 @@ def make_solver(
         view_memory(currents),
         view_memory(model.weight),
         PartKnowledge(
-            view_memory(model.part_axes), view_memory(model.part_offsets), view_memory(model.touch_errors)
+            *(view_memory(model.part_axes), view_memory(model.part_axis_ends)),
+            *(view_memory(model.part_offsets), view_memory(model.touch_errors)),
         ),
         view_memory(model.gain_covariance),
         view_memory(offset_std_a),

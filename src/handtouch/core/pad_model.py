@@ -58,9 +58,9 @@ class PadModel:
     electrodes includes `gains` (n, c); `noise_counts` (n,) and `noise_a` (n, c) are standard deviations of a
     channel. The counts of untouched pads are state of the tick: see `Baseline`.
 
-    `gain_covariance` (n, c, c) is that of log gains; `part_axes` (n, (c + p)^2), `part_offsets` (n, p) and
-    `touch_errors` (n,): see `PartKnowledge`; `quarantined` (n,): no force is published;
-    `position_unreliable` (n,).
+    `gain_covariance` (n, c, c) is that of log gains; `part_axes` (n, (c + p)^2), `part_axis_ends` (n, c + p),
+    `part_offsets` (n, p) and `touch_errors` (n,): see `PartKnowledge`; `quarantined` (n,): no force is
+    published; `position_unreliable` (n,).
 
     A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
     `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_samples`,
@@ -115,6 +115,7 @@ class PadModel:
         parts = part_count(self.channels)
         self.part_offsets = np.zeros((self.size, parts))
         self.part_axes = np.zeros((self.size, (self.channels + parts) ** 2))
+        self.part_axis_ends: NDArray[np.intp] = np.zeros((self.size, self.channels + parts), dtype=np.intp)
         for pad in range(self.size):
             self._set_parts(pad, None)
         self.quarantined = np.zeros(self.size, dtype=np.bool_)
@@ -222,6 +223,7 @@ class PadModel:
             axes = np.eye(size)
             axes[:count, :count] = _triangle(self.gain_covariance[pad, :count, :count])
         self.part_axes[pad, : size * size] = axes.ravel()
+        self.part_axis_ends[pad, :size] = ((axes != 0) * np.arange(1, size + 1)).max(axis=1)
 
     @property
     def calibration_ids(self) -> list[str]:

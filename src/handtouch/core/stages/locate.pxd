@@ -19,6 +19,7 @@ cdef class ModelTable:
 cdef class Fit:
     cdef double[::1] readings, data, weight, fractions, slope_x, slope_y, raw, beside, scaled, gain
     cdef tolerances.Whitening whitening
+    cdef double read_s, read_t
     cdef public double whitened_s, whitened_t, sum
     cdef public double s, t, total, cost, norm, mixing_x, mixing_y, gradient_x, gradient_y, xx, xy, yy
     cdef public double step_s, step_t, decrement, x, y, scale_x, scale_y
@@ -39,6 +40,7 @@ cdef void _refine(
     Py_ssize_t number) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _whiten_column(ModelTable table, Fit fit, Py_ssize_t first, double[::1] out) noexcept
+cdef void _read_model(ModelTable table, Fit fit) noexcept
 cdef double _clamp(ModelTable table, double s) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef double _coordinate(double[::1] nodes, Py_ssize_t cells, double s) noexcept

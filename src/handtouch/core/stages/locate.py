@@ -99,7 +99,8 @@ class Fit:
         self.fractions, self.slope_x, self.slope_y = fractions, slope_x, slope_y
         self.raw, self.beside, self.gain = raw, beside, gain
         self.s = self.t = 0.0  # position, in cells
-        self.whitened_s = self.whitened_t = 0.0  # the same for which tolerances were whitened
+        self.read_s = self.read_t = _INFINITY  # the same of what was read from the table
+        self.whitened_s = self.whitened_t = 0.0  # and for which tolerances were whitened
         self.sum = 0.0  # of the currents
         self.total = self.cost = 0.0
         self.norm = self.mixing_x = self.mixing_y = 0.0  # of fractions; slopes' part that the total absorbs
@@ -129,6 +130,7 @@ def locate(
     where no contact explains the currents better than none.
     """
     fit.sum = 0.0
+    fit.read_s = fit.read_t = _INFINITY
     for i in range(table.electrodes):
         fit.sum += fit.readings[i] / fit.weight[i]
     tracked, settled = s == s and t == t, False
@@ -166,7 +168,7 @@ def _whiten(
 ) -> None:
     """Whiten for noise and tolerances at (s, t)."""
     n = table.electrodes
-    tables.read_table(table.values, 0, table.cells, n + 1, fit.s, fit.t, fit.raw)
+    _read_model(table, fit)
     total = max(fit.sum, 0.0)
     tolerances.whiten(fit.whitening, pad, known, number, fit.raw, fit.weight, total, fit.s, fit.t)
     for i in range(n):
@@ -190,6 +192,13 @@ def _refine(
         _whiten(table, fit, pad, known, number)
         _maximise(table, fit, False)
     _compute_covariance(table, fit)
+
+
+def _read_model(table: ModelTable, fit: Fit) -> None:
+    """Read the table at (s, t), unless that was done."""
+    if fit.s != fit.read_s or fit.t != fit.read_t:
+        tables.read_table(table.values, 0, table.cells, table.electrodes + 1, fit.s, fit.t, fit.raw)
+        fit.read_s, fit.read_t = fit.s, fit.t
 
 
 def _clamp(table: ModelTable, s: float) -> float:
@@ -234,7 +243,7 @@ def _cell_at(nodes: memoryview[float], cells: int, x: float) -> float:
 def _linearise(table: ModelTable, fit: Fit) -> None:
     """Evaluate the model at (s, t), with the total eliminated."""
     n = table.electrodes
-    tables.read_table(table.values, 0, table.cells, n + 1, fit.s, fit.t, fit.raw)
+    _read_model(table, fit)
     _whiten_column(table, fit, 0, fit.fractions)
     _whiten_column(table, fit, n + 1, fit.slope_x)
     _whiten_column(table, fit, 2 * n + 2, fit.slope_y)
@@ -450,6 +459,7 @@ def _compute_covariance(table: ModelTable, fit: Fit) -> None:
             fit.raw[i] += ds * fit.raw[n + 1 + i] + dt * fit.raw[2 * n + 2 + i]
         fit.total *= 1.0 - fit.mixing_x * ds - fit.mixing_y * dt
         fit.cost = max(0.0, fit.cost - fit.decrement)
+        fit.read_s = fit.read_t = _INFINITY
         fit.step_s = fit.step_t = fit.decrement = 0.0
     _compute_position(table, fit)
     _invert_information(table, fit)

@@ -78,23 +78,26 @@ def read_values(
     v0, w0 = 1.0 - v1, 1.0 - w1
     d0, d1 = p * (1.0 - p) * (1.0 - p), p * p * (p - 1.0)
     e0, e1 = q * (1.0 - q) * (1.0 - q), q * q * (q - 1.0)
+    # weights of a node's value and its slopes: near or far along s (0, 1), then near or far along t
+    v00, s00, t00, b00 = v0 * w0, d0 * w0, v0 * e0, d0 * e0
+    v10, s10, t10, b10 = v1 * w0, d1 * w0, v1 * e0, d1 * e0
+    v01, s01, t01, b01 = v0 * w1, d0 * w1, v0 * e1, d0 * e1
+    v11, s11, t11, b11 = v1 * w1, d1 * w1, v1 * e1, d1 * e1
     near = 4 * columns * (j * (cells + 1) + i)
-    far = near + 4 * columns * (cells + 1)
     for c in range(columns):
-        out[c] = 0.0
-    for node in range(4):
-        is_right, is_far = node % 2 == 1, node > 1
-        along, along_slope = v1 if is_right else v0, d1 if is_right else d0
-        across, across_slope = w1 if is_far else w0, e1 if is_far else e0
-        first = far if is_far else near
-        if is_right:
-            first += 4 * columns
-        value, by_s = along * across, along_slope * across
-        by_t, by_both = along * across_slope, along_slope * across_slope
-        for c in range(columns):
-            a = first + c
-            out[c] += value * table[a] + by_s * table[a + columns]
-            out[c] += by_t * table[a + 2 * columns] + by_both * table[a + 3 * columns]
+        a = near + c
+        value = v00 * table[a] + s00 * table[a + columns]
+        value += t00 * table[a + 2 * columns] + b00 * table[a + 3 * columns]
+        a += 4 * columns
+        value += v10 * table[a] + s10 * table[a + columns]
+        value += t10 * table[a + 2 * columns] + b10 * table[a + 3 * columns]
+        a += 4 * columns * cells
+        value += v01 * table[a] + s01 * table[a + columns]
+        value += t01 * table[a + 2 * columns] + b01 * table[a + 3 * columns]
+        a += 4 * columns
+        value += v11 * table[a] + s11 * table[a + columns]
+        value += t11 * table[a + 2 * columns] + b11 * table[a + 3 * columns]
+        out[c] = value
 
 
 class PadSurface:

@@ -14,7 +14,8 @@ cdef class PadTolerances:
 
 cdef class PartKnowledge:
     cdef double[::1] axes, offsets, touch_errors
-    cdef Py_ssize_t size, parts
+    cdef Py_ssize_t[::1] ends
+    cdef Py_ssize_t size, rows, parts
 
 cdef class Whitening:
     cdef double[::1] matrix, shift, fields, changes, vector

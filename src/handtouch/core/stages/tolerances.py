@@ -64,17 +64,22 @@ class PartKnowledge:
     """Knowledge of the log gains of all pads, and of their parts in standard deviations as stated.
 
     A pad has n log gains, then p = `part_count(n)` parts. axes: (pads size,), of each pad the (n + p)^2
-    numbers of an upper triangle, row by row, whose product with its transpose is their covariance. offsets:
-    (pads parts,) most likely values of the parts. `size` and `parts` are those of the pad with most
-    electrodes. touch_errors: (pads,) standard deviation of the fractions of a touch, another one each time.
+    numbers of an upper triangle, row by row, whose product with its transpose is their covariance. ends:
+    (pads rows,) number of columns of each row up to the last that isn't 0. offsets: (pads parts,) most likely
+    values of the parts. `size`, `rows` and `parts` are those of the pad with most electrodes. touch_errors:
+    (pads,) standard deviation of the fractions of a touch, another one each time.
     """
 
     def __init__(
-        self, axes: memoryview[float], offsets: memoryview[float], touch_errors: memoryview[float]
+        self,
+        axes: memoryview[float],
+        ends: memoryview[int],
+        offsets: memoryview[float],
+        touch_errors: memoryview[float],
     ) -> None:
-        self.axes, self.offsets, self.touch_errors = axes, offsets, touch_errors
+        self.axes, self.ends, self.offsets, self.touch_errors = axes, ends, offsets, touch_errors
         pads = len(touch_errors)
-        self.size, self.parts = len(axes) // pads, len(offsets) // pads
+        self.size, self.rows, self.parts = len(axes) // pads, len(ends) // pads, len(offsets) // pads
 
 
 class Whitening:
@@ -152,7 +157,7 @@ def whiten(
         row = number * known.size + k * size
         for i in range(n):
             vector[i] = axes[row + i] * total * fractions[i] * weight[i] if i >= k else 0.0
-        for j in range(max(k - n, 0), varied):
+        for j in range(max(k - n, 0), min(known.ends[number * known.rows + k] - n, varied)):
             step = axes[row + n + j]
             if step != 0.0:
                 for i in range(n):
