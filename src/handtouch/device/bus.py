@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handtouch.canbus import cia301
 from handtouch.config import shipped
-from handtouch.device.inputs import CHANNELS
+from handtouch.device.inputs import CHANNELS, MAX_CHANNELS
 from handtouch.device.lss import StoreId
 from handtouch.device.node import NMT_COMMANDS, RESETS, Device
 from handtouch.device.object_values import Address
@@ -26,12 +26,12 @@ from handtouch.device.spec import ANALOGUE_INPUTS, DeviceSpec
 from handtouch.device.unconfigured import UnconfiguredDevice
 
 Sampler = Callable[[int], NDArray[np.signedinteger[Any]]]
-"""Host's monotonic time [ns] -> counts (n, 4) in each node's own scale: one row per node in the order of
-their addition, one column per electrode, int64 or narrower. Values beyond the type of a node's object are
-clipped.
+"""Host's monotonic time [ns] -> counts (n, c) in each node's own scale: one row per node in the order of
+their addition, one column per electrode of the node that has most, int64 or narrower. Values beyond the type
+of a node's object are clipped.
 """
 
-_SAMPLE_BYTES = 2 * CHANNELS  # of the standard layout: int16
+_COUNT_BYTES, _SAMPLE_BYTES = 2, 2 * CHANNELS  # of the standard layout: int16
 _MIN_INT16, _MAX_INT16 = np.int64(-32768), np.int64(32767)
 _MAX_WAIT_S = 0.1  # so that `stop` is prompt
 _MAX_DISCARDED_FRAMES = 100_000  # so that constant traffic doesn't delay the start
@@ -87,15 +87,15 @@ class DeviceBus:
         product_code: int | None = None,
         serial: int | None = None,
         channels: tuple[Address, ...] = ANALOGUE_INPUTS,
-        counts_per_unit: tuple[float | None, ...] = (None,) * CHANNELS,
+        counts_per_unit: tuple[float | None, ...] | None = None,
         excitation: Address | None = None,
         strict_pdo: bool = False,
     ) -> Device:
         """Add a node on the next row of `sample`; it is silent until `Device.plug` or `start`.
 
-        `eds` : by default the one shipped with handtouch
+        `eds` : by default the one shipped with handtouch, for 4 or 16 channels
         `vendor_id`, `product_code`, `serial` : by default those of the EDS
-        `channels` : the objects (index, sub-index) of the four channels
+        `channels` : the objects (index, sub-index) of the channels
         `counts_per_unit` : channels that are REAL32 carry the count divided by this, by default by 1
         `excitation` : the object that switches the sheet's excitation, by default 0x2100 if it has that name
         in the EDS
@@ -108,7 +108,10 @@ class DeviceBus:
         if not 1 <= node_id <= 127 or node_id in self.devices:
             raise ValueError(f"node_id must be 1 to 127 and used once, got {node_id}")
         spec = DeviceSpec(
-            _eds_path(eds), vendor_id, product_code, serial, channels, counts_per_unit, excitation, strict_pdo
+            _eds_path(eds, len(channels)),
+            *(vendor_id, product_code, serial, channels),
+            counts_per_unit or (None,) * len(channels),
+            *(excitation, strict_pdo),
         )
         device = Device(self, self._rows, node_id, spec)
         self._rows += 1
@@ -254,7 +257,7 @@ class DeviceBus:
         """Return the counts of a row at the latest sample, 0 before the first."""
         if self._count_lists is None:
             self._count_lists = self._counts.tolist()
-        return self._count_lists[row] if row < len(self._count_lists) else [0] * CHANNELS
+        return self._count_lists[row] if row < len(self._count_lists) else [0] * MAX_CHANNELS
 
     def transmit(self, message: can.Message) -> None:
         """Send a frame; if the bus refuses it, the frame is lost and counted, as on a real node."""
@@ -317,7 +320,8 @@ class DeviceBus:
                     and tpdo.period_syncs == 1
                     and device.sends_sampled_counts
                 ):
-                    self._standard_tpdos.append((tpdo.message, _SAMPLE_BYTES * device.row))
+                    start = _COUNT_BYTES * self._counts.shape[1] * device.row
+                    self._standard_tpdos.append((tpdo.message, start))
                 elif tpdo.is_sync_driven:
                     self._sync_tpdos.append((device, tpdo))
             if not device.inputs_settled:
@@ -377,5 +381,6 @@ class DeviceBus:
                 self.transmit(can.Message(arbitration_id=identifier, data=response, is_extended_id=False))
 
 
-def _eds_path(eds: Path | str | None) -> str:
-    return str(eds or shipped.path("handtouch-node.eds"))
+def _eds_path(eds: Path | str | None, channels: int = CHANNELS) -> str:
+    name = "handtouch-node.eds" if channels <= CHANNELS else "handtouch-node-16.eds"
+    return str(eds or shipped.path(name))

@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 
 import can
 
-from handtouch.device.inputs import CHANNELS, STRAIGHT_WIRING
+from handtouch.device.inputs import CHANNELS, MAX_CHANNELS, STRAIGHT_WIRING
 
 T = TypeVar("T")
 
@@ -91,7 +91,7 @@ class FaultSwitch(Generic[T]):
 
 
 def _are_channels(values: Sequence[int] | AbstractSet[int] | Mapping[int, int]) -> bool:
-    return set(values) <= set(range(CHANNELS))
+    return set(values) <= set(range(MAX_CHANNELS))
 
 
 class FaultSwitches:
@@ -112,17 +112,19 @@ class FaultSwitches:
     line: FaultSwitch[LineFaults | None] = FaultSwitch(None)
     """Faults of its cable."""
     stuck_counts: FaultSwitch[Mapping[int, int]] = FaultSwitch(
-        MappingProxyType({}), _are_channels, "channels from 0 to 3"
+        MappingProxyType({}), _are_channels, "channels from 0 to 15"
     )
-    """Channel (0-3) -> constant count of this channel."""
+    """Channel (from 0) -> constant count of this channel."""
     open_electrodes: FaultSwitch[AbstractSet[int]] = FaultSwitch(
-        frozenset(), _are_channels, "electrodes from 0 to 3"
+        frozenset(), _are_channels, "electrodes from 0 to 15"
     )
-    """Electrodes (0-3, in the sampler's order) with a broken wire: only noise is measured."""
+    """Electrodes (from 0, in the sampler's order) with a broken wire: only noise is measured."""
     wiring: FaultSwitch[Sequence[int]] = FaultSwitch(
-        STRAIGHT_WIRING, lambda w: len(w) == CHANNELS and _are_channels(w), "four electrodes from 0 to 3"
+        STRAIGHT_WIRING,
+        lambda w: len(w) >= CHANNELS and _are_channels(w),
+        "four or more electrodes from 0 to 15",
     )
-    """Electrode (0-3) that each of the four inputs is connected to."""
+    """Electrode (from 0) that each of the inputs is connected to; four also for a node with three."""
 
     def refresh(self) -> None:
         """Apply a changed switch."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 CHANNELS = 4
+MIN_CHANNELS, MAX_CHANNELS = 3, 16
 STRAIGHT_WIRING = (0, 1, 2, 3)
 SETTLE_SAMPLES = 3
 """Number of wrong samples after the excitation is switched on."""
@@ -27,18 +28,18 @@ def read_channels(
     excited: bool = True,
     settled: int = SETTLE_SAMPLES,
 ) -> list[int]:
-    """Return the counts of the four channels; `settled`: samples since the excitation was switched on.
+    """Return the counts of the channels; `settled`: samples since the excitation was switched on.
 
     Without excitation an input reads 0. After switching on, the charging current adds an eighth of the range,
     halved with each sample, for SETTLE_SAMPLES.
     """
-    values = [0] * CHANNELS
+    values = [0] * len(limits)
     if excited:
-        values = [electrodes[electrode] for electrode in wiring]
+        values = [electrodes[electrode] for electrode in wiring[: len(limits)]]
         if open_electrodes:
             values = [
                 round(noise.gauss(0.0, _NOISE_COUNTS)) if electrode in open_electrodes else value
-                for electrode, value in zip(wiring, values, strict=True)
+                for electrode, value in zip(wiring, values, strict=False)
             ]
         if settled < SETTLE_SAMPLES:
             values = [v + (high >> 3 + settled) for v, (_, high) in zip(values, limits, strict=True)]

@@ -176,7 +176,7 @@ class Device(FaultSwitches):
         self.stuck_counts = {channel: high for channel, (_, high) in enumerate(self._limits)}
 
     def stick_channel(self, channel: int) -> None:
-        """Keep a channel (0-3) at its present count until `release_channels`."""
+        """Keep a channel (from 0) at its present count until `release_channels`."""
         with self._bus.lock:
             self.stuck_counts = {**self.stuck_counts, channel: self.channel_counts()[channel]}
 
@@ -285,7 +285,7 @@ class Device(FaultSwitches):
         )
 
     def channel_counts(self) -> list[int]:
-        """Return the counts of the four channels at the latest sample."""
+        """Return the counts of the channels at the latest sample."""
         if self._counts_sample != self._bus.sample_count:
             self._counts_sample = self._bus.sample_count
             self._counts = inputs.read_channels(

@@ -56,7 +56,7 @@ class DeviceTpdo:
 
         `default` : its state after power-on
         `channels` : the objects of the channels
-        `sample` : returns the counts of the four channels
+        `sample` : returns the counts of the channels
         `encode` : bits of a channel at a count, as in its object
         `strict` : refuse changes while it is valid
         """

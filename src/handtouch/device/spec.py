@@ -10,7 +10,7 @@ from handtouch.canbus import cia301
 from handtouch.config import eds
 from handtouch.config.channels import integer_limits
 from handtouch.config.eds import REAL32
-from handtouch.device.inputs import CHANNELS, ChannelLimits
+from handtouch.device.inputs import CHANNELS, MAX_CHANNELS, MIN_CHANNELS, ChannelLimits
 from handtouch.device.object_values import Address, ObjectValues
 
 ANALOGUE_INPUTS: tuple[Address, ...] = tuple((cia301.ANALOGUE_INPUTS, sub) for sub in (1, 2, 3, 4))
@@ -22,7 +22,7 @@ _DEFAULT_EXCITATION = (0x2100, 0)
 class DeviceSpec:
     """Kind and identity of a node; identity fields that are None are those of the EDS.
 
-    `channels` : the objects of the four channels
+    `channels` : the objects of the channels, at most 16
     `counts_per_unit` : those that are REAL32 carry the count divided by this
     `excitation` : the object that switches the excitation, None for 0x2100 if it has that name in the EDS
     `strict_pdo` : a valid PDO can't be changed
@@ -71,8 +71,13 @@ class DeviceSpec:
 
     def channel_limits(self, objects: ObjectValues) -> ChannelLimits:
         """Return the minimum and maximum count of each channel. Raises ValueError for unsuitable objects."""
-        if len(set(self.channels)) != CHANNELS:
-            raise ValueError(f"channels must be four different objects, got {self.channels}")
+        if (
+            len(set(self.channels)) != len(self.channels)
+            or not MIN_CHANNELS <= len(self.channels) <= MAX_CHANNELS
+        ):
+            raise ValueError(
+                f"channels must be {MIN_CHANNELS} to {MAX_CHANNELS} different objects, got {self.channels}"
+            )
         limits = []
         for index, sub in self.channels:
             kind = REAL32[:2] if objects.is_real32(index, sub) else objects.integer_type(index, sub)

@@ -85,6 +85,6 @@ def look_up_patches(
         points = position[:, None, long] + _NODES[:, None] * focus[:, None, long]
         shape = (_NODE_COUNT, len(long))
         found, by = bank.look_up(np.tile(sheet[long], _NODE_COUNT), *points.reshape(2, -1))
-        values[:4, long] = np.einsum("n,mnk->mk", _WEIGHTS, found[:4].reshape(4, *shape))
-        slopes[:4, :, long] = np.einsum("n,mank->mak", _WEIGHTS, by[:4].reshape(4, 2, *shape))
+        values[:-1, long] = np.einsum("n,mnk->mk", _WEIGHTS, found[:-1].reshape(-1, *shape))
+        slopes[:-1, :, long] = np.einsum("n,mank->mak", _WEIGHTS, by[:-1].reshape(-1, 2, *shape))
     return values, slopes

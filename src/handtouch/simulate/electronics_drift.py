@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
 from handtouch.simulate.worlds import DrawnWorld
 
@@ -24,8 +24,15 @@ class ElectronicsDrift:
     Rows are pads. All methods are functions of times (n,) since the start.
     """
 
-    def __init__(self, world: DrawnWorld, names: Sequence[tuple[str, str]]) -> None:
-        """names: hand and link of each row."""
+    def __init__(
+        self,
+        world: DrawnWorld,
+        names: Sequence[tuple[str, str]],
+        channels: Sequence[Sequence[str]] | None = None,
+    ) -> None:
+        """names: hand and link of each row. channels: names of each pad's; c is their greatest number."""
+        channels = [SIDE_ELECTRODES] * len(names) if channels is None else channels
+        count = max(map(len, channels))
         electronics, pads = world.world.electronics, ["/".join(name) for name in names]
         self._zero_counts_per_s, self._temperature_k_per_s, self._supply_per_s = (
             world.hand_rate(getattr(electronics, rate), rate)
@@ -35,13 +42,13 @@ class ElectronicsDrift:
         self._zero_keys = np.array(
             [
                 noise.stream_key(world.seed, "zero", *name, channel)
-                for name in names
-                for channel in ELECTRODES
+                for name, own in zip(names, channels, strict=True)
+                for channel in (*own, *[""] * (count - len(own)))
             ],
             np.uint64,
         )
-        self._offset_counts_per_k = np.array([world.offset_counts_per_k(pad) for pad in pads])
-        self._gain_per_k = np.array([world.gain_per_k(pad) for pad in pads])
+        self._offset_counts_per_k = np.array([world.offset_counts_per_k(pad, count) for pad in pads])
+        self._gain_per_k = np.array([world.gain_per_k(pad, count) for pad in pads])
         self._temperature_key, self._supply_key = (
             np.array([noise.stream_key(world.seed, name)]) for name in ("warmth", "supply")
         )
@@ -55,13 +62,13 @@ class ElectronicsDrift:
         return np.asarray(1 + self._bounded_walk(self._supply_per_s, self._supply_key, times_s)[0])
 
     def gain_ratio(self, times_s: FloatArray) -> FloatArray:
-        """Return the gains of the channels (n, rows, 4) relative to those at the start."""
+        """Return the gains of the channels (n, rows, c) relative to those at the start."""
         return 1 + self._gain_per_k * self.temperature_rise_k(times_s)[:, None, None]
 
     def zero_counts(self, times_s: FloatArray) -> FloatArray:
-        """Return the counts (n, rows, 4) of channels without current."""
+        """Return the counts (n, rows, c) of channels without current."""
         walk = self._bounded_walk(self._zero_counts_per_s, self._zero_keys, times_s)
-        zeros = walk.T.reshape(len(times_s), len(self._zero_keys) // 4, 4)
+        zeros = walk.T.reshape(len(times_s), *self._gain_per_k.shape)
         return np.asarray(zeros + self._offset_counts_per_k * self.temperature_rise_k(times_s)[:, None, None])
 
     @staticmethod

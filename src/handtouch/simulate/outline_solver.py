@@ -21,6 +21,7 @@ from handtouch.simulate.sheet_solver import (
     EDGE_INSET_FRACTION,
     RADIUS_NODES,
     TABLE_NODES,
+    ArcEnds,
     ElectrodeGaps,
     MutualResistance,
     SheetMaps,
@@ -29,8 +30,9 @@ from handtouch.simulate.spectral_elements import ElementAxis, lobatto_nodes
 from handtouch.simulate.unevenness import Unevenness
 
 FloatArray = NDArray[np.float64]
-_DEGREE, _RADIUS_DEGREE = 5, 4
+_DEGREE, _RADIUS_DEGREE, _ARC_RADIUS_DEGREE = 5, 4, 3  # arcs have more elements
 _MIN_GAP_FRACTION = 1e-3  # of a side
+_MIN_ARC_FRACTION = 1e-4  # of a side: shorter parts of an electrode are left out
 _TABLE_DEGREE = 12
 _NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_TABLE_DEGREE)
 _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' nodes
@@ -40,23 +42,30 @@ _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' 
 
 
 @lru_cache(maxsize=32)
-def solve_outline(shape: SimulatedOutline, gaps: ElectrodeGaps, unevenness: Unevenness) -> SheetMaps:
+def solve_outline(
+    shape: SimulatedOutline, gaps: ElectrodeGaps | ArcEnds, unevenness: Unevenness
+) -> SheetMaps:
     """Return the maps of a sheet of nominally 1 ohm per square; cached.
 
     Shares and conductance are those of the uneven sheet, the conformal radius that of an even one.
     """
-    sheet = _OutlineSheet(shape, gaps, unevenness, _DEGREE)
-    to_table = sheet.evaluate(TABLE_NODES, TABLE_NODES)
-    shares = (to_table @ sheet.unit_potentials).T.reshape(4, len(TABLE_NODES), -1)
-    even = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE)
+    covers_sides = isinstance(gaps, ElectrodeGaps)
+    sheet = _OutlineSheet(shape, gaps, unevenness, _DEGREE if covers_sides else _RADIUS_DEGREE)
+    shares = sheet.interpolate(TABLE_NODES, TABLE_NODES, sheet.unit_potentials)
+    even = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE if covers_sides else _ARC_RADIUS_DEGREE)
     coarse = np.stack(np.meshgrid(_NODES, _NODES, indexing="ij")).reshape(2, -1)
     regular = (even.evaluate(_NODES, _NODES) * even.regular_parts(coarse).T).sum(axis=1)
     log_radius = 2 * math.pi * regular + np.log(shape.stretch_at(coarse))
     log_radius -= math.log(
         (1 + shape.stretch) / 2
     )  # a disc is stretched to an ellipse, of that mean half axis
-    smooth = log_radius.reshape(2 * (len(_NODES),)) - _log_edge_distance(_NODES)
-    table = _TO_TABLE @ smooth @ _TO_TABLE.T + _log_edge_distance(TABLE_NODES)
+    table = log_radius.reshape(2 * (len(_NODES),))
+    if covers_sides:  # the radius vanishes at all sides; without that a polynomial is left
+        table = _TO_TABLE @ (table - _log_edge_distance(_NODES)) @ _TO_TABLE.T + _log_edge_distance(
+            TABLE_NODES
+        )
+    else:
+        table = _TO_TABLE @ table @ _TO_TABLE.T
     return SheetMaps(sheet.conductance, np.concatenate([shares, table[None]]))
 
 
@@ -70,7 +79,7 @@ def _log_edge_distance(nodes: FloatArray) -> FloatArray:
 class _OutlineMutualResistance(MutualResistance):
     """Green's function of a sheet of any outline with grounded electrodes, as a resistance."""
 
-    def __init__(self, shape: SimulatedOutline, gaps: ElectrodeGaps) -> None:
+    def __init__(self, shape: SimulatedOutline, gaps: ElectrodeGaps | ArcEnds) -> None:
         sheet = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE)
         points = np.stack(np.meshgrid(RADIUS_NODES, RADIUS_NODES, indexing="ij")).reshape(2, -1)
         regular = sheet.evaluate(RADIUS_NODES, RADIUS_NODES) @ sheet.regular_parts(points)
@@ -85,7 +94,7 @@ class _OutlineMutualResistance(MutualResistance):
 
 
 @lru_cache(maxsize=24)
-def outline_mutual_resistance(shape: SimulatedOutline, gaps: ElectrodeGaps) -> MutualResistance:
+def outline_mutual_resistance(shape: SimulatedOutline, gaps: ElectrodeGaps | ArcEnds) -> MutualResistance:
     """Return the Green's function of a sheet; cached."""
     return _OutlineMutualResistance(shape, gaps)
 
@@ -104,20 +113,17 @@ class _OutlineSheet:
     """Solutions on one sheet; nodes are those of the square, p slowest."""
 
     def __init__(
-        self, shape: SimulatedOutline, gaps: ElectrodeGaps, unevenness: Unevenness, degree: int
+        self, shape: SimulatedOutline, gaps: ElectrodeGaps | ArcEnds, unevenness: Unevenness, degree: int
     ) -> None:
         from scipy.sparse.linalg import splu
 
         self._shape, self._degree = shape, degree
-        units = (shape.arc, shape.arc, shape.length_m, shape.length_m)
-        bare = [
-            tuple(max(gap / unit, _MIN_GAP_FRACTION) for gap in pair)
-            for pair, unit in zip(gaps, units, strict=True)
-        ]  # of x0, xa, y0, yb, as fractions of their sides
-        self._bare = bare
-        ends = [
-            [end for before, after in pair for end in (before, 1 - after)] for pair in (bare[2:], bare[:2])
-        ]
+        self._covered = (
+            _sides_covered(shape, gaps) if isinstance(gaps, ElectrodeGaps) else _arcs_covered(shape, gaps)
+        )
+        ends: list[list[float]] = [[], []]
+        for side, begin, end in (part for parts in self._covered for part in parts):
+            ends[side < 2] += [at for at in (begin, end) if 0 < at < 1]
         self._p = ElementAxis.graded(1.0, _distinct([*ends[0], *shape.breaks((0, 2))]), degree)
         self._q = ElementAxis.graded(1.0, _distinct([*ends[1], *shape.breaks((1, 3))]), degree)
         stiffness = self._assemble(unevenness)
@@ -127,8 +133,15 @@ class _OutlineSheet:
         lines = (self._q.nodes, self._q.nodes, self._p.nodes, self._p.nodes)
         slack = 1e-9
         self._electrodes = [
-            side[(line >= before - slack) & (line <= 1 - after + slack)]
-            for side, line, (before, after) in zip(sides, lines, bare, strict=True)
+            np.unique(
+                np.concatenate(
+                    [
+                        sides[side][(lines[side] >= begin - slack) & (lines[side] <= end + slack)]
+                        for side, begin, end in parts
+                    ]
+                )
+            )
+            for parts in self._covered
         ]
         held = np.concatenate(self._electrodes)
         self._free = np.setdiff1d(number.ravel(), held)
@@ -139,16 +152,21 @@ class _OutlineSheet:
             diag_pivot_thresh=0.0,
             options={"SymmetricMode": True},
         )
-        potentials = np.zeros((number.size, 4))
+        potentials = np.zeros((number.size, len(self._electrodes)))
         for electrode, nodes in enumerate(self._electrodes):
             potentials[nodes, electrode] = 1.0
         self.unit_potentials = self._complete(potentials, np.zeros_like(potentials))
-        """(nodes, 4), with one electrode at 1."""
+        """(nodes, m), with one electrode at 1."""
         self.conductance: FloatArray = self.unit_potentials.T @ (stiffness @ self.unit_potentials)
 
     def evaluate(self, p: FloatArray, q: FloatArray) -> FloatArray:
         """Return the matrix (points, nodes) to the values on the grid p x q."""
         return np.asarray(np.kron(self._p.evaluate_basis(p), self._q.evaluate_basis(q)), np.float64)
+
+    def interpolate(self, p: FloatArray, q: FloatArray, values: FloatArray) -> FloatArray:
+        """Return values (nodes, k) on the grid p x q: (k, points p, points q)."""
+        grid = values.T.reshape(-1, len(self._p.nodes), len(self._q.nodes))
+        return np.asarray(self._p.evaluate_basis(p) @ grid @ self._q.evaluate_basis(q).T, np.float64)
 
     def regular_parts(self, position: FloatArray) -> FloatArray:
         """Return the regular part (nodes, k) of the potential of a unit current at positions (2, k).
@@ -158,15 +176,16 @@ class _OutlineSheet:
         source = _stretched(self._shape, position)[0]
         potentials = np.zeros((len(self._p.nodes) * len(self._q.nodes), position.shape[1]))
         loads = np.zeros_like(potentials)
-        for side in range(4):
-            line = self._q if side < 2 else self._p
-            nodes = self._electrodes[side]
+        for nodes in self._electrodes:
             at = self._node_positions[:, nodes]
             apart = _stretched(self._shape, at)[0][:, :, None] - source[:, None]
             potentials[nodes] = np.log(np.hypot(*apart)) / (2 * math.pi)
-            before, after = self._bare[side]
+        for side in range(4):
+            line = self._q if side < 2 else self._p
             points = line.quadrature_points
-            is_bare = (points < before) | (points > 1 - after)
+            is_bare = np.ones(len(points), np.bool_)
+            for on, begin, end in (part for parts in self._covered for part in parts):
+                is_bare &= (on != side) | (points < begin) | (points > end)
             fixed = np.full(int(is_bare.sum()), float(side % 2))
             way = points[is_bare]
             on_side = np.stack([fixed, way] if side < 2 else [way, fixed])
@@ -240,3 +259,33 @@ def _distinct(ends: list[float]) -> list[float]:
         if not kept or end - kept[-1] > 1e-6:
             kept.append(end)
     return kept
+
+
+_Covered = list[list[tuple[int, float, float]]]
+"""Of each electrode, what it covers: side (0 to 3: x0, xa, y0, yb), begin and end as fractions of it."""
+
+
+def _sides_covered(shape: SimulatedOutline, gaps: ElectrodeGaps) -> _Covered:
+    units = (shape.arc, shape.arc, shape.length_m, shape.length_m)
+    bare = [
+        [max(gap / unit, _MIN_GAP_FRACTION) for gap in pair] for pair, unit in zip(gaps, units, strict=True)
+    ]
+    return [[(side, before, 1 - after)] for side, (before, after) in enumerate(bare)]
+
+
+def _arcs_covered(shape: SimulatedOutline, arcs: ArcEnds) -> _Covered:
+    """Divide arcs at the corners of the square."""
+    whole = sum(shape.side_lengths_m)
+    covered: _Covered = []
+    for begin, end in arcs:
+        parts: list[tuple[int, float, float]] = []
+        length = (end - begin) % whole
+        # sides in the order of the outline, which passes yb and x0 from their high to their low ends
+        for side, corner, own in zip((2, 1, 3, 0), shape.corners_m, shape.side_lengths_m, strict=True):
+            for turn in (0.0, whole):
+                from_begin = (corner - begin) % whole - turn
+                low, high = max(0.0, -from_begin) / own, min(own, length - from_begin) / own
+                if high - low > _MIN_ARC_FRACTION:
+                    parts.append((side, low, high) if side in (1, 2) else (side, 1 - high, 1 - low))
+        covered.append(parts)
+    return covered

@@ -28,6 +28,7 @@ from handtouch.simulate.outline_solver import outline_mutual_resistance
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_circuit import SheetCircuit, Wiring
 from handtouch.simulate.sheet_solver import (
+    ArcEnds,
     ElectrodeGaps,
     SheetMapBank,
     SheetMaps,
@@ -78,7 +79,7 @@ class PadCircuit:
     """Circuit of a pad with its true parts; `gaps` in the coordinates of the surface."""
 
     shape: SimulatedSurface
-    gaps: ElectrodeGaps
+    gaps: ElectrodeGaps | ArcEnds
     maps: SheetMaps
     unevenness: Unevenness
     sheet: config.Sheet
@@ -103,12 +104,12 @@ class PadCircuit:
         force_ratio: FloatArray,
         supply_ratio: FloatArray | float = 1.0,
     ) -> FloatArray:
-        """Return the currents (n, 4) [A] that the wires of x0, xa, y0, yb carry to the amplifiers.
+        """Return the currents (n, m) [A] that the wires of the electrodes carry to the amplifiers.
 
         force_ratio: (n,), apparent over true force. supply_ratio: (n,) or (), actual over nominal voltage.
         """
         changes = [fault for fault in faults if _changes_circuit(fault)]
-        currents = np.zeros((len(times_s), 4))
+        currents = np.zeros((len(times_s), len(self.series_ohm)))
         active = np.array([fault.is_active(times_s) for fault in changes]).reshape(len(changes), len(times_s))
         for pattern in np.unique(active, axis=1).T if changes else [np.zeros(0, np.bool_)]:
             rows = np.flatnonzero((active == pattern[:, None]).all(0))
@@ -152,6 +153,7 @@ class PadCircuit:
         for fault in changes:
             fault.modify_wiring(wiring)
             if fault.cut_corner:
+                assert isinstance(self.gaps, ElectrodeGaps)
                 maps = cut_sheet_maps(self.shape, self.gaps, maps, fault.cut_corner)
         circuit = SheetCircuit.from_wiring(maps.conductance, self.sheet.ohm_per_square, wiring)
         return circuit, SheetMapBank([maps])
@@ -163,17 +165,17 @@ class PadCircuit:
         contacts: Sequence[_ContactSeries],
         rows: NDArray[np.intp],
     ) -> FloatArray:
-        """Return the currents (n, 4) that contacts cause in the amplifiers at the times `rows`."""
+        """Return the currents (n, m) that contacts cause in the amplifiers at the times `rows`."""
         shares, own = [], []
         for contact in contacts:
             at = rows[:1] if contact.is_static else rows
             sheet = np.zeros(len(at), np.intp)
             values, _ = look_up_patches(bank, sheet, contact.position[:, at], contact.focus[:, at])
-            shares.append(np.broadcast_to(values[:4].T, (len(rows), 4)))
-            spreading = np.maximum(values[4] - np.log(contact.radius_m[rows]), 0.0)
+            shares.append(np.broadcast_to(values[:-1].T, (len(rows), len(values) - 1)))
+            spreading = np.maximum(values[-1] - np.log(contact.radius_m[rows]), 0.0)
             local_ohm = self._local_ohm(contact.position[:, rows])
             own.append(contact.contact_ohm[rows] + local_ohm / (2 * math.pi) * spreading)
-        phi = np.stack(shares, axis=1)  # (n, k, 4)
+        phi = np.stack(shares, axis=1)  # (n, k, m)
         ohm = phi @ circuit.impedance_ohm @ phi.transpose(0, 2, 1)
         number = np.arange(len(contacts))
         ohm[:, number, number] += np.stack(own, axis=1)
@@ -191,6 +193,7 @@ class PadCircuit:
         if isinstance(self.shape, SimulatedOutline):
             green = outline_mutual_resistance(self.shape, self.gaps)
         else:
+            assert isinstance(self.gaps, ElectrodeGaps)
             green = mutual_resistance(self.shape, self.gaps)
         mutual = np.zeros((len(rows), len(contacts), len(contacts)))
         moving: list[tuple[int, int, float]] = []

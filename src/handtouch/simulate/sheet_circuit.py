@@ -1,4 +1,4 @@
-"""Circuit between a sheet and its four channels: resistors, broken wires, short circuits.
+"""Circuit between a sheet and its channels: resistors, broken wires, short circuits.
 
 Public names: `Wiring`, `SheetCircuit`.
 
@@ -23,12 +23,12 @@ _AMPLIFIER_INPUT_OHM = 1e-3
 
 @dataclass
 class Wiring:
-    """Wiring of a pad, which faults modify; electrodes are numbered in the order x0, xa, y0, yb."""
+    """Wiring of a pad of m electrodes, which faults modify."""
 
     series_ohm: FloatArray
     drive_v: float
     limit_a: FloatArray
-    """(4,), maximum currents of the amplifiers; beyond, an electrode is no longer held at ground."""
+    """(m,), maximum currents of the amplifiers; beyond, an electrode is no longer held at ground."""
     electrode_shorts: list[tuple[int, int, float]] = field(default_factory=list)
     """Short circuits between two electrodes, with their resistance."""
     layer_shorts: list[tuple[int, float]] = field(default_factory=list)
@@ -51,9 +51,9 @@ class SheetCircuit:
 
     @classmethod
     def from_wiring(cls, conductance: FloatArray, sheet_ohm: float, wiring: Wiring) -> SheetCircuit:
-        """Solve the circuit; conductance: (4, 4), of the sheet with 1 ohm per square."""
+        """Solve the circuit; conductance: (m, m), of the sheet with 1 ohm per square."""
         into = 1 / (wiring.series_ohm + _AMPLIFIER_INPUT_OHM)
-        sunk = np.zeros(4)
+        sunk = np.zeros(len(into))
         circuit = cls._solve_nodal(conductance / sheet_ohm, into, sunk, wiring)
         beyond = circuit.idle_a > wiring.limit_a
         if beyond.any():  # overdriven amplifiers sink their maximum, and their electrodes float

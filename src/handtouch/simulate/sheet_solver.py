@@ -44,7 +44,6 @@ _TABLE_DEGREE = 5
 _POWERS = np.arange(_TABLE_DEGREE + 1)
 _VALUES = np.linalg.inv(np.vander(lobatto_nodes(_TABLE_DEGREE), increasing=True))  # Lagrange polynomials
 _SLOPES = np.append(_POWERS[1:, None] * _VALUES[1:], np.zeros((1, _TABLE_DEGREE + 1)), axis=0)
-_TABLE_ROWS = np.arange(5)
 _MUTUAL_DEGREE = 5
 
 
@@ -71,14 +70,18 @@ class ElectrodeGaps(NamedTuple):
         return ElectrodeGaps(x0, xa, y0, yb)
 
 
+ArcEnds = tuple[tuple[float, float], ...]
+"""Begin and end of each electrode on an outline, lengths along it [m] counter-clockwise."""
+
+
 @dataclass(frozen=True)
 class SheetMaps:
     """Response of a sheet of 1 ohm per square to a current injected at a point."""
 
     conductance: FloatArray
-    """(4, 4) siemens: current into the sheet at electrode i per volt at electrode j."""
+    """(m, m) siemens: current into the sheet at electrode i per volt at electrode j."""
     table: FloatArray
-    """(5, n, n) over (s, phi): shares of electrodes x0, xa, y0, yb; logarithm of the conformal radius [m].
+    """(m + 1, n, n) over (s, phi): shares of the m electrodes; logarithm of the conformal radius [m].
 
     A round contact of the conformal radius would have no sheet resistance to the electrodes.
     """
@@ -170,12 +173,18 @@ class SheetMapBank:
     """Maps of many sheets, evaluated together."""
 
     def __init__(self, sheets: Sequence[SheetMaps]) -> None:
-        self._tables = np.stack([sheet.table for sheet in sheets])  # (sheets, 5, n, n)
+        rows = max(len(sheet.table) for sheet in sheets)
+        self._rows = np.arange(rows)
+        self._tables = np.zeros((len(sheets), rows, *sheets[0].table.shape[1:]))
+        for table, sheet in zip(self._tables, sheets, strict=True):
+            table[: len(sheet.table) - 1], table[-1] = sheet.table[:-1], sheet.table[-1]
 
     def look_up(
         self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return values (5, k) of `SheetMaps.table` and their derivatives (5, 2, k) by s and phi.
+        """Return values (w + 1, k) of `SheetMaps.table` and their derivatives (w + 1, 2, k) by s and phi.
+
+        w is the number of electrodes of the sheet with most; shares of the others' missing ones are 0.
 
         `sheet` (k,) are indices of sheets, `s` and `phi` (k,) fractions of their sides, clipped to
         `EDGE_INSET_FRACTION` from each side.
@@ -184,7 +193,7 @@ class SheetMapBank:
         column, of_phi, slope_phi = _basis(_SHARE_BREAKS, phi)
         patch = self._tables[
             sheet[:, None, None, None],
-            _TABLE_ROWS[:, None, None],
+            self._rows[:, None, None],
             row[:, None, :, None],
             column[:, None, None, :],
         ]

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.canbus.bus.port import open_bus
-from handtouch.config.channels import ELECTRODES, parse_object, resolve_channels
+from handtouch.config.channels import parse_object, resolve_channels
 from handtouch.device import Device, DeviceBus
+from handtouch.device.inputs import CHANNELS
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.gripper_service import GripperService
@@ -193,7 +194,8 @@ class _SimulatedBus:
                 counts_per_unit=tuple(c.counts_per_unit for c in channels),
                 excitation=parse_object(node.excitation_object)[:2] if node.excitation_object else None,
             )
-            device.wiring = tuple(map(ELECTRODES.index, pad.electrodes))
+            wired = tuple(map(pad.electrode_names.index, pad.electrodes))
+            device.wiring = (*wired, *range(len(wired), CHANNELS))
             self.devices[f"{hand}/{pad.link}"] = device
         self._excited = [True] * len(virtual_hand.pads)
         self._events = sorted(self._node_events(stimulus), key=lambda event: event[0])

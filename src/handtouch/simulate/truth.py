@@ -33,8 +33,8 @@ class GroundTruth:
     normal: Vector
     force_n: float
     radius_m: float
-    currents_a: tuple[float, float, float, float]
-    """Currents of the channels x0, xa, y0, yb, before gain, noise and rounding."""
+    currents_a: tuple[float, ...]
+    """Currents of the electrodes, before gain, noise and rounding."""
     bound_m: float
     """Cramer-Rao bound: smallest rms position error of an unbiased estimate from this sample."""
 

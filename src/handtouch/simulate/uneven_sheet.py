@@ -24,6 +24,7 @@ from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import (
     EDGE_INSET_FRACTION,
     TABLE_NODES,
+    ArcEnds,
     ElectrodeGaps,
     SheetMaps,
     solve_sheet,
@@ -42,10 +43,13 @@ _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' 
 
 
 @lru_cache(maxsize=64)
-def uneven_sheet_maps(shape: SimulatedSurface, gaps: ElectrodeGaps, unevenness: Unevenness) -> SheetMaps:
+def uneven_sheet_maps(
+    shape: SimulatedSurface, gaps: ElectrodeGaps | ArcEnds, unevenness: Unevenness
+) -> SheetMaps:
     """Return the maps of an uneven sheet of nominally 1 ohm per square; cached."""
     if isinstance(shape, SimulatedOutline):
         return solve_outline(shape, gaps, unevenness)
+    assert isinstance(gaps, ElectrodeGaps)
     maps = solve_sheet(shape, gaps)
     if unevenness.is_even:
         return maps

@@ -14,6 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +32,7 @@ from handtouch.simulate.virtual_pad import VirtualPad
 from handtouch.simulate.worlds import DrawnWorld
 
 FloatArray = NDArray[np.float64]
+_Number = TypeVar("_Number", bound=np.generic)
 _QUANTISATION_VARIANCE = 1 / 12  # counts^2, by rounding
 _KEY_STEP = np.uint64(0xBF58476D1CE4E5B9)  # between the noise streams of equal hands
 
@@ -38,7 +40,8 @@ _KEY_STEP = np.uint64(0xBF58476D1CE4E5B9)  # between the noise streams of equal 
 class VirtualHand:
     """Pads of a deployment, or of one of its buses, with a stimulus in a world.
 
-    Rows are the pads in the order of the file; `pads` are (hand's name, pad), `virtual_pads` their models.
+    Rows are the pads in the order of the file, columns their channels, of the pad that has most: those that
+    others lack read 0. `pads` are (hand's name, pad), `virtual_pads` their models.
     `faults` are added to those of
     the stimulus.
     """
@@ -60,12 +63,16 @@ class VirtualHand:
         self._bank = SheetMapBank([row.circuit.maps for row in self.virtual_pads])
         self._circuits = _HealthyCircuits(self.virtual_pads)
         self._noise = np.array([row.noise_counts for row in self.virtual_pads])
-        self._keys = np.array([row.noise_keys for row in self.virtual_pads]).reshape(-1, 4)
-        self._gains = np.array([row.counts_per_ampere for row in self.virtual_pads])
-        limits = np.array([row.limits for row in self.virtual_pads])
-        self._low, self._high = limits[:, :, 0], limits[:, :, 1]
+        self._keys = _padded([row.noise_keys for row in self.virtual_pads])
+        self._gains = _padded([row.counts_per_ampere for row in self.virtual_pads])
+        self._low = _padded([row.limits[:, 0] for row in self.virtual_pads])
+        self._high = _padded([row.limits[:, 1] for row in self.virtual_pads])
         self._sample_count = 0
-        self._drift = ElectronicsDrift(world, [(row.hand, row.pad.link) for row in self.virtual_pads])
+        self._drift = ElectronicsDrift(
+            world,
+            [(row.hand, row.pad.link) for row in self.virtual_pads],
+            [row.pad.electrode_names for row in self.virtual_pads],
+        )
         self._special_rows = [
             number for number, row in enumerate(self.virtual_pads) if row.faults or row.replacement_gains
         ]
@@ -79,7 +86,7 @@ class VirtualHand:
         ]
 
     def sample(self, t_s: float) -> NDArray[np.int64]:
-        """Return counts (pads, 4) of the channels x0, xa, y0, yb, `t_s` after the start of the scenario."""
+        """Return counts (pads, c) of the channels, `t_s` after the start of the scenario."""
         self._sample_count += 1
         if history := self.virtual_pads[self._sample_count % len(self.virtual_pads)].history:
             history.extend_ahead(t_s)  # one pad per sample, to keep samples fast
@@ -93,11 +100,12 @@ class VirtualHand:
             counts[rows] += currents * gains[rows]
         readings = self.quantise(counts)
         for row in special:
-            readings[row] = self.counts(row, [t_s])[0]
+            own = self.counts(row, [t_s])[0]
+            readings[row, : len(own)] = own
         return readings
 
     def untouched_counts(self, t_s: float, hands: int = 1) -> FloatArray:
-        """Return zeros and noise (hands, pads, 4) [counts] at `t_s`, of hands that differ in noise only; the
+        """Return zeros and noise (hands, pads, c) [counts] at `t_s`, of hands that differ in noise only; the
         first one is that of `sample`."""
         keys = self._keys + (np.arange(hands, dtype=np.uint64) * _KEY_STEP)[:, None, None]
         counts = self._noise[:, None] * noise.standard_normal(keys, round(t_s * 1e9))
@@ -106,7 +114,7 @@ class VirtualHand:
         return np.asarray(counts)
 
     def counts_per_ampere(self, t_s: float) -> FloatArray:
-        """Return the gains (pads, 4) of the channels at `t_s`, for currents at the nominal supply voltage."""
+        """Return the gains (pads, c) of the channels at `t_s`, for currents at the nominal supply voltage."""
         if self._drift.is_constant:
             return self._gains
         times_s = np.array([t_s])
@@ -119,11 +127,11 @@ class VirtualHand:
         return float(self._drift.temperature_rise_k(np.array([t_s]))[0])
 
     def quantise(self, counts: FloatArray) -> NDArray[np.int64]:
-        """Return readings (..., pads, 4) of the converters."""
+        """Return readings (..., pads, c) of the converters."""
         return np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
 
     def counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:
-        """Return counts (n, 4) of one pad at times (n,), the same as those of `sample`."""
+        """Return counts (n, m) of the m channels of one pad at times (n,), the same as those of `sample`."""
         return self.virtual_pads[pad_row].counts(times_s)
 
     def prepare(self) -> None:
@@ -157,7 +165,7 @@ class VirtualHand:
         ]
 
     def _currents(self, contacts: Sequence[_PadContact], t_s: float) -> tuple[FloatArray, FloatArray]:
-        """Return currents (k, 4) [A], and derivatives (k, 4, 3) by x, y [fractions] and total current."""
+        """Return currents (k, c) [A], and derivatives (k, c, 3) by x, y [fractions] and total current."""
         rows = np.array([contact.row for contact in contacts])
         position = np.array([(contact.contact.x, contact.contact.y) for contact in contacts]).T
         patch = np.array([(contact.patch.radius_m, *contact.patch.focus_m) for contact in contacts]).T
@@ -170,18 +178,18 @@ class VirtualHand:
     def solve_contacts(
         self, rows: NDArray[np.intp], position: FloatArray, patch: FloatArray, force: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return currents (k, 4) [A] of contacts (k,), each alone on its pad, at the nominal supply voltage.
+        """Return currents (k, c) [A] of contacts (k,), each alone on its pad, at the nominal supply voltage.
 
         rows: (k,) of the pads. position: (2, k), fractions of the pad. patch: (3, k), radius and focus of a
-        `ContactPatch` [m]. force: (k,), apparent [N]. Second: the currents' derivatives (k, 4, 3) by x, y
+        `ContactPatch` [m]. force: (k,), apparent [N]. Second: the currents' derivatives (k, c, 3) by x, y
         [fractions] and total current.
         """
         pads = [self.virtual_pads[row] for row in rows.tolist()]
         equivalent_m, focus = self._patches_on_sheets(pads, position, patch)
         values, slopes = look_up_patches(self._bank, rows, position, focus)
-        shares, log_ratio = values[:4].T, values[4] - np.log(equivalent_m)
+        shares, log_ratio = values[:-1].T, values[-1] - np.log(equivalent_m)
         collected, total = self._circuits.solve_contacts(rows, position, shares, log_ratio, force, patch[0])
-        by_position = self._circuits.share_to_channel[rows] @ slopes[:4].transpose(2, 0, 1)
+        by_position = self._circuits.share_to_channel[rows] @ slopes[:-1].transpose(2, 0, 1)
         jacobian = np.concatenate([total[:, None, None] * by_position, collected[:, :, None]], axis=2)
         return total[:, None] * collected, jacobian
 
@@ -218,7 +226,7 @@ class VirtualHand:
             _vector(row.rotation @ shape.normal(s_m, phi)),
             applied.force_n,
             contact.patch.radius_m,
-            tuple(currents.tolist()),
+            tuple(currents[: len(row.limits)].tolist()),
             math.sqrt(covariance[0, 0] + covariance[1, 1]),
         )
 
@@ -240,9 +248,9 @@ class _HealthyCircuits:
         self._reference_pa = np.array([row.sheet.reference_kpa * 1e3 for row in rows])
         self._contact_ohm_m2 = np.array([row.sheet.contact_ohm_mm2 * 1e-6 for row in rows])
         circuits = [row.circuit.healthy for row in rows]
-        self._impedance_ohm = np.array([circuit.impedance_ohm for circuit in circuits])
-        self.share_to_channel = np.array([circuit.share_to_channel for circuit in circuits])
-        """(rows, 4, 4): from the shares of grounded electrodes to those of the channels."""
+        self._impedance_ohm = _padded([circuit.impedance_ohm for circuit in circuits])
+        self.share_to_channel = _padded([circuit.share_to_channel for circuit in circuits])
+        """(rows, c, c): from the shares of grounded electrodes to those of the channels."""
         self._unevenness = [row.circuit.unevenness for row in rows]
         self._is_even = all(unevenness.is_even for unevenness in self._unevenness)
 
@@ -255,7 +263,7 @@ class _HealthyCircuits:
         force_n: FloatArray,
         radius_m: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the shares (k, 4) of the channels in each contact's current, and these currents (k,) [A].
+        """Return the shares (k, c) of the channels in each contact's current, and these currents (k,) [A].
 
         log_ratio: (k,), logarithm of the conformal radius over that of the equivalent disc. radius_m: (k,),
         of the disc of the same area.
@@ -286,3 +294,12 @@ class _HealthyCircuits:
 def _vector(values: FloatArray) -> Vector:
     x, y, z = values.tolist()
     return x, y, z
+
+
+def _padded(arrays: Sequence[NDArray[_Number]]) -> NDArray[_Number]:
+    """Return arrays of different shapes as one, (rows, ...), with zeros beyond their own."""
+    shape = np.max([array.shape for array in arrays], axis=0)
+    padded = np.zeros((len(arrays), *shape), arrays[0].dtype)
+    for row, array in zip(padded, arrays, strict=True):
+        row[tuple(map(slice, array.shape))] = array
+    return padded

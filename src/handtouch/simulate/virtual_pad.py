@@ -1,6 +1,7 @@
 """One pad of a virtual hand, with its true parts, contacts and faults: counts of its channels at any time.
 
-Public names: `VirtualPad`, `true_gaps`. It has neither clock nor state: the same time gives the same counts.
+Public names: `VirtualPad`, `true_gaps`, `true_arcs`. It has no clock and no state:
+the same time gives the same counts.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from handtouch.simulate.pad_circuit import PadCircuit
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.sheet_physics import SheetLaw
-from handtouch.simulate.sheet_solver import ElectrodeGaps
+from handtouch.simulate.sheet_solver import ArcEnds, ElectrodeGaps
 from handtouch.simulate.stimulus import PadStimulus, Stimulus
 from handtouch.simulate.uneven_sheet import uneven_sheet_maps
 from handtouch.simulate.unevenness import Unevenness
@@ -46,13 +47,13 @@ class VirtualPad:
     translation: FloatArray
     noise_counts: float
     noise_keys: NDArray[np.uint64]
-    """(4,), random streams of the channels' noise."""
+    """(m,), random streams of the channels' noise."""
     limits: CountArray
-    """(4, 2), lowest and highest count of each channel."""
+    """(m, 2), lowest and highest count of each channel."""
     counts_per_ampere: FloatArray
-    """(4,), channels x0, xa, y0, yb."""
+    """(m,), of the channels."""
     replacement_gains: tuple[tuple[float, FloatArray], ...]
-    """Times of node replacements [s], with the gains (4,) of the new node relative to the first one's."""
+    """Times of node replacements [s], with the gains (m,) of the new node relative to the first one's."""
     drift: ElectronicsDrift
     """Drift of this pad."""
     sheet_law: SheetLaw | None
@@ -74,11 +75,12 @@ class VirtualPad:
         sheet = world.sheet(hand, pad, deployment.sheets[pad.sheet])
         channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad)
         limits = np.array([channel.limits for channel in channels])
-        scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in ELECTRODES])
+        scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in pad.electrode_names])
         full = np.array([node.full_scale_counts or high for high in limits[:, 1]])
         per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(hidden.gain_ratio)
         shape = world.surface(hand, pad)
-        gaps = true_gaps(shape, hidden)
+        gaps = true_arcs(pad, hidden) if pad.arcs_mm else true_gaps(shape, hidden)
+        _check_faults(pad, faults, stimulus)
         unevenness = Unevenness(UNEVEN_MODES, hidden.unevenness)
         circuit = PadCircuit(
             shape,
@@ -90,7 +92,7 @@ class VirtualPad:
             node.drive_v,
             limits[:, 1] / per_ampere,
         )
-        keys = [noise.stream_key(world.seed, "noise", hand, pad.link, name) for name in ELECTRODES]
+        keys = [noise.stream_key(world.seed, "noise", hand, pad.link, name) for name in pad.electrode_names]
         return cls(
             hand,
             pad,
@@ -111,7 +113,7 @@ class VirtualPad:
                 for node in sorted(stimulus.node_replacements, key=lambda node: node.at_s)
                 if node.link == pad.link
             ),
-            ElectronicsDrift(world, [(hand, pad.link)]),
+            ElectronicsDrift(world, [(hand, pad.link)], [pad.electrode_names]),
             hidden.sheet_law,
             stimulus.duration_s if stimulus.repeat else np.inf,
         )
@@ -127,7 +129,7 @@ class VirtualPad:
         return not (self.faults or self.replacement_gains) and self.touches.max_contacts <= 1
 
     def counts(self, times_s: ArrayLike) -> CountArray:
-        """Return counts (n, 4) of the channels x0, xa, y0, yb at times (n,) since the start."""
+        """Return counts (n, m) of the channels at times (n,) since the start."""
         t = np.atleast_1d(np.asarray(times_s, np.float64))
         counts = self._compute_counts(t, self._other_faults)
         for fault in self._stuck_faults:
@@ -246,3 +248,20 @@ def true_gaps(shape: SimulatedSurface, hidden: HiddenPad) -> ElectrodeGaps:
         )
     )
     return ElectrodeGaps(x0, xa, y0, yb)
+
+
+def true_arcs(pad: config.Pad, hidden: HiddenPad) -> ArcEnds:
+    """Return the ends of electrodes on arcs of a pad's outline."""
+    return tuple(
+        (1e-3 * (begin + before), 1e-3 * (end - after))
+        for (begin, end), before, after in zip(
+            pad.arcs_mm, hidden.gap_before_mm, hidden.gap_after_mm, strict=True
+        )
+    )
+
+
+def _check_faults(pad: config.Pad, faults: Sequence[Fault], stimulus: Stimulus) -> None:
+    """Raise ValueError for faults and replacements of a pad that the simulator has for four sides only."""
+    changes = [*(f.link for f in faults), *(node.link for node in stimulus.node_replacements)]
+    if pad.arcs_mm and pad.link in changes:
+        raise ValueError(f"{pad.link}: faults and replaced nodes aren't simulated with electrodes on arcs")

@@ -81,7 +81,7 @@ class Contact:
     """total current of the pad"""
     residual: float | None
     """excess of the two x currents over those of a point contact there, as a fraction of the total; positive:
-    elongated along x"""
+    elongated along x; nil of pads with other electrodes than x0, xa, y0, yb"""
     residual_std: float | None
     """its standard deviation for a point contact: beyond a few of these, the contact is not a point"""
     begin_threshold_n: float

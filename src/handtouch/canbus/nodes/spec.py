@@ -34,7 +34,7 @@ from handtouch.wire.emergency import Emergency
 class NodeSpec:
     """A node of the deployment; identity fields that are None are not checked.
 
-    `channels` : those of the electrodes x0, xa, y0, yb
+    `channels` : those of the electrodes, in their order
     `allow_pdo_remapping` : they may be mapped to a TPDO over SDO
     `allow_nmt_reset` : one NMT reset communication may be sent when it refuses to run
     `event_timer_ms` : period of a node that can't follow SYNC

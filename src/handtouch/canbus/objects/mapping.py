@@ -1,4 +1,4 @@
-"""PDO mapping of a node's four channels: read from the node, taken from its EDS, or written to the node.
+"""PDO mapping of a node's channels: read from the node, taken from its EDS, or written to the node.
 
 Public names: `NodeTpdo`, `PdoMapping`, `find_channels`, `mapping_from_eds`, `tpdo_numbers`, `read_mapping`.
 """
@@ -54,7 +54,7 @@ class NodeTpdo:
 
 @dataclass(frozen=True, slots=True)
 class PdoMapping:
-    """TPDOs that carry the four channels, and the layout of the channels in them."""
+    """TPDOs that carry the channels, and the layout of the channels in them."""
 
     tpdos: tuple[NodeTpdo, ...]
     layout: ChannelLayout
@@ -78,8 +78,7 @@ def find_channels(tpdos: Sequence[NodeTpdo], channels: Channels) -> PdoMapping |
         for row, channel in zip(rows, channels, strict=True)
         if row is not None
     ]
-    x0, xa, y0, yb = fields
-    return PdoMapping(tuple(tpdos[row] for row in used), (x0, xa, y0, yb))
+    return PdoMapping(tuple(tpdos[row] for row in used), tuple(fields))
 
 
 def mapping_from_eds(path: Path | str | None, node_id: int, channels: Channels) -> PdoMapping:

@@ -31,7 +31,7 @@ from handtouch.simulate.worlds.spreads import (
 )
 
 FloatArray = NDArray[np.float64]
-Four = tuple[float, float, float, float]
+PerElectrode = tuple[float, ...]
 _MIN_RADIUS_RATIO = 0.3
 UNEVEN_MODES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 """Waves (m, n), cos(m pi x) cos(n pi y), of the logarithm of an uneven sheet's resistance."""
@@ -67,13 +67,14 @@ class World:
 
 @dataclass(frozen=True)
 class HiddenPad:
-    """True properties of a pad; electrodes in the order x0, xa, y0, yb. Ratios are to values of the file."""
+    """True properties of a pad, electrodes in their order. Ratios are to values of the file."""
 
-    gain_ratio: Four
-    series_ohm: Four
-    gap_before_mm: Four
-    """Bare length of each electrode's side, along the surface, at its low end (y = 0 or x = 0)."""
-    gap_after_mm: Four
+    gain_ratio: PerElectrode
+    series_ohm: PerElectrode
+    gap_before_mm: PerElectrode
+    """Bare length of each electrode's side, along the surface, at its low end (y = 0 or x = 0), or of its arc
+    at its begin."""
+    gap_after_mm: PerElectrode
     """Bare length at its high end."""
     sheet_ohm_ratio: float
     anisotropy_ratio: float
@@ -88,8 +89,8 @@ class HiddenPad:
     sheet_law: SheetLaw | None
     """Behaviour of the sheet; None: ideal."""
     noise_ratio: float
-    offset_counts_per_k: Four
-    gain_per_k: Four
+    offset_counts_per_k: PerElectrode
+    gain_per_k: PerElectrode
 
 
 @dataclass(frozen=True)
@@ -140,16 +141,17 @@ class DrawnWorld:
         parts, mounts, sheets = self.world.parts, self.world.mounts, self.world.sheets
         electronics, link = self.world.electronics, f"{hand}/{pad.link}"
         rng = self._stream(link)
-        gain = parts.gain_ratio.sample(rng, 4)
-        resistors = parts.resistor_ratio.sample(rng, 4)
+        count = len(pad.electrode_names)
+        gain = parts.gain_ratio.sample(rng, count)
+        resistors = parts.resistor_ratio.sample(rng, count)
         nominal = np.array(pad.gaps_mm).T.ravel()
-        gaps = np.maximum(nominal + parts.gap_offset_mm.sample(rng, 8), 0.0)
+        gaps = np.maximum(nominal + parts.gap_offset_mm.sample(rng, 2 * count), 0.0)
         mount = self._stream("mount", link)
         return HiddenPad(
-            gain_ratio=_four(gain),
-            series_ohm=_four(np.array(pad.series_ohm) * resistors),
-            gap_before_mm=_four(gaps[:4]),
-            gap_after_mm=_four(gaps[4:]),
+            gain_ratio=_floats(gain),
+            series_ohm=_floats(np.array(pad.series_ohm) * resistors),
+            gap_before_mm=_floats(gaps[:count]),
+            gap_after_mm=_floats(gaps[count:]),
             sheet_ohm_ratio=self._number(parts.sheet_ohm_ratio, "sheet_ohm", link),
             anisotropy_ratio=self._number(parts.anisotropy_ratio, "anisotropy", link),
             unevenness=tuple(self._numbers(parts.unevenness, len(UNEVEN_MODES), "unevenness", link).tolist()),
@@ -161,8 +163,8 @@ class DrawnWorld:
             alpha_offset=self._number(sheets.alpha_offset, "alpha", link),
             sheet_law=self._sheet_law(link, pad.sheet),
             noise_ratio=self._number(electronics.noise_ratio, "noise_ratio", link),
-            offset_counts_per_k=_four(self.offset_counts_per_k(link)),
-            gain_per_k=_four(self.gain_per_k(link)),
+            offset_counts_per_k=_floats(self.offset_counts_per_k(link, count)),
+            gain_per_k=_floats(self.gain_per_k(link, count)),
         )
 
     def mount(self, hand: str, pad: config.Pad) -> tuple[FloatArray, FloatArray]:
@@ -218,9 +220,9 @@ class DrawnWorld:
         std_deg = float(np.hypot(mounts.joint_offset_deg.std, noise_deg))
         return HiddenJoints(tuple(offsets.tolist()), float(noise_deg), float(delay_s), std_deg)
 
-    def replacement_gain(self, serial: int) -> Four:
+    def replacement_gain(self, serial: int) -> PerElectrode:
         """Return the channel gains of a replacement node."""
-        return _four(self.world.parts.gain_ratio.sample(np.random.default_rng((self.seed, serial, 1)), 4))
+        return _floats(self.world.parts.gain_ratio.sample(np.random.default_rng((self.seed, serial, 1)), 4))
 
     def sheet_kind(self, sheet: str) -> SheetKind | None:
         """Return the kind of the file's sheets of a name; None: ideal."""
@@ -250,13 +252,15 @@ class DrawnWorld:
         nodes = {name: node.model_copy(update=of_node) for name, node in deployment.nodes.items()}
         return deployment.model_copy(update={"sheets": sheets, "nodes": nodes})
 
-    def offset_counts_per_k(self, pad_name: str) -> FloatArray:
-        """Return the temperature coefficients (4,) of the zeros of a pad, "hand/link"."""
-        return self._numbers(self.world.electronics.offset_counts_per_k, 4, "offset_counts_per_k", pad_name)
+    def offset_counts_per_k(self, pad_name: str, count: int = 4) -> FloatArray:
+        """Return the temperature coefficients (count,) of the zeros of a pad, "hand/link"."""
+        return self._numbers(
+            self.world.electronics.offset_counts_per_k, count, "offset_counts_per_k", pad_name
+        )
 
-    def gain_per_k(self, pad_name: str) -> FloatArray:
-        """Return the relative temperature coefficients (4,) of the gains of a pad, "hand/link"."""
-        return self._numbers(self.world.electronics.gain_per_k, 4, "gain_per_k", pad_name)
+    def gain_per_k(self, pad_name: str, count: int = 4) -> FloatArray:
+        """Return the relative temperature coefficients (count,) of the gains of a pad, "hand/link"."""
+        return self._numbers(self.world.electronics.gain_per_k, count, "gain_per_k", pad_name)
 
     def hand_rate(self, rate: Distribution, name: str) -> float:
         """Return a quantity with one value per hand, such as a drift rate."""
@@ -283,9 +287,8 @@ class DrawnWorld:
         return np.random.default_rng((self.seed, zlib.crc32("/".join(names).encode())))
 
 
-def _four(values: FloatArray) -> Four:
-    x0, xa, y0, yb = values.tolist()
-    return x0, xa, y0, yb
+def _floats(values: FloatArray) -> PerElectrode:
+    return tuple(map(float, values))
 
 
 def _three(values: FloatArray) -> tuple[float, float, float]:
