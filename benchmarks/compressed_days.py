@@ -14,7 +14,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
@@ -58,7 +58,7 @@ from handtouch.wire.status import ForceStatus, PositionStatus
 FloatArray = NDArray[np.float64]
 SEED = 41
 PERIOD_NS = 5 * 10**6
-"""Of SYNC, as the deployment has it, by which a replay computes too; there are samples in some periods only."""
+"""Of SYNC, as the deployment has it, by which a replay computes too; not every period has samples."""
 HOUR_NS = 3600 * 10**9
 EPOCH = datetime(2026, 1, 1, tzinfo=UTC)
 FIRST_SERIAL = 1001
@@ -371,7 +371,7 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
     logger.addHandler(log)
     recording = Recording(folder)
     session = Session(days, store, recording, 1, 0)
-    memory: list[tuple[float, float, int, int, int]] = []
+    memory: list[tuple[float, float, int, int, int, float]] = []
     steps: list[tuple[float, Act, bool]] = sorted(
         [(act.from_s, act, True) for act in days.acts] + [(a.until_s, a, False) for a in days.acts],
         key=lambda step: step[0],
@@ -414,7 +414,7 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
             gc.collect()
             used = resident_mb(os.getpid()), descriptors(os.getpid()), len(gc.get_objects())
             size = sum(path.stat().st_size for path in store.parent.glob(f"{store.name}*"))
-            memory.append((now_s / 3600, *used, size))
+            memory.append((now_s / 3600, *used, size, kept_mb(rows, diagnosed.values())))
             if len(memory) % 6 == 1:
                 progress(
                     f"{now_s / 3600:.1f} of {days.hours:g} h, {used[0]:.0f} MB, {len(log.lines)} warnings"
@@ -443,6 +443,12 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
         "malformed_messages": recording.recorder.malformed,
         "last_recordings": [str(path) for path in recording.paths[-KEPT_RECORDINGS:]],
     }
+
+
+def kept_mb(rows: list[HourRow], diagnosed: Iterable[list[float]]) -> float:
+    """Return the memory [MB] of what the test keeps itself: a number and its place for each tick and report."""
+    count = sum(row.ticks for row in rows) + sum(map(len, diagnosed))
+    return 32e-6 * count
 
 
 def wall(now_ns: int) -> datetime:
