@@ -446,7 +446,7 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
 
 
 def kept_mb(rows: list[HourRow], diagnosed: Iterable[list[float]]) -> float:
-    """Return the memory [MB] of what the test keeps itself: a number and its place for each tick and report."""
+    """Return the memory [MB] of what the test keeps itself: a number and its place a tick and report."""
     count = sum(row.ticks for row in rows) + sum(map(len, diagnosed))
     return 32e-6 * count
 
