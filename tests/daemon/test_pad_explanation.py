@@ -10,11 +10,25 @@ from handtouch.daemon.pad_explanation import explain_pad_state
 from handtouch.wire import PadState
 
 
+def test_a_faulty_channel_has_the_name_of_its_own_pads_electrode() -> None:
+    counts, railed = np.array([5, 7, 32767, 0]), np.array([False, False, True, False])
+    names = ["end", "left", "right"]  # another pad has four
+    text = explain_pad_state(PadState.FAULTED, NodeState.OPERATIONAL, "", names, counts, railed)
+    assert text.startswith("channel right at the end of its range")
+    counts = np.array([5, 6, 7, -40, 8, 9])
+    names = ("a", "b", "c", "d", "e", "f")
+    text = explain_pad_state(
+        PadState.FAULTED, NodeState.OPERATIONAL, "", names, counts, np.zeros(6, np.bool_)
+    )
+    assert text.startswith("channel d reads -40 counts")
+
+
 @pytest.mark.parametrize("node", NodeState)
 @pytest.mark.parametrize("pad", [PadState.CLEAR, PadState.TOUCHED])
 def test_a_node_that_is_not_operational_has_its_reason_before_the_next_tick(
     pad: PadState, node: NodeState
 ) -> None:
     counts, railed = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.bool_)
-    reason = explain_pad_state(pad, node, "the node's reason", counts, railed)
+    names = ["x0", "xa", "y0", "yb"]
+    reason = explain_pad_state(pad, node, "the node's reason", names, counts, railed)
     assert reason == ("" if node is NodeState.OPERATIONAL else "the node's reason")

@@ -53,10 +53,11 @@ class PadModel:
     """Columns of the n pads of a deployment, in its order, which is also the slab's.
 
     `hands`, `links`, `frame_links` (URDF links) and `calibration_ids` (n,) are names; `rows_of_hand`: hand ->
-    slice of rows; `calibrations` (n,): the active ones. `electrode_counts` (n,): electrodes of each pad; `c`,
-    `channels`, is the largest of them. Columns beyond a pad's own are 0. `ampere_per_count` (n, c) of the
-    electrodes includes `gains` (n, c); `noise_counts` (n,) and `noise_a` (n, c) are standard deviations of a
-    channel. The counts of untouched pads are state of the tick: see `Baseline`.
+    slice of rows; `calibrations` (n,): the active ones. `electrodes`: names of each pad's, `electrode_counts`
+    (n,) their numbers; `c`, `channels`, is the largest of them. Columns beyond a pad's own are 0.
+    `ampere_per_count` (n, c) of the electrodes includes `gains` (n, c); `noise_counts` (n,) and `noise_a` (n,
+    c) are standard deviations of a channel. The counts of untouched pads are state of the tick: see
+    `Baseline`.
 
     `gain_covariance` (n, c, c) is that of log gains; `part_axes` (n, (c + p)^2), `part_axis_ends` (n, c + p),
     `part_offsets` (n, p) and `touch_errors` (n,): see `PartKnowledge`; `quarantined` (n,): no force is
@@ -90,7 +91,8 @@ class PadModel:
         self.rows_of_hand = _rows_of_hands(self.hands)
         self.default_calibration_ids = [default_calibration_id_of(pad, deployment) for pad in pads]
         kinds = {name: resolve_channels(node.channels, node.eds) for name, node in deployment.nodes.items()}
-        self.electrode_counts = np.array([len(pad.electrode_names) for pad in pads])
+        self.electrodes = [pad.electrode_names for pad in pads]
+        self.electrode_counts = np.array([len(names) for names in self.electrodes])
         self.channels = int(self.electrode_counts.max())
         self.calibrations = [self.default_calibration(pad) for pad in range(self.size)]
         self._used = np.arange(self.channels) < self.electrode_counts[:, None]

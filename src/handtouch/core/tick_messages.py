@@ -41,6 +41,7 @@ _INT, _LONG = struct.Struct(">I"), struct.Struct(">Q")
 _TRUE, _FALSE = b"\xc3", b"\xc2"  # of msgpack
 _EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
 _END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
+_RAW_CHANNELS = wire.COLUMNS[wire.Raw]["counts"].elements
 _PAD_TEXTS = 4  # the last is empty
 _MAX_VALUE_BYTES = 1024  # numbers and names of statuses
 
@@ -120,7 +121,7 @@ class TickMessages:
         for hand, topic, raw in self._hand_topics:
             if sink.has_subscriber(topic):
                 sink.send(self._hand_frame(hand))
-            if sink.has_subscriber(raw):
+            if self._model.channels == _RAW_CHANNELS and sink.has_subscriber(raw):
                 sink.send(self._raw_message(hand, slab))
 
     def retained_messages(self) -> dict[str, Callable[[int], wire.OutgoingMessage | None]]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.config.channels import ELECTRODES
 from handtouch.wire import PadState
 
 
@@ -14,13 +15,14 @@ def explain_pad_state(
     state: PadState,
     node: NodeState,
     node_reason: str,
+    electrodes: Sequence[str],
     counts: NDArray[np.int64],
     railed: NDArray[np.bool_],
 ) -> str:
     """Return why a pad is in its state, and a remedy; empty if there is no fault.
 
-    `node_reason` is the master's explanation of the node state, `counts` (4,) the newest sample, `railed`
-    (4,) which channels are at the end of their range.
+    `node_reason` is the master's explanation of the node state, `electrodes` (n,) their names, `counts` (n or
+    more,) the newest sample, `railed` which channels are at the end of their range.
     """
     is_fine = state <= PadState.TOUCHED
     if node == NodeState.OPERATIONAL and (is_fine or state == PadState.STARTING):
@@ -28,8 +30,8 @@ def explain_pad_state(
     if is_fine or node not in (NodeState.OPERATIONAL, NodeState.STALE):
         return node_reason  # also of a pad whose state is that of the last tick
     if state == PadState.FAULTED:
-        channels = dict(zip(ELECTRODES, counts.tolist(), strict=True))
-        if at_end := [name for name, at in zip(ELECTRODES, railed.tolist(), strict=True) if at]:
+        channels = dict(zip(electrodes, counts.tolist(), strict=False))
+        if at_end := [name for name, at in zip(electrodes, railed.tolist(), strict=False) if at]:
             return (
                 f"channel {' and '.join(at_end)} at the end of its range: "
                 "check for a short circuit, a loose electrode or a force beyond full scale"

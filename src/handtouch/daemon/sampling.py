@@ -55,7 +55,7 @@ class SamplingController:
         self.set_idle_settings(deployment.scene)
         self._last_active_ns = np.zeros(len(pads), dtype=np.int64)
         # counts of event-driven pads when they were last active
-        self._idle_counts = np.zeros((len(pads), 4), dtype=np.int64)
+        self._idle_counts = np.zeros_like(pipeline.tick.counts)
         self._next_idle_check_ns = 0
         self._sampling_changes = 0
         self._synchronous = np.ones(len(pads), dtype=np.bool_)  # as the tick has it, or will have

@@ -300,7 +300,9 @@ class StatusReporter:
             node_state_since_ns=status.since_ns,
             sampling="off" if state == PadState.OFF else "event" if status.idle else "sync",
             reason=self._disabled_reason(pad)
-            or explain_pad_state(state, status.state, status.reason, counts, railed),
+            or explain_pad_state(
+                state, status.state, status.reason, settings.electrode_names, counts, railed
+            ),
             serial=status.serial,
             rate_hz=float(self._sample_rate_hz[pad]) if state <= PadState.TOUCHED else 0.0,
             samples=int(self._pipeline.tick.state.sample_counts[pad]),

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config.channels import ELECTRODES
 from handtouch.core.events import BaselineEvent
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
@@ -46,8 +45,8 @@ class TareJob:
         self._end_ns = now_ns + max(_MIN_DURATION_NS, 10 * int(tick.state.max_sample_period_ns.max()))
         self._samples = tick.state.sample_counts.copy()
         self._count = np.zeros(len(names), dtype=np.int64)
-        self._sum = np.zeros((len(names), 4))
-        self._sum_of_squares = np.zeros((len(names), 4))
+        self._sum = np.zeros(tick.counts.shape)
+        self._sum_of_squares = np.zeros(tick.counts.shape)
         self._reference_counts = tick.counts.astype(
             np.float64
         )  # sums are of differences from it, to keep precision
@@ -104,7 +103,7 @@ class TareJob:
         worst = int(np.argmax(std))
         if std[worst] > _MAX_STD_PER_NOISE * noise:
             return (
-                f"channel {ELECTRODES[worst]}: standard deviation {std[worst]:.1f} counts, noise "
+                f"channel {model.electrodes[pad][worst]}: standard deviation {std[worst]:.1f} counts, noise "
                 f"{noise:.1f}: varying load or electrical interference; remove it and tare again"
             )
         # an offset below the end threshold can't hide a contact

@@ -47,7 +47,7 @@ class ReplaySlab(Slab):
     def load_columns(self, columns: dict[str, NDArray[Any]], limits: NDArray[np.int64]) -> None:
         """Load the slab's content at a tick."""
         self._counts[:] = columns["counts"]
-        self._low_limits[:], self._high_limits[:] = limits[:, :4], limits[:, 4:]
+        self._low_limits[:], self._high_limits[:] = np.hsplit(limits, 2)
         self.arrival_ns[:], self.fresh[:] = columns["arrival_ns"], columns["fresh"]
         self.fresh_count = int(np.count_nonzero(self.fresh))
 
@@ -172,7 +172,7 @@ class ExactReplay:
             return
         pipeline = self._new_pipeline(payload["session"], self._robots)
         load_state(pipeline, payload, self.result.build)
-        self.pipeline, self._limits = pipeline, _limits(payload["limits"])
+        self.pipeline, self._limits = pipeline, _limits(payload["limits"], pipeline.model.size)
 
     def _is_at(self, payload: dict[str, Any]) -> bool:
         """Return True if replay has come to the tick of a `state` message."""
@@ -186,7 +186,7 @@ class ExactReplay:
         period_ns = round(settings.sync_period_ms * 1e6)
         window = settings.sample_window_fraction
         pipeline = Pipeline(self._model, period_ns, window, self._sink, session, robots)
-        pipeline.slab = ReplaySlab(self._model.size)
+        pipeline.slab = ReplaySlab(self._model.size, self._model.channels)
         return pipeline
 
     def _replay_tick(self, payload: dict[str, Any]) -> None:
@@ -198,7 +198,7 @@ class ExactReplay:
             self._recorded.clear()
             return
         if payload["limits"] is not None:
-            self._limits = _limits(payload["limits"])
+            self._limits = _limits(payload["limits"], pipeline.model.size)
         load_tick(pipeline, payload, tick_columns(payload), self._limits)
         for event in self._events(payload):
             pipeline.add_event(event)
@@ -311,7 +311,11 @@ def recorded_deployment(payload: dict[str, Any]) -> Iterator[Deployment]:
 
 def tick_columns(payload: dict[str, Any]) -> dict[str, NDArray[Any]]:
     """Return the columns of a `tick` message by name. Raises ValueError if they differ in length."""
-    columns = {name: column.to_array(payload[name]) for name, column in wire.COLUMNS[wire.TickInputs].items()}
+    pads = len(payload["arrival_ns"]) // 8
+    columns = {
+        name: column.to_array(payload[name], pads if name == "counts" else None)
+        for name, column in wire.COLUMNS[wire.TickInputs].items()
+    }
     if len({len(column) for column in columns.values()}) != 1:
         raise ValueError(f"tick {payload['tick']}: its columns differ in length")
     return columns
@@ -341,8 +345,8 @@ def load_state(pipeline: Pipeline, payload: dict[str, Any], build: dict[str, Any
         ) from error
 
 
-def _limits(data: bytes) -> NDArray[np.int64]:
-    return np.frombuffer(data, dtype="<i8").reshape(-1, 8)
+def _limits(data: bytes, pads: int) -> NDArray[np.int64]:
+    return np.frombuffer(data, dtype="<i8").reshape(pads, -1)
 
 
 def _difference(

@@ -40,14 +40,17 @@ class Column:
         """Bytes of one row."""
         return self.elements * int(self.dtype[-1])
 
-    def to_array(self, data: bytes) -> NDArray[Any]:
+    def to_array(self, data: bytes, rows: int | None = None) -> NDArray[Any]:
         """Return a read-only array of the column, (n,) or (n, elements).
 
-        Raises ValueError for bytes that are no whole number of rows.
+        rows: n of a column that may have more elements in a row. Raises ValueError for bytes that are no
+        whole number of rows.
         """
         import numpy as np  # costs 0.1 s, and a plain subscriber needs no arrays
 
         values = np.frombuffer(data, dtype=self.dtype)
+        if rows is not None:
+            return values.reshape(rows, -1)
         return values if self.elements == 1 else values.reshape(-1, self.elements)
 
 

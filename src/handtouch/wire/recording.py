@@ -71,7 +71,7 @@ class TickInputs:
     stopped: bool
     """no tick, but the end of all contacts because the daemon stops"""
     counts: Annotated[bytes, Column("<i8", 4)]
-    """as in `raw`"""
+    """as in `raw`; as many for each pad as the pad with most electrodes has"""
     arrival_ns: Annotated[bytes, Column("<i8")]
     """arrival of the newest sample, 0 before the first"""
     fresh: Annotated[bytes, Column("<u1")]
@@ -79,7 +79,8 @@ class TickInputs:
     node_state: Annotated[bytes, Column("<u1", codes=PadState)]
     """0 where the node is operational, else the resulting state of its pad"""
     limits: bytes | None
-    """8 int64 per pad: limits of the four channels' ranges, all lower ones first; nil: unchanged"""
+    """int64 for each pad, two for each channel: limits of the channels' ranges, all lower ones first; nil:
+    unchanged"""
     events: tuple[dict[str, Any], ...]
     """changes since the tick before, in the order in which the tick applied them before its samples; each has
     a `kind`"""
