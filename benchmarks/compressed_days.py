@@ -11,10 +11,13 @@ import gc
 import logging
 import multiprocessing
 import os
+import queue
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,7 +48,7 @@ from handtouch.record.recorder import MessageRecorder, RotationLimits
 from handtouch.simulate.episodes import pad_size_mm
 from handtouch.simulate.faults import FAULTS
 from handtouch.simulate.stimulus import NodeReplacement
-from handtouch.simulate.worlds import WORLDS, MountSpread
+from handtouch.simulate.worlds import WORLDS, MountSpread, World
 from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
 from handtouch.supervisor.ipc import WorkerConfig, pack_worker_message
 from handtouch.supervisor.worker import SupervisorWorker
@@ -69,6 +72,11 @@ AFTERWARDS_S = 600.0
 """A fault explains diagnoses up to this time after its end."""
 TRUTH_BLOCKS = 8
 """Every so many blocks in use, one sample is compared with the ground truth."""
+DAY_S, WORK_S = 24 * 3600.0, 12 * 3600.0
+"""A day, and its first part, in which the hand is used."""
+NIGHT_HZ = 5
+WAITING_BATCHES = 400
+"""Batches made ahead: use takes the processors of both processes by turns, rest hardly any."""
 Batch = tuple[NDArray[np.int64], NDArray[np.int64], list[tuple[int, FloatArray, float]]]
 """Times (k,), counts (k, pads, 4), and of its last sample row, position [m] and force [N] of contacts."""
 
@@ -83,6 +91,27 @@ class Act(NamedTuple):
     detail: Any = None
 
 
+class WorkingDays(Hour):
+    """Days of use with nights at rest."""
+
+    def __init__(self, world: World, seed: int, length_s: float) -> None:
+        super().__init__(world, seed, length_s)
+        self.busy = [span for span in self.busy if is_work(*span)]
+        self.touches = [touch for touch in self.touches if is_work(touch.from_s)]
+        self.faults = [fault for fault in self.faults if is_work(fault.from_s)]
+
+    def _stretches(self) -> Iterator[tuple[float, float, int]]:
+        for from_s, until_s, rate in super()._stretches():
+            nights = [t for t in np.arange(WORK_S, self.length_s, DAY_S / 2).tolist() if from_s < t < until_s]
+            for begin_s, end_s in pairwise((from_s, *nights, until_s)):
+                yield begin_s, end_s, rate if is_work(begin_s) else NIGHT_HZ
+
+
+def is_work(*times_s: float) -> bool:
+    """Return True if none of the times is at night."""
+    return all(t % DAY_S < WORK_S for t in times_s)
+
+
 class Days:
     """Use and acts of some hours of a hand of the world `default`, whose pads are mounted as stated."""
 
@@ -90,7 +119,7 @@ class Days:
         self.hours, length_s = hours, 3600 * hours
         rng = np.random.default_rng(SEED)
         world = replace(WORLDS["default"], mounts=MountSpread())
-        self.use = Hour(world, SEED, length_s)
+        self.use = WorkingDays(world, SEED, length_s)
         self.acts: list[Act] = []
         for number, at in enumerate(np.arange(600.0, length_s - 1200, FAULT_PERIOD_S).tolist()):
             self._add_fault([*FAULTS][number % len(FAULTS)], at, rng)
@@ -426,9 +455,19 @@ def from_process(make: Callable[[], Iterator[Batch]]) -> Iterator[Batch]:
     reader, writer = context.Pipe(duplex=False)
 
     def produce(output: Connection) -> None:
+        waiting: queue.Queue[Batch | None] = queue.Queue(WAITING_BATCHES)
+
+        def send() -> None:
+            while (batch := waiting.get()) is not None:
+                output.send(batch)
+            output.send(None)
+
+        sender = threading.Thread(target=send)
+        sender.start()
         for batch in make():
-            output.send(batch)
-        output.send(None)
+            waiting.put(batch)
+        waiting.put(None)
+        sender.join()
 
     process = context.Process(target=produce, args=(writer,), daemon=True)
     process.start()

@@ -201,7 +201,8 @@ def page(found: dict[str, Any]) -> list[str]:
             f"## {days['hours']:g} hours, compressed", "", f"{days['made']}.", "",
             "Time is an argument of everything here, and runs as fast as the processor permits: pipeline, "
             "percepts, supervision with its store on a small disk, and recorder, in one process; samples of "
-            "a hand of the world `default` from another one, at 100 Hz in use and 20 Hz at rest. Not here: "
+            "a hand of the world `default` from another one, at 100 Hz in use, 20 Hz at rest and 5 Hz at "
+            "night, the second half of each day, without use. Not here: "
             "sockets, CANopen master and child processes; replaced nodes are the master's events.", "",
             f"{ticks} ticks, {contacts} contacts, {days['messages']} messages recorded. "
             + "; ".join(f"{kind}: {count}" for kind, count in acts.items()) + ". "
