@@ -57,7 +57,8 @@ from handtouch.wire.status import ForceStatus, PositionStatus
 
 FloatArray = NDArray[np.float64]
 SEED = 41
-PERIOD_NS = 10**9 // BUSY_HZ
+PERIOD_NS = 5 * 10**6
+"""Of SYNC, as the deployment has it, by which a replay computes too; there are samples in some periods only."""
 HOUR_NS = 3600 * 10**9
 EPOCH = datetime(2026, 1, 1, tzinfo=UTC)
 FIRST_SERIAL = 1001
