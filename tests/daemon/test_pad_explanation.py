@@ -16,10 +16,8 @@ def test_a_faulty_channel_has_the_name_of_its_own_pads_electrode() -> None:
     text = explain_pad_state(PadState.FAULTED, NodeState.OPERATIONAL, "", names, counts, railed)
     assert text.startswith("channel right at the end of its range")
     counts = np.array([5, 6, 7, -40, 8, 9])
-    names = ("a", "b", "c", "d", "e", "f")
-    text = explain_pad_state(
-        PadState.FAULTED, NodeState.OPERATIONAL, "", names, counts, np.zeros(6, np.bool_)
-    )
+    none = np.zeros(6, np.bool_)
+    text = explain_pad_state(PadState.FAULTED, NodeState.OPERATIONAL, "", [*"abcdef"], counts, none)
     assert text.startswith("channel d reads -40 counts")
 
 
