@@ -24,8 +24,9 @@ from handtouch.supervisor.diagnose import (
     PadDiagnosis,
 )
 from handtouch.supervisor.diagnose.contact_faults import ContactFault, ContactFaultDetector
-from handtouch.supervisor.diagnose.descriptions import describe_contact_fault
+from handtouch.supervisor.diagnose.descriptions import describe_contact_fault, describe_static_load
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis, HypothesisTables
+from handtouch.supervisor.diagnose.static_load import StaticLoad
 from handtouch.wire.faults import FaultKind
 
 PAD, SECOND = 13, 1_000_000_000
@@ -313,6 +314,13 @@ def test_contacts_that_no_fault_explains_are_unexplained() -> None:
 
     diagnosis, _ = play(nowhere, 120)
     assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [(FaultKind.UNEXPLAINED, ())]
+
+
+@pytest.mark.parametrize("level", [(17.0, 0.0, 0.0, 0.0), (9.0, 8.0, 0.0, 0.0), (0.0, 0.0, 9.0, 8.0)])
+def test_gum_that_is_placed_in_one_direction_only_has_no_place(level: tuple[float, ...]) -> None:
+    load = StaticLoad(SECOND, np.array(level), kind=FaultKind.GUM, probability=0.9)
+    place = describe_static_load(model(), 0, load).published.pad_m
+    assert place is None or np.isfinite(place).all()
 
 
 def test_ambiguous_gain_step_and_torn_corner_are_both_named() -> None:
