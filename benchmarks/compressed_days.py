@@ -226,7 +226,7 @@ class InlineSupervisor(ChildProcess):
 
 
 class Recording:
-    """The sink of all messages: encoded as on the wire and recorded; the newest files are kept."""
+    """The sink of all messages: encoded as on the wire and recorded; the newest files of use are kept."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.paths, self.messages = folder, list[Path](), 0
@@ -244,6 +244,10 @@ class Recording:
         self.recorder.add_message(wire.encode(message), self.now_ns)
 
     def _open_file(self, t_ns: int) -> RecordingFile:
+        if not is_work(1e-9 * t_ns - EPOCH.timestamp()):
+            night = self.folder / "night.mcap"
+            night.unlink(missing_ok=True)
+            return RecordingFile(night, {"began": str(t_ns)})
         path = self.folder / f"{len(self.paths):05}.mcap"
         self.paths.append(path)
         for old in self.paths[:-KEPT_RECORDINGS]:

@@ -24,7 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small
 
 import matplotlib
 from bench_latency import machine
-from compressed_days import AFTERWARDS_S, FULL_DISK_S, Days, run_days
+from compressed_days import AFTERWARDS_S, FULL_DISK_S, Days, is_work, run_days
 from cycled_processes import growth, in_own_network, run_cycles, unexplained
 
 from handtouch.record.recording import Recording
@@ -93,7 +93,7 @@ def compressed(hours: float, disk: Path, recordings: Path) -> dict[str, Any]:
         for entry in found["diagnosed"]
         for begin, end in entry["at_s"]
         if not any(
-            act["pad"] == entry["pad"] and act["from_s"] <= end and begin <= act["until_s"] + after(act)
+            act["pad"] == entry["pad"] and act["from_s"] <= end and begin <= explained_until_s(act)
             for act in found["acts"]
         )
     ]
@@ -105,16 +105,33 @@ def compressed(hours: float, disk: Path, recordings: Path) -> dict[str, Any]:
     return found | {"replays": replays, "links": links}
 
 
-def after(act: dict[str, Any]) -> float:
-    """Return the time [s] after an act in which it explains messages of its pad."""
-    return RELEARNT_S if act["kind"] == "swap" else AFTERWARDS_S
+def explained_until_s(act: dict[str, Any]) -> float:
+    """Return the time [s] until which an act explains messages of its pad; nights teach no calibration."""
+    at, left = float(act["until_s"]), RELEARNT_S
+    if act["kind"] != "swap":
+        return at + AFTERWARDS_S
+    while left > 0:
+        step = min(left, 60.0)
+        left -= step if is_work(at) else 0.0
+        at += step
+    return at
 
 
 def is_explained(at: float, line: str, acts: list[dict[str, Any]], links: list[str]) -> bool:
-    """Return True for a message of a faulty or replaced pad, or about the store while its disk is full."""
+    """Return True for a message of a faulty or replaced pad, or about the store while its disk is full.
+
+    After a restart or a crash a pad is replaced again, as the deployment states the serial number of its
+    first node.
+    """
     pads = {links.index(link) for link in links if re.search(rf"\b{link}\b", line)}
+    restarted = any(
+        act["kind"] in ("restart", "crash") and act["from_s"] - 1 <= at <= act["until_s"] + AFTERWARDS_S
+        for act in acts
+    )
     for act in acts:
-        if act["pad"] in pads and act["from_s"] - 1 <= at <= act["until_s"] + after(act):
+        if act["pad"] in pads and act["from_s"] - 1 <= at <= explained_until_s(act):
+            return True
+        if act["kind"] == "swap" and act["pad"] in pads and act["from_s"] <= at and restarted:
             return True
         if act["kind"] == "disk full" and "store" in line and act["from_s"] <= at <= act["until_s"] + 120:
             return True
