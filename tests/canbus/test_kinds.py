@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.config import shipped
+from handtouch.config import load, shipped
 from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
 from handtouch.config.eds import EdsError
 
+PAD = load(shipped.path("utah_mit.toml")).pads[0].pad
 Make = Callable[..., Any]
 FOLDER = Path(__file__).parent.parent / "data" / "eds"
 KINDS = {  # objects of the channels, counts that need their full width, identifiers of node 1
@@ -41,10 +42,8 @@ def make_kind(make_rig: Make, kind: str, size: int = 2, **more: Any) -> Any:
         "channels": tuple((c.index, c.sub) for c in channels),
         "counts_per_unit": tuple(c.counts_per_unit for c in channels),
     } | more.pop("device", {})
-    electrodes = more.pop("electrodes", ELECTRODES)
-    rig = make_rig(
-        size, device=device, **{"eds": path, "channels": order_by_electrode(channels, electrodes)} | more
-    )
+    pad = PAD.model_copy(update={"electrodes": more.pop("electrodes", ELECTRODES)})
+    rig = make_rig(size, device=device, **{"eds": path, "channels": order_by_electrode(channels, pad)} | more)
     rig.counts[:] = KINDS[kind][1]
     return rig
 
