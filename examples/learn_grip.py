@@ -59,11 +59,11 @@ def run(grips: GripEnvironments, policies: FloatArray, objects: tuple[FloatArray
     """Run an episode of each policy (count, 3) with its object."""
     observation, info = grips.reset(options={"objects": objects})
     cost = np.zeros(grips.num_envs)
-    begin_mm: FloatArray | None = None
+    begin_mm = np.full(grips.num_envs, np.nan)
     before_mm = np.zeros(grips.num_envs)
     for _ in range(EPISODE_STEPS):
         touched, x_m = observation["observation.touch"][:, :2].T.astype(np.float64)
-        begin_mm = 1e3 * x_m if begin_mm is None or not touched.all() else begin_mm
+        begin_mm = np.where(np.isnan(begin_mm) & (touched > 0), 1e3 * x_m, begin_mm)
         slid_mm = np.where(touched > 0, 1e3 * x_m - begin_mm, before_mm)
         speed_mm_s, before_mm = (slid_mm - before_mm) / PERIOD_S, slid_mm
         features = np.stack([np.ones(grips.num_envs), slid_mm, speed_mm_s])
