@@ -92,3 +92,10 @@ def test_a_reflex_to_slip_needs_less_force_than_any_constant_grip(
     constant = example.run(grips, np.tile([1.05 * least_n, 0.0, 0.0], (COUNT, 1)), objects)
     assert not constant.dropped.any()
     assert reflex.cost.mean() < 0.7 * constant.cost.mean()
+
+
+def test_a_dropped_object_changes_no_other_grip(grips: GripEnvironments, example: Any) -> None:
+    reflex, mass_kg = np.tile([0.5, 1.0, 0.0], (COUNT, 1)), MASS_KG.copy()
+    mass_kg[-1] = 5.0  # too heavy to hold
+    outcome = example.run(grips, reflex, (mass_kg, FRICTION))
+    assert outcome.dropped.tolist() == [False] * (COUNT - 1) + [True]
