@@ -24,8 +24,9 @@ from handtouch.supervisor.diagnose import (
     PadDiagnosis,
 )
 from handtouch.supervisor.diagnose.contact_faults import ContactFault, ContactFaultDetector
-from handtouch.supervisor.diagnose.descriptions import describe_contact_fault
+from handtouch.supervisor.diagnose.descriptions import describe_contact_fault, describe_static_load
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis, HypothesisTables
+from handtouch.supervisor.diagnose.static_load import StaticLoad
 from handtouch.wire.faults import FaultKind
 
 PAD, SECOND = 13, 1_000_000_000
@@ -199,6 +200,12 @@ def test_static_contact_that_outlasts_others_on_its_pad_is_gum() -> None:
     assert found.published.size_m is not None
     assert found.published.pad_m[0] == pytest.approx(0.3 * 0.042, abs=1e-3)
     assert found.published.pad_m[1] == pytest.approx(0.6 * 0.032, abs=1e-3)
+
+
+def test_a_load_that_no_contact_explains_has_no_position() -> None:
+    load = StaticLoad(0, np.array([0.5, 2.7, -9.8, -11.1]), kind=FaultKind.GUM)
+    published = describe_static_load(model(), 0, load).published
+    assert (published.pad_m, published.size_m) == (None, None)
 
 
 def test_still_contact_is_no_gum_while_nothing_else_happens() -> None:

@@ -196,7 +196,7 @@ def _load_position(
     current = level_counts * model.ampere_per_count[pad]
     noise = float(model.noise_counts[pad] * model.ampere_per_count[pad].max())
     found = network.estimate(current, noise)
-    if not bool(np.isfinite(found.x)):
+    if not np.isfinite([found.x, found.y]).all():
         return None, None
     u, v = model.surfaces[pad].from_rectangle(float(found.x), float(found.y))
     ohm = float(model.drive_v[pad] / found.total)
