@@ -202,6 +202,12 @@ def test_static_contact_that_outlasts_others_on_its_pad_is_gum() -> None:
     assert found.published.pad_m[1] == pytest.approx(0.6 * 0.032, abs=1e-3)
 
 
+def test_a_load_that_no_contact_explains_has_no_position() -> None:
+    load = StaticLoad(0, np.array([0.5, 2.7, -9.8, -11.1]), kind=FaultKind.GUM)
+    published = describe_static_load(model(), 0, load).published
+    assert (published.pad_m, published.size_m) == (None, None)
+
+
 def test_still_contact_is_no_gum_while_nothing_else_happens() -> None:
     """A robot that rests a finger on a table gives the same currents."""
     _, changes = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 120)

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
@@ -33,6 +33,8 @@ _LOG_GAIN_STD_PER_DAY = 1e-3
 """Standard deviation of a log gain's random walk, after a day."""
 _NODE_TO_NODE_LOG_GAIN_STD = 0.05
 """Standard deviation of a log gain from node to node."""
+_OFFSET_STD_PER_ROOT_HOUR_COUNTS = 3.0
+"""Standard deviation of an offset's random walk, after an hour."""
 MIN_GAIN, MAX_GAIN = 0.1, 10.0
 """Range of gain factors; no amplifier meant for these channels is beyond it."""
 
@@ -251,6 +253,15 @@ def age_s(version: CalibrationVersion, now: datetime) -> float:
     """Return the age of a version [s]; 0 if its time is in the future."""
     written = datetime.fromisoformat(version.written_utc).astimezone(UTC)
     return max(0.0, (now - written).total_seconds())
+
+
+def aged_offset_std(offsets: Offsets, away_s: float) -> NDArray[np.float64]:
+    """Return the standard deviations (4,) [counts] of offsets away_s after they were stored: a random walk.
+
+    They may be an hour older, as they are stored no more often.
+    """
+    walk = _OFFSET_STD_PER_ROOT_HOUR_COUNTS**2 * (1 + away_s / 3600)
+    return np.asarray(np.sqrt(np.add(offsets.variance, walk)))
 
 
 def aged_gains(

@@ -23,6 +23,7 @@ from handtouch.calibration.calibration import (
     Provenance,
     age_s,
     aged_gains,
+    aged_offset_std,
     channel_values,
     matrix,
 )
@@ -38,6 +39,7 @@ from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
     ContactLawMessage,
+    FloatArray,
     SampleBlock,
     WorkerConfig,
     WorkerMessage,
@@ -51,6 +53,12 @@ _log = logging.getLogger("handtouch.supervisor")
 _STATUS_PERIOD_NS = 500_000_000
 _STORE_POLL_PERIOD_NS = 2_000_000_000
 """Period of checks whether other processes have stored anything."""
+_ZERO_SETTLING_NS = 60_000_000_000
+"""Time in which the zero of static loads tracks the daemon's baseline, from a node's assignment on."""
+_MAX_SETTLING_STEP_NS = 1_000_000_000
+"""Greatest part of that time that passes from one block to the next, after a pause."""
+_MAX_ZERO_CHANGE_SIGMA = 3.0
+"""Greatest change of a channel's zero since it was stored; a greater one is a load."""
 
 
 class Diagnostics(Protocol):
@@ -60,7 +68,7 @@ class Diagnostics(Protocol):
         """Process a block; return the active diagnoses, each with its pad."""
 
     def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
-        """Set the stored offsets (4,) of a pad."""
+        """Set the offsets (4,) of a pad from which static loads are detected."""
 
     def set_gains(self, pad: int, gains: Gains) -> None:
         """Set the gains of a pad, with their covariance, and discard its contacts so far."""
@@ -80,6 +88,10 @@ class _PadEntry:
     foreign_source: str = ""
     """origin of its calibration, if taken over from another node"""
     last_assessment: CalibrationAssessment | None = None
+    stored_zero: tuple[FloatArray, FloatArray] | None = None
+    """stored offsets (4,) of the node and their present standard deviations (4,), if any"""
+    zero_settling_ns: int = 0
+    """remaining time in which its zero tracks the daemon's baseline"""
 
 
 class SupervisorWorker:
@@ -175,8 +187,10 @@ class SupervisorWorker:
                 serial, last, own, obstacle, self._latest_sync_ns, foreign=bool(row.foreign_source)
             )
             self._store_schedule.reset_pad(pad)
+            row.stored_zero, row.zero_settling_ns = None, _ZERO_SETTLING_NS
             if self._diagnostics is not None:
                 self._diagnostics.set_gains(pad, row.calibrator.gains)
+                self._diagnostics.set_offsets(pad, np.zeros(4))
             name = f"{row.mounting_point.hand}/{row.mounting_point.link}"
             _log.info(
                 "%s: node with serial %d: calibration %s%s", name, serial, row.calibrator.calibration_state,
@@ -235,11 +249,14 @@ class SupervisorWorker:
                 self._diagnostics.set_gains(update.pad, row.calibrator.gains)
             if update.offset_counts is not None:
                 self._diagnostics.set_offsets(update.pad, update.offset_counts)
+                row.zero_settling_ns = 0
         if {"gains", "law"} & {*given}:
             messages.append(update)
 
     def _process_block(self, block: SampleBlock, now: datetime, messages: list[WorkerMessage]) -> None:
+        elapsed_ns = min(int(block.sync_ns[-1]) - self._latest_sync_ns, _MAX_SETTLING_STEP_NS)
         self._latest_sync_ns = int(block.sync_ns[-1])
+        self._update_zeros(block, elapsed_ns)
         self._update_diagnoses(block)
         self._store_schedule.update_block(block)
         for pad in np.flatnonzero(block.contact_id.any(axis=0)).tolist():
@@ -295,15 +312,12 @@ class SupervisorWorker:
         offsets, sheet = self._store_schedule.due_parts(pad, self._latest_sync_ns, last)
         if offsets is not None or sheet is not None:
             origin = Provenance("baseline and sheet state tracked")
-            first = self._store.newest_applicable(serial, row.mounting_point, now)[0] is None
-            version = self._record_stored(
+            self._record_stored(
                 row,
                 self._store.store_parts(
                     serial, row.mounting_point, origin, now, offsets=offsets, sheet=sheet
                 ),
             )
-            if version is not None and first:
-                self._set_diagnostic_offsets(pad, version)
 
     @staticmethod
     def _record_stored(row: _PadEntry, version: CalibrationVersion | None) -> CalibrationVersion | None:
@@ -311,16 +325,38 @@ class SupervisorWorker:
             row.version_number, row.foreign_source = version.number, version.provenance.foreign
         return version
 
-    def _set_diagnostic_offsets(self, pad: int, version: CalibrationVersion) -> None:
+    def _restore_zero(self, pad: int, version: CalibrationVersion, now: datetime) -> None:
         """Make the offsets of a version the zero from which diagnostics detects static loads."""
-        if self._diagnostics is not None and version.calibration.offsets is not None:
-            self._diagnostics.set_offsets(pad, version.calibration.offsets.counts)
+        row, offsets = self._pads[pad], version.calibration.offsets
+        if self._diagnostics is None or offsets is None or version.provenance.foreign:
+            return
+        row.stored_zero = np.array(offsets.counts), aged_offset_std(offsets, age_s(version, now))
+        row.zero_settling_ns = _ZERO_SETTLING_NS
+        self._diagnostics.set_offsets(pad, offsets.counts)
+
+    def _update_zeros(self, block: SampleBlock, elapsed_ns: int) -> None:
+        """Make the daemon's baselines the zeros of static loads, while these settle.
+
+        A stored zero remains if its age doesn't explain the difference: the baseline may have tracked a load.
+        Without a stored one, such as after a node was replaced, the baseline is all that is known.
+        """
+        for pad, row in enumerate(self._pads):
+            if row.zero_settling_ns <= 0 or not np.isfinite(block.offset_std[pad]):
+                continue
+            row.zero_settling_ns -= elapsed_ns
+            offset = block.offset_counts[pad]
+            if row.stored_zero is not None:
+                stored, std = row.stored_zero
+                if (np.abs(offset - stored) > _MAX_ZERO_CHANGE_SIGMA * std).any():
+                    continue
+            if self._diagnostics is not None:
+                self._diagnostics.set_offsets(pad, offset)
 
     def _restore_calibration(self, pad: int, version: CalibrationVersion, now: datetime) -> CalibrationUpdate:
         """Return the update of a pad to a stored version."""
         known, row = version.calibration, self._pads[pad]
         row.version_number = version.number
-        self._set_diagnostic_offsets(pad, version)
+        self._restore_zero(pad, version, now)
         gains = row.calibrator.gains
         update = _calibration_update(pad, version.serial, version.calibration_id, gains)
         found: dict[str, Any] = {}
