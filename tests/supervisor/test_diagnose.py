@@ -322,13 +322,6 @@ def test_contacts_that_no_fault_explains_are_unexplained() -> None:
     assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [(FaultKind.UNEXPLAINED, ())]
 
 
-@pytest.mark.parametrize("level", [(17.0, 0.0, 0.0, 0.0), (9.0, 8.0, 0.0, 0.0), (0.0, 0.0, 9.0, 8.0)])
-def test_gum_that_is_placed_in_one_direction_only_has_no_place(level: tuple[float, ...]) -> None:
-    load = StaticLoad(SECOND, np.array(level), kind=FaultKind.GUM, probability=0.9)
-    place = describe_static_load(model(), 0, load).published.pad_m
-    assert place is None or np.isfinite(place).all()
-
-
 def test_ambiguous_gain_step_and_torn_corner_are_both_named() -> None:
     gain = Hypothesis(FaultKind.GAIN_STEP, ("x0",), 0.7)
     cut = Hypothesis(FaultKind.TORN_CORNER, ("x0", "yb"), 1.0, (0.5, 0.5))
