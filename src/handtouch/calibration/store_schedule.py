@@ -92,6 +92,12 @@ class StoreSchedule:
         )
         self._learned[pad] = self._stored_learned[pad] = np.nan
 
+    def retry_pad(self, pad: int, now_ns: int) -> None:
+        """Store a pad's parts again in a minute: they couldn't be written."""
+        self._stored_offset_counts[pad], self._stored_back_force_n[pad] = np.nan, np.nan
+        self._stored_learned[pad] = np.nan
+        self._next_ns[pad] = now_ns + _FIRST_STORE_DELAY_NS
+
     def due_parts(
         self, pad: int, now_ns: int, last: bool = False
     ) -> tuple[Offsets | None, StoredSheetState | None]:

@@ -312,12 +312,11 @@ class SupervisorWorker:
         offsets, sheet = self._store_schedule.due_parts(pad, self._latest_sync_ns, last)
         if offsets is not None or sheet is not None:
             origin = Provenance("baseline and sheet state tracked")
-            self._record_stored(
-                row,
-                self._store.store_parts(
-                    serial, row.mounting_point, origin, now, offsets=offsets, sheet=sheet
-                ),
+            stored = self._store.store_parts(
+                serial, row.mounting_point, origin, now, offsets=offsets, sheet=sheet
             )
+            if self._record_stored(row, stored) is None:
+                self._store_schedule.retry_pad(pad, self._latest_sync_ns)
 
     @staticmethod
     def _record_stored(row: _PadEntry, version: CalibrationVersion | None) -> CalibrationVersion | None:
