@@ -24,7 +24,7 @@ from scipy.stats import chi2
 from scores import Share
 
 from handtouch.calibration.auto_calibration import new_gain_estimator
-from handtouch.calibration.gains import fisher_covariance, gain_deviation
+from handtouch.calibration.contact_scores import fisher_covariance, gain_deviation
 from handtouch.field import Rectangle
 
 matplotlib.use("Agg")

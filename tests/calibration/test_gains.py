@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from handtouch.calibration.contact_scores import fisher_covariance, gain_deviation
 from handtouch.calibration.gains import (
     BATCH_CONTACTS,
     MAX_TOUCH_ERROR,
     GainEstimator,
     GainStatus,
-    fisher_covariance,
-    gain_deviation,
 )
 from handtouch.field import Electrode, ElectrodeNetwork, Rectangle
 from handtouch.field.model import ForwardModel
+from handtouch.field.perimeter_network import PerimeterNetwork
 
 FloatArray = NDArray[np.float64]
 SQUARE = Rectangle(1.0, 1.0)
@@ -35,13 +35,13 @@ def contacts(
     seed: int = 1,
     apart: float = 0.0,
 ) -> FloatArray:
-    """Currents (4, count) that `log_gains` correct; of points, or of two points `apart` along x."""
+    """Currents (channels, count) that `log_gains` correct; of points, or of two points `apart` along x."""
     generator = np.random.default_rng(seed)
     x, y = generator.uniform(0.15, 0.85, (2, count)) * [[model.a], [model.b]]
     total = generator.uniform(0.5, 2.0, count)
     fractions = (model.fractions(x - apart / 2, y) + model.fractions(x + apart / 2, y)) / 2
     return np.asarray(
-        (fractions * total + noise * generator.normal(size=(4, count))) * np.exp(-log_gains)[:, None]
+        (fractions * total + noise * generator.normal(size=fractions.shape)) * np.exp(-log_gains)[:, None]
     )
 
 
@@ -265,8 +265,8 @@ def test_any_currents_give_finite_estimates(readings: list[list[float]]) -> None
         ({"model_error": -1.0}, "model_error"),
         ({"drift_per_day": float("nan")}, "drift_per_day"),
         ({"required_std": 0.0}, "required_std"),
-        ({"start": (1.0, 1.0, 1.0)}, "four positive"),
-        ({"start": (1.0, 1.0, 1.0, 0.0)}, "four positive"),
+        ({"start": (1.0, 1.0, 1.0)}, "must be 4 positive"),
+        ({"start": (1.0, 1.0, 1.0, 0.0)}, "must be 4 positive"),
     ],
 )
 def test_invalid_parameters_are_refused_by_name(options: dict[str, Any], message: str) -> None:
@@ -328,3 +328,31 @@ def test_invalid_calls_are_refused() -> None:
     estimator.add_contacts(np.ones(4), 1e-3, 10)
     with pytest.raises(ValueError, match="now_ns = 9"):
         estimator.add_contacts(np.ones(4), 1e-3, 9)
+
+
+SIX = PerimeterNetwork(1.4, 1.0, [[k * 0.8 + 0.05, k * 0.8 + 0.75] for k in range(6)], 1.0)
+
+
+def test_gains_of_six_channels_match_their_covariance_and_the_fisher_bound() -> None:
+    truth, distances, ratios = np.array([0.03, -0.01, -0.025, 0.005, 0.02, -0.02]), [], []
+    for seed in range(12):
+        estimator = plain(SIX, tolerance=0.3)
+        estimator.add_contacts(contacts(SIX, BATCH_CONTACTS, 1e-3, truth, seed=seed), 1e-3, 0)
+        found = estimator.estimate
+        error = np.log(found.gains) - truth
+        distances.append(error @ np.linalg.pinv(found.covariance) @ error)
+        generator = np.random.default_rng(seed)
+        x, y = generator.uniform(0.15, 0.85, (2, BATCH_CONTACTS)) * [[SIX.a], [SIX.b]]
+        total = generator.uniform(0.5, 2.0, BATCH_CONTACTS)
+        ratios.append(found.std**2 / np.diag(fisher_covariance(SIX, x, y, (1e-3 / total)[None])).max())
+    assert 2.5 < np.mean(distances) < 8.3  # 99.8 % of means of 12 chi squared of five degrees of freedom
+    assert 0.9 < np.mean(ratios) < 1.3
+
+
+def test_three_channels_are_refused_as_contacts_leave_nothing_over() -> None:
+    three = PerimeterNetwork(1.0, 1.0, [[0.1, 1.2], [1.4, 2.5], [2.7, 3.9]], 1.0)
+    estimator = plain(three)
+    assert estimator.estimate.status == GainStatus.INVALID
+    assert gain_deviation(three) == np.inf
+    with pytest.raises(ValueError, match="gains of 3 channels"):
+        estimator.add_contacts(contacts(three, 4, 1e-3, np.zeros(3)), 1e-3, 0)

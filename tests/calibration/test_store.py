@@ -115,7 +115,7 @@ def test_version_round_trips_through_json(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: channel_values([1, 1, 1]), r"has shape \(3,\)"),
+        (lambda: channel_values([1, 1]), r"has shape \(2,\)"),
         (lambda: Gains(factors=(1, 1, 1, 0), covariance=matrix(np.eye(4))), r"factors\.3\n.*greater than 0"),
         (lambda: Gains((1, 1, 1, float("nan")), matrix(np.eye(4))), "finite number"),
         (lambda: Gains((1, 1, 1, 1), matrix(-np.eye(4))), "negative eigenvalues"),

@@ -13,7 +13,7 @@ MINUTE_NS = 60 * 10**9
 
 def make_schedule() -> StoreSchedule:
     """Return the schedule of a pad that has waited for a minute."""
-    none, schedule = np.full(1, np.nan), StoreSchedule(1)
+    none, schedule = np.full(1, np.nan), StoreSchedule([4])
     schedule.update_block(
         SimpleNamespace(
             offset_counts=np.full((1, 4), 12.0), offset_std=np.ones(1), noise_counts=np.ones((1, 4)),

@@ -138,7 +138,7 @@ def test_block_of_a_late_tick_leaves_out_samples_of_the_next_cycle(rig: Rig) -> 
     for pad, delay_ns in enumerate((1000, 2000, PERIOD_NS + 1000)):
         pipeline.slab.write_pdo(pad, b"\0" * 8, sync_ns + delay_ns)
     assert pipeline.finish_cycle(sync_ns + PERIOD_NS, sync_ns + PERIOD_NS + 2000) is not None
-    buffer = BlockBuffer(3)
+    buffer = BlockBuffer(3, 4)
     buffer.max_ticks = 1
     block = buffer.add_tick(pipeline)
     assert block is not None

@@ -19,7 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-ChannelValues = tuple[float, float, float, float]
+MIN_CHANNELS, MAX_CHANNELS = 3, 16
+"""Number of channels of a node."""
+ChannelValues = Annotated[tuple[float, ...], Field(min_length=MIN_CHANNELS, max_length=MAX_CHANNELS)]
 Matrix = tuple[tuple[float, ...], ...]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -57,7 +59,7 @@ def _check_covariance(values: Matrix) -> Matrix:
 
 
 Covariance3 = Annotated[Matrix, Field(min_length=3, max_length=3), AfterValidator(_check_covariance)]
-Covariance4 = Annotated[Matrix, Field(min_length=4, max_length=4), AfterValidator(_check_covariance)]
+Covariance = Annotated[Matrix, AfterValidator(_check_covariance)]
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -65,34 +67,42 @@ class LearnedParts:
     """Parts of a pad that were learned with its gains: gaps, sides, waves of the sheet, resistors.
 
     stated_stds: (p,) of the deployment that they were learned under, as `part_stds` of `hand`; 0 for parts
-    that don't matter. offsets: (p,) in these. covariance: (4 + p, 4 + p) of log gains, then of the offsets.
+    that don't matter. offsets: (p,) in these. covariance: (c + p, c + p) of the log gains of the c channels,
+    then of the offsets.
     touch_error: standard deviation of the fractions of a touch, another one each time.
     """
 
     stated_stds: tuple[float, ...]
     offsets: tuple[float, ...]
-    covariance: Annotated[Matrix, AfterValidator(_check_covariance)]
+    covariance: Covariance
     touch_error: NonNegative = 0.0
 
     def __post_init__(self) -> None:
-        count = len(self.offsets)
-        if len(self.stated_stds) != count or len(self.covariance) != 4 + count:
+        count, rows = len(self.offsets), len(self.covariance)
+        if len(self.stated_stds) != count or not MIN_CHANNELS <= rows - count <= MAX_CHANNELS:
             raise ValueError(
-                f"offsets: has {count} parts, stated_stds {len(self.stated_stds)}, covariance "
-                f"{len(self.covariance)} rows: must be as many, and 4 more"
+                f"offsets: has {count} parts, stated_stds {len(self.stated_stds)}, covariance {rows} rows: "
+                "must be as many, and one more for each channel"
             )
 
 
 @dataclass(frozen=True, config=_RECORD)
 class Gains:
-    """Factors that correct the currents of channels x0, xa, y0, yb; covariance (4, 4) of their logarithms.
+    """Factors (c,) that correct the currents of the electrodes; covariance (c, c) of their logarithms.
 
     parts: of the pad, where they were learned with the gains.
     """
 
-    factors: tuple[Positive, Positive, Positive, Positive]
-    covariance: Covariance4
+    factors: Annotated[tuple[Positive, ...], Field(min_length=MIN_CHANNELS, max_length=MAX_CHANNELS)]
+    covariance: Covariance
     parts: LearnedParts | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.factors)
+        if len(self.covariance) != count:
+            raise ValueError(f"covariance: has {len(self.covariance)} rows for {count} factors")
+        if self.parts is not None and len(self.parts.covariance) - len(self.parts.offsets) != count:
+            raise ValueError(f"parts: were learned with gains of another number of channels than {count}")
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -100,8 +110,13 @@ class Offsets:
     """Readings of untouched channels [counts], their variance [counts^2]; noise of readings if known."""
 
     counts: ChannelValues
-    variance: tuple[NonNegative, NonNegative, NonNegative, NonNegative]
-    noise: tuple[NonNegative, NonNegative, NonNegative, NonNegative] | None = None
+    variance: tuple[NonNegative, ...]
+    noise: tuple[NonNegative, ...] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.counts)
+        if len(self.variance) != count or (self.noise is not None and len(self.noise) != count):
+            raise ValueError(f"variance, noise: must have one value for each of {count} channels")
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -256,7 +271,7 @@ def age_s(version: CalibrationVersion, now: datetime) -> float:
 
 
 def aged_offset_std(offsets: Offsets, away_s: float) -> NDArray[np.float64]:
-    """Return the standard deviations (4,) [counts] of offsets away_s after they were stored: a random walk.
+    """Return the standard deviations (c,) [counts] of offsets away_s after they were stored: a random walk.
 
     They may be an hour older, as they are stored no more often.
     """
@@ -278,11 +293,12 @@ def aged_gains(
     drift = _LOG_GAIN_STD_PER_DAY**2 * age_s(version, now) / 86400
     if version.provenance.foreign:
         drift += _NODE_TO_NODE_LOG_GAIN_STD**2
-    # a random walk of four gains that leaves their product unchanged
-    walk, covariance, parts = drift * (np.eye(4) - 0.25), np.array(gains.covariance), None
+    # a random walk of gains that leaves their product unchanged
+    count = len(gains.factors)
+    walk, covariance, parts = drift * (np.eye(count) - 1 / count), np.array(gains.covariance), None
     if gains.parts is not None and not version.provenance.foreign and gains.parts.stated_stds == stated_stds:
         joint = np.array(gains.parts.covariance)
-        joint[:4, :4] += walk
+        joint[:count, :count] += walk
         parts = LearnedParts(
             gains.parts.stated_stds, gains.parts.offsets, matrix(joint), gains.parts.touch_error
         )
@@ -290,12 +306,11 @@ def aged_gains(
 
 
 def channel_values(values: ArrayLike) -> ChannelValues:
-    """Return four numbers of an array as a tuple. Raises ValueError for another shape."""
+    """Return numbers of all channels as a tuple. Raises ValueError for another shape."""
     array = np.asarray(values, dtype=np.float64)
-    if array.shape != (4,):
-        raise ValueError(f"values has shape {array.shape}: must be (4,)")
-    x0, xa, y0, yb = array.tolist()
-    return x0, xa, y0, yb
+    if array.ndim != 1 or not MIN_CHANNELS <= len(array) <= MAX_CHANNELS:
+        raise ValueError(f"values has shape {array.shape}: must be one for each of 3 to 16 channels")
+    return tuple(array.tolist())
 
 
 def matrix(values: ArrayLike) -> Matrix:

@@ -1,13 +1,13 @@
-"""Estimate the ratios of a pad's four channel gains from ordinary contacts, without a reference.
+"""Estimate the ratios of a pad's channel gains from ordinary contacts, without a reference.
 
-Public: `GainEstimator` (contacts in, `GainEstimate` out); `gain_deviation` and `fisher_covariance`, the
-Fisher bounds for a shape of pad and for given contacts.
+Public: `GainEstimator` (contacts in, `GainEstimate` out). `contact_scores` has the equations.
 
-A point contact has three unknowns and gives four currents. The one number left over, the score, is the part
-of the misfit along the left null vector n of the fit's whitened Jacobian: a standard normal number if the
-gains are right. Log gains with an error d (summing to zero) move it by h . d, where h = n * expected
-currents / noise. So each contact is one linear equation for d; contacts are fitted again with the gains found
-(Gauss-Newton), which makes it the maximum-likelihood estimate with the positions as nuisance parameters.
+A point contact has three unknowns and gives c currents, four as a rule. Each of the c - 3 numbers left over,
+a score, is the part of the misfit along a left null vector n of the fit's whitened Jacobian: a standard
+normal number if the gains are right. Log gains with an error d (summing to zero) move it by h . d, where
+h = n * expected currents / noise. So each score is one linear equation for d; contacts are fitted again with
+the gains found (Gauss-Newton), which makes it the maximum-likelihood estimate with the positions as nuisance
+parameters. Three currents leave no score: their gains aren't observable.
 
 Scores also depend on the other parts of the pad that aren't exactly as stated: gaps, sides, resistors. They
 are parameters of the same equations, with their tolerances as priors, so that the covariance of the gains
@@ -29,6 +29,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handtouch.calibration.contact_scores import (
+    UNKNOWNS,
+    ContactScores,
+    channel_count,
+    gain_basis,
+    gain_deviation,
+)
 from handtouch.field.estimate import estimate
 from handtouch.field.model import FloatArray, ForwardModel, FractionModel, channel_noise
 
@@ -53,10 +60,6 @@ _MIN_INFORMATION_FRACTION = 0.2  # of a batch's information, however unlikely it
 _MEDIAN_SQUARED_SCORE = 0.4549  # of a standard normal number
 _DAY_NS = 86_400e9
 
-# orthonormal directions of four log gains that sum to zero
-_BASIS = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [1, -1, 0, 0], [0, 0, 1, -1]], dtype=np.float64)
-_BASIS = (_BASIS / np.linalg.norm(_BASIS, axis=1, keepdims=True))[1:].T
-
 
 class GainStatus(StrEnum):
     """Status of a gain estimate."""
@@ -68,14 +71,14 @@ class GainStatus(StrEnum):
 
 @dataclass(frozen=True)
 class GainEstimate:
-    """Gains estimated from contacts, channels in the order x0, xa, y0, yb.
+    """Gains of c channels estimated from contacts, in the order of the model's.
 
-    gains: (4,), factors that correct the currents; their product is 1, a common factor is not observable.
-    covariance: (4, 4), of the logarithms of the gains; singular, as they sum to zero. Widened by the misfit.
+    gains: (c,), factors that correct the currents; their product is 1, a common factor is not observable.
+    covariance: (c, c), of the logarithms of the gains; singular, as they sum to zero. Widened by the misfit.
     touch_error: standard deviation of the fractions of a touch, another one each time, that explains the
         scores beyond noise; patches that aren't round have one.
     part_offsets: (p,) of the other parts, in their standard deviations as stated.
-    joint_covariance: (4 + p, 4 + p) of the logarithms of the gains and of these.
+    joint_covariance: (c + p, c + p) of the logarithms of the gains and of these.
     contacts: number used. effective_contacts: number that counts, once those at one position and those that
         are no points are discounted. point_fraction: share of them that are points.
     misfit: root mean square score of recent points, near 1 where model and noise are right.
@@ -103,19 +106,19 @@ class GainEstimate:
 class GainEstimator:
     """Running estimate of the gains of one pad; its state has a fixed size.
 
-    model: of the pad, with channels x0, xa, y0, yb.
+    model: of the pad, with c channels.
     tolerance: standard deviation of a log gain before any contact.
     drift_per_day: standard deviation of a log gain's random walk, after a day.
     model_error: standard deviation of the model's fractions. It is the same for all contacts in one cell of
         the pad, so a cell never adds more information than this allows, however often it is touched.
     required_std: of the least certain log gain, at which the gains count as estimated; for other parts as
         stated, as no number of contacts separates them from gains.
-    start: initial gains (4,), their covariance (4, 4) of logarithms as `covariance`, both as stored; with the
-        `part_offsets` (p,) and the `joint_covariance` (4 + p, 4 + p), if these were stored.
+    start: initial gains (c,), their covariance (c, c) of logarithms as `covariance`, both as stored; with the
+        `part_offsets` (p,) and the `joint_covariance` (c + p, c + p), if these were stored.
     parts: models in each of which one part, such as a gap, differs by one standard deviation; `model` itself
         for those without a tolerance.
 
-    Raises ValueError for a model with other channels, or a parameter out of range.
+    Raises ValueError for a parameter out of range.
     """
 
     def __init__(
@@ -141,24 +144,28 @@ class GainEstimator:
             if not least <= value < np.inf:
                 raise ValueError(f"{name} = {value}: must be finite and at least {least:g}")
         self.shape_deviation = gain_deviation(model)
-        self._model = model
+        self._model, self._channels = model, channel_count(model)
         self._drift_per_day, self._model_error, self._required_std = drift_per_day, model_error, required_std
-        self._log_gains = np.zeros(4) if start is None else _normalised_logs(start)
+        self._log_gains = np.zeros(self._channels)
+        if start is not None:
+            self._log_gains = _normalised_logs(start, self._channels)
         self._parts, self._part_offsets = tuple(parts), np.zeros(len(parts))
-        self._information: FloatArray = np.diag([tolerance**-2] * 3 + [1.0] * len(parts))
-        self._basis = np.eye(4 + len(parts))[:, 1:]
-        self._basis[:4, :3] = _BASIS
+        free, self._gain_basis = self._channels - 1, gain_basis(self._channels)
+        self._information: FloatArray = np.diag([tolerance**-2] * free + [1.0] * len(parts))
+        self._basis = np.eye(self._channels + len(parts))[:, 1:]
+        self._basis[: self._channels, :free] = self._gain_basis
         if joint_covariance is not None and part_offsets is not None:
             self._part_offsets = np.array(part_offsets, dtype=np.float64)
             known = self._basis.T @ np.asarray(joint_covariance, dtype=np.float64) @ self._basis
             self._information = _inverse(known + 1e-18 * np.eye(len(known)))
         elif covariance is not None:
-            known = _BASIS.T @ np.asarray(covariance, dtype=np.float64) @ _BASIS
-            self._information[:3, :3] = _inverse(known + 1e-18 * np.eye(3))
+            known = self._gain_basis.T @ np.asarray(covariance, dtype=np.float64) @ self._gain_basis
+            self._information[:free, :free] = _inverse(known + 1e-18 * np.eye(free))
         # the positions behind given gains are unknown: each cell starts with half of the information it can
         # add
         already = 0.0 if covariance is None or model_error == 0 else model_error**-2
-        self._cell_information = np.full((_CELLS_PER_SIDE, _CELLS_PER_SIDE), already)
+        scores = max(self._channels - UNKNOWNS, 0)
+        self._cell_information = np.full((_CELLS_PER_SIDE, _CELLS_PER_SIDE, scores), already)
         self._mixture = _OutlierMixture()
         self._pending: list[FloatArray] = []
         self._touch_variance = 0.0
@@ -169,31 +176,34 @@ class GainEstimator:
     def add_contacts(self, currents: ArrayLike, noise: ArrayLike, now_ns: int) -> int:
         """Add contacts, one column each; return the number of useful ones.
 
-        currents: (4, n) or (4,), any unit, offsets taken off, *not* corrected by this estimator's gains.
-        noise: their standard deviations, same unit: one, (4,) a channel, or broadcastable. Give a held
+        currents: (c, n) or (c,), any unit, offsets taken off, *not* corrected by this estimator's gains.
+        noise: their standard deviations, same unit: one, (c,) a channel, or broadcastable. Give a held
             contact once, as its mean with the noise of that mean. now_ns: monotonic time of the last of them.
-        Raises ValueError for other shapes, or a time before that of the contacts given before.
+        Raises ValueError for three channels, other shapes, or a time before that of the contacts given
+        before.
         """
-        readings = np.asarray(currents, dtype=np.float64)
-        if readings.shape[:1] != (4,) or readings.ndim > 2:
-            raise ValueError(f"currents have shape {readings.shape}: must be (4,) or (4, n)")
+        readings, c = np.asarray(currents, dtype=np.float64), self._channels
+        if c <= UNKNOWNS:
+            raise ValueError(f"gains of {c} channels can't be estimated: a contact has as many unknowns")
+        if readings.shape[:1] != (c,) or readings.ndim > 2:
+            raise ValueError(f"currents have shape {readings.shape}: must be ({c},) or ({c}, n)")
         sigma = channel_noise(noise, readings.shape)
         if self._last_ns is not None and now_ns < self._last_ns:
             raise ValueError(f"now_ns = {now_ns}: contacts of {self._last_ns} were added before")
         self._propagate_drift(now_ns)
-        columns = np.concatenate([readings.reshape(4, -1), sigma.reshape(4, -1)])
-        useful = columns[:, self._usable(columns[:4], columns[4:])]
+        columns = np.concatenate([readings.reshape(c, -1), sigma.reshape(c, -1)])
+        useful = columns[:, self._usable(columns[:c], columns[c:])]
         self._pending.extend(useful.T)
         while len(self._pending) >= BATCH_CONTACTS:
             batch, self._pending = np.array(self._pending[:BATCH_CONTACTS]).T, self._pending[BATCH_CONTACTS:]
-            self._process_batch(batch[:4], batch[4:])
+            self._process_batch(batch[:c], batch[c:])
         return int(useful.shape[1])
 
     def process_pending(self) -> None:
         """Process the contacts of an incomplete batch, as at the end of a recording."""
         if self._pending:
             batch, self._pending = np.array(self._pending).T, []
-            self._process_batch(batch[:4], batch[4:])
+            self._process_batch(batch[: self._channels], batch[self._channels :])
 
     @property
     def estimate(self) -> GainEstimate:
@@ -204,11 +214,12 @@ class GainEstimator:
         widening = max(1.0, np.nan_to_num(misfit) ** 2)
         joint = self._basis @ _inverse(self._information) @ self._basis.T
         joint *= widening
-        with_parts_as_stated = _BASIS @ _inverse(self._information[:3, :3]) @ _BASIS.T * widening
+        basis, free = self._gain_basis, self._channels - 1
+        with_parts_as_stated = basis @ _inverse(self._information[:free, :free]) @ basis.T * widening
         status, reason = self._assess(float(np.sqrt(np.diag(with_parts_as_stated).max())))
         return GainEstimate(
             np.exp(self._log_gains),
-            joint[:4, :4],
+            joint[: self._channels, : self._channels],
             self._part_offsets.copy(),
             joint,
             math.sqrt(self._touch_variance),
@@ -221,6 +232,11 @@ class GainEstimator:
         )
 
     def _assess(self, std: float) -> tuple[GainStatus, str]:
+        if self._channels <= UNKNOWNS:
+            return GainStatus.INVALID, (
+                f"{self._channels} channels can't be calibrated by contacts, which have as many unknowns; "
+                "measure their gains with a known current into every channel"
+            )
         if self.shape_deviation > MAX_SHAPE_DEVIATION:
             return GainStatus.INVALID, (
                 f"a pad of {self._model.a:.3g} by {self._model.b:.3g} can't be calibrated by contacts: 400 "
@@ -262,17 +278,19 @@ class GainEstimator:
         if days > 0 and self._drift_per_day > 0:
             before = _inverse(self._information)
             after = before.copy()
-            after[:3, :3] += self._drift_per_day**2 * days * np.eye(3)
+            free = self._channels - 1
+            after[:free, :free] += self._drift_per_day**2 * days * np.eye(free)
             self._information = _inverse(after)
-            self._cell_information *= np.trace(before[:3, :3]) / np.trace(after[:3, :3])
+            self._cell_information *= np.trace(before[:free, :free]) / np.trace(after[:free, :free])
 
     def _process_batch(self, currents: FloatArray, sigma: FloatArray) -> None:
-        """Process a batch (4, n): iterate around the former gains, then keep its information."""
+        """Process a batch (c, n): iterate around the former gains, then keep its information."""
         known, known_parts, positions = self._log_gains, self._part_offsets, None
         known_variance, contacts = self._touch_variance, min(self._contacts, _MEMORY_CONTACTS)
+        basis, free, count = self._gain_basis, self._channels - 1, currents.shape[1]
         for _ in range(_MAX_BATCH_ITERATIONS):
             gains = np.exp(self._log_gains)[:, None]
-            view = _ContactLinearisation.linearise(
+            view = ContactScores.linearise(
                 self._model, self._parts, currents * gains, sigma * gains, positions
             )
             positions = view.positions
@@ -280,30 +298,30 @@ class GainEstimator:
             error2 = self._model_error**2 + self._touch_variance
             spread = np.sqrt(1 + error2 * view.score_sensitivity**2)
             mixture = replace(self._mixture)
-            prior = np.concatenate([_BASIS.T @ (known - self._log_gains), known_parts])
+            prior = np.concatenate([basis.T @ (known - self._log_gains), known_parts])
             found = mixture.solve(view, share, spread, self._information, prior)
-            information = self._information + (view.score_slope * found.precision) @ view.score_slope.T
+            information = self._information + view.information(found.precision)
             # the step of the gains is from the present ones; scores are linear in the parts' offsets
-            self._log_gains = self._log_gains + _BASIS @ found.step[:3]
-            touch_variance = _touch_variance(found.squared_scores * spread**2, view.score_sensitivity)
-            self._touch_variance = (contacts * known_variance + len(share) * touch_variance) / (
-                contacts + len(share)
+            self._log_gains = self._log_gains + basis @ found.step[:free]
+            touch_variance = _touch_variance(
+                (found.squared_scores * spread**2).ravel(), view.score_sensitivity.ravel()
             )
-            step = np.concatenate([found.step[:3], found.step[3:] - self._part_offsets])
-            self._part_offsets = found.step[3:]
+            self._touch_variance = (contacts * known_variance + count * touch_variance) / (contacts + count)
+            step = np.concatenate([found.step[:free], found.step[free:] - self._part_offsets])
+            self._part_offsets = found.step[free:]
             if step @ information @ step < _CONVERGED_STEP_SIGMA**2:
                 break
         self._information, self._mixture, self._cell_information = information, mixture, cells
-        self._contacts += len(share)
-        self._effective_contacts += float(found.precision @ spread**2)
-        fade = 1 - len(share) / _MEMORY_CONTACTS
+        self._contacts += count
+        self._effective_contacts += float((found.precision * spread**2).mean(axis=1).sum())
+        fade = 1 - count / _MEMORY_CONTACTS
         self._misfit_sums = fade * self._misfit_sums + [
-            found.point_probability @ found.squared_scores,
+            found.point_probability @ found.squared_scores.mean(axis=1),
             found.point_probability.sum(),
         ]
 
-    def _information_shares(self, view: _ContactLinearisation) -> tuple[FloatArray, FloatArray]:
-        """Return the share of each contact's information (n,) given earlier ones nearby, and the updated
+    def _information_shares(self, view: ContactScores) -> tuple[FloatArray, FloatArray]:
+        """Return the share of each score's information (n, s) given earlier ones nearby, and the updated
         cells.
 
         Independent information i of a cell and a common error m give 1 / (1 / i + m^2) together. Errors of
@@ -317,7 +335,7 @@ class GainEstimator:
         )
         own = view.score_sensitivity**2
         kept = 1 / (1 + self._touch_variance * own)
-        share = np.zeros(at.shape[1])
+        share = np.zeros(own.shape)
         for k, (i, j) in enumerate(at.T):
             before = cells[i, j]
             cells[i, j] += kept[k] * own[k]
@@ -326,7 +344,7 @@ class GainEstimator:
 
 
 def _touch_variance(squared_scores: FloatArray, sensitivity: FloatArray) -> float:
-    """Return the variance of the fractions that explains the scores (n,) beyond noise.
+    """Return the variance of the fractions that explains scores (k,) beyond noise.
 
     From the median of the more sensitive half, which a minority that are no points doesn't change.
     """
@@ -334,27 +352,6 @@ def _touch_variance(squared_scores: FloatArray, sensitivity: FloatArray) -> floa
     excess = squared_scores[sensitive] / _MEDIAN_SQUARED_SCORE - 1
     variance = float(np.median(excess / sensitivity[sensitive] ** 2))
     return min(max(variance, 0.0), MAX_TOUCH_ERROR**2)
-
-
-def gain_deviation(model: ForwardModel, contacts: int = 400) -> float:
-    """Return the Fisher bound: standard deviation of the least certain log gain, per noise / total.
-
-    For `contacts` spread evenly over the pad, 10 % of a side and farther from the edges. Raises ValueError
-    for a model with other channels.
-    """
-    at = 0.1 + 0.8 * (np.arange(20) + 0.5) / 20
-    x, y = (grid.ravel() for grid in np.meshgrid(at * model.a, at * model.b))
-    covariance = fisher_covariance(model, x, y, 1.0) * x.size / contacts
-    return float(np.sqrt(np.diag(covariance).max()))
-
-
-def fisher_covariance(model: ForwardModel, x: FloatArray, y: FloatArray, noise: ArrayLike) -> FloatArray:
-    """Return the Fisher bound of the log gains, (4, 4), of contacts at unknown positions x, y (n,).
-
-    noise: of the channels as a part of each contact's total, as `channel_noise` takes it.
-    """
-    slope = _score_slopes(model, x, y, channel_noise(noise, (4, *x.shape)), np.ones(x.shape))[1]
-    return np.asarray(_BASIS @ np.linalg.pinv(slope @ slope.T, rcond=1e-14) @ _BASIS.T)
 
 
 @dataclass
@@ -376,7 +373,7 @@ class _OutlierMixture:
 
     def solve(
         self,
-        view: _ContactLinearisation,
+        view: ContactScores,
         share: FloatArray,
         spread: FloatArray,
         information: FloatArray,
@@ -384,34 +381,36 @@ class _OutlierMixture:
     ) -> _GainStep:
         """Return the most likely step of gains and parts for contacts and prior, (p,) with its information.
 
-        share (n,): of a contact's information that counts; spread (n,): standard deviation of a point's
-        score. Starts from the least absolute scores, which are robust against a minority, then
+        share (n, s): of a score's information that counts; spread (n, s): standard deviation of a point's
+        scores. Starts from the least absolute scores, which are robust against a minority, then
         expectation-maximisation.
         """
 
         def step_for(precision: FloatArray) -> FloatArray:
-            weighted = view.score_slope * precision
-            right = information @ prior - weighted @ view.score
-            return np.asarray(np.linalg.solve(information + weighted @ view.score_slope.T, right))
+            right = information @ prior - np.einsum("pns,ns->p", view.score_slope, precision * view.score)
+            return np.asarray(np.linalg.solve(information + view.information(precision), right))
 
         step = prior
         for _ in range(_L1_ITERATIONS):
-            score = np.abs(view.score + step @ view.score_slope) / spread
+            score = np.abs(view.scores_after(step)) / spread
             step = step_for(share / np.maximum(score, 0.1))
         points, others, squares = self.point_count, self.outlier_count, self.outlier_squares
         for _ in range(_EM_ITERATIONS):
-            z = (view.score + step @ view.score_slope) ** 2 / spread**2
+            z = view.scores_after(step) ** 2 / spread**2
             wide = max(self.outlier_squares / self.outlier_count, _MIN_OUTLIER_VARIANCE)
             log_odds = (
-                np.log(self.outlier_count / self.point_count) - np.log(wide) / 2 + z * (1 - 1 / wide) / 2
+                np.log(self.outlier_count / self.point_count)
+                - z.shape[1] * np.log(wide) / 2
+                + z.sum(axis=1) * (1 - 1 / wide) / 2
             )
             other = (1 + np.tanh(log_odds / 2)) / 2  # logistic function
             self.point_count, self.outlier_count = points + (1 - other).sum(), others + other.sum()
-            self.outlier_squares = squares + other @ z
-            weight = 1 - other + other / wide
+            self.outlier_squares = squares + other @ z.mean(axis=1)
+            weight = (1 - other + other / wide)[:, None]
             # uncertainty of a contact's class reduces the information (Louis 1982)
-            information_loss = other * (1 - other) * (1 - 1 / wide) ** 2 * z
-            kept = max(1 - (share @ information_loss) / (share @ weight), _MIN_INFORMATION_FRACTION)
+            information_loss = (other * (1 - other))[:, None] * (1 - 1 / wide) ** 2 * z
+            loss = (share * information_loss).sum() / (share * weight).sum()
+            kept = max(1 - loss, _MIN_INFORMATION_FRACTION)
             weight = kept * share * weight
             step = step_for(weight)
         fade = min(1.0, _MEMORY_CONTACTS / (self.point_count + self.outlier_count))
@@ -422,7 +421,7 @@ class _OutlierMixture:
 
 
 class _GainStep(NamedTuple):
-    """Step (p,); for each contact (n,): precision of its score, probability of a point, squared score."""
+    """Step (p,); precision of each score (n, s), probability (n,) of a point, squared scores (n, s)."""
 
     step: FloatArray
     precision: FloatArray
@@ -430,67 +429,13 @@ class _GainStep(NamedTuple):
     squared_scores: FloatArray
 
 
-@dataclass(frozen=True)
-class _ContactLinearisation:
-    """Linearisation of the scores of contacts (n,) around the gains that correct them.
-
-    positions (2, n); score (n,); score_slope (p, n): what a step of gains and parts adds to the score;
-    score_sensitivity (n,): score per error of the fractions.
-    """
-
-    positions: FloatArray
-    score: FloatArray
-    score_slope: FloatArray
-    score_sensitivity: FloatArray
-
-    @classmethod
-    def linearise(
-        cls,
-        model: ForwardModel,
-        parts: Sequence[FractionModel],
-        currents: FloatArray,
-        sigma: FloatArray,
-        start: FloatArray | None,
-    ) -> _ContactLinearisation:
-        found = estimate(model, currents, sigma, start)
-        positions = np.stack([found.x, found.y])
-        known = np.isfinite(positions).all(axis=0)
-        x, y = np.where(known, positions, [[model.a / 2], [model.b / 2]])
-        total = np.where(known, found.total, 1.0)
-        null, slope = _score_slopes(model, x, y, sigma, total)
-        if parts:
-            nominal = model.fractions(x, y)
-            by_part = np.zeros((len(parts), *nominal.shape))
-            for change, part in zip(by_part, parts, strict=True):
-                if part is not model:
-                    change += part.fractions(x * (part.a / model.a), y * (part.b / model.b)) - nominal
-            slope = np.concatenate([slope, -np.einsum("nc,pcn->pn", null, by_part * total / sigma)])
-        score = np.einsum("nc,cn->n", null, currents / sigma)
-        sharpness = total * np.linalg.norm(null.T / sigma, axis=0)
-        return cls(np.stack([x, y]), np.where(known, score, 0.0), slope * known, sharpness)
-
-
-def _score_slopes(
-    model: ForwardModel, x: FloatArray, y: FloatArray, sigma: FloatArray, total: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return left null vectors (n, 4) of fits at x, y (n,), and the slopes (3, n) of their scores by
-    gains."""
-    fractions, jacobian = model.fractions_with_jacobian(x, y)
-    if len(fractions) != 4:
-        raise ValueError(f"the model has {len(fractions)} channels: gains are estimated from four")
-    columns = np.moveaxis(np.concatenate([fractions[:, None], jacobian], axis=1) / sigma[:, None], 2, 0)
-    columns = columns / np.linalg.norm(columns, axis=1, keepdims=True)
-    null = np.linalg.qr(columns, mode="complete").Q[:, :, 3]
-    return null, _BASIS.T @ (null.T * total * fractions / sigma)
-
-
 def _inverse(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
-def _normalised_logs(gains: ArrayLike) -> FloatArray:
+def _normalised_logs(gains: ArrayLike, channels: int) -> FloatArray:
     values = np.asarray(gains, dtype=np.float64)
-    if values.shape != (4,) or not (values > 0).all() or not np.isfinite(values).all():
-        raise ValueError(f"gains {values}: must be four positive numbers")
+    if values.shape != (channels,) or not (values > 0).all() or not np.isfinite(values).all():
+        raise ValueError(f"gains {values}: must be {channels} positive numbers")
     logs = np.log(values)
     return np.asarray(logs - logs.mean())

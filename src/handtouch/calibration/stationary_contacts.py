@@ -25,7 +25,7 @@ _MAX_SAMPLES = 256
 
 @dataclass(frozen=True)
 class StationaryContact:
-    """Contact at rest: mean currents (4,), their noise (4,) [A], number of samples, time of the last."""
+    """Contact at rest: mean currents (c,), their noise (c,) [A], number of samples, time of the last."""
 
     currents: FloatArray
     noise: FloatArray
@@ -34,7 +34,10 @@ class StationaryContact:
 
 
 class StationaryContactDetector:
-    """Detector for the contacts of one pad; `add_sample` for every tick in which the pad is touched."""
+    """Detector for the contacts of one pad; `add_sample` for every tick in which the pad is touched.
+
+    noise_a: of a reading of each of its c channels, (c,) [A].
+    """
 
     def __init__(self, noise_a: FloatArray) -> None:
         self._noise = noise_a
@@ -42,12 +45,12 @@ class StationaryContactDetector:
         self._window: list[FloatArray] = []
         self._samples_to_skip = 0
         self._last_fractions: FloatArray | None = None
-        self._current_sum: FloatArray = np.zeros(4)
-        self._mean_fractions: FloatArray = np.zeros(4)
+        self._current_sum: FloatArray = np.zeros(len(noise_a))
+        self._mean_fractions: FloatArray = np.zeros(len(noise_a))
         self._sample_count, self._last_sync_ns = 0, 0
 
     def add_sample(self, contact_id: int, currents: FloatArray, sync_ns: int) -> StationaryContact | None:
-        """Add a sample (4,); return a stationary contact that is complete. `contact_id` 0: not touched."""
+        """Add a sample (c,); return a stationary contact that is complete. `contact_id` 0: not touched."""
         finished = None
         if contact_id != self._contact_id:
             finished = self._finish_contact()
@@ -64,7 +67,7 @@ class StationaryContactDetector:
         return self._process_window(window, sync_ns) or finished
 
     def _process_window(self, window: FloatArray, sync_ns: int) -> StationaryContact | None:
-        """Add a window (k, 4) to the stationary contact, or begin another with it."""
+        """Add a window (k, c) to the stationary contact, or begin another with it."""
         half = len(window) // 2
         mean = window.mean(axis=0)
         total = float(mean.sum())
@@ -102,7 +105,7 @@ class StationaryContactDetector:
         return StationaryContact(total / count, self._noise / np.sqrt(count), count, sync_ns)
 
     def _clear_sums(self) -> None:
-        self._current_sum = np.zeros(4)
+        self._current_sum = np.zeros(len(self._noise))
         self._sample_count = 0
 
 

@@ -6,6 +6,7 @@ Public: `StoreSchedule`; `RestoredSheet`, read from a stored sheet state by `res
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import msgpack
@@ -41,7 +42,7 @@ class TrackedState(Protocol):
 
     @property
     def offset_counts(self) -> FloatArray:
-        """Return the offsets (n, 4)."""
+        """Return the offsets (n, c), c channels of the pad with most."""
 
     @property
     def offset_std(self) -> FloatArray:
@@ -49,7 +50,7 @@ class TrackedState(Protocol):
 
     @property
     def noise_counts(self) -> FloatArray:
-        """Return the noise of readings (n, 4)."""
+        """Return the noise of readings (n, c)."""
 
     @property
     def back_n(self) -> FloatArray:
@@ -69,11 +70,12 @@ class TrackedState(Protocol):
 
 
 class StoreSchedule:
-    """Schedule of n pads; `update_block` with every block."""
+    """Schedule of pads with numbers of `channels` (n,); `update_block` with every block."""
 
-    def __init__(self, pads: int) -> None:
+    def __init__(self, channels: Sequence[int]) -> None:
         self._block: TrackedState | None = None
-        self._stored_offset_counts: FloatArray = np.full((pads, 4), np.nan)
+        self._channels, pads = channels, len(channels)
+        self._stored_offset_counts: FloatArray = np.full((pads, max(channels)), np.nan)
         self._stored_back_force_n = np.full(pads, np.nan)
         self._learned, self._stored_learned = np.full((2, pads, BANK_LEARNED), np.nan)
         self._next_ns = np.full(pads, -1, dtype=np.int64)
@@ -110,14 +112,16 @@ class StoreSchedule:
         return self._due_offsets(pad, self._block), self._due_sheet_state(pad, self._block)
 
     def _due_offsets(self, pad: int, block: TrackedState) -> Offsets | None:
-        offset, std, noise = block.offset_counts[pad], block.offset_std[pad], block.noise_counts[pad]
+        count, std = self._channels[pad], block.offset_std[pad]
+        offset, noise = block.offset_counts[pad, :count], block.noise_counts[pad, :count]
         if not np.isfinite(std):
             return None
-        moved = np.abs(offset - self._stored_offset_counts[pad])
+        moved = np.abs(offset - self._stored_offset_counts[pad, :count])
         if (moved < _MIN_OFFSET_CHANGE * np.maximum(1.0, noise)).all():  # False for NaN
             return None
-        self._stored_offset_counts[pad] = offset
-        return Offsets(channel_values(offset), channel_values(np.full(4, std**2 / 4)), channel_values(noise))
+        self._stored_offset_counts[pad, :count] = offset
+        variance = np.full(count, std**2 / count)
+        return Offsets(channel_values(offset), channel_values(variance), channel_values(noise))
 
     def _due_sheet_state(self, pad: int, block: TrackedState) -> StoredSheetState | None:
         back, std = float(block.back_n[pad]), float(block.back_std_n[pad])

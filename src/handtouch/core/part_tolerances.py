@@ -16,7 +16,7 @@ from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages.tolerances import PadTolerances
 from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.field.surface import Surface
-from handtouch.hand.pads import log_aspect_std, pad_surface, relative_size_stds
+from handtouch.hand.pads import log_aspect_std, metres_per_unit, pad_surface, relative_size_stds
 
 FloatArray = NDArray[np.float64]
 _M_PER_MM = 1e-3
@@ -33,7 +33,7 @@ def stage_tolerances(
     surface = pad_surface(pad)
     size_x, size_y = relative_size_stds(pad, sheet)
     aspect_std = log_aspect_std(pad, sheet)
-    end_stds = sheet.gap_std_mm * _M_PER_MM / np.array(_metres_per_unit(pad, network))
+    end_stds = sheet.gap_std_mm * _M_PER_MM / metres_per_unit(pad, network)
     end_vectors = np.ascontiguousarray(end_stds[:, None] * table.end_vectors)
     has_series = any(pad.series_ohm)
     elongations = _elongations(sheet, surface, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
@@ -68,9 +68,3 @@ def _elongations(sheet: config.Sheet, surface: Surface, x: FloatArray) -> FloatA
     inside = np.clip(x, 1e-6 * surface.a, (1 - 1e-6) * surface.a)
     along_x, along_y = surface.scales(inside, np.full(len(x), surface.b / 2))
     return np.ascontiguousarray(difference_m2 / (2 * math.sqrt(2)) / (along_x * along_y))
-
-
-def _metres_per_unit(pad: config.Pad, network: RectangleNetwork) -> list[float]:
-    """Return the length on the surface of a unit of the rectangle, along each electrode at each end."""
-    surface = pad_surface(pad)
-    return [float(surface.scales(end.x, end.y)[end.axis]) for end in network.ends]

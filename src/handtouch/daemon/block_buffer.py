@@ -13,19 +13,21 @@ from handtouch.supervisor.ipc import SampleBlock
 
 _MAX_BLOCK_NS = 100_000_000
 _MAX_BLOCK_BYTES = 60_000  # several blocks fit into a socket buffer
-_BYTES_PER_PAD_TICK = 30  # approximately
+_BYTES_PER_PAD_TICK, _BYTES_PER_CHANNEL = 14, 4
 _MAX_BLOCK_TICKS = 50
 
 
 class BlockBuffer:
-    """Collects ticks of `pads` pads; `add_tick` returns complete blocks, at least every 100 ms."""
+    """Collects ticks of pads with up to `channels` each; `add_tick` returns complete blocks, at least every
+    100 ms."""
 
-    def __init__(self, pads: int) -> None:
-        self.max_ticks = int(np.clip(_MAX_BLOCK_BYTES // (_BYTES_PER_PAD_TICK * pads), 1, _MAX_BLOCK_TICKS))
+    def __init__(self, pads: int, channels: int) -> None:
+        bytes_per_tick = (_BYTES_PER_PAD_TICK + _BYTES_PER_CHANNEL * channels) * pads
+        self.max_ticks = int(np.clip(_MAX_BLOCK_BYTES // bytes_per_tick, 1, _MAX_BLOCK_TICKS))
         k = self.max_ticks
         self._sync_ns: NDArray[np.int64] = np.zeros(k, np.int64)
         self._sample_ns: NDArray[np.int64] = np.zeros((k, pads), np.int64)
-        self._counts: NDArray[np.int32] = np.zeros((k, pads, 4), np.int32)
+        self._counts: NDArray[np.int32] = np.zeros((k, pads, channels), np.int32)
         self._fresh: NDArray[np.bool_] = np.zeros((k, pads), np.bool_)
         self._state: NDArray[np.uint8] = np.zeros((k, pads), np.uint8)
         self._contact_id: NDArray[np.uint32] = np.zeros((k, pads), np.uint32)

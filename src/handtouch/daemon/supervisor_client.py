@@ -48,18 +48,18 @@ from handtouch.supervisor.ipc import (
 from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
 
-_UNKNOWN_LOG_GAIN_COVARIANCE = 0.05**2 * (np.eye(4) - 0.25)
-"""Covariance of the log gains of an unknown sensor; their sum is not observable"""
-_MANUAL_LOG_GAIN_COVARIANCE = 0.01**2 * (np.eye(4) - 0.25)
-"""Covariance of manually set log gains: the error of measuring them with known currents"""
+_UNKNOWN_LOG_GAIN_STD = 0.05
+"""Standard deviation of the log gains of an unknown sensor"""
+_MANUAL_LOG_GAIN_STD = 0.01
+"""Standard deviation of manually set log gains: the error of measuring them with known currents"""
 _EXCITATION_OFF_TEXT = (
     "excitation off: the sheet has adapted to load and hides light touches; no contacts until another pad of "
     "the hand is touched, or other pads take their turn"
 )
 _IDENTIFIED_STATES = (NodeState.CONFIGURING, NodeState.OPERATIONAL)
 """States in which the identity of a node is known"""
-_POSITION_UNKNOWN_LOG_GAIN_COVARIANCE = 0.5**2 * (np.eye(4) - 0.25)
-"""Covariance where a fault makes positions invalid: about the size of the pad"""
+_POSITION_UNKNOWN_LOG_GAIN_STD = 0.5
+"""Standard deviation where a fault makes positions invalid: about the size of the pad"""
 _log = logging.getLogger("handtouch.supervisor")
 
 
@@ -103,7 +103,7 @@ class SupervisorClient:
         self._log_gain_covariance: list[NDArray[np.float64] | None] = [None] * pipeline.model.size
         self._parts: list[LearnedParts | None] = [None] * pipeline.model.size
         """of each pad; None: as the deployment states"""
-        self._block_buffer = BlockBuffer(pipeline.model.size)
+        self._block_buffer = BlockBuffer(pipeline.model.size, pipeline.model.channels)
         self._serials: list[int | None] = [None] * pipeline.model.size
         self._previous_serials: list[int | None] = [pad.serial for _, pad in self._pads]
         self._manual_parts: dict[int, set[str]] = {}
@@ -168,7 +168,8 @@ class SupervisorClient:
         replaced, or automatic calibration estimates better gains.
         """
         if "gains" in parts:
-            self._log_gain_covariance[pad], self._parts[pad] = _MANUAL_LOG_GAIN_COVARIANCE, None
+            self._log_gain_covariance[pad] = self._covariance_of(pad, _MANUAL_LOG_GAIN_STD)
+            self._parts[pad] = None
             self._update_uncertainty(pad, self._pipeline.calibrations[pad].quarantined)
         self._manual_parts[pad] = self._manual_parts.get(pad, set()) | set(parts)
         self._send_manual_calibration(pad, offset_counts)
@@ -263,14 +264,16 @@ class SupervisorClient:
         if serial is None or not given:
             return
         covariance = self._log_gain_covariance[pad]
-        covariance = self._pipeline.model.gain_covariance[pad] if covariance is None else covariance
+        if covariance is None:
+            count = self._channels(pad)
+            covariance = self._pipeline.model.gain_covariance[pad, :count, :count]
         calibration = self._pipeline.calibrations[pad]
-        law, (x0, xa, y0, yb) = calibration.law, calibration.gains
+        law = calibration.law
         message = CalibrationUpdate(
             pad=pad,
             serial=serial,
             calibration_id=calibration.calibration_id,
-            gains=(x0, xa, y0, yb),
+            gains=calibration.gains,
             covariance=tuple(covariance.ravel().tolist()),
             parts=self._parts[pad],
             offset_counts=channel_values(offset_counts) if offset_counts is not None else None,
@@ -284,7 +287,8 @@ class SupervisorClient:
         """Discard the calibration of a pad whose node was replaced, until the new node is calibrated."""
         pipeline = self._pipeline
         default = pipeline.model.default_calibration(pad)
-        self._log_gain_covariance[pad], self._parts[pad] = _UNKNOWN_LOG_GAIN_COVARIANCE, None
+        self._log_gain_covariance[pad] = self._covariance_of(pad, _UNKNOWN_LOG_GAIN_STD)
+        self._parts[pad] = None
         self._manual_parts.pop(pad, None)
         self._unconfirmed_calibrations.pop(pad, None)
         self._position_unreliable[pad], self._degrading_kinds[pad] = False, (FaultKind.NODE_REPLACED.value,)
@@ -302,7 +306,9 @@ class SupervisorClient:
     def _set_calibration(self, pad: int, calibration: ActiveCalibration, quarantined: bool) -> None:
         """Apply a calibration with what is known about its quality."""
         unreliable = bool(self._position_unreliable[pad])
-        covariance = _POSITION_UNKNOWN_LOG_GAIN_COVARIANCE if unreliable else self._log_gain_covariance[pad]
+        covariance = self._log_gain_covariance[pad]
+        if unreliable:
+            covariance = self._covariance_of(pad, _POSITION_UNKNOWN_LOG_GAIN_STD)
         self._pipeline.set_calibration(
             pad,
             replace(
@@ -325,7 +331,7 @@ class SupervisorClient:
             return
         if isinstance(message, WorkerStatus):
             self._worker_status = message
-        elif message.pad >= len(self._pads):
+        elif message.pad >= len(self._pads) or not self._has_channels(message):
             self.malformed += 1
         elif message.serial != self._serials[message.pad]:
             self.late += 1
@@ -351,11 +357,11 @@ class SupervisorClient:
         law = before.law if message.law is None else LawParameters(**message.law.model_dump())
         self._log_gain_covariance[pad], self._parts[pad] = None, message.parts
         if message.covariance is not None:
-            self._log_gain_covariance[pad] = np.reshape(message.covariance, (4, 4))
+            self._log_gain_covariance[pad] = np.reshape(message.covariance, (len(message.gains), -1))
         calibration = replace(before, calibration_id=message.calibration_id, gains=message.gains, law=law)
         self._set_calibration(pad, calibration, before.quarantined)
         if offsets is not None:
-            pipeline.add_event(BaselineEvent(pad, offsets, message.offset_std or (0.0,) * 4))
+            pipeline.add_event(BaselineEvent(pad, offsets, message.offset_std or (0.0,) * len(offsets)))
         if message.back_n is not None:
             pipeline.add_event(BackForceEvent(pad, message.back_n, message.back_std_n, message.learned))
         self.changed_pads.add(pad)
@@ -394,6 +400,18 @@ class SupervisorClient:
             {diagnosis.kind for diagnosis in message.diagnoses},
         ) or before is None:
             self.changed_pads.add(pad)
+
+    def _channels(self, pad: int) -> int:
+        return int(self._pipeline.model.electrode_counts[pad])
+
+    def _has_channels(self, message: WorkerMessage) -> bool:
+        """Return whether a message has as many gains as its pad has channels, if any."""
+        return not isinstance(message, CalibrationUpdate) or len(message.gains) == self._channels(message.pad)
+
+    def _covariance_of(self, pad: int, std: float) -> NDArray[np.float64]:
+        """Return the covariance of log gains of a standard deviation; their sum is not observable."""
+        count = self._channels(pad)
+        return std**2 * (np.eye(count) - 1 / count)
 
     def _excitation_off_diagnosis(self, pad: int) -> dict[str, Any]:
         back_n = float(self._pipeline.tick.sheet_force.back_force[0][pad])

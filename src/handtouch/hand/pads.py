@@ -1,7 +1,8 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
 Public names: `pad_surface`, `mount_transform`, `pad_network`, `electrode_network`, `models_with_other_parts`,
-`part_stds`, `relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
+`part_stds`, `metres_per_unit`, `relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`,
+`MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def pad_network(pad: config.Pad, sheet: config.Sheet) -> RectangleNetwork:
 def electrode_network(
     pad: config.Pad, sheet: config.Sheet, gap_offsets_m: ArrayLike = 0.0, log_aspect: float = 0.0
 ) -> ElectrodeNetwork:
-    """Return the pad's electrodes on its rectangle, with the bare corners as measured on the surface.
+    """Return the four electrodes of a pad on its rectangle, with the bare corners as measured on the surface.
 
     Raises ValueError for a pad with electrodes on arcs of its outline, which has a `pad_network` only.
 
@@ -92,7 +93,7 @@ def electrode_network(
 
 
 def models_with_other_parts(
-    nominal: ElectrodeNetwork, pad: config.Pad, node: config.Node, sheet: config.Sheet
+    nominal: RectangleNetwork, pad: config.Pad, node: config.Node, sheet: config.Sheet
 ) -> tuple[FractionModel, ...]:
     """Return models in each of which one part of the pad differs by one standard deviation; gains aside.
 
@@ -101,10 +102,13 @@ def models_with_other_parts(
     stds, ohm = part_stds(pad, node, sheet), np.array(pad.series_ohm)
     models: list[FractionModel] = []
     gap_std_m = sheet.gap_std_mm * _M_PER_MM
-    models += [electrode_network(pad, sheet, gap_std_m * end) for end in np.eye(8).reshape(8, 4, 2)]
-    models.append(electrode_network(pad, sheet, log_aspect=log_aspect_std(pad, sheet)))
+    steps = gap_std_m / metres_per_unit(pad, nominal)
+    models += [nominal.with_moved_end(end, step) for end, step in enumerate(steps.tolist())]
+    models.append(nominal.stretched(math.exp(log_aspect_std(pad, sheet))))
     models += [UnevenSheet(nominal, wave, sheet.unevenness_std) for wave in range(len(UNEVEN_WAVES))]
-    changes = [node.series_std * one for one in np.eye(4)] + [np.full(4, -sheet.ohm_per_square_std)]
+    changes = [node.series_std * one for one in np.eye(len(ohm))] + [
+        np.full(len(ohm), -sheet.ohm_per_square_std)
+    ]
     models += [nominal.with_series_ohm(ohm * np.exp(change)) for change in changes]
     return tuple(model if std else nominal for model, std in zip(models, stds, strict=True))
 
@@ -115,9 +119,21 @@ def part_stds(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[
     Gaps [mm] at both ends of each electrode; logarithms of the ratio of the sides, of the waves of the sheet
     resistance (`UNEVEN_WAVES`), of each series resistor, and of the sheet resistance beside these.
     """
-    resistors = (*(node.series_std,) * 4, sheet.ohm_per_square_std) if any(pad.series_ohm) else (0.0,) * 5
+    count = len(pad.electrode_names)
+    resistors = (*(node.series_std,) * count, sheet.ohm_per_square_std)
+    if not any(pad.series_ohm):
+        resistors = (0.0,) * (count + 1)
     waves = (sheet.unevenness_std,) * len(UNEVEN_WAVES)
-    return (*(sheet.gap_std_mm,) * 8, log_aspect_std(pad, sheet), *waves, *resistors)
+    return (*(sheet.gap_std_mm,) * (2 * count), log_aspect_std(pad, sheet), *waves, *resistors)
+
+
+def metres_per_unit(pad: config.Pad, network: RectangleNetwork) -> NDArray[np.float64]:
+    """Return the length on the surface of a unit of the rectangle, along each electrode at each end, (2 c,).
+
+    `network`: the pad's.
+    """
+    surface = pad_surface(pad)
+    return np.array([float(surface.scales(end.x, end.y)[end.axis]) for end in network.ends])
 
 
 def relative_size_stds(pad: config.Pad, sheet: config.Sheet) -> tuple[float, float]:

@@ -11,15 +11,22 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, ValidationError, field_validator
+from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
 from handtouch.calibration.auto_calibration import CalibrationState
-from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LearnedParts
+from handtouch.calibration.calibration import (
+    MAX_CHANNELS,
+    MAX_GAIN,
+    MIN_CHANNELS,
+    MIN_GAIN,
+    ChannelValues,
+    LearnedParts,
+)
 from handtouch.config import Deployment, Table
 from handtouch.sheet import BANK_LEARNED, check_learned
 from handtouch.wire.diagnosis import Diagnosis
@@ -30,7 +37,6 @@ MAX_TEXT = 1000
 """Number of characters of a text in a message."""
 FloatArray = NDArray[np.float64]
 ShortText = Annotated[str, Field(max_length=MAX_TEXT)]
-FourFloats = tuple[float, float, float, float]
 FloatTriple = tuple[float, float, float]
 GainFactor = Annotated[float, Field(ge=MIN_GAIN, le=MAX_GAIN)]
 PositiveFloat = Annotated[float, Field(gt=0)]
@@ -46,8 +52,9 @@ class WorkerMessageError(ValueError):
 class WorkerConfig:
     """Configuration of the supervisor process; pads in the order of the deployment.
 
-    default_calibration_ids: of the deployment file's own calibrations. ampere_per_count (n, 4) without any
-    calibration; noise_counts (n,). store: path of the calibration store.
+    default_calibration_ids: of the deployment file's own calibrations. ampere_per_count (n, c) without any
+    calibration, c channels of the pad with most, 0 beyond a pad's own; noise_counts (n,). store: path of the
+    calibration store.
     """
 
     deployment: Deployment
@@ -83,11 +90,11 @@ class WorkerConfig:
 
 @dataclass(frozen=True)
 class SampleBlock:
-    """k ticks of all n pads; electrodes in the order x0, xa, y0, yb.
+    """k ticks of all n pads; c channels of the pad with most, in the order of its electrodes.
 
-    sync_ns (k,); sample_ns (k, n); counts (k, n, 4), raw; fresh (k, n): the sample belongs to the tick;
-    pad_state (k, n) PadState; contact_id (k, n), 0 for none; at the end of the block: offset_counts (n, 4),
-    standard deviation offset_std (n,) of their sum, NaN if unknown, noise_counts (n, 4) as estimated; back_n
+    sync_ns (k,); sample_ns (k, n); counts (k, n, c), raw; fresh (k, n): the sample belongs to the tick;
+    pad_state (k, n) PadState; contact_id (k, n), 0 for none; at the end of the block: offset_counts (n, c),
+    standard deviation offset_std (n,) of their sum, NaN if unknown, noise_counts (n, c) as estimated; back_n
     and back_std_n (n,): back force of the sheets [N], to which they have adapted, NaN if unknown; learned
     (`sheet.BANK_LEARNED`,): learned behaviour of the sheet of one pad, `learned_pad` (), another one in each
     block, NaN if not modelled.
@@ -110,21 +117,22 @@ class SampleBlock:
     def dump(self) -> bytes:
         """Return the block as msgpack."""
         parts = {name: np.ascontiguousarray(value).tobytes() for name, value in vars(self).items()}
-        packed: bytes = msgpack.packb({"kind": "block", "ticks": len(self.sync_ns), **parts})
+        shape = {"ticks": len(self.sync_ns), "channels": self.counts.shape[2]}
+        packed: bytes = msgpack.packb({"kind": "block", **shape, **parts})
         return packed
 
 
-_BLOCK_LAYOUT: dict[str, tuple[str, int, bool]] = {  # dtype, elements per pad, one row per tick
-    "sample_ns": ("<i8", 1, True),
-    "counts": ("<i4", 4, True),
-    "fresh": ("?", 1, True),
-    "pad_state": ("u1", 1, True),
-    "contact_id": ("<u4", 1, True),
-    "offset_counts": ("<f8", 4, False),
-    "offset_std": ("<f8", 1, False),
-    "noise_counts": ("<f8", 4, False),
-    "back_n": ("<f8", 1, False),
-    "back_std_n": ("<f8", 1, False),
+_BLOCK_LAYOUT: dict[str, tuple[str, bool, bool]] = {  # dtype, one element per channel, one row per tick
+    "sample_ns": ("<i8", False, True),
+    "counts": ("<i4", True, True),
+    "fresh": ("?", False, True),
+    "pad_state": ("u1", False, True),
+    "contact_id": ("<u4", False, True),
+    "offset_counts": ("<f8", True, False),
+    "offset_std": ("<f8", False, False),
+    "noise_counts": ("<f8", True, False),
+    "back_n": ("<f8", False, False),
+    "back_std_n": ("<f8", False, False),
 }
 
 
@@ -137,12 +145,12 @@ def pack_serials(now: Sequence[int | None], before: Sequence[int | None], sync_n
 
 def unpack_block(message: dict[str, Any], pads: int) -> SampleBlock:
     """Return the block in a message of the daemon, which is trusted."""
-    ticks = int(message["ticks"])
+    ticks, channels = int(message["ticks"]), int(message["channels"])
     whole = {"sync_ns": "<i8", "learned_pad": "<i4", "learned": "<f8"}
     arrays: dict[str, Any] = {name: np.frombuffer(message[name], kind) for name, kind in whole.items()}
     arrays["learned_pad"] = arrays["learned_pad"].reshape(())
-    for name, (kind, width, per_tick) in _BLOCK_LAYOUT.items():
-        shape = (*((ticks,) if per_tick else ()), pads, *((width,) if width > 1 else ()))
+    for name, (kind, per_channel, per_tick) in _BLOCK_LAYOUT.items():
+        shape = (*((ticks,) if per_tick else ()), pads, *((channels,) if per_channel else ()))
         arrays[name] = np.frombuffer(message[name], kind).reshape(shape)
     return SampleBlock(**arrays)
 
@@ -172,25 +180,38 @@ class ContactLawMessage(Table):
 class CalibrationUpdate(Table):
     """Calibration to apply to a pad, as long as its node has this serial number.
 
-    covariance: (4, 4) of log gains, row by row; None, as the deployment states. parts: of the pad, learned
-    with the gains; None, as the deployment states. If known: offset_counts and their standard deviations, per
-    channel; contact law; back_n, back_std_n: back force [N] of its sheet; learned: its behaviour, as
-    `sheet.ModelBank.learned`, or empty.
+    covariance: (c, c) of the log gains of c channels, row by row; None, as the deployment states. parts: of
+    the pad, learned with the gains; None, as the deployment states. If known: offset_counts and their
+    standard deviations, per channel; contact law; back_n, back_std_n: back force [N] of its sheet; learned:
+    its behaviour, as `sheet.ModelBank.learned`, or empty.
     """
 
     kind: Literal["calibration"] = "calibration"
     pad: PadIndex
     serial: Serial
     calibration_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
-    gains: tuple[GainFactor, GainFactor, GainFactor, GainFactor]
-    covariance: Annotated[tuple[float, ...], Field(min_length=16, max_length=16)] | None = None
+    gains: Annotated[tuple[GainFactor, ...], Field(min_length=MIN_CHANNELS, max_length=MAX_CHANNELS)]
+    covariance: tuple[float, ...] | None = None
     parts: LearnedParts | None = None
-    offset_counts: FourFloats | None = None
-    offset_std: FourFloats | None = None
+    offset_counts: ChannelValues | None = None
+    offset_std: ChannelValues | None = None
     law: ContactLawMessage | None = None
     back_n: Annotated[float, Field(ge=0)] | None = None
     back_std_n: Annotated[float, Field(ge=0)] = 0.0
     learned: tuple[float, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_channels(self) -> Self:
+        count = len(self.gains)
+        if self.covariance is not None and len(self.covariance) != count**2:
+            raise ValueError(f"covariance: has {len(self.covariance)} values for {count} gains")
+        if self.parts is not None and len(self.parts.covariance) - len(self.parts.offsets) != count:
+            raise ValueError(f"parts: were learned with another number of gains than {count}")
+        for name in ("offset_counts", "offset_std"):
+            values = getattr(self, name)
+            if values is not None and len(values) != count:
+                raise ValueError(f"{name}: has {len(values)} values for {count} gains")
+        return self
 
     @field_validator("learned")
     @classmethod

@@ -31,8 +31,8 @@ from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.field.model import FractionModel
-from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import electrode_network, models_with_other_parts, part_stds
+from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.hand import models_with_other_parts, pad_network, part_stds
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
     MAX_TEXT,
@@ -68,7 +68,7 @@ class Diagnostics(Protocol):
         """Process a block; return the active diagnoses, each with its pad."""
 
     def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
-        """Set the offsets (4,) of a pad from which static loads are detected."""
+        """Set the offsets (c,) of a pad from which static loads are detected."""
 
     def set_gains(self, pad: int, gains: Gains) -> None:
         """Set the gains of a pad, with their covariance, and discard its contacts so far."""
@@ -81,6 +81,7 @@ class _PadEntry:
     mounting_point: MountingPoint
     calibrator: AutoCalibrator
     contact_detector: StationaryContactDetector
+    channels: int
     version_number: int = 0
     """number of the newest stored version of the node, 0 for none"""
     rejection_reason: str = ""
@@ -89,7 +90,7 @@ class _PadEntry:
     """origin of its calibration, if taken over from another node"""
     last_assessment: CalibrationAssessment | None = None
     stored_zero: tuple[FloatArray, FloatArray] | None = None
-    """stored offsets (4,) of the node and their present standard deviations (4,), if any"""
+    """stored offsets (c,) of the node and their present standard deviations (c,), if any"""
     zero_settling_ns: int = 0
     """remaining time in which its zero tracks the daemon's baseline"""
 
@@ -105,27 +106,25 @@ class SupervisorWorker:
     ) -> None:
         deployment = start.deployment
         entries = deployment.pads
-        models: dict[object, tuple[ElectrodeNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}
+        models: dict[object, tuple[RectangleNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}
         self._pads = []
         noise = start.noise_counts[:, None] * start.ampere_per_count
         for number, (hand, pad) in enumerate(entries):
             design, sheet = (
-                (pad.surface, pad.gaps_mm, pad.series_ohm, pad.sheet, pad.node),
+                (pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.sheet, pad.node),
                 deployment.sheets[pad.sheet],
             )
             if design not in models:
-                network, node = electrode_network(pad, sheet), deployment.nodes[pad.node]
+                network, node = pad_network(pad, sheet), deployment.nodes[pad.node]
                 others = models_with_other_parts(network, pad, node, sheet)
                 models[design] = network, others, part_stds(pad, node, sheet)
             mounting_point = MountingPoint(hand, pad.link, start.default_calibration_ids[number])
-            self._pads.append(
-                _PadEntry(
-                    mounting_point, AutoCalibrator(*models[design]), StationaryContactDetector(noise[number])
-                )
-            )
+            channels = len(pad.electrode_names)
+            detector = StationaryContactDetector(noise[number, :channels])
+            self._pads.append(_PadEntry(mounting_point, AutoCalibrator(*models[design]), detector, channels))
         self._ampere_per_count = start.ampere_per_count
         self._store, self._diagnostics = store, diagnostics
-        self._store_schedule = StoreSchedule(len(entries))
+        self._store_schedule = StoreSchedule([row.channels for row in self._pads])
         self._diagnoses: dict[int, list[Diagnosis]] = {}
         self._latest_sync_ns = self._status_sent_ns = self._store_polled_ns = 0
 
@@ -190,7 +189,7 @@ class SupervisorWorker:
             row.stored_zero, row.zero_settling_ns = None, _ZERO_SETTLING_NS
             if self._diagnostics is not None:
                 self._diagnostics.set_gains(pad, row.calibrator.gains)
-                self._diagnostics.set_offsets(pad, np.zeros(4))
+                self._diagnostics.set_offsets(pad, np.zeros(row.channels))
             name = f"{row.mounting_point.hand}/{row.mounting_point.link}"
             _log.info(
                 "%s: node with serial %d: calibration %s%s", name, serial, row.calibrator.calibration_state,
@@ -240,7 +239,7 @@ class SupervisorWorker:
             return
         if "gains" in given:
             row.foreign_source = ""
-            covariance = np.reshape(update.covariance or (0.0,) * 16, (4, 4))
+            covariance = np.reshape(update.covariance or (0.0,) * row.channels**2, (row.channels, -1))
             row.calibrator.apply_gains(Gains(update.gains, matrix(covariance), update.parts))
         if "law" in given:
             row.calibrator.accept_measured_law()
@@ -272,7 +271,8 @@ class SupervisorWorker:
         if not row.calibrator.can_learn or pad in self._diagnoses:  # nothing is learnt from a faulty pad
             return
         fresh = block.fresh[:, pad]
-        currents = (block.counts[:, pad] - block.offset_counts[pad]) * self._ampere_per_count[pad]
+        counts = block.counts[:, pad] - block.offset_counts[pad]
+        currents = (counts * self._ampere_per_count[pad])[:, : row.channels]
         for sync_ns, contact_id, reading in zip(
             block.sync_ns[fresh].tolist(), block.contact_id[fresh, pad].tolist(), currents[fresh], strict=True
         ):
@@ -343,7 +343,7 @@ class SupervisorWorker:
             if row.zero_settling_ns <= 0 or not np.isfinite(block.offset_std[pad]):
                 continue
             row.zero_settling_ns -= elapsed_ns
-            offset = block.offset_counts[pad]
+            offset = block.offset_counts[pad, : row.channels]
             if row.stored_zero is not None:
                 stored, std = row.stored_zero
                 if (np.abs(offset - stored) > _MAX_ZERO_CHANGE_SIGMA * std).any():
@@ -360,7 +360,11 @@ class SupervisorWorker:
         update = _calibration_update(pad, version.serial, version.calibration_id, gains)
         found: dict[str, Any] = {}
         if not known.gains and row.calibrator.calibration_state is CalibrationState.DEFAULT:
-            found = {"gains": (1.0,) * 4, "covariance": None, "parts": None}  # as in the deployment file
+            found = {
+                "gains": (1.0,) * row.channels,
+                "covariance": None,
+                "parts": None,
+            }  # as in the deployment file
         if known.offsets:
             found["offset_counts"] = known.offsets.counts
             found["offset_std"] = channel_values(np.sqrt(known.offsets.variance))
