@@ -12,8 +12,9 @@ import pytest
 
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.config import load, shipped
-from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
+from handtouch.config.channels import order_by_electrode, resolve_channels
 from handtouch.config.eds import EdsError
+from handtouch.config.tables import SIDE_ELECTRODES
 
 PAD = load(shipped.path("utah_mit.toml")).pads[0].pad
 Make = Callable[..., Any]
@@ -42,7 +43,7 @@ def make_kind(make_rig: Make, kind: str, size: int = 2, **more: Any) -> Any:
         "channels": tuple((c.index, c.sub) for c in channels),
         "counts_per_unit": tuple(c.counts_per_unit for c in channels),
     } | more.pop("device", {})
-    pad = PAD.model_copy(update={"electrodes": more.pop("electrodes", ELECTRODES)})
+    pad = PAD.model_copy(update={"electrodes": more.pop("electrodes", SIDE_ELECTRODES)})
     rig = make_rig(size, device=device, **{"eds": path, "channels": order_by_electrode(channels, pad)} | more)
     rig.counts[:] = KINDS[kind][1]
     return rig
@@ -75,13 +76,13 @@ def test_node_of_another_vendor_comes_back_after_a_reboot(make_rig: Make, kind: 
     assert rig.slab.unpack_counts().tolist() == [list(KINDS[kind][1])] * 2
 
 
-@pytest.mark.parametrize("wired", [*itertools.permutations(ELECTRODES)][::5])
+@pytest.mark.parametrize("wired", [*itertools.permutations(SIDE_ELECTRODES)][::5])
 def test_channels_are_reordered_by_electrode(make_rig: Make, wired: tuple[str, ...]) -> None:
     rig = make_kind(make_rig, "hapt24.dcf", 1, electrodes=wired)
     rig.counts[:] = (1, 2, 3, 4)
     rig.boot()
     rig.run(10)
-    assert rig.slab.unpack_counts().tolist() == [[wired.index(name) + 1 for name in ELECTRODES]]
+    assert rig.slab.unpack_counts().tolist() == [[wired.index(name) + 1 for name in SIDE_ELECTRODES]]
 
 
 def test_lost_part_of_a_sample_discards_only_that_sample(make_rig: Make) -> None:

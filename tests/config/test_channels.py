@@ -9,7 +9,6 @@ import pytest
 
 from handtouch.config import parse, shipped
 from handtouch.config.channels import (
-    ELECTRODES,
     STANDARD_CHANNELS,
     Channel,
     order_by_electrode,
@@ -18,6 +17,7 @@ from handtouch.config.channels import (
     resolve_channels,
 )
 from handtouch.config.eds import REAL32, EdsError, ValueType
+from handtouch.config.tables import SIDE_ELECTRODES
 from tests.deployments import deployment_text, pad_text
 
 FOLDER = Path(__file__).parent.parent / "data" / "eds"
@@ -103,9 +103,9 @@ def test_real32_channels_have_their_counts_per_unit() -> None:
 
 def test_order_of_electrodes_is_that_of_the_pad_whatever_the_wiring() -> None:
     pad = parse(deployment_text(pad_text("plane", 1))).pads[0].pad
-    for wired in itertools.permutations(ELECTRODES):
+    for wired in itertools.permutations(SIDE_ELECTRODES):
         ordered = order_by_electrode(STANDARD_CHANNELS, pad.model_copy(update={"electrodes": wired}))
-        assert [wired[channel.sub - 1] for channel in ordered] == list(ELECTRODES)
+        assert [wired[channel.sub - 1] for channel in ordered] == list(SIDE_ELECTRODES)
 
 
 def test_written_objects_need_their_type() -> None:

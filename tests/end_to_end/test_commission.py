@@ -17,7 +17,7 @@ import struct
 import subprocess
 import sys
 import termios
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.canbus.bus.port import open_bus
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.device import DeviceBus
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -77,7 +77,7 @@ class PressableHand:
         self.nodes = DeviceBus(self._bus, self._sample)
         for pad in pads:
             device = self.nodes.add(pad.node_id, serial=pad.serial)
-            device.wiring = tuple(map(ELECTRODES.index, pad.electrodes))
+            device.wiring = tuple(map(SIDE_ELECTRODES.index, pad.electrodes))
         self.nodes.start()
 
     def press(self, link: str, near: str, hard: str) -> None:
@@ -115,8 +115,8 @@ def scramble(text: str, seed: int) -> tuple[str, str]:
         block = block.replace('node = "four_channel"\n', kind)
         block = block.replace(f"= {ids[number]}\n", f"= {ids[number]} # as printed on it\n")
         guessed = number % 3 == 0  # the file has some order
-        order, guess = chance.sample(ELECTRODES, 4), chance.sample(ELECTRODES, 4)
-        stated = guessed or order != list(ELECTRODES)
+        order, guess = chance.sample(SIDE_ELECTRODES, 4), chance.sample(SIDE_ELECTRODES, 4)
+        stated = guessed or order != list(SIDE_ELECTRODES)
         right.append(block.replace(kind, kind + _key(order)) if stated else block)
         block = block.replace(f"= {ids[number]} ", f"= {other_ids[number]} ")
         block = block.replace(f"serial = {serials[number]}", f"serial = {other_serials[number]}")
@@ -126,7 +126,7 @@ def scramble(text: str, seed: int) -> tuple[str, str]:
     return "".join(wrong), "".join(right)
 
 
-def _key(order: list[str]) -> str:
+def _key(order: Sequence[str]) -> str:
     return f"electrodes = [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in order)}]\n"
 
 

@@ -24,7 +24,7 @@ from handtouch.canbus.nodes.spec import NodeStatus
 from handtouch.cli import commission_text
 from handtouch.cli.commission_text import format_table
 from handtouch.config import shipped
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.device import Device, DeviceBus
 from handtouch.hand import electrode_network, pad_surface
 from handtouch.procedures.commission.deployment_edit import apply_edits
@@ -242,7 +242,7 @@ def test_electrode_order_is_found_whatever_the_file_contains(
     made: Callable[..., Pads], order: tuple[str, ...]
 ) -> None:
     pads = made("index_middle")
-    pads.devices["index_middle"].wiring = tuple(map(ELECTRODES.index, order))
+    pads.devices["index_middle"].wiring = tuple(map(SIDE_ELECTRODES.index, order))
     outcomes, _ = run_commissioning(
         pads, SimulatedUser(pads), with_pads(pads.truth, index_middle={"electrodes": order[::-1]})
     )
@@ -299,8 +299,8 @@ def test_randomly_wired_hand_is_found(made: Callable[..., Pads]) -> None:
     wrong: dict[str, dict[str, Any]] = {}
     others = chance.sample(hand.pads, len(hand.pads))
     for pad, other in zip(hand.pads, others, strict=True):
-        right[pad.link] = {"electrodes": tuple(chance.sample(ELECTRODES, 4))}
-        pads.devices[pad.link].wiring = tuple(map(ELECTRODES.index, right[pad.link]["electrodes"]))
+        right[pad.link] = {"electrodes": tuple(chance.sample(SIDE_ELECTRODES, 4))}
+        pads.devices[pad.link].wiring = tuple(map(SIDE_ELECTRODES.index, right[pad.link]["electrodes"]))
         wrong[pad.link] = {"node_id": other.node_id, "serial": other.serial}
     outcomes, procedure = run_commissioning(
         pads, SimulatedUser(pads), with_pads(pads.truth, **wrong), assume_yes=True
@@ -328,8 +328,8 @@ def test_dead_channel_is_named_and_the_order_still_found(
 ) -> None:
     pads = made("palm_thumb")
     order = ("yb", "x0", "y0", "xa")
-    pads.devices["palm_thumb"].wiring = tuple(map(ELECTRODES.index, order))
-    pads.devices["palm_thumb"].open_electrodes = {ELECTRODES.index("y0")}
+    pads.devices["palm_thumb"].wiring = tuple(map(SIDE_ELECTRODES.index, order))
+    pads.devices["palm_thumb"].open_electrodes = {SIDE_ELECTRODES.index("y0")}
     outcomes, _ = run_commissioning(pads, SimulatedUser(pads))
     assert outcomes["palm_thumb"].electrodes == order
     assert outcomes["palm_thumb"].problems == [
@@ -349,7 +349,7 @@ def test_stuck_noisy_and_offset_channels_are_named(made: Callable[..., Pads]) ->
     negative, noisy = outcomes["palm_heel"].problems
     assert negative == "channel 1 has a negative reading of -80 counts at rest"
     assert re.fullmatch(r"channel 3 is noisy: [45]\.\d counts, noise_counts = 1 is configured", noisy)
-    assert all(outcome.electrodes == ELECTRODES for outcome in outcomes.values())
+    assert all(outcome.electrodes == SIDE_ELECTRODES for outcome in outcomes.values())
 
 
 def test_pad_without_response_is_reported_with_causes_and_others_continue(
@@ -415,12 +415,12 @@ def test_saturating_press_is_repeated(made: Callable[..., Pads]) -> None:
 def test_unequal_channel_scales_are_taken_into_account(made: Callable[..., Pads]) -> None:
     pads = made("palm_heel", channel_scale=(4.0, 1.0, 1.0, 0.5))
     order = ("y0", "xa", "x0", "yb")
-    pads.devices["palm_heel"].wiring = tuple(map(ELECTRODES.index, order))
+    pads.devices["palm_heel"].wiring = tuple(map(SIDE_ELECTRODES.index, order))
     electrode_scale = {"y0": 4.0, "xa": 1.0, "x0": 1.0, "yb": 0.5}
 
     def press(near: ElectrodeName | None) -> None:
         pads.press("palm_heel", near)
-        pads.currents[0] /= [electrode_scale[name] for name in ELECTRODES]
+        pads.currents[0] /= [electrode_scale[name] for name in SIDE_ELECTRODES]
 
     outcomes, _ = run_commissioning(pads, SimulatedUser(pads, instead={"palm_heel": press}))
     assert outcomes["palm_heel"].electrodes == order

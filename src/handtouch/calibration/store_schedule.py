@@ -87,18 +87,17 @@ class StoreSchedule:
 
     def reset_pad(self, pad: int) -> None:
         """Restart the schedule of a pad, whose node was replaced."""
-        self._stored_offset_counts[pad], self._stored_back_force_n[pad], self._next_ns[pad] = (
-            np.nan,
-            np.nan,
-            -1,
-        )
-        self._learned[pad] = self._stored_learned[pad] = np.nan
+        self._forget_stored(pad)
+        self._learned[pad] = np.nan
+        self._next_ns[pad] = -1
 
     def retry_pad(self, pad: int, now_ns: int) -> None:
         """Store a pad's parts again in a minute: they couldn't be written."""
-        self._stored_offset_counts[pad], self._stored_back_force_n[pad] = np.nan, np.nan
-        self._stored_learned[pad] = np.nan
+        self._forget_stored(pad)
         self._next_ns[pad] = now_ns + _FIRST_STORE_DELAY_NS
+
+    def _forget_stored(self, pad: int) -> None:
+        self._stored_offset_counts[pad] = self._stored_back_force_n[pad] = self._stored_learned[pad] = np.nan
 
     def due_parts(
         self, pad: int, now_ns: int, last: bool = False

@@ -2,7 +2,7 @@
 
 A channel is an integer, its count, or REAL32: count = value x counts per unit, rounded.
 
-Public names: `Channel`, `Channels`, `WritableObject`, `STANDARD_CHANNELS`, `ELECTRODES`, `PROFILE_TYPES`,
+Public names: `Channel`, `Channels`, `WritableObject`, `STANDARD_CHANNELS`, `PROFILE_TYPES`,
 `resolve_channels`, `order_by_electrode`, `parse_object`, `parse_writable_object`, `full_scale_counts`,
 `max_count`, `integer_limits`.
 """
@@ -18,7 +18,6 @@ from pathlib import Path
 from handtouch.config import Node, Pad, eds
 from handtouch.config.eds import REAL32, ValueType
 
-ELECTRODES = ("x0", "xa", "y0", "yb")
 MAX_CHANNEL_BITS = 32
 _OBJECT_PATTERN = re.compile(
     r"0x([0-9A-Fa-f]{4}):(0x[0-9A-Fa-f]{1,2}|\d{1,3})"

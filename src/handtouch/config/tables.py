@@ -27,7 +27,8 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)
 Output = Literal["position", "force", "raw", "palm", "base", "motion", "stiffness", "shape", "texture"]
 Ends = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
 MIN_ELECTRODES, MAX_ELECTRODES = 3, 16
-SIDE_ELECTRODES = ("x0", "xa", "y0", "yb")
+Electrode = Literal["x0", "xa", "y0", "yb"]
+SIDE_ELECTRODES: tuple[Electrode, ...] = ("x0", "xa", "y0", "yb")
 _PerChannel = Field(strict=False, min_length=MIN_ELECTRODES, max_length=MAX_ELECTRODES)
 PositivePerChannel = Annotated[tuple[Positive, ...], _PerChannel]
 Arc = Annotated[tuple[float, float], Field(strict=False)]

@@ -177,7 +177,7 @@ class PadModel:
 
         Parts that the calibration lacks are the deployment's.
         """
-        gains = calibration.gains.factors if calibration.gains else (1.0,) * int(self.electrode_counts[pad])
+        gains = calibration.gains.factors if calibration.gains else self.default_calibration(pad).gains
         self.set_gains_and_law(pad, gains, name, calibration.law)
 
     def set_calibration(self, pad: int, calibration: ActiveCalibration) -> None:

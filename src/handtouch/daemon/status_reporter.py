@@ -322,7 +322,7 @@ class StatusReporter:
         sheet_force = self._pipeline.tick.sheet_force
         if not sheet_force.modelled[pad]:
             return ""
-        return "rejected" if sheet_force.adaptation_rejected[pad] else "compensated"
+        return "rejected" if self._rejected_adaptation[pad] else "compensated"
 
     def _disabled_reason(self, pad: int) -> str:
         by = self._disabled_by.get(pad)

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -19,7 +19,7 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 def electrode(rng: np.random.Generator) -> str:
     """Draw an electrode's name."""
-    return str(rng.choice(ELECTRODES))
+    return str(rng.choice(SIDE_ELECTRODES))
 
 
 def position(rng: np.random.Generator, margin: float = 0.12) -> tuple[float, float]:

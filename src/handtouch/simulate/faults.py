@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from handtouch.config.base import Table
-from handtouch.config.channels import ELECTRODES
-from handtouch.config.tables import Name, NonNegative, Positive
+from handtouch.config.tables import SIDE_ELECTRODES, Electrode, Name, NonNegative, Positive
 from handtouch.simulate import draws
 from handtouch.simulate.sheet_circuit import Wiring
 from handtouch.simulate.smoothstep import smoothstep_array
@@ -27,7 +26,6 @@ from handtouch.wire.faults import FaultKind
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
-Electrode = Literal["x0", "xa", "y0", "yb"]
 Corner = Literal["x0y0", "x0yb", "xay0", "xayb"]
 Size = tuple[float, float]
 
@@ -228,7 +226,7 @@ class ShortedElectrode(Fault):
     @classmethod
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
         """Draw the keys that are the kind's own."""
-        one, other = rng.permutation(ELECTRODES)[:2].tolist()
+        one, other = rng.permutation(SIDE_ELECTRODES)[:2].tolist()
         to = "layer" if rng.random() < 0.5 else other
         return {"electrode": one, "to": to, "short_ohm": draws.log_uniform(rng, 0.5, 20)}
 
@@ -260,14 +258,14 @@ class SwappedCables(Fault):
     @classmethod
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
         """Draw the keys that are the kind's own."""
-        order = list(ELECTRODES)
+        order = list(SIDE_ELECTRODES)
         i, j = rng.permutation(4)[:2].tolist()
         order[i], order[j] = order[j], order[i]
         return {"order": tuple(order)}
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        if set(self.order) != set(ELECTRODES) or self.order == ELECTRODES:
+        if set(self.order) != set(SIDE_ELECTRODES) or self.order == SIDE_ELECTRODES:
             raise ValueError("order must name each of x0, xa, y0, yb once, and change their order")
         return self
 
@@ -406,4 +404,4 @@ else:
 
 
 def _electrode_index(electrode: str) -> int:
-    return ELECTRODES.index(electrode)
+    return SIDE_ELECTRODES.index(electrode)

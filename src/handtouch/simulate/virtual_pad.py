@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
-from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
+from handtouch.config.channels import order_by_electrode, resolve_channels
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault, Gum, StuckChannel
@@ -221,7 +222,7 @@ class VirtualPad:
     def _apply_stuck_channel(self, fault: StuckChannel, times_s: FloatArray, counts: CountArray) -> None:
         active = np.flatnonzero(fault.is_active(self._scenario_time_s(times_s)))
         if len(active):
-            channel = ELECTRODES.index(fault.electrode)
+            channel = SIDE_ELECTRODES.index(fault.electrode)
             stuck = self._compute_counts(np.array([fault.from_s]), self._other_faults)[0, channel]
             counts[active, channel] = stuck
 

@@ -22,7 +22,7 @@ from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import STALE_PERIODS, Master
 from handtouch.canbus.nodes.spec import NodeStatus, node_specs
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.core.slab import Slab
 from handtouch.procedures.commission.deployment_edit import PadEdit, apply_edits
 
@@ -32,7 +32,9 @@ _MIN_STALE_AFTER_NS = 100_000_000  # late and lost samples don't end a press
 def with_default_wiring(deployment: config.Deployment) -> config.Deployment:
     """Return the deployment with channels in the nodes' own order, and without serial numbers."""
     edits = {
-        (entry.hand, entry.pad.link): replace(PadEdit.from_pad(entry.pad), serial=None, electrodes=ELECTRODES)
+        (entry.hand, entry.pad.link): replace(
+            PadEdit.from_pad(entry.pad), serial=None, electrodes=SIDE_ELECTRODES
+        )
         for entry in deployment.pads
     }
     return apply_edits(deployment, edits)

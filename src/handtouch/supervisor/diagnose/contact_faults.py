@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.supervisor.diagnose.contact_evidence import Evidence, explain_contacts
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis, HypothesisTables, Scores
 from handtouch.supervisor.diagnose.model import FloatArray
@@ -262,7 +262,9 @@ class ContactFaultDetector:
         covariances = np.repeat(_TOLERANCE_WIDENING**2 * covariance[None], len(indices), axis=0)
         for row, index in enumerate(indices):
             if index is not None and self._tables.kinds[index] == FaultKind.GAIN_STEP:
-                channel = ELECTRODES.index(self._tables.hypotheses[index].electrodes[0]) - len(ELECTRODES)
+                channel = SIDE_ELECTRODES.index(self._tables.hypotheses[index].electrodes[0]) - len(
+                    SIDE_ELECTRODES
+                )
                 covariances[row, channel, channel] += _GAIN_STEP_STD**2
         cells = Counter(one.cell for one in memory)
         weights = np.array([(2 - 2.0 ** (1 - cells[one.cell])) / cells[one.cell] for one in memory])

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.supervisor.diagnose.channel_faults import ChannelFault
 from handtouch.supervisor.diagnose.contact_faults import ContactFault
 from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, PadDiagnosis
@@ -71,10 +71,10 @@ def describe_channel_faults(link: str, faults: Mapping[int, ChannelFault]) -> li
     diagnoses = []
     for kind in sorted({fault.kind for fault in faults.values()}):
         of_kind = {channel: fault for channel, fault in faults.items() if fault.kind == kind}
-        names = tuple(ELECTRODES[channel] for channel in sorted(of_kind))
+        names = tuple(SIDE_ELECTRODES[channel] for channel in sorted(of_kind))
         cause, remedy = _CHANNEL_FAULT_TEXTS[kind]
         values = {
-            f"{ELECTRODES[c]} {k}": v for c, fault in of_kind.items() for k, v in fault.evidence.items()
+            f"{SIDE_ELECTRODES[c]} {k}": v for c, fault in of_kind.items() for k, v in fault.evidence.items()
         }
         since_ns = min(fault.since_ns for fault in of_kind.values())
         cause = cause.format(electrodes=" and ".join(names))
@@ -87,7 +87,7 @@ def describe_channel_faults(link: str, faults: Mapping[int, ChannelFault]) -> li
 
 def named_electrodes(load: StaticLoad) -> tuple[str, ...]:
     """Return the electrodes that the diagnosis of a static load names."""
-    return (ELECTRODES[load.channel],) if load.kind == FaultKind.OFFSET else ()
+    return (SIDE_ELECTRODES[load.channel],) if load.kind == FaultKind.OFFSET else ()
 
 
 def describe_static_load(model: DiagnosisModel, pad: int, load: StaticLoad) -> PadDiagnosis:

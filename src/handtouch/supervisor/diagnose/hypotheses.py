@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config.channels import ELECTRODES
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
@@ -100,7 +100,9 @@ class HypothesisTables:
             orders.append(order)
             factors.append(np.ones(4))
         for channel, factor in itertools.product(range(4), _GAIN_STEP_FACTORS):
-            self.hypotheses.append(Hypothesis(FaultKind.GAIN_STEP, (ELECTRODES[channel],), float(factor)))
+            self.hypotheses.append(
+                Hypothesis(FaultKind.GAIN_STEP, (SIDE_ELECTRODES[channel],), float(factor))
+            )
             orders.append(np.arange(4))
             factors.append(np.where(np.arange(4) == channel, 1 / factor, 1.0))
         self._orders, self._factors = np.array(orders).T, np.array(factors).T
@@ -108,14 +110,14 @@ class HypothesisTables:
         others = []
         for channel in range(4):
             floating = network.with_series_ohm(np.where(np.arange(4) == channel, np.inf, series).tolist())
-            self.hypotheses.append(Hypothesis(FaultKind.DEAD_ELECTRODE, (ELECTRODES[channel],)))
+            self.hypotheses.append(Hypothesis(FaultKind.DEAD_ELECTRODE, (SIDE_ELECTRODES[channel],)))
             others.append(floating.fractions(x, y).T)
         if series.any():
             for i, j in itertools.combinations(range(4), 2):
                 merged = nominal.copy()
                 merged[:, [i, j]] = nominal[:, [i, j]].mean(axis=1, keepdims=True)
                 self.hypotheses.append(
-                    Hypothesis(FaultKind.SHORTED_ELECTRODE, (ELECTRODES[i], ELECTRODES[j]))
+                    Hypothesis(FaultKind.SHORTED_ELECTRODE, (SIDE_ELECTRODES[i], SIDE_ELECTRODES[j]))
                 )
                 others.append(merged)
         self._electrode_faults, torn_ones = _FractionTable(np.stack(others)), []
@@ -287,5 +289,5 @@ def _swap_permutations() -> list[tuple[NDArray[np.intp], tuple[str, ...]]]:
     for i, j in pairs:
         order = np.arange(4)
         order[[i, j]] = j, i
-        found.append((order, (ELECTRODES[i], ELECTRODES[j])))
-    return [*found, (np.array([2, 3, 0, 1]), ELECTRODES)]
+        found.append((order, (SIDE_ELECTRODES[i], SIDE_ELECTRODES[j])))
+    return [*found, (np.array([2, 3, 0, 1]), SIDE_ELECTRODES)]

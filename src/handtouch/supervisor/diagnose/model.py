@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.config.channels import ELECTRODES, order_by_electrode, resolve_channels
+from handtouch.config.channels import order_by_electrode, resolve_channels
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
@@ -94,7 +95,7 @@ class DiagnosisModel:
         scale, limits = np.zeros((len(pads), 4)), np.zeros((len(pads), 4, 2))
         for row, (pad, node) in enumerate(zip(pads, nodes, strict=True)):
             channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad)
-            for k, (name, channel) in enumerate(zip(ELECTRODES, channels, strict=True)):
+            for k, (name, channel) in enumerate(zip(SIDE_ELECTRODES, channels, strict=True)):
                 full = node.full_scale_counts or channel.limits[1]
                 factor = node.channel_scale[pad.electrodes.index(name)]
                 scale[row, k] = node.full_scale_ma * 1e-3 / full * factor
