@@ -247,7 +247,7 @@ class PadCircuit:
                     )
                 )
             elif discs.conductance_s is not None and discs.conductance_s.any():
-                with np.errstate(divide="ignore"):
+                with np.errstate(divide="ignore", over="ignore"):
                     leak_ohm = len(discs.position) / discs.conductance_s
                 contacts.append(_ContactSeries(positions, radii, focus, leak_ohm + disc_ohm, True))
         return contacts
