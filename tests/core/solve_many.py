@@ -22,7 +22,7 @@ def main(count: int) -> None:
     n = model.size
     covariance = ((0.01, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.01))
     model.set_gains_and_law(
-        1, [1.01, 0.99, 1.0, 1.02], "1-1", LawParameters(20000.0, 1.4, 2400.0, covariance)
+        1, [1.01, 0.99, 1.0, 1.02], "1-1", LawParameters(20000.0, 1.4, 2400.0, covariance, 2.0)
     )
     model.set_uncertainty(1, 1e-4 * np.eye(4), quarantined=False)
     currents, values = np.zeros((n, 4)), np.full((n, VALUE_COUNT), np.nan)

@@ -99,6 +99,7 @@ def solve_drawn(text: str, forces: FloatArray) -> tuple[FloatArray, FloatArray, 
             sheet.alpha + sheet.alpha_std * rng.normal(),
             1e-3 * max(1.0, sheet.contact_radius_mm + sheet.contact_radius_std_mm * rng.normal()),
             reference_pa=1e3 * sheet.reference_kpa,
+            hertz_n=sheet.hertz_force_n,
         )
         sheet_ohm = sheet.ohm_per_square * np.exp(sheet.ohm_per_square_std * rng.normal())
         currents.append(float(law.current(force_n, 5.0, sheet_ohm, spreading_m)) * fractions)
@@ -106,7 +107,14 @@ def solve_drawn(text: str, forces: FloatArray) -> tuple[FloatArray, FloatArray, 
     return force, std, status
 
 
-@pytest.mark.parametrize("tolerances", ["contact_radius_std_mm = 0.5", WIDE], ids=["default", "wide"])
+HERTZ = "contact_radius_std_mm = 0.5\nhertz_force_n = 2.0"
+
+
+@pytest.mark.parametrize(
+    "tolerances",
+    ["contact_radius_std_mm = 0.5", WIDE, HERTZ, f"{WIDE}\nhertz_force_n = 2.0"],
+    ids=["default", "wide", "hertz", "wide-hertz"],
+)
 def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(tolerances: str) -> None:
     text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
     text = text.replace("contact_radius_std_mm = 0.5", tolerances)
@@ -128,6 +136,37 @@ def test_without_a_greatest_force_those_at_the_sheets_limit_are_lower_bounds(ben
     found, std, status = solve(model, float(law.current(30.0, 5.0, 2400.0, spreading_m)) * fractions)
     assert (status, std) == (ForceEstimateStatus.LOWER_BOUND, np.inf)
     assert found < 30.0
+
+
+EXACT = """contact_radius_std_mm = 0.0
+contact_ohm_std = 0.0
+alpha_std = 0.0
+ohm_per_square_std = 0.0
+max_force_n = 300.0
+hertz_force_n = 0.5"""
+
+
+@pytest.mark.parametrize("alpha", [1.0, 1.5, 2.2])
+def test_a_radius_that_grows_with_the_force_is_that_of_the_force_found(alpha: float) -> None:
+    text = TOLERANT_DEPLOYMENT.replace("contact_radius_std_mm = 0.5", EXACT)
+    # the greatest force has a radius of 12.5 mm, that of an edge contact
+    forces = np.geomspace(0.05, 60.0, 25)
+    found, _, status = solve_drawn(text.replace("alpha = 1.5", f"alpha = {alpha}"), forces)
+    assert (status == ForceEstimateStatus.VALID).all()
+    inside = forces < 10.0
+    assert found[inside] == pytest.approx(forces[inside], rel=5e-3)
+
+
+def test_a_growing_contact_whose_layer_no_longer_resists_gives_a_lower_bound() -> None:
+    text = TOLERANT_DEPLOYMENT.replace("contact_radius_std_mm = 0.5", HERTZ)
+    forces = np.array([0.3, 1e3, 1e4])
+    found, std, status = solve_drawn(text, forces)
+    assert status.tolist() == [
+        ForceEstimateStatus.VALID,
+        *[ForceEstimateStatus.LOWER_BOUND] * 2,
+    ]
+    assert (found[1:] < forces[1:]).all()
+    assert np.isinf(std[1:]).all()
 
 
 RADIUS_ALONE = """contact_radius_std_mm = 0.5

@@ -9,7 +9,7 @@ import pytest
 
 from handtouch.calibration.calibration import LawParameters
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
-from handtouch.core.pad_model import PadModel
+from handtouch.core.pad_model import PadModel, contact_law, law_of
 from tests.procedures.test_calibrate import TRUE, Table, deployed, fitted, weights
 
 FORCES = np.array([0.3, 1.0, 2.0, 4.0])
@@ -23,7 +23,9 @@ def test_confidence_intervals_of_forces_cover_the_truth_in_95_percent_of_session
     values = np.full((1, VALUE_COUNT), np.nan)
     inside, sessions = np.zeros(len(FORCES)), 80
     centre = float(network.spreading_radius(network.a / 2, network.b / 2))
-    totals_a = [float(true._law.current(force, 5.0, TRUE["ohm_per_square"], centre)[0]) for force in FORCES]
+    sheet = deployed(**TRUE).sheets["s"]
+    law = contact_law(sheet, law_of(sheet))
+    totals_a = [float(law.current(force, 5.0, sheet.ohm_per_square, centre)) for force in FORCES]
     for seed in range(500, 500 + sessions):
         model.set_gains_and_law(0, np.ones(4), "4711-1", fitted(Table(weights(), seed).readings()).law)
         solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)

@@ -23,15 +23,16 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from handtouch import cli, client, config
+from handtouch.calibration.calibration import CalibrationVersion
 from handtouch.calibration.store import Store
-from handtouch.core.pad_model import default_calibration_id_of, law_of
+from handtouch.core.pad_model import PadModel, default_calibration_id_of, law_of
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.device import DeviceBus
 from handtouch.procedures import calibrate
 from handtouch.procedures.calibrate import plot
 from handtouch.procedures.calibrate import procedure as procedure_module
 from handtouch.procedures.calibrate import recording as record
-from handtouch.procedures.calibrate.fit import PARAMETERS, LawFit, fit_law
+from handtouch.procedures.calibrate.fit import MIN_EVIDENCE, PARAMETERS, LawFit, fit_law
 from handtouch.procedures.calibrate.procedure import PadSample, SettlingDetector, WeightProcedure
 from handtouch.procedures.calibrate.readings import (
     GRAM_FORCE_N,
@@ -72,7 +73,10 @@ def deployed(**sheet: float) -> config.Deployment:
 
 
 class Table:
-    """A pad on a table under weights, one after another: the k-th placed on it at the times from 10 k + 1."""
+    """A pad on a table under weights, one after another: the k-th placed on it at the times from 10 k + 1.
+
+    On flat feet; with `hertz_force_n` on a round one, under which the contact has 2.5 mm at that force.
+    """
 
     def __init__(
         self,
@@ -91,7 +95,7 @@ class Table:
                 duration_s=9.0,
                 path=((0.5 + 0.02 * rng.normal(), 0.5 + 0.02 * rng.normal()),),
                 force_n=(weight.force_n * math.exp(scatter * rng.normal()),),
-                radius_mm=1e3 * radii[weight.radius_m],
+                radius_mm=None if "hertz_force_n" in law else 1e3 * radii[weight.radius_m],
             )
             for k, weight in enumerate(weights)
         )
@@ -109,8 +113,8 @@ class Table:
         return output
 
 
-def fitted(readings: list[WeightReading], radius_std: float = 0.01) -> LawFit:
-    deployment = deployed()
+def fitted(readings: list[WeightReading], radius_std: float = 0.01, **sheet: float) -> LawFit:
+    deployment = deployed(**sheet)
     circuit_model = PadCircuitModel(deployment, deployment.hands[0].pads[0])
     circuits = [circuit_model.circuit_at(reading.position_m, 1e-4) for reading in readings]
     return fit_law(
@@ -145,6 +149,37 @@ def test_intervals_cover_the_true_law_in_95_percent_of_procedures(radius_std: fl
             held[name] += fit.intervals[name].low <= TRUE[name] <= fit.intervals[name].high
     for name, count in held.items():
         assert 0.90 <= count / sessions <= 0.995, (name, count)  # 95 %, give or take 2.5 deviations of 100
+
+
+WIDE_SPAN = "10,20,50,100,200,500,1000,2000"
+IN_THE_MIDDLE_N = math.exp(sum(math.log(w.force_n) for w in weights(WIDE_SPAN, 1)) / 8)
+
+
+@pytest.mark.parametrize("file", [{}, {"hertz_force_n": 1.0}], ids=["file-constant", "file-hertz"])
+def test_the_radius_law_that_explains_the_readings_much_better_is_chosen(file: dict[str, float]) -> None:
+    given_n = file.get("hertz_force_n", IN_THE_MIDDLE_N)
+    flat = fitted(Table(weights(WIDE_SPAN)).readings(), 0.1, **file)
+    round_ = fitted(Table(weights(WIDE_SPAN), hertz_force_n=given_n).readings(), 0.1, **file)
+    assert flat.law.hertz_force_n is None
+    assert flat.evidence < -MIN_EVIDENCE
+    assert round_.law.hertz_force_n == pytest.approx(given_n)
+    assert round_.evidence > MIN_EVIDENCE
+    for fit in (flat, round_):
+        assert not fit.problems
+        for name in PARAMETERS:
+            assert fit.intervals[name].low <= TRUE[name] <= fit.intervals[name].high
+    forces = np.array([0.1, 10.0])
+    assert round_.radius_m(forces, 2.5e-3) == pytest.approx(
+        2.5e-3 * np.cbrt(forces / given_n), rel=0.3
+    )  # as known as by the prior of 10 %, and the sheet
+
+
+def test_readings_that_decide_on_no_radius_law_keep_the_files() -> None:
+    readings = Table(weights(), seed=3, hertz_force_n=1.0).readings()
+    for file in ({}, {"hertz_force_n": 1.0}):
+        fit = fitted(readings, 0.2, **file)
+        assert abs(fit.evidence) < MIN_EVIDENCE
+        assert fit.law.hertz_force_n == file.get("hertz_force_n")
 
 
 def test_scatter_between_presses_is_estimated() -> None:
@@ -435,6 +470,27 @@ def test_recording_is_fitted_again_plotted_and_stored(
     assert answer["law"]["alpha"] == version.calibration.law.alpha
     assert answer["intervals_95"]["alpha"][0] < TRUE["alpha"] < answer["intervals_95"]["alpha"][1]
     assert answer["force_error_after"] < 0.1
+
+
+def test_a_law_of_a_growing_radius_is_stored_and_applied(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    readings = Table(weights(WIDE_SPAN), hertz_force_n=1.0).readings()
+    file, log = written(tmp_path, readings)
+    assert cli.main(["calibrate", "plane", "--config", str(file), "--from", str(log), "--yes"]) == 0
+    assert "grows as force^(1/3)" in capsys.readouterr().out
+    with Store(tmp_path / "store.db") as store:
+        version = store.newest(4711)
+    assert version is not None
+    law = CalibrationVersion.from_json(json.loads(json.dumps(version.to_json()))).calibration.law
+    assert law is not None
+    assert law.hertz_force_n == pytest.approx(IN_THE_MIDDLE_N)
+    model = PadModel(deployed())
+    before_a = model.end_threshold_a[0]
+    model.apply_calibration(0, version.calibration, version.calibration_id)
+    light_a = min(reading.current_a for reading in readings)  # of 10 gf, four times the threshold
+    assert 0.1 * light_a < model.end_threshold_a[0] < 0.4 * light_a
+    assert model.end_threshold_a[0] > 1.5 * before_a
 
 
 def test_exit_status_of_insufficient_or_invalid_recordings(

@@ -64,6 +64,8 @@ def check_currents(deployment: config.Deployment, link: str, tolerance: float = 
     network = electrode_network(pad, sheet)
     x, y = surface.to_rectangle(true.u_m, true.v_m)
     radius_m = sheet.contact_radius_mm * 1e-3
+    if sheet.hertz_force_n is not None:
+        radius_m *= (true.force_n / sheet.hertz_force_n) ** (1 / 3)
     pressure_kpa = true.force_n / (math.pi * radius_m**2) * 1e-3
     contact_ohm_m2 = 1e-6 * sheet.contact_ohm_mm2 * (sheet.reference_kpa / pressure_kpa) ** sheet.alpha
     outer_m = network.spreading_radius(x, y) * surface.scale(x, y)
@@ -74,6 +76,19 @@ def check_currents(deployment: config.Deployment, link: str, tolerance: float = 
     rotation, translation = mount_transform(pad)
     np.testing.assert_allclose(true.position_m, rotation @ surface.point(x, y) + translation, atol=1e-12)
     np.testing.assert_allclose(true.normal, rotation @ surface.normal(x, y), atol=1e-12)
+
+
+def test_currents_agree_with_exact_theory_of_a_patch_that_grows_with_the_force(
+    deployment: config.Deployment,
+) -> None:
+    sheets = {
+        name: sheet.model_copy(update={"hertz_force_n": 0.7}) for name, sheet in deployment.sheets.items()
+    }
+    growing = deployment.model_copy(update={"sheets": sheets})
+    check_currents(growing, "round")
+    hand, row = VirtualHand(growing, press("round"), IDEAL), LINKS.index("round")
+    (one,), (true,) = hand.counts(row, [10.0]), hand.truth(10.0)
+    assert one == pytest.approx(true.currents_a * hand.counts_per_ampere(10.0)[row], abs=10.0)
 
 
 def test_counts_are_true_currents_with_configured_noise(

@@ -123,13 +123,15 @@ class Offsets:
 class LawParameters:
     """Contact law (paper eq. 12) and sheet; keys as in a deployment's `[sheet.NAME]`.
 
-    covariance: (3, 3), of ln contact_ohm_mm2, alpha, ln ohm_per_square.
+    covariance: (3, 3), of ln contact_ohm_mm2, alpha, ln ohm_per_square. hertz_force_n: force at which a
+    contact has the sheet's contact_radius_mm, from which it grows as force^(1/3); None: it doesn't.
     """
 
     contact_ohm_mm2: Positive
     alpha: Positive
     ohm_per_square: Positive
     covariance: Covariance3
+    hertz_force_n: Positive | None = None
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -329,7 +331,7 @@ def differences(
     for part, names in (
         ("gains", ("factors",)),
         ("offsets", ("counts", "variance", "noise")),
-        ("law", ("contact_ohm_mm2", "alpha", "ohm_per_square")),
+        ("law", ("contact_ohm_mm2", "alpha", "ohm_per_square", "hertz_force_n")),
         ("sheet", ("kind", "version", "data")),
     ):
         one, other = getattr(before, part), getattr(after, part)

@@ -30,6 +30,7 @@ def run(
     gains: Sequence[float] | None,
     offsets: Sequence[float] | None,
     law: Sequence[float] | None,
+    hertz_force_n: float | None,
     **options: Any,
 ) -> int:
     """Measure a contact law, set a calibration or print the active one; `options` of `CalibrateOptions`.
@@ -39,6 +40,9 @@ def run(
     guided = bool(weights) or from_file is not None
     values: dict[str, Any] = {"gains": gains, "offset_counts": offsets, "law": law}
     values = {option: value for option, value in values.items() if value is not None}
+    if hertz_force_n is not None and law is None:
+        print("handtouch calibrate: --hertz-force-n is of the law that --law sets", file=sys.stderr)
+        return 2
     if conflict := _find_conflict(guided, values, name, config, bool(weights) and from_file is not None):
         print(f"handtouch calibrate: {conflict}", file=sys.stderr)
         return 2
@@ -52,6 +56,7 @@ def run(
         return _run_guided(guided_options, calibrate.DaemonEndpoints(live, endpoint, key))
     if law is not None:
         values["law"] = dict(zip(("contact_ohm_mm2", "alpha", "ohm_per_square"), law, strict=True))
+        values["law"]["hertz_force_n"] = hertz_force_n
     if name is not None:
         values["name"] = name
     return control_text.run_calibrate(endpoint, key, as_json, pad, **values)

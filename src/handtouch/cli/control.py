@@ -102,7 +102,8 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
         "--radius-mm",
         type=positive_number,
         metavar="MM",
-        help="radius of the base that the weights stand on (default: the sheet's contact_radius_mm)",
+        help="radius of the contact under the weights (default: the sheet's contact_radius_mm); of a round "
+        "base at hertz_force_n, else at the geometric mean of the weights",
     )
     guided.add_argument(
         "--radius-std-mm",
@@ -153,6 +154,12 @@ def _add_direct(direct: argparse._ArgumentGroup) -> None:
         nargs=3,
         metavar=("K", "ALPHA", "OHM"),
         help="contact_ohm_mm2, alpha and ohm_per_square, as in [sheet.NAME]",
+    )
+    direct.add_argument(
+        "--hertz-force-n",
+        type=positive_number,
+        metavar="N",
+        help="with --law: hertz_force_n, as in [sheet.NAME] (default: the same radius at every force)",
     )
 
 

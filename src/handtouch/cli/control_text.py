@@ -159,6 +159,7 @@ def _calibration_lines(answer: Reply) -> Iterable[str]:
     yield (
         f"law      contact_ohm_mm2 {law['contact_ohm_mm2']:.5g}, alpha {law['alpha']:.4g}, "
         f"ohm_per_square {law['ohm_per_square']:.5g}"
+        + (f", hertz_force_n {law['hertz_force_n']:.4g}" if law["hertz_force_n"] else "")
     )
 
 

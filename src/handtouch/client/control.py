@@ -82,6 +82,8 @@ class LawValues(TypedDict):
     """its exponent of pressure"""
     ohm_per_square: float
     """of the sheet"""
+    hertz_force_n: NotRequired[float | None]
+    """force at which a contact has `contact_radius_mm`, which grows as force^(1/3); None: it doesn't"""
 
 
 class PadCalibration(TypedDict):

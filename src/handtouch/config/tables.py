@@ -273,6 +273,11 @@ class Sheet(Table):
     alpha: float = Field(gt=0, le=5, description="exponent of pressure in the contact law")
     contact_radius_mm: Positive = Field(description="radius assumed for a contact")
     contact_radius_std_mm: NonNegative = Field(description="error of that radius (1 sigma)")
+    hertz_force_n: Positive | None = Field(
+        None,
+        description="force at which a contact has contact_radius_mm, which grows as force^(1/3), as under "
+        "round objects (Hertz); default: the same radius at every force",
+    )
     contact_elongation_std: Annotated[float, Field(ge=0, le=2)] = Field(
         0.0,
         description="logarithm of a contact's length over its width, in any direction (1 sigma); default: "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -147,20 +147,15 @@ class PadModel:
             count = len(network.series_ohm)
             form[:count, :count] = network.series_quadratic_form
         self._has_series = np.array([any(pad.series_ohm) for pad in pads])
-        self._law = ContactLaw(
-            np.array([sheet.contact_ohm_mm2 * 1e-6 for sheet in sheets]),
-            np.array([sheet.alpha for sheet in sheets]),
-            np.array([sheet.contact_radius_mm * 1e-3 for sheet in sheets]),
-            np.array([sheet.contact_radius_std_mm * 1e-3 for sheet in sheets]),
-            np.array([sheet.reference_kpa * 1e3 for sheet in sheets]),
-        )
+        self._laws = [contact_law(sheet, law) for sheet, law in zip(sheets, self._file_laws, strict=True)]
         self.law_parameters = np.zeros((self.size, LAW_PARAMETERS))
         """(n, LAW_PARAMETERS), see `PadLaw`"""
         for pad in range(self.size):
             self._update_law_parameters(pad)
         self._centre_spreading = self._spreading_at_centre(networks)
         self.begin_threshold_a, self.end_threshold_a = (
-            self._threshold_current(force) for force in (self.begin_threshold_n, self.end_threshold_n)
+            np.array([self._threshold_current(pad, force[pad]) for pad in range(self.size)])
+            for force in (self.begin_threshold_n, self.end_threshold_n)
         )
 
     @cached_property
@@ -308,51 +303,60 @@ class PadModel:
 
         `currents` (c, n), in any unit, and the spreading radius there identify the position.
         """
-        return self._law.select(index).force(
-            total_a,
-            self._drive_v[index],
-            self._sheet_ohm[index],
-            radius_m,
-            self._series_resistance(index, currents),
-            current_std_a=total_std_a,
+        series_ohm = self._series_resistance(index, currents)
+        found = [
+            self._laws[pad].force(
+                total_a[k],
+                self._drive_v[pad],
+                self._sheet_ohm[pad],
+                radius_m[k],
+                series_ohm[k],
+                current_std_a=total_std_a[k],
+            )
+            for k, pad in enumerate(index.tolist())
+        ]
+        force, std, status, radius = (
+            np.array([getattr(one, field.name) for one in found]) for field in fields(ForceEstimate)
         )
+        return ForceEstimate(force, std, status, radius)
 
-    def _series_resistance(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray | float:
+    def _series_resistance(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray:
         """Return the equivalent series resistance from contact to ground [ohm] (n,), sum of phi_i V_i / I."""
         if not self._has_series[index].any():
-            return 0.0
+            return np.zeros(len(index))
         with np.errstate(divide="ignore", invalid="ignore"):
             fractions = currents / currents.sum(axis=0)
         return np.asarray(np.einsum("in,nij,jn->n", fractions, self._series_form[index], fractions))
 
     def _set_law(self, pad: int, law: LawParameters | None) -> None:
         """Apply a contact law, and the thresholds [A] that follow from it."""
-        applied, old = law or self._file_laws[pad], self._law
-        contact, alpha = np.array(old.contact_ohm_m2), np.array(old.alpha)
-        contact[pad], alpha[pad] = applied.contact_ohm_mm2 * 1e-6, applied.alpha
+        applied = law or self._file_laws[pad]
         self._sheet_ohm[pad] = applied.ohm_per_square
-        self._law = replace(old, contact_ohm_m2=contact, alpha=alpha)
+        self._laws[pad] = contact_law(self._parts[pad][2], applied)
         self._update_law_parameters(pad)
-        self.begin_threshold_a[pad] = self._threshold_current(self.begin_threshold_n)[pad]
-        self.end_threshold_a[pad] = self._threshold_current(self.end_threshold_n)[pad]
+        self.begin_threshold_a[pad] = self._threshold_current(pad, self.begin_threshold_n[pad])
+        self.end_threshold_a[pad] = self._threshold_current(pad, self.end_threshold_n[pad])
 
     def _update_law_parameters(self, pad: int) -> None:
         """Write the law of a pad as the stages take it."""
-        law = self._law.select(np.array([pad]))
-        layer, alpha, radius, radius_std, reference = (
-            float(np.ravel(column)[0])
-            for column in (law.contact_ohm_m2, law.alpha, law.radius_m, law.radius_std_m, law.reference_pa)
+        law, sheet = self.law(pad), self._parts[pad][2]
+        alpha, greatest_n = law.alpha, sheet.max_force_n
+        log_radius, radius_variance = _log_radius(
+            sheet.contact_radius_mm * 1e-3, sheet.contact_radius_std_mm * 1e-3
         )
-        log_radius, radius_variance = _log_radius(radius, radius_std)
-        log_sheet, greatest_n = math.log(self._sheet_ohm[pad]), self._parts[pad][2].max_force_n
-        log_reference_n = math.log(math.pi * reference) + 2 * log_radius
+        power, growth = 1 / alpha, 0.0
+        if law.hertz_force_n is not None:
+            power, growth = 3 / (2 + alpha), 1 / (2 + alpha)
+            log_radius -= math.log(law.hertz_force_n) / 3
+        log_sheet = math.log(law.ohm_per_square)
+        log_reference_n = math.log(math.pi * sheet.reference_kpa * 1e3) + 2 * log_radius
         # x^2 = A^2 rho / sigma, here at 1 N
-        log_x2 = log_sheet + 2 * log_radius - math.log(layer) - alpha * log_reference_n
-        log_max_x2 = log_x2 + alpha * math.log(greatest_n) if greatest_n else math.inf
+        log_x2 = log_sheet + 2 * log_radius - math.log(law.contact_ohm_mm2 * 1e-6) - alpha * log_reference_n
+        log_max_x2 = log_x2 + math.log(greatest_n) / power if greatest_n else math.inf
         self.law_parameters[pad] = (
-            *(log_x2, 1 / alpha, 2 - 2 * alpha, log_radius, radius_variance, log_sheet, self._drive_v[pad]),
-            *(log_x2 / alpha + log_reference_n, *np.array(self.law(pad).covariance)[np.triu_indices(3)]),
-            *(log_max_x2, float(stack_factor(np.exp(0.5 * log_max_x2))) if greatest_n else 0.0),
+            *(log_x2, power, 2 - 2 * alpha, log_radius, radius_variance, log_sheet, self._drive_v[pad]),
+            *(log_x2 * (power - 2 * growth) + log_reference_n, *np.array(law.covariance)[np.triu_indices(3)]),
+            *(log_max_x2, float(stack_factor(np.exp(0.5 * log_max_x2))) if greatest_n else 0.0, growth),
         )
 
     def stage_tolerances(self) -> list[PadTolerances]:
@@ -374,9 +378,7 @@ class PadModel:
             )
         ]
 
-    def _spreading_at_centre(
-        self, networks: Sequence[RectangleNetwork]
-    ) -> tuple[FloatArray, FloatArray | float]:
+    def _spreading_at_centre(self, networks: Sequence[RectangleNetwork]) -> tuple[FloatArray, FloatArray]:
         """Return spreading radius [m] and series resistance [ohm] at the centre of each pad."""
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
         pads = np.arange(self.size)
@@ -388,9 +390,11 @@ class PadModel:
         )
         return radius * scale, self._series_resistance(pads, fractions)
 
-    def _threshold_current(self, force_n: FloatArray) -> FloatArray:
-        """Return the total current of a contact of that force at the centre of each pad."""
-        return self._law.current(force_n, self._drive_v, self._sheet_ohm, *self._centre_spreading)
+    def _threshold_current(self, pad: int, force_n: float) -> float:
+        """Return the total current of a contact of that force at the centre of a pad."""
+        spreading_m, series_ohm = (values[pad] for values in self._centre_spreading)
+        drive_v, sheet_ohm = self._drive_v[pad], self._sheet_ohm[pad]
+        return float(self._laws[pad].current(force_n, drive_v, sheet_ohm, spreading_m, series_ohm))
 
 
 def _log_radius(radius: float, std: float) -> tuple[float, float]:
@@ -446,7 +450,21 @@ def law_of(sheet: config.Sheet) -> LawParameters:
     """Return the contact law of a deployment's sheet, with its tolerances."""
     local_std = math.hypot(sheet.ohm_per_square_std, _LOCAL_UNEVENNESS * sheet.unevenness_std)
     covariance = np.diag(np.square([sheet.contact_ohm_std, sheet.alpha_std, local_std]))
-    return LawParameters(sheet.contact_ohm_mm2, sheet.alpha, sheet.ohm_per_square, matrix(covariance))
+    return LawParameters(
+        sheet.contact_ohm_mm2, sheet.alpha, sheet.ohm_per_square, matrix(covariance), sheet.hertz_force_n
+    )
+
+
+def contact_law(sheet: config.Sheet, law: LawParameters) -> ContactLaw:
+    """Return a law in SI units, with the contact radius of the deployment's sheet."""
+    return ContactLaw(
+        law.contact_ohm_mm2 * 1e-6,
+        law.alpha,
+        sheet.contact_radius_mm * 1e-3,
+        sheet.contact_radius_std_mm * 1e-3,
+        sheet.reference_kpa * 1e3,
+        law.hertz_force_n,
+    )
 
 
 def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
@@ -458,5 +476,6 @@ def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
     absent = set() if pad.arcs_mm else {"electrode_arcs_mm"}
     text = pad.model_copy(update={"serial": None}).model_dump_json(exclude=absent)
-    text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=_SHEET_TOLERANCES)
+    unstated = _SHEET_TOLERANCES | ({"hertz_force_n"} if sheet.hertz_force_n is None else set())
+    text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=unstated)
     return "nominal-" + hashlib.sha256(text.encode()).hexdigest()[:12]

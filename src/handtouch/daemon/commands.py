@@ -77,6 +77,7 @@ class _LawArguments(Table):
     contact_ohm_mm2: Resistance
     alpha: Annotated[float, Field(ge=0.1, le=10)]
     ohm_per_square: Resistance
+    hertz_force_n: Annotated[float, Field(gt=0, le=1000)] | None = None
 
 
 class _CalibrateArguments(Table):

@@ -198,6 +198,7 @@ def pad_design(deployment: config.Deployment, link: str | None = None) -> PadDes
         sheet.contact_radius_mm * 1e-3,
         sheet.contact_radius_std_mm * 1e-3,
         sheet.reference_kpa * 1e3,
+        sheet.hertz_force_n,
     )
     return PadDesign(
         chosen.link,

@@ -20,6 +20,7 @@ from handtouch.simulate.sheet_solver import SheetMapBank
 
 FloatArray = NDArray[np.float64]
 
+_MIN_FORCE_N = 1e-6
 _NODE_COUNT = 7
 _ANGLES = math.pi * np.arange(1, _NODE_COUNT + 1) / (_NODE_COUNT + 1)
 _NODES: Final = np.cos(_ANGLES)  # Gauss quadrature, exact up to degree 13
@@ -27,16 +28,36 @@ _WEIGHTS: Final = 2 / (_NODE_COUNT + 1) * np.sin(_ANGLES) ** 2
 
 
 class ContactPatch(NamedTuple):
-    """Patch of a contact [m]; `focus_m` along x and y on the pad."""
+    """Patch of a contact [m]; `focus_m` along x and y on the pad.
+
+    `hertz_force_n`: force at which it has this size, which grows as force^(1/3); None: it doesn't.
+    """
 
     radius_m: float
     focus_m: tuple[float, float] = (0.0, 0.0)
+    hertz_force_n: float | None = None
 
     @classmethod
-    def ellipse(cls, radius_m: float, elongation: float, direction_rad: float) -> ContactPatch:
+    def ellipse(
+        cls, radius_m: float, elongation: float, direction_rad: float, hertz_force_n: float | None = None
+    ) -> ContactPatch:
         """Return an ellipse of half axes radius elongation^(1/2) and radius elongation^(-1/2)."""
         focus_m = radius_m * math.sqrt(max(elongation - 1 / elongation, 0.0))
-        return cls(radius_m, (focus_m * math.cos(direction_rad), focus_m * math.sin(direction_rad)))
+        focus = focus_m * math.cos(direction_rad), focus_m * math.sin(direction_rad)
+        return cls(radius_m, focus, hertz_force_n)
+
+    def growth(self, force_n: FloatArray) -> FloatArray:
+        """Return the patch's size under forces (n,), relative to that stated."""
+        if self.hertz_force_n is None:
+            return np.ones_like(force_n)
+        return np.asarray(np.cbrt(np.maximum(force_n, _MIN_FORCE_N) / self.hertz_force_n))
+
+    def under(self, force_n: float) -> ContactPatch:
+        """Return the patch under a force."""
+        if self.hertz_force_n is None:
+            return self
+        growth, (x, y) = float(self.growth(np.array(force_n))), self.focus_m
+        return ContactPatch(growth * self.radius_m, (growth * x, growth * y))
 
 
 def mean_half_axis(radius_m: FloatArray, focus_length_m: FloatArray) -> FloatArray:

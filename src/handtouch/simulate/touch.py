@@ -158,5 +158,7 @@ class ScheduledTouches:
                     during = order[first:last]
                     position[row][:, during] = touch.positions(times_s[during])
                     force[row, during] = touch.forces(times_s[during])
-                    patches[row][:, during] = np.array([patch.radius_m, *patch.focus_m])[:, None]
+                    patches[row][:, during] = np.outer(
+                        [patch.radius_m, *patch.focus_m], patch.growth(force[row, during])
+                    )
         return position, force, patches

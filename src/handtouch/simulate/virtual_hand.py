@@ -159,7 +159,7 @@ class VirtualHand:
 
     def _contacts_at(self, t_s: float) -> list[_PadContact]:
         return [
-            _PadContact(row, contact, ContactPatch(contact.radius_m) if contact.radius_m else patch)
+            _PadContact(row, contact, _applied_patch(contact, patch))
             for contact in self._stimulus.contacts_at(t_s)
             for row, patch in self._touch_pads[contact.touch_number]
         ]
@@ -229,6 +229,10 @@ class VirtualHand:
             tuple(currents[: len(row.limits)].tolist()),
             math.sqrt(covariance[0, 0] + covariance[1, 1]),
         )
+
+
+def _applied_patch(contact: AppliedContact, patch: ContactPatch) -> ContactPatch:
+    return ContactPatch(contact.radius_m) if contact.radius_m else patch.under(contact.force_n)
 
 
 @dataclass(frozen=True)

@@ -175,6 +175,7 @@ class ContactLawMessage(Table):
     alpha: PositiveFloat
     ohm_per_square: PositiveFloat
     covariance: tuple[FloatTriple, FloatTriple, FloatTriple]
+    hertz_force_n: PositiveFloat | None = None
 
 
 class CalibrationUpdate(Table):

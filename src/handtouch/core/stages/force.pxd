@@ -1,11 +1,12 @@
 cimport cython
 from libc cimport math
 
-cdef Py_ssize_t _LOG_X2, _PER_ALPHA, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE
-cdef Py_ssize_t _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR
+cdef Py_ssize_t _LOG_X2, _POWER, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE
+cdef Py_ssize_t _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR, _GROWTH
 cdef double _BOUND_SIGMA, _MAX_CURRENT_FRACTION, _MIN_LOG_SPREADING_RATIO, _MIN_CURRENT_A, _MIN_LEFT
 cdef double _TWO_PI, _INFINITY, _NAN, _MAX_SIGMA, _MIN_RELATIVE_VARIANCE, _UNLIMITED_SIGMA, _MAX_LOG_FORCE
-cdef Py_ssize_t _VALID, _LOWER_BOUND, _NOT_ESTIMATED
+cdef double _CONVERGED_SIGMA
+cdef Py_ssize_t _VALID, _LOWER_BOUND, _NOT_ESTIMATED, _MAX_STEPS
 
 cdef class StackTable:
     cdef double[::1] inverse, values, nodes
@@ -19,12 +20,18 @@ cdef class PadLaw:
 cdef class ForceResult:
     cdef public double force_n, std_n
     cdef double left, high, low, bend, by_radius, variance, sigma, std, step, density
+    cdef double spreading, gradient2, total
     cdef public Py_ssize_t status
 
 @cython.locals(is_limited=bint)
 cdef void estimate_force(
     StackTable stack, PadLaw law, ForceResult result, double total_a, double total_std_a,
     double log_spreading_m, double gradient2, double position_variance, double series_ohm) noexcept
+cdef void _set_radius(ForceResult result, double log_radius) noexcept
+cdef double _find_end(StackTable stack, PadLaw law, double log_spreading_m, double resistors) noexcept
+@cython.locals(_=Py_ssize_t)
+cdef double _find_likely(
+    StackTable stack, PadLaw law, ForceResult result, double left, double least, double top) noexcept
 @cython.locals(k=Py_ssize_t)
 cdef void _integrate(StackTable stack, PadLaw law, ForceResult result, double log_x2, double top) noexcept
 @cython.locals(k=Py_ssize_t)

@@ -10,7 +10,8 @@ the edge at that force. So it holds near the maximum current of the sheet.
 
 The integral is over ln x^2 = ln(A^2 rho / sigma), which is linear in the logarithm of the force. The radius
 A is log-normal: mean and variance by it are those of the second-order expansion of that logarithm, whose
-second derivative follows from the first, d f / d ln x^2 = (1 - x^2 f^2) / 2.
+second derivative follows from the first, d f / d ln x^2 = (1 - x^2 f^2) / 2. Where the radius grows with the
+force (Hertz), it is that of each force: A^3 ~ F, so ln F and ln A are still linear in ln x^2.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ import math
 from handtouch.field import contact_law
 
 _VALID, _LOWER_BOUND, _NOT_ESTIMATED = 0, 1, 2  # of a result's status
-_LOG_X2, _PER_ALPHA, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE = 0, 1, 2, 3, 4
-_LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR = 5, 6, 7, 8, 14, 15
-LAW_PARAMETERS = 16
+_LOG_X2, _POWER, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE = 0, 1, 2, 3, 4
+_LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR, _GROWTH = 5, 6, 7, 8, 14, 15, 16
+LAW_PARAMETERS = 17
 _BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_CURRENT_FRACTION
 _MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
 _MIN_CURRENT_A, _MIN_LEFT = 1e-200, 1e-12
@@ -31,6 +32,7 @@ _MAX_SIGMA = 3.3  # of the quadrature over the stack factor
 _MIN_RELATIVE_VARIANCE = 1e-18
 _UNLIMITED_SIGMA = 3.0
 _MAX_LOG_FORCE = 300.0
+_MAX_STEPS, _CONVERGED_SIGMA = 12, 0.1
 
 
 class StackTable:
@@ -61,12 +63,13 @@ class StackTable:
 class PadLaw:
     """Contact law of one pad, in logarithms, and what it is applied to.
 
-    parameters: (LAW_PARAMETERS,) ln x^2 at 1 N; 1 / alpha; 2 - 2 alpha, derivative of ln x^2 by that of the
-    radius at one force; mean of the logarithm of the contact radius [m], and its variance; ln of the sheet
-    resistance; drive voltage; ln of the force at the reference pressure; upper triangle of the calibrated
-    law's covariance (ln specific resistance, alpha, ln sheet resistance); and ln x^2 with its stack factor at
-    the greatest force, infinite and 0 where that is unknown. series: (n n,) quadratic form of the series
-    resistors [ohm]; has_series: any isn't 0.
+    parameters: (LAW_PARAMETERS,) ln x^2 at 1 N; derivative of ln force by it, 1 / alpha of a constant radius;
+    2 - 2 alpha, derivative of ln x^2 by that of the radius at one force; mean of the logarithm of the contact
+    radius [m] at 1 N, and its variance; ln of the sheet resistance; drive voltage; what ln of the pressure
+    over the reference is less at ln x^2 = 0; upper triangle of the calibrated law's covariance (ln specific
+    resistance, alpha, ln sheet resistance); ln x^2 with its stack factor at the greatest force, infinite and
+    0 where that is unknown; and the derivative of ln radius by ln x^2, 0 of a constant radius. series: (n n,)
+    quadratic form of the series resistors [ohm]; has_series: any isn't 0.
     """
 
     def __init__(self, parameters: memoryview[float], series: memoryview[float], has_series: bool) -> None:
@@ -79,17 +82,20 @@ class ForceResult:
     """Force of one contact [N]; `std_n` is infinite where `status` is LOWER_BOUND.
 
     The rest is working memory. Of the contact: `left`, stack factor and spreading that its current leaves;
-    `high`, `low` and `bend`: limits of the spreading, the lower one less `bend` times the share of the
+    `spreading` and `gradient2`: ln of the spreading radius, and square of its gradient; `high`, `low` and
+    `bend`, at one radius: limits of the spreading, the lower one less `bend` times the share of the
     current that adapts to the edge; `by_radius`: derivative of their mean; `variance`, by noise, of the
     logarithm of `left`.
     At one ln x^2: standard deviation `std` of `left`; `sigma`, by how many of them its logarithm is above the
-    expected one; `density` of the logarithm, over that of `sigma`; and ln x^2 a standard deviation, `step`.
+    expected one, `total`; `density` of the logarithm, over that of `sigma`; and ln x^2 a standard deviation,
+    `step`.
     """
 
     def __init__(self) -> None:
         self.force_n = self.std_n = _NAN
         self.status = _NOT_ESTIMATED
         self.left = self.high = self.low = self.bend = self.by_radius = self.variance = 0.0
+        self.spreading = self.gradient2 = self.total = 0.0
         self.sigma = self.std = self.step = self.density = 0.0
 
 
@@ -117,44 +123,85 @@ def estimate_force(
     whole = whole_factor(law, total_a)
     noise = whole * total_std_a / total_a
     resistors = whole / law.parameters[_DRIVE] * total_a * series_ohm
-    ratio = log_spreading_m - law.parameters[_LOG_RADIUS]
     result.left = max(whole - resistors, _MIN_LEFT)
-    result.high, result.low = max(ratio, _MIN_LOG_SPREADING_RATIO), max(ratio, 0.0)
-    result.bend = 0.0
-    if gradient2 > 0.0:
-        result.bend = 0.25 * min(gradient2 * math.exp(2.0 * law.parameters[_LOG_RADIUS]), 1.0)
-    result.by_radius = 0.0
-    if ratio > 0.0:
-        result.by_radius = -1.0 if ratio > _MIN_LOG_SPREADING_RATIO else -0.5
+    result.spreading, result.gradient2 = log_spreading_m, gradient2
     result.variance = max(noise * noise + position_variance, 0.0) / (result.left * result.left)
+    _set_radius(result, law.parameters[_LOG_RADIUS])
     # beyond a share of the maximum current, forces hardly differ in current
     least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (result.high + resistors)
-    is_limited = law.parameters[_MIN_FACTOR] >= least
     top = law.parameters[_MAX_LOG_X2]
-    if not is_limited:
-        top = find_log_x2(stack, least)
-    least = max(least, law.parameters[_MIN_FACTOR])
-    log_x2 = min(find_log_x2(stack, max(result.left - 0.5 * (result.high + result.low), least)), top)
+    if law.parameters[_GROWTH] > 0.0:
+        end = _find_end(stack, law, log_spreading_m, resistors)
+        is_limited = top <= end
+        top = min(top, end)
+    else:
+        is_limited = law.parameters[_MIN_FACTOR] >= least
+        least = max(least, law.parameters[_MIN_FACTOR])
+        if not is_limited:
+            top = find_log_x2(stack, least)
+    log_x2 = _find_likely(stack, law, result, result.left, least, top)
     _evaluate(stack, law, result, log_x2)
     if log_x2 >= top or not is_limited:
-        sigma, std = result.sigma, result.std
+        sigma, std, total = result.sigma, result.std, result.total
         if log_x2 < top:
             _evaluate(stack, law, result, top)
-            sigma, std = result.sigma, result.std
+            sigma, std, total = result.sigma, result.std, result.total
             _evaluate(stack, law, result, log_x2)
         # without a greatest force, those from the limit on differ too little in current to have a mean
         if not sigma > (-_BOUND_SIGMA if is_limited else _UNLIMITED_SIGMA):
-            log_x2 = find_log_x2(stack, least + max((sigma + _BOUND_SIGMA) * std, 0.0))
-            log_force = (log_x2 - law.parameters[_LOG_X2]) * law.parameters[_PER_ALPHA]
+            margin = max((sigma + _BOUND_SIGMA) * std, 0.0)
+            if law.parameters[_GROWTH] > 0.0:
+                result.left = total + margin
+                log_x2 = _find_likely(stack, law, result, result.left, least, top)
+            else:
+                log_x2 = find_log_x2(stack, least + margin)
+            log_force = (log_x2 - law.parameters[_LOG_X2]) * law.parameters[_POWER]
             result.force_n, result.std_n = math.exp(min(_MAX_LOG_FORCE, log_force)), _INFINITY
             result.status = _LOWER_BOUND
             return
     _integrate(stack, law, result, log_x2, top)
 
 
+def _set_radius(result: ForceResult, log_radius: float) -> None:
+    """Set the limits of the spreading from a contact of a radius [m], given by its logarithm."""
+    ratio = result.spreading - log_radius
+    result.high, result.low = max(ratio, _MIN_LOG_SPREADING_RATIO), max(ratio, 0.0)
+    result.bend = 0.0
+    if result.gradient2 > 0.0:
+        result.bend = 0.25 * min(result.gradient2 * math.exp(2.0 * log_radius), 1.0)
+    result.by_radius = 0.0
+    if ratio > 0.0:
+        result.by_radius = -1.0 if ratio > _MIN_LOG_SPREADING_RATIO else -0.5
+
+
+def _find_end(stack: StackTable, law: PadLaw, log_spreading_m: float, resistors: float) -> float:
+    """Return ln x^2 from which on forces of a contact that grows hardly differ in current.
+
+    It has reached an edge, and the resistance of its layer is a small share.
+    """
+    least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (_MIN_LOG_SPREADING_RATIO + resistors)
+    room = log_spreading_m - _MIN_LOG_SPREADING_RATIO - law.parameters[_LOG_RADIUS]
+    at_edge = law.parameters[_LOG_X2] + room / law.parameters[_GROWTH]
+    return min(max(at_edge, find_log_x2(stack, least)), stack.first + stack.intervals / stack.per_width)
+
+
+def _find_likely(
+    stack: StackTable, law: PadLaw, result: ForceResult, left: float, least: float, top: float
+) -> float:
+    """Return ln x^2 of `left`, at most `top`; of a contact that grows by Newton steps on its logarithm."""
+    log_x2 = min(find_log_x2(stack, max(left - 0.5 * (result.high + result.low), least)), top)
+    if law.parameters[_GROWTH] > 0.0:
+        for _ in range(_MAX_STEPS):
+            _evaluate(stack, law, result, log_x2)
+            if abs(result.sigma) < _CONVERGED_SIGMA:
+                break
+            log_x2 = max(stack.first, min(top, log_x2 - result.sigma * result.step))
+    return log_x2
+
+
 def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float, top: float) -> None:
     """Integrate over ln x^2 up to `top`, about a likely one, at which the result was evaluated."""
-    per_alpha = law.parameters[_PER_ALPHA]
+    power = law.parameters[_POWER]
     low = max(stack.first, log_x2 - (_MAX_SIGMA + result.sigma) * result.step)
     high = min(top, log_x2 + (_MAX_SIGMA - result.sigma) * result.step)
     _evaluate(stack, law, result, low)
@@ -167,7 +214,7 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
         at = low + (high - low) * stack.nodes[2 * k]
         _evaluate(stack, law, result, at)
         weight = stack.nodes[2 * k + 1] * math.exp(-0.5 * result.sigma * result.sigma) * result.density
-        force = math.exp((at - log_x2) * per_alpha)
+        force = math.exp((at - log_x2) * power)
         weights += weight
         inverse += weight / force
         mean += weight * force
@@ -175,7 +222,7 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
     if weights > 0.0:
         force = weights / inverse
         mean_square = (square - 2.0 * force * mean) / weights + force * force
-        log_unit = (log_x2 - law.parameters[_LOG_X2]) * per_alpha
+        log_unit = (log_x2 - law.parameters[_LOG_X2]) * power
         unit = math.exp(max(-_MAX_LOG_FORCE, min(_MAX_LOG_FORCE, log_unit)))
         result.force_n = unit * force
         result.std_n = unit * math.sqrt(max(mean_square, _MIN_RELATIVE_VARIANCE * force * force))
@@ -204,6 +251,9 @@ def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float
     factor = stack.values[k] + t * (stack.values[k + 1] + t * (square + t * cubic))
     slope = (stack.values[k + 1] + t * (2.0 * square + 3.0 * t * cubic)) * stack.per_width
     density = 1.0 - 2.0 * slope  # (x factor)^2
+    growth = law.parameters[_GROWTH]
+    if growth > 0.0:
+        _set_radius(result, law.parameters[_LOG_RADIUS] + growth * (log_x2 - law.parameters[_LOG_X2]))
     bend = result.bend
     if bend > 0.0:
         bend *= max(1.0 - 2.0 * factor / density, 0.0)
@@ -213,7 +263,9 @@ def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float
     first = by_radius * slope + result.by_radius - bend
     second = -0.5 * by_radius * by_radius * density * (1.0 + 2.0 * slope / factor) - first * first / total
     by_sheet = total + slope
-    by_alpha = slope * (log_x2 * law.parameters[_PER_ALPHA] - law.parameters[_LOG_REFERENCE])
+    by_alpha = slope * (
+        log_x2 * (law.parameters[_POWER] - 2.0 * growth) - law.parameters[_LOG_REFERENCE]
+    )  # the logarithm of the pressure
     # errors of the spreading don't grow with the rest: a logarithm's slope is that between the two values
     chord = (result.left + total + 4.0 * math.sqrt(result.left * total)) / 6.0
     width *= total / chord
@@ -226,7 +278,8 @@ def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float
     mixed -= slope * (law.parameters[_COVARIANCE + 1] * by_alpha + law.parameters[_COVARIANCE + 2] * by_sheet)
     variance += 2.0 * mixed
     std = math.sqrt(max(variance, _MIN_RELATIVE_VARIANCE * factor * factor))
-    result.std, result.step, result.density = std, -std / slope, total / std
+    slope += growth * result.by_radius
+    result.std, result.step, result.density, result.total = std, -std / slope, total / std, total
     result.sigma = (math.log(result.left / total) - 0.5 * second * radius_variance / total) * result.density
 
 

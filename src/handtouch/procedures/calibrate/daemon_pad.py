@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 from handtouch import client, wire
@@ -86,7 +86,7 @@ class ServedPad:
 
     def apply_law(self, calibration_id: str, law: LawParameters) -> str:
         """Apply a law; return the identifier of the active calibration."""
-        parameters = {key: getattr(law, key) for key in ("contact_ohm_mm2", "alpha", "ohm_per_square")}
+        parameters = {key: value for key, value in asdict(law).items() if key != "covariance"}
         answer = self._request("calibrate", pad=self.name, name=calibration_id, law=parameters)
         return str(answer["calibration_id"])
 

@@ -1,6 +1,6 @@
 """Fit of contact law and sheet resistance to readings of known weights, as in the paper's 4.3.
 
-Public names: `fit_law`, `LawFit`, `ConfidenceInterval`, `PARAMETERS`.
+Public names: `fit_law`, `LawFit`, `ConfidenceInterval`, `PARAMETERS`, `MIN_EVIDENCE`.
 
 A contact of radius A under a force F passes I = V / (stack(sheet, sigma, A, R) + series), eq. 11, with
 sigma = k / (F / pi A^2)^alpha, eq. 12. The paper guesses the plane's resistance from the largest force and
@@ -10,6 +10,10 @@ known within its standard deviation. Errors are of two kinds: of the measurement
 sheet's own scatter from press to press, of one relative size in load, which is unknown and estimated (Mandel
 and Paule: so that the sum of squared residuals equals the degrees of freedom). Intervals are Student's, for
 that reason.
+
+Both radius laws are fitted: the same radius at every force, as under a flat foot, and one that grows as
+force^(1/3), as under a round one (Hertz). They have as many parameters. The deployment's is kept unless the
+readings are much likelier under the other one, by `MIN_EVIDENCE`.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,6 +40,9 @@ SHEET_LOG_STD = 0.2
 _MAX_OBSERVED_LOG_STD = (
     0.1  # standard deviation of ln sheet resistance, from the readings alone, that counts as observed
 )
+MIN_EVIDENCE = 6.0
+"""Twice the log likelihood ratio from which on the other radius law replaces the deployment's: "strong" in
+the scale of Kass and Raftery, J. Am. Stat. Assoc. 90, 1995; a ratio of 20."""
 _MIN_WEIGHTS, _MIN_DEGREES_OF_FREEDOM = 3, 3
 _MAX_HALF_INTERVALS = {
     "contact_ohm_mm2": math.log(2),
@@ -43,6 +50,7 @@ _MAX_HALF_INTERVALS = {
 }  # half widths above which an interval is useless
 _MIN_CURRENT_SLOPE = 0.2  # of ln current by ln force; 1 to 2 if the contact limits the current
 _MIN_LAW_PROBABILITY = 1e-3  # probability below which the readings contradict any such law
+_NO_FIT_DEVIANCE = 1e6
 _MAX_ITERATIONS, _MAX_STEP, _CONVERGED_STEP = 60, 1.0, 1e-9
 _DIFFERENCE_STEP = 1e-5
 
@@ -62,8 +70,9 @@ class LawFit:
     scatter: relative standard deviation from press to press, as load. residuals (n,): of ln current;
     misfit: their root mean square in standard deviations. freedom: degrees of freedom. observed: whether the
     readings determine the sheet's resistance; else it is the file's, within SHEET_LOG_STD. radii_m: of the
-    indenters, as fitted. problems: reasons not to use the law, with remedies; remarks: limitations.
-    basis: data for `band`.
+    indenters, as fitted; where the law's `hertz_force_n` is known, at that force. evidence: twice the log
+    likelihood ratio of the radius law that grows over the constant one. problems: reasons not to use the law,
+    with remedies; remarks: limitations. basis: data for `band`.
     """
 
     law: LawParameters
@@ -74,9 +83,16 @@ class LawFit:
     sheet_observed: bool
     radii_m: FloatArray
     residuals: FloatArray
+    evidence: float
     problems: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     basis: _BandBasis | None = field(default=None, repr=False, compare=False)
+
+    def radius_m(self, force_n: FloatArray, radius_m: float) -> FloatArray:
+        """Return the fitted radius (n,) under the indenter of a stated radius [m], at forces (n,)."""
+        assert self.basis is not None
+        fitted = self.radii_m[np.argmin(np.abs(self.basis.data.radii_m - radius_m))]
+        return np.asarray(fitted * np.exp(self.basis.data.log_growth(np.log(force_n))))
 
     def band(self, force_n: FloatArray, circuit: ContactCircuit, radius_m: float) -> FloatArray:
         """Return ln current and half its 95 % interval, (2, n), at forces under an indenter in a circuit."""
@@ -98,13 +114,27 @@ def fit_law(
     """
     if lack := _insufficient_data(readings):
         raise ValueError(lack)
-    data = _ReadingColumns.from_readings(readings, circuits, reference_pa, radius_std)
+    constant = _ReadingColumns.from_readings(readings, circuits, reference_pa, radius_std)
+    growing = replace(
+        constant, hertz_force_n=start.hertz_force_n or float(np.exp(np.log(constant.force_n).mean()))
+    )
+    evidence = _deviance(constant, start) - _deviance(growing, start)
+    is_growing = evidence > (MIN_EVIDENCE if start.hertz_force_n is None else -MIN_EVIDENCE)
+    data = growing if is_growing else constant
     free = _solve(data, start, sheet_std=math.inf)
     observed = free is not None and free.sheet_std < _MAX_OBSERVED_LOG_STD
     solved = free if observed and free is not None else _solve(data, start, sheet_std=SHEET_LOG_STD)
     if solved is None:
         raise ValueError(f"no law fits these readings: {_failure_causes(readings)}")
-    return _build_fit(solved, observed, readings)
+    return _build_fit(solved, observed, readings, evidence)
+
+
+def _deviance(data: _ReadingColumns, start: LawParameters) -> float:
+    """Return -2 ln of the greatest likelihood of the readings, with the file's sheet resistance for prior."""
+    solved = _solve(data, start, sheet_std=SHEET_LOG_STD)
+    if solved is None:
+        return _NO_FIT_DEVIANCE
+    return solved.deviance
 
 
 @dataclass(frozen=True)
@@ -123,6 +153,8 @@ class _ReadingColumns:
     indenter: NDArray[np.intp]
     reference_pa: float
     radius_std: float
+    hertz_force_n: float | None = None
+    """at which the indenters have their radii; None: at every force"""
 
     @classmethod
     def from_readings(
@@ -157,12 +189,17 @@ class _ReadingColumns:
         k is in ohm m^2 at the reference.
         """
         log_k, alpha, log_sheet = (theta[..., i, None] for i in range(3))
-        law = ContactLaw(
-            np.exp(log_k), alpha, np.exp(theta[..., 3:][..., self.indenter]), reference_pa=self.reference_pa
-        )
         force = self.force_n if log_force is None else np.exp(log_force)
+        log_radius = theta[..., 3:][..., self.indenter] + self.log_growth(np.log(force))
+        law = ContactLaw(np.exp(log_k), alpha, np.exp(log_radius), reference_pa=self.reference_pa)
         spreading = self.spreading_m * math.exp(log_spread)
         return np.log(law.current(force, self.drive_v, np.exp(log_sheet), spreading, self.series_ohm))
+
+    def log_growth(self, log_force: FloatArray) -> FloatArray:
+        """Return ln of the radius at forces over that stated."""
+        if self.hertz_force_n is None:
+            return np.zeros_like(log_force)
+        return np.asarray((log_force - math.log(self.hertz_force_n)) / 3)
 
     def slopes(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return slopes of ln current (n,) by ln force, and its standard deviation by the position."""
@@ -183,6 +220,8 @@ class _LawSolution:
     scatter: float
     variance: FloatArray
     degrees_of_freedom: int
+    deviance: float
+    """-2 ln of the likelihood"""
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -203,9 +242,12 @@ def _solve(data: _ReadingColumns, start: LawParameters, sheet_std: float) -> _La
     sheet_std: of the file's ln sheet resistance; infinite to use the readings alone.
     """
     priors = np.concatenate([[math.inf, math.inf, sheet_std], np.full(len(data.radii_m), data.radius_std)])
+    alpha = start.alpha
+    if (data.hertz_force_n is None) != (start.hertz_force_n is None):  # the current's slope by force is kept
+        alpha = 3 * alpha - 2 if start.hertz_force_n is None else (alpha + 2) / 3
     start_theta = np.concatenate(
         [
-            [math.log(start.contact_ohm_mm2 * 1e-6), start.alpha, math.log(start.ohm_per_square)],
+            [math.log(start.contact_ohm_mm2 * 1e-6), max(alpha, 0.5), math.log(start.ohm_per_square)],
             np.log(data.radii_m),
         ]
     )
@@ -235,7 +277,9 @@ def _solve(data: _ReadingColumns, start: LawParameters, sheet_std: float) -> _La
         return None
     if np.linalg.cond(normal) > 1e14:
         return None
-    return _LawSolution(data, theta, normal, scatter, variance, freedom)
+    away = (theta - start_theta) / priors
+    deviance = float((residual**2 / variance + np.log(variance)).sum() + (away**2).sum())
+    return _LawSolution(data, theta, normal, scatter, variance, freedom, deviance)
 
 
 def _scatter(residual: FloatArray, known: FloatArray, by_load: FloatArray, freedom: int) -> float:
@@ -253,13 +297,16 @@ def _scatter(residual: FloatArray, known: FloatArray, by_load: FloatArray, freed
     return math.exp(low)
 
 
-def _build_fit(solved: _LawSolution, observed: bool, readings: Sequence[WeightReading]) -> LawFit:
+def _build_fit(
+    solved: _LawSolution, observed: bool, readings: Sequence[WeightReading], evidence: float
+) -> LawFit:
     theta, data = solved.theta, solved.data
     law = LawParameters(
         math.exp(theta[0]) * 1e6,
         float(theta[1]),
         math.exp(theta[2]),
         matrix(_symmetric(solved.covariance[:3, :3])),
+        data.hertz_force_n,
     )
     quantile = float(stdtrit(solved.degrees_of_freedom, 0.975))
     half = [quantile * solved.std(i) for i in range(3)]
@@ -277,7 +324,7 @@ def _build_fit(solved: _LawSolution, observed: bool, readings: Sequence[WeightRe
     radii = np.exp(theta[3:])
     return LawFit(
         law, intervals, solved.scatter, misfit, solved.degrees_of_freedom, observed, radii, residual,
-        tuple(problems), tuple(remarks), _BandBasis(data, theta, solved.covariance, quantile),
+        evidence, tuple(problems), tuple(remarks), _BandBasis(data, theta, solved.covariance, quantile),
     )  # fmt: skip
 
 
@@ -291,10 +338,11 @@ class _BandBasis:
     def band(self, force_n: FloatArray, circuit: ContactCircuit, radius_m: float) -> FloatArray:
         indenter = int(np.argmin(np.abs(self.data.radii_m - radius_m)))
         like = np.ones_like(force_n)
-        at = _ReadingColumns(
-            force_n, like, like, circuit.spreading_m * like, 0 * like, circuit.drive_v * like,
-            circuit.series_ohm * like, self.data.radii_m, np.full(len(force_n), indenter, dtype=np.intp),
-            self.data.reference_pa, self.data.radius_std,
+        at = replace(
+            self.data, force_n=force_n, log_current=like, variance=like,
+            spreading_m=circuit.spreading_m * like, spreading_log_std=0 * like,
+            drive_v=circuit.drive_v * like, series_ohm=circuit.series_ohm * like,
+            indenter=np.full(len(force_n), indenter, dtype=np.intp),
         )  # fmt: skip
         values = at.log_current_model(
             np.vstack([self.theta, self.theta + np.eye(len(self.theta)) * _DIFFERENCE_STEP])
@@ -364,7 +412,8 @@ def _problems(
     if not wide and (chance := _lack_of_fit_probability(solved, residual)) < _MIN_LAW_PROBABILITY:
         found.append(
             f"the readings don't lie on such a law (chance {chance:.1g}): does the contact's size change "
-            "with the weight, as under a round object? Stand all weights on one flat foot"
+            "with the weight, otherwise than under a round object? Stand all weights on one foot, flat or "
+            "round"
         )
     return found
 

@@ -124,17 +124,18 @@ def _plot_contact_resistance(
     mark: str,
     label: str,
 ) -> None:
-    """Plot V / I less the plane's part, k A^(2 alpha - 2) ... F^-alpha: a line of slope -alpha."""
-    radius = float(fit.radii_m[np.argmin(np.abs(fit.radii_m - readings[0].weight.radius_m))])
-    circuit = _median_circuit(circuits)
+    """Plot V / I less the plane's part, a line of slope -alpha (if A is constant)."""
+    stated_m, circuit = readings[0].weight.radius_m, _median_circuit(circuits)
     force = np.array([reading.weight.force_n for reading in readings])
-    plane = np.array([_sheet_resistance(fit, one, radius) for one in circuits])
+    radii = fit.radius_m(force, stated_m)
+    plane = np.array([_sheet_resistance(fit, *one) for one in zip(circuits, radii, strict=True)])
     drive = np.array([one.drive_v for one in circuits])
     contact = drive / np.array([reading.current_a for reading in readings]) - plane
     grid = np.geomspace(force.min() / _FORCE_MARGIN, force.max() * _FORCE_MARGIN, 200)
     law, _ = fit.band(grid, circuit, readings[0].weight.radius_m)
-    line = circuit.drive_v / np.exp(law) - _sheet_resistance(fit, circuit, radius)
-    legend = f"law, slope -{fit.law.alpha:.2f} where it is straight"
+    line = circuit.drive_v / np.exp(law) - _sheet_resistance(fit, circuit, fit.radius_m(grid, stated_m))
+    slope = fit.law.alpha if fit.law.hertz_force_n is None else (fit.law.alpha + 2) / 3
+    legend = f"law, slope -{slope:.2f} where it is straight"
     axes.loglog(grid, line / 1e3, color=_FIT, label=_unique_label(axes, legend))
     above = contact > 0
     kiloohm = contact[above] / 1e3
@@ -148,10 +149,10 @@ def _unique_label(axes: Axes, label: str) -> str:
     return "_" if label in axes.get_legend_handles_labels()[1] else label
 
 
-def _sheet_resistance(fit: LawFit, circuit: ContactCircuit, radius_m: float) -> float:
-    """Return the resistance [ohm] of sheet and resistors under a contact of no resistance."""
+def _sheet_resistance(fit: LawFit, circuit: ContactCircuit, radius_m: FloatArray) -> FloatArray:
+    """Return the resistance [ohm] of sheet and resistors under contacts of no resistance."""
     sheet = fit.law.ohm_per_square / (2 * math.pi)
-    return sheet * math.log(circuit.spreading_m / radius_m) + circuit.series_ohm
+    return np.asarray(sheet * np.log(circuit.spreading_m / radius_m) + circuit.series_ohm)
 
 
 def _median_circuit(circuits: Sequence[ContactCircuit]) -> ContactCircuit:

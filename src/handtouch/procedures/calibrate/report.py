@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from handtouch.calibration.calibration import LawParameters
-from handtouch.field import ContactLaw
-from handtouch.procedures.calibrate.fit import PARAMETERS, LawFit
+from handtouch.core.pad_model import contact_law
+from handtouch.procedures.calibrate.fit import MIN_EVIDENCE, PARAMETERS, LawFit
 from handtouch.procedures.calibrate.readings import ContactCircuit, PadCircuitModel, WeightReading
 
 _UNITS = {"contact_ohm_mm2": "ohm mm2", "alpha": "", "ohm_per_square": "ohm per square"}
@@ -81,13 +81,7 @@ def reported_force(
 ) -> float:
     """Return the force [N] that the daemon estimates for a reading under a law; NaN above the sheet's
     limit."""
-    contact = ContactLaw(
-        law.contact_ohm_mm2 * 1e-6,
-        law.alpha,
-        circuit_model.sheet.contact_radius_mm * 1e-3,
-        reference_pa=circuit_model.sheet.reference_kpa * 1e3,
-    )
-    estimate = contact.force(
+    estimate = contact_law(circuit_model.sheet, law).force(
         reading.current_a, circuit.drive_v, law.ohm_per_square, circuit.spreading_m, circuit.series_ohm
     )
     return float(estimate.force_n)
@@ -118,10 +112,28 @@ def format_text(report: CalibrationReport) -> str:
             f"{name:<16} {value:>9.5g}  95 %: {interval.low:.5g} to {interval.high:.5g} {_UNITS[name]}; "
             f"file: {file:.5g}{kept}"
         )
+    lines += _radius_lines(report)
     lines.append(f"{'scatter':<16} {fit.scatter:>9.1%}  from press to press, of the load")
     lines += [f"Note: {remark}." for remark in fit.remarks]
     lines += [f"Not enough: {problem}." for problem in fit.problems]
     return "\n".join(lines)
+
+
+def _radius_lines(report: CalibrationReport) -> list[str]:
+    """Return the radius law that was chosen, and the evidence for it."""
+    fit = report.fit
+    names = "the same at every force", "grows as force^(1/3)"
+    chosen_n, is_files = fit.law.hertz_force_n, "the file's"
+    at = "" if chosen_n is None else f", {1e3 * fit.radii_m[0]:.3g} mm at {chosen_n:.3g} N"
+    if (chosen_n is None) != (report.default_law.hertz_force_n is None):
+        is_files = "unlike the file's"
+    verdict = f"strong beyond +-{MIN_EVIDENCE:.0f}"
+    if abs(fit.evidence) < MIN_EVIDENCE:
+        verdict = f"undecided within +-{MIN_EVIDENCE:.0f}: add lighter and heavier weights, to 1:100"
+    return [
+        f"{'contact radius':<16} {names[chosen_n is not None]}{at}; {is_files}",
+        f"{'':<16} 2 ln(likelihood ratio) of growing over constant: {fit.evidence:+.1f}; {verdict}",
+    ]
 
 
 def to_json(report: CalibrationReport, **more: Any) -> dict[str, Any]:
@@ -129,7 +141,8 @@ def to_json(report: CalibrationReport, **more: Any) -> dict[str, Any]:
     fit = report.fit
     record = {
         "pad": report.pad,
-        "law": {**{name: getattr(fit.law, name) for name in PARAMETERS}, "covariance": fit.law.covariance},
+        "law": asdict(fit.law),
+        "radius_evidence": fit.evidence,
         "intervals_95": {name: [interval.low, interval.high] for name, interval in fit.intervals.items()},
         "sheet_observed": fit.sheet_observed,
         "scatter": fit.scatter,

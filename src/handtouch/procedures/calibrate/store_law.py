@@ -52,7 +52,8 @@ def store_law(
         host=platform.node(),
         program=f"{getpass.getuser()}, handtouch {handtouch.__version__}",
         note=f"weights {weights}; scatter {fit.scatter:.1%}; sheet "
-        f"{'' if fit.sheet_observed else 'not '}observed",
+        f"{'' if fit.sheet_observed else 'not '}observed; radius "
+        f"{'constant' if fit.law.hertz_force_n is None else 'by Hertz'}, evidence {fit.evidence:+.1f}",
     )
     with Store(store_path(deployment.daemon.store, path.parent)) as store:
         newest = store.newest(header.serial, header.default_calibration_id)

@@ -101,11 +101,14 @@ class HiddenContact:
     elongation: float
     direction_rad: float
     """Angle between the long axis and x on the pad."""
+    hertz_force_n: float | None = None
+    """Force at which it has this size; None: at every force."""
 
     @property
     def patch(self) -> ContactPatch:
         """The patch, in metres."""
-        return ContactPatch.ellipse(1e-3 * self.radius_mm, self.elongation, self.direction_rad)
+        radius_m = 1e-3 * self.radius_mm
+        return ContactPatch.ellipse(radius_m, self.elongation, self.direction_rad, self.hertz_force_n)
 
 
 @dataclass(frozen=True)
@@ -203,6 +206,7 @@ class DrawnWorld:
             max(radius_mm, _MIN_RADIUS_RATIO * sheet.contact_radius_mm),
             elongation,
             float(patch.uniform(0, np.pi)),
+            sheet.hertz_force_n,
         )
 
     def shear(self, pad_name: str) -> HiddenShear:
