@@ -83,3 +83,31 @@ surface = {surface}
 gap_mm = {gap_mm}
 {extra}
 """
+
+
+THREE_ARCS = {"end": (50.187, 6.3617), "left": (7.7754, 27.5675), "right": (28.9812, 48.7732)}
+SIX_ARCS = {
+    "a": (0.5, 8.9),
+    "b": (9.9, 18.3),
+    "c": (19.3, 27.7),
+    "d": (28.7, 37.2),
+    "e": (38.2, 46.6),
+    "f": (47.6, 56.0),
+}
+
+
+def arcs_text(arcs: dict[str, tuple[float, float]] = THREE_ARCS) -> str:
+    """Return a hand of a pad with four sides and a disc with electrodes on arcs."""
+    text = deployment_text(pad_text("plane", 1))
+    first, _, node = text.partition("[node.n]")
+    channels = ", ".join(f'"0x6401:{sub}"' for sub in range(1, len(arcs) + 1))
+    text = f"{first}[node.arcs]\nchannels = [{channels}]\n{node.partition('[')[0]}[node.n]{node}"
+    listed = ", ".join(f"{name} = [{begin}, {end}]" for name, (begin, end) in arcs.items())
+    pad = pad_text("disc", 2).replace('node = "n"', f'node = "arcs"\nelectrode_arcs_mm = {{ {listed} }}')
+    surface = (
+        'surface = { kind = "outline", outline_x_mm = [9, -9], outline_y_mm = [0, 0], '
+        "edge_turn_deg = [180, 180], corners_mm = [35.3429, 49.4801, 7.0686, 21.2058] }"
+    )
+    lines = [surface if line.startswith("surface") else line for line in pad.splitlines()]
+    lines = ["gap_mm = 0.0" if line.startswith("gap_mm") else line for line in lines]
+    return text + "\n" + "\n".join(lines) + "\n"

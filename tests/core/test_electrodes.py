@@ -2,49 +2,35 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from handtouch.config import ConfigError, parse
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import ChannelField, Slab
 from handtouch.core.state import TickState
+from handtouch.field.contact_law import ContactLaw
 from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.outline_surface import OutlineSurface
 from handtouch.hand import pad_network, pad_surface
-from tests.deployments import deployment_text, pad_text
-
-ARCS = {"end": (50.187, 6.3617), "left": (7.7754, 27.5675), "right": (28.9812, 48.7732)}
-
-
-def hand_text(arcs: dict[str, tuple[float, float]] = ARCS) -> str:
-    """Return a hand of a pad with four sides and a disc with electrodes on arcs."""
-    text = deployment_text(pad_text("plane", 1))
-    first, _, node = text.partition("[node.n]")
-    channels = ", ".join(f'"0x6401:{sub}"' for sub in range(1, len(arcs) + 1))
-    text = f"{first}[node.arcs]\nchannels = [{channels}]\n{node.partition('[')[0]}[node.n]{node}"
-    listed = ", ".join(f"{name} = [{begin}, {end}]" for name, (begin, end) in arcs.items())
-    pad = pad_text("disc", 2).replace('node = "n"', f'node = "arcs"\nelectrode_arcs_mm = {{ {listed} }}')
-    surface = (
-        'surface = { kind = "outline", outline_x_mm = [9, -9], outline_y_mm = [0, 0], '
-        "edge_turn_deg = [180, 180], corners_mm = [35.3429, 49.4801, 7.0686, 21.2058] }"
-    )
-    lines = [surface if line.startswith("surface") else line for line in pad.splitlines()]
-    lines = ["gap_mm = 0.0" if line.startswith("gap_mm") else line for line in lines]
-    return text + "\n" + "\n".join(lines) + "\n"
+from tests.deployments import SIX_ARCS, THREE_ARCS, arcs_text
 
 
 @pytest.fixture(scope="module")
 def model() -> PadModel:
-    return PadModel(parse(hand_text()))
+    return PadModel(parse(arcs_text()))
 
 
 def test_fractions_of_arcs_are_those_of_the_outline_itself() -> None:
-    pad = parse(hand_text()).pads[1].pad
+    pad = parse(arcs_text()).pads[1].pad
     surface = pad_surface(pad)
     assert isinstance(surface, OutlineSurface)
-    network = pad_network(pad, parse(hand_text()).sheets[pad.sheet])
+    network = pad_network(pad, parse(arcs_text()).sheets[pad.sheet])
     ends = [(1e-3 * begin, 1e-3 * end) for begin, end in pad.arcs_mm]
     expected = OutlineNetwork(
         surface.outline.at_origin(), [BoundaryElectrode(begin, end) for begin, end in ends], 1.0
@@ -90,11 +76,64 @@ def test_a_state_names_its_number_of_channels_unless_it_is_four() -> None:
     ("arcs", "message"),
     [
         ({"a": (0.0, 10.0), "b": (20.0, 30.0)}, "channels"),
-        ({**ARCS, "left": (5.0, 27.5)}, "end and left touch or overlap"),
-        ({"end": ARCS["end"], "right": ARCS["right"], "left": ARCS["left"]}, "left must follow right"),
-        ({**ARCS, "right": (28.9812, 200.0)}, "outline is 56.549 mm long"),
+        ({**THREE_ARCS, "left": (5.0, 27.5)}, "end and left touch or overlap"),
+        (
+            {"end": THREE_ARCS["end"], "right": THREE_ARCS["right"], "left": THREE_ARCS["left"]},
+            "left must follow right",
+        ),
+        ({**THREE_ARCS, "right": (28.9812, 200.0)}, "outline is 56.549 mm long"),
     ],
 )
 def test_impossible_arcs_are_refused(arcs: dict[str, tuple[float, float]], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        parse(hand_text(arcs))
+        parse(arcs_text(arcs))
+
+
+def solved(model: PadModel, fractions: NDArray[np.float64], total_a: float) -> NDArray[np.float64]:
+    """Return the contact values of the disc with these currents."""
+    currents, values = np.zeros((2, model.channels)), np.full((2, VALUE_COUNT), np.nan)
+    currents[1, : len(fractions)] = total_a * fractions
+    solver = make_solver(model, currents, np.zeros(2), np.ones(2, np.bool_), values)
+    solver.solve_contacts(np.array([1]).data)
+    return np.asarray(values[1])
+
+
+def test_contacts_are_located_without_a_dead_electrode() -> None:
+    deployment = parse(arcs_text(SIX_ARCS))
+    model = PadModel(deployment)
+    network, sheet, whole = model.networks[1], deployment.sheets["s"], model.calibrations[1]
+    at = np.array([0.35, 0.62]) * (network.a, network.b)
+    floating = network.with_series_ohm([math.inf if k == 2 else 0.0 for k in range(6)])
+    fractions = floating.fractions(*at)
+    assert fractions[2] == 0
+    law = ContactLaw(sheet.contact_ohm_mm2 * 1e-6, sheet.alpha, sheet.contact_radius_mm * 1e-3, 0.0)
+    scale_m = pad_surface(deployment.pads[1].pad).scale(*at)
+    drive_v = deployment.nodes["arcs"].drive_v
+    whole_a, total_a = (
+        float(
+            law.current(
+                1.5,
+                drive_v,
+                sheet.ohm_per_square,
+                pad.spreading_radius(*at) * scale_m,
+                pad.series_resistance(*at),
+            )
+        )
+        for pad in (network, floating)
+    )
+    assert total_a < 0.98 * whole_a
+
+    before = solved(model, network.fractions(*at), whole_a)
+    model.set_calibration(1, replace(whole, dead_electrode=2))
+    found = solved(model, fractions, total_a)
+    np.testing.assert_allclose(found[VALUE_SLICES["xy"]], at, atol=1e-4 * network.a)
+    assert found[VALUE_SLICES["force_n"]] == pytest.approx(before[VALUE_SLICES["force_n"]], rel=1e-3)
+    assert found[VALUE_SLICES["squared_misfit"]] < 1e-3
+    trace = [values[VALUE_SLICES["covariance_m2"]][::4].sum() for values in (before, found)]
+    assert trace[1] > trace[0]
+    noisy = fractions.copy()
+    noisy[2] = 0.3  # whatever an open channel reads
+    np.testing.assert_allclose(solved(model, noisy, total_a)[VALUE_SLICES["xy"]], at, atol=1e-4 * network.a)
+
+    model.set_calibration(1, whole)
+    np.testing.assert_array_equal(solved(model, network.fractions(*at), whole_a), before)

@@ -187,6 +187,13 @@ def test_manual_calibration_is_sent_until_a_better_one_is_estimated(rig: Rig) ->
         (b"\xc1 malformed", "malformed"),
         (calibrate(3, 13), "malformed"),  # no such pad
         (calibrate(1, 12, offset_counts=(2e4, 0.0, 0.0, 0.0)), "malformed"),  # beyond half the range
+        (calibrate(1, 12, gains=(1.1,) * 6, covariance=None), "malformed"),  # of another number of channels
+        (
+            CalibrationAssessment(
+                pad=1, serial=12, calibration_state=CalibrationState.DEFAULT, dead_electrode=4
+            ),
+            "malformed",
+        ),
         (calibrate(1, 99), "late"),  # of another node
         (CalibrationAssessment(pad=1, serial=99, calibration_state=CalibrationState.CALIBRATED), "late"),
     ],
@@ -239,6 +246,17 @@ def test_diagnosis_is_published_and_logged_and_its_end_too(rig: Rig, caplog: Any
     rig.receive(CalibrationAssessment(pad=2, serial=13, calibration_state=CalibrationState.DEFAULT))
     assert rig.supervisor.health_fields(2)["diagnoses"] == ()
     assert "gum: cleared" in caplog.text
+
+
+def test_a_dead_electrode_is_left_out_until_the_node_is_replaced(rig: Rig) -> None:
+    whole = rig.pipeline.model.forward_tables[2]
+    state = CalibrationState.DEFAULT
+    rig.receive(CalibrationAssessment(pad=2, serial=13, calibration_state=state, dead_electrode=1))
+    assert not rig.pipeline.model.forward_tables[2].search_fractions[:, 1].any()
+    rig.swap(2, 13, 14)
+    rig.step()
+    rig.step()
+    assert rig.pipeline.model.forward_tables[2] is whole
 
 
 def test_fault_invalidates_force_and_position_until_it_ends(rig: Rig) -> None:

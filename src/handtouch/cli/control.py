@@ -143,10 +143,14 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
 def _add_direct(direct: argparse._ArgumentGroup) -> None:
     direct.add_argument("--name", help="id of the new calibration, published in contact messages (required)")
     direct.add_argument(
-        "--gains", type=float, nargs=4, metavar="G", help="relative gains of the channels x0, xa, y0, yb"
+        "--gains",
+        type=float,
+        nargs="+",
+        metavar="G",
+        help="relative gains of the electrodes' channels: x0, xa, y0, yb, or those of electrode_arcs_mm",
     )
     direct.add_argument(
-        "--offsets", type=float, nargs=4, metavar="COUNTS", help="counts of the untouched channels"
+        "--offsets", type=float, nargs="+", metavar="COUNTS", help="counts of the untouched channels"
     )
     direct.add_argument(
         "--law",

@@ -192,7 +192,7 @@ class DaemonControl:
         offset_counts: Sequence[float] | None = None,
         law: LawValues | None = None,
     ) -> PadCalibration:
-        """Set gains (4,), offsets (4,) or the law of one pad under a calibration's name; return all of it.
+        """Set gains (c,), offsets (c,) or the law of one pad under a calibration's name; return all of it.
 
         With the pad alone, nothing changes.
         """

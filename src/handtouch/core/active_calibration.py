@@ -17,7 +17,8 @@ class ActiveCalibration:
     gains: (n,) of the electrodes. law: None, the deployment's. gain_covariance: (n n,) of log gains;
     None, as the deployment states. parts: learned with the gains; None, as the deployment states.
     quarantined: no force is published. diagnoses: names of those responsible for `quarantined` or
-    `position_unreliable`.
+    `position_unreliable`. dead_electrode: index of an electrode that is connected to nothing, without which
+    contacts are located.
     """
 
     calibration_id: str
@@ -27,4 +28,5 @@ class ActiveCalibration:
     parts: LearnedParts | None = None
     quarantined: bool = False
     position_unreliable: bool = False
+    dead_electrode: int | None = None
     diagnoses: tuple[str, ...] = ()

@@ -46,6 +46,7 @@ _SHEET_TOLERANCES = {
 
 
 _MIN_RADIUS_RATIO = 0.3  # least radius of a contact, relative to the stated one
+_DEAD_WEIGHT = 1e-6  # of a dead electrode, whose readings are left out
 _LOCAL_UNEVENNESS = 1.5  # standard deviation of ln of the local sheet resistance, per wave's: a sum of five
 
 
@@ -69,8 +70,9 @@ class PadModel:
     slower rise to `end_threshold_n` is drift. `behaviours` (n,): sheet behaviour, None where it isn't
     modelled.
 
-    `forward_tables`, `surface_tables` and `law_parameters` are what the stages read; `weight` (n, c) is
-    1 / `noise_a`. `networks`, `placement` and `estimate_force` are the exact theory that they tabulate.
+    `forward_tables` (those without an electrode where it is dead), `surface_tables` and `law_parameters` are
+    what the stages read; `weight` (n, c) is 1 / `noise_a`. `networks`, `placement` and `estimate_force` are
+    the exact theory that they tabulate.
     """
 
     def __init__(
@@ -134,6 +136,7 @@ class PadModel:
         self.networks = networks
         tables = {key: forward_table(network) for key, network in {id(n): n for n in networks}.items()}
         self.forward_tables = [tables[id(network)] for network in networks]
+        self._whole_tables = list(self.forward_tables)
         self._parts = list(zip(pads, nodes, sheets, strict=True))
         self.surface_tables = [
             SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
@@ -186,6 +189,10 @@ class PadModel:
         self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
         self.noise_a[pad] = self.noise_counts[pad] * self.ampere_per_count[pad]
         self.weight[pad, :count] = 1 / self.noise_a[pad, :count]
+        if calibration.dead_electrode != before.dead_electrode:
+            self._set_dead_electrode(pad, calibration.dead_electrode)
+        if calibration.dead_electrode is not None:
+            self.weight[pad, calibration.dead_electrode] *= _DEAD_WEIGHT
         self.mean_ampere_per_count[pad] = self.ampere_per_count[pad].sum() / count
         self.gain_covariance[pad] = self._stated_gain_covariance[pad]
         if calibration.gain_covariance is not None:
@@ -195,6 +202,20 @@ class PadModel:
         self._set_parts(pad, calibration.parts)
         self.quarantined[pad] = calibration.quarantined
         self.position_unreliable[pad] = calibration.position_unreliable
+
+    def _set_dead_electrode(self, pad: int, electrode: int | None) -> None:
+        """Take the forward model without an electrode, None: with all.
+
+        Without one, the resistors' part is in the spreading radius.
+        """
+        network, table = self.networks[pad], self._whole_tables[pad]
+        self._series_form[pad] = 0.0
+        if electrode is None:
+            count = self.electrode_counts[pad]
+            self._series_form[pad, :count, :count] = network.series_quadratic_form
+            self.forward_tables[pad] = table
+        else:
+            self.forward_tables[pad] = table.with_dead_electrode(network, electrode)
 
     def set_gains_and_law(
         self, pad: int, gains: ArrayLike, calibration_id: str, law: LawParameters | None = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from statistics import NormalDist
 
@@ -110,12 +110,8 @@ class ForwardTable:
         nodes_x, nodes_y = (axis.nodes() for axis in axes)
         x, y = np.meshgrid(*(_inside(at[:, 0]) for at in (nodes_x, nodes_y)))
         fractions = model.fractions(x, y)
-        edge = _MIN_RADIUS_DISTANCE
-        x, y = (
-            np.clip(x, edge * model.a, (1 - edge) * model.a),
-            np.clip(y, edge * model.b, (1 - edge) * model.b),
-        )
-        values = np.stack([*fractions, np.log(spreading_radius(model, x, y))], axis=-1)
+        log_spreading = _log_spreading(model, *_spreading_nodes(model, nodes_x, nodes_y))
+        values = np.stack([*fractions, log_spreading], axis=-1)
         search = (np.arange(SEARCH_POINTS) + 0.5) / SEARCH_POINTS
         x, y = (at.ravel() for at in np.meshgrid(model.a * search, model.b * search))
         return cls(
@@ -135,6 +131,31 @@ class ForwardTable:
         """Number of electrodes."""
         return int(self.search_fractions.shape[1])
 
+    def with_dead_electrode(self, model: RectangleNetwork, electrode: int) -> ForwardTable:
+        """Return the table of the same pad with one electrode connected to nothing.
+
+        model: the pad's network. The others collect its current in constant proportions; how these vary with
+        the tolerances of parts is neglected.
+        """
+        series = [math.inf if k == electrode else ohm for k, ohm in enumerate(model.series_ohm)]
+        floating = model.with_series_ohm(series)
+        mixing = floating.currents_per_ideal @ np.linalg.inv(model.currents_per_ideal)
+        n = self.electrodes
+        nodes, tolerances = self.nodes.copy(), self.tolerance_nodes.copy()
+        nodes[..., :n] = nodes[..., :n] @ mixing.T
+        by_part = tolerances[..., 2 * n :].reshape(*tolerances.shape[:-1], -1, n) @ mixing.T
+        tolerances[..., 2 * n :] = by_part.reshape(*tolerances.shape[:-1], -1)
+        x, y = _spreading_nodes(model, self.nodes_x, self.nodes_y)
+        nodes[..., n:] = hermite_table(_log_spreading(floating, x, y)[..., None])
+        return replace(
+            self,
+            nodes=nodes,
+            search_fractions=np.ascontiguousarray(self.search_fractions @ mixing.T),
+            tolerance_nodes=tolerances,
+            end_vectors=self.end_vectors @ mixing.T,
+            series_vectors=np.ascontiguousarray(floating.series_sensitivity.T),
+        )
+
     def pad_table(self) -> ModelTable:
         """Return it as the stages take it."""
         return ModelTable(
@@ -146,8 +167,27 @@ class ForwardTable:
             view_memory(self.search_fractions),
             view_memory(self.search_cells),
             SEARCH_POINTS,
-            _misfit_scale(self.electrodes),
+            _misfit_scale(int(np.count_nonzero(self.search_fractions.any(axis=0)))),
         )
+
+
+def _spreading_nodes(
+    model: RectangleNetwork, nodes_x: FloatArray, nodes_y: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the positions at which the spreading radius is tabulated, off the edges, where it vanishes."""
+    edge = _MIN_RADIUS_DISTANCE
+    x, y = np.meshgrid(nodes_x[:, 0], nodes_y[:, 0])
+    return np.clip(x, edge * model.a, (1 - edge) * model.a), np.clip(y, edge * model.b, (1 - edge) * model.b)
+
+
+def _log_spreading(model: RectangleNetwork, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return ln of the spreading radius; with a floating electrode, enlarged by the resistance that it and
+    the resistors add."""
+    log_radius = np.log(spreading_radius(model, x, y))
+    if np.isfinite(model.series_ohm).all():
+        return np.asarray(log_radius)
+    added_ohm = model.series_resistance(x, y)
+    return np.asarray(log_radius + 2 * math.pi * added_ohm / model.sheet_ohm_per_square)
 
 
 def _misfit_scale(electrodes: int) -> float:

@@ -167,6 +167,8 @@ class TickProcessor:
     def refresh(self) -> None:
         """Compute what follows from state and model, after either was changed as a whole."""
         model, held = self.model, self.state
+        if any(now is not before for now, before in zip(model.forward_tables, self._tables, strict=True)):
+            self._set_stages(model)
         self.contacts.set_settings(_detection_settings(model))
         self.baseline.set_settings(
             *(model.noise_counts, model.begin_threshold_counts, model.end_threshold_counts),
@@ -240,7 +242,7 @@ class TickProcessor:
 
     def _set_stages(self, model: PadModel) -> None:
         """Set the stages that read the model's arrays in place."""
-        columns = self.columns
+        columns, self._tables = self.columns, list(model.forward_tables)
         self.solver = make_solver(
             *(model, self.contacts.currents, self.contacts.offset_std_a, self._estimate_force, columns.values)
         )

@@ -83,8 +83,8 @@ class _LawArguments(Table):
 class _CalibrateArguments(Table):
     pad: Annotated[str, Field(max_length=200)]
     name: CalibrationId | None = None
-    gains: Annotated[tuple[Gain, Gain, Gain, Gain], Field(strict=False)] | None = None
-    offset_counts: Annotated[tuple[Offset, Offset, Offset, Offset], Field(strict=False)] | None = None
+    gains: Annotated[tuple[Gain, ...], Field(strict=False)] | None = None
+    offset_counts: Annotated[tuple[Offset, ...], Field(strict=False)] | None = None
     law: _LawArguments | None = None
 
 
@@ -221,12 +221,18 @@ class ControlCommands:
             "calibration_id": calibration.calibration_id,
             "default_calibration_id": model.default_calibration_ids[pad],
             "gains": list(calibration.gains),
-            "offset_counts": list(offsets or pipeline.tick.baseline.expected_counts[pad].tolist()),
+            "offset_counts": list(
+                offsets or pipeline.tick.baseline.expected_counts[pad, : self._channels(pad)].tolist()
+            ),
             "law": {key: getattr(law, key) for key in _LawArguments.model_fields},
         }
 
     def _apply_calibration(self, pad: int, request: _CalibrateArguments, name: str) -> None:
         pipeline = self._pipeline
+        for key in ("gains", "offset_counts"):
+            values = getattr(request, key)
+            if values is not None and len(values) != self._channels(pad):
+                raise RefusedError(f"{key} = {list(values)}: must have {self._channels(pad)} values")
         offsets, max_counts = request.offset_counts, float(pipeline.model.max_counts[pad]) / 2
         if offsets is not None and max(map(abs, offsets)) > max_counts:
             raise RefusedError(
@@ -240,12 +246,15 @@ class ControlCommands:
         pipeline.set_calibration(pad, replace(before, calibration_id=name, gains=gains, law=law))
         pipeline.add_event(EvidenceEvent(pad))
         if offsets is not None:
-            pipeline.add_event(BaselineEvent(pad, offsets, (0.0,) * 4))
+            pipeline.add_event(BaselineEvent(pad, offsets, (0.0,) * len(offsets)))
         if self._reporter.supervisor is not None:
             parts = ("gains", "law", "offset_counts")
             self._reporter.supervisor.register_manual_calibration(
                 pad, {part for part in parts if getattr(request, part) is not None}, offsets
             )
+
+    def _channels(self, pad: int) -> int:
+        return int(self._pipeline.model.electrode_counts[pad])
 
     def _disable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
         request = parse_arguments(_SwitchArguments, arguments)

@@ -201,13 +201,6 @@ class HandtouchDaemon:
         settings = self.deployment.daemon
         if not settings.supervise:
             return None
-        if others := [entry.name for entry in self.deployment.pads if entry.pad.arcs_mm]:
-            _log.warning(
-                "supervisor is off: %s: electrodes on arcs; no self-calibration, no diagnoses, no stored "
-                "offsets; baselines are tracked",
-                ", ".join(others),
-            )
-            return None
         supervisor = SupervisorClient(
             self.deployment,
             self.pipeline,

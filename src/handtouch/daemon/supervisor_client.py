@@ -100,6 +100,7 @@ class SupervisorClient:
         self._position_unreliable = np.zeros(pipeline.model.size, dtype=np.bool_)
         self._degrading_kinds: list[tuple[str, ...]] = [()] * pipeline.model.size
         """of each pad, kinds of the diagnoses that invalidate force or position"""
+        self._dead_electrodes: list[int | None] = [None] * pipeline.model.size
         self._log_gain_covariance: list[NDArray[np.float64] | None] = [None] * pipeline.model.size
         self._parts: list[LearnedParts | None] = [None] * pipeline.model.size
         """of each pad; None: as the deployment states"""
@@ -292,6 +293,7 @@ class SupervisorClient:
         self._manual_parts.pop(pad, None)
         self._unconfirmed_calibrations.pop(pad, None)
         self._position_unreliable[pad], self._degrading_kinds[pad] = False, (FaultKind.NODE_REPLACED.value,)
+        self._dead_electrodes[pad] = None
         self._set_calibration(pad, default, quarantined=True)
         pipeline.add_event(ReplacementEvent(pad))
         self.changed_pads.add(pad)
@@ -318,6 +320,7 @@ class SupervisorClient:
                 quarantined=quarantined,
                 position_unreliable=unreliable,
                 diagnoses=self._degrading_kinds[pad],
+                dead_electrode=self._dead_electrodes[pad],
             ),
         )
 
@@ -378,6 +381,7 @@ class SupervisorClient:
         position_unreliable = not all(diagnosis.position_valid for diagnosis in message.diagnoses)
         kinds = tuple(f.kind for f in message.diagnoses if not (f.position_valid and f.force_valid))
         self._position_unreliable[pad], self._degrading_kinds[pad] = position_unreliable, kinds
+        self._dead_electrodes[pad] = message.dead_electrode
         self._update_uncertainty(pad, force_invalid)
         known = {diagnosis.kind for diagnosis in before.diagnoses} if before else set()
         old_state = before.calibration_state if before else "default"
@@ -404,9 +408,11 @@ class SupervisorClient:
     def _channels(self, pad: int) -> int:
         return int(self._pipeline.model.electrode_counts[pad])
 
-    def _has_channels(self, message: WorkerMessage) -> bool:
-        """Return whether a message has as many gains as its pad has channels, if any."""
-        return not isinstance(message, CalibrationUpdate) or len(message.gains) == self._channels(message.pad)
+    def _has_channels(self, message: CalibrationUpdate | CalibrationAssessment) -> bool:
+        """Return whether a message is about as many channels as its pad has."""
+        if isinstance(message, CalibrationUpdate):
+            return len(message.gains) == self._channels(message.pad)
+        return message.dead_electrode is None or message.dead_electrode < self._channels(message.pad)
 
     def _covariance_of(self, pad: int, std: float) -> NDArray[np.float64]:
         """Return the covariance of log gains of a standard deviation; their sum is not observable."""

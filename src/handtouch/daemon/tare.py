@@ -37,7 +37,7 @@ class TareJob:
         now_ns: int,
         on_tared: Callable[[int, tuple[float, ...]], None] = lambda _, __: None,
     ) -> None:
-        """Start measuring; `on_tared` is called with the row and the offsets (4,) of each tared pad."""
+        """Start measuring; `on_tared` is called with the row and the offsets (c,) of each tared pad."""
         self._names, self._selected, self._sampling = names, selected, pacer
         self._pipeline, self._tick = pipeline, pipeline.tick
         tick = self._tick
@@ -70,7 +70,8 @@ class TareJob:
 
     def _finish_pad(self, pad: int, model: PadModel) -> dict[str, Any]:
         hand, link = self._names[pad]
-        before = self._tick.baseline.expected_counts[pad].copy()
+        own = slice(int(model.electrode_counts[pad]))
+        before = self._tick.baseline.expected_counts[pad, own].copy()
         result = {
             "hand": hand,
             "link": link,
@@ -82,9 +83,9 @@ class TareJob:
             state = PadState(int(self._tick.columns.state[pad])).name.lower()
             why = f"{count} samples in one second, at least {_MIN_SAMPLES} needed; the pad is {state}"
             return {**result, "tared": False, "reason": why}
-        part = self._sum[pad] / count
-        mean = self._reference_counts[pad] + part
-        std = np.sqrt(np.maximum(self._sum_of_squares[pad] / count - part**2, 0.0))
+        part = self._sum[pad, own] / count
+        mean = self._reference_counts[pad, own] + part
+        std = np.sqrt(np.maximum(self._sum_of_squares[pad, own] / count - part**2, 0.0))
         result |= {"mean_counts": mean.tolist(), "std_counts": std.tolist()}
         if why := self._refusal_reason(pad, model, mean, std):
             return {**result, "tared": False, "reason": why}
@@ -108,7 +109,7 @@ class TareJob:
             )
         # an offset below the end threshold can't hide a contact
         baseline = self._tick.baseline
-        moved = np.abs(mean - baseline.expected_counts[pad]).sum()
+        moved = np.abs(mean - baseline.expected_counts[pad, : len(mean)]).sum()
         allowed = model.end_threshold_counts[pad] + _MAX_OFFSET_SIGMA * np.hypot(noise, baseline.std[pad])
         if moved > allowed:
             return (

@@ -111,6 +111,11 @@ class ElectrodeNetwork(RectangleNetwork):
             for at in (start, stop)
         )
 
+    @property
+    def centres(self) -> FloatArray:
+        """Middle of each electrode, (m, 2)."""
+        return np.asarray(np.array([end[:2] for end in self.ends]).reshape(-1, 2, 2).mean(axis=1))
+
     def with_moved_end(self, end: int, step: float) -> ElectrodeNetwork:
         """Return the pad with an end (index of `ends`) moved inward, which makes its electrode shorter."""
         number, is_stop = divmod(end, 2)

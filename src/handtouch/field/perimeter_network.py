@@ -18,6 +18,7 @@ from handtouch.field.rectangle_network import ElectrodeEnd, RectangleNetwork
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
+_CENTRE_POINTS = 64  # of an electrode, whose mean is its centre
 
 
 class PerimeterNetwork(RectangleNetwork):
@@ -75,6 +76,13 @@ class PerimeterNetwork(RectangleNetwork):
         within = np.mod(positions, self.a + self.b)
         axes = (within >= self.a).astype(int)
         return tuple(map(ElectrodeEnd, x.tolist(), y.tolist(), axes.tolist()))
+
+    @property
+    def centres(self) -> FloatArray:
+        """Mean position of each electrode, (m, 2)."""
+        along = (np.arange(_CENTRE_POINTS) + 0.5) / _CENTRE_POINTS
+        positions = self.spans[:, :1] + np.diff(self.spans) * along
+        return np.asarray(perimeter_point(self.a, self.b, positions).mean(axis=-1).T)
 
     def with_moved_end(self, end: int, step: float) -> PerimeterNetwork:
         """Return the pad with an end (index of `ends`) moved inward, which makes its electrode shorter."""

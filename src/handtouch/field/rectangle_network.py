@@ -29,6 +29,11 @@ class RectangleNetwork(GroundedElectrodes):
     def ends(self) -> tuple[ElectrodeEnd, ...]:
         """Both ends of each electrode, in the order of the channels: (2 m,)."""
 
+    @property
+    @abstractmethod
+    def centres(self) -> FloatArray:
+        """Middle of each electrode, (m, 2)."""
+
     @abstractmethod
     def with_moved_end(self, end: int, step: float) -> Self:
         """Return the pad with an end (index of `ends`) moved inward, which makes its electrode shorter."""

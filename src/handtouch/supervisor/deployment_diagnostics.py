@@ -52,7 +52,8 @@ class DeploymentDiagnostics:
         self._diagnoses = []
         for rows, hand in self._hands:
             if fresh[:, rows].any():
-                samples = counts[:, rows].astype(np.int64)
+                most = self._models[rows.start].ampere_per_count.shape[1]
+                samples = counts[:, rows, :most].astype(np.int64)
                 hand.process_block(diagnose.HandSamples(sample_ns[:, rows], samples, fresh[:, rows]))
             self._diagnoses += [
                 (rows.start + row, diagnosis.published)
@@ -61,8 +62,16 @@ class DeploymentDiagnostics:
             ]
         return self._diagnoses
 
+    def dead_electrodes(self) -> dict[int, int]:
+        """Return the dead electrodes of pads that are located with the others, by pad."""
+        return {
+            rows.start + row: electrode
+            for rows, hand in self._hands
+            for row, electrode in hand.dead_electrodes().items()
+        }
+
     def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
-        """Set the stored offsets (4,) of a pad."""
+        """Set the stored offsets (c,) of a pad."""
         rows, hand = self._hand_of(pad)
         hand.set_offsets(pad - rows.start, offset_counts)
 
@@ -73,11 +82,12 @@ class DeploymentDiagnostics:
         """
         rows, hand = self._hand_of(pad)
         row, model = pad - rows.start, self._models[rows.start]
-        model.ampere_per_count[row] = self._default_ampere_per_count[rows.start][row] * np.asarray(
-            gains.factors
+        own = slice(len(gains.factors))
+        model.ampere_per_count[row, own] = (
+            self._default_ampere_per_count[rows.start][row, own] * gains.factors
         )
-        stated, known = self._stated_gain_covariance[rows.start][row], np.array(gains.covariance)
-        model.gain_covariance[row] = known if 0 < np.trace(known) < np.trace(stated) else stated
+        stated, known = self._stated_gain_covariance[rows.start][row, own, own], np.array(gains.covariance)
+        model.gain_covariance[row, own, own] = known if 0 < np.trace(known) < np.trace(stated) else stated
         hand.reset_contacts(row)
 
     def _hand_of(self, pad: int) -> tuple[slice, diagnose.HandDiagnostics]:

@@ -223,7 +223,10 @@ class CalibrationUpdate(Table):
 
 
 class CalibrationAssessment(Table):
-    """Calibration state of the node at a pad, and the pad's diagnoses."""
+    """Calibration state of the node at a pad, and the pad's diagnoses.
+
+    dead_electrode: index of the electrode without which contacts are to be located, None without one.
+    """
 
     kind: Literal["assessment"] = "assessment"
     pad: PadIndex
@@ -231,6 +234,7 @@ class CalibrationAssessment(Table):
     calibration_state: CalibrationState
     calibration_progress: ShortText = ""
     diagnoses: Annotated[tuple[Diagnosis, ...], Field(max_length=MAX_DIAGNOSES)] = ()
+    dead_electrode: Annotated[int, Field(ge=0, lt=MAX_CHANNELS)] | None = None
 
 
 def pack_manual_calibration(update: CalibrationUpdate, given: Collection[str]) -> bytes:

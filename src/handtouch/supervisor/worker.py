@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from typing import Any, Protocol
@@ -66,6 +66,9 @@ class Diagnostics(Protocol):
 
     def process_block(self, block: SampleBlock) -> Sequence[tuple[int, Diagnosis]]:
         """Process a block; return the active diagnoses, each with its pad."""
+
+    def dead_electrodes(self) -> Mapping[int, int]:
+        """Return the dead electrodes of pads, by pad, that are located with the others."""
 
     def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
         """Set the offsets (c,) of a pad from which static loads are detected."""
@@ -126,6 +129,7 @@ class SupervisorWorker:
         self._store, self._diagnostics = store, diagnostics
         self._store_schedule = StoreSchedule([row.channels for row in self._pads])
         self._diagnoses: dict[int, list[Diagnosis]] = {}
+        self._dead_electrodes: Mapping[int, int] = {}
         self._latest_sync_ns = self._status_sent_ns = self._store_polled_ns = 0
 
     def process_message(self, message: dict[str, Any], now: datetime) -> list[WorkerMessage]:
@@ -380,6 +384,8 @@ class SupervisorWorker:
         self._diagnoses = {}
         for pad, diagnosis in self._diagnostics.process_block(block) if self._diagnostics else ():
             self._diagnoses.setdefault(pad, []).append(diagnosis)
+        if self._diagnostics is not None:
+            self._dead_electrodes = self._diagnostics.dead_electrodes()
 
     def _report_assessment(self, pad: int, messages: list[WorkerMessage]) -> None:
         """Report the assessment of a pad, if it changed."""
@@ -394,6 +400,7 @@ class SupervisorWorker:
             calibration_state=row.calibrator.calibration_state,
             calibration_progress=progress[:MAX_TEXT],
             diagnoses=tuple(map(_shorten, diagnoses[:MAX_DIAGNOSES])),
+            dead_electrode=self._dead_electrodes.get(pad),
         )
         if row.calibrator.serial is not None and assessment != row.last_assessment:
             row.last_assessment = assessment

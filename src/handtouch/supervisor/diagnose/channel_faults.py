@@ -22,11 +22,11 @@ ALARM_NATS = 40.0
 _MIN_REPEATS = 200
 _MIN_RAILED_NS = 1_000_000_000
 _MIN_RAILED_TOUCHED_NS = 20_000_000_000
-_MAX_UNTOUCHED_FRACTION = 0.03  # of the railed channel: less than the other three get from a contact anywhere
+_MAX_UNTOUCHED_FRACTION = 0.03  # of the railed channel: less than the others get from a contact anywhere
 _IDLE_RATIO_RANGE = (
     0.7,
     1.3,
-)  # of the currents that the layer's potential on an electrode drives into the other three
+)  # of the currents that the layer's potential on an electrode drives into the others
 _FAULT_CLEAR_NS = 2_000_000_000
 
 
@@ -40,7 +40,7 @@ class ChannelFault:
 
 
 class ChannelFaultDetector:
-    """Detector of faults of the four channels of n pads."""
+    """Detector of faults of the channels of n pads."""
 
     def __init__(self, model: DiagnosisModel) -> None:
         self._model = model
@@ -49,21 +49,21 @@ class ChannelFaultDetector:
             0.5 * np.hypot(model.noise_counts, 0.0)
         )  # half the noise, as a channel may be quieter
         self._max_repeats = np.maximum(np.ceil(ALARM_NATS / -np.log(chance)), _MIN_REPEATS)
-        self._repeats = np.zeros((n, 4), dtype=np.int64)
-        self._repeats_since_ns = np.zeros((n, 4), dtype=np.int64)
-        self._railed_since_ns = np.full((n, 4), -1, dtype=np.int64)  # begin of saturation; -1: none
-        self._healthy_since_ns = np.zeros((n, 4), dtype=np.int64)  # since when it is healthy again
+        self._used = model.ampere_per_count > 0
+        c = self._used.shape[1]
+        self._repeats = np.zeros((n, c), dtype=np.int64)
+        self._repeats_since_ns = np.zeros((n, c), dtype=np.int64)
+        self._railed_since_ns = np.full((n, c), -1, dtype=np.int64)  # begin of saturation; -1: none
+        self._healthy_since_ns = np.zeros((n, c), dtype=np.int64)  # since when it is healthy again
         self._min_counts = np.full(
-            (n, 4, 4), np.inf
+            (n, c, c), np.inf
         )  # lowest reading of each channel while another was railed
-        self._idle_counts = np.array(
-            [_idle_counts(model, row) for row in range(n)]
-        )  # (n, 4 shorted, 4 channels)
+        self._idle_counts = [_idle_counts(model, row) for row in range(n)]  # (shorted, channels) of each pad
         self.faults: dict[tuple[int, int], ChannelFault] = {}
 
     @property
     def faulty_channels(self) -> NDArray[np.bool_]:
-        """Return the channels (n, 4) with a fault."""
+        """Return the channels (n, c) with a fault."""
         bad = np.zeros(self._repeats.shape, dtype=np.bool_)
         for pad, channel in self.faults:
             bad[pad, channel] = True
@@ -79,9 +79,10 @@ class ChannelFaultDetector:
         self._railed_since_ns = np.where(
             railed, np.where(self._railed_since_ns < 0, t_ns, self._railed_since_ns), -1
         )
-        least = (features.means / self._model.ampere_per_count).min(axis=0)[:, None, :]
+        least = features.mean_counts.min(axis=0)[:, None, :]
         self._min_counts = np.where(railed[:, :, None], np.minimum(self._min_counts, least), np.inf)
-        for pad, channel in np.argwhere(railed | (self._repeats >= self._max_repeats[:, None])).tolist():
+        stuck = self._used & (self._repeats >= self._max_repeats[:, None])
+        for pad, channel in np.argwhere(railed | stuck).tolist():
             fault = self._classify(pad, channel, features)
             if fault is not None:
                 self._healthy_since_ns[pad, channel] = -1
@@ -105,9 +106,10 @@ class ChannelFaultDetector:
         lasted = int(features.last_sample_ns[pad]) - since
         if lasted < _MIN_RAILED_NS:
             return None
-        others = np.delete(features.means[:, pad] / self._model.ampere_per_count[pad], channel, axis=1)
-        least = np.delete(self._min_counts[pad, channel], channel)
-        expected = np.delete(self._idle_counts[pad, channel], channel)
+        own = slice(len(self._idle_counts[pad]))
+        others = np.delete(features.mean_counts[:, pad, own], channel, axis=1)
+        least = np.delete(self._min_counts[pad, channel, own], channel)
+        expected = np.delete(self._idle_counts[pad][channel], channel)
         evidence = {"count": float(count), "others_counts": float(others.sum(axis=1).min())}
         if (
             count > 0
@@ -135,6 +137,6 @@ def _idle_counts(model: DiagnosisModel, row: int) -> FloatArray:
     try:
         conductance = network.conductance / network.sheet_ohm_per_square
     except ValueError:
-        return np.full((4, 4), np.inf)
+        return np.full((len(network.series_ohm),) * 2, np.inf)
     volts = model.drive_v[row]
-    return np.asarray(-volts * conductance / model.ampere_per_count[row])
+    return np.asarray(-volts * conductance / model.ampere_per_count[row, : len(conductance)])

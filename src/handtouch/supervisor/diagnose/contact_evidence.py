@@ -22,7 +22,7 @@ _NON_POINT_SHARE_RANGE = (0.1, 0.7)
 _MAX_SCATTER = 4.0
 """Standard deviation of scores of points, at most; at least 1."""
 _LOG_NON_POINT_SPREAD = np.log(8.0)
-"""Of contacts that are no points; with the least share, it bounds what one contact counts."""
+"""Of each score of contacts that are no points; with the least share, it bounds what one contact counts."""
 
 
 class Evidence(NamedTuple):
@@ -35,28 +35,33 @@ class Evidence(NamedTuple):
 def explain_contacts(found: Scores, weights: FloatArray, covariance: FloatArray) -> Evidence:
     """Return the evidence of k contacts of some weights (k,) for the h explanations that gave their scores.
 
-    found: arrays (h, k), (h, k, t), (h, k). covariance: (h, t, t), of the parameters of the slopes.
+    found: arrays (h, k, s), (h, k, s, t), (h, k). covariance: (h, t, t), of the parameters of the slopes.
     """
     r, slopes, rest = found
     precision = np.linalg.inv(covariance)
-    spread = 1 + np.einsum("hkt,hkt->hk", slopes @ covariance, slopes)  # before anything is known
-    theta = np.zeros((len(r), slopes.shape[2]))
+    flat = slopes.reshape(len(r), -1, slopes.shape[3])
+    spread = 1 + np.einsum("hjt,hjt->hj", flat @ covariance, flat).reshape(
+        r.shape
+    )  # before anything is known
+    theta, freedom = np.zeros((len(r), slopes.shape[3])), r.shape[2]
     share, scatter = np.full((len(r), 1), _NON_POINT_SHARE_RANGE[0]), np.ones((len(r), 1))
     for iteration in range(_ITERATIONS + 1):
-        left = (r - (slopes @ theta[:, :, None])[:, :, 0]) ** 2
-        variance = scatter**2 * (spread if iteration == 0 else 1.0)
-        log_point = np.log1p(-share) - 0.5 * ((left + rest) / variance + np.log(variance))
-        log_sum = np.logaddexp(log_point, np.log(share) - _LOG_NON_POINT_SPREAD)
+        left = (r - (flat @ theta[:, :, None])[:, :, 0].reshape(r.shape)) ** 2
+        variance = scatter[:, :, None] ** 2 * (spread if iteration == 0 else np.ones(r.shape))
+        misfit = (left / variance + np.log(variance)).sum(axis=2) + rest / variance.mean(axis=2)
+        log_point = np.log1p(-share) - 0.5 * misfit
+        log_sum = np.logaddexp(log_point, np.log(share) - freedom * _LOG_NON_POINT_SPREAD)
         part = weights * np.exp(log_point - log_sum)
         points = part.sum(axis=1, keepdims=True)
         if iteration > 1:
-            squares = (part * np.where(part > 0, left + rest, 0.0)).sum(axis=1, keepdims=True)
-            scatter = np.sqrt(np.clip(squares / np.maximum(points, 1e-9), 1.0, _MAX_SCATTER**2))
+            squares = (part * np.where(part > 0, left.sum(axis=2) + rest, 0.0)).sum(axis=1, keepdims=True)
+            squares /= np.maximum(freedom * points, 1e-9)
+            scatter = np.sqrt(np.clip(squares, 1.0, _MAX_SCATTER**2))
         share = np.clip(1 - points / weights.sum(), *_NON_POINT_SHARE_RANGE)
-        weighted = (slopes * (part / scatter**2)[:, :, None]).transpose(0, 2, 1)
-        information = precision + weighted @ slopes
+        weighted = (slopes * (part / scatter**2)[:, :, None, None]).reshape(flat.shape).transpose(0, 2, 1)
+        information = precision + weighted @ flat
         if iteration < _ITERATIONS:
-            theta = np.linalg.solve(information, weighted @ r[:, :, None])[:, :, 0]
+            theta = np.linalg.solve(information, weighted @ r.reshape(len(r), -1, 1))[:, :, 0]
     volume = 0.5 * (np.linalg.slogdet(precision)[1] - np.linalg.slogdet(information)[1])
     prior = 0.5 * np.einsum("ht,htu,hu->h", theta, precision, theta)
     return Evidence(log_sum @ weights - prior + volume, share[:, 0])

@@ -3,11 +3,11 @@
 Public: `ContactFaultDetector`. Each alternative to the nominal pad is tested by how well *its* pad explains
 the same currents:
 
-    dead      the electrode floats, the other three share all
+    dead      the electrode floats, the others share all
     merged    two electrodes are one; each channel gets half (observable with series resistors only)
     swapped   the channels are permuted; permutations that mirror the pad are not observable and left out
     gain      a channel is multiplied by a factor beyond tolerances of parts
-    torn      a cut across a corner removes a part of both its sides
+    torn      a cut across a corner removes a part of both its sides (pads with four sides only)
     (none)    no contact is a point: a fault that isn't in this list
 
 Two steps. Each contact adds the logarithm of its likelihood ratio to a sum kept above zero (Page's CUSUM),
@@ -27,7 +27,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.supervisor.diagnose.contact_evidence import Evidence, explain_contacts
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis, HypothesisTables, Scores
 from handtouch.supervisor.diagnose.model import FloatArray
@@ -103,7 +102,7 @@ class _RememberedContact:
 class ContactFaultDetector:
     """Detector of faults of one pad by its contacts, one after another.
 
-    gain_covariance: (4, 4), of the logarithms of the channels' gains, as calibrated or stated.
+    gain_covariance: (c, c), of the logarithms of the channels' gains, as calibrated or stated.
     """
 
     def __init__(self, tables: HypothesisTables, gain_covariance: FloatArray) -> None:
@@ -257,14 +256,13 @@ class ContactFaultDetector:
         since = len(memory) - count
         rows = [self._score(None, memory[:since]) + self._score(index, memory[since:]) for index in indices]
         scores = Scores(*(np.array([[one[part] for one in row] for row in rows]) for part in range(3)))
-        covariance = np.eye(scores.slopes.shape[2])
-        covariance[-4:, -4:] = self._gain_covariance + _CALIBRATED_GAIN_STD**2 * np.eye(4)
+        electrodes = self._tables.electrodes
+        gains, covariance = slice(-len(electrodes), None), np.eye(scores.slopes.shape[-1])
+        covariance[gains, gains] = self._gain_covariance + _CALIBRATED_GAIN_STD**2 * np.eye(len(electrodes))
         covariances = np.repeat(_TOLERANCE_WIDENING**2 * covariance[None], len(indices), axis=0)
         for row, index in enumerate(indices):
             if index is not None and self._tables.kinds[index] == FaultKind.GAIN_STEP:
-                channel = SIDE_ELECTRODES.index(self._tables.hypotheses[index].electrodes[0]) - len(
-                    SIDE_ELECTRODES
-                )
+                channel = electrodes.index(self._tables.hypotheses[index].electrodes[0]) - len(electrodes)
                 covariances[row, channel, channel] += _GAIN_STEP_STD**2
         cells = Counter(one.cell for one in memory)
         weights = np.array([(2 - 2.0 ** (1 - cells[one.cell])) / cells[one.cell] for one in memory])

@@ -21,6 +21,8 @@ from handtouch.wire.faults import FaultKind
 
 _ASSUMED_PRESSURE_PA = 20e3
 """Pressure assumed under a stuck object, to estimate its size: that of 0.4 N on a disc of 5 mm diameter."""
+_MIN_CHANNELS_WITH_DEAD = 5
+"""Channels of a pad that locates contacts without one, which leaves at least one number over."""
 
 _STATIC_LOAD_TEXTS = {
     FaultKind.HELD_OBJECT: ("an object is held: it has the hand's tremor, or touches other pads too", ""),
@@ -60,21 +62,23 @@ _CHANNEL_FAULT_TEXTS = {
     ),
     FaultKind.SHORTED_ELECTRODE: (
         "electrode {electrodes} is shorted to the conducting layer: its channel is at the end of its range "
-        "and the other three carry the current that its potential drives through the sheet",
+        "and the others carry the current that its potential drives through the sheet",
         "look for a crushed rim or a whisker between electrode and layer; switch the pad off until then",
     ),
 }
 
 
-def describe_channel_faults(link: str, faults: Mapping[int, ChannelFault]) -> list[PadDiagnosis]:
+def describe_channel_faults(
+    model: DiagnosisModel, pad: int, faults: Mapping[int, ChannelFault]
+) -> list[PadDiagnosis]:
     """Return one diagnosis for each kind of fault among the channels of a pad."""
-    diagnoses = []
+    link, electrodes, diagnoses = model.links[pad], model.electrodes[pad], []
     for kind in sorted({fault.kind for fault in faults.values()}):
         of_kind = {channel: fault for channel, fault in faults.items() if fault.kind == kind}
-        names = tuple(SIDE_ELECTRODES[channel] for channel in sorted(of_kind))
+        names = tuple(electrodes[channel] for channel in sorted(of_kind))
         cause, remedy = _CHANNEL_FAULT_TEXTS[kind]
         values = {
-            f"{SIDE_ELECTRODES[c]} {k}": v for c, fault in of_kind.items() for k, v in fault.evidence.items()
+            f"{electrodes[c]} {k}": v for c, fault in of_kind.items() for k, v in fault.evidence.items()
         }
         since_ns = min(fault.since_ns for fault in of_kind.values())
         cause = cause.format(electrodes=" and ".join(names))
@@ -85,16 +89,16 @@ def describe_channel_faults(link: str, faults: Mapping[int, ChannelFault]) -> li
     return diagnoses
 
 
-def named_electrodes(load: StaticLoad) -> tuple[str, ...]:
+def named_electrodes(model: DiagnosisModel, pad: int, load: StaticLoad) -> tuple[str, ...]:
     """Return the electrodes that the diagnosis of a static load names."""
-    return (SIDE_ELECTRODES[load.channel],) if load.kind == FaultKind.OFFSET else ()
+    return (model.electrodes[pad][load.channel],) if load.kind == FaultKind.OFFSET else ()
 
 
 def describe_static_load(model: DiagnosisModel, pad: int, load: StaticLoad) -> PadDiagnosis:
     """Return the diagnosis of a classified static load."""
     assert load.kind is not None
     kind = load.kind
-    names = named_electrodes(load)
+    names = named_electrodes(model, pad, load)
     position: tuple[float, float] | None = None
     size: float | None = None
     if kind in (FaultKind.GUM, FaultKind.MOISTURE, FaultKind.HELD_OBJECT, FaultKind.HYSTERESIS_TAIL):
@@ -103,7 +107,13 @@ def describe_static_load(model: DiagnosisModel, pad: int, load: StaticLoad) -> P
     cause, remedy = _STATIC_LOAD_TEXTS[kind]
     cause = cause.format(electrodes=" and ".join(names))
     if position is not None:
-        cause += f"; {1e3 * position[0]:.0f} mm from electrode x0 and {1e3 * position[1]:.0f} mm from y0"
+        along, across = (f"{1e3 * at:.0f} mm" for at in position)
+        by_arcs = model.electrodes[pad] != SIDE_ELECTRODES
+        cause += (
+            f"; at u = {along}, v = {across} of its drawing"
+            if by_arcs
+            else f"; {along} from electrode x0 and {across} from y0"
+        )
     if size is not None:
         cause += f", about {1e3 * size:.0f} mm across"
     values = dict(load.evidence)
@@ -127,7 +137,7 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
     hypothesis = fault.hypothesis
     names = hypothesis.electrodes
     values = {"nats": fault.nats, "contacts": float(fault.contacts)}
-    force_valid = False
+    position_valid = force_valid = False
     if fault.rival is not None:
         gain, cut = sorted((hypothesis, fault.rival), key=lambda h: h.kind != FaultKind.GAIN_STEP)
         names = gain.electrodes
@@ -145,6 +155,9 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
     elif hypothesis.kind == FaultKind.DEAD_ELECTRODE:
         cause = f"electrode {names[0]} carries no current: its wire is broken or unplugged"
         remedy = "check the wire and the socket of that electrode"
+        if len(model.electrodes[pad]) >= _MIN_CHANNELS_WITH_DEAD:
+            remedy += "; until then, contacts are located with the others"
+            position_valid = force_valid = True
     elif hypothesis.kind == FaultKind.SHORTED_ELECTRODE:
         cause = f"electrodes {names[0]} and {names[1]} are shorted to one another"
         remedy = "check where their wires or the two ends of the electrodes meet"
@@ -178,7 +191,7 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
         remedy,
         fault.since_ns,
         min(max(fault.probability, 0.0), 1.0),
-        position_valid=False,
+        position_valid=position_valid,
         force_valid=force_valid,
     )
     return PadDiagnosis(published, model.links[pad], values, names)
@@ -191,9 +204,9 @@ def _evidence_text(values: Mapping[str, float]) -> str:
 def _load_position(
     model: DiagnosisModel, pad: int, level_counts: FloatArray
 ) -> tuple[tuple[float, float] | None, float | None]:
-    """Return arc lengths [m] and radius [m] of a contact that reads `level_counts` (4,)."""
+    """Return arc lengths [m] and radius [m] of a contact that reads `level_counts` (c,)."""
     network, sheet = model.networks[pad], model.sheets[pad]
-    current = level_counts * model.ampere_per_count[pad]
+    current = level_counts * model.ampere_per_count[pad, : len(level_counts)]
     noise = float(model.noise_counts[pad] * model.ampere_per_count[pad].max())
     found = network.estimate(current, noise)
     if not (np.isfinite(found.x) and np.isfinite(found.y)):  # one of them alone places nothing

@@ -24,9 +24,10 @@ from handtouch.supervisor.diagnose.features import (
     GROUP_SAMPLES,
     BlockFeatures,
     approximate_position,
+    electrode_weights,
     extract_features,
 )
-from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, HypothesisTables
+from handtouch.supervisor.diagnose.hypotheses import MIN_CHANNELS, ContactCurrents, HypothesisTables
 from handtouch.supervisor.diagnose.model import (
     DiagnosisModel,
     FloatArray,
@@ -44,7 +45,7 @@ _MIN_MOVE_FRACTION, _MAX_SMEAR_FRACTION = 0.08, 0.03  # of a side, roughly
 class HandDiagnostics:
     """Detectors and active diagnoses of all pads of a hand; `process_block` takes block after block.
 
-    offset_counts: (n, 4), stored readings of the untouched channels; those of the model if left out.
+    offset_counts: (n, c), stored readings of the untouched channels; those of the model if left out.
     tables: of hypotheses, by design, shared by diagnostics of one model.
     """
 
@@ -60,7 +61,8 @@ class HandDiagnostics:
         n = len(model.links)
         noise = np.hypot(model.noise_counts, 12**-0.5)
         self._channels = ChannelFaultDetector(model)
-        self._static_loads = StaticLoadDetector(noise)
+        self._weights = [electrode_weights(network) for network in model.networks]
+        self._static_loads = StaticLoadDetector(noise, self._weights)
         self._mean_noise_counts = noise / np.sqrt(GROUP_SAMPLES)
         self._tables = {} if tables is None else tables
         self._contact_detectors: dict[int, ContactFaultDetector] = {}
@@ -76,16 +78,24 @@ class HandDiagnostics:
         """Return all active diagnoses, each with the row of its pad."""
         return [(pad, diagnosis) for (pad, _), diagnosis in self._diagnoses.items()]
 
+    def dead_electrodes(self) -> dict[int, int]:
+        """Return the dead electrodes of pads that locate contacts with the others, by the row of the pad."""
+        return {
+            pad: self._model.electrodes[pad].index(diagnosis.electrodes[0])
+            for (pad, kind), diagnosis in self._diagnoses.items()
+            if kind == FaultKind.DEAD_ELECTRODE and diagnosis.published.position_valid
+        }
+
     def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
-        """Replace the stored offsets (4,) of a pad."""
+        """Replace the stored offsets (c,) of a pad, with as many channels as it has."""
         self._offsets = self._offsets.copy()
-        self._offsets[pad] = offset_counts
+        self._offsets[pad, : self._model.channel_counts[pad]] = offset_counts
         self._static_loads.reset_zero(np.arange(len(self._model.links)) == pad)
 
     def reset_contacts(self, pad: int) -> None:
         """Discard the contacts of a pad, whose calibration or node was replaced."""
         if pad in self._contact_detectors:
-            self._contact_detectors[pad].reset(self._model.gain_covariance[pad])
+            self._contact_detectors[pad].reset(self._gain_covariance(pad))
 
     def process_block(self, block: HandSamples) -> list[PadDiagnosis]:
         """Process a block; return the diagnoses that began, changed or ended.
@@ -96,10 +106,10 @@ class HandDiagnostics:
         sample_ns = int(features.last_sample_ns.max())
         self._channels.process_block(features)
         faulty = self._channels.faulty_channels
-        counts = features.means / self._model.ampere_per_count
+        counts = features.mean_counts
         healthy: BoolArray = np.asarray(np.logical_not(faulty.any(axis=1)))
         self._static_loads.process_block(
-            sample_ns, counts, np.repeat(healthy[:, None], 4, axis=1).astype(np.float64)
+            sample_ns, counts, np.repeat(healthy[:, None], counts.shape[2], axis=1).astype(np.float64)
         )
         self._process_contacts(features, counts, healthy)
         return self._update_diagnoses(self._collect_diagnoses(), sample_ns)
@@ -111,10 +121,12 @@ class HandDiagnostics:
         least = np.maximum(_MIN_CONTACT_COUNTS, 2 * np.abs(self._static_loads.floor_counts).sum(axis=1))
         self._released |= totals.min(axis=0) < _MAX_RELEASED_COUNTS
         strongest = totals.argmax(axis=0)
-        for pad in np.flatnonzero((totals.max(axis=0) > least) & healthy).tolist():
-            reading = excess[strongest[pad], pad]
-            position = approximate_position(reading)
-            if _is_sliding(excess[:, pad], int(strongest[pad]), position):
+        observable = np.array(self._model.channel_counts) >= MIN_CHANNELS
+        for pad in np.flatnonzero((totals.max(axis=0) > least) & healthy & observable).tolist():
+            own, weights = slice(self._model.channel_counts[pad]), self._weights[pad]
+            reading = excess[strongest[pad], pad, own]
+            position = approximate_position(reading, weights)
+            if _is_sliding(excess[:, pad, own], int(strongest[pad]), position, weights):
                 continue
             if (
                 not self._released[pad]
@@ -124,13 +136,13 @@ class HandDiagnostics:
             self._released[pad] = totals[-1, pad] < _MAX_RELEASED_COUNTS
             self._last_position[pad] = position
             noise = np.hypot(
-                self._mean_noise_counts[pad], 0.05 * np.abs(self._static_loads.floor_counts[pad])
+                self._mean_noise_counts[pad], 0.05 * np.abs(self._static_loads.floor_counts[pad, own])
             )
-            scale = self._model.ampere_per_count[pad]
+            scale = self._model.ampere_per_count[pad, own]
             contact = ContactCurrents(
                 int(features.last_sample_ns[pad]), reading * scale, noise * scale, position
             )
-            self._contact_detector(pad).add_contact(contact, np.zeros(4, dtype=np.bool_))
+            self._contact_detector(pad).add_contact(contact, np.zeros(len(reading), dtype=np.bool_))
 
     def _contact_detector(self, pad: int) -> ContactFaultDetector:
         """Return the detector of a pad, made on first use: tables take a quarter of a second per design."""
@@ -141,23 +153,28 @@ class HandDiagnostics:
                     self._model.networks[pad],
                     self._model.surfaces[pad],
                     self._model.parts[pad](),
+                    self._model.electrodes[pad],
                 )
             self._contact_detectors[pad] = ContactFaultDetector(
-                self._tables[design], self._model.gain_covariance[pad]
+                self._tables[design], self._gain_covariance(pad)
             )
         return self._contact_detectors[pad]
+
+    def _gain_covariance(self, pad: int) -> FloatArray:
+        own = slice(self._model.channel_counts[pad])
+        return self._model.gain_covariance[pad, own, own]
 
     def _collect_diagnoses(self) -> dict[tuple[int, FaultKind], PadDiagnosis]:
         active: dict[tuple[int, FaultKind], PadDiagnosis] = {}
         faulty = {pad for pad, _ in self._channels.faults}
         for pad in faulty:
             faults = {channel: f for (row, channel), f in self._channels.faults.items() if row == pad}
-            for diagnosis in describe_channel_faults(self._model.links[pad], faults):
+            for diagnosis in describe_channel_faults(self._model, pad, faults):
                 active[pad, diagnosis.kind] = diagnosis
         for pad, load in self._static_loads.loads.items():
             if pad not in faulty and load.kind is not None:
                 before = self._diagnoses.get((pad, load.kind))
-                names = named_electrodes(load)
+                names = named_electrodes(self._model, pad, load)
                 if before is None or before.electrodes != names:  # locating a load is expensive
                     before = describe_static_load(self._model, pad, load)
                 active[pad, load.kind] = before
@@ -182,11 +199,11 @@ class HandDiagnostics:
         return changes
 
 
-def _is_sliding(excess: FloatArray, at: int, position: FloatArray) -> bool:
-    """Return whether the contact slides so fast that the short mean (g, 4) at `at` smears it."""
+def _is_sliding(excess: FloatArray, at: int, position: FloatArray, weights: FloatArray) -> bool:
+    """Return whether the contact slides so fast that the short mean (g, c) at `at` smears it."""
     near = [excess[k] for k in (at - 1, at + 1) if 0 <= k < len(excess)]
     there = [e for e in near if e.sum() > 0.3 * excess[at].sum()]
-    return any(np.abs(approximate_position(e) - position).max() > _MAX_SMEAR_FRACTION for e in there)
+    return any(np.abs(approximate_position(e, weights) - position).max() > _MAX_SMEAR_FRACTION for e in there)
 
 
 def _differs(before: PadDiagnosis, now: PadDiagnosis) -> bool:

@@ -1,7 +1,8 @@
 """Pads with and without a fault, tabulated: how well each explains the currents of a contact.
 
-Public: `Hypothesis`, `HypothesisTables`, `ContactCurrents`. A contact has three unknowns (position and total)
-and four currents. The one number left over is the contact's score under a hypothesis.
+Public: `Hypothesis`, `HypothesisTables`, `ContactCurrents`, `MIN_CHANNELS`. A contact has three unknowns
+(position and total) and c currents, four as a rule. The c - 3 numbers left over are its scores under a
+hypothesis.
 """
 
 from __future__ import annotations
@@ -17,11 +18,15 @@ from numpy.typing import NDArray
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.field.surface import Surface
 from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.supervisor.diagnose.sheet_changes import CORNERS, SheetChanges
 from handtouch.wire.faults import FaultKind
 
+_UNKNOWNS = 3
+MIN_CHANNELS = _UNKNOWNS + 1
+"""Of a pad whose contacts contradict anything."""
 _GAIN_TOLERANCE_STD = 0.02
 """Of a channel's gain, as noise of log likelihood ratios, which raise suspicions only."""
 _SEARCH_TOLERANCE = 0.02  # of each current, in the search of the first node
@@ -34,7 +39,7 @@ _NON_POINT_PROBABILITIES = np.array(
     [0.03, 0.5]
 )  # of all contacts: usually, and while two objects are handled
 _MIN_LOG_LIKELIHOOD, _MAX_SQUARED_MISFIT = -1e3, 1e6
-_LOG_NON_POINT_SPREAD = np.log(40.0)  # log ratio of the scatter of contacts that are no points
+_LOG_NON_POINT_SPREAD = np.log(40.0)  # log ratio of the scatter of each score of contacts that are no points
 _CUT_FRACTIONS = (
     0.2,
     0.35,
@@ -59,7 +64,7 @@ class Hypothesis(NamedTuple):
 
 @dataclass(frozen=True)
 class ContactCurrents:
-    """Currents (4,) and noise (4,) [A] of a contact; position (2,) as fractions of the pad, nominal fit."""
+    """Currents (c,) and noise (c,) [A] of a contact; position (2,) as fractions of the pad, nominal fit."""
 
     sample_ns: int
     currents: FloatArray
@@ -70,7 +75,8 @@ class ContactCurrents:
 class Scores(NamedTuple):
     """Misfits of k contacts under one hypothesis, in standard deviations.
 
-    scores (k,): along the direction that no position and total explains. slopes (k, t): their change by one
+    scores (k, s): along the directions that no position and total explains. slopes (k, s, t): their change by
+    one
     standard deviation of each tolerance of the sheet and its electrodes, of both sizes of a cut, which are 0
     for other hypotheses, then by the log gain of each channel. rest (k,): squared misfit along the
     other directions, where no position fits.
@@ -82,64 +88,78 @@ class Scores(NamedTuple):
 
 
 class HypothesisTables:
-    """Current shares under each hypothesis, for one design of pad.
+    """Current shares under each hypothesis, for one design of pad with at least `MIN_CHANNELS`.
 
-    parts: networks in each of which one part differs by one standard deviation.
+    electrodes: names of the c electrodes. parts: networks in each of which one part differs by one standard
+    deviation.
     """
 
     def __init__(
-        self, network: ElectrodeNetwork, surface: Surface, parts: Sequence[FractionModel] = ()
+        self,
+        network: RectangleNetwork,
+        surface: Surface,
+        parts: Sequence[FractionModel] = (),
+        electrodes: tuple[str, ...] = SIDE_ELECTRODES,
     ) -> None:
         self.hypotheses: list[Hypothesis] = []
+        self.electrodes, c = electrodes, len(electrodes)
+        self._freedom = c - _UNKNOWNS
         x, y = _nodes(network)
         nominal = network.fractions(x, y).T
         series = np.array(network.series_ohm)
-        orders, factors = [np.arange(4)], [np.ones(4)]
-        for order, names in _swap_permutations():
+        orders, factors = [np.arange(c)], [np.ones(c)]
+        for order in _swap_permutations(network, c):
+            names = tuple(electrodes[k] for k in np.flatnonzero(order != np.arange(c)))
             self.hypotheses.append(Hypothesis(FaultKind.SWAPPED_CABLES, names))
             orders.append(order)
-            factors.append(np.ones(4))
-        for channel, factor in itertools.product(range(4), _GAIN_STEP_FACTORS):
-            self.hypotheses.append(
-                Hypothesis(FaultKind.GAIN_STEP, (SIDE_ELECTRODES[channel],), float(factor))
-            )
-            orders.append(np.arange(4))
-            factors.append(np.where(np.arange(4) == channel, 1 / factor, 1.0))
+            factors.append(np.ones(c))
+        for channel, factor in itertools.product(range(c), _GAIN_STEP_FACTORS):
+            self.hypotheses.append(Hypothesis(FaultKind.GAIN_STEP, (electrodes[channel],), float(factor)))
+            orders.append(np.arange(c))
+            factors.append(np.where(np.arange(c) == channel, 1 / factor, 1.0))
         self._orders, self._factors = np.array(orders).T, np.array(factors).T
         self._nominal = _FractionTable(nominal[None])
         others = []
-        for channel in range(4):
-            floating = network.with_series_ohm(np.where(np.arange(4) == channel, np.inf, series).tolist())
-            self.hypotheses.append(Hypothesis(FaultKind.DEAD_ELECTRODE, (SIDE_ELECTRODES[channel],)))
+        for channel in range(c):
+            floating = network.with_series_ohm(np.where(np.arange(c) == channel, np.inf, series).tolist())
+            self.hypotheses.append(Hypothesis(FaultKind.DEAD_ELECTRODE, (electrodes[channel],)))
             others.append(floating.fractions(x, y).T)
         if series.any():
-            for i, j in itertools.combinations(range(4), 2):
+            for i, j in itertools.combinations(range(c), 2):
                 merged = nominal.copy()
                 merged[:, [i, j]] = nominal[:, [i, j]].mean(axis=1, keepdims=True)
                 self.hypotheses.append(
-                    Hypothesis(FaultKind.SHORTED_ELECTRODE, (SIDE_ELECTRODES[i], SIDE_ELECTRODES[j]))
+                    Hypothesis(FaultKind.SHORTED_ELECTRODE, (electrodes[i], electrodes[j]))
                 )
                 others.append(merged)
-        self._electrode_faults, torn_ones = _FractionTable(np.stack(others)), []
-        sheet = SheetChanges(network, surface, _NODE_FRACTIONS)
-        cuts = list(itertools.product(CORNERS, _CUT_FRACTIONS, _CUT_FRACTIONS))
-        changes = sheet.by_cuts((CORNERS[corner], p, q) for corner, p, q in cuts)
-        for (corner, p, q), (change, beyond) in zip(cuts, changes, strict=True):
-            self.hypotheses.append(Hypothesis(FaultKind.TORN_CORNER, corner, 1.0, (p, q)))
-            torn = nominal + change.reshape(-1, 4)
-            torn[beyond.ravel()] = 0.0
-            torn_ones.append(torn)
-        self._torn = _FractionTable(np.stack(torn_ones))
+        self._electrode_faults = _FractionTable(np.stack(others))
+        torn = self._torn_pads(network, surface, nominal) if isinstance(network, ElectrodeNetwork) else []
+        self._torn = _FractionTable(np.reshape(torn, (len(torn), *nominal.shape)))
         self.hypotheses.append(Hypothesis(FaultKind.UNEXPLAINED, ()))
         self.kinds = np.array([h.kind for h in self.hypotheses])
         varied = (part for part in parts if part is not network)
         tolerances = [part.fractions(*_nodes(part)).T - nominal for part in varied]
         no_cut = np.zeros((2, *nominal.shape))
-        self._tolerances = np.array([*tolerances, *no_cut, *(nominal * channel for channel in np.eye(4))])
+        self._tolerances = np.array([*tolerances, *no_cut, *(nominal * channel for channel in np.eye(c))])
+
+    def _torn_pads(
+        self, network: ElectrodeNetwork, surface: Surface, nominal: FloatArray
+    ) -> list[FloatArray]:
+        """Add the hypotheses of torn corners; return their fractions (P, c)."""
+        pads = []
+        sheet = SheetChanges(network, surface, _NODE_FRACTIONS)
+        cuts = list(itertools.product(CORNERS, _CUT_FRACTIONS, _CUT_FRACTIONS))
+        changes = sheet.by_cuts((CORNERS[corner], p, q) for corner, p, q in cuts)
+        for (corner, p, q), (change, beyond) in zip(cuts, changes, strict=True):
+            self.hypotheses.append(Hypothesis(FaultKind.TORN_CORNER, corner, 1.0, (p, q)))
+            torn = nominal + change.reshape(nominal.shape)
+            torn[beyond.ravel()] = 0.0
+            pads.append(torn)
+        return pads
 
     def log_likelihood_ratios(self, contact: ContactCurrents, left_out: NDArray[np.bool_]) -> FloatArray:
         """Return log likelihood ratios (2, hypotheses) to a nominal pad with few contacts that are no points,
-        and to one with many; channels (4,) with a known fault are left out."""
+        and to one with many; channels (c,) with a known fault are left out."""
         data = contact.currents
         total = max(float(data.sum()), 1e-30)
         sigma = np.sqrt(
@@ -153,15 +173,16 @@ class HypothesisTables:
         torn = self._torn.fit(data[:, None], torn_sigma[:, None])[0] - np.log(torn_sigma / sigma).sum()
         others = self._electrode_faults.fit(data[:, None], sigma[:, None])[0]
         level = np.concatenate([level, others, torn]) - volume[0]
-        level = np.append(level, -_LOG_NON_POINT_SPREAD)
+        non_point = -self._freedom * _LOG_NON_POINT_SPREAD
+        level = np.append(level, non_point)
         few, many = (
-            np.logaddexp(np.log1p(-part) + level, np.log(part) - _LOG_NON_POINT_SPREAD)
+            np.logaddexp(np.log1p(-part) + level, np.log(part) + non_point)
             for part in _NON_POINT_PROBABILITIES
         )
         return np.stack([few[1:] - few[0], few[1:] - many[0]])
 
     def score(self, index: int | None, currents: FloatArray, noise: FloatArray) -> Scores:
-        """Return the scores of contacts (4, k) with their noise under a hypothesis; None: no fault."""
+        """Return the scores of contacts (c, k) with their noise under a hypothesis; None: no fault."""
         table, pad, tolerances = self._nominal, 0, self._tolerances
         permuted, others = self._orders.shape[1] - 1, self._electrode_faults.pads
         if index is not None and index < permuted:
@@ -172,7 +193,8 @@ class HypothesisTables:
         elif index is not None:
             table, pad = self._torn, index - permuted - others
             tolerances = tolerances.copy()
-            tolerances[-6:-4] = _CUT_STEP_STD * self._torn.changes_by_cut(pad)
+            gains = len(tolerances) - len(self.electrodes)
+            tolerances[gains - 2 : gains] = _CUT_STEP_STD * self._torn.changes_by_cut(pad)
         sigma = np.hypot(noise, _SCORE_MODEL_ERROR_FRACTION * currents.sum(axis=0))
         return table.score(pad, currents, sigma, tolerances)
 
@@ -183,11 +205,11 @@ def _nodes(network: FractionModel) -> tuple[FloatArray, FloatArray]:
 
 
 class _FractionTable:
-    """Fractions (t, P, 4) of t pads on the grid, and their slopes."""
+    """Fractions (t, P, c) of t pads on the grid, and their slopes."""
 
     def __init__(self, fractions: FloatArray) -> None:
         self._fractions = fractions
-        cube = fractions.reshape(len(fractions), _NODES_PER_SIDE, _NODES_PER_SIDE, 4)
+        cube = fractions.reshape(-1, _NODES_PER_SIDE, _NODES_PER_SIDE, fractions.shape[2])
         self._slopes = np.stack([v.reshape(fractions.shape) for v in np.gradient(cube, axis=(1, 2))])
         self._coarse = (
             np.arange(_NODES_PER_SIDE**2).reshape(_NODES_PER_SIDE, _NODES_PER_SIDE)[::2, ::2].ravel()
@@ -198,7 +220,7 @@ class _FractionTable:
     def fit(self, data: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods, up to a constant, of point contacts anywhere, and their volume terms.
 
-        Of data (4, k) with standard deviations sigma: (k,) for one pad, (t,) for t pads and k = 1. The
+        Of data (c, k) with standard deviations sigma: (k,) for one pad, (t,) for t pads and k = 1. The
         nearest node of a coarse grid, then two Gauss-Newton steps.
         """
         table, node = self._nearest_nodes(data, sigma)
@@ -207,16 +229,16 @@ class _FractionTable:
         return np.asarray(volume - 0.5 * (misfit**2).sum(axis=0)), np.asarray(volume)
 
     def score(self, pad: int, data: FloatArray, sigma: FloatArray, tolerances: FloatArray) -> Scores:
-        """Return the scores of data (4, k) with standard deviations on one pad; tolerances (t, P, 4)."""
+        """Return the scores of data (c, k) with standard deviations on one pad; tolerances (t, P, c)."""
         node = self._nearest_nodes(data, np.hypot(sigma, _SEARCH_TOLERANCE * data), pad)[1]
         table = np.full(data.shape[1], pad)
         node, jacobian, misfit, _, undetermined = self._refine(table, node, data, sigma)
-        null = np.linalg.svd(jacobian.transpose(2, 1, 0), full_matrices=True)[0][:, :, 3]
+        null = np.linalg.svd(jacobian.transpose(2, 1, 0), full_matrices=True)[0][:, :, _UNKNOWNS:]
         flat = node[0] * _NODES_PER_SIDE + node[1]
         total = np.maximum(data.sum(axis=0), 1e-30)
-        slopes = np.einsum("ck,tkc->kt", null.T * total / sigma, tolerances[:, flat])
-        scores = np.einsum("kc,ck->k", null, misfit)
-        rest = np.maximum((misfit**2).sum(axis=0) - scores**2, 0.0)
+        slopes = np.einsum("kcs,tkc->kst", null * (total / sigma).T[:, :, None], tolerances[:, flat])
+        scores = np.einsum("kcs,ck->ks", null, misfit)
+        rest = np.maximum((misfit**2).sum(axis=0) - (scores**2).sum(axis=1), 0.0)
         return Scores(scores, slopes, np.where(undetermined, _MAX_SQUARED_MISFIT, rest))
 
     @property
@@ -274,7 +296,7 @@ class _FractionTable:
     def _linearise(
         self, table: NDArray[np.intp], node: NDArray[np.intp], data: FloatArray, sigma: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return whitened Jacobian (3, 4, k) by log total and position, and misfit, at nodes (2, k)."""
+        """Return whitened Jacobian (3, c, k) by log total and position, and misfit, at nodes (2, k)."""
         flat = node[0] * _NODES_PER_SIDE + node[1]
         f = self._fractions[table, flat].T
         slopes = self._slopes[:, table, flat].transpose(0, 2, 1)
@@ -282,12 +304,13 @@ class _FractionTable:
         return np.stack([f, slopes[0], slopes[1]]) * total / sigma, (data - total * f) / sigma
 
 
-def _swap_permutations() -> list[tuple[NDArray[np.intp], tuple[str, ...]]]:
-    """Return permutations up to mirroring: the four swaps of neighbours, and both pairs at once."""
-    pairs = [(0, 2), (0, 3), (1, 2), (1, 3)]
+def _swap_permutations(network: RectangleNetwork, channels: int) -> list[NDArray[np.intp]]:
+    """Return swaps of two cables, except those that mirror a pad of four; and, of four sides, both pairs."""
+    opposite = {(0, 1), (2, 3)} if isinstance(network, ElectrodeNetwork) else {(0, 2), (1, 3)}
     found = []
-    for i, j in pairs:
-        order = np.arange(4)
-        order[[i, j]] = j, i
-        found.append((order, (SIDE_ELECTRODES[i], SIDE_ELECTRODES[j])))
-    return [*found, (np.array([2, 3, 0, 1]), SIDE_ELECTRODES)]
+    for pair in itertools.combinations(range(channels), 2):
+        if channels > 4 or pair not in opposite:
+            order = np.arange(channels)
+            order[list(pair)] = pair[::-1]
+            found.append(order)
+    return [*found, np.array([2, 3, 0, 1])] if isinstance(network, ElectrodeNetwork) else found

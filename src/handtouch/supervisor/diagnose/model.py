@@ -1,6 +1,7 @@
 """Inputs and results of a hand's diagnosis: `DiagnosisModel`, `HandSamples`, `PadDiagnosis`.
 
-Electrodes and channels are always in the order x0, xa, y0, yb.
+Electrodes and channels are in the order of the pad's: x0, xa, y0, yb, or that of its arcs. Arrays have c
+channels, those of the pad with most; columns beyond a pad's own are 0.
 """
 
 from __future__ import annotations
@@ -14,11 +15,10 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.config.channels import order_by_electrode, resolve_channels
-from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import FractionModel
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.field.surface import Surface
-from handtouch.hand import electrode_network, models_with_other_parts, pad_surface
+from handtouch.hand import models_with_other_parts, pad_network, pad_surface
 from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
 
@@ -29,7 +29,7 @@ FloatArray = NDArray[np.float64]
 class HandSamples:
     """m consecutive samples of all n pads of a hand, as in topic `raw/<hand>`.
 
-    sample_ns: (m, n) time of each sample. counts: (m, n, 4). fresh: (m, n), whether the sample belongs to
+    sample_ns: (m, n) time of each sample. counts: (m, n, c). fresh: (m, n), whether the sample belongs to
     this tick. Blocks of 0.2 to 0.5 s work best; samples of a pad are in order of time.
     """
 
@@ -67,15 +67,17 @@ class PadDiagnosis:
 class DiagnosisModel:
     """Parameters of the n pads of a hand, from deployment file and calibration.
 
-    networks, surfaces, sheets: of each pad; parts: networks in each of which one part of the pad differs by
-    one standard deviation, made when called. drive_v: (n,). ampere_per_count, offset_counts: (n, 4) as
-    calibrated; offsets are the stored ones, not a running baseline. gain_covariance: (n, 4, 4) of the
-    logarithms of the gains, as stated or calibrated. noise_counts: (n,) of a reading. limits: (n, 4, 2)
-    lowest and highest count. designs: equal for pads of which all this is equal, calibration aside.
+    electrodes: names of each pad's. networks, surfaces, sheets: of each pad; parts: networks in each of which
+    one part of the pad differs by one standard deviation, made when called. drive_v: (n,). ampere_per_count,
+    offset_counts: (n, c) as calibrated; offsets are the stored ones, not a running baseline.
+    gain_covariance: (n, c, c) of the logarithms of the gains, as stated or calibrated. noise_counts: (n,) of
+    a reading. limits: (n, c, 2) lowest and highest count, infinite beyond a pad's own. designs: equal for
+    pads of which all this is equal, calibration aside.
     """
 
     links: tuple[str, ...]
-    networks: Sequence[ElectrodeNetwork]
+    electrodes: Sequence[tuple[str, ...]]
+    networks: Sequence[RectangleNetwork]
     surfaces: Sequence[Surface]
     sheets: Sequence[config.Sheet]
     parts: Sequence[Callable[[], Sequence[FractionModel]]]
@@ -92,25 +94,29 @@ class DiagnosisModel:
         """Build the model of a hand from its deployment. Raises KeyError for an unknown hand."""
         pads = {h.name: h.pads for h in deployment.hands}[hand]
         nodes = [deployment.nodes[pad.node] for pad in pads]
-        scale, limits = np.zeros((len(pads), 4)), np.zeros((len(pads), 4, 2))
+        most = max(len(pad.electrode_names) for pad in pads)
+        scale, limits = np.zeros((len(pads), most)), np.zeros((len(pads), most, 2))
+        limits[:] = -np.inf, np.inf
         for row, (pad, node) in enumerate(zip(pads, nodes, strict=True)):
             channels = order_by_electrode(resolve_channels(node.channels, node.eds), pad)
-            for k, (name, channel) in enumerate(zip(SIDE_ELECTRODES, channels, strict=True)):
+            for k, (name, channel) in enumerate(zip(pad.electrode_names, channels, strict=True)):
                 full = node.full_scale_counts or channel.limits[1]
                 factor = node.channel_scale[pad.electrodes.index(name)]
                 scale[row, k] = node.full_scale_ma * 1e-3 / full * factor
                 limits[row, k] = channel.limits
-        by_design: dict[Hashable, ElectrodeNetwork] = {}  # pads of one design share one network
+        by_design: dict[Hashable, RectangleNetwork] = {}  # pads of one design share one network
         networks, designs = [], []
         for pad, node in zip(pads, nodes, strict=True):
             sheet = deployment.sheets[pad.sheet]
-            design = (pad.surface, pad.gaps_mm, pad.series_ohm, sheet, node.gain_std, node.series_std)
+            parts = pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm
+            design = (*parts, sheet, node.gain_std, node.series_std)
             designs.append(design)
             if design not in by_design:
-                by_design[design] = electrode_network(pad, sheet)
+                by_design[design] = pad_network(pad, sheet)
             networks.append(by_design[design])
         return cls(
             links=tuple(pad.link for pad in pads),
+            electrodes=[pad.electrode_names for pad in pads],
             networks=networks,
             surfaces=[pad_surface(pad) for pad in pads],
             sheets=[deployment.sheets[pad.sheet] for pad in pads],
@@ -123,6 +129,16 @@ class DiagnosisModel:
             noise_counts=np.array([node.noise_counts for node in nodes]),
             limits=limits,
             designs=designs,
-            offset_counts=np.zeros((len(pads), 4)),
-            gain_covariance=np.stack([node.gain_std**2 * np.eye(4) for node in nodes]),
+            offset_counts=np.zeros(scale.shape),
+            gain_covariance=np.stack(
+                [
+                    node.gain_std**2 * np.diag((row > 0).astype(float))
+                    for node, row in zip(nodes, scale, strict=True)
+                ]
+            ),
         )
+
+    @property
+    def channel_counts(self) -> list[int]:
+        """Number of channels of each pad."""
+        return [len(names) for names in self.electrodes]

@@ -12,6 +12,7 @@ elsewhere on the pad come and go while it stays, the hand's other pads are used 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -76,7 +77,7 @@ _NOISE_GAIN = 0.05  # of a block without a load
 
 @dataclass
 class StaticLoad:
-    """Static load of one pad: level_counts (4,) now; kind and its probability once classified; evidence as
+    """Static load of one pad: level_counts (c,) now; kind and its probability once classified; evidence as
     numbers by name."""
 
     since_ns: int
@@ -106,25 +107,29 @@ class StaticLoad:
 
 
 class StaticLoadDetector:
-    """Floors and static loads of the n pads of a hand."""
+    """Floors and static loads of the n pads of a hand.
 
-    def __init__(self, noise_counts: FloatArray) -> None:
-        n = len(noise_counts)
+    noise_counts: (n,) of a reading. weights: of each pad's channels, as `electrode_weights`.
+    """
+
+    def __init__(self, noise_counts: FloatArray, weights: Sequence[FloatArray]) -> None:
+        self._weights = weights
+        n, c = len(noise_counts), max(one.shape[-1] for one in weights)
         self._variance = np.square(noise_counts) / GROUP_SAMPLES  # of a channel's short mean, as measured
-        self._zero = np.zeros((n, 4))
+        self._zero = np.zeros((n, c))
         self._recent_floors: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._last_unloaded_ns = np.full(n, -1, dtype=np.int64)
         self._recent_peaks: deque[tuple[int, FloatArray]] = deque()
-        self.floor_counts = np.zeros((n, 4))
+        self.floor_counts = np.zeros((n, c))
         self.loads: dict[int, StaticLoad] = {}
         self._touched = np.zeros(n, dtype=np.bool_)
         self._contacts = np.zeros(n, dtype=np.int64)  # begun
         self._last_ns = -1
 
     def process_block(self, sample_ns: int, counts: FloatArray, valid: FloatArray) -> None:
-        """Update floors and loads by the short means (g, n, 4) of a block that ended at sample_ns.
+        """Update floors and loads by the short means (g, n, c) of a block that ended at sample_ns.
 
-        counts: relative to the stored offsets. valid: (n, 4), 0 for channels with a known fault, which are
+        counts: relative to the stored offsets. valid: (n, c), 0 for channels with a known fault, which are
         ignored.
         """
         counts = (counts - self._zero) * valid
@@ -156,13 +161,14 @@ class StaticLoadDetector:
             del self.loads[pad]
         if len(counts) > 3:
             for pad in np.flatnonzero(size.max(axis=0) <= MIN_LOAD_COUNTS).tolist():
-                self._variance[pad] += _NOISE_GAIN * (_scatter(counts[:, pad]) - self._variance[pad])
+                scatter = _scatter(counts[:, pad, : self._channels(pad)])
+                self._variance[pad] += _NOISE_GAIN * (scatter - self._variance[pad])
         touched = size.max(axis=0) > np.abs(self.floor_counts).sum(axis=1) + _BEGIN_COUNTS
         self._contacts += touched & ~self._touched
         self._touched = touched
         for pad in np.flatnonzero(~quiet).tolist():
             self._track_load(pad, sample_ns, floor[pad], float(total[pad]))
-            self._track_presses(self.loads[pad], sample_ns, counts[:, pad])
+            self._track_presses(pad, self.loads[pad], sample_ns, counts[:, pad])
         for pad, load in self.loads.items():
             age_s = (sample_ns - load.since_ns) * 1e-9
             if age_s - load.classified_age_s >= (1.0 if age_s < 60 else 5.0) and age_s >= 6.0:
@@ -178,28 +184,32 @@ class StaticLoadDetector:
         if load is None:
             since = int(self._last_unloaded_ns[pad])
             peak = max(peaks[pad] for _, peaks in self._recent_peaks)
-            load = self.loads[pad] = StaticLoad(since, floor, float(peak))
+            load = self.loads[pad] = StaticLoad(since, floor[: self._channels(pad)], float(peak))
             load.contacts_before = int(self._contacts.sum() - self._contacts[pad])
             for at, older, size in self._recent_floors:  # its begin
                 if at > since:
                     self._record_floor(load, (at - since) * 1e-9, older[pad], float(size[pad]))
             return
-        load.level_counts = self.floor_counts[pad]
+        load.level_counts = self.floor_counts[pad, : self._channels(pad)]
         self._record_floor(load, (sample_ns - load.since_ns) * 1e-9, floor, total)
 
-    def _track_presses(self, load: StaticLoad, sample_ns: int, counts: FloatArray) -> None:
+    def _channels(self, pad: int) -> int:
+        return int(self._weights[pad].shape[-1])
+
+    def _track_presses(self, pad: int, load: StaticLoad, sample_ns: int, counts: FloatArray) -> None:
         """Count presses elsewhere on the pad that leave the load as it was; measure scatter in between."""
-        level = load.level_counts
+        level, weights = load.level_counts, self._weights[pad]
+        counts = counts[:, : len(level)]
         size, totals = float(np.abs(level).sum()), counts.sum(axis=1)
         if totals.max() > _MAX_FLOOR_RATIO * size:
             load.last_press_ns = sample_ns
-            excess, place = counts[totals.argmax()] - level, approximate_position(level)
-            away = np.abs(approximate_position(excess) - place).max()
+            excess, place = counts[totals.argmax()] - level, approximate_position(level, weights)
+            away = np.abs(approximate_position(excess, weights) - place).max()
             if excess.sum() > max(_MIN_PRESS_COUNTS, 0.5 * size) and away > _MIN_PRESS_AWAY:
                 load.pressed_from = place if load.pressed_from is None else load.pressed_from
             return
         if load.pressed_from is not None:
-            moved = np.abs(approximate_position(counts.mean(axis=0)) - load.pressed_from).max()
+            moved = np.abs(approximate_position(counts.mean(axis=0), weights) - load.pressed_from).max()
             load.presses += int(moved < _MAX_FLOOR_MOVE)
             load.pressed_from = None
         if totals.min() > 0 and len(counts) > 3 and sample_ns - load.last_press_ns > _AFTER_PRESS_NS:
@@ -296,10 +306,9 @@ class StaticLoadDetector:
         if len(load.scatter) < _MIN_SCATTER_BLOCKS:
             return 0.0
         noise = float(np.sqrt(self._variance[pad])) / max(float(np.abs(load.level_counts).sum()), 1.0)
-        variance, blocks = float(np.median(load.scatter)), len(load.scatter)
-        return _log_bayes_factor(
-            variance, 3 * blocks, np.sqrt(0.75) * noise, _TREMOR_POSITION_STDS, _STILL_POSITION_STDS
-        )
+        variance, blocks, free = float(np.median(load.scatter)), len(load.scatter), self._channels(pad) - 1
+        noise *= np.sqrt(free / (free + 1))  # fractions sum to one
+        return _log_bayes_factor(variance, free * blocks, noise, _TREMOR_POSITION_STDS, _STILL_POSITION_STDS)
 
 
 def _scatter(values: FloatArray) -> float:
