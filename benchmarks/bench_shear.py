@@ -40,8 +40,6 @@ PATTERNS: dict[str, dict[str, Any]] = {
     "crossed bars": BARS,
     "discs": {"kind": "discs", "discs": 9, "radius_mm": 2.0, "gap_mm": 0.4},
 }
-EDGE_MM = {"crossed bars": 0.6, "discs": 2.0}
-"""Overlap that an error of an edge compares with."""
 MAX_NORMAL_N, FRICTION, MAX_FORCE_N = 8.0, 0.8, 3.0
 CENTRE_STD_M, NORMAL_STD = 1e-3, 0.1
 """Errors of the contact above: its centre, and its normal force, relative."""
@@ -76,7 +74,7 @@ class Load(NamedTuple):
 class Bench:
     """One drawn pad with its node, loads and estimator."""
 
-    def __init__(self, drawn: DrawnWorld, nominal: Shear, edge_mm: float) -> None:
+    def __init__(self, drawn: DrawnWorld, nominal: Shear) -> None:
         self.rng = np.random.default_rng((drawn.seed, 5))
         hidden = drawn.shear("bench/tip")
         self._history = LayerHistory(nominal, hidden)
@@ -84,7 +82,7 @@ class Bench:
         gains = drawn.world.parts.gain_ratio.sample(self.rng, 4)
         self._counts_per_a = COUNTS / FULL_SCALE_A * gains[: self._pad.channels]
         self._noise = NOISE_COUNTS * float(drawn.world.electronics.noise_ratio.sample(self.rng, 1)[0])
-        self.stated = drawn.world.shear.describe(nominal, edge_mm)
+        self.stated = drawn.world.shear.describe(nominal)
         self._estimator = ShearPad(nominal.build_pattern(), DRIVE_V, nominal.build_film(), PART_STD)
         self._loads: list[Load] = []
         self._moved: list[FloatArray] = []
@@ -125,7 +123,7 @@ class Bench:
 def force_errors(pattern: str, world: str, seed: int) -> list[Estimates]:
     """Return the error of one load on one drawn pad, before and after its calibration."""
     drawn = WORLDS[world].draw(Family.REPORTING.seed(seed))
-    bench = Bench(drawn, shear_table(pattern), EDGE_MM[pattern])
+    bench = Bench(drawn, shear_table(pattern))
     bench.apply(Load(np.zeros(2), 0.0, np.zeros(2), 0.1))  # tare
     factor = 1 + REFERENCE_STD * bench.rng.standard_normal()
     for force in REFERENCES_N.T:

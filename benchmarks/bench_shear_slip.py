@@ -6,7 +6,6 @@ Prints its table and writes docs/benchmarks/shear_slip.md and shear_slip.json.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from handtouch.percept.friction import FrictionMonitor
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.simulation import GraspRecord, simulate_grasp
+from handtouch.simulate.grasp.tangential import PadForces, pad_forces
 from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
 from handtouch.simulate.worlds import DrawnWorld
 
@@ -40,33 +40,10 @@ CONFIRMED_S = 0.1
 """Time after its onset at which a slip teaches the limit: about the 95 % delay of detection by position."""
 
 
-@dataclass(frozen=True)
-class PadForces:
-    """Forces on one pad by sample: tangential (2, n) along its x and y, and normal (n,) [N]."""
-
-    tangential_n: FloatArray
-    normal_n: FloatArray
-
-
 def forces_on(grasp: GraspRecord, row: int) -> PadForces:
     """Return MuJoCo's forces on a pad, mean of the steps of each sample."""
-    pad, count = grasp.pads[row], len(grasp.times_s)
-    mine = grasp.pad_row == row
-    step = grasp.step_index[mine]
-    rotation = grasp.link_rotation[step, row]
-    on_link = np.einsum("kji,kj->ki", rotation, grasp.point_m[mine] - grasp.link_m[step, row])
-    force = np.einsum("kji,kj->ki", rotation, grasp.force_n[mine]) @ pad.rotation
-    foot = pad.shape.project((on_link - pad.translation_m) @ pad.rotation)
-    inward = np.einsum("ki,ki->k", force, foot.normal)
-    along = force - inward[:, None] * foot.normal
-    across = np.cross(foot.normal, [1.0, 0.0, 0.0])
-    across /= np.linalg.norm(across, axis=1)[:, None]
-    forward = np.cross(across, foot.normal)
-    total = np.zeros((3, count))
-    for k, values in enumerate(
-        (np.einsum("ki,ki->k", along, forward), np.einsum("ki,ki->k", along, across), -inward)
-    ):
-        np.add.at(total[k], step, values)
+    forces = pad_forces(grasp, row)
+    total = np.vstack([forces.tangential_n, forces.normal_n])
     sampled = total.reshape(3, -1, STEPS).mean(axis=2)
     return PadForces(sampled[:2], sampled[2])
 
@@ -89,7 +66,7 @@ def measured(forces: PadForces, world: DrawnWorld, name: str) -> tuple[FloatArra
     pad = ShearPad(nominal.build_pattern(), DRIVE_V, nominal.build_film(), PART_STD)
     found = pad.estimate(amperes, NOISE_A, normal_force_n=normal, centre_std_m=1e-3)
     displacement = found.motion - found.motion[:, :1]
-    stated = world.world.shear.describe(nominal, 0.6)
+    stated = world.world.shear.describe(nominal)
     layer = calibrate_layer(displacement[:, 1:5], REFERENCES_N, REFERENCE_STD, stated.hysteresis)
     force = layer.force(displacement[:, 5:], found.covariance[5:], 2.0)
     scale = 1 + NORMAL_STD * rng.standard_normal()

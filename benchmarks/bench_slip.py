@@ -73,7 +73,7 @@ def hold(world: DrawnWorld, hz: float, seconds: float) -> Record:
     return run(grips, world, hz, seconds)
 
 
-def grip(number: int, from_s: float, seconds: float, force_n: float, seed: int, **slip: float) -> GripTouch:
+def grip(number: int, from_s: float, seconds: float, force_n: float, seed: int, **slip: Any) -> GripTouch:
     link, size_mm = PADS[number]
     return GripTouch(
         link=link,

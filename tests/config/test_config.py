@@ -81,7 +81,7 @@ DEPLOYMENTS = [path for path in sorted(CONFIG.glob("*.toml")) if "\n[[hand]]\n" 
 @pytest.mark.parametrize("path", DEPLOYMENTS, ids=lambda path: path.name)
 def test_shipped_deployments_are_valid(path: Path) -> None:
     deployment = config.load(path)
-    pads = {"two_finger": 2, "electrodes": 2, "outlined": 3}.get(path.stem, 15)
+    pads = {"two_finger": 2, "electrodes": 2, "outlined": 3, "shear": 2}.get(path.stem, 15)
     assert [len(hand.pads) for hand in deployment.hands] == [pads]
 
 
@@ -350,6 +350,52 @@ ERRORS = {
     "byte order mark": (("\n[[bus]]", "\ufeff\n[[bus]]"), "line 1: its first character is a byte order mark"),
     "no TOML": (("[touch]", "[touch"), "hand.toml: TOML, line 19, column 7 `[touch`: Expected ']'"),
 }
+
+
+SHEAR_ERRORS = {
+    "no such shear pad": (
+        ('shear = "bars"', 'shear = "bar"'),
+        'shear = "bar": no [shear.NAME] of that name; did you mean "bars"? known: bars, discs',
+    ),
+    "too few channels": (
+        (', "0x6401:8"', ""),
+        'node = "eight_channel": has 7 channels, the pad 4 electrodes and its shear pad 4; list as many',
+    ),
+    "curved pad": (
+        (
+            'kind = "plane", length_mm = 16.0, width_mm',
+            'kind = "cylinder", radius_mm = 9, length_mm = 16.0, arc_deg',
+        ),
+        'shear = "bars": lies beneath a flat pad: it needs surface.kind = "plane", not "cylinder"',
+    ),
+    "electrode twice": (
+        ('shear = "bars"', 'shear = "bars"\nshear_electrodes = ["x0", "xa", "y0", "y0"]'),
+        'shear_electrodes = ["x0", "xa", "y0", "y0"]: must name each of x0, xa, y0, yb once',
+    ),
+    "pattern without y": (
+        ('kind = "crossed_bars"', 'kind = "bars"'),
+        '[shear.bars]: pattern.kind = "bars": senses the component x only, which is no force vector; use',
+    ),
+    "unknown pattern": (
+        ('kind = "crossed_bars"', 'kind = "stripes"'),
+        'pattern.kind = "stripes": needs kind = "bars", kind = "crossed_bars", kind = "pinwheel" or kind',
+    ),
+    "misspelt key of a pattern": (
+        ("radius_mm = 2.0, gap_mm", "radius = 2.0, gap_mm"),
+        '[shear.discs.pattern]: radius = 2.0: unknown key; did you mean "radius_mm"? Keys carry their unit',
+    ),
+    "impossible pattern": (
+        ("radius_mm = 2.0, gap_mm = 0.4", "radius_mm = 2.0, gap_mm = 2.4"),
+        "[shear.discs]: pattern: gap_m 0.0024 must be less than radius_m 0.002",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "expected"), SHEAR_ERRORS.values(), ids=SHEAR_ERRORS.keys())
+def test_errors_of_shear_pads_name_location_value_and_remedy(change: tuple[str, str], expected: str) -> None:
+    text = (CONFIG / "shear.toml").read_text()
+    assert change[0] in text
+    assert expected in config_error(text.replace(*change, 1))
 
 
 @pytest.mark.parametrize(("change", "expected"), ERRORS.values(), ids=ERRORS.keys())

@@ -81,7 +81,8 @@ class _FrameColumn(Generic[T]):
 class LinkColumns:
     """The columns of `wire.HandFrame` by link, as attributes; a row per pad.
 
-    Unknown values are NaN. Those of the palm and the base raise LookupError while no scene requests them.
+    Unknown values are NaN. Those of the palm and the base raise LookupError while no scene requests them, and
+    force vectors for a hand without shear pads.
     """
 
     state = _FrameColumn[int]("State of the pad, a `wire.PadState`; only CLEAR means no contact.")
@@ -110,6 +111,11 @@ class LinkColumns:
     base_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the base's frame.")
     base_covariance_m2 = _FrameColumn[FloatArray]("(9,) its covariance in the base's frame [m^2].")
     joints_age_s = _FrameColumn[float]("Time from the sample to the nearest joint state [s].")
+    force_vector_status = _FrameColumn[int]("Status of the force vector, a `wire.ForceStatus`.")
+    force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the link's frame [N].")
+    force_vector_covariance_n2 = _FrameColumn[FloatArray]("(9,) its covariance, row by row [N^2].")
+    palm_force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the palm's frame [N].")
+    base_force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the base's frame [N].")
 
     def column(self, name: str) -> LinkColumn[Any]:
         """Return a column by its name. Raises LookupError while it isn't published."""
@@ -234,6 +240,8 @@ class HandArrays(LinkColumns):
         if derive := _DERIVED.get(name):
             return derive(_COLUMNS["state"].to_array(self.frame.state))
         data = getattr(self.frame, name)
+        if not data and self.links and name.startswith("force_vector"):
+            raise LookupError(f"{name} needs a pad with a shear pad; see docs/shear.md")
         if not data and self.links:
             output = name.split("_")[0] if name != "group" else "palm"
             raise LookupError(f'no scene requests {name}; add "{output}" to the outputs of the scene')

@@ -20,8 +20,10 @@ from handtouch.config import shipped
 from handtouch.config.base import Table
 from handtouch.config.checks import problems_in, problems_in_buses
 from handtouch.config.problems import ConfigError, Problem, problems_of
-from handtouch.config.surfaces import SURFACE_TABLES, SurfaceTable, surface_table
+from handtouch.config.shear import Shear
+from handtouch.config.surfaces import SurfaceTable, surface_table
 from handtouch.config.tables import (
+    KINDS,
     TABLES,
     Behaviour,
     Bus,
@@ -49,6 +51,7 @@ __all__ = [
     "Node",
     "Pad",
     "Problem",
+    "Shear",
     "Sheet",
     "SurfaceTable",
     "Table",
@@ -78,7 +81,7 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
     try:
         deployment = Deployment.model_validate(raw)
     except ValidationError as error:
-        raise ConfigError(file, problems_of(raw, error, TABLES, SURFACE_TABLES)) from error
+        raise ConfigError(file, problems_of(raw, error, TABLES, KINDS)) from error
     nodes = {
         name: node.model_copy(update={"eds": str((folder or Path()) / node.eds)}) if node.eds else node
         for name, node in deployment.nodes.items()

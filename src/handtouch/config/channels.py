@@ -3,7 +3,8 @@
 A channel is an integer, its count, or REAL32: count = value x counts per unit, rounded.
 
 Public names: `Channel`, `Channels`, `WritableObject`, `STANDARD_CHANNELS`, `PROFILE_TYPES`,
-`resolve_channels`, `order_by_electrode`, `parse_object`, `parse_writable_object`, `full_scale_counts`,
+`resolve_channels`, `order_by_electrode`, `order_channels`, `shear_numbers`, `parse_object`,
+`parse_writable_object`, `full_scale_counts`,
 `max_count`, `integer_limits`.
 """
 
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from handtouch.config import Node, Pad, eds
 from handtouch.config.eds import REAL32, ValueType
+from handtouch.config.tables import SIDE_ELECTRODES
 
 MAX_CHANNEL_BITS = 32
 _OBJECT_PATTERN = re.compile(
@@ -152,6 +154,18 @@ def parse_writable_object(text: str) -> WritableObject:
 def order_by_electrode(channels: Channels, pad: Pad) -> Channels:
     """Return the channels of a pad's electrodes, in their order; `channels` are those of its node."""
     return tuple(channels[pad.electrodes.index(name)] for name in pad.electrode_names)
+
+
+def order_channels(channels: Channels, pad: Pad) -> Channels:
+    """Return the channels of a pad's electrodes, then those of its shear pad's x0, xa, y0, yb."""
+    return *order_by_electrode(channels, pad), *(channels[number] for number in shear_numbers(pad))
+
+
+def shear_numbers(pad: Pad) -> tuple[int, ...]:
+    """Return the numbers of the node's channels of a shear pad's electrodes x0, xa, y0, yb; () without."""
+    if pad.shear is None:
+        return ()
+    return tuple(len(pad.electrode_names) + pad.shear_electrodes.index(name) for name in SIDE_ELECTRODES)
 
 
 def full_scale_counts(node: Node) -> int:

@@ -12,9 +12,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from handtouch.config.problems import Problem, suggest_name
+from handtouch.config.shear import Shear
 from handtouch.config.tables import (
     MAX_ELECTRODES,
     MIN_ELECTRODES,
+    SIDE_ELECTRODES,
     Bus,
     Daemon,
     Deployment,
@@ -28,6 +30,7 @@ from handtouch.field.outline_surface import OutlineSurface
 
 UDP_MULTICAST_PORT = 43113
 """python-can's default port of a udp_multicast bus."""
+_FLAT_SURFACE = "plane"
 _MAX_OVERLAP_MM = 1e-6  # of arcs that end in one point: rounding
 
 
@@ -37,6 +40,8 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
     yield from problems_in_buses(deployment.buses)
     for name, node in deployment.nodes.items():
         yield from _check_node(f"[node.{name}]", node)
+    for name, shear in deployment.shears.items():
+        yield from _check_shear(f"[shear.{name}]", shear)
     yield from _check_touch("[touch]: ", deployment.touch)
     yield from _check_names("[[hand]]", "name", [hand.name for hand in deployment.hands])
     yield from _check_scene(deployment)
@@ -52,6 +57,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
             in_wrong_unit = list(pad_unit_problems(location, pad))
             yield from in_wrong_unit or _check_shape(location, pad)
             yield from _check_electrodes(location, pad, deployment)
+            yield from _check_shear_pad(location, pad)
             if pad.touch:
                 yield from _check_touch(f"{location}touch.", pad.touch)
             if (pad.bus, pad.node_id) in taken:
@@ -258,10 +264,11 @@ def _check_references(location: str, pad: Pad, deployment: Deployment) -> Iterat
         ("bus", "[[bus]]", [bus.name for bus in deployment.buses]),
         ("node", "[node.NAME]", list(deployment.nodes)),
         ("sheet", "[sheet.NAME]", list(deployment.sheets)),
+        ("shear", "[shear.NAME]", list(deployment.shears)),
     )
     for key, header, names in known:
         value = getattr(pad, key)
-        if value not in names:
+        if value is not None and value not in names:
             there = f"known: {', '.join(names)}" if names else "none is defined"
             yield Problem(
                 f"{location}{key}",
@@ -282,13 +289,44 @@ def _check_electrodes(location: str, pad: Pad, deployment: Deployment) -> Iterat
             remedy = f"needs {len(names)} values, one for each electrode, has {len(values)}"
             yield Problem(f"{location}{key}", _format_value(values), remedy)
     node = deployment.nodes.get(pad.node)
-    if node is not None and len(node.channels) != len(names):
+    if node is not None and len(node.channels) != pad.channel_count:
+        shear = f" and its shear pad {len(pad.shear_electrodes)}" if pad.shear else ""
         yield Problem(
             f"{location}node",
             _format_value(pad.node),
-            f"has {len(node.channels)} channels, the pad {len(names)} electrodes; list as many objects in "
-            f"channels of [node.{pad.node}], or of a kind of node for this pad",
+            f"has {len(node.channels)} channels, the pad {len(names)} electrodes{shear}; list as many "
+            f"objects in channels of [node.{pad.node}], or of a kind of node for this pad",
         )
+
+
+def _check_shear(location: str, shear: Shear) -> Iterator[Problem]:
+    """Check that a shear pad's pattern can exist and gives both components of the force."""
+    try:
+        components = shear.build_pattern().components
+    except ValueError as error:
+        yield Problem(f"{location}: pattern", "", f"{error}")
+        return
+    if "y" not in components:
+        yield Problem(
+            f"{location}: pattern.kind",
+            _format_value(shear.pattern.kind),
+            "senses the component x only, which is no force vector; use crossed_bars, discs or pinwheel",
+        )
+
+
+def _check_shear_pad(location: str, pad: Pad) -> Iterator[Problem]:
+    """Check the surface above a shear pad, and the names of its electrodes."""
+    if pad.shear is None:
+        return
+    if pad.surface.kind != _FLAT_SURFACE:
+        yield Problem(
+            f"{location}shear",
+            _format_value(pad.shear),
+            f'lies beneath a flat pad: it needs surface.kind = "{_FLAT_SURFACE}", not "{pad.surface.kind}"',
+        )
+    if sorted(pad.shear_electrodes) != sorted(SIDE_ELECTRODES):
+        once = f"must name each of {', '.join(SIDE_ELECTRODES)} once"
+        yield Problem(f"{location}shear_electrodes", _format_value(pad.shear_electrodes), once)
 
 
 def _check_arcs(location: str, pad: Pad) -> Iterator[Problem]:

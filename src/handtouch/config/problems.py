@@ -58,20 +58,18 @@ class ConfigError(ValueError):
 
 
 def problems_of(
-    raw: Mapping[str, Any], error: ValidationError, tables: Tables, kinds: Tables
+    raw: Mapping[str, Any], error: ValidationError, tables: Tables, kinds: Mapping[str, Tables]
 ) -> tuple[Problem, ...]:
-    """Return the errors that pydantic found in a file's tables; `kinds` are the models by their `kind`."""
+    """Return the errors that pydantic found in a file's tables.
+
+    kinds: of each table that follows one of several models by its key `kind`, the models by kind.
+    """
     found = [_ValidationMistake(raw, item, tables, kinds) for item in error.errors()]
     misspelled = {(mistake.section, mistake.closest_key) for mistake in found if mistake.closest_key}
     problems = (mistake.to_problem() for mistake in found if (mistake.section, mistake.key) not in misspelled)
     return tuple(dict.fromkeys(problem for problem in problems if problem))
 
 
-_KIND_TABLES = (
-    ["surface"],
-    ["fault"],
-    ["node_fault"],
-)  # tables that follow one of several models, by their key `kind`
 _SCALAR_TYPES = ("str", "int", "float", "bool")  # pydantic's marks for the alternatives of a scalar union
 _MESSAGE_REPLACEMENTS = (
     ("Input should be ", "must be "),
@@ -87,14 +85,16 @@ _MESSAGE_REPLACEMENTS = (
 class _ValidationMistake:
     """One of pydantic's errors, located in the file."""
 
-    def __init__(self, raw: Mapping[str, Any], error: Any, tables: Tables, kinds: Tables) -> None:
+    def __init__(
+        self, raw: Mapping[str, Any], error: Any, tables: Tables, kinds: Mapping[str, Tables]
+    ) -> None:
         loc = tuple(error["loc"])
         self.error_type: str = error["type"]
         self.is_scalar_union = loc[-1] in _SCALAR_TYPES if loc else False
         self.error = error
         self.kinds = kinds
         path, self.section, self.key_path, self.table = _locate(
-            raw, loc[:-1] if self.is_scalar_union else loc
+            raw, loc[:-1] if self.is_scalar_union else loc, kinds
         )
         self.path, self.tables = path, tables
         self.key = path[-1] if path else ""
@@ -120,7 +120,9 @@ class _ValidationMistake:
             given = self.error["input"].get("kind") if isinstance(self.error["input"], dict) else None
             at, value = (".kind", f" = {_format_input(given)}") if given is not None else ("", value)
             return Problem(
-                self.location + at, value, "needs " + _join_alternatives(f'kind = "{k}"' for k in self.kinds)
+                self.location + at,
+                value,
+                "needs " + _join_alternatives(f'kind = "{k}"' for k in self.kinds[self.key]),
             )
         if self.error_type == "too_short" and len(self.error["input"]) >= context["min_length"]:
             return None  # pydantic also calls a list too short when all its entries are invalid
@@ -174,7 +176,7 @@ class _ValidationMistake:
 
 
 def _locate(
-    raw: Mapping[str, Any], loc: tuple[str | int, ...]
+    raw: Mapping[str, Any], loc: tuple[str | int, ...], kinds: Mapping[str, Tables]
 ) -> tuple[list[str], str, str, Mapping[str, Any]]:
     """Translate pydantic's location into (keys, section header, remaining keys, innermost table)."""
     here: Any = raw
@@ -192,9 +194,7 @@ def _locate(
             elif shown:
                 shown[-1] += f"[{step}]"
             continue
-        if step == "[key]" or (
-            isinstance(here, dict) and here.get("kind") == step and path[-1:] in _KIND_TABLES
-        ):
+        if step == "[key]" or (isinstance(here, dict) and here.get("kind") == step and path[-1] in kinds):
             continue  # pydantic's own marks, not keys of the file
         if isinstance(here, dict):
             table = here
@@ -207,11 +207,11 @@ def _locate(
 
 
 def _table_model(
-    path: list[str], table: Mapping[str, Any], tables: Tables, kinds: Tables
+    path: list[str], table: Mapping[str, Any], tables: Tables, kinds: Mapping[str, Tables]
 ) -> type[BaseModel] | None:
     """Return the model of the table at a path."""
-    if path[-1:] in _KIND_TABLES:
-        return kinds.get(str(table.get("kind")))
+    if path and path[-1] in kinds:
+        return kinds[path[-1]].get(str(table.get("kind")))
     return tables.get(".".join(path)) or tables.get(".".join([*path[:-1], "*"]))
 
 

@@ -1,6 +1,6 @@
 """The table `[shear.NAME]`: a kind of shear pad, its electrode pattern, film and elastic layer.
 
-Public names: `Shear`, `ShearPatternTable` and the tables of its kinds.
+Public names: `Shear`, `ShearPatternTable`, the tables of its kinds and `SHEAR_PATTERNS`, by their kind.
 """
 
 from __future__ import annotations
@@ -73,6 +73,13 @@ class Discs(Table):
         return DiscPattern(self.discs, self.radius_mm * _MM, self.gap_mm * _MM, film_m)
 
 
+SHEAR_PATTERNS: dict[str, type[Table]] = {
+    "bars": Bars,
+    "crossed_bars": CrossedBars,
+    "pinwheel": Pinwheel,
+    "discs": Discs,
+}
+"""Tables of patterns by their kind."""
 ShearPatternTable = Annotated[Bars | CrossedBars | Pinwheel | Discs, Field(discriminator="kind")]
 
 

@@ -1,6 +1,7 @@
 """Tables of a deployment file: every key with its type, unit, range, default and description.
 
-Public names: `Deployment` and the tables in it; `TABLES`, by their names in the file.
+Public names: `Deployment` and the tables in it; `TABLES`, by their names in the file; `KINDS`, of tables that
+follow one of several models.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, model_validator
 
 from handtouch.config.base import Table
-from handtouch.config.surfaces import PadSurface
+from handtouch.config.shear import SHEAR_PATTERNS, Shear
+from handtouch.config.surfaces import SURFACE_TABLES, PadSurface
 from handtouch.host.endpoints import (
     COMPLETE_ENDPOINT,
     CONTROL_ENDPOINT,
@@ -384,6 +386,16 @@ class Pad(Table):
         description="series resistors of electrodes x0, xa, y0, yb, or of each arc, to ground; default: 0",
     )
     mount: Mount = Field(Mount(), description="pose of the pad on its link")
+    shear: Name | None = Field(
+        None,
+        description="kind of shear pad beneath this flat pad, a [shear.NAME] table, on channels of the same "
+        "node; x along x, its centre at the pad's; default: none",
+    )
+    shear_electrodes: Annotated[tuple[Name, ...], Field(strict=False)] = Field(
+        SIDE_ELECTRODES,
+        description="electrodes of the shear pad that the node's channels after those of the pad are wired "
+        "to, in channel order",
+    )
     touch: Touch | None = Field(None, description="thresholds of this pad; default: those of [touch]")
 
     @model_validator(mode="before")
@@ -405,6 +417,11 @@ class Pad(Table):
     def electrode_names(self) -> tuple[str, ...]:
         """Names of the electrodes, in the order of the columns of all currents."""
         return SIDE_ELECTRODES if self.electrode_arcs_mm is None else tuple(self.electrode_arcs_mm)
+
+    @property
+    def channel_count(self) -> int:
+        """Number of channels of the pad's node: its electrodes', then those of its shear pad."""
+        return len(self.electrode_names) + (len(self.shear_electrodes) if self.shear else 0)
 
     @property
     def arcs_mm(self) -> tuple[tuple[float, float], ...]:
@@ -526,6 +543,7 @@ class Deployment(Table):
     buses: Annotated[tuple[Bus, ...], Field(strict=False, min_length=1)] = Field(alias="bus")
     nodes: dict[Name, Node] = Field(alias="node")
     sheets: dict[Name, Sheet] = Field(alias="sheet")
+    shears: dict[Name, Shear] = Field({}, alias="shear")
     touch: Touch = Touch()
     hands: Annotated[tuple[HandTable, ...], Field(strict=False, min_length=1)] = Field(alias="hand")
 
@@ -563,9 +581,12 @@ TABLES: dict[str, type[Table]] = {
     "node.*.idle": Idle,
     "sheet.*": Sheet,
     "sheet.*.behaviour": Behaviour,
+    "shear.*": Shear,
     "touch": Touch,
     "hand": HandTable,
     "hand.pad": Pad,
     "hand.pad.mount": Mount,
     "hand.pad.touch": Touch,
 }
+KINDS: dict[str, dict[str, type[Table]]] = {"surface": {**SURFACE_TABLES}, "pattern": {**SHEAR_PATTERNS}}
+"""Models by the key `kind`, of each table that follows one of several."""

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 STAGES = (
     *("tables", "tolerances", "locate", "force", "solve", "slip", "receive", "detect", "sheets", "publish"),
-    *("kinematics", "frames", "groups"),
+    *("kinematics", "frames", "groups", "shear"),
 )
 """Modules of `handtouch.core.stages`, lowest first."""
 DIRECTIVES = {

@@ -46,15 +46,21 @@ class Event(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class BaselineEvent:
-    """Offsets (n,) of a pad and their standard deviations [counts]: a tare, or from a calibration."""
+    """Offsets (n,) of a pad and their standard deviations [counts]: a tare, or from a calibration.
+
+    shear_counts: (4,) of the shear pad beneath it at rest; () leaves its rest position as it is.
+    """
 
     kind: ClassVar[str] = "baseline"
     pad: int
     offset_counts: tuple[float, ...]
     std_counts: tuple[float, ...]
+    shear_counts: tuple[float, ...] = ()
 
     def apply(self, target: EventTarget) -> None:
         target.tick.set_baseline(self.pad, self.offset_counts, self.std_counts)
+        if self.shear_counts:
+            target.tick.shear.set_rest(self.pad, self.shear_counts)
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,7 +91,7 @@ class TickJournal:
                 now_ns=now_ns,
                 cycle_end_ns=None if until_ns == _NO_LIMIT_NS else until_ns,
                 stopped=stopped,
-                counts=tick.counts.astype("<i8", copy=False).tobytes(),
+                counts=tick.channel_counts.astype("<i8", copy=False).tobytes(),
                 arrival_ns=slab.arrival_ns.astype("<i8", copy=False).tobytes(),
                 fresh=slab.fresh.tobytes(),
                 node_state=pipeline.node_state.tobytes(),

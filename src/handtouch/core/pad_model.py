@@ -18,11 +18,13 @@ from handtouch.config.channels import (
     Channels,
     order_by_electrode,
     resolve_channels,
+    shear_numbers,
 )
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches
 from handtouch.core.part_tolerances import stage_tolerances
+from handtouch.core.shear import shear_tables_of
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.core.stages.tolerances import PadTolerances, part_count
@@ -56,6 +58,8 @@ class PadModel:
     `hands`, `links`, `frame_links` (URDF links) and `calibration_ids` (n,) are names; `rows_of_hand`: hand ->
     slice of rows; `calibrations` (n,): the active ones. `electrodes`: names of each pad's, `electrode_counts`
     (n,) their numbers; `c`, `channels`, is the largest of them. Columns beyond a pad's own are 0.
+    `slab_channels` and `slab_columns` (n,): those of the slab, electrodes before those of shear pads, which
+    `shear_tables` describe.
     `ampere_per_count` (n, c) of the electrodes includes `gains` (n, c); `noise_counts` (n,) and `noise_a` (n,
     c) are standard deviations of a channel. The counts of untouched pads are state of the tick: see
     `Baseline`.
@@ -108,6 +112,10 @@ class PadModel:
         self.weight = np.zeros(self.noise_a.shape)
         self.weight[self._used] = 1 / self.noise_a[self._used]
         self.mean_ampere_per_count = self.ampere_per_count.sum(axis=1) / self.electrode_counts
+        shear = [range(self.channels, self.channels + len(shear_numbers(pad))) for pad in pads]
+        self.slab_channels = self.channels + max(map(len, shear))
+        self.slab_columns = [(*range(k), *own) for k, own in zip(self.electrode_counts, shear, strict=True)]
+        self.shear_tables = shear_tables_of(deployment, self.channels, self.noise_counts)
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = self._used.astype(np.float64)
@@ -495,7 +503,7 @@ def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
     deployment file gets its serial number. Nor with tolerances: they are no part of what is calibrated.
     """
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
-    absent = set() if pad.arcs_mm else {"electrode_arcs_mm"}
+    absent = {"shear", "shear_electrodes"} | (set() if pad.arcs_mm else {"electrode_arcs_mm"})
     text = pad.model_copy(update={"serial": None}).model_dump_json(exclude=absent)
     unstated = _SHEET_TOLERANCES | ({"hertz_force_n"} if sheet.hertz_force_n is None else set())
     text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=unstated)

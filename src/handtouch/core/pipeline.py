@@ -51,7 +51,7 @@ class Pipeline:
     ) -> None:
         self.model = model
         self.state = TickState.empty(model.size, len(model.rows_of_hand), model.channels)
-        self.slab = Slab(model.size, model.channels)
+        self.slab = Slab(model.size, model.slab_channels, model.slab_columns)
         self.cycle = Cycle(period_ns, window)
         self.tick = TickProcessor(model, period_ns, self.state)
         self.transforms = ContactTransforms(model.hands, robots, self.state)
@@ -219,6 +219,9 @@ class Pipeline:
             solve_contacts(tick, touching)
             tick.sheet_force.store_forces()
             tick.output.publish()
+            if tick.shear.any_configured:
+                self.state.shear_sample_ns[touching] = 0
+                tick.shear.update_forces(self.slab)
 
     def load_state(
         self, saved: bytes, layout: str, calibrations: Sequence[ActiveCalibration] | None = None
@@ -250,7 +253,8 @@ def run_tick(
     Samples that arrived at `until_ns` or later belong to the next cycle. `node_state` (n,):
     PadState.CLEAR where the node is up, else the state to give its pad.
     """
-    tick.counts, tick.sync_ns = slab.unpack_counts(), cycle.sync_ns
+    tick.channel_counts, tick.sync_ns = slab.unpack_counts(), cycle.sync_ns
+    tick.counts = tick.channel_counts[:, : tick.model.channels]
     changes = detect_contacts(tick.contacts, slab, node_state, cycle, until_ns)
     if len(changes.began):
         tick.sheet_force.begin_contacts(changes.began)
@@ -259,6 +263,8 @@ def run_tick(
     if tick.sheet_force.any_modelled:
         tick.sheet_force.compensate_forces(cycle.sync_ns)
     tick.output.publish()
+    if tick.shear.any_configured:
+        tick.shear.update_forces(slab)
     return TickResult(cycle.sync_ns, changes.began, changes.updated, changes.ended, changes.silent)
 
 

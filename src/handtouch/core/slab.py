@@ -8,6 +8,7 @@ Public names: `Slab`, `CountSlab`, `Cycle`, `ChannelField`, `ChannelLayout`, `ST
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,15 +58,17 @@ STANDARD_LAYOUT: ChannelLayout = (
 class Slab:
     """Latest complete sample of each of `size` pads, as arrays in memory that the receive path writes.
 
-    channels: of the pad with most electrodes; those that a pad lacks count 0, and are at no limit.
+    channels: number of columns; columns: of each slot, those of its channels, by default the first. What a
+    slot lacks counts 0, and is at no limit.
 
     `arrival_ns` (size,) int64 arrival of its last PDO on the host's monotonic clock, 0 before the first;
     `fresh` (size,) uint8, 1 if it arrived since `begin_cycle`; `repeat_counts` (size,) int64, samples that
     replaced a fresh one.
     """
 
-    def __init__(self, size: int, channels: int = 4) -> None:
+    def __init__(self, size: int, channels: int = 4, columns: Sequence[Sequence[int]] | None = None) -> None:
         self.size, self.channels = size, channels
+        self._columns = columns or [range(channels)] * size
         self.arrival_ns: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
         self.repeat_counts: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
         self.fresh_count = 0
@@ -101,7 +104,7 @@ class Slab:
         self._fields[slot, :, 0] = slot * MAX_PDOS
         self._counts_per_unit[slot] = 0.0
         self._low_limits[slot], self._high_limits[slot] = -1, 1
-        for channel, field in enumerate(layout):
+        for channel, field in zip(self._columns[slot], layout, strict=False):
             sign = 1 << field.bits - 1 if field.signed else 0
             word = slot * MAX_PDOS + field.pdo
             self._fields[slot, channel] = word, field.first_bit, (1 << field.bits) - 1, sign

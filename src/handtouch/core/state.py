@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.frames import FRAME_VALUES
+from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.core.stages.slip import SLIP_COUNT
 from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.sheet import BANK_MODELS, BANK_WINDOW
@@ -196,6 +197,23 @@ class TickState:
     slip_contact_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
     slip_sample_ns: Annotated[IntArray, Stored("<i8", _PADS)]
     slip_requested: Annotated[BoolArray, Stored("?", _PADS)]
+
+    # shear pads, see `ShearForces`
+    shear_sample_ns: Annotated[IntArray, Stored("<i8", _PADS)]
+    """newest sample processed"""
+    shear_rest_m: Annotated[FloatArray, Stored("<f8", _PADS, 3, fill=math.nan)]
+    """motion at rest, x, y [m] and twist [rad]; NaN while it isn't known"""
+    shear_rest_sum: Annotated[FloatArray, Stored("<f8", _PADS, SHEAR_CHANNELS)]
+    """counts of untouched samples, to measure it"""
+    shear_rest_samples: Annotated[IntArray, Stored("<i8", _PADS)]
+    shear_peak_n: Annotated[FloatArray, Stored("<f8", _PADS)]
+    """greatest tangential force since the rest position was measured, which bounds the hysteresis"""
+    force_vector: Annotated[FloatArray, Stored("<f8", _PADS, 12, fill=math.nan)]
+    """force in the link's frame and its covariance, row by row"""
+    force_vector_status: Annotated[Uint8Array, Stored("u1", _PADS)]
+    """ForceStatus"""
+    frame_force_vector: Annotated[FloatArray, Stored("<f8", _PADS, 6, fill=math.nan)]
+    """force in the palm's frame, then in the base's"""
 
     # messages
     contact_seq: Annotated[IntArray, Stored("<i8", _PADS)]

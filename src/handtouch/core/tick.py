@@ -17,6 +17,7 @@ from handtouch.core.contact_solver import VALUE_SLICES, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, DetectionSettings, IntArray
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
+from handtouch.core.shear import ShearForces
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
 from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.publish import PUBLISHED_SLICES, PUBLISHED_VALUES, ContactColumns
@@ -136,7 +137,9 @@ class TickProcessor:
         self.state = held = state
         self.columns = PadColumns.of_state(held)
         self.counts: NDArray[np.int64] = np.zeros((model.size, model.channels), dtype=np.int64)
-        """counts of the last tick"""
+        """counts of the electrodes in the last tick"""
+        self.channel_counts: NDArray[np.int64] = np.zeros((model.size, model.slab_channels), dtype=np.int64)
+        """counts of all channels, electrodes first"""
         held.max_sample_period_ns[:] = period_ns
         self.baseline = Baseline(
             *(model.noise_counts, model.begin_threshold_counts, model.end_threshold_counts),
@@ -211,6 +214,7 @@ class TickProcessor:
         """Forget what was learned of a pad: its node and sheet were replaced."""
         self.baseline.reset_pad(pad)
         self.sheet_force.reset_evidence(pad, new_sheet=True)
+        self.shear.forget_rest([pad])
         self.discard_solutions(np.array([pad]))
 
     def update_force_gains(self, reference: ForceReference) -> int:
@@ -224,6 +228,7 @@ class TickProcessor:
             self.sheet_force.reset_evidence(pad)
         self.model = model
         self._set_stages(model)
+        self.shear.forget_rest(changed.tolist())
         self.refresh()
         self.discard_solutions(changed)
 
@@ -233,12 +238,14 @@ class TickProcessor:
         held.solved[pads] = False
         held.values[pads] = np.nan
         held.uncompensated_force_n[pads] = np.nan
+        self.shear.discard(pads)
         self.slip.restart_contacts(pads)  # a position that a new calibration moves doesn't slip
 
     def clear_ended(self, ended: IntArray) -> None:
         """Clear the ids and published columns of ended contacts, after their last message was built."""
         self.state.contact_id[ended] = 0
         self.output.publish()
+        self.shear.discard(ended)
 
     def _set_stages(self, model: PadModel) -> None:
         """Set the stages that read the model's arrays in place."""
@@ -251,6 +258,10 @@ class TickProcessor:
             *(view_memory(columns.published_values), view_memory(columns.published["total_current_a"])),
             *(view_memory(columns.position_status), view_memory(columns.force_status)),
         )
+        self.shear = ShearForces(
+            model.shear_tables, self.state, columns.position_status, columns.force_status
+        )
+        """force vectors of contacts above shear pads"""
 
     def detect_slips(self, result: TickResult) -> None:
         """Detect slip and lift-off of a tick's contacts; call it once the tick's messages are out."""

@@ -142,6 +142,8 @@ class TickMessages:
     def _hand_frame(self, hand: str, retained: bool = False) -> wire.EncodedMessage:
         rows = self._model.rows_of_hand[hand]
         optional = self._transforms.hand_columns(rows) if self._transforms.any_requested else {}
+        if self._tick.shear.any_configured:
+            optional |= self._tick.shear.hand_columns(rows)
         seq, tick_number, sync_ns = self._frame_numbers()
         return self._encoders[hand].encode(seq, sync_ns, tick_number, retained, optional)
 

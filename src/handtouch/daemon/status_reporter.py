@@ -285,7 +285,7 @@ class StatusReporter:
         sample_ns = int(columns.sample_ns[pad])
         state = PadState(int(columns.state[pad]))
         counts = self._pipeline.tick.counts[pad]
-        railed = self._pipeline.slab.saturated(self._pipeline.tick.counts)[pad]
+        railed = self._pipeline.slab.saturated(self._pipeline.tick.channel_counts)[pad, : len(counts)]
         return wire.Health(
             v=wire.SCHEMA_VERSION,
             session=self._publisher.session,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from handtouch.core.events import BaselineEvent
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.daemon.sampling import SamplingController
 from handtouch.wire import PadState
 
@@ -51,6 +52,7 @@ class TareJob:
             np.float64
         )  # sums are of differences from it, to keep precision
         self._touched = np.zeros(len(names), dtype=np.bool_)
+        self._shear_sum = np.zeros((len(names), SHEAR_CHANNELS))
         pacer.request_full_rate(selected, now_ns)
 
     def poll(self, now_ns: int) -> dict[str, Any] | None:
@@ -64,6 +66,8 @@ class TareJob:
         self._sum += difference
         self._sum_of_squares += difference**2
         self._touched |= tick.contacts.touching
+        shear = tick.channel_counts[:, tick.model.channels :]
+        self._shear_sum[:, : shear.shape[1]] += shear * new[:, None]
         if now_ns < self._end_ns:
             return None
         return {"pads": [self._finish_pad(pad, tick.model) for pad in np.flatnonzero(selected).tolist()]}
@@ -90,7 +94,10 @@ class TareJob:
         if why := self._refusal_reason(pad, model, mean, std):
             return {**result, "tared": False, "reason": why}
         offsets, spread = tuple(mean.tolist()), tuple((std / np.sqrt(count)).tolist())
-        self._pipeline.add_event(BaselineEvent(pad, offsets, spread))
+        at_rest: tuple[float, ...] = ()
+        if self._tick.shear.has_shear(pad):
+            at_rest = tuple((self._shear_sum[pad] / count).tolist())
+        self._pipeline.add_event(BaselineEvent(pad, offsets, spread, at_rest))
         self._on_tared(pad, offsets)
         return {**result, "tared": True, "reason": "", "offset_counts": mean.tolist()}
 

@@ -155,7 +155,7 @@ class BarPattern:
         return 1 + max(cell.channel for cell in self.cells)
 
     @cached_property
-    def _edges(self) -> FloatArray:
+    def edges(self) -> FloatArray:
         """Direction and position (m, 4) of points of integration along the electrodes' edges."""
         points = []
         for cell in self.cells:
@@ -165,10 +165,17 @@ class BarPattern:
         return np.array(points)
 
     @cached_property
-    def _edge_weights(self) -> FloatArray:
+    def edge_weights(self) -> FloatArray:
         """Share (channels, m) of each of these points in the electrode of a channel."""
         member = np.array([cell.channel for cell in self.cells]) == np.arange(self.channels)[:, None]
         return np.kron(member, _GAUSS_WEIGHTS / 2)
+
+    @property
+    def gap_gain_m(self) -> float:
+        """Width that the gap to the other electrode under a bar adds to an overlap, 0 without; negative."""
+        if math.isinf(self.gap_m):
+            return 0.0
+        return self.gap_m / 2 - gap_loss(self.gap_m, self.film_m) / 2 - edge_excess(self.film_m)
 
     @property
     def travel_m(self) -> float:
@@ -194,17 +201,16 @@ class BarPattern:
         given = np.asarray(motion, np.float64)
         x, y, twist = (given[k] if k < len(given) else np.zeros(given.shape[1:]) for k in range(3))
         excess, film = edge_excess(self.film_m), self.film_m
-        lost = 0.0 if math.isinf(self.gap_m) else self.gap_m / 2 - gap_loss(self.gap_m, film) / 2 - excess
         length = self.length_m + 2 * excess
-        edges = self._edges.reshape(-1, 4, *[1] * x.ndim)
+        edges = self.edges.reshape(-1, 4, *[1] * x.ndim)
         wx, wy, px, py = (edges[:, k] for k in range(4))
         qx, qy = px + wx * self.overlap_m, py + wy * self.overlap_m
         cosine, sine = np.cos(twist), np.sin(twist)
         rx, ry = cosine * qx - sine * qy, sine * qx + cosine * qy
-        ratio, slope = overlap_ratio((wx * (rx + x - px) + wy * (ry + y - py) + lost) / film)
+        ratio, slope = overlap_ratio((wx * (rx + x - px) + wy * (ry + y - py) + self.gap_gain_m) / film)
         turn = wy * rx - wx * ry
         rates = np.stack([slope * wx, slope * wy, slope * turn], axis=1)
-        weights = length * self._edge_weights
+        weights = length * self.edge_weights
         areas = np.tensordot(weights, film * ratio, axes=1)
         slopes = np.tensordot(weights, rates, axes=1)
         return areas, slopes[:, : len(self.components)]

@@ -186,7 +186,7 @@ class ExactReplay:
         period_ns = round(settings.sync_period_ms * 1e6)
         window = settings.sample_window_fraction
         pipeline = Pipeline(self._model, period_ns, window, self._sink, session, robots)
-        pipeline.slab = ReplaySlab(self._model.size, self._model.channels)
+        pipeline.slab = ReplaySlab(self._model.size, self._model.slab_channels)
         return pipeline
 
     def _replay_tick(self, payload: dict[str, Any]) -> None:

@@ -240,6 +240,10 @@ class LivePadStimulus:
         n = len(times_s)
         return np.full((1, 2, n), 0.5), np.zeros((1, n)), np.tile([[1.0], [0.0], [0.0]], (1, 1, n))
 
+    def tangential_n(self, times_s: FloatArray) -> FloatArray:
+        """Return no force."""
+        return np.zeros((2, len(times_s)))
+
 
 def _create_object(object_name: str, parameters: Mapping[str, float]) -> SoftBlock | CurvedEdge:
     if object_name not in GRIPPER_OBJECTS:

@@ -24,7 +24,7 @@ from handtouch.simulate.stimulus import AppliedContact, NodeReplacement
 from handtouch.simulate.touch import ScenarioTouch, ScheduledTouches
 
 _TOUR_TOUCH_S, _TOUR_STEP_S = 1.6, 1.0
-_FAULT_TABLES = {**FAULTS, **INFLUENCES, **NODE_FAULTS}
+_KINDS: dict[str, dict[str, type[Table]]] = {"fault": {**FAULTS, **INFLUENCES}, "node_fault": {**NODE_FAULTS}}
 
 
 class Scenario(Table):
@@ -64,13 +64,16 @@ class Scenario(Table):
                 "swap": NodeReplacement,
                 "joint": JointMotion,
             }
-            raise ConfigError(file, problems_of(raw, error, tables, _FAULT_TABLES)) from error
+            raise ConfigError(file, problems_of(raw, error, tables, _KINDS)) from error
         return scenario
 
     @classmethod
     def tour(cls, deployment: Deployment) -> Self:
-        """Return a scenario with one sliding touch per pad, each begun before the previous one ends."""
-        links = dict.fromkeys(entry.pad.link for entry in deployment.pads)
+        """Return a scenario with one sliding touch per pad, each begun before the previous one ends.
+
+        Those on pads above shear pads have tangential forces.
+        """
+        links = {entry.pad.link: entry.pad.shear for entry in deployment.pads}
         touches = [
             ScenarioTouch(
                 link=link,
@@ -78,8 +81,9 @@ class Scenario(Table):
                 duration_s=_TOUR_TOUCH_S,
                 path=((0.3, 0.35), (0.7, 0.5), (0.4, 0.65)),
                 force_n=(0.5, 2.0, 1.0),
+                tangential_n=((0.1, 0.0), (0.8, -0.4), (0.2, 0.3)) if shear else (),
             )
-            for number, link in enumerate(links)
+            for number, (link, shear) in enumerate(links.items())
         ]
         return cls.model_validate({"touch": touches, "repeat": True})
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.canbus.bus.port import open_bus
 from handtouch.config.channels import parse_object, resolve_channels
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.device import Device, DeviceBus
 from handtouch.device.inputs import CHANNELS
 from handtouch.hand.urdf import RobotDescription
@@ -195,6 +196,8 @@ class _SimulatedBus:
                 excitation=parse_object(node.excitation_object)[:2] if node.excitation_object else None,
             )
             wired = tuple(map(pad.electrode_names.index, pad.electrodes))
+            if pad.shear:
+                wired += tuple(len(wired) + SIDE_ELECTRODES.index(name) for name in pad.shear_electrodes)
             device.wiring = (*wired, *range(len(wired), CHANNELS))
             self.devices[f"{hand}/{pad.link}"] = device
         self._excited = [True] * len(virtual_hand.pads)

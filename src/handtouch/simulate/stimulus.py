@@ -71,6 +71,9 @@ class PadStimulus(Protocol):
         k is `max_contacts`, n the number of times. A patch is the radius and focus of a `ContactPatch`.
         """
 
+    def tangential_n(self, times_s: FloatArray) -> FloatArray:
+        """Return the sum (2, n) of the contacts' tangential forces along x and y of the pad [N]."""
+
 
 class Stimulus(Protocol):
     """Input of a simulated hand. Times are seconds since the start; a repeating one starts again at 0."""

@@ -23,6 +23,7 @@ from handtouch.simulate.smoothstep import smoothstep, smoothstep_array
 
 FloatArray = NDArray[np.float64]
 _Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
+_Force2 = Annotated[tuple[float, float], Field(strict=False)]
 _Point = Annotated[tuple[_Fraction, _Fraction], Field(strict=False)]
 
 
@@ -37,6 +38,11 @@ class ScenarioTouch(Table):
     )
     force_n: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = Field(
         description="forces at evenly spaced times between the ramps, smoothly interpolated; one: constant"
+    )
+    tangential_n: Annotated[tuple[_Force2, ...], Field(strict=False)] = Field(
+        (),
+        description="tangential forces along x and y of the pad, at such times likewise; only shear pads "
+        "sense them; default: none",
     )
     ramp_s: Positive = Field(
         0.15, description="time in which the force rises from 0, and falls to 0 at the end"
@@ -91,9 +97,18 @@ class ScenarioTouch(Table):
 
     def forces(self, times_s: FloatArray) -> FloatArray:
         """Return `force_at` for times (n,)."""
+        return self._interpolate(np.array(self.force_n), times_s)
+
+    def tangential_forces(self, times_s: FloatArray) -> FloatArray:
+        """Return the tangential force (2, n) at times (n,)."""
+        levels = np.array(self.tangential_n or [(0.0, 0.0)])
+        return np.stack([self._interpolate(along, times_s) for along in levels.T])
+
+    def _interpolate(self, levels: FloatArray, times_s: FloatArray) -> FloatArray:
+        """Interpolate levels at evenly spaced times between the ramps."""
         ramp = min(self.ramp_s, self.duration_s / 2)
         elapsed, remaining = times_s - self.from_s, self.until_s - times_s
-        levels, span = np.array(self.force_n), self.duration_s - 2 * ramp
+        span = self.duration_s - 2 * ramp
         plateau = levels[:1]
         if len(levels) > 1 and span > 0:
             progress = np.clip((elapsed - ramp) / span, 0.0, 1.0) * (len(levels) - 1)
@@ -162,3 +177,11 @@ class ScheduledTouches:
                         [patch.radius_m, *patch.focus_m], patch.growth(force[row, during])
                     )
         return position, force, patches
+
+    def tangential_n(self, times_s: FloatArray) -> FloatArray:
+        """Return the sum (2, n) of the touches' tangential forces along x and y of the pad [N]."""
+        total = np.zeros((2, len(times_s)))
+        for touch in (touch for lane in self._lanes for touch, _ in lane if touch.tangential_n):
+            during = (touch.from_s < times_s) & (times_s < touch.until_s)
+            total[:, during] += touch.tangential_forces(times_s[during])
+        return total

@@ -37,6 +37,8 @@ class GroundTruth:
     """Currents of the electrodes, before gain, noise and rounding."""
     bound_m: float
     """Cramer-Rao bound: smallest rms position error of an unbiased estimate from this sample."""
+    force_vector_n: Vector | None = None
+    """Force on a pad above a shear pad, in the link's frame; tangential part that of all its contacts."""
 
 
 def write_header(file: TextIO, wall_minus_monotonic_ns: int) -> None:
@@ -64,7 +66,7 @@ def read_records(path: Path | str, *, wall: bool = False) -> list[GroundTruth]:
             if found.keys() != names:
                 raise ValueError(f"{path}: line {number} is not a ground-truth record")
             found["t_ns"] += offset_ns
-            for name in ("position_m", "normal", "currents_a"):
-                found[name] = tuple(found[name])
+            for name in ("position_m", "normal", "currents_a", "force_vector_n"):
+                found[name] = tuple(found[name]) if found.get(name) is not None else None
             records.append(GroundTruth(**found))
     return records

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
 from handtouch.simulate.contact_patch import ContactPatch, look_up_patches
 from handtouch.simulate.electronics_drift import ElectronicsDrift
@@ -60,6 +61,7 @@ class VirtualHand:
         self.virtual_pads = [
             VirtualPad.build(deployment, hand, pad, stimulus, world, all_faults) for hand, pad in self.pads
         ]
+        self._shear_rows = [(k, pad.shear) for k, pad in enumerate(self.virtual_pads) if pad.shear]
         self._bank = SheetMapBank([row.circuit.maps for row in self.virtual_pads])
         self._circuits = _HealthyCircuits(self.virtual_pads)
         self._noise = np.array([row.noise_counts for row in self.virtual_pads])
@@ -86,7 +88,10 @@ class VirtualHand:
         ]
 
     def sample(self, t_s: float) -> NDArray[np.int64]:
-        """Return counts (pads, c) of the channels, `t_s` after the start of the scenario."""
+        """Return counts (pads, c) of the channels, `t_s` after the start of the scenario.
+
+        Those of a pad's shear pad follow its own.
+        """
         self._sample_count += 1
         if history := self.virtual_pads[self._sample_count % len(self.virtual_pads)].history:
             history.extend_ahead(t_s)  # one pad per sample, to keep samples fast
@@ -102,7 +107,16 @@ class VirtualHand:
         for row in special:
             own = self.counts(row, [t_s])[0]
             readings[row, : len(own)] = own
-        return readings
+        return self._beside_shear(readings, t_s) if self._shear_rows else readings
+
+    def _beside_shear(self, readings: NDArray[np.int64], t_s: float) -> NDArray[np.int64]:
+        """Return readings with those of each pad's shear pad after its own channels."""
+        widened = np.zeros((len(readings), readings.shape[1] + len(SIDE_ELECTRODES)), np.int64)
+        widened[:, : readings.shape[1]] = readings
+        for row, shear in self._shear_rows:
+            first = len(self.virtual_pads[row].limits)
+            widened[row, first : first + len(SIDE_ELECTRODES)] = shear.counts(np.array([t_s]))[0]
+        return widened
 
     def untouched_counts(self, t_s: float, hands: int = 1) -> FloatArray:
         """Return zeros and noise (hands, pads, c) [counts] at `t_s`, of hands that differ in noise only; the
@@ -153,7 +167,7 @@ class VirtualHand:
         if not contacts:
             return []
         return [
-            self._truth(contact, currents, jacobian, sync_ns)
+            self._truth(contact, currents, jacobian, sync_ns, t_s)
             for contact, currents, jacobian in zip(contacts, *self._currents(contacts, t_s), strict=True)
         ]
 
@@ -207,7 +221,7 @@ class VirtualHand:
         return np.concatenate([radius for radius, _ in found]), np.hstack([focus for _, focus in found])
 
     def _truth(
-        self, contact: _PadContact, currents: FloatArray, jacobian: FloatArray, sync_ns: int
+        self, contact: _PadContact, currents: FloatArray, jacobian: FloatArray, sync_ns: int, t_s: float
     ) -> GroundTruth:
         row, applied = self.virtual_pads[contact.row], contact.contact
         shape = row.shape
@@ -228,7 +242,15 @@ class VirtualHand:
             contact.patch.radius_m,
             tuple(currents[: len(row.limits)].tolist()),
             math.sqrt(covariance[0, 0] + covariance[1, 1]),
+            self._true_force_vector(row, applied.force_n, t_s),
         )
+
+    @staticmethod
+    def _true_force_vector(pad: VirtualPad, force_n: float, t_s: float) -> Vector | None:
+        """Return the force on a pad in its link's frame, where a shear pad senses it."""
+        if pad.shear is None:
+            return None
+        return _vector(pad.rotation @ [*pad.shear.tangential_n(np.array([t_s]))[:, 0], -force_n])
 
 
 def _applied_patch(contact: AppliedContact, patch: ContactPatch) -> ContactPatch:

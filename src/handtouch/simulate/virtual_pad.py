@@ -27,6 +27,7 @@ from handtouch.simulate.sheet_solver import ArcEnds, ElectrodeGaps
 from handtouch.simulate.stimulus import PadStimulus, Stimulus
 from handtouch.simulate.uneven_sheet import uneven_sheet_maps
 from handtouch.simulate.unevenness import Unevenness
+from handtouch.simulate.virtual_shear import VirtualShear
 from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, HiddenPad
 
 FloatArray = NDArray[np.float64]
@@ -60,6 +61,8 @@ class VirtualPad:
     sheet_law: SheetLaw | None
     repeat_period_s: float
     """Period after which the scenario repeats; infinite: it doesn't."""
+    shear: VirtualShear | None
+    """Shear pad beneath it."""
 
     @classmethod
     def build(
@@ -93,13 +96,16 @@ class VirtualPad:
             node.drive_v,
             limits[:, 1] / per_ampere,
         )
+        touches = stimulus.pad_stimulus(pad.link, lambda number: world.contact(sheet, number).patch)
+        repeat_s = stimulus.duration_s if stimulus.repeat else np.inf
+        shear = VirtualShear(deployment, hand, pad, touches, world, repeat_s) if pad.shear else None
         keys = [noise.stream_key(world.seed, "noise", hand, pad.link, name) for name in pad.electrode_names]
         return cls(
             hand,
             pad,
             sheet,
             circuit,
-            stimulus.pad_stimulus(pad.link, lambda number: world.contact(sheet, number).patch),
+            touches,
             tuple(fault for fault in faults if fault.link == pad.link),
             *world.mount(hand, pad),
             node.noise_counts * hidden.noise_ratio,
@@ -116,7 +122,8 @@ class VirtualPad:
             ),
             ElectronicsDrift(world, [(hand, pad.link)], [pad.electrode_names]),
             hidden.sheet_law,
-            stimulus.duration_s if stimulus.repeat else np.inf,
+            repeat_s,
+            shear,
         )
 
     @property

@@ -124,6 +124,18 @@ class Contact:
     fresh: bool = True
     """false while samples of the pad are missing: the contact continues with the values of its last sample,
     at `t_ns`; absent where true"""
+    force_vector_status: Annotated[ForceStatusName, ForceStatus] = ForceStatus.NOT_COMPUTED.text
+    """status of the force vector: `not_computed` of a pad without a shear pad; `lower_bound` and `unreliable`
+    as `force_status`, `unreliable` also where `position_status` is, as with several contacts; `invalid` while
+    the rest position of the shear pad isn't known, or if its currents are those of no displacement"""
+    force_vector_n: Vector3 | None = None
+    """force of the object on the pad, in the link's frame: tangential by the shear pad, normal `force_n`"""
+    force_vector_covariance_n2: Matrix3 | None = None
+    """its covariance, row by row; nil where the status is `lower_bound`"""
+    palm_force_vector_n: Vector3 | None = None
+    """the force in the palm's frame; nil unless `palm_status` is `valid`"""
+    base_force_vector_n: Vector3 | None = None
+    """the force in the base's frame"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +205,16 @@ class HandFrame:
     """covariance of `base_position_m`, row by row"""
     joints_age_s: Annotated[bytes, Column("<f4")] = b""
     """as in `contact`"""
+    force_vector_status: Annotated[bytes, Column("<u1", codes=ForceStatus)] = b""
+    """as in `contact`; this and the following are empty for a hand without shear pads"""
+    force_vector_n: Annotated[bytes, Column("<f4", 3)] = b""
+    """force of the object on the pad, in the link's frame"""
+    force_vector_covariance_n2: Annotated[bytes, Column("<f4", 9)] = b""
+    """its covariance, row by row; NaN where the status is LOWER_BOUND"""
+    palm_force_vector_n: Annotated[bytes, Column("<f4", 3)] = b""
+    """the force in the palm's frame"""
+    base_force_vector_n: Annotated[bytes, Column("<f4", 3)] = b""
+    """the force in the base's frame"""
 
 
 @dataclass(frozen=True, slots=True)

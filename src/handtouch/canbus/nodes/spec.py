@@ -22,7 +22,7 @@ from handtouch.config.channels import (
     STANDARD_CHANNELS,
     Channels,
     WritableObject,
-    order_by_electrode,
+    order_channels,
     parse_writable_object,
     resolve_channels,
 )
@@ -34,7 +34,7 @@ from handtouch.wire.emergency import Emergency
 class NodeSpec:
     """A node of the deployment; identity fields that are None are not checked.
 
-    `channels` : those of the electrodes, in their order
+    `channels` : those of the electrodes, in their order, then those of the shear pad's
     `allow_pdo_remapping` : they may be mapped to a TPDO over SDO
     `allow_nmt_reset` : one NMT reset communication may be sent when it refuses to run
     `event_timer_ms` : period of a node that can't follow SYNC
@@ -78,7 +78,7 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
                 product_code=kind.product_code,
                 revision=kind.revision,
                 serial=pad.serial,
-                channels=order_by_electrode(resolve_channels(kind.channels, kind.eds), pad),
+                channels=order_channels(resolve_channels(kind.channels, kind.eds), pad),
                 allow_pdo_remapping=kind.allow_pdo_remapping,
                 allow_nmt_reset=kind.allow_nmt_reset,
                 idle=_idle_settings(kind, deployment.daemon.sync_period_ms),

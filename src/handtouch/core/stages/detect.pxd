@@ -30,7 +30,7 @@ cdef void _take_sample(
     ContactDetection stage, SampleMemory memory, Py_ssize_t pad, bint operational, long long sync_ns,
     long long previous_sync_ns, long long until_ns) noexcept
 @cython.locals(railed=bint, sources=bint, total=double, magnitude=double, low=double, high=double,
-               excess=double, least=double, c=Py_ssize_t, i=Py_ssize_t, count='long long')
+               excess=double, least=double, c=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, count='long long')
 cdef void _check_sample(ContactDetection stage, SampleMemory memory, Py_ssize_t pad) noexcept
 @cython.locals(period_ns='long long')
 cdef void _check_silence(

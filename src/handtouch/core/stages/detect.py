@@ -25,7 +25,8 @@ class ContactDetection:
     mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,), begin_samples,
     end_samples and max_gap_periods (n,); expected_counts (n c) of untouched pads. Written for the solver:
     currents (n c,) and offset_std_a (n,), the standard deviation of their sums from the baseline [A].
-    c is the number of channels of the pad that has most; those that a pad lacks have no current.
+    c is the number of electrodes of the pad that has most; those that a pad lacks have no current. Further
+    channels of the slab are those of shear pads, whose currents never end: they are no part of a contact.
 
     rows: (5 n,): pads whose contact began, ended, has a new sample and didn't begin, misses one, or is to be
     solved, `began`, `ended`, `updated`, `silent` and `solved` of them, n from one list to the next.
@@ -133,9 +134,9 @@ def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> No
     railed, total, magnitude = False, 0.0, 0.0
     low = high = 0.0
     for c in range(stage.channels):
-        i = pad * stage.channels + c
-        count = memory.counts[i]
-        if count <= memory.low_limits[i] or count >= memory.high_limits[i]:
+        i, k = pad * stage.channels + c, pad * memory.channels + c
+        count = memory.counts[k]
+        if count <= memory.low_limits[k] or count >= memory.high_limits[k]:
             railed = True
         excess = count - stage.expected_counts[i]
         stage.excess[c] = excess

@@ -1,7 +1,7 @@
 cimport cython
 from handtouch.core.stages cimport kinematics
 
-cdef Py_ssize_t _COUNT, _ROW, _AGE, _VALUES, _POSITION, _NORMAL, _COVARIANCE
+cdef Py_ssize_t _COUNT, _ROW, _AGE, _VALUES, _POSITION, _NORMAL, _COVARIANCE, _VECTOR, _FRAME_VECTORS
 cdef Py_ssize_t _NOT_COMPUTED, _VALID, _STALE, _INVALID
 cdef double _NAN, _INFINITY
 cdef long long _NEVER_NS
@@ -15,7 +15,7 @@ cdef class HandFrames:
 
 cdef class FrameStage:
     cdef Py_ssize_t pads
-    cdef double[::1] values, frame_values, rotation, joint_variance_m2, pose, covariance
+    cdef double[::1] values, frame_values, rotation, joint_variance_m2, pose, covariance, vector, frame_vector
     cdef float[::1] published
     cdef long long[::1] sample_ns
     cdef unsigned char[::1] palm_requested, base_requested, palm_status, base_status, pending

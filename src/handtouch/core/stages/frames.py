@@ -13,6 +13,7 @@ FRAME_SLICES = {"position_m": slice(0, 3), "normal": slice(3, 6), "covariance_m2
 _COUNT, _ROW, _AGE = FRAME_VALUES, 2 * FRAME_VALUES + 1, 2 * FRAME_VALUES
 _VALUES, _POSITION = VALUE_COUNT, VALUE_SLICES["position_m"].start
 _NORMAL, _COVARIANCE = VALUE_SLICES["normal"].start, VALUE_SLICES["covariance_m2"].start
+_VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and base
 _NOT_COMPUTED, _VALID, _STALE, _INVALID = 0, 1, 2, 3  # FrameStatus
 _NAN, _INFINITY = float("nan"), float("inf")
 _NEVER_NS = 1 << 62
@@ -67,6 +68,7 @@ class FrameStage:
         self.palm_status, self.base_status = arrays["palm_status"], arrays["base_status"]
         self.frame_values, self.rotation = arrays["palm_values"], arrays["palm_rotation"]
         self.joint_variance_m2 = arrays["joint_variance_m2"]
+        self.vector, self.frame_vector = arrays["force_vector"], arrays["frame_force_vector"]
         self.published, self.pending = published, pending
         self.pose, self.covariance = pose, covariance
 
@@ -127,6 +129,8 @@ def _discard(stage: FrameStage, pad: int) -> None:
     stage.palm_status[pad] = stage.base_status[pad] = _NOT_COMPUTED
     for i in range(_ROW):
         stage.frame_values[pad * _ROW + i] = _NAN
+    for i in range(_FRAME_VECTORS):
+        stage.frame_vector[pad * _FRAME_VECTORS + i] = _NAN
     _publish_pad(stage, pad)
 
 
@@ -194,6 +198,9 @@ def _transform(
             at = on_pad + (_NORMAL if j else _POSITION)
             turned = a * values[at] + b * values[at + 1] + c * values[at + 2]
             stage.frame_values[row + 3 * j + i] = turned if j else turned + pose[9 + i]
+        at = _VECTOR * pad
+        turned = a * stage.vector[at] + b * stage.vector[at + 1] + c * stage.vector[at + 2]
+        stage.frame_vector[_FRAME_VECTORS * pad + (3 if in_base else 0) + i] = turned
     for i in range(9):
         stage.frame_values[row + 6 + i] = stage.covariance[i]
     return oldest_s

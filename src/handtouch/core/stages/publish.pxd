@@ -5,7 +5,7 @@ cdef Py_ssize_t _NOT_COMPUTED, _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_
 cdef Py_ssize_t _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVALID, _EVIDENCE_MISSING
 cdef Py_ssize_t _PALM_VALUES, _PAD_M, _NORMAL, _COVARIANCE, _RESIDUAL, _RESIDUAL_STD, _BASE, _AGE, _END
 cdef Py_ssize_t _EVENTS, _POSITION_STATUSES, _FORCE_STATUSES, _FRAME_STATUSES, _REASONS, _REQUIRED
-cdef Py_ssize_t _HEADER_BYTES, _PAD_TEXTS, _FRAME_VALID
+cdef Py_ssize_t _HEADER_BYTES, _PAD_TEXTS, _FRAME_VALID, _VECTOR, _FRAME_VECTORS
 cdef long long _MAX_SILENT_PERIODS
 cdef double _SECONDS_PER_NS
 cdef double _MAX_SQUARED_MISFIT, _LOWER_BOUND_ESTIMATE, _NAN, _INFINITY
@@ -38,6 +38,8 @@ cdef class ContactEncoder:
     cdef long long[::1] text_ends, pad_text_ends, contact_seq, sample_ns, begin_ns, silent_ns
     cdef long long[::1] max_sample_period_ns
     cdef double[::1] number, values, palm_values, peak_force_n, total_current_a, uncompensated_force_n
+    cdef unsigned char[::1] vector_status
+    cdef double[::1] vector, frame_vector
     cdef Py_ssize_t written, field, fields
     @cython.locals(sample_ns='long long', begin_ns='long long', t_ns='long long', first=Py_ssize_t,
                    status=Py_ssize_t, located=bint, has_std=bint, max_silent_ns='long long')

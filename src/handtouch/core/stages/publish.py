@@ -36,13 +36,15 @@ WRITTEN_FIELDS = (
     *("total_current_a", "residual", "residual_std", "end_reason", "retained", "group"),
     *("palm_status", "palm_position_m", "palm_normal", "palm_covariance_m2"),
     *("base_status", "base_position_m", "base_normal", "base_covariance_m2"),
-    *("joints_age_s", "uncompensated_force_n", "fresh"),
+    *("joints_age_s", "uncompensated_force_n", "fresh", "force_vector_status", "force_vector_n"),
+    *("force_vector_covariance_n2", "palm_force_vector_n", "base_force_vector_n"),
 )
 """Fields in the order in which they are written; the others are texts of the pad."""
 _PALM_VALUES, _PAD_M = 31, VALUE_SLICES["pad_m"].start
 _NORMAL, _COVARIANCE = VALUE_SLICES["normal"].start, VALUE_SLICES["covariance_m2"].start
 _RESIDUAL, _RESIDUAL_STD = VALUE_SLICES["residual"].start, VALUE_SLICES["residual_std"].start
 _BASE, _AGE = 15, 30  # in the values of a contact in palm and base
+_VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and base
 _END = 2  # number of the event
 _EVENTS = len(WRITTEN_FIELDS)  # first of the names of events, statuses and reasons
 _POSITION_STATUSES, _FORCE_STATUSES, _FRAME_STATUSES, _REASONS = (
@@ -196,6 +198,8 @@ class ContactEncoder:
         self.palm_requested, self.base_requested = arrays["palm_requested"], arrays["base_requested"]
         self.palm_status, self.base_status = arrays["palm_status"], arrays["base_status"]
         self.palm_values, self.group_id = arrays["palm_values"], arrays["group_id"]
+        self.vector, self.vector_status = arrays["force_vector"], arrays["force_vector_status"]
+        self.frame_vector = arrays["frame_force_vector"]
         self.pad_texts, self.pad_text_ends = pad_texts, pad_text_ends
         self.written = self.field = self.fields = 0
 
@@ -251,6 +255,15 @@ class ContactEncoder:
         if self.silent_ns[pad] > max_silent_ns:
             self.fields += 1
             _write_truth(self, False)
+        else:
+            self.field += 1
+        if self.vector_status[pad] != _NOT_COMPUTED:
+            self.fields += 1
+            _write_name(self, _FORCE_STATUSES + self.vector_status[pad])
+            _write_optional_array(self, self.vector, _VECTOR * pad, 3)
+            _write_optional_array(self, self.vector, _VECTOR * pad + 3, 9)
+            _write_optional_array(self, self.frame_vector, _FRAME_VECTORS * pad, 3)
+            _write_optional_array(self, self.frame_vector, _FRAME_VECTORS * pad + 3, 3)
         self.message[0], self.message[1], self.message[2] = 0xDE, 0, self.fields
         return self.written
 

@@ -7,7 +7,7 @@ cdef Py_ssize_t _CONTROL_SIZE, _MESSAGE_SIZE, _STAMP_BYTES, _FRAME_BYTES, _IDENT
 cdef class SampleMemory:
     cdef long long[::1] words, arrival_ns, repeat_counts, counts, fields, low_limits, high_limits
     cdef unsigned char[::1] fresh, single
-    cdef readonly Py_ssize_t new_fresh, stored_bytes
+    cdef readonly Py_ssize_t channels, new_fresh, stored_bytes
 
 cdef class FrameBatch:
     cdef long long[::1] headers, frames, control

@@ -46,6 +46,7 @@ class SampleMemory:
         high_limits: memoryview[int],
     ) -> None:
         self.counts, self.fields = counts, fields
+        self.channels = len(counts) // max(len(arrival_ns), 1)
         self.low_limits, self.high_limits = low_limits, high_limits
         self.words, self.arrival_ns, self.repeat_counts = words, arrival_ns, repeat_counts
         self.fresh, self.single = fresh, single

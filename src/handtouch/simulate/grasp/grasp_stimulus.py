@@ -19,6 +19,7 @@ from handtouch.simulate.faults import Fault
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches
 from handtouch.simulate.grasp.simulation import GraspRecord
+from handtouch.simulate.grasp.tangential import pad_forces
 from handtouch.simulate.node_faults import NodeFault
 from handtouch.simulate.stimulus import AppliedContact, JointTrajectory, NodeReplacement
 from handtouch.simulate.worlds import DrawnWorld, HiddenJoints
@@ -71,6 +72,8 @@ class GraspStimulus:
     joints: tuple[str, ...]
     reported_rad: FloatArray
     """(n, m), joint positions reported by the robot."""
+    tangential_n: FloatArray
+    """(p, 2, n), tangential force on each pad along its x and y."""
     repeat: bool = False
     faults: Sequence[Fault] = ()
     node_faults: Sequence[NodeFault] = ()
@@ -86,7 +89,9 @@ class GraspStimulus:
     ) -> GraspStimulus:
         """Return the stimulus of a grasp; without `encoders` the joint positions are exact."""
         reported_rad = encoders.readings(grasp.joint_rad) if encoders else grasp.joint_rad
-        return cls(patches, tuple(pad.link for pad in grasp.pads), grasp.joints, reported_rad, repeat)
+        links = tuple(pad.link for pad in grasp.pads)
+        tangential = np.stack([pad_forces(grasp, row).tangential_n for row in range(len(links))])
+        return cls(patches, links, grasp.joints, reported_rad, tangential, repeat)
 
     def with_single_discs(self, radius_m: FloatArray) -> GraspStimulus:
         """Return the same forces with one disc per pad, of radius (p,)."""
@@ -194,6 +199,11 @@ class _GraspPadStimulus:
         radius = np.asarray(patches.radius_m[steps, self.row][:, lanes].T)
         discs = np.stack([radius, np.zeros_like(radius), np.zeros_like(radius)], axis=1)
         return np.asarray(position), np.asarray(force), discs
+
+    def tangential_n(self, times_s: FloatArray) -> FloatArray:
+        """Return the tangential force (2, n) along x and y of the pad [N]."""
+        steps = self.stimulus.step_indices(times_s)
+        return np.asarray(self.stimulus.tangential_n[self.row][:, steps] * (steps >= 0))
 
 
 def _times_s(steps: IntArray) -> FloatArray:

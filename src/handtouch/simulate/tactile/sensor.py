@@ -221,9 +221,14 @@ def _pipelines(deployment: config.Deployment, environments: int, period_ns: int)
 
 
 def _repeated(deployment: config.Deployment, count: int) -> config.Deployment:
-    """Return a deployment with copies of its hands."""
+    """Return a deployment with copies of its hands, without shear pads: MuJoCo's contacts give their normal
+    forces only."""
+    without = {
+        hand.name: tuple(pad.model_copy(update={"shear": None}) for pad in hand.pads)
+        for hand in deployment.hands
+    }
     hands = tuple(
-        hand.model_copy(update={"name": f"{hand.name}.{number}"})
+        hand.model_copy(update={"name": f"{hand.name}.{number}", "pads": without[hand.name]})
         for number in range(count)
         for hand in deployment.hands
     )

@@ -167,6 +167,9 @@ class _Snapshots:
         at = times_s.astype(np.intp)
         return self.position[:, :, at], self.force_n[:, at], self.patches[:, :, at]
 
+    def tangential_n(self, times_s: FloatArray) -> FloatArray:
+        return np.zeros((2, len(times_s)))
+
 
 class _NoStimulus:
     """A stimulus without contacts: those of a running simulation are given to each sample."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config.shear import Shear
+from handtouch.config.shear import Discs, Shear
 from handtouch.simulate.worlds.distributions import Distribution, Fixed
 
 FloatArray = NDArray[np.float64]
@@ -49,9 +49,10 @@ class ShearSpread:
     stiffening: Distribution = _ZERO
     """Relative growth of the stiffness at a displacement of half the travel."""
 
-    def describe(self, shear: Shear, overlap_mm: float) -> Shear:
-        """Return a table as its builder writes it: with the tolerances of his parts, for edges that overlap
-        by `overlap_mm`."""
+    def describe(self, shear: Shear) -> Shear:
+        """Return a table as its builder writes it: with the tolerances of his parts."""
+        pattern = shear.pattern
+        overlap_mm = pattern.radius_mm if isinstance(pattern, Discs) else pattern.overlap_mm
         edges = self.edge_offset_mm.std / math.sqrt(2) / overlap_mm
         common = (self.stiffness_ratio.std, self.creep.mean, self.stiffening.mean, self.hysteresis.mean)
         return shear.model_copy(

@@ -216,6 +216,10 @@ class DrawnWorld:
             lambda spread, count, name: self._numbers(spread, count, "shear", name, pad_name),
         )
 
+    def shear_gain(self, pad_name: str) -> FloatArray:
+        """Return the gains (4,) of the channels of a shear pad, "hand/link", relative to configured ones."""
+        return self._numbers(self.world.parts.gain_ratio, 4, "shear_gain", pad_name)
+
     def joints(self, hand: str, count: int) -> HiddenJoints:
         """Return the errors of a hand's joint positions."""
         mounts, rng = self.world.mounts, self._stream("joints", hand)
@@ -254,7 +258,8 @@ class DrawnWorld:
             behaviour = {"behaviour": kind.behaviour} if kind else {}
             sheets[name] = sheet.model_copy(update=of_sheet | behaviour)
         nodes = {name: node.model_copy(update=of_node) for name, node in deployment.nodes.items()}
-        return deployment.model_copy(update={"sheets": sheets, "nodes": nodes})
+        shears = {name: self.world.shear.describe(shear) for name, shear in deployment.shears.items()}
+        return deployment.model_copy(update={"sheets": sheets, "nodes": nodes, "shears": shears})
 
     def offset_counts_per_k(self, pad_name: str, count: int = 4) -> FloatArray:
         """Return the temperature coefficients (count,) of the zeros of a pad, "hand/link"."""
