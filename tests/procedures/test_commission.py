@@ -26,15 +26,16 @@ from handtouch.cli.commission_text import format_table
 from handtouch.config import shipped
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.device import Device, DeviceBus
-from handtouch.hand import electrode_network, pad_surface
+from handtouch.hand import pad_network, pad_surface
 from handtouch.procedures.commission.deployment_edit import apply_edits
-from handtouch.procedures.commission.electrode_order import PRESS_TARGETS, ElectrodeName
+from handtouch.procedures.commission.electrode_order import PRESS_TARGETS, target_fractions
 from handtouch.procedures.commission.outcome import PadOutcome, PadResult, SampleSource
 from handtouch.procedures.commission.procedure import CommissioningProcedure
 from handtouch.procedures.commission.sample_source import HandSample, open_sample_source
 from handtouch.procedures.dialogue import Key
+from tests.deployments import SIX_ARCS, arcs_text
 
-PROMPT = re.compile(r"\[\d+/\d+\] right/(\w+): press (?:it anywhere|near electrode (\w+))")
+PROMPT = re.compile(r"\[\d+/\d+\] \w+/(\w+): press (?:it anywhere|near electrode (\w+))")
 TOTAL = 4000.0
 PERIOD_NS = 20_000_000
 START = 1  # NMT
@@ -46,33 +47,38 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 class Pads:
     """A hand of a few pads on a virtual bus; presses show in the next samples."""
 
-    def __init__(self, links: list[str], **changes: Any) -> None:
+    def __init__(self, links: list[str], whole: config.Deployment | None = None, **changes: Any) -> None:
         channel = f"commission{next(_numbers)}"
         self.option = f"can0=virtual:{channel}"
-        whole = config.parse(shipped.path("utah_mit.toml").read_text())
+        whole = whole or config.parse(shipped.path("utah_mit.toml").read_text())
         pads = tuple(pad for pad in whole.hands[0].pads if pad.link in links)
         hand = whole.hands[0].model_copy(update={"pads": pads})
-        nodes = {"four_channel": whole.nodes["four_channel"].model_copy(update=changes)}
+        nodes = {name: node.model_copy(update=changes) for name, node in whole.nodes.items()}
         self.truth = config.with_bus(whole.model_copy(update={"hands": (hand,), "nodes": nodes}), self.option)
         self._pads = pads
-        self._networks = [electrode_network(pad, whole.sheets[pad.sheet]) for pad in pads]
+        self._networks = [pad_network(pad, whole.sheets[pad.sheet]) for pad in pads]
         self._rng = np.random.default_rng(1)
-        self.currents = np.zeros((len(pads), 4))
-        self.offset = np.zeros((len(pads), 4))
-        self.noise = np.ones((len(pads), 4))
+        shape = len(pads), max(len(pad.electrode_names) for pad in pads)
+        self.currents, self.offset, self.noise = np.zeros(shape), np.zeros(shape), np.ones(shape)
         self._bus = can.Bus(interface="virtual", channel=channel)
         self.nodes = DeviceBus(self._bus, self._sample)
         self.devices: dict[str, Device] = {
-            pad.link: self.nodes.add(pad.node_id, serial=pad.serial) for pad in pads
+            pad.link: self.nodes.add(
+                pad.node_id,
+                serial=pad.serial,
+                channels=tuple((0x6401, sub + 1) for sub in range(len(pad.electrode_names))),
+            )
+            for pad in pads
         }
 
-    def press(self, link: str, near: ElectrodeName | None, total: float = TOTAL) -> None:
+    def press(self, link: str, near: str | None, total: float = TOTAL) -> None:
         """Press near an electrode, or in the middle."""
         row = [pad.link for pad in self._pads].index(link)
-        surface = pad_surface(self._pads[row])
-        s, t = (0.5, 0.5) if near is None else PRESS_TARGETS[near]
-        x, _ = surface.to_rectangle(s * surface.extent_m[0], 0.0)
-        self.currents[row] = total * self._networks[row].fractions(float(x), t * surface.b)
+        pad, network, surface = self._pads[row], self._networks[row], pad_surface(self._pads[row])
+        targets = dict(zip(pad.electrode_names, target_fractions(network), strict=True))
+        s, t = (0.5, 0.5) if near is None else targets[near] if pad.arcs_mm else PRESS_TARGETS[near]
+        x = s * network.a if pad.arcs_mm else surface.to_rectangle(s * surface.extent_m[0], 0.0)[0]
+        self.currents[row, : len(targets)] = total * network.fractions(float(x), t * surface.b)
 
     def release(self) -> None:
         self.currents = np.zeros_like(self.currents)
@@ -129,7 +135,10 @@ class SteppedSource:
         while True:
             self._t_ns += PERIOD_NS
             self._send(0x080)
-            counts = np.array([device.channel_counts() for device in self._devices])
+            counts = np.zeros(self._pads.currents.shape, np.int64)
+            for row, device in zip(counts, self._devices, strict=True):
+                read = device.channel_counts()
+                row[: len(read)] = read
             yield HandSample(
                 self._t_ns, counts, np.array([bool(device.active_tpdos) for device in self._devices])
             )
@@ -148,7 +157,7 @@ class SimulatedUser:
 
     pads: Pads
     keys: list[Key] = field(default_factory=list)
-    instead: Mapping[str, Callable[[ElectrodeName | None], None]] = field(default_factory=dict)
+    instead: Mapping[str, Callable[[str | None], None]] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
     pending: list[Key] = field(default_factory=list)
     other_pads: Pads | None = None
@@ -248,6 +257,25 @@ def test_electrode_order_is_found_whatever_the_file_contains(
     )
     assert outcomes["index_middle"].electrodes == order
     assert outcomes["index_middle"].result is PadResult.CHANGED
+
+
+def test_electrodes_on_arcs_are_found_beside_a_pad_with_sides(made: Callable[..., Pads]) -> None:
+    pads = made("plane", "disc", whole=config.parse(arcs_text(SIX_ARCS)))
+    wired = (4, 1, 0, 5, 3, 2)
+    pads.devices["disc"].wiring = wired
+    user = SimulatedUser(pads)
+    outcomes, _ = run_commissioning(pads, user)
+    assert outcomes["disc"].electrodes == tuple("abcdef"[k] for k in wired)
+    assert [outcome.result for outcome in outcomes.values()] == [PadResult.AS_CONFIGURED, PadResult.CHANGED]
+    assert "the rim towards" in user.text
+
+
+def test_a_node_of_another_number_of_channels_is_not_assigned(made: Callable[..., Pads]) -> None:
+    pads = made("plane", "disc", whole=config.parse(arcs_text(SIX_ARCS)))
+    user = SimulatedUser(pads, instead={"plane": lambda near: pads.press("disc", near and "a")})
+    outcomes, _ = run_commissioning(pads, user)
+    assert outcomes["plane"].electrodes is None
+    assert "a node of 6 channels responded" in outcomes["plane"].problems[0]
 
 
 def test_cyclically_swapped_nodes_are_assigned(made: Callable[..., Pads]) -> None:
@@ -366,7 +394,7 @@ def test_pad_without_response_is_reported_with_causes_and_others_continue(
 def test_two_pads_pressed_together_are_reported(made: Callable[..., Pads]) -> None:
     pads = made("index_proximal", "index_distal")
 
-    def both(near: ElectrodeName | None) -> None:
+    def both(near: str | None) -> None:
         pads.press("index_proximal", near)
         pads.press("index_distal", near)
 
@@ -380,7 +408,7 @@ def test_press_of_another_pad_is_reported_and_repeated(made: Callable[..., Pads]
     pads = made("index_proximal", "index_distal")
     presses = itertools.count()
 
-    def press_another(near: ElectrodeName | None) -> None:
+    def press_another(near: str | None) -> None:
         pads.press("index_distal" if next(presses) == 1 else "index_proximal", near)
 
     outcomes, _ = run_commissioning(
@@ -418,7 +446,7 @@ def test_unequal_channel_scales_are_taken_into_account(made: Callable[..., Pads]
     pads.devices["palm_heel"].wiring = tuple(map(SIDE_ELECTRODES.index, order))
     electrode_scale = {"y0": 4.0, "xa": 1.0, "x0": 1.0, "yb": 0.5}
 
-    def press(near: ElectrodeName | None) -> None:
+    def press(near: str | None) -> None:
         pads.press("palm_heel", near)
         pads.currents[0] /= [electrode_scale[name] for name in SIDE_ELECTRODES]
 
@@ -431,10 +459,10 @@ def test_keys_skip_repeat_and_quit(made: Callable[..., Pads]) -> None:
     user = SimulatedUser(pads)
     prompts: list[str] = []
 
-    def key(link: str, *keys: Key) -> Callable[[ElectrodeName | None], None]:
+    def key(link: str, *keys: Key) -> Callable[[str | None], None]:
         remaining = list(keys)
 
-        def act(near: ElectrodeName | None) -> None:
+        def act(near: str | None) -> None:
             prompts.append(f"{link} {near}")
             if remaining:
                 user.pending.append(remaining.pop(0))
@@ -507,7 +535,7 @@ def test_line_ends_are_preserved(setup: CommissioningSetup) -> None:
 
 
 def test_concurrent_edits_of_the_file_are_kept(setup: CommissioningSetup) -> None:
-    def press_and_write(near: ElectrodeName | None) -> None:
+    def press_and_write(near: str | None) -> None:
         if near is None:
             setup.path.write_text(setup.path.read_text() + "# Mind the third finger.\n")
         setup.pads.press("thumb_middle", near)
@@ -524,7 +552,7 @@ def test_file_that_cannot_hold_the_results_is_left_unchanged(
 ) -> None:
     broken = "a pad too few"
 
-    def press_and_break(near: ElectrodeName | None) -> None:
+    def press_and_break(near: str | None) -> None:
         setup.path.write_text(broken)
         setup.pads.press("thumb_middle", near)
 

@@ -13,23 +13,23 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
-from handtouch.hand import electrode_network, pad_surface
+from handtouch.hand import electrode_network, pad_network, pad_surface
 from handtouch.procedures.commission.electrode_order import (
-    ELECTRODES,
     PRESS_TARGETS,
-    ElectrodeName,
     ElectrodeOrder,
     PressReading,
     ShareGrid,
     find_electrode_order,
 )
+from tests.deployments import SIX_ARCS, THREE_ARCS, arcs_text
 
 SHEET = config.Sheet(
     ohm_per_square=2400.0, contact_ohm_mm2=2e4, alpha=1.5, contact_radius_mm=2.5, contact_radius_std_mm=0.5
 )
-SEQUENCE: tuple[ElectrodeName, ...] = ("xa", "yb", "x0", "y0", "xa", "yb")
+SEQUENCE: tuple[str, ...] = ("xa", "yb", "x0", "y0", "xa", "yb")
 ALL = np.ones(4, bool)
 
 
@@ -99,7 +99,7 @@ def trial(
         readings.append(PressReading(electrode, np.abs(counts), 1.0, working))
         if len(readings) >= 2 and (order := find_electrode_order(built.shares, readings)).is_clear:
             break
-    return order, tuple(ELECTRODES[i] for i in wired), len(readings)
+    return order, tuple(SIDE_ELECTRODES[i] for i in wired), len(readings)
 
 
 def campaign(seed: int, pads: int, each: int, off: float) -> Counter[str]:
@@ -181,3 +181,25 @@ def test_missing_press_raises_value_error() -> None:
 if __name__ == "__main__":  # the figures of docs/commission.md
     for off in (0.1, 0.2, 0.25, 0.3, 0.4):
         print(off, dict(campaign(seed=2, pads=200, each=25, off=off)))
+
+
+@pytest.mark.parametrize("arcs", [THREE_ARCS, SIX_ARCS], ids=["three", "six"])
+def test_order_of_electrodes_on_arcs_is_found_with_few_presses(arcs: dict[str, tuple[float, float]]) -> None:
+    pad = config.parse(arcs_text(arcs)).pads[1].pad
+    network, names, rng = pad_network(pad, SHEET), pad.electrode_names, np.random.default_rng(1)
+    grid, count, presses = ShareGrid(network, pad_surface(pad), names), len(names), []
+    for _ in range(20):
+        wired, gains = rng.permutation(count), 1 + 0.05 * rng.standard_normal(count)
+        readings: list[PressReading] = []
+        for electrode in (names[0], names[-(-count // 3)], *names, *names):
+            off = rng.uniform(-0.15, 0.15, 2)
+            x, y = np.clip(grid.targets[names.index(electrode)] + off, 0.03, 0.97) * (network.a, network.b)
+            currents = rng.uniform(1000, 20_000) * network.fractions(x, y)[wired] * gains
+            currents += rng.standard_normal(count)
+            readings.append(PressReading(electrode, np.abs(currents), 1.0, np.ones(count, bool)))
+            if len(readings) >= 2 and (order := find_electrode_order(grid, readings)).is_clear:
+                break
+        assert order.is_clear
+        assert order.electrodes == tuple(names[i] for i in wired)
+        presses.append(len(readings))
+    assert np.median(presses) <= 3

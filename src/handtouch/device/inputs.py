@@ -8,7 +8,7 @@ from collections.abc import Set as AbstractSet
 
 CHANNELS = 4
 MIN_CHANNELS, MAX_CHANNELS = 3, 16
-STRAIGHT_WIRING = (0, 1, 2, 3)
+STRAIGHT_WIRING = tuple(range(MAX_CHANNELS))
 SETTLE_SAMPLES = 3
 """Number of wrong samples after the excitation is switched on."""
 _NOISE_COUNTS = 1.0  # standard deviation of an input without a current

@@ -278,7 +278,7 @@ class Device(FaultSwitches):
         return (
             self.inputs_settled
             and (self._excited_sample is not None or not self.spec.simulates_excitation)
-            and tuple(self.wiring) == inputs.STRAIGHT_WIRING
+            and tuple(self.wiring) == inputs.STRAIGHT_WIRING[: len(self.wiring)]
             and not (self.stuck_counts or self.open_electrodes)
             and self.line is None
             and self.frame_bytes is None

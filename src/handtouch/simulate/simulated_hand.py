@@ -22,7 +22,7 @@ from handtouch.canbus.bus.port import open_bus
 from handtouch.config.channels import parse_object, resolve_channels
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.device import Device, DeviceBus
-from handtouch.device.inputs import CHANNELS
+from handtouch.device.inputs import MAX_CHANNELS
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.gripper_service import GripperService
@@ -198,7 +198,7 @@ class _SimulatedBus:
             wired = tuple(map(pad.electrode_names.index, pad.electrodes))
             if pad.shear:
                 wired += tuple(len(wired) + SIDE_ELECTRODES.index(name) for name in pad.shear_electrodes)
-            device.wiring = (*wired, *range(len(wired), CHANNELS))
+            device.wiring = (*wired, *range(len(wired), MAX_CHANNELS))
             self.devices[f"{hand}/{pad.link}"] = device
         self._excited = [True] * len(virtual_hand.pads)
         self._events = sorted(self._node_events(stimulus), key=lambda event: event[0])

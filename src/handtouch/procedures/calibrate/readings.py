@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from handtouch import config
-from handtouch.field import ElectrodeNetwork, Surface
-from handtouch.hand import electrode_network, pad_surface
+from handtouch.field import Surface
+from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.hand import pad_network, pad_surface
 
 GRAM_FORCE_N = 9.80665e-3
 """Weight of one gram [N] at standard gravity."""
@@ -96,7 +97,7 @@ class PadCircuitModel:
         self.pad = pad
         self.node, self.sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
         self._surface: Surface = pad_surface(pad)
-        self._network: ElectrodeNetwork = electrode_network(pad, self.sheet)
+        self._network: RectangleNetwork = pad_network(pad, self.sheet)
 
     def circuit_at(self, position_m: tuple[float, float], std_m: float = 0.0) -> ContactCircuit:
         """Return the circuit at arc lengths (x, y) from x0 and y0; std_m: standard deviation of the

@@ -1,4 +1,4 @@
-"""Bars of a node's four channels, for a terminal.
+"""Bars of a node's channels, for a terminal.
 
 Public name: `render_channel_bars`.
 """
@@ -13,9 +13,11 @@ from handtouch.procedures.commission.press import PRESS_THRESHOLD_SIGMA, PressDe
 _BAR_COLUMNS = 40
 
 
-def render_channel_bars(slot: int, name: str, detector: PressDetector) -> Text:
-    """Return bars of a slot's channels, scaled to the strongest, at least to half the press threshold."""
-    deltas = detector.deltas[slot]
+def render_channel_bars(slot: int, name: str, detector: PressDetector, channels: int) -> Text:
+    """Return bars of a slot's first `channels`, scaled to the strongest, at least to half the press
+    threshold.
+    """
+    deltas = detector.deltas[slot, :channels]
     scale = max(float(np.abs(deltas).max()), PRESS_THRESHOLD_SIGMA * float(detector.noise_counts[slot]) / 2)
     pressed = detector.level_sigma[slot] > PRESS_THRESHOLD_SIGMA
     text = Text()

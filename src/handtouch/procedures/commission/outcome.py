@@ -12,7 +12,6 @@ from typing import Protocol
 
 from handtouch import config
 from handtouch.canbus.nodes.spec import NodeStatus
-from handtouch.procedures.commission.electrode_order import ElectrodeName
 from handtouch.procedures.commission.sample_source import HandSample
 
 
@@ -47,7 +46,7 @@ class PadOutcome:
     pad: config.Pad
     result: PadResult = PadResult.NOT_DONE
     slot: int | None = None
-    electrodes: tuple[ElectrodeName, ElectrodeName, ElectrodeName, ElectrodeName] | None = None
+    electrodes: tuple[str, ...] | None = None
     problems: list[str] = field(default_factory=list)
 
     @property

@@ -28,9 +28,9 @@ _MIN_NOISE_COUNTS = 0.5  # with less noise, a working channel may show a constan
 
 @dataclass(frozen=True)
 class RestStatistics:
-    """Statistics of an untouched pad's four channels, in the node's order, over `samples` samples.
+    """Statistics of an untouched pad's c channels, in the node's order, over `samples` samples.
 
-    Counts (4,): `mean`, `std`; `span`: peak to peak.
+    Counts (c,): `mean`, `std`; `span`: peak to peak.
     """
 
     samples: int
@@ -40,13 +40,13 @@ class RestStatistics:
 
     @classmethod
     def from_counts(cls, counts: FloatArray) -> RestStatistics:
-        """Compute the statistics of samples (n, 4)."""
+        """Compute the statistics of samples (n, c)."""
         if not len(counts):
-            return cls(0, np.zeros(4), np.zeros(4), np.zeros(4))
+            return cls(0, *np.zeros((3, counts.shape[1])))
         return cls(len(counts), counts.mean(axis=0), counts.std(axis=0), np.ptp(counts, axis=0))
 
     def stuck_channels(self, noise_counts: float) -> BoolArray:
-        """Return the channels (4,) that are constant though noise is expected."""
+        """Return the channels (c,) that are constant though noise is expected."""
         sure = self.samples >= 20 and noise_counts >= _MIN_NOISE_COUNTS
         return np.asarray((self.span == 0) & sure)
 
@@ -57,7 +57,7 @@ class RestStatistics:
 
 @dataclass(frozen=True)
 class ChannelProblem:
-    """Problem of a channel (0 to 3 in the node's order)."""
+    """Problem of a channel (from 0, in the node's order)."""
 
     channel: int
     text: str
@@ -70,7 +70,7 @@ def find_rest_problems(rest: RestStatistics, noise_counts: float) -> list[Channe
     """Return stuck and noisy channels, offsets and negative readings."""
     findings = []
     stuck = rest.stuck_channels(noise_counts)
-    for channel in range(4):
+    for channel in range(len(rest.mean)):
         mean, std = float(rest.mean[channel]), float(rest.std[channel])
         if stuck[channel]:
             findings.append(
@@ -90,7 +90,7 @@ def find_rest_problems(rest: RestStatistics, noise_counts: float) -> list[Channe
 
 @dataclass(frozen=True)
 class Press:
-    """A press: the node of `slot` responded with mean counts (4,) above its baseline.
+    """A press: the node of `slot` responded with mean counts (c,) above its baseline.
 
     `other_slots`: slots that responded as well.
     """
@@ -104,7 +104,7 @@ class Press:
 class PressDetector:
     """Detects presses in samples of n pads; each lasts 0.3 s and begins with all pads released.
 
-    `baseline` (n, 4): counts at rest, NaN to take a pad's first sample; tracks drift while untouched.
+    `baseline` (n, c): counts at rest, NaN to take a pad's first sample; tracks drift while untouched.
     `noise_counts` (n,): standard deviation of a channel. `level_sigma` (n,): summed channel deviations of
     each pad in standard deviations; above PRESS_THRESHOLD_SIGMA it is pressed.
     """
@@ -141,7 +141,7 @@ class PressDetector:
         return [int(slot) for slot in order if self.level_sigma[slot] > RELEASE_THRESHOLD_SIGMA]
 
     def detect_press(self, t_ns: int, counts: NDArray[np.signedinteger], fresh: BoolArray) -> Press | None:
-        """Process a sample (n, 4), valid for `fresh` pads (n,), and return a press when one is complete."""
+        """Process a sample (n, c), valid for `fresh` pads (n,), and return a press when one is complete."""
         new = fresh & np.isnan(self.baseline[:, 0])
         self.baseline[new] = counts[new]
         self.deltas = np.where(fresh[:, None], counts - self.baseline, 0.0)
@@ -192,7 +192,7 @@ class PressDetector:
 def find_reversed_channels(presses: Sequence[Press], noise: float) -> list[ChannelProblem]:
     """Return the channels whose counts decrease when pressed."""
     findings = []
-    for channel in range(4):
+    for channel in range(len(presses[0].counts) if presses else 0):
         down = [
             press.counts[channel] for press in presses if press.counts[channel] < -MIN_REACTION_SIGMA * noise
         ]
@@ -203,6 +203,6 @@ def find_reversed_channels(presses: Sequence[Press], noise: float) -> list[Chann
 
 
 def reacting_channels(presses: Sequence[Press], noise: float) -> BoolArray:
-    """Return the channels (4,) that respond to any of the presses."""
+    """Return the channels (c,) that respond to any of the presses."""
     peak = np.max([np.abs(press.counts) for press in presses], axis=0)
     return np.asarray(peak > MIN_REACTION_SIGMA * noise)

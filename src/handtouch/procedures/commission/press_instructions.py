@@ -1,6 +1,6 @@
 """Descriptions of where to press on a pad, by directions in the frame of its link.
 
-Public names: `describe_position`, `describe_press`.
+Public names: `describe_position`, `describe_press`, `describe_arc_press`.
 """
 
 from __future__ import annotations
@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import mount_transform, pad_surface
-from handtouch.procedures.commission.electrode_order import PRESS_TARGETS, ElectrodeName
+from handtouch.procedures.commission.electrode_order import PRESS_TARGETS, target_fractions
 
 _MIN_NAMED_COMPONENT_FRACTION = 0.6  # of the greatest component, to be named too
-_OPPOSITE_ELECTRODE: dict[ElectrodeName, ElectrodeName] = {"x0": "xa", "xa": "x0", "y0": "yb", "yb": "y0"}
+_OPPOSITE_ELECTRODE: dict[str, str] = {"x0": "xa", "xa": "x0", "y0": "yb", "yb": "y0"}
 _MAX_SIMILAR_DISTANCE_RATIO = 0.97  # of distances of two ends from the link's origin
 
 
-def describe_position(pad: config.Pad, electrode: ElectrodeName) -> str:
+def describe_position(pad: config.Pad, electrode: str) -> str:
     """Describe a position near an electrode: "the end towards +x of the link, away from its origin"."""
     origin, other, position = (
         _position_in_link(pad, fractions) for fractions in _target_fractions(electrode)
@@ -33,16 +34,32 @@ def describe_position(pad: config.Pad, electrode: ElectrodeName) -> str:
     return text
 
 
-def describe_press(pad: config.Pad, electrode: ElectrodeName) -> str:
+def describe_press(pad: config.Pad, electrode: str) -> str:
     """Describe a position to press, with its coordinates in millimetres in the link's frame."""
     *_, position = (_position_in_link(pad, fractions) for fractions in _target_fractions(electrode))
-    x, y, z = (round(1e3 * value) for value in position.tolist())
     across = "across" if electrode in ("x0", "xa") else "lengthwise"
-    return f"{describe_position(pad, electrode)}; in the middle {across} (about x {x}, y {y}, z {z} mm)"
+    return f"{describe_position(pad, electrode)}; in the middle {across} ({_coordinates(position)})"
+
+
+def describe_arc_press(pad: config.Pad, network: RectangleNetwork, electrode: str) -> str:
+    """Describe a position near an electrode on an arc: "the rim towards +y of the link (about x ...)"."""
+    fractions = target_fractions(network)[pad.electrode_names.index(electrode)]
+    surface, (rotation, translation) = pad_surface(pad), mount_transform(pad)
+    middle, position = (
+        rotation @ surface.point(*(at * (network.a, network.b))) + translation
+        for at in (np.array([0.5, 0.5]), fractions)
+    )
+    direction = _describe_direction(position - middle)
+    return f"the rim towards {direction} of the link ({_coordinates(position)})"
+
+
+def _coordinates(position: NDArray[np.float64]) -> str:
+    x, y, z = (round(1e3 * value) for value in position.tolist())
+    return f"about x {x}, y {y}, z {z} mm"
 
 
 def _target_fractions(
-    electrode: ElectrodeName,
+    electrode: str,
 ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
     return (0.5, 0.5), PRESS_TARGETS[_OPPOSITE_ELECTRODE[electrode]], PRESS_TARGETS[electrode]
 

@@ -8,6 +8,7 @@ Public name: `CommissioningProcedure`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,12 +18,11 @@ from handtouch import config
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import NodeStatus
 from handtouch.config.channels import resolve_channels
-from handtouch.hand import electrode_network, pad_surface
+from handtouch.hand import pad_network, pad_surface
 from handtouch.procedures.commission import press_instructions as words
 from handtouch.procedures.commission.channel_bars import render_channel_bars
 from handtouch.procedures.commission.deployment_edit import PadEdit
 from handtouch.procedures.commission.electrode_order import (
-    ElectrodeName,
     ElectrodeOrder,
     PressReading,
     ShareGrid,
@@ -45,8 +45,8 @@ _NS_PER_S = 1_000_000_000
 _BOOT_TIMEOUT_NS = 10 * _NS_PER_S
 _MIN_REST_NS, _MIN_REST_SAMPLES = _NS_PER_S, 24
 _MAX_ATTEMPTS = 3
-_REQUIRED_PRESSES: tuple[ElectrodeName, ...] = ("xa", "yb")
-_EXTRA_PRESSES: tuple[ElectrodeName, ...] = ("x0", "y0", "xa", "yb")  # while the order is ambiguous
+_REQUIRED_PRESSES, _EXTRA_PRESSES = ("xa", "yb"), ("x0", "y0", "xa", "yb")
+"""Electrodes on sides that are pressed, and those that are pressed while the order is ambiguous."""
 _SATURATION_FRACTION = 0.98  # of the range
 _NO_ANSWER_TEXT = (
     "no node responded. Likely causes: the node isn't on the bus, or has a node id that the deployment "
@@ -93,14 +93,15 @@ class CommissioningProcedure:
         kinds = [deployment.nodes[outcome.pad.node] for outcome in self.outcomes]
         self._noise_counts = [kind.noise_counts for kind in kinds]
         channels = {name: resolve_channels(n.channels, n.eds) for name, n in deployment.nodes.items()}
-        max_counts = np.array(
-            [[c.limits[1] for c in channels[o.pad.node]] for o in self.outcomes], np.float64
-        )
-        full = np.array([[kind.full_scale_counts or 0] * 4 for kind in kinds])
-        self._max_counts = max_counts
-        self._full_scale_per_count = np.array([kind.channel_scale for kind in kinds]) / np.where(
-            full > 0, full, max_counts
-        )
+        self._channels = [len(outcome.pad.electrode_names) for outcome in self.outcomes]
+        self._max_counts = [
+            np.array([channel.limits[1] for channel in channels[outcome.pad.node][:count]])
+            for outcome, count in zip(self.outcomes, self._channels, strict=True)
+        ]
+        self._full_scale_per_count = [
+            np.array(kind.channel_scale[: len(most)]) / (kind.full_scale_counts or most)
+            for kind, most in zip(kinds, self._max_counts, strict=True)
+        ]
         self._detector: PressDetector
         self._share_grid = cache(self._make_share_grid)
 
@@ -159,12 +160,14 @@ class CommissioningProcedure:
                 break
             if attempt + 1 < _MAX_ATTEMPTS:
                 self._print_line(f"  {', '.join(moved)} changed; trying again.", "bad")
-        baseline = [rest.mean if rest.samples else np.full(4, np.nan) for rest in self.rest_statistics]
+        baseline = np.zeros((len(self.outcomes), max(self._channels)))
+        for row, rest in zip(baseline, self.rest_statistics, strict=True):
+            row[: len(rest.mean)] = rest.mean if rest.samples else np.nan
         noise = [
             max(n, 0.5, float(np.median(r.std)))
             for n, r in zip(self._noise_counts, self.rest_statistics, strict=True)
         ]
-        self._detector = PressDetector(np.array(baseline), np.array(noise))
+        self._detector = PressDetector(baseline, np.array(noise))
 
     def _collect_rest_samples(self) -> list[RestStatistics]:
         samples: list[HandSample] = []
@@ -176,7 +179,8 @@ class CommissioningProcedure:
         counts = np.array([sample.counts for sample in samples], np.float64)
         fresh = np.array([sample.fresh for sample in samples])
         return [
-            RestStatistics.from_counts(counts[fresh[:, slot], slot]) for slot in range(len(self.outcomes))
+            RestStatistics.from_counts(counts[fresh[:, slot], slot, :channels])
+            for slot, channels in enumerate(self._channels)
         ]
 
     # One pad ----------------------------------------------------------------------------------------------
@@ -219,6 +223,13 @@ class CommissioningProcedure:
                 continue
             if press.slot == self.assignment.slot_of(row):
                 return press.slot
+            found, needed = self._channels[press.slot], len(self.outcomes[row].pad.electrode_names)
+            if found != needed:
+                raise _PressFailed(
+                    PadResult.AMBIGUOUS,
+                    f"a node of {found} channels responded ({self._node_text(press.slot)}), and the pad has "
+                    f"{needed} electrodes: another pad was pressed, or the nodes are swapped",
+                )
             other = self.outcomes[self.assignment.row_of(press.slot)].name
             self._print_line(
                 f"  the node of {other} responded ({self._node_text(press.slot)}): the nodes are swapped, or "
@@ -231,15 +242,14 @@ class CommissioningProcedure:
 
     def _find_electrode_order(
         self, row: int, slot: int, title: str
-    ) -> tuple[list[tuple[ElectrodeName, Press]], ElectrodeOrder | None]:
+    ) -> tuple[list[tuple[str, Press]], ElectrodeOrder | None]:
         """Request presses until the order is clear. Raises _PressFailed and DialogueCancelled."""
-        presses: list[tuple[ElectrodeName, Press]] = []
+        presses: list[tuple[str, Press]] = []
         order: ElectrodeOrder | None = None
-        requested = list(_REQUIRED_PRESSES)
-        more = list(_EXTRA_PRESSES)
+        requested, more = _requested_presses(self.outcomes[row].pad)
         while requested:
             electrode = requested.pop(0)
-            position = words.describe_press(self.outcomes[row].pad, electrode)
+            position = self._describe_press(self.outcomes[row].pad, electrode)
             presses.append(
                 (
                     electrode,
@@ -262,7 +272,7 @@ class CommissioningProcedure:
         return presses, order
 
     def _save_outcome(
-        self, row: int, slot: int, presses: list[tuple[ElectrodeName, Press]], order: ElectrodeOrder | None
+        self, row: int, slot: int, presses: list[tuple[str, Press]], order: ElectrodeOrder | None
     ) -> None:
         outcome = self.outcomes[row]
         self.assignment.assign_node(row, slot)
@@ -321,7 +331,7 @@ class CommissioningProcedure:
         if expected is not None and press.slot != expected:
             name = self.outcomes[press.slot].name
             return f"this time the node of {name} responded: press the same pad as before"
-        reading = press.counts + self._detector.baseline[press.slot]
+        reading = press.counts + self._detector.baseline[press.slot, : self._channels[press.slot]]
         if (np.abs(reading) >= _SATURATION_FRACTION * self._max_counts[press.slot]).any():
             return "a channel is saturated: press more lightly"
         return None
@@ -337,7 +347,7 @@ class CommissioningProcedure:
             shown = strongest if strongest in self._detector.pressed_slots else slot
             self._show_bars(sample.sync_ns, shown, name if shown == slot else self.outcomes[shown].name)
             if press is not None:
-                return press
+                return replace(press, counts=press.counts[: self._channels[press.slot]])
             if sample.sync_ns - start_ns > self._timeout_ns:
                 break
         raise _PressFailed(PadResult.NO_ANSWER, _NO_ANSWER_TEXT)
@@ -367,16 +377,14 @@ class CommissioningProcedure:
                 detector.reset_baseline()
                 return
 
-    def _working_channels(
-        self, slot: int, presses: Sequence[tuple[ElectrodeName, Press]]
-    ) -> NDArray[np.bool_]:
-        """Return the channels (4,) that respond to presses."""
+    def _working_channels(self, slot: int, presses: Sequence[tuple[str, Press]]) -> NDArray[np.bool_]:
+        """Return the channels (c,) that respond to presses."""
         noise = float(self._detector.noise_counts[slot])
         stuck = self.rest_statistics[slot].stuck_channels(self._noise_counts[slot])
         return np.asarray(reacting_channels([press for _, press in presses], noise) & ~stuck)
 
     def _press_readings(
-        self, slot: int, presses: Sequence[tuple[ElectrodeName, Press]], working: NDArray[np.bool_]
+        self, slot: int, presses: Sequence[tuple[str, Press]], working: NDArray[np.bool_]
     ) -> list[PressReading]:
         per_count = self._full_scale_per_count[slot]  # of full scale
         noise = float(self._detector.noise_counts[slot] * per_count.max())
@@ -385,9 +393,16 @@ class CommissioningProcedure:
             for electrode, press in presses
         ]
 
+    def _describe_press(self, pad: config.Pad, electrode: str) -> str:
+        if not pad.arcs_mm:
+            return words.describe_press(pad, electrode)
+        network = pad_network(pad, self._deployment.sheets[pad.sheet])
+        return words.describe_arc_press(pad, network, electrode)
+
     def _make_share_grid(self, row: int) -> ShareGrid:
         pad = self.outcomes[row].pad
-        return ShareGrid(electrode_network(pad, self._deployment.sheets[pad.sheet]), pad_surface(pad))
+        network = pad_network(pad, self._deployment.sheets[pad.sheet])
+        return ShareGrid(network, pad_surface(pad), pad.electrode_names)
 
     def _node_text(self, slot: int) -> str:
         node = self._source.nodes[slot]
@@ -426,15 +441,28 @@ class CommissioningProcedure:
             raise DialogueCancelled(Key.QUIT)
 
     def _show_bars(self, t_ns: int, slot: int, name: str) -> None:
-        self._dialogue.show_live(t_ns, lambda: render_channel_bars(slot, name, self._detector))
+        self._dialogue.show_live(
+            t_ns, lambda: render_channel_bars(slot, name, self._detector, self._channels[slot])
+        )
 
     def _print_line(self, text: str, style: str = "") -> None:
         self._dialogue.print_line(text, style)
 
 
-def _electrode_of_silent_channel(
-    order: ElectrodeOrder | None, working: NDArray[np.bool_]
-) -> ElectrodeName | None:
+def _requested_presses(pad: config.Pad) -> tuple[list[str], list[str]]:
+    """Return the electrodes of a pad near which it is pressed, and those while the order is ambiguous.
+
+    Of electrodes on arcs, two that aren't opposite come first, then the others around the pad.
+    """
+    if not pad.arcs_mm:
+        return list(_REQUIRED_PRESSES), list(_EXTRA_PRESSES)
+    names = pad.electrode_names
+    first = [names[0], names[-(-len(names) // 3)]]
+    others = [name for name in names if name not in first]
+    return first, [*others, *first]
+
+
+def _electrode_of_silent_channel(order: ElectrodeOrder | None, working: NDArray[np.bool_]) -> str | None:
     """Return the electrode to press for the only channel that hasn't responded yet."""
     silent = np.flatnonzero(~working)
     return order.electrodes[silent[0]] if order is not None and len(silent) == 1 else None

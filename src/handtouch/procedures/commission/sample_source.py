@@ -22,7 +22,6 @@ from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import STALE_PERIODS, Master
 from handtouch.canbus.nodes.spec import NodeStatus, node_specs
-from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.core.slab import Slab
 from handtouch.procedures.commission.deployment_edit import PadEdit, apply_edits
 
@@ -33,7 +32,7 @@ def with_default_wiring(deployment: config.Deployment) -> config.Deployment:
     """Return the deployment with channels in the nodes' own order, and without serial numbers."""
     edits = {
         (entry.hand, entry.pad.link): replace(
-            PadEdit.from_pad(entry.pad), serial=None, electrodes=SIDE_ELECTRODES
+            PadEdit.from_pad(entry.pad), serial=None, electrodes=entry.pad.electrode_names
         )
         for entry in deployment.pads
     }
@@ -42,7 +41,10 @@ def with_default_wiring(deployment: config.Deployment) -> config.Deployment:
 
 @dataclass(frozen=True)
 class HandSample:
-    """Latest counts (n, 4) at a SYNC, in the order of each node's channels; `fresh` (n,): not stale."""
+    """Latest counts (n, c) at a SYNC, in the order of each node's channels, c of the node with most.
+
+    `fresh` (n,): not stale.
+    """
 
     sync_ns: int
     counts: NDArray[np.int64]
@@ -58,7 +60,7 @@ def open_sample_source(deployment: config.Deployment) -> Iterator[CanSampleSourc
     deployment = with_default_wiring(deployment)
     specs = node_specs(deployment)
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
-    slab = Slab(len(specs))
+    slab = Slab(len(specs), max(len(spec.channels) for spec in specs))
     with contextlib.ExitStack() as stack:
         ports: dict[str, Port] = {}
         for bus in deployment.buses:
