@@ -250,7 +250,7 @@ class SupervisorClient:
 
     def _make_start_message(self, deployment: Deployment) -> WorkerConfig:
         model = self._pipeline.model
-        scale = np.array(model.ampere_per_count / model.gains)
+        scale = np.array(model.ampere_per_count / np.where(model.gains > 0, model.gains, 1.0))
         return WorkerConfig(
             deployment, self._store, tuple(model.default_calibration_ids), scale, model.noise_counts
         )
