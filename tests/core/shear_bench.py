@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from handtouch.config import Deployment, Shear, parse
 from handtouch.core.contact_solver import VALUE_SLICES
-from handtouch.core.shear import ShearForces, shear_tables_of
+from handtouch.core.shear import ShearForces, shear_parameters
 from handtouch.core.slab import ChannelField, Slab
 from handtouch.core.state import TickState
 from handtouch.field.shear import ShearPad
@@ -73,8 +73,8 @@ class ShearBench:
             self.slab.set_layout(slot, LAYOUT)
         self.position_status = np.full(self.pads, PositionStatus.VALID, np.uint8)
         self.force_status = np.full(self.pads, ForceStatus.VALID, np.uint8)
-        tables = shear_tables_of(self.deployment, 4, np.full(self.pads, NOISE_COUNTS))
-        self.forces = ShearForces(tables, self.state, self.position_status, self.force_status)
+        pads = shear_parameters(self.deployment, 4, np.full(self.pads, NOISE_COUNTS))
+        self.forces = ShearForces(pads, self.state, self.position_status, self.force_status)
         self.state.unverified[:] = False
         self.state.pad_state[:] = PadState.CLEAR
 

@@ -24,7 +24,7 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches
 from handtouch.core.part_tolerances import stage_tolerances
-from handtouch.core.shear import shear_tables_of
+from handtouch.core.shear import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.core.stages.tolerances import PadTolerances, part_count
@@ -59,7 +59,7 @@ class PadModel:
     slice of rows; `calibrations` (n,): the active ones. `electrodes`: names of each pad's, `electrode_counts`
     (n,) their numbers; `c`, `channels`, is the largest of them. Columns beyond a pad's own are 0.
     `slab_channels` and `slab_columns` (n,): those of the slab, electrodes before those of shear pads, which
-    `shear_tables` describe.
+    `shear_pads` describe.
     `ampere_per_count` (n, c) of the electrodes includes `gains` (n, c); `noise_counts` (n,) and `noise_a` (n,
     c) are standard deviations of a channel. The counts of untouched pads are state of the tick: see
     `Baseline`.
@@ -115,7 +115,7 @@ class PadModel:
         shear = [range(self.channels, self.channels + len(shear_numbers(pad))) for pad in pads]
         self.slab_channels = self.channels + max(map(len, shear))
         self.slab_columns = [(*range(k), *own) for k, own in zip(self.electrode_counts, shear, strict=True)]
-        self.shear_tables = shear_tables_of(deployment, self.channels, self.noise_counts)
+        self.shear_pads = shear_parameters(deployment, self.channels, self.noise_counts)
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = self._used.astype(np.float64)

@@ -1,12 +1,13 @@
 """Force vectors of contacts above shear pads: the compiled stage on the tables of a deployment.
 
-Public names: `ShearForces`, `shear_tables_of`. Derivation: docs/shear.md.
+Public names: `ShearForces`, `ShearParameters`, `shear_parameters`. Derivation: docs/shear.md.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,21 @@ _WORK = 46
 _HIGH_LOAD = 1e12  # over the film's reference pressure
 
 
+class ShearParameters(NamedTuple):
+    """Arguments of a `ShearTable`."""
+
+    pad: int
+    column: int
+    unknowns: int
+    points: FloatArray
+    numbers: FloatArray
+
+    def table(self) -> ShearTable:
+        """Return the table for the stage."""
+        numbers = view_memory(self.numbers)
+        return ShearTable(self.pad, self.column, self.unknowns, view_memory(self.points), numbers)
+
+
 class ShearForces:
     """Force vectors of n pads, in a tick's state: those of contacts above shear pads, 0 to n of them.
 
@@ -33,17 +49,17 @@ class ShearForces:
 
     def __init__(
         self,
-        tables: Sequence[ShearTable],
+        pads: Sequence[ShearParameters],
         state: TickState,
         position_status: NDArray[np.uint8],
         force_status: NDArray[np.uint8],
     ) -> None:
-        self._numbers = {table.pad: number for number, table in enumerate(tables)}
-        self.any_configured = bool(tables)
+        self._numbers = {shear.pad: number for number, shear in enumerate(pads)}
+        self.any_configured = bool(pads)
         """there is a shear pad"""
         self._state = state
         self._stage = ShearStage(
-            *(list(tables), state.pads, state.memory()),
+            *([shear.table() for shear in pads], state.pads, state.memory()),
             *(view_memory(position_status), view_memory(force_status), view_memory(np.zeros(_WORK))),
         )
 
@@ -89,23 +105,23 @@ class ShearForces:
         return columns
 
 
-def shear_tables_of(
+def shear_parameters(
     deployment: config.Deployment, channels: int, noise_counts: FloatArray
-) -> list[ShearTable]:
-    """Return the tables of a deployment's shear pads; channels: column of their first channel in the slab.
+) -> list[ShearParameters]:
+    """Return those of a deployment's shear pads; channels: column of their first channel in the slab.
 
     noise_counts: (n,) of the pads' channels.
     """
     return [
-        _table(row, pad, deployment, channels, float(noise_counts[row]))
+        _parameters(row, pad, deployment, channels, float(noise_counts[row]))
         for row, (_, pad) in enumerate(deployment.pads)
         if pad.shear
     ]
 
 
-def _table(
+def _parameters(
     row: int, pad: config.Pad, deployment: config.Deployment, column: int, noise_counts: float
-) -> ShearTable:
+) -> ShearParameters:
     shear, node = deployment.shears[pad.shear or ""], deployment.nodes[pad.node]
     pattern, film, layer = shear.build_pattern(), shear.build_film(), shear.build_layer()
     surface = pad.surface.build()
@@ -128,8 +144,7 @@ def _table(
     }
     for name, value in values.items():
         numbers[SHEAR_NUMBERS[name]] = value
-    points = _points(pattern)
-    return ShearTable(row, column, len(pattern.components), view_memory(points), view_memory(numbers))
+    return ShearParameters(row, column, len(pattern.components), _points(pattern), numbers)
 
 
 def _geometry(pattern: ShearPattern) -> dict[str, ArrayLike]:

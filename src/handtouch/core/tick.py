@@ -258,9 +258,7 @@ class TickProcessor:
             *(view_memory(columns.published_values), view_memory(columns.published["total_current_a"])),
             *(view_memory(columns.position_status), view_memory(columns.force_status)),
         )
-        self.shear = ShearForces(
-            model.shear_tables, self.state, columns.position_status, columns.force_status
-        )
+        self.shear = ShearForces(model.shear_pads, self.state, columns.position_status, columns.force_status)
         """force vectors of contacts above shear pads"""
 
     def detect_slips(self, result: TickResult) -> None:

@@ -105,9 +105,11 @@ def _tick_rows(entry: RecordedMessage, names: list[tuple[str, str]]) -> Rows:
     if payload["stopped"] or not names:
         return
     columns = {
-        name: column.to_array(payload[name]).reshape(-1, column.elements).tolist()
+        name: column.to_array(payload[name], len(names)).tolist()
         for name, column in wire.COLUMNS[wire.TickInputs].items()
     }
+    further = (f"channel{number}_counts" for number in range(5, len(columns["counts"][0]) + 1))
+    channels = (*_CHANNELS, *further)
     about = {
         "time_ns": entry.wall_ns,
         "session": payload["session"],
@@ -128,7 +130,7 @@ def _tick_rows(entry: RecordedMessage, names: list[tuple[str, str]]) -> Rows:
                 **about,
                 "hand": hand,
                 "link": link,
-                **dict(zip(_CHANNELS, counts, strict=True)),
+                **dict(zip(channels, counts, strict=True)),
                 "arrival_ns": arrival_ns,
                 "fresh": bool(fresh),
                 "node_state": _PAD_STATES[state],

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import TextIO
 
@@ -58,12 +58,13 @@ def read_records(path: Path | str, *, wall: bool = False) -> list[GroundTruth]:
     Raises ValueError naming the line that isn't a record.
     """
     names = {field.name for field in fields(GroundTruth)}
+    required = {field.name for field in fields(GroundTruth) if field.default is MISSING}
     records = []
     with open(path, encoding="utf-8") as file:
         offset_ns = json.loads(file.readline())[_OFFSET_KEY] if wall else file.readline() and 0
         for number, line in enumerate(file, 2):
             found = json.loads(line)
-            if found.keys() != names:
+            if not required <= found.keys() <= names:
                 raise ValueError(f"{path}: line {number} is not a ground-truth record")
             found["t_ns"] += offset_ns
             for name in ("position_m", "normal", "currents_a", "force_vector_n"):

@@ -1,0 +1,113 @@
+"""A recording of a hand with a shear pad repeats its force vectors, and has the counts of all channels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from handtouch import wire
+from handtouch.config import parse
+from handtouch.core.events import BaselineEvent
+from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
+from handtouch.record.exact_replay import ExactReplay
+from handtouch.record.recording import Recording
+from handtouch.record.tables import rows_of
+from tests.core.shear_bench import LAYOUT, ShearBench, shear_deployment
+from tests.record.conftest import PERIOD_NS, SESSION, CollectingSink, Hand, RecordingSession
+
+KINDS = ("crossed",)
+
+
+class ShearHand(Hand):
+    """A pad above a shear pad; `press` is a cycle with both samples, or with the touch pad's PDO only."""
+
+    bench = ShearBench(KINDS)
+
+    def press(self, current_a: float, moved_m: Any, *, complete: bool = True) -> None:
+        """Press the middle of the pad with a current while the skin has moved (2,)."""
+        self.t_ns += PERIOD_NS
+        pipeline = self.pipeline
+        pipeline.begin_cycle(self.t_ns, self.t_ns)
+        shear = np.rint(self.bench.counts(0, moved_m, 0.0)).astype("<i2").tobytes()
+        for number, data in enumerate((self.counts(0, 0.45, 0.5, current_a), shear)):
+            if complete or number == 0:
+                pipeline.slab.write_pdo(0, data, self.t_ns + 1000 + number, number)
+        pipeline.tick_if_due(self.t_ns + PERIOD_NS * 3 // 4)
+        pipeline.prepare_next_tick()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[wire.Contact]]:
+    """A recording: rest, a pull, a tare, a pull in which the second PDO stays out."""
+    deployment = parse(shear_deployment(KINDS))
+
+    def make(take: Callable[[list[bytes]], None]) -> Hand:
+        sink = CollectingSink(take)
+        pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.6, sink, SESSION)
+        pipeline.slab.set_layout(0, LAYOUT)
+        pipeline.node_state[:] = wire.PadState.CLEAR
+        return ShearHand(deployment, pipeline, sink)
+
+    session = RecordingSession(make, tmp_path_factory.mktemp("shear"))
+    hand = session.hand
+    assert isinstance(hand, ShearHand)
+    for _ in range(100):
+        hand.press(0.0, (0.0, 0.0))
+    for tick in range(40):
+        hand.press(1e-3, (5e-6 * tick, 0.0))
+    for _ in range(30):
+        hand.press(0.0, (0.03e-3, 0.0))
+    rest = tuple(hand.bench.counts(0, (0.03e-3, 0.0), 0.0).tolist())
+    hand.pipeline.add_event(BaselineEvent(0, (0.0,) * 4, (0.1,) * 4, rest))
+    session.send_retained()
+    for tick in range(20):
+        hand.press(1e-3, (0.03e-3, 5e-6 * tick))
+    for _ in range(12):
+        hand.press(1e-3, (0.03e-3, 0.1e-3), complete=False)
+    hand.pipeline.end_session(hand.t_ns + PERIOD_NS)
+    session.recorder.finish()
+    return session.paths[0], hand.sink.contacts()
+
+
+def test_force_vectors_of_a_recording_are_repeated_bit_for_bit(recorded: Any) -> None:
+    path, sent = recorded
+    contacts: list[wire.Contact] = []
+    replay = ExactReplay(contacts.append)
+    for entry in Recording(path):
+        replay.process_message(entry)
+    assert replay.result.first_difference is None
+    assert replay.result.equal == replay.result.compared == len(contacts) == len(sent)
+    assert sum(contact.force_vector_n is not None for contact in contacts) > 50
+
+
+def test_vectors_follow_the_skin_from_the_rest_position_of_the_last_tare(recorded: Any) -> None:
+    _, sent = recorded
+    first, second = ([c for c in sent if c.id == number and c.fresh] for number in (1, 2))
+    pulls = [np.hypot(*np.subtract(c.force_vector_n, first[0].force_vector_n)[:2]) for c in first[:-1]]
+    assert pulls[-1] == pytest.approx(max(pulls))
+    assert max(pulls) > 1.0  # 0.19 mm of 12 N/mm
+    assert second[0].peak_force_n is not None
+    assert np.trace(np.reshape(second[0].force_vector_covariance_n2, (3, 3))) < np.trace(
+        np.reshape(first[-2].force_vector_covariance_n2, (3, 3))
+    )
+
+
+def test_a_missing_pdo_of_the_shear_pad_is_a_missing_sample_of_the_pad(recorded: Any) -> None:
+    _, sent = recorded
+    silent = [contact for contact in sent if not contact.fresh]
+    assert silent
+    before = next(contact for contact in reversed(sent) if contact.fresh and contact.event == "update")
+    assert silent[0].force_vector_n == before.force_vector_n
+    assert sent[-1].event == "end"
+    assert sent[-1].end_reason == "stale"
+
+
+def test_recorded_ticks_have_the_counts_of_all_channels(recorded: Any) -> None:
+    rows = [row for table, row in rows_of(Recording(recorded[0])) if table == "raw"]
+    assert rows[5]["channel5_counts"] > 1000
+    assert rows[120]["x0_counts"] > 100
