@@ -60,6 +60,12 @@ export interface Contact extends Envelope {
   diagnoses?: string[];
   /** false while samples are missing: values of the last sample; absent where true */
   fresh?: boolean;
+  force_vector_status?: ForceStatus;
+  /** force on the pad above a shear pad, in the link's frame, and its covariance row by row */
+  force_vector_n?: number[];
+  force_vector_covariance_n2?: number[];
+  palm_force_vector_n?: number[];
+  base_force_vector_n?: number[];
 }
 
 interface RequiredColumns {
@@ -90,12 +96,19 @@ interface OptionalColumns {
   base_normal?: Float32Array;
   base_covariance_m2?: Float32Array;
   joints_age_s?: Float32Array;
+  force_vector_status?: Uint8Array;
+  force_vector_n?: Float32Array;
+  force_vector_covariance_n2?: Float32Array;
+  palm_force_vector_n?: Float32Array;
+  base_force_vector_n?: Float32Array;
 }
 
 type Scalars = "state" | "contact_id" | "total_current_a" | "position_status" | "force_n" | "force_std_n"
-  | "force_status" | "residual" | "residual_std" | "group" | "palm_status" | "base_status" | "joints_age_s";
+  | "force_status" | "residual" | "residual_std" | "group" | "palm_status" | "base_status" | "joints_age_s"
+  | "force_vector_status";
 type Vectors = "position_m" | "normal" | "covariance_m2" | "pad_m" | "palm_position_m" | "palm_normal"
-  | "palm_covariance_m2" | "base_position_m" | "base_normal" | "base_covariance_m2";
+  | "palm_covariance_m2" | "base_position_m" | "base_normal" | "base_covariance_m2"
+  | "force_vector_n" | "force_vector_covariance_n2" | "palm_force_vector_n" | "base_force_vector_n";
 
 /** `hand/<hand>`: the whole hand at one tick; columns have a row for each link, NaN where unknown. */
 export interface Frame extends Envelope, RequiredColumns, OptionalColumns {}

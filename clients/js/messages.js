@@ -30,6 +30,11 @@ const OPTIONAL = {
   base_status: [Uint8Array, 1],
   ...Object.fromEntries([...inFrame("palm_"), ...inFrame("base_")]),
   joints_age_s: [Float32Array, 1],
+  force_vector_status: [Uint8Array, 1],
+  force_vector_n: [Float32Array, 3],
+  force_vector_covariance_n2: [Float32Array, 9],
+  palm_force_vector_n: [Float32Array, 3],
+  base_force_vector_n: [Float32Array, 3],
 };
 
 /** A message that violates the wire contract. */

@@ -77,6 +77,9 @@ void print_contact(const handtouch::Contact& c) {
     print_place("", "position_status", c.in_link);
     print_place("palm_", "palm_status", c.in_palm);
     print_place("base_", "base_status", c.in_base);
+    field("force_vector_status", c.force_vector_status); field("force_vector_n", c.force_vector_n);
+    field("force_vector_covariance_n2", c.force_vector_covariance_n2);
+    field("palm_force_vector_n", c.palm_force_vector_n); field("base_force_vector_n", c.base_force_vector_n);
     std::puts("}");
 }
 
@@ -96,6 +99,11 @@ void print_frame(const handtouch::Frame& f, const std::map<std::string, handtouc
     optional_field("base_status", f.base_status); optional_field("base_position_m", f.base_position_m);
     optional_field("base_normal", f.base_normal); optional_field("base_covariance_m2", f.base_covariance_m2);
     optional_field("joints_age_s", f.joints_age_s);
+    optional_field("force_vector_status", f.force_vector_status);
+    optional_field("force_vector_n", f.force_vector_n);
+    optional_field("force_vector_covariance_n2", f.force_vector_covariance_n2);
+    optional_field("palm_force_vector_n", f.palm_force_vector_n);
+    optional_field("base_force_vector_n", f.base_force_vector_n);
     if (contacts != nullptr) {
         std::printf(",\"contacts\":{");
         const char* separator = "";

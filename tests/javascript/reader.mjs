@@ -51,6 +51,11 @@ const OPTIONAL = {
     base_normal: [float32, 3],
     base_covariance_m2: [float32, 9],
     joints_age_s: [float32, 1],
+    force_vector_status: [uint8, 1],
+    force_vector_n: [float32, 3],
+    force_vector_covariance_n2: [float32, 9],
+    palm_force_vector_n: [float32, 3],
+    base_force_vector_n: [float32, 3],
   },
 };
 

@@ -44,6 +44,10 @@ struct Contact {
     std::optional<double> force_n, force_std_n, peak_force_n, uncompensated_force_n;
     std::optional<double> residual, residual_std, joints_age_s;
     std::vector<std::string> diagnoses;
+    // Force on the pad above a shear pad, in the frames of link, palm and base; covariance in the link's.
+    std::string force_vector_status = "not_computed";
+    std::optional<Vector<3>> force_vector_n, palm_force_vector_n, base_force_vector_n;
+    std::optional<Vector<9>> force_vector_covariance_n2;
 };
 
 // A column of a hand frame: N elements for each link; empty where no scene requests it.
@@ -83,12 +87,13 @@ struct Frame {
     bool retained = false;
     std::string hand;
     std::vector<std::string> links;
-    Codes state, position_status, force_status, palm_status, base_status;
+    Codes state, position_status, force_status, palm_status, base_status, force_vector_status;
     Column<std::uint32_t> contact_id, group;
     Column<std::int64_t> sample_ns;
     Scalars total_current_a, force_n, force_std_n, residual, residual_std, joints_age_s;
     Vectors position_m, normal, palm_position_m, palm_normal, base_position_m, base_normal;
-    Matrices covariance_m2, palm_covariance_m2, base_covariance_m2;
+    Vectors force_vector_n, palm_force_vector_n, base_force_vector_n;
+    Matrices covariance_m2, palm_covariance_m2, base_covariance_m2, force_vector_covariance_n2;
     Column<float, 2> pad_m;
 
     // The row of a link; look it up once. Throws std::out_of_range.
@@ -189,6 +194,11 @@ inline Contact decode_contact(std::string_view payload) {
     made.joints_age_s = detail::maybe(map.find("joints_age_s"));
     if (const Value* diagnoses = map.find("diagnoses"))
         for (const Value& kind : diagnoses->as_array()) made.diagnoses.push_back(kind.as_text());
+    if (const Value* status = map.find("force_vector_status")) made.force_vector_status = status->as_text();
+    made.force_vector_n = detail::vector<3>(map.find("force_vector_n"));
+    made.force_vector_covariance_n2 = detail::vector<9>(map.find("force_vector_covariance_n2"));
+    made.palm_force_vector_n = detail::vector<3>(map.find("palm_force_vector_n"));
+    made.base_force_vector_n = detail::vector<3>(map.find("base_force_vector_n"));
     return made;
 }
 
@@ -228,6 +238,11 @@ inline Frame decode_frame(std::string_view payload) {
     read(made.base_normal, map, "base_normal", rows, true);
     read(made.base_covariance_m2, map, "base_covariance_m2", rows, true);
     read(made.joints_age_s, map, "joints_age_s", rows, true);
+    read(made.force_vector_status, map, "force_vector_status", rows, true);
+    read(made.force_vector_n, map, "force_vector_n", rows, true);
+    read(made.force_vector_covariance_n2, map, "force_vector_covariance_n2", rows, true);
+    read(made.palm_force_vector_n, map, "palm_force_vector_n", rows, true);
+    read(made.base_force_vector_n, map, "base_force_vector_n", rows, true);
     return made;
 }
 
