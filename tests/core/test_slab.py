@@ -199,3 +199,15 @@ def test_unpacking_reuses_one_array() -> None:
     slab = Slab(2)
     assert slab.unpack_counts() is slab.unpack_counts()
     assert slab.unpack_counts().dtype == np.int64
+
+
+def test_channels_of_a_shear_pad_follow_the_electrodes_of_the_widest_pad() -> None:
+    fields = tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(7))
+    slab, narrow = Slab(1, 8, [(0, 1, 2, 4, 5, 6, 7)]), Slab(1, 3)
+    for made in (slab, narrow):
+        made.set_layout(0, fields)
+        for pdo, words in enumerate(([1, 2, 3, 4], [5, 6, 7, 0])):
+            assert not made.fresh[0]
+            made.write_pdo(0, np.array(words).astype("<i2").tobytes(), 10 + pdo, pdo)
+    assert slab.unpack_counts().tolist() == [[1, 2, 3, 0, 4, 5, 6, 7]]
+    assert narrow.unpack_counts().tolist() == [[1, 2, 3]]

@@ -99,7 +99,10 @@ class Slab:
             self.set_layout(slot, STANDARD_LAYOUT[:channels])
 
     def set_layout(self, slot: int, layout: ChannelLayout) -> None:
-        """Set the channel fields of a slot, STANDARD_LAYOUT by default; its present sample is discarded."""
+        """Set the channel fields of a slot, STANDARD_LAYOUT by default; its present sample is discarded.
+
+        Channels beyond the slot's columns belong to a sample, but aren't unpacked.
+        """
         self._fields[slot] = 0
         self._fields[slot, :, 0] = slot * MAX_PDOS
         self._counts_per_unit[slot] = 0.0

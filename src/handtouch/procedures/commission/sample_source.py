@@ -60,7 +60,8 @@ def open_sample_source(deployment: config.Deployment) -> Iterator[CanSampleSourc
     deployment = with_default_wiring(deployment)
     specs = node_specs(deployment)
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
-    slab = Slab(len(specs), max(len(spec.channels) for spec in specs))
+    # channels of shear pads, which follow, are left out
+    slab = Slab(len(specs), max(len(entry.pad.electrode_names) for entry in deployment.pads))
     with contextlib.ExitStack() as stack:
         ports: dict[str, Port] = {}
         for bus in deployment.buses:
