@@ -19,6 +19,7 @@ from scores import Estimates, bin_labels
 from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.core.pad_model import PadModel
+from handtouch.core.slab import ChannelField
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -73,16 +74,21 @@ def draw_touches(links: Sequence[str], count: int, seed: int) -> tuple[ScenarioT
 def serve(
     model: PadModel, deployment: Deployment, counts: NDArray[np.int64], sampled: Mapping[int, int]
 ) -> dict[tuple[int, str], wire.Contact]:
-    """Return the contacts in the `sampled` ticks by touch number and link; counts (ticks, pads, 4)."""
+    """Return the contacts in the `sampled` ticks by touch number and link; counts (ticks, pads, c)."""
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
     collector = Collector()
     pipeline = pipeline_of(deployment, collector, model=model)
+    for pad, electrodes in enumerate(model.electrodes):
+        layout = tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(len(electrodes)))
+        pipeline.slab.set_layout(pad, layout)
     for tick, rows in enumerate(counts.astype("<i2")):
         t_ns = _FIRST_NS + tick * period_ns
         collector.sampled = sampled.get(tick)
         pipeline.begin_cycle(t_ns, t_ns)
         for pad, row in enumerate(rows):
-            pipeline.slab.write_pdo(pad, row.tobytes(), t_ns + 1)
+            for number in range(-(-len(model.electrodes[pad]) // 4)):
+                data = row[4 * number : 4 * number + 4].tobytes().ljust(8, b"\0")
+                pipeline.slab.write_pdo(pad, data, t_ns + 1, number)
         pipeline.tick_if_due(t_ns + period_ns)
         pipeline.prepare_next_tick()
     return collector.contacts
@@ -96,7 +102,10 @@ def sampled(hand: VirtualHand, model: PadModel, deployment: Deployment, numbers:
 
 @dataclass(frozen=True)
 class TouchReadings:
-    """Counts (ticks, pads, 4) of touches, and truths of their samples; `sampled`: touch number by tick."""
+    """Counts (ticks, pads, c) of touches, c of the pad with most electrodes, and truths of their samples.
+
+    `sampled`: touch number by tick.
+    """
 
     counts: NDArray[np.int64]
     sampled: Mapping[int, int]
@@ -107,8 +116,11 @@ class TouchReadings:
         """Return all touches up to the last of these numbers, `STEP_S` apart; these numbers are sampled."""
         period_s = deployment.daemon.sync_period_ms * 1e-3
         times_s = period_s * np.arange(round((REST_S + numbers.stop * STEP_S) / period_s))
-        rows = range(len(deployment.pads))
-        counts = np.stack([hand.counts(row, times_s) for row in rows], axis=1)
+        pads = [entry.pad for entry in deployment.pads]
+        most = max(len(pad.electrode_names) for pad in pads)
+        counts = np.zeros((len(times_s), len(pads), most), np.int64)
+        for row, pad in enumerate(pads):
+            counts[:, row, : len(pad.electrode_names)] = hand.counts(row, times_s)
         ticks = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
         truths = {
             (k, truth.link): truth for tick, k in ticks.items() for truth in hand.truth(float(times_s[tick]))

@@ -36,6 +36,7 @@ from handtouch.simulate.worlds import (
     Uniform,
     World,
 )
+from tests.deployments import SIX_ARCS, arcs_text
 
 
 def kind_of(law: SheetLaw) -> SheetKind:
@@ -191,3 +192,10 @@ def test_sheets_of_a_hand_differ_and_remain_stable(deployment: config.Deployment
     assert all(law is not None and law.adaptation.shares == (1.0,) for law in laws)
     ideal = WORLDS["default"].with_sheets().draw(2)
     assert ideal.pad("right", deployment.hands[0].pads[0]).sheet_law is None
+
+
+def test_ends_of_arcs_are_off_in_both_directions_without_touching() -> None:
+    (pad,) = (entry.pad for entry in config.parse(arcs_text(SIX_ARCS)).pads if entry.pad.arcs_mm)
+    gaps = np.array([WORLDS["harsh"].draw(seed).pad("h", pad).gap_before_mm for seed in range(40)])
+    assert gaps.min() < -0.1 < 0.1 < gaps.max()
+    assert gaps.min() >= -0.4 * 1.0

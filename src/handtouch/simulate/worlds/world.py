@@ -33,6 +33,7 @@ from handtouch.simulate.worlds.spreads import (
 FloatArray = NDArray[np.float64]
 PerElectrode = tuple[float, ...]
 _MIN_RADIUS_RATIO = 0.3
+_MAX_ARC_GROWTH = 0.4  # of the shortest bare stretch between electrodes on arcs, at each end
 UNEVEN_MODES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 """Waves (m, n), cos(m pi x) cos(n pi y), of the logarithm of an uneven sheet's resistance."""
 
@@ -148,7 +149,7 @@ class DrawnWorld:
         gain = parts.gain_ratio.sample(rng, count)
         resistors = parts.resistor_ratio.sample(rng, count)
         nominal = np.array(pad.gaps_mm).T.ravel()
-        gaps = np.maximum(nominal + parts.gap_offset_mm.sample(rng, 2 * count), 0.0)
+        gaps = np.maximum(nominal + parts.gap_offset_mm.sample(rng, 2 * count), _least_gap_mm(pad))
         mount = self._stream("mount", link)
         return HiddenPad(
             gain_ratio=_floats(gain),
@@ -294,6 +295,14 @@ class DrawnWorld:
     def _stream(self, *names: str) -> np.random.Generator:
         """Return the random stream of some quantities of an object, independent of all others."""
         return np.random.default_rng((self.seed, zlib.crc32("/".join(names).encode())))
+
+
+def _least_gap_mm(pad: config.Pad) -> float:
+    """Return the least gap of a pad's electrodes: arcs may be longer than stated, without touching."""
+    ends = np.array(pad.arcs_mm).reshape(-1, 2)
+    bare = np.roll(ends[:, 0], -1) - ends[:, 1]
+    between = bare[bare > 0]  # not that with the first vertex, from where lengths begin again
+    return -_MAX_ARC_GROWTH * float(between.min()) if between.size else 0.0
 
 
 def _floats(values: FloatArray) -> PerElectrode:
