@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from handtouch.config import parse
 from handtouch.core.events import BaselineEvent
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.sampling import SamplingController
+from handtouch.daemon.tare import TareJob
 from handtouch.record.exact_replay import ExactReplay
 from handtouch.record.recording import Recording
 from handtouch.record.tables import rows_of
@@ -42,18 +45,26 @@ class ShearHand(Hand):
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[wire.Contact]]:
-    """A recording: rest, a pull, a tare, a pull in which the second PDO stays out."""
+def make_shear_hand() -> Callable[..., ShearHand]:
     deployment = parse(shear_deployment(KINDS))
+    model = PadModel(deployment)
 
-    def make(take: Callable[[list[bytes]], None]) -> Hand:
+    def make(take: Callable[[list[bytes]], None] = lambda _: None) -> ShearHand:
         sink = CollectingSink(take)
-        pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.6, sink, SESSION)
+        pipeline = Pipeline(copy.deepcopy(model), PERIOD_NS, 0.6, sink, SESSION)
         pipeline.slab.set_layout(0, LAYOUT)
         pipeline.node_state[:] = wire.PadState.CLEAR
         return ShearHand(deployment, pipeline, sink)
 
-    session = RecordingSession(make, tmp_path_factory.mktemp("shear"))
+    return make
+
+
+@pytest.fixture(scope="module")
+def recorded(
+    make_shear_hand: Callable[..., ShearHand], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[wire.Contact]]:
+    """A recording: rest, a pull, a tare, a pull in which the second PDO stays out."""
+    session = RecordingSession(make_shear_hand, tmp_path_factory.mktemp("shear"))
     hand = session.hand
     assert isinstance(hand, ShearHand)
     for _ in range(100):
@@ -95,6 +106,26 @@ def test_vectors_follow_the_skin_from_the_rest_position_of_the_last_tare(recorde
     assert np.trace(np.reshape(second[0].force_vector_covariance_n2, (3, 3))) < np.trace(
         np.reshape(first[-2].force_vector_covariance_n2, (3, 3))
     )
+
+
+class FullRate:
+    """A sampling controller of pads that are always sampled."""
+
+    def request_full_rate(self, pads: Any, now_ns: int) -> None: ...
+
+
+def test_a_tare_measures_the_rest_position(make_shear_hand: Callable[..., ShearHand]) -> None:
+    hand = make_shear_hand()
+    for _ in range(100):
+        hand.press(0.0, (0.0, 0.0))
+    tare = TareJob(
+        [("h", "tip0")], np.ones(1, np.bool_), hand.pipeline, cast(SamplingController, FullRate()), hand.t_ns
+    )
+    while (done := tare.poll(hand.t_ns)) is None:
+        hand.press(0.0, (0.05e-3, -0.02e-3))
+    assert [pad["tared"] for pad in done["pads"]] == [True]
+    hand.press(0.0, (0.05e-3, -0.02e-3))  # the tick that applies it
+    np.testing.assert_allclose(hand.pipeline.state.shear_rest_m[0, :2], (0.05e-3, -0.02e-3), atol=1e-6)
 
 
 def test_a_missing_pdo_of_the_shear_pad_is_a_missing_sample_of_the_pad(recorded: Any) -> None:

@@ -152,6 +152,11 @@ def test_a_disconnected_daemon_differs_from_an_untouched_hand() -> None:
             replace(CONTACT, position_m=None, covariance_m2=None, position_status="invalid"),
             "position invalid",
         ),
+        (
+            replace(CONTACT, force_vector_status="valid", force_vector_n=(0.5, -0.25, -1.2)),
+            "vector (  0.50,  -0.25,  -1.20) N",
+        ),
+        (replace(CONTACT, force_vector_status="invalid"), "vector invalid"),
         (replace(CONTACT, event="end", end_reason="lost"), "lost after 0.50 s, peak 2.50 N"),
     ],
 )

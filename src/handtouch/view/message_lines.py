@@ -26,6 +26,11 @@ def contact_line(contact: wire.Contact) -> str:
     if contact.palm_status != "not_computed":
         parts.append(palm_position_text(contact))
     parts.append(force_text(contact))
+    if contact.force_vector_n is not None:
+        fx, fy, fz = contact.force_vector_n
+        parts.append(f"vector ({fx:6.2f}, {fy:6.2f}, {fz:6.2f}) N")
+    elif contact.force_vector_status != "not_computed":
+        parts.append(f"vector {contact.force_vector_status}")
     if contact.event == "end":
         peak = "" if contact.peak_force_n is None else f", peak {contact.peak_force_n:.2f} N"
         parts.append(f"{contact.end_reason} after {contact.duration_s:.2f} s{peak}")
