@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from handtouch import wire
+from handtouch.client.subscriber import columns
 from handtouch.config import ConfigError, parse
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import ChannelField, Slab
 from handtouch.core.state import TickState
 from handtouch.field.contact_law import ContactLaw
@@ -137,3 +140,38 @@ def test_contacts_are_located_without_a_dead_electrode() -> None:
 
     model.set_calibration(1, whole)
     np.testing.assert_array_equal(solved(model, network.fractions(*at), whole_a), before)
+
+
+class RawMessages:
+    """Keeps the raw messages, as a client decodes them."""
+
+    def __init__(self) -> None:
+        self.received: list[wire.Raw] = []
+
+    def has_subscriber(self, topic: str) -> bool:
+        return topic.startswith("raw/")
+
+    def send(self, message: wire.OutgoingMessage) -> None:
+        decoded = wire.decode(wire.encode(message))
+        assert isinstance(decoded, wire.Raw)
+        self.received.append(decoded)
+
+
+@pytest.mark.parametrize("arcs", [THREE_ARCS, SIX_ARCS], ids=["three", "six"])
+def test_raw_counts_have_as_many_columns_as_the_pad_with_most_electrodes(
+    arcs: dict[str, tuple[float, float]],
+) -> None:
+    sink, now_ns = RawMessages(), 10**9
+    pipeline = Pipeline(PadModel(parse(arcs_text(arcs))), 5_000_000, 0.6, sink)
+    pipeline.begin_cycle(now_ns, now_ns)
+    for pad, count in enumerate((4, len(arcs))):
+        pipeline.slab.set_layout(
+            pad, tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(count))
+        )
+        read = np.where(np.arange(8) < count, np.arange(1, 9), 0).astype("<i2")
+        for number in range(-(-count // 4)):
+            pipeline.slab.write_pdo(pad, read[4 * number : 4 * number + 4].tobytes(), now_ns + 10, number)
+    pipeline.finish_cycle(now_ns + 5_000_000, now_ns + 5_000_000)
+    (raw,) = sink.received
+    expected = [[1, 2, 3, 4, 0, 0], [1, 2, 3, 4, 5, 6]] if len(arcs) == 6 else [[1, 2, 3, 4], [1, 2, 3, 0]]
+    assert columns(raw)["counts"].tolist() == expected

@@ -277,7 +277,7 @@ def columns(frame: wire.HandFrame | wire.Raw) -> dict[str, NDArray[Any]]:
     Rows are in the order of `frame.links`. Columns that no scene requests (palm and base frame) are absent.
     """
     return {
-        name: column.to_array(getattr(frame, name))
+        name: column.to_array(getattr(frame, name), len(frame.links) if column.is_least else None)
         for name, column in wire.COLUMNS[type(frame)].items()
         if getattr(frame, name) or not frame.links
     }

@@ -41,7 +41,7 @@ _INT, _LONG = struct.Struct(">I"), struct.Struct(">Q")
 _TRUE, _FALSE = b"\xc3", b"\xc2"  # of msgpack
 _EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
 _END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
-_RAW_CHANNELS = wire.COLUMNS[wire.Raw]["counts"].elements
+_MIN_RAW_CHANNELS = wire.COLUMNS[wire.Raw]["counts"].elements
 _PAD_TEXTS = 4  # the last is empty
 _MAX_VALUE_BYTES = 1024  # numbers and names of statuses
 
@@ -121,7 +121,7 @@ class TickMessages:
         for hand, topic, raw in self._hand_topics:
             if sink.has_subscriber(topic):
                 sink.send(self._hand_frame(hand))
-            if self._model.channels == _RAW_CHANNELS and sink.has_subscriber(raw):
+            if sink.has_subscriber(raw):
                 sink.send(self._raw_message(hand, slab))
 
     def retained_messages(self) -> dict[str, Callable[[int], wire.OutgoingMessage | None]]:
@@ -177,7 +177,10 @@ class TickMessages:
         }
 
     def _raw_message(self, hand: str, slab: Slab) -> wire.Raw:
-        rows = self._model.rows_of_hand[hand]
+        rows, counts = self._model.rows_of_hand[hand], self._tick.counts
+        most = int(self._model.electrode_counts[rows].max())
+        columns = np.zeros((rows.stop - rows.start, max(most, _MIN_RAW_CHANNELS)), "<i8")
+        columns[:, :most] = counts[rows, :most]
         seq, tick_number, sync_ns = self._frame_numbers()
         return wire.Raw(
             v=wire.SCHEMA_VERSION,
@@ -187,7 +190,7 @@ class TickMessages:
             tick=tick_number,
             hand=hand,
             links=tuple(self._model.links[rows]),
-            counts=self._tick.counts[rows].astype("<i8").tobytes(),
+            counts=columns.tobytes(),
             sample_ns=self._tick.columns.sample_ns[rows].astype("<i8").tobytes(),
             fresh=slab.fresh[rows].tobytes(),
             retained=False,

@@ -157,7 +157,7 @@ def _check_columns(name: str, message: Any) -> None:
         size = len(getattr(message, key))
         if size == 0 and key in _DEFAULTS[type(message)]:
             continue
-        if size != rows * column.row_bytes:
+        if not column.fits(size, rows):
             raise WireError(
                 f"{name}: {key} must have one row of {column.elements} {column.dtype} for each of "
                 f"{rows} links, {rows * column.row_bytes} bytes, not {size}"

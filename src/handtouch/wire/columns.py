@@ -29,6 +29,8 @@ class Column:
     """per row"""
     codes: type[IntEnum] | None = None
     """meaning of the values, for a column of status codes"""
+    is_least: bool = False
+    """rows may have more elements"""
 
     @property
     def type_name(self) -> str:
@@ -40,10 +42,16 @@ class Column:
         """Bytes of one row."""
         return self.elements * int(self.dtype[-1])
 
+    def fits(self, size: int, rows: int) -> bool:
+        """Return whether so many bytes are as many rows."""
+        expected = rows * self.row_bytes
+        more = self.is_least and size > expected > 0 and size % (rows * int(self.dtype[-1])) == 0
+        return size == expected or more
+
     def to_array(self, data: bytes, rows: int | None = None) -> NDArray[Any]:
         """Return a read-only array of the column, (n,) or (n, elements).
 
-        rows: n of a column that may have more elements in a row. Raises ValueError for bytes that are no
+        rows: n, needed where a row may have more elements. Raises ValueError for bytes that are no
         whole number of rows.
         """
         import numpy as np  # costs 0.1 s, and a plain subscriber needs no arrays

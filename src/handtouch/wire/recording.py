@@ -24,8 +24,9 @@ class Raw:
     """name of the hand"""
     links: tuple[str, ...]
     """row names of all columns"""
-    counts: Annotated[bytes, Column("<i8", 4)]
-    """electrodes x0, xa, y0, yb; for any width of the node's channels"""
+    counts: Annotated[bytes, Column("<i8", 4, is_least=True)]
+    """electrodes x0, xa, y0, yb, or those of `electrode_arcs_mm`; for any width of the node's channels. More
+    where a pad of the hand has more, as many as that; 0 beyond a pad's own"""
     sample_ns: Annotated[bytes, Column("<i8")]
     """time of the row's sample, 0 before the first"""
     fresh: Annotated[bytes, Column("<u1")]
